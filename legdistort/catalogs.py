@@ -1,0 +1,196 @@
+"""The column contract of every table that enters or leaves, checked in one place."""
+
+from pathlib import Path
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable, Table
+
+from .exceptions import InputError
+
+#: Columns of a table of matched positions: name -> (unit, required)
+MATCHED = {
+    "exposure": (None, True),
+    "star": (None, True),
+    "x": (u.pix, True),
+    "y": (u.pix, True),
+    "x_err": (u.pix, True),
+    "y_err": (u.pix, True),
+    "xy_corr": (None, False),
+    "detector": (None, False),
+    "flux": (None, False),
+}
+
+#: Columns of a table of detections.
+DETECTED = {
+    "exposure": (None, True),
+    "x": (u.pix, True),
+    "y": (u.pix, True),
+    "x_err": (u.pix, True),
+    "y_err": (u.pix, True),
+    "xy_corr": (None, False),
+    "flux": (None, False),
+    "flux_err": (None, False),
+    "fwhm": (u.pix, False),
+    "flags": (None, False),
+}
+
+
+def values(table, column, unit=None):
+    """A column as a plain float array in `unit`; columns without a unit are taken as they are.
+
+    Raises
+    ------
+    InputError
+        If the column's unit cannot be converted.
+    """
+    data = table[column]
+    if np.ma.isMaskedArray(data) and np.ma.is_masked(data):
+        data = data.astype(float).filled(np.nan)
+    try:
+        if getattr(data, "unit", None) is not None and unit is not None:
+            data = u.Quantity(data).to_value(unit)
+        return np.array(data, dtype=float)
+    except (u.UnitConversionError, TypeError, ValueError) as error:
+        raise InputError(f"column {column!r} cannot be read as numbers in {unit or 'no unit'}: {error}") from None
+
+
+def labels(table, column):
+    """A column of names (str) or serials (int) as a plain array."""
+    data = np.asarray(table[column])
+    if data.dtype.kind == "S":
+        data = np.char.decode(data)
+    if data.dtype.kind == "O":
+        data = data.astype(str)
+    if data.dtype.kind not in "iuU":
+        raise InputError(f"column {column!r} must hold names or integers, got {data.dtype}")
+    return data
+
+
+def rename(table, columns):
+    """Copy of a table with columns renamed to the contract's names.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table` or anything that it takes
+    columns : dict
+        ``{contract name: name in the table}``, for example ``{"star": "name", "x_err": "xe"}``.
+
+    Raises
+    ------
+    InputError
+        Naming the column that is not there.
+    """
+    table = Table(table, copy=False)
+    for wanted, present in columns.items():
+        if present not in table.colnames:
+            raise InputError(f"no column {present!r} to use as {wanted!r}; the table has {', '.join(table.colnames)}")
+    source = {present: wanted for wanted, present in columns.items()}
+    out = Table()
+    for name in table.colnames:
+        target = source.get(name, name)
+        if target != name or name not in columns:
+            out[target] = table[name]
+    return out
+
+
+def _rows(bad, table, what):
+    first = int(np.flatnonzero(bad)[0])
+    where = ", ".join(f"{k} {table[k][first]}" for k in ("exposure", "star") if k in table.colnames)
+    return f"{what} in {np.count_nonzero(bad)} of {len(bad)} rows; the first is row {first} ({where})"
+
+
+def check(table, contract, what):
+    """Check a table against a column contract and return it as a `~astropy.table.QTable`.
+
+    Columns beyond the contract are kept. Positions must be finite, errors positive
+    and finite, correlations inside (-1, 1).
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+    contract : dict
+        `MATCHED` or `DETECTED`.
+    what : str
+        How messages call the table.
+
+    Raises
+    ------
+    InputError
+        Naming the column and the first row at fault.
+    """
+    table = Table(table, copy=False)
+    missing = [name for name, (_, required) in contract.items() if required and name not in table.colnames]
+    if missing:
+        raise InputError(
+            f"{what} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}; it has "
+            f"{', '.join(table.colnames)} (map names with columns={{'{missing[0]}': ...}} or --columns {missing[0]}=...)"
+        )
+    if len(table) == 0:
+        raise InputError(f"{what} is empty")
+    out = QTable()
+    for name in table.colnames:
+        unit = contract[name][0] if name in contract else None
+        if name in ("exposure", "star", "detector"):
+            out[name] = labels(table, name)
+        elif name in contract:
+            column = values(table, name, unit)
+            out[name] = column * unit if unit is not None else column
+        else:
+            out[name] = table[name]
+    for name in ("x", "y"):
+        bad = ~np.isfinite(out[name].value)
+        if bad.any():
+            raise InputError(f"{what}: " + _rows(bad, out, f"{name} is not finite"))
+    for name in ("x_err", "y_err"):
+        bad = ~(np.isfinite(out[name].value) & (out[name].value > 0))
+        if bad.any():
+            raise InputError(
+                f"{what}: "
+                + _rows(bad, out, f"{name} is not a positive finite number")
+                + "; errors are standard deviations in pixels, leave out rows without one"
+            )
+    if "xy_corr" in out.colnames:
+        bad = ~(np.abs(out["xy_corr"]) < 1)
+        if bad.any():
+            raise InputError(f"{what}: " + _rows(bad, out, "xy_corr is not inside (-1, 1)"))
+    return out
+
+
+def read_table(path, *, columns=None):
+    """Read a table of positions from a file.
+
+    ``.ecsv``, ``.fits`` and ``.csv`` by their ending, anything else as text with a header line (commented
+    or not). A table without a column ``exposure`` is taken for one exposure, named after the file.
+
+    Parameters
+    ----------
+    path : str or path
+    columns : dict, optional
+        ``{contract name: name in the file}``, see `rename`.
+
+    Raises
+    ------
+    InputError
+        Naming the file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    formats = {".ecsv": ["ascii.ecsv"], ".fits": ["fits"], ".csv": ["ascii.csv"]}
+    errors = []
+    for kind in formats.get(path.suffix.lower(), ["ascii.commented_header", "ascii"]):
+        try:
+            table = Table.read(path, format=kind)
+            break
+        except Exception as error:  # readers raise what they like
+            errors.append(str(error).strip().splitlines()[0])
+    else:
+        raise InputError(f"{path} cannot be read as a table: {errors[-1]}")
+    try:
+        table = rename(table, columns or {})
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    if "exposure" not in table.colnames:
+        table["exposure"] = path.name.split(".")[0]
+    return table

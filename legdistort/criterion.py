@@ -1,0 +1,384 @@
+"""The weighted least-squares criterion J: residuals, derivatives and normal blocks. It knows no solver.
+
+``J = sum_ij r_ij' W_ij r_ij`` over residuals ``r = x_data - D_i(X_j)`` in detector pixels
+(Bernard et al. 2017, eq. of section 3.1, per axis and with correlated errors), plus Gaussian priors on the
+coefficients. With ``q = T_i(X)``, ``G = I + A grad b`` and ``J_ij = G R_i`` (2, 2), an observation
+contributes to the normal equations::
+
+    V_j  += J' W J           star block (2, 2)
+    U_i  += W (x) b b'       exposure block (2 n_modes, 2 n_modes)
+    E_ij  = (J' W) (x) b     coupling, kept as its factors F = J' W and b
+
+Arrays are ordered by exposure, coordinates first, so that every sweep reads memory once and in order.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from . import basis
+from .exceptions import InputError, SolveError
+from .priors import Prior, similarity_basis
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Everything in J that does not change while it is minimised.
+
+    Attributes
+    ----------
+    degree : int
+        Total degree that is fitted; modes of the prior beyond it stay at the prior.
+    names : tuple of str
+    shapes : list of (ny, nx), one an exposure
+    n_stars : int
+    order : ndarray of int, shape (n,)
+        Row of the table behind every observation.
+    start : ndarray of int, shape (n_exposures + 1,)
+        Observations ``start[i]:start[i + 1]`` belong to exposure i.
+    star : ndarray of int, shape (n,)
+        Ascending within an exposure.
+    xy : ndarray, shape (2, n)
+    weight : ndarray, shape (3, n)
+        Inverse covariance: xx, yy, xy [1/pix^2]; zero for an observation that is left out.
+    prior_mean : ndarray, shape (n_exposures, 2, n_all)
+    prior_sigma : ndarray, shape (n_exposures, 2, n_modes), or None
+    """
+
+    degree: int
+    names: tuple
+    shapes: list
+    n_stars: int
+    order: np.ndarray
+    start: np.ndarray
+    star: np.ndarray
+    xy: np.ndarray
+    weight: np.ndarray
+    prior_mean: np.ndarray
+    prior_sigma: np.ndarray | None = None
+
+    @property
+    def n_exposures(self):
+        """Number of exposures."""
+        return len(self.shapes)
+
+    @property
+    def n_modes(self):
+        """Number of fitted modes per axis."""
+        return basis.n_modes(self.degree)
+
+    def part(self, i):
+        """Observations of exposure i, as a slice."""
+        return slice(self.start[i], self.start[i + 1])
+
+    def scaled(self, factor):
+        """The same problem with all weights multiplied by `factor` (n,); zero leaves an observation out."""
+        return replace(self, weight=self.weight * factor)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The unknowns: positions (2, n_stars), coefficients (n_exposures, 2, n_all), poses (n_exposures, 2, 3)."""
+
+    positions: np.ndarray
+    coefficients: np.ndarray
+    poses: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """J and its normal equations at one state.
+
+    Attributes
+    ----------
+    chi2 : float
+        Data part of J.
+    penalty : float
+        Prior part of J.
+    residual : ndarray, shape (2, n)
+    v : ndarray, shape (3, n_stars)
+        Star blocks xx, yy, xy.
+    g_star : ndarray, shape (2, n_stars)
+    u : ndarray, shape (n_exposures, 2 n_modes, 2 n_modes)
+        Exposure blocks with the prior, x modes first.
+    u_data : ndarray
+        The same without the prior.
+    g_exposure : ndarray, shape (n_exposures, 2 n_modes)
+    coupling : ndarray, shape (2, 2, n)
+        F = J' W, star coordinate first.
+    values : ndarray, shape (n_modes, n)
+        Basis at every observation.
+    """
+
+    chi2: float
+    penalty: float
+    residual: np.ndarray
+    v: np.ndarray
+    g_star: np.ndarray
+    u: np.ndarray
+    u_data: np.ndarray
+    g_exposure: np.ndarray
+    coupling: np.ndarray
+    values: np.ndarray
+
+    @property
+    def cost(self):
+        """J: data and prior."""
+        return self.chi2 + self.penalty
+
+
+def build(matches, degree, *, prior=None, error_floor=0.0):
+    """The problem posed by `legdistort.matches.Matches`.
+
+    Parameters
+    ----------
+    matches : Matches
+    degree : int
+    prior : Prior or dict, optional
+        One for all exposures, or by ``detector`` or exposure name.
+    error_floor : float
+        Pixels, added in quadrature to every position error.
+
+    Raises
+    ------
+    InputError
+        For a bad degree, floor or prior.
+    SolveError
+        Naming an exposure with fewer stars than modes and no prior to make up for it.
+    """
+    degree = basis.check_degree(degree)
+    if not (np.isfinite(error_floor) and error_floor >= 0):
+        raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
+    obs = matches.observations
+    order = np.lexsort((obs.star, obs.exposure))
+    counts = np.bincount(obs.exposure, minlength=len(matches.names))
+    var_x, var_y, cov = (obs.covariance[order] + [error_floor**2, error_floor**2, 0.0]).T
+    weight = np.stack([var_y, var_x, -cov]) / (var_x * var_y - cov**2)
+    priors = _priors(matches, prior, counts, obs.exposure)
+    n_fit = basis.n_modes(degree)
+    top = max([degree, *(p.degree for p in priors if p is not None)])
+    mean = np.zeros((len(priors), 2, basis.n_modes(top)))
+    sigma = np.full((len(priors), 2, n_fit), np.inf)
+    for i, p in enumerate(priors):
+        if p is not None:
+            mean[i, :, : p.mean.shape[1]] = p.mean
+            if p.sigma is not None:
+                given = p.sigma[:, :n_fit]
+                sigma[i, :, : given.shape[1]] = given
+    free = np.isinf(sigma).all(axis=(1, 2))
+    for name, count, is_free in zip(matches.names, counts, free, strict=True):
+        if is_free and count < n_fit:
+            raise SolveError(
+                f"exposure {name} has {count} stars, fewer than the {n_fit} modes of degree {degree}: "
+                f"lower the degree (at most {_highest_degree(count)} here), give a prior with sigma, "
+                "or leave the exposure out"
+            )
+    return Problem(
+        degree=degree,
+        names=matches.names,
+        shapes=[matches.shapes[name] for name in matches.names],
+        n_stars=len(matches.stars),
+        order=order,
+        start=np.concatenate([[0], np.cumsum(counts)]),
+        star=obs.star[order],
+        xy=np.ascontiguousarray(obs.xy[order].T),
+        weight=weight,
+        prior_mean=mean,
+        prior_sigma=None if free.all() else sigma,
+    )
+
+
+def _highest_degree(count):
+    return max(d for d in range(basis.MAX_DEGREE + 1) if basis.n_modes(d) <= max(count, 1))
+
+
+def _priors(matches, prior, counts, exposure):
+    """One prior (or None) per exposure."""
+    if prior is None or isinstance(prior, Prior):
+        return [prior] * len(matches.names)
+    if not isinstance(prior, dict):
+        raise InputError(f"prior must be a Prior or a dict of them, got {type(prior).__name__}")
+    detectors = {}
+    if "detector" in matches.table.colnames:
+        names, first = np.unique(exposure, return_index=True)
+        detectors = {matches.names[i]: matches.table["detector"][k] for i, k in zip(names, first, strict=True)}
+    out = []
+    for name in matches.names:
+        key = name if name in prior else detectors.get(name)
+        if key not in prior:
+            raise InputError(f"prior has no entry for exposure {name} (nor for its detector {key!r})")
+        out.append(prior[key])
+    return out
+
+
+def prior_precision(problem, i):
+    """Inverse prior covariance (2 n_modes, 2 n_modes) of exposure i; none along its similarities.
+
+    A similarity of the coefficients is a change of the pose, which has no prior.
+    """
+    n = 2 * problem.n_modes
+    if problem.prior_sigma is None or np.isinf(problem.prior_sigma[i]).all():
+        return np.zeros((n, n))
+    # a width of zero or infinity stands for "held" and "free" at 1e-6 and 1e6 px
+    sigma = np.clip(problem.prior_sigma[i].ravel(), 1e-6, 1e6)
+    others = complement(similarity_basis(problem.shapes[i], problem.n_modes))
+    return others.T @ np.linalg.solve(others * sigma**2 @ others.T, others)
+
+
+def complement(rows):
+    """Orthonormal rows that span what the orthonormal `rows` (k, n) leave, shape (n - k, n)."""
+    return np.linalg.qr(rows.T, mode="complete")[0][:, len(rows) :].T
+
+
+def predict(problem, state, i, *, derivative=True):
+    """Model positions of the observations of exposure i, with what the normal equations need.
+
+    Returns
+    -------
+    position : ndarray, shape (2, n_i)
+    values : ndarray, shape (n_all, n_i)
+        Basis values.
+    jacobian : ndarray, shape (2, 2, n_i)
+        dD/dX, detector axis first. Only if `derivative`.
+    """
+    ny, nx = problem.shapes[i]
+    pose, a = state.poses[i], state.coefficients[i]
+    q = pose[:, :2] @ state.positions[:, problem.star[problem.part(i)]] + pose[:, 2:]
+    u, v = (2 * q[0] + 1) / nx - 1, (2 * q[1] + 1) / ny - 1
+    degree = basis.degree_of(a.shape[1])
+    if not derivative:
+        values = basis.values(degree, u, v)
+        return q + a @ values, values
+    values, du, dv = basis.gradients(degree, u, v)
+    gx, gy = a @ du * (2 / nx), a @ dv * (2 / ny)  # columns of G - I
+    gx[0] += 1
+    gy[1] += 1
+    r = pose[:, :2]
+    jacobian = np.stack([gx * r[0, 0] + gy * r[1, 0], gx * r[0, 1] + gy * r[1, 1]], axis=1)
+    return q + a @ values, values, jacobian
+
+
+def residuals(problem, state):
+    """``x_data - D(X)`` of every observation, shape (2, n) pixels, in the order of the problem."""
+    out = np.empty_like(problem.xy)
+    for i in range(problem.n_exposures):
+        part = problem.part(i)
+        out[:, part] = problem.xy[:, part] - predict(problem, state, i, derivative=False)[0]
+    return out
+
+
+def squares(problem, residual):
+    """``r' W r`` of every observation, shape (n,)."""
+    w, (x, y) = problem.weight, residual
+    return w[0] * x * x + w[1] * y * y + 2 * w[2] * x * y
+
+
+def linearise(problem, state):
+    """J and its normal equations at a state: one pass over the observations."""
+    n_modes, n_exposures, n = problem.n_modes, problem.n_exposures, problem.xy.shape[1]
+    residual, values, coupling = np.empty((2, n)), np.empty((n_modes, n)), np.empty((2, 2, n))
+    v, g_star = np.zeros((3, problem.n_stars)), np.zeros((2, problem.n_stars))
+    u = np.empty((n_exposures, 2 * n_modes, 2 * n_modes))
+    g_exposure = np.empty((n_exposures, 2 * n_modes))
+    correlated = bool(np.any(problem.weight[2]))
+    for i in range(n_exposures):
+        part = problem.part(i)
+        star, w = problem.star[part], problem.weight[:, part]
+        position, b, jac = predict(problem, state, i)
+        b = values[:, part] = b[:n_modes]
+        r = residual[:, part] = problem.xy[:, part] - position
+        f = coupling[:, :, part]
+        f[:, 0], f[:, 1] = jac[0] * w[0] + jac[1] * w[2], jac[0] * w[2] + jac[1] * w[1]
+        # a star stands once in an exposure, so plain indexed addition is right
+        v[0, star] += f[0, 0] * jac[0, 0] + f[0, 1] * jac[1, 0]
+        v[1, star] += f[1, 0] * jac[0, 1] + f[1, 1] * jac[1, 1]
+        v[2, star] += f[0, 0] * jac[0, 1] + f[0, 1] * jac[1, 1]
+        g_star[:, star] += f[:, 0] * r[0] + f[:, 1] * r[1]
+        wr = np.stack([w[0] * r[0] + w[2] * r[1], w[2] * r[0] + w[1] * r[1]])
+        g_exposure[i] = (wr @ b.T).ravel()
+        u[i, :n_modes, :n_modes] = (b * w[0]) @ b.T
+        u[i, n_modes:, n_modes:] = u[i, :n_modes, :n_modes] if np.array_equal(w[0], w[1]) else (b * w[1]) @ b.T
+        u[i, :n_modes, n_modes:] = u[i, n_modes:, :n_modes] = (b * w[2]) @ b.T if correlated else 0.0
+    u_data, penalty = u, 0.0
+    if problem.prior_sigma is not None:
+        u = u.copy()
+        for i in range(n_exposures):
+            precision = prior_precision(problem, i)
+            departure = (state.coefficients[i] - problem.prior_mean[i])[:, :n_modes].ravel()
+            u[i] += precision
+            g_exposure[i] -= precision @ departure
+            penalty += float(departure @ precision @ departure)
+    chi2 = float(squares(problem, residual).sum())
+    return Blocks(chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values)
+
+
+def inverse_star_blocks(v):
+    """Inverse (3, n_stars) of symmetric 2 x 2 blocks; zero for a star without observations."""
+    determinant = v[0] * v[1] - v[2] ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out = np.stack([v[1], v[0], -v[2]]) / determinant
+    out[:, determinant <= 0] = 0
+    return out
+
+
+def symmetric_times(block, x):
+    """Symmetric 2 x 2 blocks (3, n) times vectors (2, n)."""
+    return np.stack([block[0] * x[0] + block[2] * x[1], block[2] * x[0] + block[1] * x[1]])
+
+
+def to_stars(problem, blocks, a):
+    """E a: coefficients (n_exposures, 2 n_modes) -> stars (2, n_stars)."""
+    out = np.zeros((2, problem.n_stars))
+    n_modes = problem.n_modes
+    for i in range(problem.n_exposures):
+        part = problem.part(i)
+        t = a[i].reshape(2, n_modes) @ blocks.values[:, part]
+        f = blocks.coupling[:, :, part]
+        out[:, problem.star[part]] += f[:, 0] * t[0] + f[:, 1] * t[1]
+    return out
+
+
+def to_exposures(problem, blocks, y):
+    """E' y: stars (2, n_stars) -> coefficients (n_exposures, 2 n_modes)."""
+    out = np.empty((problem.n_exposures, 2 * problem.n_modes))
+    for i in range(problem.n_exposures):
+        part = problem.part(i)
+        z, f = y[:, problem.star[part]], blocks.coupling[:, :, part]
+        out[i] = ((f[0] * z[0] + f[1] * z[1]) @ blocks.values[:, part].T).ravel()
+    return out
+
+
+def reduced_matrix(problem, blocks):
+    """Schur complement ``S = U - E' V^-1 E`` with the stars eliminated, shape (n_unknowns, n_unknowns).
+
+    The product is taken over blocks of stars, each a dense matrix product.
+    """
+    size = 2 * problem.n_modes
+    n = problem.n_exposures * size
+    out = np.zeros((n, n))
+    for i in range(problem.n_exposures):
+        out[i * size : (i + 1) * size, i * size : (i + 1) * size] = blocks.u[i]
+    for factor in star_factors(problem, blocks):
+        out -= factor @ factor.T
+    return out
+
+
+def star_factors(problem, blocks, *, n_block=512):
+    """Yield ``E' L`` for blocks of stars, with ``L L' = V^-1``: arrays (n_unknowns, 2 n_block)."""
+    size = 2 * problem.n_modes
+    inverse = inverse_star_blocks(blocks.v)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        l00 = np.sqrt(inverse[0])
+        l10 = np.where(l00 > 0, inverse[2] / l00, 0)
+        l11 = np.sqrt(np.maximum(inverse[1] - l10**2, 0))
+    for first in range(0, problem.n_stars, n_block):
+        last = min(first + n_block, problem.n_stars)
+        factor = np.zeros((problem.n_exposures * size, 2, last - first))
+        for i in range(problem.n_exposures):
+            lo, hi = problem.start[i] + np.searchsorted(problem.star[problem.part(i)], [first, last])
+            star, f, b = problem.star[lo:hi], blocks.coupling[:, :, lo:hi], blocks.values[:, lo:hi]
+            column = [f[0] * l00[star] + f[1] * l10[star], f[1] * l11[star]]  # each (axis, n)
+            for k in (0, 1):
+                rows = (column[k][:, None, :] * b).reshape(size, -1)
+                factor[i * size : (i + 1) * size, k, star - first] = rows
+        yield factor.reshape(len(factor), -1)

@@ -1,0 +1,296 @@
+"""One exposure's distortion: undistorted pixels q -> detector pixels, and its certified inverse.
+
+``D(q) = q + sum_m a_m b_m(u(q))`` (Bernard et al. 2017, eq. for X_ij in section 2.1, with the basis in
+detector coordinates). D is exact; the opposite direction has no closed form and is fitted once by a
+Legendre tensor whose degree is raised until the round trip holds.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from astropy.modeling import models
+
+from . import basis
+from .exceptions import FoldError, InputError
+
+#: Largest round-trip error of a certified inverse, pixels.
+TOLERANCE = 1e-6
+#: A Jacobian determinant below this counts as a fold.
+FOLD = 0.1
+_MAX_INVERSE_DEGREE = 30
+_CHUNK = 8192  # points per block: the work arrays stay in the cache
+
+
+class FastLegendre2D(models.Legendre2D):
+    """`~astropy.modeling.models.Legendre2D` that is thread-safe, keeps no work arrays and knows where it is valid.
+
+    The stock model stores its recurrence in attributes: two threads that evaluate one instance corrupt each
+    other, and full-size arrays stay behind. Only the evaluation differs; parameters, fitting and
+    serialisation are those of `Legendre2D`, and ASDF files hold the stock model.
+
+    Attributes
+    ----------
+    valid : tuple or None
+        ``(x_min, x_max, y_min, y_max)``: NaN is returned outside, where the polynomial would be extrapolated
+        and could fold back onto the detector.
+    """
+
+    valid = None
+
+    def evaluate(self, x, y, *coeffs):
+        """Value at (x, y); coefficients in the order of ``param_names``."""
+        shape = (self.y_degree + 1, self.x_degree + 1)
+        c = np.array([np.asarray(c, dtype=float).reshape(-1)[0] for c in coeffs]).reshape(shape)
+        c /= np.outer(basis.norm(np.arange(shape[0])), basis.norm(np.arange(shape[1])))
+        x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
+        out = np.empty(x.shape)
+        flat_x, flat_y, flat = x.reshape(-1), y.reshape(-1), out.reshape(-1)
+        for start in range(0, flat.size, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            px = basis.legendre(self.x_degree, _to_window(flat_x[part], self.x_domain, self.x_window))
+            py = basis.legendre(self.y_degree, _to_window(flat_y[part], self.y_domain, self.y_window))
+            np.einsum("jn,jn->n", c @ px, py, out=flat[part])
+        if self.valid is not None:
+            out[outside(self.valid, x, y)] = np.nan
+        return out
+
+    def stock(self):
+        """The same function as a plain `~astropy.modeling.models.Legendre2D`."""
+        return models.Legendre2D(
+            self.x_degree,
+            self.y_degree,
+            x_domain=self.x_domain,
+            y_domain=self.y_domain,
+            x_window=self.x_window,
+            y_window=self.y_window,
+            name=self.name,
+            **dict(zip(self.param_names, self.parameters, strict=True)),
+        )
+
+
+def _to_window(x, domain, window):
+    (d0, d1), (w0, w1) = domain, window
+    return w0 + (x - d0) * ((w1 - w0) / (d1 - d0))
+
+
+def outside(box, x, y):
+    """Whether points lie outside a box ``(x_min, x_max, y_min, y_max)``; NaN counts as outside."""
+    x_min, x_max, y_min, y_max = box
+    return ~((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max))
+
+
+def displacement_model(tensors, shape, *, valid=None, name=None):
+    """Model (x, y) -> (x, y) + two Legendre series on the detector.
+
+    Parameters
+    ----------
+    tensors : array_like, shape (2, n, n)
+        Coefficients ``[axis, i, j]`` of the un-normalised ``P_i(u) P_j(v)``, pixels.
+    shape : tuple
+        ``(ny, nx)`` of the detector.
+    valid : tuple, optional
+        See `FastLegendre2D`.
+    """
+    ny, nx = shape
+    parts = []
+    for axis, tensor in zip("xy", tensors, strict=True):
+        degree = len(tensor) - 1
+        part = FastLegendre2D(
+            degree,
+            degree,
+            x_domain=(-0.5, nx - 0.5),
+            y_domain=(-0.5, ny - 0.5),
+            x_window=(-1, 1),
+            y_window=(-1, 1),
+            name=f"d{axis}",
+            **{f"c{i}_{j}": float(tensor[i][j]) for i in range(degree + 1) for j in range(degree + 1)},
+        )
+        part.valid = valid
+        parts.append(part)
+    model = models.Identity(2) + (models.Mapping((0, 1, 0, 1)) | (parts[0] & parts[1]))
+    model.name = name
+    return model
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """Fitted inverse of a `Distortion`.
+
+    Attributes
+    ----------
+    tensors : ndarray, shape (2, n, n)
+        Displacement q - p as un-normalised Legendre tensors of the detector pixel p.
+    error : float
+        Largest round-trip error found, detector pixels.
+    valid : tuple
+        ``(x_min, x_max, y_min, y_max)``: box of undistorted pixels around the image of the detector.
+    """
+
+    tensors: np.ndarray
+    error: float
+    valid: tuple
+
+
+@dataclass(frozen=True, eq=False)
+class Distortion:
+    """Distortion of one exposure in its own pixels.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (2, n_modes)
+        Of the normalised basis, x then y, pixels.
+    shape : tuple
+        ``(ny, nx)`` of the detector.
+    name : str
+        For messages.
+    """
+
+    coefficients: np.ndarray
+    shape: tuple
+    name: str = ""
+
+    def __post_init__(self):
+        c = np.asarray(self.coefficients, dtype=float)
+        if c.ndim != 2 or len(c) != 2 or not np.all(np.isfinite(c)):
+            raise InputError(f"coefficients must be finite, of shape (2, n_modes), got shape {c.shape}")
+        basis.degree_of(c.shape[1])
+        object.__setattr__(self, "coefficients", c)
+
+    @property
+    def degree(self):
+        """Total degree."""
+        return basis.degree_of(self.coefficients.shape[1])
+
+    def __call__(self, q):
+        """Undistorted pixels (n, 2) -> detector pixels (n, 2)."""
+        q = np.asarray(q, dtype=float)
+        return q + (self.coefficients @ basis.values(self.degree, *basis.normalize(q, self.shape))).T
+
+    def jacobian(self, q):
+        """Derivative dD/dq, shape (n, 2, 2), first index the detector axis."""
+        return self._value_and_jacobian(np.asarray(q, dtype=float))[1]
+
+    def _value_and_jacobian(self, q):
+        b, bu, bv = basis.gradients(self.degree, *basis.normalize(q, self.shape))
+        ny, nx = self.shape
+        jacobian = np.empty((len(q), 2, 2))
+        jacobian[:, :, 0] = (self.coefficients @ bu).T * (2 / nx)
+        jacobian[:, :, 1] = (self.coefficients @ bv).T * (2 / ny)
+        jacobian[:, 0, 0] += 1
+        jacobian[:, 1, 1] += 1
+        return q + (self.coefficients @ b).T, jacobian
+
+    def invert(self, p, *, tolerance=1e-10, max_iterations=50):
+        """Detector pixels (n, 2) -> undistorted pixels by Newton's method.
+
+        The scheme is that of the corrected positions, criterion J_3 of section 3.3.
+
+        Raises
+        ------
+        FoldError
+            Naming the worst place, if some points do not converge.
+        """
+        p = np.asarray(p, dtype=float)
+        q = 2 * p - self(p)
+        for _ in range(max_iterations):
+            value, jacobian = self._value_and_jacobian(q)
+            with np.errstate(invalid="ignore", over="ignore"):
+                step = _solve2(jacobian, p - value)
+                q = q + step
+            if not np.nanmax(np.abs(step), initial=0) > tolerance:
+                break
+        wrong = ~(np.abs(self(q) - p).max(axis=1) < max(1e-8, tolerance))
+        wrong &= np.isfinite(p).all(axis=1)
+        if wrong.any():
+            self._raise_fold(p[wrong][0], "cannot be inverted")
+        return q
+
+    def _raise_fold(self, place, what):
+        raise FoldError(
+            f"the distortion{f' of exposure {self.name}' if self.name else ''} {what} near pixel "
+            f"({place[0]:.0f}, {place[1]:.0f}): two places fall on one; too few stars there for degree {self.degree}?"
+        )
+
+    def check_fold(self):
+        """Raise `FoldError` if the Jacobian determinant is below `FOLD` anywhere on the detector."""
+        t = np.linspace(-1, 1, 8 * self.degree + 9)
+        q = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), self.shape)
+        determinant = np.linalg.det(self.jacobian(q))
+        worst = int(np.argmin(determinant))
+        if determinant[worst] <= FOLD:
+            self._raise_fold(q[worst], f"folds (Jacobian determinant {determinant[worst]:.2f})")
+
+    @cached_property
+    def inverse(self):
+        """The fitted `Inverse`, certified to `TOLERANCE` on a grid, random points, the edges and the corners.
+
+        Raises
+        ------
+        FoldError
+            If the map folds, or no inverse of degree up to 30 reaches the tolerance.
+        """
+        self.check_fold()
+        nodes, weights = np.polynomial.legendre.leggauss(_MAX_INVERSE_DEGREE + 12)
+        u, v = np.meshgrid(nodes, nodes, indexing="ij")
+        p = basis.denormalize(u.ravel(), v.ravel(), self.shape)
+        shift = (self.invert(p) - p).T.reshape(2, *u.shape)
+        vander = weights[:, None] * basis.legendre(_MAX_INVERSE_DEGREE, nodes).T
+        normalised = np.einsum("ui,vj,auv->aij", vander, vander, shift, optimize=True)
+        norms = basis.norm(np.arange(_MAX_INVERSE_DEGREE + 1))
+        tensors = normalised * np.outer(norms, norms)
+        check = _check_points(self.shape)
+        q = self.invert(check)
+        errors = []
+        for degree in range(max(self.degree, 1), _MAX_INVERSE_DEGREE + 1):
+            part = tensors[:, : degree + 1, : degree + 1]
+            errors.append(self.round_trip_error(part, check))
+            if errors[-1] <= TOLERANCE / 2:  # half, so that unchecked points stay below the promise
+                return Inverse(part.copy(), errors[-1], _valid_box(q, self.shape))
+        raise FoldError(
+            f"no inverse of the distortion{f' of exposure {self.name}' if self.name else ''} up to degree "
+            f"{_MAX_INVERSE_DEGREE} is better than {min(errors):.1e} px ({TOLERANCE:.0e} is wanted); "
+            "the distortion is too strong or too ragged, lower the degree"
+        )
+
+    def round_trip_error(self, tensors, p=None):
+        """Largest ``|D(E(p)) - p|`` [pix] of an inverse E given by its displacement tensors, over check points."""
+        p = _check_points(self.shape) if p is None else p
+        u, v = basis.normalize(p, self.shape)
+        shift = np.stack([np.polynomial.legendre.legval2d(u, v, t) for t in tensors], axis=-1)
+        return float(np.abs(self(p + shift) - p).max())
+
+    def model(self):
+        """D as an astropy compound model (undistorted -> detector pixels) with the certified inverse attached."""
+        inverse = self.inverse
+        forward = displacement_model(
+            basis.to_tensor(self.coefficients), self.shape, valid=inverse.valid, name="distortion"
+        )
+        forward.inverse = displacement_model(inverse.tensors, self.shape, name="correction")
+        return forward
+
+
+def _solve2(a, b):
+    """Solve n systems of two equations, a (n, 2, 2), b (n, 2), without LAPACK's cost per call."""
+    determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+    x = (a[:, 1, 1] * b[:, 0] - a[:, 0, 1] * b[:, 1]) / determinant
+    y = (a[:, 0, 0] * b[:, 1] - a[:, 1, 0] * b[:, 0]) / determinant
+    return np.stack([x, y], axis=1)
+
+
+def _check_points(shape):
+    """Random points, a regular grid with the edges and the corners of a detector, (n, 2) pixels."""
+    t = np.linspace(-1, 1, 33)
+    grid = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
+    scattered = np.random.default_rng(20170101).uniform(-1, 1, (1000, 2))
+    edge = np.linspace(-1, 1, 129)
+    ends = np.ones_like(edge)
+    sides = np.concatenate([np.stack(s, axis=1) for s in ((edge, ends), (edge, -ends), (ends, edge), (-ends, edge))])
+    return basis.denormalize(*np.concatenate([grid, scattered, sides]).T, shape)
+
+
+def _valid_box(q, shape, margin=0.01):
+    """Box around the image of the detector, with a margin of 1 % of its size."""
+    extra = margin * max(shape)
+    (x_min, y_min), (x_max, y_max) = q.min(axis=0) - extra, q.max(axis=0) + extra
+    return (float(x_min), float(x_max), float(y_min), float(y_max))

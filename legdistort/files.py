@@ -1,0 +1,73 @@
+"""Outputs appear under their name only when they are complete, and replace nothing unless asked."""
+
+import os
+import shutil
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+
+from .exceptions import InputError
+
+
+@contextmanager
+def replacing(path, *, overwrite=False):
+    """A temporary name beside `path` that becomes `path` when the block ends well.
+
+    Parameters
+    ----------
+    path : str or path
+    overwrite : bool
+        Replace a file that exists.
+
+    Raises
+    ------
+    InputError
+        If `path` exists and `overwrite` is false, or its folder does not exist.
+    """
+    path = Path(path)
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} exists already; give overwrite=True (--overwrite) to replace it, or another name")
+    if not path.parent.is_dir():
+        raise InputError(f"the folder {path.parent} does not exist; make it first")
+    # the whole suffix is kept, since writers choose compression by it
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".partial-", suffix=f"-{path.name}")
+    os.close(handle)
+    os.unlink(temporary)  # some writers refuse an existing file
+    try:
+        yield Path(temporary)
+        os.replace(temporary, path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(out):
+    """A temporary folder whose content moves into the folder `out` when the block ends well.
+
+    What stands in `out` under other names stays.
+
+    Parameters
+    ----------
+    out : str or path
+        Made, with its parents, if it does not exist.
+
+    Raises
+    ------
+    InputError
+        If `out` is a file.
+    """
+    out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; give a folder for the results")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".partial-{out.name}-"))
+    try:
+        yield temporary
+        out.mkdir(exist_ok=True)
+        for item in temporary.iterdir():
+            target = out / item.name
+            if item.is_dir() and target.is_dir():
+                shutil.rmtree(target)
+            item.replace(target)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

@@ -1,0 +1,270 @@
+"""What the data cannot tell, and the convention that settles it.
+
+Any map G of the reference plane leaves J (nearly) as it is when every D_i takes it back: the six affine
+directions exactly, all 2 n_modes polynomial directions to a part in a million. Left free they are noise, so
+they are fixed by as many linear constraints on the coefficients,
+
+    sum_i N_i' W_i (A_i - A_0) = 0,
+
+where N_i tells how a reference-plane mode changes the coefficients of exposure i. With
+``W_i = (Lambda + C_i)^-1`` this is the solution with the smallest dynamic part in the metric of its own
+scatter Lambda and errors C_i (gauge ``"minimal"``); with ``N_i' W_i = 1`` it is ``sum_i (A_i - A_0) = 0``
+(gauge ``"mean"``), which the paper's starting point implies for undithered exposures.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from . import basis, poses
+from .criterion import State, complement
+from .exceptions import InputError, SolveError
+from .priors import similarity_basis, similarity_part
+
+KINDS = ("minimal", "mean")
+#: Below this the constraints of the "mean" gauge leave a direction free.
+_MEAN_LIMIT = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Gauge:
+    """The convention in which a solution and its errors are given.
+
+    Attributes
+    ----------
+    kind : {"minimal", "mean"}
+    constraint : ndarray, shape (2 n_modes, n_exposures, 2 n_modes)
+        Rows of the constraints; they act on A_i - A_0, x modes first.
+    motion : ndarray, shape (n_exposures, 2 n_modes, 2 n_modes)
+        N_i: displacement modes of the reference plane -> coefficients of exposure i.
+    dynamic : ndarray, same shape
+        Lambda, covariance of a single exposure's departure from the prior mean, px^2; nothing along its
+        similarities.
+    box : ndarray, shape (2, 2)
+        Centre and half size of the reference-plane box on which the modes are defined, pixels.
+    """
+
+    kind: str
+    constraint: np.ndarray
+    motion: np.ndarray
+    dynamic: np.ndarray
+    box: np.ndarray
+
+    @property
+    def n_constraints(self):
+        """Number of directions that the convention fixes, 2 n_modes."""
+        return self.motion.shape[1]
+
+    @property
+    def scatter(self):
+        """Dynamic scatter of single exposures per axis and mode (2, n_modes), pixels, mean over the exposures."""
+        return np.sqrt(np.einsum("iaa->a", self.dynamic) / len(self.dynamic)).reshape(2, -1)
+
+    @cached_property
+    def orthonormal(self):
+        """Orthonormal rows that span `constraint`, shape (2 n_modes, n_exposures * 2 n_modes)."""
+        q, _ = np.linalg.qr(self.constraint.reshape(self.n_constraints, -1).T)
+        return q.T
+
+    def violation(self, departure):
+        """Values of the orthonormal constraints at departures A_i - A_0 (n_exposures, 2 n_modes)."""
+        return self.orthonormal @ departure.ravel()
+
+    def modes_at(self, xy):
+        """Values (n_modes, n) of the reference-plane modes at reference positions (n, 2)."""
+        degree = basis.degree_of(self.n_constraints // 2)
+        u, v = ((np.asarray(xy) - self.box[0]) / self.box[1]).T
+        return basis.values(degree, u, v)
+
+    def absolute_covariance(self, static_sigma=None):
+        """Covariance (2 n_modes, 2 n_modes) of the reference-plane modes that the convention hides.
+
+        The mean dynamic distortion of the set, with the observed scatter per mode, and the uncertainty of
+        the static distortion (2, n_modes), if given; both as they pass through the constraint. The similarities,
+        which are a matter of pointing, are left out.
+        """
+        rows = self.constraint.transpose(1, 0, 2)
+        pull = np.linalg.pinv(np.einsum("iab,ibc->ac", rows, self.motion))
+        through = pull @ rows  # coefficients of one exposure -> reference-plane modes
+        out = np.einsum("iab,ibc,idc->ad", through, self.dynamic, through, optimize=True)
+        if static_sigma is not None:
+            common = through.sum(axis=0)
+            out += common * np.ravel(static_sigma) ** 2 @ common.T
+        return out
+
+    def __str__(self):
+        size = self.n_constraints
+        degree = basis.degree_of(size // 2)
+        how = {
+            "minimal": "the smallest dynamic part, weighted by its scatter and errors",
+            "mean": "dynamic parts that sum to zero",
+        }[self.kind]
+        rms = np.sqrt(np.mean(np.sum(self.scatter**2, axis=1))) / 2
+        return (
+            f"{self.kind}: the data do not tell a map of the reference plane of degree {degree} common to all "
+            f"exposures ({size} modes, 6 of them exactly); they are fixed by the convention of {how}. "
+            f"Shift, rotation and scale stay those of the nominal poses (mean over exposures). "
+            f"Dynamic scatter {rms:.3g} px rms per axis and exposure."
+        )
+
+
+def make(kind, problem, state, blocks):
+    """The gauge at a state, its weights from the blocks of the criterion and the scatter seen there.
+
+    Raises
+    ------
+    InputError
+        For an unknown kind.
+    SolveError
+        If the "mean" gauge leaves a direction free, as for rolls that cancel.
+    """
+    if kind not in KINDS:
+        raise InputError(f"gauge must be one of {', '.join(map(repr, KINDS))}, got {kind!r}")
+    box = reference_box(problem, state)
+    motion = np.stack([_motion(problem, state.poses[i], i, box) for i in range(problem.n_exposures)])
+    if kind == "mean":
+        _check_mean(motion)
+    similar = [similarity_basis(shape, problem.n_modes) for shape in problem.shapes]
+    others = np.stack([complement(rows) for rows in similar])
+    similar = np.stack(similar)
+    error = _conditional_errors(blocks.u_data)
+    dynamic = _dynamic_covariance(problem, state, error, motion, others)
+    if kind == "mean":
+        constraint = np.broadcast_to(np.eye(motion.shape[1])[:, None], (motion.shape[1], *motion.shape[:2])).copy()
+    else:
+        constraint = _minimal_constraint(motion, error, dynamic, similar, others, box)
+    return Gauge(kind, constraint, motion, dynamic, box)
+
+
+def _minimal_constraint(motion, error, dynamic, similar, others, box):
+    """Rows ``N_i' W_i``: those of all but the common similarities see the departures without their similarity part."""
+    inner = others @ (dynamic + error) @ others.transpose(0, 2, 1)
+    weight = others.transpose(0, 2, 1) @ np.linalg.solve(inner, others) if others.shape[1] else np.zeros_like(error)
+    pose_weight = _scalar_weights(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
+    common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
+    pulled = motion.transpose(0, 2, 1)
+    rows = np.concatenate([complement(common) @ pulled @ weight, common @ pulled @ pose_weight], axis=1)
+    return rows.transpose(1, 0, 2)
+
+
+def _scalar_weights(error, rows):
+    """Weights (n_exposures,): inverse mean variance within `rows`, equal for exposures of like quality."""
+    if not rows.shape[1]:
+        return np.ones(len(error))
+    own = np.einsum("ika,iab,ikb->ik", rows, error, rows, optimize=True).mean(axis=1)
+    return 1 / (own + 10 * np.median(own))
+
+
+def reference_box(problem, state):
+    """Centre and half size (2, 2) of the box of the reference plane that all detectors cover."""
+    corners = []
+    for shape, pose in zip(problem.shapes, state.poses, strict=True):
+        ends = basis.denormalize(np.array([-1, 1, 1, -1.0]), np.array([-1, -1, 1, 1.0]), shape)
+        corners.append(poses.apply(poses.invert(pose), ends))
+    corners = np.concatenate(corners)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    return np.stack([(low + high) / 2, (high - low) / 2])
+
+
+def _motion(problem, pose, i, box):
+    """N_i, to first order in the distortion: a displacement g of the reference plane moves q by R g(T^-1 q)."""
+    shape, degree = problem.shapes[i], problem.degree
+    u, v, w = basis.quadrature(degree)
+    back = poses.apply(poses.invert(pose), basis.denormalize(u, v, shape))
+    reference = basis.values(degree, *((back - box[0]) / box[1]).T)
+    mixing = (basis.values(degree, u, v) * w) @ reference.T
+    return np.kron(pose[:, :2], mixing)
+
+
+def _conditional_errors(u_data):
+    """C_i, covariance of the coefficients if the stars were known; huge where the data say nothing."""
+    size = u_data.shape[1]
+    ridge = 1e-12 * np.trace(u_data, axis1=1, axis2=2)[:, None, None] / size + 1e-300
+    return np.linalg.inv(u_data + ridge * np.eye(size))
+
+
+def _dynamic_covariance(problem, state, error, motion, others):
+    """Lambda of every exposure: from the prior if it has widths, else from the scatter seen beyond the errors.
+
+    The common map of the reference plane that fits the departures A_i - A_0 best is taken out first, so that the
+    result does not depend on the gauge of the state; then, mode by mode (shears for the linear ones), the variance
+    that makes the weighted scatter what it should be (Paule & Mandel 1982).
+    """
+    n_modes = problem.n_modes
+    if problem.prior_sigma is not None:
+        variance = np.minimum(problem.prior_sigma.reshape(problem.n_exposures, -1), 1e6) ** 2
+        inner = others * variance[:, None, :] @ others.transpose(0, 2, 1)
+        return others.transpose(0, 2, 1) @ inner @ others
+    departure = (state.coefficients - problem.prior_mean)[:, :, :n_modes].reshape(problem.n_exposures, -1)
+    own = np.einsum("ika,ia->ik", others, departure)
+    moved = others @ motion
+    w = _scalar_weights(error, others)
+    normal = np.einsum("i,ika,ikb->ab", w, moved, moved, optimize=True)
+    common = np.linalg.pinv(normal, rcond=1e-10, hermitian=True) @ np.einsum("i,ika,ik->a", w, moved, own)
+    variance = np.einsum("ika,iab,ikb->ik", others, error, others, optimize=True)
+    scatter = _excess_scatter(own - moved @ common, variance)
+    return others.transpose(0, 2, 1) * scatter**2 @ others
+
+
+def _excess_scatter(a, variance):
+    """Standard deviation per column of a (n, k) beyond the given variances, by bisection."""
+    low, high = np.zeros(a.shape[1]), np.var(a, axis=0) * len(a) + 1e-300
+
+    def excess(extra):
+        w = 1 / (variance + extra + 1e-300)
+        mean = (w * a).sum(axis=0) / w.sum(axis=0)
+        return (w * (a - mean) ** 2).sum(axis=0) - (len(a) - 1)
+
+    present = excess(low) > 0
+    for _ in range(50):
+        middle = (low + high) / 2
+        above = excess(middle) > 0
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return np.sqrt(high * present)
+
+
+def _check_mean(motion):
+    """Refuse the "mean" gauge where the mean of N_i loses a direction that single exposures have."""
+    mean = motion.mean(axis=0)
+    power = np.einsum("iba,ibc->ac", motion, motion) / len(motion)
+    ratio = np.linalg.eigvals(np.linalg.solve(power, mean.T @ mean)).real.min()
+    if ratio < _MEAN_LIMIT:
+        raise SolveError(
+            "gauge='mean' leaves a common map of the reference plane free: the orientations of these exposures cancel "
+            f"in the mean (ratio {max(ratio, 0):.1e}), as for rolls of 0, 90, 180 and 270 degrees; use gauge='minimal'"
+        )
+
+
+def absorb_similarities(problem, state):
+    """Move the similarity part of every dynamic distortion into its pose; D_i stays what it is.
+
+    ``q' = S q`` and ``A' b(q') = q - q' + A b(S^-1 q')``, a polynomial of the same degree, so the change is exact
+    (prior modes beyond the fitted degree excepted: they stay with the detector).
+
+    Returns
+    -------
+    State
+    float
+        Largest move of a detector corner, pixels.
+    """
+    coefficients, pose_list = state.coefficients.copy(), state.poses.copy()
+    degree, n_modes = basis.degree_of(coefficients.shape[2]), problem.n_modes
+    u, v, w = basis.quadrature(degree)
+    project = (basis.values(degree, u, v) * w).T
+    largest = 0.0
+    for i, shape in enumerate(problem.shapes):
+        nodes = basis.denormalize(u, v, shape)
+        ends = basis.denormalize(np.array([-1, 1, 1, -1.0]), np.array([-1, -1, 1, 1.0]), shape)
+        for _ in range(4):
+            shift = similarity_part((coefficients[i] - problem.prior_mean[i])[:, :n_modes], shape)
+            move = np.abs(poses.apply(shift, ends) - ends).max()
+            largest = max(largest, move)
+            if move < 1e-9:
+                break
+            old = poses.apply(poses.invert(shift), nodes)
+            values = basis.values(degree, *basis.normalize(old, shape))
+            changed = ((old - nodes).T + coefficients[i] @ values) @ project
+            coefficients[i, :, :n_modes] = changed[:, :n_modes]
+            pose_list[i] = poses.compose(shift, pose_list[i])
+    return State(state.positions, coefficients, pose_list), largest

@@ -1,0 +1,309 @@
+"""Matched positions: which detection of which exposure is which star, and roughly where everything lies."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from . import catalogs, poses
+from .exceptions import InputError, MatchError
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """The plain arrays behind `Matches`, one row an observation.
+
+    Attributes
+    ----------
+    exposure, star : ndarray of int, shape (n,)
+        Indices into `Matches.names` and `Matches.stars`.
+    xy : ndarray, shape (n, 2)
+        Pixels.
+    covariance : ndarray, shape (n, 3)
+        ``var_x, var_y, cov_xy`` [pix^2].
+    """
+
+    exposure: np.ndarray
+    star: np.ndarray
+    xy: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Positions of the same stars in several exposures.
+
+    Attributes
+    ----------
+    table : `~astropy.table.QTable`
+        One row an observation: ``exposure``, ``star``, ``x``, ``y``, ``x_err``, ``y_err`` [pix]
+        and what else came with it. Rows are never reordered.
+    shapes : dict
+        ``{exposure: (ny, nx)}``.
+    poses : dict
+        ``{exposure: (2, 3) array}``, reference plane -> undistorted pixels (see `legdistort.poses`).
+    sky : `~legdistort.poses.TangentPlane` or None
+        Where the reference plane lies on the sky, if that is known.
+    left_out : dict
+        ``{exposure: reason}`` of exposures that could not be used.
+    """
+
+    table: QTable
+    shapes: dict
+    poses: dict
+    sky: poses.TangentPlane | None = None
+    left_out: dict = field(default_factory=dict)
+
+    @cached_property
+    def names(self):
+        """Exposure names, in the order in which they first appear."""
+        _, first = np.unique(self.table["exposure"], return_index=True)
+        return tuple(str(name) for name in self.table["exposure"][np.sort(first)])
+
+    @cached_property
+    def stars(self):
+        """Star identifiers, sorted."""
+        return np.unique(self.table["star"])
+
+    @cached_property
+    def observations(self):
+        """The table as plain arrays (`Observations`)."""
+        return _observations(self.table, self.names, self.stars)
+
+    @cached_property
+    def positions(self):
+        """Rough reference positions (n_stars, 2): mean of the measured ones carried back by the poses."""
+        obs = self.observations
+        back = np.empty_like(obs.xy)
+        for i, name in enumerate(self.names):
+            rows = obs.exposure == i
+            back[rows] = poses.apply(poses.invert(self.poses[name]), obs.xy[rows])
+        return _star_means(back, obs.star, len(self.stars))
+
+    def to_meta(self):
+        """Shapes, poses and sky as plain lists, for the header of a table file; see `read_meta`."""
+        sky = self.sky
+        return {
+            "shapes": {name: list(self.shapes[name]) for name in self.names},
+            "poses": {name: self.poses[name].tolist() for name in self.names},
+            "sky": None if sky is None else {"lon": sky.lon, "lat": sky.lat, "matrix": sky.matrix.tolist()},
+            "left_out": dict(self.left_out),
+        }
+
+    @staticmethod
+    def read_meta(meta):
+        """What `to_meta` wrote, as arguments ``poses``, ``sky``, ``left_out`` of `from_table`."""
+        given, sky = meta.get("poses"), meta.get("sky")
+        return {
+            "poses": None if given is None else {name: np.array(pose) for name, pose in given.items()},
+            "sky": None if sky is None else poses.TangentPlane(sky["lon"], sky["lat"], np.array(sky["matrix"])),
+            "left_out": meta.get("left_out"),
+        }
+
+    def __repr__(self):
+        return f"<Matches: {len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures>"
+
+    @classmethod
+    def from_table(cls, table, *, shape, poses=None, sky=None, left_out=None):
+        """Matches from anybody's table.
+
+        Parameters
+        ----------
+        table : `~astropy.table.Table`
+            Columns ``exposure``, ``star`` (int or str), ``x``, ``y``, ``x_err``, ``y_err`` (pixels,
+            0-based, standard deviations), optional ``xy_corr``, ``detector``, ``flux``.
+        shape : tuple or dict
+            ``(ny, nx)``, or that by exposure.
+        poses : dict, optional
+            ``{exposure: (2, 3)}``, reference -> undistorted pixels; estimated from the positions if not given.
+        sky : `~legdistort.poses.TangentPlane`, optional
+        left_out : dict, optional
+            Passed on.
+
+        Raises
+        ------
+        InputError
+            For missing columns, bad values, duplicate (exposure, star) rows, a missing shape or pose.
+        MatchError
+            For one exposure only, or exposures in groups without a common star.
+        """
+        table = catalogs.check(table, catalogs.MATCHED, "the table of matched positions")
+        table["exposure"] = table["exposure"].astype(str)
+        names = tuple(dict.fromkeys(table["exposure"].tolist()))
+        shapes = _by_exposure(shape, names)
+        stars, star_index = np.unique(table["star"], return_inverse=True)
+        exposure_index = _index(table["exposure"], names)
+        _check_duplicates(table, exposure_index, star_index, len(stars))
+        _check_connected(exposure_index, star_index, names, len(stars))
+        if poses is None:
+            xy = np.column_stack([table["x"].value, table["y"].value])
+            pose_list = estimate_poses(exposure_index, star_index, xy, names=names)
+            poses = dict(zip(names, pose_list, strict=True))
+        else:
+            poses = _check_poses(poses, names)
+        return cls(table, shapes, poses, sky, dict(left_out or {}))
+
+
+def _by_exposure(shape, names):
+    if not isinstance(shape, dict):
+        shape = dict.fromkeys(names, shape)
+    missing = [name for name in names if name not in shape]
+    if missing:
+        raise InputError(f"shape has no entry for exposure {missing[0]!r}; give (ny, nx) for every exposure")
+    out = {}
+    for name in names:
+        try:
+            ny, nx = (int(n) for n in shape[name])
+        except (TypeError, ValueError):
+            ny = nx = 0
+        if ny < 1 or nx < 1:
+            raise InputError(f"shape of exposure {name!r} must be (ny, nx) in pixels, got {shape[name]!r}")
+        out[name] = (ny, nx)
+    return out
+
+
+def _check_poses(given, names):
+    missing = [name for name in names if name not in given]
+    if missing:
+        raise InputError(f"poses has no entry for exposure {missing[0]!r}; give a (2, 3) array for every exposure")
+    return {name: poses.check(given[name], f"pose of exposure {name!r}") for name in names}
+
+
+def _index(column, names):
+    order = {name: i for i, name in enumerate(names)}
+    unique, inverse = np.unique(np.asarray(column), return_inverse=True)
+    return np.array([order[str(name)] for name in unique])[inverse]
+
+
+def _observations(table, names, stars):
+    x_err, y_err = table["x_err"].to_value(u.pix), table["y_err"].to_value(u.pix)
+    corr = np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else np.zeros(len(table))
+    return Observations(
+        exposure=_index(table["exposure"], names),
+        star=np.searchsorted(stars, table["star"]),
+        xy=np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)]),
+        covariance=np.column_stack([x_err**2, y_err**2, corr * x_err * y_err]),
+    )
+
+
+def _check_duplicates(table, exposure, star, n_stars):
+    key = exposure.astype(np.int64) * n_stars + star
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(np.diff(key[order]) == 0)
+    if len(same):
+        rows = order[same[0] : same[0] + 2]
+        raise InputError(
+            f"star {table['star'][rows[0]]} stands {'twice' if len(same) == 1 else 'more than once'} in exposure "
+            f"{table['exposure'][rows[0]]} (rows {rows[0]} and {rows[1]}; {len(same)} such rows in all); "
+            "keep one position of a star in an exposure"
+        )
+
+
+def _check_connected(exposure, star, names, n_stars):
+    if len(names) < 2:
+        raise MatchError(
+            f"only one exposure ({names[0]}): the distortion is found from the differences between exposures, "
+            "give at least two of the same field"
+        )
+    n = len(names) + n_stars
+    graph = coo_array((np.ones(len(star)), (exposure, star + len(names))), shape=(n, n))
+    count, group = connected_components(graph, directed=False)
+    if count > 1:
+        groups = [[name for name, g in zip(names, group, strict=False) if g == label] for label in range(count)]
+        groups = [g for g in groups if g]
+        listed = "; ".join(_shorten(g) for g in groups)
+        raise MatchError(
+            f"the exposures form {len(groups)} groups with no star in common: {listed}; solve each group by itself"
+        )
+
+
+def _shorten(names, most=6):
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _star_means(xy, star, n_stars, weights=None):
+    w = np.ones(len(star)) if weights is None else weights
+    total = np.bincount(star, w, n_stars)
+    sums = np.column_stack([np.bincount(star, w * xy[:, k], n_stars) for k in (0, 1)])
+    with np.errstate(invalid="ignore"):
+        return sums / total[:, None]
+
+
+def robust_similarity(source, target, *, weights=None, n_iterations=10):
+    """Similarity by iteratively reweighted least squares with Cauchy weights at the observed scale.
+
+    Parameters as for `legdistort.poses.fit_similarity`. The scale is the median residual.
+    """
+    base = np.ones(len(source)) if weights is None else weights
+    w = base
+    for _ in range(n_iterations):
+        pose = poses.fit_similarity(source, target, weights=w)
+        r2 = ((poses.apply(pose, source) - target) ** 2).sum(axis=1)
+        scale2 = np.median(r2)
+        if scale2 <= 1e-20 * np.ptp(target, axis=0).max() ** 2:
+            break
+        w = base / (1 + r2 / (2 * scale2))
+    return pose
+
+
+def estimate_poses(exposure, star, xy, *, names=None):
+    """Poses of all exposures from matched positions alone.
+
+    The exposure with the most stars becomes the reference plane; the others are tied one after the
+    other, each to all that already stand, the best connected first, then all are refined together.
+
+    Parameters
+    ----------
+    exposure, star : ndarray of int, shape (n,)
+    xy : ndarray, shape (n, 2)
+    names : sequence of str, optional
+        For messages.
+
+    Returns
+    -------
+    list of ndarray, each (2, 3)
+
+    Raises
+    ------
+    MatchError
+        Naming an exposure that shares fewer than two stars with all the others.
+    """
+    n_exposures, n_stars = exposure.max() + 1, star.max() + 1
+    names = range(n_exposures) if names is None else names
+    rows = [np.flatnonzero(exposure == i) for i in range(n_exposures)]
+    first = int(np.argmax([len(r) for r in rows]))
+    found = {first: poses.identity()}
+    back = np.full_like(xy, np.nan)
+    back[rows[first]] = xy[rows[first]]
+    sums, counts = np.zeros((n_stars, 2)), np.zeros(n_stars)
+    np.add.at(sums, star[rows[first]], xy[rows[first]])
+    np.add.at(counts, star[rows[first]], 1)
+    while len(found) < n_exposures:
+        shared = {i: rows[i][counts[star[rows[i]]] > 0] for i in range(n_exposures) if i not in found}
+        best = max(shared, key=lambda i: len(shared[i]))
+        r = shared[best]
+        if len(r) < 2 or np.all(np.ptp(xy[r], axis=0) == 0):
+            raise MatchError(
+                f"exposure {names[best]} shares {len(r)} star{'s' * (len(r) != 1)} with the other exposures; its shift "
+                "and rotation need at least 2: give poses, or leave it out"
+            )
+        found[best] = robust_similarity(sums[star[r]] / counts[star[r], None], xy[r])
+        back = poses.apply(poses.invert(found[best]), xy[rows[best]])
+        np.add.at(sums, star[rows[best]], back)
+        np.add.at(counts, star[rows[best]], 1)
+    return _refine_poses([found[i] for i in range(n_exposures)], rows, star, xy)
+
+
+def _refine_poses(pose_list, rows, star, xy, n_sweeps=3):
+    """Refit every pose to the mean of all, the first one's plane held by the mean of the poses."""
+    for _ in range(n_sweeps):
+        back = np.empty_like(xy)
+        for pose, r in zip(pose_list, rows, strict=True):
+            back[r] = poses.apply(poses.invert(pose), xy[r])
+        mean = _star_means(back, star, star.max() + 1)
+        pose_list = [robust_similarity(mean[star[r]], xy[r]) for r in rows]
+    return pose_list

@@ -1,0 +1,24 @@
+"""Shared fixtures: where the real data are, and small synthetic sets."""
+
+import os
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+matplotlib.use("Agg")
+
+
+def data_folder():
+    """Folder of real data: ``LEGDISTORT_DATA``, or ``../shared/data`` beside the repository; None if absent."""
+    candidates = [os.environ.get("LEGDISTORT_DATA"), Path(__file__).parents[2] / "shared" / "data"]
+    return next((Path(c) for c in candidates if c and Path(c).is_dir()), None)
+
+
+@pytest.fixture(scope="session")
+def shared_data():
+    """Folder of real data, or skip."""
+    folder = data_folder()
+    if folder is None:
+        pytest.skip("real data absent: set LEGDISTORT_DATA to their folder")
+    return folder
