@@ -57,6 +57,12 @@ def values(table, column, unit=None):
 
 def labels(table, column):
     """A column of names (str) or serials (int) as a plain array."""
+    missing = np.ma.getmaskarray(table[column]) if np.ma.isMaskedArray(table[column]) else np.zeros(len(table), bool)
+    if missing.any():
+        raise InputError(
+            f"column {column!r} has no value in {np.count_nonzero(missing)} of {len(missing)} rows, the first is row "
+            f"{int(np.argmax(missing))}; fill them or leave these rows out"
+        )
     data = np.asarray(table[column])
     if data.dtype.kind == "S":
         data = np.char.decode(data)
@@ -85,11 +91,10 @@ def rename(table, columns):
     for wanted, present in columns.items():
         if present not in table.colnames:
             raise InputError(f"no column {present!r} to use as {wanted!r}; the table has {', '.join(table.colnames)}")
-    source = {present: wanted for wanted, present in columns.items()}
-    out = Table()
+    out = Table(meta=table.meta)
     for name in table.colnames:
-        target = source.get(name, name)
-        if target != name or name not in columns:
+        targets = [wanted for wanted, present in columns.items() if present == name]  # one column may serve twice
+        for target in targets or ([] if name in columns else [name]):
             out[target] = table[name]
     return out
 

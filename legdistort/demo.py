@@ -1,0 +1,99 @@
+"""A simulated night run through the whole road and compared with its truth."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from . import performance
+from .files import replacing
+from .instruments import gsaoi_static
+from .pipeline import check_folder, run
+from .priors import Prior
+from .simulation import simulate_exposures
+
+#: Degree of the prior: the static map is then followed to 3e-6 px.
+PRIOR_DEGREE = 5
+_HELD_OUT_PER_SIDE = 20
+
+
+def run_demo(*, out, small=False, seed=0, overwrite=False, progress=False):
+    """Simulate a GSAOI-like night, solve its frames and say how far the result is from the truth.
+
+    The static distortion is that of a GSAOI detector (published polynomials), known beforehand as the prior; every
+    exposure adds a dynamic distortion of its own and a header that is 0.3" off.
+
+    Parameters
+    ----------
+    out : str or path
+        Folder; gets ``frames/`` with the FITS files beside the results of `legdistort.run`.
+    small : bool
+        A night of a few seconds.
+    seed : int
+    overwrite, progress : bool
+
+    Returns
+    -------
+    Run
+        Its summary has the figures of `compare` added.
+    """
+    out = Path(out)
+    check_folder(out, overwrite)
+    night = simulate_exposures(small=small, seed=seed, progress=progress)
+    shape = night.truth.shape
+    out.mkdir(parents=True, exist_ok=True)
+    paths = night.write(out / "frames")
+    prior = Prior.from_model(
+        gsaoi_static(2, size=shape[1]), shape=shape, direction="detector_to_reference", degree=PRIOR_DEGREE
+    )
+    result = run(paths, out=out, prior=prior, overwrite=overwrite, progress=progress)
+    result.summary.update(compare(result.solution, night.truth, seed=seed))
+    with replacing(out / "summary.json", overwrite=True) as temporary:
+        temporary.write_text(json.dumps(result.summary, indent=1) + "\n")
+    return result
+
+
+def compare(solution, truth, *, seed=0):
+    """How far a solution is from the truth, and how far its own errors say it should be.
+
+    Returns
+    -------
+    dict
+        ``b_px``: error of the star positions after the common map of the fitted degree (free of the gauge);
+        ``b_bound_px``: its Cramer-Rao bound. ``b_abs_px``: error after a common shift, rotation and scale (pointing);
+        ``b_abs_err_px``: reported for it. ``sigma_new_px``, ``sigma_new_expected_px``: scatter of corrected
+        positions that the solution has not seen, measured and from the Fisher matrix.
+    """
+    true = nearest(solution.positions, truth.positions)
+    names = list(solution.names)
+    error = float(np.median(solution.observations["x_err"].value))
+    new = np.concatenate([truth.grid(name, _HELD_OUT_PER_SIDE) for name in names[:: max(1, len(names) // 3)]])
+    rng = np.random.default_rng(seed + 1)
+    corrected = np.full((len(names), len(new), 2), np.nan)
+    for i, name in enumerate(names):
+        seen = np.flatnonzero(solution.supported(name, truth.distort(name, new)))
+        noisy = truth.distort(name, new[seen]) + error * rng.normal(size=(len(seen), 2))
+        corrected[i, seen] = solution.correct(name, noisy)
+    measured = performance.scatter(corrected)
+    expected = performance.expected_scatter(solution, new, error, seen=np.isfinite(corrected[..., 0]))
+    good = np.isfinite(measured) & np.isfinite(expected)
+    return {
+        "b_px": performance.bias(solution.positions, true, removed=solution.degree),
+        "b_bound_px": performance.expected_bias(solution, removed=solution.degree),
+        "b_abs_px": performance.bias(solution.positions, true, removed="similarity"),
+        "b_abs_err_px": performance.expected_bias(solution, removed="similarity", absolute=True),
+        "sigma_new_px": float(np.sqrt(np.mean(measured[good] ** 2))),
+        "sigma_new_expected_px": float(np.sqrt(np.mean(expected[good] ** 2))),
+    }
+
+
+def nearest(positions, candidates):
+    """The candidate (n, 2) that belongs to every position, a common shift of some pixels allowed for."""
+    tree, shift = cKDTree(candidates), np.zeros(2)
+    good = np.isfinite(positions).all(axis=1)
+    index = np.zeros(len(positions), dtype=int)
+    for _ in range(20):
+        index[good] = tree.query(positions[good] - shift)[1]
+        shift = np.median(positions[good] - candidates[index[good]], axis=0)
+    return candidates[index]

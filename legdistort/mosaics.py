@@ -1,0 +1,95 @@
+"""The co-added image and its file."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS
+
+from .files import replacing
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Mosaic:
+    """Co-added image.
+
+    Attributes
+    ----------
+    data : ndarray of float32, shape (ny, nx)
+        In the unit of the exposures, at their mean exposure time; NaN where nothing contributes.
+    variance : ndarray of float32, shape (ny, nx)
+        Of each pixel by itself. Interpolation correlates neighbours: the variance of a sum over many pixels is
+        larger than the sum of theirs (about 1.3 times at order 3, 2.2 times at order 1).
+    footprint : ndarray of int32, shape (ny, nx)
+        Number of exposures that contribute to each pixel.
+    wcs : `~astropy.wcs.WCS`
+        TAN if the sky is known, else linear with the reference plane (0-based) as world; or the WCS asked for.
+    exposures : tuple of str
+        Names of the exposures used.
+    left_out : dict
+        Names of the others, with the reason.
+    offset : tuple of int or None
+        ``(ox, oy)``: the centre of pixel (x, y) is the point (x + ox, y + oy) of the reference plane. None = the
+        mosaic has another grid.
+    header : `~astropy.io.fits.Header`
+        Unit, exposure time, method and what else goes into the file besides the WCS.
+    """
+
+    data: np.ndarray
+    variance: np.ndarray
+    footprint: np.ndarray
+    wcs: WCS
+    exposures: tuple
+    left_out: dict = field(default_factory=dict)
+    offset: tuple | None = None
+    header: fits.Header = field(default_factory=fits.Header)
+
+    @property
+    def shape(self):
+        """Image shape ``(ny, nx)``."""
+        return self.data.shape
+
+    def __repr__(self):
+        ny, nx = self.shape
+        left_out = f", {len(self.left_out)} left out" if self.left_out else ""
+        return f"<Mosaic: {nx} x {ny} px, {len(self.exposures)} exposures{left_out}>"
+
+    def to_hdulist(self):
+        """The FITS file: image (primary HDU, ``SCI``), ``VAR`` and ``FOOTPRINT``, each with the WCS."""
+        header = self.header.copy()
+        header.update(self.wcs.to_header(relax=True))
+        if self.offset is not None:  # IRAF's logical = LTM physical + LTV, 1-based: physical is the reference plane
+            for axis, shift in enumerate(self.offset, start=1):
+                header[f"LTM{axis}_{axis}"] = (1.0, "reference-plane pixels are mosaic pixels")
+                header[f"LTV{axis}"] = (-float(shift), "reference plane + LTV = mosaic pixel")
+        planes = {"SCI": self.data, "VAR": self.variance, "FOOTPRINT": self.footprint}
+        hdulist = fits.HDUList()
+        for name, plane in planes.items():
+            hdu = (fits.ImageHDU if hdulist else fits.PrimaryHDU)(plane, header)
+            hdu.name = name
+            hdulist.append(hdu)
+        unit = header.get("BUNIT")
+        if unit:
+            hdulist["VAR"].header["BUNIT"] = f"({unit})**2"
+        hdulist["FOOTPRINT"].header["BUNIT"] = ("", "number of exposures")
+        return hdulist
+
+    def write(self, path, *, overwrite=False):
+        """Write the mosaic as a FITS file (see `to_hdulist`).
+
+        The file appears under its name only when it is complete.
+
+        Parameters
+        ----------
+        path : str or path
+            With ``.gz`` at its end it is compressed.
+        overwrite : bool
+            Replace a file that exists.
+
+        Raises
+        ------
+        InputError
+            If the file exists and `overwrite` is false, or its folder does not exist.
+        """
+        with replacing(path, overwrite=overwrite) as temporary:
+            self.to_hdulist().writeto(temporary)

@@ -1,0 +1,211 @@
+"""The whole road: frames -> positions -> matches -> solution -> WCS files, mosaic and report."""
+
+import json
+import logging
+import time
+import warnings
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from . import archive, performance
+from .coaddition import coadd
+from .estimation import solve
+from .exceptions import AssumptionWarning, InputError, MatchError
+from .exposures import Exposure, read_exposures
+from .files import replacing_folder
+from .matching import match
+from .measurement import UNUSABLE, measure
+from .report import write_report
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What `run` made.
+
+    Attributes
+    ----------
+    out : Path
+        Folder with ``solution.asdf``, ``stars.ecsv``, ``wcs/NAME.asdf``, ``mosaic.fits``, ``report.html``.
+    solution : Solution
+    mosaic : Mosaic
+    summary : dict
+        Plain numbers and strings, see `summarise`.
+    """
+
+    out: Path
+    solution: object
+    mosaic: object
+    summary: dict
+
+    def __repr__(self):
+        return f"<Run: {self.solution!r} in {self.out}>"
+
+
+def run(
+    paths,
+    *,
+    out,
+    ext=None,
+    degree=3,
+    prior=None,
+    min_exposures=4,
+    clip=5.0,
+    measuring=None,
+    matching=None,
+    solving=None,
+    coadding=None,
+    overwrite=False,
+    progress=False,
+):
+    """Solve a set of frames and co-add them.
+
+    Parameters
+    ----------
+    paths : str, path, HDUList, CCDData or a sequence of them
+        See `legdistort.read_exposures`.
+    out : str or path
+        Folder for the results; made if it does not exist. Nothing is left there if the run fails.
+    ext : int, str or (str, int), optional
+        Extension to read from every file.
+    degree : int
+        Total degree of the distortion.
+    prior : Prior, optional
+        Static distortion.
+    min_exposures : int
+        Stars seen in fewer exposures are not used.
+    clip : float or None
+        Leave out observations beyond this many standard errors.
+    measuring, matching, solving, coadding : dict, optional
+        Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`.
+    overwrite : bool
+        Replace the results of an earlier run.
+    progress : bool
+        Show progress bars.
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    LegdistortError
+        With the file, exposure or argument at fault.
+    """
+    out = Path(out)
+    check_folder(out, overwrite)
+    timings = {}
+    with _timed(timings, "read"):
+        exposures = read_exposures(paths, ext=ext, progress=progress)
+        _check_shapes(exposures)
+    with _timed(timings, "measure"):
+        detections = measure(exposures, progress=progress, **(measuring or {}))
+    with _timed(timings, "match"):
+        matches = match(detections, exposures=exposures, min_exposures=min_exposures, **(matching or {}))
+    with _timed(timings, "solve"):
+        solution = solve(matches, degree=degree, prior=prior, clip=clip, **(solving or {}))
+    with _timed(timings, "coadd"):
+        kept = [exposure for exposure in exposures if exposure.name in solution.names]
+        mosaic = coadd(kept, solution, progress=progress, **(coadding or {}))
+    with replacing_folder(out) as target:
+        with _timed(timings, "write"):
+            write_results(solution, target)
+            mosaic.write(target / "mosaic.fits")
+        summary = summarise(solution, timings=timings) | {"fwhm_ratio": fwhm_ratio(mosaic, solution)}
+        write_report(target / "report.html", solution, mosaic=mosaic, summary=summary)
+        (target / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+    return Run(out, solution, mosaic, summary)
+
+
+def write_results(solution, target):
+    """Write ``solution.asdf``, ``stars.ecsv`` and ``wcs/NAME.asdf`` of a solution into an existing folder."""
+    solution.write(target / "solution.asdf")
+    solution.stars.write(target / "stars.ecsv", format="ascii.ecsv")
+    (target / "wcs").mkdir()
+    for name in solution.names:
+        archive.write_wcs(solution, name, target / "wcs" / f"{name}.asdf")
+
+
+def summarise(solution, *, timings=None):
+    """Figures of a solution as plain numbers and strings, as ``--json`` prints them.
+
+    ``rms_px``: unweighted rms residual per axis, used observations. ``sigma_px``: the paper's sigma (section 3.4) over
+    the fitted stars, per axis.
+    """
+    sigma = performance.scatter(performance.corrected_positions(solution))
+    return {
+        "n_exposures": len(solution.names),
+        "n_stars": int(np.count_nonzero(np.isfinite(solution.positions[:, 0]))),
+        "n_observations": int(np.count_nonzero(solution.observations["used"])),
+        "chi2": float(solution.chi2),
+        "dof": int(solution.dof),
+        "rms_px": float(np.sqrt(np.mean(solution.rms**2))),
+        "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
+        "gauge": str(solution.gauge),
+        "max_inverse_error_px": float(solution.max_inverse_error),
+        "left_out": dict(solution.left_out),
+        "timings": {step: round(seconds, 3) for step, seconds in (timings or {}).items()},
+    }
+
+
+def fwhm_ratio(mosaic, solution):
+    """FWHM of stars in the mosaic over that in single exposures: median over the brighter half; None if unknown."""
+    table = solution.observations
+    if "fwhm" not in table.colnames or mosaic.offset is None:
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AssumptionWarning)  # of the errors, which are not used
+        stacked = measure([Exposure(name="mosaic", data=mosaic.data, mask=~np.isfinite(mosaic.data))])
+    stacked = stacked[(stacked["flags"] & UNUSABLE) == 0]
+    if len(stacked) == 0:
+        return None
+    stars = solution.stars
+    bright = stars[stars["flux"] >= np.nanmedian(stars["flux"])] if "flux" in stars.colnames else stars
+    place = np.column_stack([bright["x"].value, bright["y"].value]) - mosaic.offset
+    distance, found = cKDTree(np.column_stack([stacked["x"].value, stacked["y"].value])).query(place)
+    table = table[table["used"]]
+    ratios = [
+        stacked["fwhm"][k].value / np.nanmedian(table["fwhm"][table["star"] == star].value)
+        for star, k, d in zip(bright["star"], found, distance, strict=True)
+        if d < 2
+    ]
+    return float(np.median(ratios)) if ratios else None
+
+
+def check_folder(out, overwrite):
+    """Raise `InputError` if `out` is a file, or holds results and `overwrite` is false."""
+    out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; give a folder for the results")
+    if (out / "solution.asdf").exists() and not overwrite:
+        raise InputError(f"{out} already holds a run; give overwrite=True (--overwrite) or another folder")
+
+
+def _check_shapes(exposures):
+    """All frames of a run show one detector; a run on a mixture would co-add nonsense."""
+    if len(exposures) < 2:
+        raise MatchError(
+            f"only one exposure ({exposures[0].name}): the distortion is found from the differences between "
+            "exposures, give at least two of the same field"
+        )
+    first = exposures[0]
+    for exposure in exposures[1:]:
+        if exposure.shape != first.shape:
+            raise InputError(
+                f"exposure {exposure.name} has shape {exposure.shape}, {first.name} has {first.shape} (ny, nx): "
+                "give frames of one detector, or solve their tables with a shape for each"
+            )
+
+
+@contextmanager
+def _timed(timings, step):
+    log.info("%s ...", step)
+    begin = time.perf_counter()
+    yield
+    timings[step] = timings.get(step, 0.0) + time.perf_counter() - begin
+    log.info("%s: %.1f s", step, timings[step])

@@ -1,0 +1,548 @@
+"""Co-addition: positions, fluxes, edges and header of mosaics of synthetic frames with a 20 px distortion."""
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import gwcs.coordinate_frames as cf
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.coordinates import ICRS, SkyCoord
+from astropy.io import fits
+from astropy.modeling import models
+from astropy.wcs import WCS
+from gwcs import WCS as GWCS
+from scipy.optimize import least_squares
+
+from legdistort import poses
+from legdistort.basis import from_tensor
+from legdistort.coaddition import coadd, reference_grid
+from legdistort.distortion import Distortion, outside
+from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.exposures import Exposure, read_exposures
+from legdistort.resampling import fill_bad, tabulate, trace
+
+SHAPE = (300, 400)
+SIGMA = 1.4  # of the Gaussian stars, px
+SKY = poses.TangentPlane(83.2, -31.7, np.array([[-5e-5, 1e-5, 0.004], [1e-5, 5e-5, -0.003]]))
+
+
+@dataclass
+class StandIn:
+    """The part of a solution that co-adding needs, with truth inside."""
+
+    poses: dict
+    distortions: dict
+    sky: object = None
+    left_out: dict = field(default_factory=dict)
+
+    @property
+    def shapes(self):
+        return {name: d.shape for name, d in self.distortions.items()}
+
+    def distortion(self, name):
+        return self.distortions[name]
+
+    def distort(self, name, xy):
+        q = poses.apply(self.poses[name], xy)
+        p = self.distortions[name](q)
+        p[outside(self.distortions[name].inverse.valid, *q.T)] = np.nan
+        return p
+
+    def correct(self, name, xy):
+        return poses.apply(poses.invert(self.poses[name]), self.distortions[name].invert(xy))
+
+    def wcs(self, name):
+        m = poses.invert(self.poses[name])
+        to_reference = models.AffineTransformation2D(m[:, :2], m[:, 2])
+        pixels = cf.Frame2D(name="detector", unit=(u.pix, u.pix))
+        forward = self.distortions[name].model()
+        correction = forward.inverse
+        correction.inverse = forward
+        chain = correction | to_reference | self.sky.model()
+        return GWCS([(pixels, chain), (cf.CelestialFrame(reference_frame=ICRS(), unit=(u.deg, u.deg)), None)])
+
+
+def star_image(xy, flux, shape=SHAPE):
+    """Gaussian stars sampled at pixel centres."""
+    y, x = np.arange(shape[0]), np.arange(shape[1])
+    gx, gy = (np.exp(-(np.subtract.outer(s, t) ** 2) / (2 * SIGMA**2)) for s, t in zip(xy.T, (x, y), strict=True))
+    return (flux[:, None] / (2 * np.pi * SIGMA**2) * gy).T @ gx
+
+
+def scene(n=4, *, peak=20.0, sky=SKY, rolls=(0, 2, -3, 40), spread=15.0, seed=1):
+    """Exposures of one star field with different degree-3 distortions, dithers and rolls; stars, fluxes."""
+    rng = np.random.default_rng(seed)
+    names = [f"frame{i}" for i in range(n)]
+    solution = StandIn({}, {}, sky)
+    centre = np.array(SHAPE[::-1]) / 2
+    for name, roll in zip(names, rolls, strict=False):
+        angle = np.radians(roll)
+        m = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        solution.poses[name] = np.column_stack([m, centre - m @ centre + rng.uniform(-spread, spread, 2)])
+        coefficients = rng.normal(size=(2, 10))
+        coefficients[:, 0] = 0
+        coefficients[:, 6:] /= 2
+        raw = Distortion(coefficients, SHAPE)
+        grid = np.stack(np.meshgrid(np.linspace(0, SHAPE[1], 20), np.linspace(0, SHAPE[0], 20)), -1).reshape(-1, 2)
+        coefficients *= peak / np.abs(raw(grid) - grid).max()
+        solution.distortions[name] = Distortion(coefficients, SHAPE, name)
+    gx, gy = np.meshgrid(np.arange(-20, 440, 33.0), np.arange(-20, 340, 33.0))
+    stars = np.stack([gx.ravel(), gy.ravel()], 1) + rng.uniform(-4, 4, (gx.size, 2))
+    flux = rng.uniform(3e3, 3e4, len(stars))
+    return solution, stars, flux
+
+
+def expose(solution, stars, flux, **changes):
+    exposures = []
+    for name in solution.poses:
+        seen = solution.distort(name, stars)
+        ok = np.isfinite(seen).all(axis=1)
+        exposures.append(Exposure(name, star_image(seen[ok], flux[ok]), **changes))
+    return exposures
+
+
+@cache
+def plain():
+    """Scene, exposures and the mosaic with defaults; shared, not to be changed."""
+    solution, stars, flux = scene()
+    exposures = expose(solution, stars, flux, header=fits.Header({"BUNIT": "adu", "OBJECT": "field"}))
+    return solution, stars, flux, exposures, coadd(exposures, solution)
+
+
+def fit_star(image, xy, flux, r=6):
+    """Position of an elliptical Gaussian fitted by plain least squares, and the sum of the pixels around it."""
+    ix, iy = np.round(xy).astype(int)
+    box = image[iy - r : iy + r + 1, ix - r : ix + r + 1]
+    y, x = np.mgrid[iy - r : iy + r + 1, ix - r : ix + r + 1]
+
+    def model(p):
+        dx, dy = x - p[0], y - p[1]
+        norm = p[2] * np.sqrt(p[3] * p[4] - p[5] ** 2) / (2 * np.pi)
+        return norm * np.exp(-(p[3] * dx**2 + p[4] * dy**2 + 2 * p[5] * dx * dy) / 2) + p[6]
+
+    start = [*xy, flux, 1 / SIGMA**2, 1 / SIGMA**2, 0, 0]
+    p = least_squares(lambda p: (model(p) - box).ravel(), start, x_scale=[1, 1, flux, 0.1, 0.1, 0.1, 1]).x
+    ring = 9  # far enough for the sum to be the flux, and neighbours are farther
+    return p[:2], image[iy - ring : iy + ring + 1, ix - ring : ix + ring + 1].sum()
+
+
+def covered(mosaic, xy, r=9):
+    """Stars that no edge of an exposure crosses."""
+    ny, nx = mosaic.shape
+    out = []
+    for i, (x, y) in enumerate(np.round(xy).astype(int)):
+        inside = r <= x < nx - r and r <= y < ny - r
+        around = mosaic.footprint[y - r : y + r + 1, x - r : x + r + 1]
+        if inside and around.min() == around.max() > 0:
+            out.append(i)
+    return out
+
+
+def check_stars(mosaic, xy, flux, *, position=0.01, relative=0.003, chosen=None):
+    chosen = covered(mosaic, xy) if chosen is None else chosen
+    assert len(chosen) > 20
+    for i in chosen:
+        place, f = fit_star(mosaic.data.astype(float), xy[i], flux[i])
+        assert np.abs(place - xy[i]).max() < position
+        if relative:
+            assert f == pytest.approx(flux[i], rel=relative)
+
+
+class TestReferencePlane:
+    def test_stars_have_true_positions_and_fluxes(self):
+        _, stars, flux, _, mosaic = plain()
+        check_stars(mosaic, stars - mosaic.offset, flux)
+
+    def test_there_are_no_ghosts(self):
+        _, stars, flux, _, mosaic = plain()
+        y, x = np.mgrid[: mosaic.shape[0], : mosaic.shape[1]]
+        near = np.zeros(mosaic.shape, dtype=bool)
+        for sx, sy in stars - mosaic.offset:
+            near |= np.hypot(x - sx, y - sy) < 9 * SIGMA
+        away = np.abs(mosaic.data[~near & np.isfinite(mosaic.data)])
+        assert away.max() < 1e-3 * flux.max() / (2 * np.pi * SIGMA**2)
+
+    def test_a_distortion_that_folds_back_outside_makes_no_ghost(self):
+        tensor = np.zeros((2, 4, 4))
+        tensor[1, 0, [1, 3]] = np.array([0.06, -0.06]) * SHAPE[0] / 2  # 1.15 v - 0.15 v^3 folds at v = 1.6
+        distortion = Distortion(from_tensor(tensor), SHAPE)
+        m = np.array([[1, -1], [1, 1]]) / np.sqrt(2)
+        solution = StandIn({"a": np.column_stack([m, [0, 0]])}, {"a": distortion})
+        mosaic = coadd([Exposure("a", np.ones(SHAPE))], solution)
+        y, x = np.nonzero(mosaic.footprint)
+        q = poses.apply(solution.poses["a"], np.stack([x, y], 1) + mosaic.offset)
+        assert np.all((q > -5) & (q < np.array(SHAPE[::-1]) + 5))
+        corner = poses.apply(solution.poses["a"], np.array([mosaic.offset], dtype=float))
+        assert np.all((distortion(corner) > 0) & (distortion(corner) < SHAPE[::-1]))  # here it would have been
+
+    def test_footprint_counts_detectors(self):
+        solution, _, _, exposures, mosaic = plain()
+        ny, nx = mosaic.shape
+        gx, gy = np.meshgrid(np.arange(nx), np.arange(ny))
+        reference = np.stack([gx.ravel(), gy.ravel()], 1) + mosaic.offset
+        expected = np.zeros(nx * ny, dtype=int)
+        for e in exposures:
+            p = solution.distort(e.name, reference)
+            expected += np.all((p >= 0) & (p <= np.array(SHAPE[::-1]) - 1), axis=1)
+        np.testing.assert_array_equal(mosaic.footprint.ravel(), expected)
+        np.testing.assert_array_equal(np.isnan(mosaic.data), mosaic.footprint == 0)
+
+    def test_grid_is_the_bounding_box(self):
+        mosaic = plain()[-1]
+        seen = mosaic.footprint > 0
+        for edge in (seen[:2], seen[-2:], seen[:, :2], seen[:, -2:]):
+            assert edge.any()
+        identity = StandIn({"a": poses.identity()}, {"a": Distortion(np.zeros((2, 1)), SHAPE)})
+        grid = reference_grid(["a"], identity)
+        assert grid.shape == SHAPE
+        assert grid.offset == (0, 0)
+
+    def test_identity_returns_the_image(self):
+        image = np.random.default_rng(0).normal(size=SHAPE)
+        identity = StandIn({"a": poses.identity()}, {"a": Distortion(np.zeros((2, 3)), SHAPE)})
+        for order in (0, 1, 3):
+            mosaic = coadd([Exposure("a", image)], identity, order=order)
+            np.testing.assert_allclose(mosaic.data, image, atol=1e-6)
+
+    def test_order_1_is_worse_and_named_as_in_reproject(self):
+        solution, stars, _, exposures, mosaic = plain()
+        bilinear = coadd(exposures, solution, order="bilinear")
+        np.testing.assert_array_equal(bilinear.data, coadd(exposures, solution, order=1).data)
+        xy = stars - mosaic.offset
+        peaks = [m.data[tuple(np.round(xy[covered(mosaic, xy)]).astype(int).T[::-1])] for m in (mosaic, bilinear)]
+        assert np.mean(peaks[1] / peaks[0]) < 0.95
+
+    def test_surface_brightness_is_left_alone_on_request(self):
+        solution, *_ = plain()
+        flat = [Exposure(name, np.full(SHAPE, 7.0)) for name in solution.poses]
+        flux = coadd(flat, solution, match_background=False)
+        brightness = coadd(flat, solution, match_background=False, conserve="surface_brightness")
+        seen = brightness.footprint > 0
+        np.testing.assert_allclose(brightness.data[seen], 7, rtol=1e-6)
+        assert np.ptp(flux.data[seen]) > 0.5
+        matched = coadd(flat, solution)
+        np.testing.assert_allclose(matched.data[seen], 7, rtol=1e-6)  # the sky stays flat
+
+    def test_total_flux_is_the_sum_over_the_detector(self):
+        solution, *_ = plain()
+        name = "frame0"
+        image = star_image(np.array([[80.0, 60], [320, 240]]), np.array([1e4, 2e4]))
+        for algorithm in ("interp", "adaptive", "exact"):
+            mosaic = coadd([Exposure(name, image)], solution, algorithm=algorithm, match_background=False)
+            assert np.nansum(mosaic.data) == pytest.approx(3e4, rel=2e-3), algorithm
+
+    @pytest.mark.parametrize("algorithm", ["adaptive", "exact"])
+    def test_other_algorithms(self, algorithm):
+        solution, stars, flux, exposures, _ = plain()
+        mosaic = coadd(exposures[:1], solution, algorithm=algorithm)
+        check_stars(mosaic, stars - mosaic.offset, flux, position=0.04, relative=0.01)
+
+
+class TestSky:
+    def test_header_gives_the_sky_of_the_solution(self):
+        solution, stars, *_, mosaic = plain()
+        sky = mosaic.wcs.pixel_to_world(*(stars - mosaic.offset).T)
+        assert solution.sky.to_sky(stars).separation(sky).max() < 1e-9 * u.deg
+
+    def test_other_grid_through_the_gwcs(self):
+        solution, stars, flux, exposures, _ = plain()
+        grid = WCS(naxis=2)
+        grid.wcs.ctype = ["GLON-CAR", "GLAT-CAR"]
+        centre = solution.sky.to_sky(np.array([[200.0, 150]]))[0].galactic
+        grid.wcs.crval = [centre.l.deg, 0]
+        grid.wcs.crpix = [330, 330 - centre.b.deg / 6e-5]
+        grid.wcs.cdelt = [-6e-5, 6e-5]
+        grid.array_shape = (660, 660)
+        mosaic = coadd(exposures, solution, grid=grid)
+        assert mosaic.offset is None
+        xy = np.stack(grid.world_to_pixel(solution.sky.to_sky(stars)), 1)
+        check_stars(mosaic, xy, flux)
+        # The footprint by the exact chain, gwcs and all.
+        gx, gy = (a.ravel() for a in np.meshgrid(np.arange(0, 660, 9), np.arange(0, 660, 9)))
+        expected = np.zeros(len(gx), dtype=int)
+        for e in exposures:
+            p = np.stack(solution.wcs(e.name).world_to_pixel(grid.pixel_to_world(gx, gy).icrs), 1)
+            expected += np.all((p >= 0) & (p <= np.array(SHAPE[::-1]) - 1), axis=1)
+        np.testing.assert_array_equal(mosaic.footprint[gy, gx], expected)
+
+    def test_own_grid_given_back_is_the_same_mosaic(self):
+        solution, _, _, exposures, mosaic = plain()
+        header = mosaic.to_hdulist()["SCI"].header
+        again = coadd(exposures, solution, grid=header)
+        np.testing.assert_allclose(again.data, mosaic.data, rtol=1e-4, atol=0.01)
+
+    def test_without_sky_the_world_is_the_reference_plane(self):
+        solution, stars, *_ = plain()
+        blind = StandIn(solution.poses, solution.distortions)
+        mosaic = coadd(plain()[3], blind)
+        world = np.stack(mosaic.wcs.pixel_to_world_values(*(stars - mosaic.offset).T), 1)
+        np.testing.assert_allclose(world, stars, atol=1e-9)
+
+    def test_pixel_maps_agree_with_the_exact_chain(self):
+        solution = plain()[0]
+        grid = reference_grid(list(solution.poses), solution)
+        rng = np.random.default_rng(3)
+        for name in solution.poses:
+            planes = tabulate(lambda p, name=name: trace(p, name, solution, grid), (0, 0), grid.shape)
+            y, x = rng.integers(0, 280, (2, 500))
+            exact = trace(np.stack([x, y], 1).astype(float), name, solution, grid)
+            np.testing.assert_allclose(planes[:, y, x].T, exact, atol=1e-9)
+            # The area is the derivative of the chain.
+            h, hx, xy = 1e-4, np.array([1e-4, 0]), np.stack([x, y], 1) + np.array(grid.offset, dtype=float)
+            dx = (solution.distort(name, xy + hx) - solution.distort(name, xy - hx)) / (2 * h)
+            dy = (solution.distort(name, xy + hx[::-1]) - solution.distort(name, xy - hx[::-1])) / (2 * h)
+            ok = np.isfinite(dx + dy).all(axis=1)
+            area = np.abs(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0])
+            np.testing.assert_allclose(exact[ok, 4], area[ok], rtol=1e-6)
+
+    def test_a_rough_function_is_evaluated_everywhere(self):
+        def rough(p):
+            return np.stack([np.sin(3 * p[:, 0]), np.floor(p[:, 1] / 3)], 1)
+
+        y, x = np.mgrid[:50, :70]
+        out = tabulate(rough, (5, 6), (50, 70))
+        np.testing.assert_allclose(out, np.stack([np.sin(3.0 * (x + 5)), (y + 6) // 3]), atol=1e-12)
+
+
+class TestCombination:
+    @pytest.mark.parametrize("method", ["median", "clipped"])
+    def test_hot_pixel_and_trail_are_rejected(self, method):
+        solution, stars, flux = scene(4, rolls=(0, 1, -1, 2), spread=5)
+        rng = np.random.default_rng(5)
+        exposures = [Exposure(e.name, e.data + rng.normal(0, 1, SHAPE)) for e in expose(solution, stars, flux)]
+        clean = coadd(exposures, solution, method=method)
+        spoilt = exposures[1].data.copy()
+        spoilt[100, 130] += 1e5
+        spoilt[60, :] += 3e3
+        exposures[1] = Exposure("frame1", spoilt)
+        mosaic = coadd(exposures, solution, method=method)
+        ok = clean.footprint == 4
+        assert np.abs(mosaic.data - clean.data)[ok].max() < 200  # images differ in sharpness a little
+        assert np.nanmax(np.abs(coadd(exposures, solution).data - clean.data)) > 1e4
+        xy = stars - clean.offset
+        chosen = covered(coadd(exposures, solution), xy)
+        check_stars(clean, xy, flux, position=0.05, relative=0.03, chosen=chosen)
+
+    def test_clipping_spares_stars_of_different_sharpness(self):
+        solution, stars, flux = scene(peak=5.0)
+        exposures = expose(solution, stars, flux)
+        noisy = [
+            Exposure(e.name, e.data + np.random.default_rng(i).normal(0, 1, SHAPE)) for i, e in enumerate(exposures)
+        ]
+        clipped, mean = coadd(noisy, solution, method="clipped"), coadd(noisy, solution)
+        lost = (mean.footprint - clipped.footprint)[mean.footprint >= 3]
+        assert lost.mean() < 1e-3
+        check_stars(
+            clipped,
+            stars - clipped.offset,
+            flux,
+            position=0.05,
+            relative=0.03,
+            chosen=covered(mean, stars - mean.offset),
+        )
+
+    def test_backgrounds_are_matched_through_overlaps(self):
+        solution, _, _, exposures, clean = plain()
+        levels = [100.0, 130.0, 90.0, 115.0]
+        raised = [Exposure(e.name, e.data + level) for e, level in zip(exposures, levels, strict=True)]
+        mosaic = coadd(raised, solution)
+        assert mosaic.header["SKYLEVEL"] == pytest.approx(np.mean(levels), abs=1)
+        ok = mosaic.footprint > 0
+        np.testing.assert_allclose(mosaic.data[ok] - np.mean(levels), clean.data[ok], atol=1.0)
+        steps = coadd(raised, solution, match_background=False)
+        assert np.abs(steps.data[ok] - mosaic.data[ok]).max() > 10
+
+    def test_variance_is_that_of_the_pixels(self):
+        solution, *_ = scene(4, rolls=(0, 1, -1, 2))
+        rng = np.random.default_rng(8)
+        sigmas = dict(zip(solution.poses, (1.0, 2.0, 1.5, 3.0), strict=True))
+        for settings in ({}, {"order": 1}, {"method": "median"}, {"method": "clipped"}, {"algorithm": "adaptive"}):
+            for given in (True, False) if not settings else (False,):
+                exposures = [
+                    Exposure(n, rng.normal(0, s, SHAPE), uncertainty=np.full(SHAPE, s) if given else None)
+                    for n, s in sigmas.items()
+                ]
+                mosaic = coadd(exposures, solution, **settings)
+                ok = mosaic.footprint == 4
+                pull = mosaic.data[ok] / np.sqrt(mosaic.variance[ok])
+                # A median of unequal errors does better than the formula for equal ones.
+                low = 0.75 if settings.get("method") == "median" else 0.95
+                assert low < pull.std() < 1.05, (settings, given)
+
+    @pytest.mark.parametrize("sigma", [0.3, 1.0, 12.5])
+    def test_noise_of_whole_numbers(self, sigma):
+        solution, stars, flux = scene(1)
+        (frame,) = expose(solution, stars, flux)
+        whole = np.rint(frame.data + np.random.default_rng(4).normal(100, sigma, SHAPE))
+        mosaic = coadd([Exposure("frame0", whole)], solution, order=0, conserve="surface_brightness")
+        true = np.hypot(sigma, 1 / np.sqrt(12))
+        assert np.sqrt(np.nanmedian(mosaic.variance)) == pytest.approx(true, rel=0.2)
+
+    def test_weights(self):
+        solution, *_ = scene(2)
+        two = [Exposure("frame0", np.full(SHAPE, 1.0)), Exposure("frame1", np.full(SHAPE, 4.0))]
+        settings = {"conserve": "surface_brightness", "match_background": False}
+        mosaic = coadd(two, solution, weights={"frame0": 2, "frame1": 1}, **settings)
+        np.testing.assert_allclose(mosaic.data[mosaic.footprint == 2], 2, rtol=1e-5)
+        rng = np.random.default_rng(1)
+        noisy = [Exposure(f"frame{i}", rng.normal(v, s, SHAPE)) for i, (v, s) in enumerate([(0, 1), (30, 3)])]
+        mosaic = coadd(noisy, solution, **settings)
+        assert np.median(mosaic.data[mosaic.footprint == 2]) == pytest.approx(3, abs=0.2)
+
+    def test_exposure_times(self):
+        solution, stars, flux = scene(2)
+        short, long = expose(solution, stars, flux)
+        two = [
+            Exposure("frame0", short.data * 10, exposure_time=10.0),
+            Exposure("frame1", long.data * 30, exposure_time=30.0),
+        ]
+        mosaic = coadd(two, solution)
+        assert mosaic.header["EXPTIME"] == 20
+        assert mosaic.header["TEXPTIME"] == 40
+        check_stars(mosaic, stars - mosaic.offset, 20 * flux)
+        with pytest.warns(AssumptionWarning, match="no exposure time known for frame1"):
+            coadd([two[0], long], solution)
+
+    def test_bad_pixels_leave_no_trace(self):
+        solution, stars, flux, exposures, clean = plain()
+        data, mask = exposures[0].data.copy(), np.zeros(SHAPE, dtype=bool)
+        rng = np.random.default_rng(2)
+        bad = rng.random(SHAPE) < 0.01
+        bad[:, 100] = True
+        data[bad] = 1e6
+        data[50, 50:53] = np.nan
+        mask |= bad
+        one = coadd([Exposure("frame0", data, mask=mask)], solution, match_background=False)
+        good = coadd([exposures[0]], solution, match_background=False)
+        kept = one.footprint == 1
+        assert 0.8 < kept.sum() / good.footprint.sum() < 0.98
+        assert np.abs(one.data - good.data)[kept].max() < 0.05 * np.nanmax(good.data)
+        many = coadd([Exposure("frame0", data, mask=mask), *exposures[1:]], solution)
+        xy = stars - clean.offset
+        check_stars(many, xy, flux, position=0.05, relative=0.03, chosen=covered(clean, xy))
+
+    def test_fill_bad(self):
+        plane = np.add.outer(2.0 * np.arange(30), np.arange(40))
+        bad = np.zeros(plane.shape, dtype=bool)
+        bad[10, 10] = bad[0, 0] = bad[20:28, 20:30] = True
+        spoilt = np.where(bad, np.nan, plane)
+        filled = fill_bad(spoilt, bad)
+        assert filled[10, 10] == pytest.approx(plane[10, 10])
+        assert np.isfinite(filled).all()
+        np.testing.assert_array_equal(filled[~bad], plane[~bad])
+        assert np.isnan(spoilt[10, 10])  # the input is left alone
+
+
+class TestFile:
+    def test_write_and_read(self, tmp_path):
+        solution, stars, _, exposures, _ = plain()
+        noisy = [Exposure(e.name, e.data, uncertainty=np.full(SHAPE, 2.0), header=e.header) for e in exposures]
+        mosaic = coadd(noisy, solution)
+        mosaic.write(tmp_path / "m.fits")
+        assert [p.name for p in tmp_path.iterdir()] == ["m.fits"]
+        with fits.open(tmp_path / "m.fits") as hdulist:
+            assert [h.name for h in hdulist] == ["SCI", "VAR", "FOOTPRINT"]
+            header = hdulist[0].header
+            assert header["BUNIT"] == "adu"
+            assert header["NCOMBINE"] == 4
+            assert (-header["LTV1"], -header["LTV2"]) == mosaic.offset
+            for hdu in hdulist:
+                sky = WCS(hdu.header).pixel_to_world(*(stars - mosaic.offset).T)
+                assert solution.sky.to_sky(stars).separation(sky).max() < 1e-9 * u.deg
+            np.testing.assert_array_equal(hdulist["FOOTPRINT"].data, mosaic.footprint)
+        (back,) = read_exposures(tmp_path / "m.fits")
+        np.testing.assert_array_equal(back.data, mosaic.data)
+        assert np.median(mosaic.variance[mosaic.footprint == 4]) == pytest.approx(0.7, abs=0.3)
+        np.testing.assert_allclose(back.uncertainty**2, mosaic.variance, rtol=1e-5)
+
+    def test_a_file_is_not_overwritten_unasked(self, tmp_path):
+        mosaic = plain()[-1]
+        path = tmp_path / "m.fits"
+        path.write_text("precious")
+        with pytest.raises(InputError, match=r"m.fits exists; give overwrite=True"):
+            mosaic.write(path)
+        assert path.read_text() == "precious"
+        mosaic.write(path, overwrite=True)
+        assert fits.getdata(path).shape == mosaic.shape
+        with pytest.raises(InputError, match="no such folder"):
+            mosaic.write(tmp_path / "none" / "m.fits")
+
+    def test_repr_shows_counts(self):
+        mosaic = plain()[-1]
+        ny, nx = mosaic.shape
+        assert repr(mosaic) == f"<Mosaic: {nx} x {ny} px, 4 exposures>"
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"method": "sum"}, "method must be one of 'mean', 'median', 'clipped', got 'sum'"),
+            ({"order": 7}, "order must be an integer from 0 to 5"),
+            ({"order": "cubic"}, "got 'cubic'"),
+            ({"algorithm": "drizzle"}, "algorithm must be one of"),
+            ({"conserve": "mass"}, "conserve must be one of"),
+            ({"weights": "best"}, "weights must be 'noise', None or a dict"),
+            ({"weights": {"frame0": 1}}, "weights of exposure frame1 must be a positive number, got None"),
+            ({"scale": {"frame0": -1}}, "scale of exposure frame0"),
+            ({"grid": 3}, "grid must be None, an astropy WCS or a FITS header, got int"),
+            ({"grid": WCS(naxis=2)}, "both celestial"),
+        ],
+    )
+    def test_options(self, settings, message):
+        solution, *_, exposures, _ = plain()
+        with pytest.raises(InputError, match=message):
+            coadd(exposures, solution, **settings)
+
+    def test_grids(self):
+        solution, *_, exposures, mosaic = plain()
+        grid = mosaic.wcs.deepcopy()
+        grid.array_shape = None
+        with pytest.raises(InputError, match="grid has no shape"):
+            coadd(exposures, solution, grid=grid)
+        with pytest.raises(InputError, match="not tied to the sky"):
+            coadd(exposures, StandIn(solution.poses, solution.distortions), grid=mosaic.wcs)
+        away = mosaic.wcs.deepcopy()
+        away.wcs.crpix = away.wcs.crpix + 5000
+        with pytest.raises(InputError, match="no exposure meets the output grid: frame0: it does not meet"):
+            coadd(exposures, solution, grid=away)
+
+    def test_exposures(self):
+        solution, _, _, exposures, mosaic = plain()
+        stranger = Exposure("stranger", np.ones(SHAPE))
+        with pytest.warns(AssumptionWarning, match="left out of the mosaic: stranger: it is not in the solution"):
+            with_stranger = coadd([*exposures, stranger], solution)
+        np.testing.assert_array_equal(with_stranger.data, mosaic.data)
+        assert list(with_stranger.left_out) == ["stranger"]
+        with pytest.raises(InputError, match="no exposure to co-add: stranger: it is not in"):
+            coadd([stranger], solution)
+        with pytest.raises(InputError, match="the list is empty"):
+            coadd([], solution)
+        with pytest.raises(InputError, match=r"frame0: its shape \(9, 9\) is not that of the solution, \(300, 400\)"):
+            coadd([Exposure("frame0", np.ones((9, 9)))], solution)
+        with pytest.raises(InputError, match="exposures come twice: frame0"):
+            coadd([exposures[0], exposures[0]], solution)
+
+    def test_absurd_size(self):
+        solution, *_, exposures, _ = plain()
+        lost = StandIn(dict(solution.poses), solution.distortions)
+        lost.poses["frame1"] = lost.poses["frame1"] + np.array([[0, 0, 1e6], [0, 0, -1e6]])
+        with pytest.raises(InputError, match=r"needs \d+ GB, this machine has \d+; are the poses right"):
+            coadd(exposures, lost)
+
+    def test_inputs_are_not_changed(self):
+        solution, *_, exposures, _ = plain()
+        before = [e.data.copy() for e in exposures]
+        coadd(exposures, solution, method="clipped")
+        for e, data in zip(exposures, before, strict=True):
+            np.testing.assert_array_equal(e.data, data)
+
+
+def test_sky_of_the_stand_in_is_consistent():
+    """The oracle itself: gwcs and tangent plane agree."""
+    solution, stars, *_ = plain()
+    seen = solution.distort("frame0", stars)
+    ok = np.isfinite(seen).all(axis=1)
+    sky = SkyCoord(*solution.wcs("frame0")(*seen[ok].T) * u.deg)
+    assert solution.sky.to_sky(stars[ok]).separation(sky).max() < 1e-9 * u.deg

@@ -1,0 +1,343 @@
+"""Pictures: what is drawn is what the solution holds, and every axis says what it is and in which unit."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.table import QTable
+from matplotlib import pyplot
+from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.quiver import Quiver, QuiverKey
+
+from legdistort import basis, drawing, plotting
+from legdistort.exceptions import InputError
+from legdistort.solution import Solution
+
+
+def make_solution(
+    n_exposures=11, n_stars=80, degree=3, *, shape=(2048, 2048), names=None, flux=True, prior=True, seed=1
+):
+    """A solution with numbers of our own: GSAOI-like static part, dynamic parts of about 0.4 px."""
+    rng = np.random.default_rng(seed)
+    names = tuple(names or [f"rgS20130201S{i:04d}" for i in range(n_exposures)])
+    size = (len(names), 2, basis.n_modes(degree))
+    mean = np.zeros(size)
+    if degree >= 2:
+        mean[:, 0, [3, 5]] = -4.1, -3.8
+        mean[:, 1, 3:6] = 0.3, -0.7, 0.5
+    coefficients = mean + rng.normal(0, 0.4 / np.sqrt(size[2] / 2), size)
+    brightness = 10 ** rng.uniform(2, 5, n_stars)
+    error = np.tile(np.hypot(0.8 / np.sqrt(brightness), 0.003), len(names))
+    positions = rng.uniform(0, 1, (n_stars, 2)) * (shape[1], shape[0]) - 0.5
+    rows = QTable({"exposure": np.repeat(names, n_stars), "star": np.tile(np.arange(n_stars), len(names))})
+    rows["x"], rows["y"] = np.tile(positions, (len(names), 1)).T * u.pix
+    for axis in "xy":
+        rows[f"{axis}_err"] = error * u.pix
+        rows[f"d{axis}"] = error * rng.normal(size=len(rows)) * u.pix
+    if flux:
+        rows["flux"] = np.tile(brightness, len(names))
+    rows["used"] = rng.uniform(size=len(rows)) > 0.01
+    return Solution(
+        names=names,
+        degree=degree,
+        shapes=dict.fromkeys(names, shape),
+        poses={name: np.column_stack([np.eye(2), rng.normal(0, 99, 2)]) for name in names},
+        coefficients=coefficients,
+        prior_mean=mean if prior else np.zeros(size),
+        star_names=np.arange(n_stars),
+        positions=positions,
+        observations=rows,
+        chi2=1432.1,
+        dof=1380,
+        status="converged after 4 iterations",
+        gauge="minimal",
+        uncertainty=None,
+        left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},
+    )
+
+
+def make_mosaic(size=900, seed=2):
+    """Stars on noise, with a strip that no exposure covers."""
+    rng = np.random.default_rng(seed)
+    y, x = np.indices((size, size))
+    image = rng.normal(10, 2, (size, size))
+    for flux, x0, y0 in zip(10 ** rng.uniform(2, 5, 60), *rng.uniform(0, size, (2, 60)), strict=True):
+        image += flux / 50 * (1 + ((x - x0) ** 2 + (y - y0) ** 2) / 9) ** -2.5
+    image[:, : size // 30] = np.nan
+    return SimpleNamespace(data=image.astype(np.float32))
+
+
+@pytest.fixture(autouse=True)
+def _close():
+    yield
+    pyplot.close("all")
+
+
+@pytest.fixture(scope="module")
+def solution():
+    return make_solution()
+
+
+def texts(ax):
+    ax.figure.canvas.draw()
+    return ax.get_title(loc="left"), ax.get_xlabel(), ax.get_ylabel()
+
+
+def grids(ax):
+    return {tuple(np.round(c.get_color()[0][:3], 2)): np.array(c.get_segments()) for c in ax.collections}
+
+
+def color(name):
+    from matplotlib.colors import to_rgb
+
+    return tuple(np.round(to_rgb(name), 2))
+
+
+# -- residuals
+
+
+def test_residual_arrows_are_the_used_residuals_in_stated_proportion(solution):
+    name = solution.names[2]
+    ax = plotting.plot_residuals(solution, name, scale=500)
+    title, xlabel, ylabel = texts(ax)
+    assert name in title
+    assert "× 500" in title
+    assert (xlabel, ylabel) == ("x [px]", "y [px]")
+    quiver = next(c for c in ax.collections if isinstance(c, Quiver))
+    rows = solution.residuals[(solution.residuals["exposure"] == name) & solution.residuals["used"]]
+    np.testing.assert_allclose(quiver.U, rows["dx"].value)
+    np.testing.assert_allclose(quiver.V, rows["dy"].value)
+    np.testing.assert_allclose(quiver.XY, np.column_stack([rows["x"].value, rows["y"].value]))
+    assert quiver.scale == 1 / 500
+    assert quiver.angles == quiver.scale_units == "xy"
+
+
+def test_residuals_of_all_exposures_have_a_key_and_mark_what_was_not_used(solution):
+    ax = plotting.plot_residuals(solution)
+    quiver = next(c for c in ax.collections if isinstance(c, Quiver))
+    key = next(c for c in ax.get_children() if isinstance(c, QuiverKey))
+    assert key.label == f"{key.U:g} px"
+    assert 0.03 * 2048 < key.U / quiver.scale <= 0.1 * 2048  # length in pixels of the picture
+    assert np.count_nonzero(solution.residuals["used"]) == quiver.N
+    (crosses,) = ax.lines
+    assert len(crosses.get_xdata()) == np.count_nonzero(~solution.residuals["used"]) > 0
+
+
+def test_many_residuals_are_thinned():
+    ax = plotting.plot_residuals(make_solution(11, 400))
+    assert next(c for c in ax.collections if isinstance(c, Quiver)).N == 3000
+
+
+def test_residuals_refuse_what_they_cannot_draw(solution):
+    with pytest.raises(InputError, match="no exposure 'nonsense'"):
+        plotting.plot_residuals(solution, "nonsense")
+    empty = make_solution(2)
+    empty.residuals["used"][empty.residuals["exposure"] == empty.names[1]] = False
+    with pytest.raises(InputError, match=f"no position of {empty.names[1]} was used"):
+        plotting.plot_residuals(empty, empty.names[1])
+
+
+# -- distortions
+
+
+def test_grid_is_the_distortion_magnified(solution):
+    name = solution.names[3]
+    ax = plotting.plot_distortion(solution, name)
+    assert "× 50" in texts(ax)[0]
+    lines = grids(ax)
+    straight, bent = lines[color(drawing.GREY)], lines[color(drawing.BLUE)]
+    q = straight.reshape(-1, 2)
+    expected = q + 50 * (solution.distortion(name)(q) - q)
+    np.testing.assert_allclose(bent.reshape(-1, 2), expected, atol=1e-8)
+    assert np.ptp(q[:, 0]) == 2048  # edge to edge
+    prior = lines[color(drawing.ORANGE)].reshape(-1, 2)
+    shift = solution.prior_mean[3] @ basis.values(3, *basis.normalize(q, (2048, 2048)))
+    np.testing.assert_allclose(prior, q + 50 * shift.T, atol=1e-8)
+
+
+def test_dynamic_grid_leaves_the_prior_out(solution):
+    ax = plotting.plot_distortion(solution, solution.names[0], part="dynamic", scale=10)
+    lines = grids(ax)
+    assert color(drawing.ORANGE) not in lines
+    q = lines[color(drawing.GREY)].reshape(-1, 2)
+    shift = (solution.coefficients[0] - solution.prior_mean[0]) @ basis.values(3, *basis.normalize(q, (2048, 2048)))
+    np.testing.assert_allclose(lines[color(drawing.BLUE)].reshape(-1, 2), q + 10 * shift.T, atol=1e-8)
+
+
+def test_automatic_magnification_makes_a_tenth_of_the_detector(solution):
+    scale = plotting.distortion_scale(solution, solution.names)
+    t = np.linspace(-0.5, 2047.5, 40)
+    q = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
+    peak = max(np.abs(solution.distortion(name)(q) - q).max() for name in solution.names)
+    assert 0.03 * 2048 < scale * peak <= 0.1 * 2048 * 1.02
+
+
+def test_small_multiples_come_in_pages_of_twelve():
+    solution = make_solution(15, 10)
+    first, second = plotting.plot_distortions(solution), plotting.plot_distortions(solution, page=1)
+    shown = [ax.get_title(loc="left") for ax in (*first, *second)]
+    assert shown == list(solution.names)
+    assert len(first) == 12
+    assert len({(ax.get_xlim(), ax.get_ylim()) for ax in first}) == 1  # one scale for the eye
+    assert "× 50" in first[0].figure.get_suptitle()
+    assert first[0].figure.get_supxlabel() == "x [px]"
+    with pytest.raises(InputError, match="page 2 is empty: 15 exposures fill 2 pages"):
+        plotting.plot_distortions(solution, page=2)
+
+
+def test_unknown_part_is_refused(solution):
+    with pytest.raises(InputError, match="'total' or 'dynamic', got 'static'"):
+        plotting.plot_distortion(solution, solution.names[0], part="static")
+
+
+# -- coefficients
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 6])
+def test_bars_are_the_coefficients_beside_the_prior(degree):
+    solution = make_solution(3, 20, degree)
+    panels = plotting.plot_coefficients(solution, solution.names[1])
+    n = basis.n_modes(degree)
+    for axis, ax in enumerate(panels):
+        heights = {c.get_label(): [bar.get_height() for bar in c] for c in ax.containers}
+        np.testing.assert_allclose(heights[solution.names[1]], solution.coefficients[1, axis])
+        if degree >= 2:
+            np.testing.assert_allclose(heights["prior"], solution.prior_mean[1, axis])
+        assert ax.get_ylabel() == f"along {'xy'[axis]} [px]"
+    labels = [t.get_text() for t in panels[1].get_xticklabels()]
+    assert len(labels) == n
+    assert labels[:3] == ["(0, 0)", "(1, 0)", "(0, 1)"]
+    assert "orders" in panels[1].get_xlabel()
+
+
+def test_bars_of_all_exposures_show_mean_and_scatter(solution):
+    panels = plotting.plot_coefficients(solution)
+    bars = next(c for c in panels[0].containers if "mean" in c.get_label())
+    np.testing.assert_allclose([b.get_height() for b in bars], solution.coefficients[:, 0].mean(axis=0))
+    error = bars.errorbar.lines[2][0].get_segments()
+    np.testing.assert_allclose([np.ptp(s[:, 1]) / 2 for s in error], solution.coefficients[:, 0].std(axis=0))
+
+
+def test_no_orange_bars_without_prior():
+    solution = make_solution(2, 20, prior=False)
+    for ax in plotting.plot_coefficients(solution):
+        assert [c.get_label() for c in ax.containers if c.get_label() == "prior"] == []
+
+
+# -- scatter against flux
+
+
+def test_scatter_is_the_rms_of_the_used_residuals_of_each_star(solution):
+    ax = plotting.plot_scatter(solution)
+    points, curve = ax.lines
+    rows = solution.residuals[solution.residuals["used"]]
+    star = rows[rows["star"] == 7]
+    expected = np.sqrt(np.mean((star["dx"].value ** 2 + star["dy"].value ** 2) / 2))
+    at = np.argmin(np.abs(points.get_xdata() - star["flux"][0]))
+    assert points.get_ydata()[at] == pytest.approx(expected)
+    middle = np.hypot(0.8 / np.sqrt(curve.get_xdata()), 0.003)  # the law from which the errors were made
+    np.testing.assert_allclose(curve.get_ydata(), middle, rtol=0.05)
+    assert ax.get_xscale() == ax.get_yscale() == "log"
+    assert texts(ax)[1:] == ("flux [unit of the input]", "rms residual per axis [px]")
+
+
+def test_without_flux_the_reported_error_takes_its_place():
+    ax = plotting.plot_scatter(make_solution(2, 30, flux=False))
+    assert texts(ax)[1] == "reported error per axis [px]"
+    curve = ax.lines[1]
+    np.testing.assert_array_equal(curve.get_xdata(), curve.get_ydata())
+
+
+def test_flux_unit_is_shown_and_unknown_fluxes_are_left_out():
+    solution = make_solution(3, 30)
+    solution.residuals["flux"] = solution.residuals["flux"] * u.adu
+    solution.residuals["flux"][solution.residuals["star"] == 4] = np.nan
+    ax = plotting.plot_scatter(solution)
+    assert ax.get_xlabel() == "flux [adu]"
+    assert len(ax.lines[0].get_xdata()) == 29
+
+
+# -- images
+
+
+def test_mosaic_is_averaged_in_blocks_and_keeps_its_pixels():
+    mosaic = make_mosaic(300)
+    ax = plotting.plot_mosaic(mosaic, max_size=100, stars=[[10, 20], [200, 250]])
+    (image,) = ax.images
+    assert image.get_array().shape == (100, 100)
+    assert np.ma.getmaskarray(image.get_array())[:, :3].all()  # the strip of 10 pixels without data
+    assert image.get_extent() == [-0.5, 299.5, -0.5, 299.5]
+    assert texts(ax)[1:] == ("x [px]", "y [px]")
+    np.testing.assert_array_equal(ax.lines[0].get_xdata(), [10, 200])
+
+
+def test_block_mean_ignores_what_is_not_finite():
+    image = np.arange(35.0).reshape(5, 7)
+    image[0, 0] = np.nan
+    out = drawing.block_mean(image, 2)
+    assert out.shape == (3, 4)
+    assert out[0, 0] == pytest.approx(np.mean([1, 7, 8]))
+    assert out[2, 3] == 34
+    image[:2, :2] = np.nan
+    assert np.isnan(drawing.block_mean(image, 2)[0, 0])
+
+
+def test_mosaic_without_data_is_refused():
+    with pytest.raises(InputError, match="no finite pixel"):
+        plotting.plot_mosaic(SimpleNamespace(data=np.full((5, 5), np.nan)))
+
+
+def test_sigma_map_shows_the_rms_of_both_axes():
+    x, y = np.linspace(-0.5, 99.5, 6), np.linspace(-0.5, 49.5, 4)
+    sigma = np.random.default_rng(0).uniform(0.1, 0.3, (4, 6, 2))
+    sigma[0, 0] = np.nan
+    ax = plotting.plot_sigma_map(x, y, sigma, stars=[[3, 4]])
+    mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
+    shown = np.ma.filled(mesh.get_array().reshape(4, 6), np.nan)
+    np.testing.assert_allclose(shown, np.sqrt((sigma**2).mean(axis=2)))
+    assert ax.get_xlim() == (-0.5, 99.5)
+    assert texts(ax)[1:] == ("x [px]", "y [px]")
+    assert "[px]" in ax.figure.axes[1].get_ylabel()
+    with pytest.raises(InputError, match=r"sigma must have shape \(6, 4\)"):
+        plotting.plot_sigma_map(y, x, sigma)
+
+
+# -- all of them
+
+
+def test_axes_given_are_used_and_nothing_else_is_opened(solution):
+    before = pyplot.get_fignums()
+    from matplotlib.figure import Figure
+
+    ax = Figure().subplots()
+    assert plotting.plot_residuals(solution, ax=ax) is ax
+    assert plotting.plot_mosaic(make_mosaic(50), ax=Figure().subplots()).images
+    fig = Figure()
+    assert plotting.plot_coefficients(solution, fig=fig)[0].figure is fig
+    assert pyplot.get_fignums() == before
+
+
+def test_names_are_taken_literally_and_cut():
+    name = r"$\frac{a$_b<c>" + "x" * 80
+    solution = make_solution(names=[name, "other"], n_stars=20)
+    for ax in (
+        plotting.plot_residuals(solution, name),
+        plotting.plot_distortion(solution, name),
+        plotting.plot_coefficients(solution, name)[0],
+    ):
+        ax.figure.canvas.draw()  # mathtext would fail here
+    assert len(drawing.shorten(name)) == 44
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [(1, 1), (0.99, 0.5), (0.05, 0.05), (4.9, 2), (1000, 1000), (7e-5, 5e-5), (0, 1), (np.inf, 1)],
+)
+def test_round_down(value, expected):
+    assert drawing.round_down(value) == pytest.approx(expected)
+
+
+def test_grid_collections_carry_lines_only(solution):
+    ax = plotting.plot_distortion(solution, solution.names[0])
+    assert all(isinstance(c, LineCollection) for c in ax.collections)

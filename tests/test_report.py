@@ -1,0 +1,223 @@
+"""The page: complete in itself, everything named, nothing taken for markup."""
+
+import base64
+import re
+from html.parser import HTMLParser
+from io import BytesIO
+
+import numpy as np
+import pytest
+from astropy import units as u
+from matplotlib import pyplot
+from PIL import Image
+from test_plotting import make_mosaic, make_solution
+
+from legdistort import basis, report, simulation
+from legdistort.estimation import solve
+from legdistort.exceptions import InputError
+
+ODD = ["a<b>&\"c'", "$x$_\\frac{", "<script>alert(1)</script>", "星 plain"]
+VOID = {"meta", "img", "br"}
+
+
+class Page(HTMLParser):
+    """Tags that match, references, texts of table cells."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.references, self.cells, self.images = [], [], [], [], []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        attrs = dict(attrs)
+        self.references += [attrs[key] for key in ("src", "href", "data", "action") if key in attrs]
+        if tag == "img":
+            self.images.append(attrs)
+        if tag in ("td", "th"):
+            self.cells.append("")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "td" in self.open or "th" in self.open:
+            self.cells[-1] += data
+
+    def row(self, first):
+        """The ten cells of an exposure, or the fact that follows its name."""
+        at = self.cells.index(first)
+        return self.cells[at : at + 10]
+
+
+@pytest.fixture(scope="module")
+def solution():
+    return make_solution(names=ODD, n_stars=40)
+
+
+@pytest.fixture(scope="module")
+def text(solution):
+    return report.render(solution, mosaic=make_mosaic(600), summary={"timings": {"solve": 0.0812, "co<add": 3.0}})
+
+
+@pytest.fixture(scope="module")
+def page(text):
+    return Page(text)
+
+
+@pytest.fixture
+def tables_only(monkeypatch):
+    """Without pictures, for tests that do not look at them."""
+    monkeypatch.setattr(report, "_pictures", lambda *args: "")
+
+
+def test_page_is_well_formed_and_needs_nothing_else(page, text):
+    assert page.references
+    assert all(reference.startswith("data:image/png;base64,") for reference in page.references)
+    assert "http:" not in re.sub(r"base64,[^\"]*", "", text)
+    assert {"script", "link", "iframe"}.isdisjoint(page.tags)
+    assert "title" in page.tags
+    assert len(text) < 2e6
+
+
+def test_every_name_is_there_literally(page):
+    assert set(ODD) <= set(page.cells)
+    assert page.row("Left out")[1] == "bad <one>: only 2 stars matched, <i>10</i> & more are needed"
+    assert page.row("Time")[1] == "solve 0.08 s, co<add 3.00 s"
+
+
+def test_pictures_open_and_each_has_its_sentence(page, text):
+    assert len(page.images) == 6  # residuals, scatter, distortion, dynamic part, coefficients, mosaic
+    for attrs in page.images:
+        with Image.open(BytesIO(base64.b64decode(attrs["src"].split(",")[1]))) as image:
+            assert min(image.size) > 300
+            grey = np.asarray(image.convert("L"))
+        assert len(np.unique(grey)) > 10  # not blank
+        assert grey.min() < 20  # the palette keeps black, however rare
+        assert grey.max() == 255
+        assert f"<figcaption>{attrs['alt']}</figcaption>" in text
+        assert attrs["alt"].endswith(".")
+
+
+def test_numbers_are_those_of_the_solution(page, solution):
+    name = ODD[1]
+    rows = solution.residuals[(solution.residuals["exposure"] == name) & solution.residuals["used"]]
+    rms = [np.sqrt(np.mean(rows[d].to_value(u.pix) ** 2)) for d in ("dx", "dy")]
+    shift = solution.poses[name][:, 2]
+    # rms over the detector by brute force
+    t = np.linspace(-0.5, 2047.5, 801)
+    t = (t[1:] + t[:-1]) / 2
+    q = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
+    sizes = []
+    for c in (solution.coefficients[1], solution.coefficients[1] - solution.prior_mean[1]):
+        displacement = c @ basis.values(3, *basis.normalize(q, (2048, 2048)))
+        sizes.append(np.sqrt(np.sum(np.var(displacement, axis=1))))
+    expected = [f"{shift[0]:.2f}", f"{shift[1]:.2f}", "0.0000", "1.000000", str(len(rows))]
+    expected += [f"{r:.4f}" for r in rms]
+    assert page.row(name)[1:8] == expected
+    np.testing.assert_allclose([float(c) for c in page.row(name)[8:]], sizes, atol=2e-3)
+    assert page.row("Residuals, rms")[1] == f"{solution.rms[0]:.4f} px in x, {solution.rms[1]:.4f} px in y"
+    assert page.row("Stars")[1] == "40"
+    assert page.row("χ² / degrees of freedom")[1].startswith("1432.1 / 1380 = 1.038")
+    assert float(page.row("Largest error of an inverse")[1].split()[0]) == pytest.approx(
+        solution.max_inverse_error, rel=0.1
+    )
+
+
+def test_summary_replaces_what_follows_from_the_solution(solution, tables_only):
+    summary = {"n_stars": 77, "rms_px": 0.0123, "sigma_px": [0.004, 0.005], "max_inverse_error_px": 2.5e-7}
+    page = Page(report.render(solution, summary=summary | {"left_out": {}, "n_observations": 500}))
+    assert page.row("Stars")[1] == "77"
+    assert page.row("Residuals, rms")[1] == "0.0123 px per axis"
+    assert page.row("Scatter of corrected positions")[1] == "0.0040 px in x, 0.0050 px in y"
+    assert page.row("Largest error of an inverse")[1] == "2.5e-07 px"
+    assert page.row("Left out")[1] == "none"
+    assert page.row("Positions used")[1].startswith("500 ")
+
+
+def test_outlying_exposures_are_marked(tables_only):
+    solution = make_solution(5, 40)
+    solution.residuals["dy"][solution.residuals["exposure"] == solution.names[3]] *= 4
+    text = report.render(solution)
+    marked = re.findall(r'<td class="high">([\d.]+)</td>', text)
+    assert marked == [Page(text).row(solution.names[3])[7]]
+
+
+@pytest.mark.parametrize("degree", [1, 2, 6])
+def test_two_exposures_without_flux_prior_or_mosaic(degree):
+    solution = make_solution(2, 30, degree, flux=False, prior=False)
+    page = Page(report.render(solution))
+    assert set(solution.names) <= set(page.cells)
+    assert len(page.images) == 4
+
+
+def test_strong_distortion_is_magnified_less():
+    solution = make_solution(2, 30, 2)
+    solution.coefficients[:, 0, 3] = 40
+    text = report.render(solution)
+    assert "magnified 50 times" not in text
+    assert "magnified 2 times" in text
+
+
+def test_many_exposures_are_listed_and_the_dozen_that_departs_most_is_drawn():
+    solution = make_solution(14, 10)
+    solution.coefficients[5] = solution.prior_mean[5]
+    page = Page(text := report.render(solution))
+    assert set(solution.names) <= set(page.cells)
+    assert "the 12 exposures that depart most" in text
+    assert page.row(solution.names[5])[9] == "0.000"
+
+
+def test_exposure_without_used_positions_has_no_rms(tables_only):
+    solution = make_solution(3, 20)
+    solution.residuals["used"][solution.residuals["exposure"] == solution.names[0]] = False
+    assert Page(report.render(solution)).row(solution.names[0])[5:8] == ["0", "–", "–"]
+
+
+def test_fold_is_reported_in_words(tables_only):
+    solution = make_solution(2, 20, 2)
+    solution.coefficients[0, 0, 3] = 400
+    assert "folds" in Page(report.render(solution)).row("Largest error of an inverse")[1]
+
+
+def test_file_is_written_once(tmp_path, solution, monkeypatch):
+    monkeypatch.setattr(report, "render", lambda *args, **kwargs: "first ✓")
+    path = report.write_report(tmp_path / "report.html", solution)
+    assert path == tmp_path / "report.html"
+    assert path.read_text(encoding="utf-8") == "first ✓"
+    monkeypatch.setattr(report, "render", lambda *args, **kwargs: "second")
+    with pytest.raises(InputError, match=r"report\.html exists"):
+        report.write_report(path, solution)
+    assert path.read_text(encoding="utf-8") == "first ✓"
+    report.write_report(str(path), solution, overwrite=True)
+    assert path.read_text(encoding="utf-8") == "second"
+    with pytest.raises(InputError, match="does not exist"):
+        report.write_report(tmp_path / "nowhere" / "report.html", solution)
+
+
+def test_nothing_is_left_behind_when_it_fails(tmp_path, solution, monkeypatch):
+    def fail(*args, **kwargs):
+        raise InputError("no")
+
+    monkeypatch.setattr(report, "render", fail)
+    with pytest.raises(InputError, match="no"):
+        report.write_report(tmp_path / "report.html", solution)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_solved_set_gives_a_page(tmp_path):
+    matches = simulation.simulate_matches(n_stars=25, n_exposures=3, degree=2, seed=3).matches
+    solution = solve(matches, degree=2)
+    before = pyplot.get_fignums()
+    with pyplot.style.context("dark_background"):  # a user's style does not reach the page
+        path = report.write_report(tmp_path / "report.html", solution)
+    page = Page(path.read_text(encoding="utf-8"))
+    assert set(solution.names) <= set(page.cells)
+    assert page.row("Gauge")[1] == str(solution.gauge)
+    with Image.open(BytesIO(base64.b64decode(page.references[0].split(",")[1]))) as image:
+        assert image.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
+    assert pyplot.get_fignums() == before
