@@ -4,16 +4,18 @@ Files follow ASDF standard 1.5.0, which stacks of early 2025 read as well. The t
 tables, numbers and strings under ``legdistort``; the WCS of an exposure stands at ``meta.wcs``.
 """
 
+import dataclasses
 import datetime
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 
 import asdf
 import numpy as np
 from astropy import units as u
-from astropy.table import QTable
+from astropy.table import Column, QTable
 
-from .exceptions import InputError
+from .exceptions import AssumptionWarning, InputError
 from .files import replacing
 from .gauge import Gauge
 from .poses import TangentPlane
@@ -24,6 +26,8 @@ from .uncertainty import StoredUncertainty
 ASDF_STANDARD = "1.5.0"
 #: Version of the layout under ``legdistort``.
 LAYOUT = 1
+
+_GAUGE = [field.name for field in dataclasses.fields(Gauge)]
 
 
 def provenance():
@@ -52,7 +56,7 @@ def write_wcs(solution, name, path, *, overwrite=False):
 
 def write_solution(solution, path, *, overwrite=False):
     """Write a `Solution`, its covariances included, to an ASDF file."""
-    table = solution.observations
+    table = _plain_columns(solution.observations)
     tree = {
         "layout": LAYOUT,
         "provenance": provenance(),
@@ -72,12 +76,12 @@ def write_solution(solution, path, *, overwrite=False):
             for name, a, a0 in zip(solution.names, solution.coefficients, solution.prior_mean, strict=True)
         ],
         "stars": {"star": _plain(solution.star_names), "position": solution.positions},
+        "columns": table.colnames,  # their order: that of a mapping is lost in files
         "observations": {
             name: {"values": _plain(table[name]), "unit": str(table[name].unit or "")} for name in table.colnames
         },
         "covariance": solution.uncertainty.stored(),
-        "gauge": {key: getattr(solution.gauge, key) for key in ("kind", "constraint", "motion", "dynamic", "box")},
-        "static_sigma": solution.static_sigma,
+        "gauge": {key: getattr(solution.gauge, key) for key in _GAUGE},
         "sky": None
         if solution.sky is None
         else {"lon": solution.sky.lon, "lat": solution.sky.lat, "matrix": solution.sky.matrix},
@@ -88,9 +92,25 @@ def write_solution(solution, path, *, overwrite=False):
     return Path(path)
 
 
+def _plain_columns(table):
+    """The table without columns of composed objects (coordinates, times), which plain arrays cannot hold."""
+    others = [name for name in table.colnames if not isinstance(table[name], (Column, u.Quantity))]
+    if others:
+        warnings.warn(
+            f"the column{'s' * (len(others) > 1)} {', '.join(others)} of the observations hold no plain numbers or text: "
+            "left out of the file",
+            AssumptionWarning,
+            stacklevel=4,
+        )
+    return table[[name for name in table.colnames if name not in others]]
+
+
 def _plain(column):
-    """A column as an array that ASDF takes; names as a list."""
-    values = np.asarray(getattr(column, "value", column))
+    """A column as an array that ASDF takes, NaN or empty where masked; names as a list."""
+    values = np.array(getattr(column, "value", column))
+    mask = getattr(column, "mask", False)
+    if np.any(mask):
+        values = np.where(mask, "" if values.dtype.kind in "UO" else np.nan, values)
     return values.tolist() if values.dtype.kind in "UO" else values
 
 
@@ -119,15 +139,22 @@ def read_solution(path):
         raise InputError(f"{path} is damaged: {type(error).__name__} {error}") from None
 
 
+def _gauge(tree):
+    arrays = {key: tree[key] for key in _GAUGE if key not in ("kind", "prior")}
+    arrays = {key: None if value is None else np.array(value) for key, value in arrays.items()}
+    return Gauge(kind=tree["kind"], prior=bool(tree["prior"]), **arrays)
+
+
 def _from_tree(tree):
     exposures = tree["exposures"]
     names = tuple(e["name"] for e in exposures)
     table = QTable()
-    for name, column in tree["observations"].items():
+    for name in tree["columns"]:
+        column = tree["observations"][name]
         values = np.array(column["values"])
         table[name] = values * u.Unit(column["unit"]) if column["unit"] else values
-    g, sky = tree["gauge"], tree["sky"]
-    return Solution(
+    sky = tree["sky"]
+    solution = Solution(
         names=names,
         degree=int(tree["degree"]),
         shapes={e["name"]: tuple(e["shape"]) for e in exposures},
@@ -140,10 +167,22 @@ def _from_tree(tree):
         chi2=tree["chi2"],
         dof=tree["dof"],
         status=tree["status"],
-        gauge=Gauge(g["kind"], *(np.array(g[key]) for key in ("constraint", "motion", "dynamic", "box"))),
+        gauge=_gauge(tree["gauge"]),
         uncertainty=StoredUncertainty(*(np.array(tree["covariance"][key]) for key in ("coefficients", "stars"))),
-        static_sigma=None if tree["static_sigma"] is None else np.array(tree["static_sigma"]),
         sky=None if sky is None else TangentPlane(sky["lon"], sky["lat"], np.array(sky["matrix"])),
         left_out=dict(tree["left_out"]),
         settings=dict(tree["settings"]),
     )
+    _check_sizes(solution)
+    return solution
+
+
+def _check_sizes(solution):
+    size, n_stars = len(solution.names) * solution.gauge.n_constraints, len(solution.star_names)
+    for what, array, shape in (
+        ("positions", solution.positions, (n_stars, 2)),
+        ("covariance of the coefficients", solution.uncertainty.coefficients, (size, size)),
+        ("covariance of the stars", solution.uncertainty.stars, (3, n_stars)),
+    ):
+        if array.shape != shape:
+            raise ValueError(f"the {what} should have shape {shape}, not {array.shape}")

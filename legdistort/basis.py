@@ -8,6 +8,7 @@ is mapped on [-1, 1].
 """
 
 from functools import lru_cache
+from numbers import Real
 
 import numpy as np
 
@@ -29,7 +30,7 @@ def degree_of(n):
     InputError
         If `n` is not a triangular number.
     """
-    degree = (int(np.sqrt(8 * n + 1)) - 3) // 2
+    degree = (int(np.sqrt(8 * max(n, 0) + 1)) - 3) // 2
     if degree < 0 or n_modes(degree) != n:
         raise InputError(
             f"n = {n} is not a number of modes: a total degree d has (d+1)(d+2)/2 = 1, 3, 6, 10, 15, ... of them"
@@ -39,7 +40,7 @@ def degree_of(n):
 
 def check_degree(degree, name="degree"):
     """Return `degree` as int, or raise `InputError` naming the argument."""
-    if isinstance(degree, bool) or int(degree) != degree or not 0 <= degree <= MAX_DEGREE:
+    if isinstance(degree, bool) or not isinstance(degree, Real) or degree not in range(MAX_DEGREE + 1):
         raise InputError(f"{name} must be an integer from 0 to {MAX_DEGREE}, got {degree!r}")
     return int(degree)
 
@@ -83,7 +84,7 @@ def legendre(degree, u, derivative=False):
         p[1] = u
     for n in range(1, degree):
         # (n+1) P_{n+1} = (2n+1) u P_n - n P_{n-1}
-        np.multiply(u, p[n], out=p[n + 1])
+        np.multiply(u, p[n], out=p[n + 1, ...])
         p[n + 1] *= (2 * n + 1) / (n + 1)
         p[n + 1] -= n / (n + 1) * p[n - 1]
     scale = norm(np.arange(degree + 1)).reshape(-1, *[1] * u.ndim)
@@ -93,7 +94,7 @@ def legendre(degree, u, derivative=False):
     d = np.zeros_like(p)
     for n in range(degree):
         # P'_{n+1} = P'_{n-1} + (2n+1) P_n
-        np.multiply(p[n], 2 * n + 1, out=d[n + 1])
+        np.multiply(p[n], 2 * n + 1, out=d[n + 1, ...])
         if n:
             d[n + 1] += d[n - 1]
     p *= scale
@@ -255,5 +256,5 @@ def project(function, degree, n_nodes=None):
     -------
     ndarray, shape (..., n_modes)
     """
-    u, v, w = quadrature((degree if n_nodes is None else n_nodes - 1))
+    u, v, w = quadrature(degree if n_nodes is None else n_nodes - 1)
     return np.asarray(function(u, v)) * w @ values(degree, u, v).T

@@ -129,7 +129,7 @@ def check(table, contract, what):
     if missing:
         raise InputError(
             f"{what} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}; it has "
-            f"{', '.join(table.colnames)} (map names with columns={{'{missing[0]}': ...}} or --columns {missing[0]}=...)"
+            f"{', '.join(table.colnames)} (map names: columns={{'{missing[0]}': ...}} or --columns {missing[0]}=...)"
         )
     if len(table) == 0:
         raise InputError(f"{what} is empty")

@@ -207,7 +207,7 @@ def _extension(text):
 
 
 def _solving(a):
-    return {"gauge": a.gauge, "method": a.method, "loss": a.loss, "error_floor": a.error_floor}
+    return {"gauge": a.gauge, "method": a.method, "loss": a.loss, "error_floor": a.error_floor, "errors": a.errors}
 
 
 def _prior(text):
@@ -352,6 +352,7 @@ def _fit(p, *, clip):
     p.add_argument("--method", choices=("joint", "alternating"), default="joint", help="(default joint)")
     p.add_argument("--loss", choices=("linear", "huber", "cauchy"), default="linear", help="(default linear)")
     p.add_argument("--clip", type=float, default=clip, help=f"leave out beyond so many sigma (default {clip or 'no'})")
+    p.add_argument("--errors", choices=("stated", "scale", "floor"), default="stated", help="(default stated)")
     p.add_argument("--error-floor", type=float, default=0.0, help="pixels, added in quadrature to every error")
 
 

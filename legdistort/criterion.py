@@ -13,12 +13,22 @@ Arrays are ordered by exposure, coordinates first, so that every sweep reads mem
 """
 
 from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from importlib.util import find_spec
 
 import numpy as np
 
 from . import basis
 from .exceptions import InputError, SolveError
 from .priors import Prior, similarity_basis
+
+#: Number of observations from which compiled loops are used, if numba is installed.
+COMPILED_FROM = 30_000
+
+
+@cache
+def _numba_found():
+    return find_spec("numba") is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +53,8 @@ class Problem:
         Inverse covariance: xx, yy, xy [1/pix^2]; zero for an observation that is left out.
     prior_mean : ndarray, shape (n_exposures, 2, n_all)
     prior_sigma : ndarray, shape (n_exposures, 2, n_modes), or None
+    static_sigma : ndarray, shape (2, n_modes), or None
+        Uncertainty of the prior mean; of several priors the largest.
     """
 
     degree: int
@@ -56,6 +68,17 @@ class Problem:
     weight: np.ndarray
     prior_mean: np.ndarray
     prior_sigma: np.ndarray | None = None
+    static_sigma: np.ndarray | None = None
+
+    @cached_property
+    def unequal(self):
+        """Whether some observation has different or correlated axis weights."""
+        return bool(np.any(self.weight[0] != self.weight[1]) or np.any(self.weight[2]))
+
+    @property
+    def compiled(self):
+        """Whether the compiled loops of `legdistort.kernels` serve this problem."""
+        return self.xy.shape[1] >= COMPILED_FROM and _numba_found()
 
     @property
     def n_exposures(self):
@@ -66,6 +89,10 @@ class Problem:
     def n_modes(self):
         """Number of fitted modes per axis."""
         return basis.n_modes(self.degree)
+
+    def is_held(self, i):
+        """Whether the prior has widths for exposure i, so that it may have fewer stars than modes."""
+        return self.prior_sigma is not None and bool(np.isfinite(self.prior_sigma[i]).any())
 
     def part(self, i):
         """Observations of exposure i, as a slice."""
@@ -185,7 +212,13 @@ def build(matches, degree, *, prior=None, error_floor=0.0):
         weight=weight,
         prior_mean=mean,
         prior_sigma=None if free.all() else sigma,
+        static_sigma=_static_sigma(priors, degree),
     )
+
+
+def _static_sigma(priors, degree):
+    given = [p.static_sigma for p in priors if p is not None and p.static_sigma is not None]
+    return np.max([basis.change_degree(sigma, degree) for sigma in given], axis=0) if given else None
 
 
 def _highest_degree(count):
@@ -217,7 +250,7 @@ def prior_precision(problem, i):
     A similarity of the coefficients is a change of the pose, which has no prior.
     """
     n = 2 * problem.n_modes
-    if problem.prior_sigma is None or np.isinf(problem.prior_sigma[i]).all():
+    if not problem.is_held(i):
         return np.zeros((n, n))
     # a width of zero or infinity stands for "held" and "free" at 1e-6 and 1e6 px
     sigma = np.clip(problem.prior_sigma[i].ravel(), 1e-6, 1e6)
@@ -275,12 +308,32 @@ def squares(problem, residual):
 
 def linearise(problem, state):
     """J and its normal equations at a state: one pass over the observations."""
+    if problem.compiled:
+        from . import kernels
+
+        values, coupling, residual, v, g_star, u, g_exposure, chi2 = kernels.linearise(problem, state)
+    else:
+        values, coupling, residual, v, g_star, u, g_exposure = _sums(problem, state)
+        chi2 = float(squares(problem, residual).sum())
+    u_data, penalty = u, 0.0
+    if problem.prior_sigma is not None:
+        u = u.copy()
+        for i in range(problem.n_exposures):
+            precision = prior_precision(problem, i)
+            departure = (state.coefficients[i] - problem.prior_mean[i])[:, : problem.n_modes].ravel()
+            u[i] += precision
+            g_exposure[i] -= precision @ departure
+            penalty += float(departure @ precision @ departure)
+    return Blocks(chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values)
+
+
+def _sums(problem, state):
+    """The plain twin of `legdistort.kernels.linearise`."""
     n_modes, n_exposures, n = problem.n_modes, problem.n_exposures, problem.xy.shape[1]
     residual, values, coupling = np.empty((2, n)), np.empty((n_modes, n)), np.empty((2, 2, n))
     v, g_star = np.zeros((3, problem.n_stars)), np.zeros((2, problem.n_stars))
     u = np.empty((n_exposures, 2 * n_modes, 2 * n_modes))
     g_exposure = np.empty((n_exposures, 2 * n_modes))
-    correlated = bool(np.any(problem.weight[2]))
     for i in range(n_exposures):
         part = problem.part(i)
         star, w = problem.star[part], problem.weight[:, part]
@@ -297,19 +350,9 @@ def linearise(problem, state):
         wr = np.stack([w[0] * r[0] + w[2] * r[1], w[2] * r[0] + w[1] * r[1]])
         g_exposure[i] = (wr @ b.T).ravel()
         u[i, :n_modes, :n_modes] = (b * w[0]) @ b.T
-        u[i, n_modes:, n_modes:] = u[i, :n_modes, :n_modes] if np.array_equal(w[0], w[1]) else (b * w[1]) @ b.T
-        u[i, :n_modes, n_modes:] = u[i, n_modes:, :n_modes] = (b * w[2]) @ b.T if correlated else 0.0
-    u_data, penalty = u, 0.0
-    if problem.prior_sigma is not None:
-        u = u.copy()
-        for i in range(n_exposures):
-            precision = prior_precision(problem, i)
-            departure = (state.coefficients[i] - problem.prior_mean[i])[:, :n_modes].ravel()
-            u[i] += precision
-            g_exposure[i] -= precision @ departure
-            penalty += float(departure @ precision @ departure)
-    chi2 = float(squares(problem, residual).sum())
-    return Blocks(chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values)
+        u[i, n_modes:, n_modes:] = (b * w[1]) @ b.T if problem.unequal else u[i, :n_modes, :n_modes]
+        u[i, :n_modes, n_modes:] = u[i, n_modes:, :n_modes] = (b * w[2]) @ b.T if problem.unequal else 0.0
+    return values, coupling, residual, v, g_star, u, g_exposure
 
 
 def inverse_star_blocks(v):
@@ -328,6 +371,10 @@ def symmetric_times(block, x):
 
 def to_stars(problem, blocks, a):
     """E a: coefficients (n_exposures, 2 n_modes) -> stars (2, n_stars)."""
+    if problem.compiled:
+        from . import kernels
+
+        return kernels.to_stars(problem, blocks, a)
     out = np.zeros((2, problem.n_stars))
     n_modes = problem.n_modes
     for i in range(problem.n_exposures):
@@ -340,6 +387,10 @@ def to_stars(problem, blocks, a):
 
 def to_exposures(problem, blocks, y):
     """E' y: stars (2, n_stars) -> coefficients (n_exposures, 2 n_modes)."""
+    if problem.compiled:
+        from . import kernels
+
+        return kernels.to_exposures(problem, blocks, y)
     out = np.empty((problem.n_exposures, 2 * problem.n_modes))
     for i in range(problem.n_exposures):
         part = problem.part(i)

@@ -209,7 +209,7 @@ class Distortion:
     def _raise_fold(self, place, what):
         raise FoldError(
             f"the distortion{f' of exposure {self.name}' if self.name else ''} {what} near pixel "
-            f"({place[0]:.0f}, {place[1]:.0f}): two places fall on one; too few stars there for degree {self.degree}?"
+            f"({round(place[0])}, {round(place[1])}): two places fall on one; too few stars there for degree {self.degree}?"
         )
 
     def check_fold(self):

@@ -1,11 +1,14 @@
 """`solve`: from matched positions to a `Solution`."""
 
 import logging
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from astropy import units as u
+from scipy.optimize import brentq
 
-from . import basis, criterion, outliers, solvers
+from . import criterion, outliers, solvers
 from .exceptions import InputError
 from .solution import Solution
 from .uncertainty import Uncertainty
@@ -13,6 +16,7 @@ from .uncertainty import Uncertainty
 log = logging.getLogger(__name__)
 
 METHODS = ("joint", "alternating")
+ERRORS = ("stated", "scale", "floor")
 
 
 def solve(
@@ -25,6 +29,7 @@ def solve(
     loss="linear",
     clip=None,
     error_floor=0.0,
+    errors="stated",
     max_iterations=None,
 ):
     """Estimate all star positions and all distortions at once.
@@ -50,6 +55,9 @@ def solve(
         that is larger than the stated errors); they are listed in ``residuals["used"]``.
     error_floor : float
         Pixels, added in quadrature to every stated error.
+    errors : {"stated", "scale", "floor"}
+        Take the stated errors as they are; or scale the reported errors by sqrt(chi2/dof); or find the error floor
+        that makes chi2 its degrees of freedom (zero if it is smaller already). What was found is in ``settings``.
     max_iterations : int, optional
 
     Returns
@@ -69,45 +77,148 @@ def solve(
         raise InputError("method='alternating' is the published scheme: it takes neither loss nor clip")
     if loss not in solvers.LOSSES:
         raise InputError(f"loss must be one of {', '.join(map(repr, solvers.LOSSES))}, got {loss!r}")
+    if errors not in ERRORS:
+        raise InputError(f"errors must be one of {', '.join(map(repr, ERRORS))}, got {errors!r}")
+    if errors == "floor" and error_floor:
+        raise InputError("errors='floor' finds the error floor itself: leave error_floor out")
     if clip is not None and not clip > 1:
         raise InputError(f"clip must be a number of standard errors above 1, got {clip!r}")
-    problem = criterion.build(matches, degree, prior=prior, error_floor=error_floor)
-    start = solvers.start(problem, np.stack([matches.poses[name] for name in matches.names]))
-    limit = {} if max_iterations is None else {"max_iterations": max_iterations}
-    if method == "alternating":
-        result, used = solvers.solve_alternating(problem, start, gauge=gauge, **limit), None
-    elif clip is None:
-        result, used = solvers.solve_joint(problem, start, gauge=gauge, loss=loss, **limit), None
-    else:
-        result, used = outliers.solve_clipped(problem, start, clip=clip, gauge=gauge, loss=loss, **limit)
-    log.info("%s; chi2 %.1f", result.status, result.blocks.chi2)
+    options = {
+        "degree": degree,
+        "prior": prior,
+        "gauge": gauge,
+        "method": method,
+        "loss": loss,
+        "clip": clip,
+        "limit": {} if max_iterations is None else {"max_iterations": max_iterations},
+    }
+    fit = _fit(matches, error_floor, options)
+    if errors == "floor":
+        fit = _fit_with_floor(matches, fit, options)
+    log.info("%s; chi2 %.1f for %d degrees of freedom", fit.result.status, fit.chi2, fit.dof)
+    scale = np.sqrt(fit.chi2 / fit.dof) if errors == "scale" and fit.dof > 0 else 1.0
     settings = {
         "degree": int(degree),
         "gauge": gauge,
         "method": method,
         "loss": loss,
         "clip": None if clip is None else float(clip),
-        "error_floor": float(error_floor),
+        "errors": errors,
+        "error_floor": float(fit.error_floor),
+        "error_scale": float(scale),
         "prior": prior is not None,
     }
-    return _solution(matches, problem, result, used, prior=prior, settings=settings)
+    return _solution(fit, scale, settings)
 
 
-def _solution(matches, problem, result, used, *, prior, settings):
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """One minimisation: what went in (after whole exposures were dropped), and what came out."""
+
+    matches: object
+    problem: criterion.Problem
+    result: solvers.Result
+    used: np.ndarray
+    error_floor: float
+
+    @cached_property
+    def weighted(self):
+        """The problem with the weights that were in force."""
+        if self.used.all() and np.all(self.result.robust == 1):
+            return self.problem
+        return self.problem.scaled(self.used * self.result.robust)
+
+    @cached_property
+    def blocks(self):
+        """The normal equations with these weights."""
+        if self.weighted is self.problem:
+            return self.result.blocks
+        return criterion.linearise(self.weighted, self.result.state)
+
+    @cached_property
+    def uncertainty(self):
+        """Covariances at the stated errors."""
+        return Uncertainty(self.weighted, self.blocks, self.result.gauge)
+
+    @property
+    def chi2(self):
+        """Weighted squares of the used residuals."""
+        return self.blocks.chi2
+
+    @cached_property
+    def dof(self):
+        """Degrees of freedom: the directions fixed by the gauge are no unknowns, and a prior does part of the work."""
+        problem = self.problem
+        n_stars = np.count_nonzero(self.blocks.v[0] > 0)
+        n_free = 2 * n_stars + (problem.n_exposures - 1) * 2 * problem.n_modes
+        if problem.prior_sigma is not None:
+            size = 2 * problem.n_modes
+            blocks = self.uncertainty.coefficients.reshape(problem.n_exposures, size, problem.n_exposures, size)
+            n_free -= sum(
+                np.sum(criterion.prior_precision(problem, i) * blocks[i, :, i]) for i in range(problem.n_exposures)
+            )
+        return round(2 * np.count_nonzero(self.used) - n_free)
+
+
+def _fit(matches, error_floor, options):
+    """Minimise; exposures whose stars mostly deviate are dropped by name and the rest is solved again."""
+    gauge, loss, clip, limit = (options[key] for key in ("gauge", "loss", "clip", "limit"))
+    problem = criterion.build(matches, options["degree"], prior=options["prior"], error_floor=error_floor)
+    nominal = np.stack([matches.poses[name] for name in matches.names])
+    robust = clip is not None or loss != "linear"
+    start, misplaced = solvers.start(problem, nominal, robust=robust)
+    if robust and misplaced.any():
+        reason = "its stars lie nowhere near where the other exposures put them (mismatched, or not this field?)"
+        return _fit_without(
+            matches, error_floor, {problem.names[i]: reason for i in np.flatnonzero(misplaced)}, options
+        )
+    used = np.ones(problem.xy.shape[1], dtype=bool)
+    if options["method"] == "alternating":
+        result = solvers.solve_alternating(problem, start, gauge=gauge, **limit)
+    elif clip is None:
+        result = solvers.solve_joint(problem, start, gauge=gauge, loss=loss, **limit)
+    else:
+        result, used, unfit = outliers.solve_clipped(problem, start, clip=clip, gauge=gauge, loss=loss, **limit)
+        if unfit:
+            return _fit_without(matches, error_floor, unfit, options)
+    return _Fit(matches, problem, result, used, error_floor)
+
+
+def _fit_without(matches, error_floor, unfit, options):
+    """The fit without some exposures, ``{name: reason}``."""
+    for name, reason in unfit.items():
+        log.warning("exposure %s is left out: %s", name, reason)
+    return _fit(matches.without(unfit), error_floor, options)
+
+
+def _fit_with_floor(matches, fit, options):
+    """The fit whose error floor makes chi2 its degrees of freedom."""
+    if fit.dof <= 0 or fit.chi2 <= fit.dof:
+        return fit
+    residual = np.sqrt(np.mean(fit.result.blocks.residual[:, fit.used] ** 2))
+    tried = {}
+
+    def excess(log_floor):
+        tried[log_floor] = _fit(matches, np.exp(log_floor), options)
+        return np.log(tried[log_floor].chi2 / tried[log_floor].dof)
+
+    high = np.log(4 * residual)
+    low = high - 12  # a floor of 1e-5 of the residuals is none
+    best = brentq(excess, low, high, xtol=1e-3, maxiter=40) if excess(low) > 0 > excess(high) else high
+    return tried[best] if best in tried else _fit(matches, np.exp(best), options)
+
+
+def _solution(fit, scale, settings):
     """Bring the solver's arrays back into the order and the words of the user."""
-    used = np.ones(problem.xy.shape[1], dtype=bool) if used is None else used
-    weighted = problem.scaled(used * result.robust)
-    blocks = criterion.linearise(weighted, result.state)
+    matches, problem, result = fit.matches, fit.problem, fit.result
     table = matches.table.copy()
-    back = np.empty_like(blocks.residual)
-    back[:, problem.order] = blocks.residual
+    back = np.empty_like(fit.blocks.residual)
+    back[:, problem.order] = fit.blocks.residual
     table["dx"], table["dy"] = back * u.pix
     table["used"] = np.zeros(len(table), dtype=bool)
-    table["used"][problem.order] = used
+    table["used"][problem.order] = fit.used
     positions = result.state.positions.T.copy()
-    positions[blocks.v[0] <= 0] = np.nan
-    n_stars = np.count_nonzero(blocks.v[0] > 0)
-    n_free = 2 * n_stars + (problem.n_exposures - 1) * 2 * problem.n_modes
+    positions[fit.blocks.v[0] <= 0] = np.nan
     return Solution(
         names=problem.names,
         degree=problem.degree,
@@ -118,20 +229,12 @@ def _solution(matches, problem, result, used, *, prior, settings):
         star_names=np.asarray(matches.stars),
         positions=positions,
         observations=table,
-        chi2=blocks.chi2,
-        dof=int(2 * np.count_nonzero(used) - n_free),
+        chi2=fit.chi2,
+        dof=fit.dof,
         status=result.status,
         gauge=result.gauge,
-        uncertainty=Uncertainty(weighted, blocks, result.gauge),
-        static_sigma=_static_sigma(prior, problem.n_modes),
+        uncertainty=fit.uncertainty if scale == 1 else Uncertainty(fit.weighted, fit.blocks, result.gauge, scale=scale),
         sky=matches.sky,
         left_out=dict(matches.left_out),
         settings=settings,
     )
-
-
-def _static_sigma(prior, n_modes):
-    """Uncertainty of the static distortion (2, n_modes); of several priors the largest."""
-    given = [p.static_sigma for p in (prior.values() if isinstance(prior, dict) else [prior]) if p is not None]
-    given = [basis.change_degree(s, basis.degree_of(n_modes)) for s in given if s is not None]
-    return np.max(given, axis=0) if given else None

@@ -22,9 +22,11 @@ def replacing(path, *, overwrite=False):
     Raises
     ------
     InputError
-        If `path` exists and `overwrite` is false, or its folder does not exist.
+        If `path` is a folder, or exists and `overwrite` is false, or its folder does not exist.
     """
     path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give the name of a file")
     if path.exists() and not overwrite:
         raise InputError(f"{path} exists already; give overwrite=True (--overwrite) to replace it, or another name")
     if not path.parent.is_dir():
@@ -66,8 +68,10 @@ def replacing_folder(out):
         out.mkdir(exist_ok=True)
         for item in temporary.iterdir():
             target = out / item.name
-            if item.is_dir() and target.is_dir():
+            if target.is_dir() and not target.is_symlink():
                 shutil.rmtree(target)
+            elif item.is_dir():
+                target.unlink(missing_ok=True)
             item.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

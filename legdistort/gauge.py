@@ -43,6 +43,10 @@ class Gauge:
         similarities.
     box : ndarray, shape (2, 2)
         Centre and half size of the reference-plane box on which the modes are defined, pixels.
+    static_sigma : ndarray, shape (2, n_modes), or None
+        Uncertainty of the prior mean itself.
+    prior : bool
+        Whether the prior has widths, which then pin the modes together with the constraint.
     """
 
     kind: str
@@ -50,6 +54,8 @@ class Gauge:
     motion: np.ndarray
     dynamic: np.ndarray
     box: np.ndarray
+    static_sigma: np.ndarray | None = None
+    prior: bool = False
 
     @property
     def n_constraints(self):
@@ -64,8 +70,7 @@ class Gauge:
     @cached_property
     def orthonormal(self):
         """Orthonormal rows that span `constraint`, shape (2 n_modes, n_exposures * 2 n_modes)."""
-        q, _ = np.linalg.qr(self.constraint.reshape(self.n_constraints, -1).T)
-        return q.T
+        return np.linalg.qr(self.constraint.reshape(self.n_constraints, -1).T)[0].T
 
     def violation(self, departure):
         """Values of the orthonormal constraints at departures A_i - A_0 (n_exposures, 2 n_modes)."""
@@ -77,36 +82,84 @@ class Gauge:
         u, v = ((np.asarray(xy) - self.box[0]) / self.box[1]).T
         return basis.values(degree, u, v)
 
-    def absolute_covariance(self, static_sigma=None):
+    @cached_property
+    def absolute_covariance(self):
         """Covariance (2 n_modes, 2 n_modes) of the reference-plane modes that the convention hides.
 
         The mean dynamic distortion of the set, with the observed scatter per mode, and the uncertainty of
-        the static distortion (2, n_modes), if given; both as they pass through the constraint. The similarities,
+        the static distortion, if given; both as they pass through the constraint. The similarities,
         which are a matter of pointing, are left out.
         """
         rows = self.constraint.transpose(1, 0, 2)
         pull = np.linalg.pinv(np.einsum("iab,ibc->ac", rows, self.motion))
         through = pull @ rows  # coefficients of one exposure -> reference-plane modes
         out = np.einsum("iab,ibc,idc->ad", through, self.dynamic, through, optimize=True)
-        if static_sigma is not None:
+        if self.static_sigma is not None:
             common = through.sum(axis=0)
-            out += common * np.ravel(static_sigma) ** 2 @ common.T
-        return out
+            out += common * np.ravel(self.static_sigma) ** 2 @ common.T
+        similar = similarity_basis(2 * self.box[1, ::-1], self.n_constraints // 2)
+        keep = np.eye(len(out)) - similar.T @ similar
+        return keep @ out @ keep
 
-    def __str__(self):
-        size = self.n_constraints
-        degree = basis.degree_of(size // 2)
+    def absolute_errors(self):
+        """What the convention hides, per degree of the common map: rms error over the field and axis, pixels.
+
+        Returns
+        -------
+        list of (str, int, float)
+            Name, number of modes, error; the similarities first, with NaN.
+        """
+        degree = basis.degree_of(self.n_constraints // 2)
+        variance = np.diag(self.absolute_covariance).reshape(2, -1).sum(axis=0) / 8  # b_m has mean square 1/4
+        rows = [("shift, rotation, scale" if degree else "shift", 4 if degree else 2, np.nan)]
+        for d in range(1, degree + 1):
+            part = slice(basis.n_modes(d - 1), basis.n_modes(d))
+            rows.append((f"degree {d}" if d > 1 else "shear", 2 * (d + 1) if d > 1 else 2, variance[part].sum() ** 0.5))
+        return rows
+
+    @property
+    def sentence(self):
+        """The convention in a sentence."""
         how = {
             "minimal": "the smallest dynamic part, weighted by its scatter and errors",
             "mean": "dynamic parts that sum to zero",
         }[self.kind]
-        rms = np.sqrt(np.mean(np.sum(self.scatter**2, axis=1))) / 2
+        hidden = np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()]))
         return (
-            f"{self.kind}: the data do not tell a map of the reference plane of degree {degree} common to all "
-            f"exposures ({size} modes, 6 of them exactly); they are fixed by the convention of {how}. "
-            f"Shift, rotation and scale stay those of the nominal poses (mean over exposures). "
-            f"Dynamic scatter {rms:.3g} px rms per axis and exposure."
+            f"{self.kind}: {self.n_constraints} modes of a map common to all exposures, which the data do not tell, "
+            f"are fixed by {how}; they hide {hidden:.2g} px rms per axis, pointing aside"
         )
+
+    def __repr__(self):
+        return f"<Gauge {self.kind!r}: {self.n_constraints} constraints, {len(self.motion)} exposures>"
+
+    def __str__(self):
+        convention = {
+            "minimal": "the constraint (smallest dynamic part, weighted by its scatter and errors)",
+            "mean": "the constraint (dynamic parts that sum to zero)",
+        }[self.kind]
+        if self.prior:
+            convention += " and the prior widths"
+        degree = basis.degree_of(self.n_constraints // 2)
+        dynamic = np.sqrt(np.sum(self.scatter**2) / 8)
+        lines = [
+            f"Gauge {self.kind!r}. A map of the reference plane of degree {degree} that every exposure takes back "
+            f"changes nothing in the data: {self.n_constraints} modes, {min(6, self.n_constraints)} of them exactly.",
+            f"{'modes':24s} {'number':>6s} {'absolute error':>15s}  pinned by",
+        ]
+        for name, number, error in self.absolute_errors():
+            if np.isnan(error):
+                lines.append(f"{name:24s} {number:6d} {'not known':>15s}  the nominal poses, mean over exposures")
+            else:
+                lines.append(f"{name:24s} {number:6d} {f'{error:.2g} px':>15s}  {convention}")
+        source = "the scatter of single exposures" + (
+            " and the uncertainty of the static distortion" if self.static_sigma is not None else ""
+        )
+        lines.append(
+            f"Absolute errors (rms over the field, per axis) come from {source}; single exposures depart from the prior "
+            f"mean by {dynamic:.2g} px rms per axis. No external reference was used."
+        )
+        return "\n".join(lines)
 
 
 def make(kind, problem, state, blocks):
@@ -134,7 +187,7 @@ def make(kind, problem, state, blocks):
         constraint = np.broadcast_to(np.eye(motion.shape[1])[:, None], (motion.shape[1], *motion.shape[:2])).copy()
     else:
         constraint = _minimal_constraint(motion, error, dynamic, similar, others, box)
-    return Gauge(kind, constraint, motion, dynamic, box)
+    return Gauge(kind, constraint, motion, dynamic, box, problem.static_sigma, problem.prior_sigma is not None)
 
 
 def _minimal_constraint(motion, error, dynamic, similar, others, box):
@@ -159,7 +212,9 @@ def _scalar_weights(error, rows):
 def reference_box(problem, state):
     """Centre and half size (2, 2) of the box of the reference plane that all detectors cover."""
     corners = []
-    for shape, pose in zip(problem.shapes, state.poses, strict=True):
+    scale = np.sqrt(np.abs(np.linalg.det(state.poses[:, :, :2])))
+    usual = np.abs(np.log(scale / np.median(scale))) < np.log(2)  # a mismatched exposure may have any scale
+    for shape, pose in zip(np.array(problem.shapes)[usual], state.poses[usual], strict=True):
         ends = basis.denormalize(np.array([-1, 1, 1, -1.0]), np.array([-1, -1, 1, 1.0]), shape)
         corners.append(poses.apply(poses.invert(pose), ends))
     corners = np.concatenate(corners)

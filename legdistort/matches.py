@@ -84,6 +84,23 @@ class Matches:
             back[rows] = poses.apply(poses.invert(self.poses[name]), obs.xy[rows])
         return _star_means(back, obs.star, len(self.stars))
 
+    def without(self, reasons):
+        """The same matches without some exposures, ``{name: reason}``, which join `left_out`.
+
+        Raises
+        ------
+        MatchError
+            If what is left is one exposure, or falls apart.
+        """
+        table = self.table[~np.isin(self.table["exposure"], list(reasons))]
+        kept = {name: pose for name, pose in self.poses.items() if name not in reasons}
+        left_out = self.left_out | dict(reasons)
+        if len(table) == 0:
+            raise MatchError(
+                "no exposure agrees with the others: " + "; ".join(f"{k}: {v}" for k, v in reasons.items())
+            )
+        return type(self).from_table(table, shape=self.shapes, poses=kept, sky=self.sky, left_out=left_out)
+
     def to_meta(self):
         """Shapes, poses and sky as plain lists, for the header of a table file; see `read_meta`."""
         sky = self.sky

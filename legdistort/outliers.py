@@ -34,11 +34,13 @@ def solve_clipped(problem, start, *, clip, gauge="minimal", loss="linear", **lim
     Result
     ndarray of bool, shape (n,)
         Observations that were used, in the order of the problem.
+    dict
+        ``{exposure: reason}`` of exposures most of whose observations deviate: they should be left out as a whole.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # a start, good to a fraction of the errors, is enough
         result = solvers.solve_joint(problem, start, gauge=gauge, loss="cauchy", max_iterations=20, tolerance=0.02)
-    used = np.ones(problem.xy.shape[1], dtype=bool)
+    used, unfit = np.ones(problem.xy.shape[1], dtype=bool), {}
     for count in range(MAX_ROUNDS):
         weighted = problem.scaled(result.robust * used)
         pull = deviations(problem, weighted, criterion.linearise(weighted, result.state))
@@ -46,9 +48,12 @@ def solve_clipped(problem, start, *, clip, gauge="minimal", loss="linear", **lim
         fresh = used & (pull > clip * max(1.0, typical))
         if count and not fresh.any():
             break
-        used = keep_solvable(problem, used & ~fresh, used)
+        used &= ~fresh
+        unfit = unfit_exposures(problem, used)
+        if unfit:
+            break
         result = solvers.solve_joint(problem.scaled(used.astype(float)), result.state, gauge=gauge, loss=loss, **limit)
-    return result, used
+    return result, used, unfit
 
 
 def deviations(problem, weighted, blocks):
@@ -82,11 +87,16 @@ def deviations(problem, weighted, blocks):
     return np.sqrt(squares / (1 - np.minimum(leverage, 0.9)))
 
 
-def keep_solvable(problem, used, before):
-    """Leave no exposure with fewer observations than modes: such an exposure keeps what it had."""
-    used = used.copy()
-    for i in range(problem.n_exposures):
-        part = problem.part(i)
-        if np.count_nonzero(used[part]) < problem.n_modes <= np.count_nonzero(before[part]):
-            used[part] = before[part]
-    return used
+def unfit_exposures(problem, used):
+    """Exposures left with fewer than half their observations, or fewer than modes: ``{name: reason}``."""
+    out = {}
+    for i, name in enumerate(problem.names):
+        mine = used[problem.part(i)]
+        left = np.count_nonzero(mine)
+        needed = 1 if problem.is_held(i) else problem.n_modes
+        if left < max(len(mine) / 2, needed):
+            out[name] = (
+                f"{len(mine) - left} of its {len(mine)} stars deviate from the solution of the others "
+                "(mismatched, or not this field?)"
+            )
+    return out

@@ -52,7 +52,7 @@ def expected_bias(solution, *, removed=None, absolute=False):
     covariance = solution.uncertainty.star_matrix[np.ix_(np.tile(good, 2), np.tile(good, 2))]
     if absolute:
         modes = np.kron(np.eye(2), solution.gauge.modes_at(xy)).T
-        covariance = covariance + modes @ solution.gauge.absolute_covariance(solution.static_sigma) @ modes.T
+        covariance = covariance + modes @ solution.gauge.absolute_covariance @ modes.T
     columns = _columns(xy, removed)
     left = np.trace(covariance) - np.trace(columns.T @ covariance @ columns)
     return float(np.sqrt(left / len(covariance)))
@@ -131,7 +131,7 @@ def expected_scatter(solution, xy, sigma, *, seen=None):
     xy = np.asarray(xy, dtype=float)
     size = solution.gauge.n_constraints
     rows = np.zeros((len(xy), 2, len(solution.names), size))
-    noise = np.zeros((len(xy), len(solution.names)))
+    noise, n = np.zeros(len(xy)), np.zeros(len(xy), dtype=int)
     for i, name in enumerate(solution.names):
         distortion, pose = solution.distortion(name), solution.poses[name]
         ny, nx = solution.shapes[name]
@@ -143,14 +143,13 @@ def expected_scatter(solution, xy, sigma, *, seen=None):
         back = np.linalg.inv(distortion.jacobian(q[on]) @ pose[:, :2])
         b = basis.values(solution.degree, *basis.normalize(q[on], solution.shapes[name]))
         rows[on, :, i] = np.einsum("kac,mk->kacm", back, b).reshape(len(b.T), 2, size)
-        noise[on, i] = sigma**2 * (back**2).sum(axis=(1, 2))
+        noise[on] += sigma**2 * (back**2).sum(axis=(1, 2))
+        n[on] += 1
     covariance = solution.uncertainty.coefficients
     blocks = covariance.reshape(len(solution.names), size, len(solution.names), size)
     own = np.einsum("kaip,ipiq,kaiq->k", rows, blocks, rows, optimize=True)
     flat = rows.reshape(len(xy), 2, -1)
     together = np.einsum("kap,kap->k", flat @ covariance, flat)
-    n = np.count_nonzero(noise, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        total = own + noise.sum(axis=1)
-        variance = (total - (together + noise.sum(axis=1)) / n) / (2 * n)
+        variance = (own + noise - (together + noise) / n) / (2 * n)
     return np.sqrt(np.where(n > 1, variance, np.nan))

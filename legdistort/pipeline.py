@@ -146,7 +146,7 @@ def summarise(solution, *, timings=None):
         "dof": int(solution.dof),
         "rms_px": float(np.sqrt(np.mean(solution.rms**2))),
         "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
-        "gauge": str(solution.gauge),
+        "gauge": solution.gauge.sentence,
         "max_inverse_error_px": float(solution.max_inverse_error),
         "left_out": dict(solution.left_out),
         "timings": {step: round(seconds, 3) for step, seconds in (timings or {}).items()},

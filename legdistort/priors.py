@@ -77,8 +77,9 @@ class Prior:
         return basis.degree_of(self.mean.shape[1])
 
     def __repr__(self):
-        widths = [f"{name} given" for name in ("sigma", "static_sigma") if getattr(self, name) is not None]
-        return f"<Prior: degree {self.degree}, {self.mean.shape[1]} modes an axis{', ' if widths else ''}{', '.join(widths)}>"
+        words = [f"degree {self.degree}", f"{self.mean.shape[1]} modes an axis"]
+        words += [f"{name} given" for name in ("sigma", "static_sigma") if getattr(self, name) is not None]
+        return f"<Prior: {', '.join(words)}>"
 
     @classmethod
     def from_model(cls, model, *, shape, direction, origin=0, degree=5, parity=None, sigma=None, static_sigma=None):
@@ -124,10 +125,9 @@ class Prior:
             pose = poses.compose(shift, pose)
             if np.abs(poses.apply(shift, to_plane.pixels) - to_plane.pixels).max() < 1e-10:
                 break
-        t = np.linspace(-1, 1, 41)
-        u, v = (a.ravel() for a in np.meshgrid(t, t))
-        exact = to_plane.displacement(basis.denormalize(u, v, shape), pose)
-        truncation = float(np.abs(exact - mean @ basis.values(degree, u, v)).max())
+        q = poses.apply(pose, to_plane.plane)
+        left = to_plane.pixels - q - (mean @ basis.values(degree, *basis.normalize(q, shape))).T
+        truncation = float(np.hypot(*left.T).max())
         return cls(mean, sigma=sigma, static_sigma=static_sigma, truncation=truncation, plane=pose)
 
 
@@ -136,7 +136,7 @@ class _Plane:
 
     def __init__(self, model, shape, direction, origin):
         self._model, self._origin, self._inverse = model, origin, direction == "reference_to_detector"
-        t = np.linspace(-1, 1, 21)
+        t = np.linspace(-1, 1, 41)
         self.pixels = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), shape)
         if self._inverse:
             self.plane = self._locate_plane()

@@ -131,7 +131,7 @@ def _facts_table(solution, facts):
     error = facts["max_inverse_error_px"]
     rows["Largest error of an inverse"] = escape(error) if isinstance(error, str) else f"{error:.1e} px"
     rows["Minimisation"] = escape(str(solution.status))
-    rows["Gauge"] = escape(str(solution.gauge))
+    rows["Gauge"] = escape(solution.gauge.sentence)
     rows["Left out"] = (
         "<br>".join(f"{escape(str(n))}: {escape(str(r))}" for n, r in facts["left_out"].items()) or "none"
     )
@@ -253,8 +253,9 @@ def _distortion_figures(solution):
     gentle = plotting.distortion_scale(solution, names, part=part)  # largest displacement a tenth of the detector
     scale = 50 if gentle >= 20 else gentle
     text = (
-        f"Distortion of {which}{', without its linear part' * (part == 'nonlinear')}, magnified {scale:g} times: a regular grid (grey) as the detector sees it; a panel "
-        "unlike the others, or lines that cross or crowd at an edge, would be worrying."
+        f"Distortion of {which}{', without its linear part' * (part == 'nonlinear')}, magnified {scale:g} times: "
+        "a regular grid (grey) as the detector sees it; a panel unlike the others, or lines that cross or crowd at an "
+        "edge, would be worrying."
     )
     yield _figure(plotting.plot_distortions(solution, names=names, part=part, scale=scale, fig=_new_figure())[0], text)
     if np.any(solution.prior_mean):

@@ -47,8 +47,6 @@ class Solution:
     gauge : Gauge
     uncertainty : Uncertainty
         Covariances in the gauge.
-    static_sigma : ndarray, shape (2, n_modes), or None
-        Uncertainty of the prior mean.
     sky : TangentPlane or None
     left_out : dict
         ``{exposure: reason}``.
@@ -70,7 +68,6 @@ class Solution:
     status: str
     gauge: object
     uncertainty: object
-    static_sigma: np.ndarray | None = None
     sky: poses.TangentPlane | None = None
     left_out: dict = field(default_factory=dict)
     settings: dict = field(default_factory=dict)
@@ -114,7 +111,7 @@ class Solution:
     def hidden_variance(self, xy):
         """Variance (n, 2) [pix^2] that the gauge hides at reference positions (n, 2)."""
         modes = self.gauge.modes_at(xy)
-        covariance = self.gauge.absolute_covariance(self.static_sigma)
+        covariance = self.gauge.absolute_covariance
         n = len(modes)
         blocks = covariance[:n, :n], covariance[n:, n:]
         return np.stack([np.einsum("mj,mk,kj->j", modes, block, modes) for block in blocks], axis=1)
@@ -174,6 +171,11 @@ class Solution:
         return max(distortion.inverse.error for distortion in self._distortions)
 
     # -- errors
+
+    @property
+    def static_sigma(self):
+        """Uncertainty of the prior mean, shape (2, n_modes) [pix], or None."""
+        return self.gauge.static_sigma
 
     def coefficient_errors(self, name):
         """Standard deviations (2, n_modes) of the fitted coefficients of an exposure in the gauge, pixels."""
@@ -250,7 +252,7 @@ class Solution:
         lines = [
             repr(self)[1:-1],
             f"status  {self.status}",
-            f"gauge   {self.gauge}",
+            f"gauge   {self.gauge.sentence}",
             f"rms     {self.rms[0]:.4f}, {self.rms[1]:.4f} px in x, y; "
             f"{np.count_nonzero(used)} of {len(used)} observations used",
             "",

@@ -56,7 +56,7 @@ class Result:
     robust: np.ndarray
 
 
-def start(problem, nominal, *, n_sweeps=3):
+def start(problem, nominal, *, n_sweeps=3, robust=False):
     """Start values: coefficients at the prior mean, poses refined to one another, positions their weighted mean.
 
     Parameters
@@ -64,6 +64,14 @@ def start(problem, nominal, *, n_sweeps=3):
     problem : Problem
     nominal : ndarray, shape (n_exposures, 2, 3)
     n_sweeps : int
+    robust : bool
+        Give deviant observations less weight, so that mismatched exposures do not drag the others along.
+
+    Returns
+    -------
+    State
+    ndarray of bool, shape (n_exposures,)
+        Exposures that are `misplaced`.
 
     Raises
     ------
@@ -78,12 +86,16 @@ def start(problem, nominal, *, n_sweeps=3):
                 q[:, part] = Distortion(problem.prior_mean[i], shape, problem.names[i]).invert(q[:, part].T).T
             except FoldError as error:
                 raise SolveError(f"the prior is not usable: {error}") from None
-    weight = problem.weight[:2].sum(axis=0) / 2
-    current = np.array(nominal, dtype=float)
+    full = problem.weight[:2].sum(axis=0) / 2
+    current, weight = np.array(nominal, dtype=float), full
+    n_sweeps *= 5 if robust else 1
     for sweep in range(n_sweeps + 1):
         positions = _mean_positions(problem, current, q, weight)
         if sweep == n_sweeps:
             break
+        if robust:
+            distance2 = distances(problem, current, q, positions)
+            weight = full / (1 + distance2 / (2 * np.median(distance2) + 1e-12))
         for i in range(problem.n_exposures):
             part = problem.part(i)
             own = problem.star[part]
@@ -92,7 +104,48 @@ def start(problem, nominal, *, n_sweeps=3):
                 current[i] = poses.fit_similarity(
                     positions[:, own].T, q[:, part].T, weights=weight[part], parity=parity
                 )
-    return State(positions, problem.prior_mean.copy(), current)
+    distance2 = distances(problem, current, q, positions)
+    common = _common_similarity(problem, nominal, current, distance2)
+    current = np.stack([poses.compose(pose, common) for pose in current])
+    positions = poses.apply(poses.invert(common), positions.T).T
+    return State(positions, problem.prior_mean.copy(), current), misplaced(problem, distance2)
+
+
+def _common_similarity(problem, nominal, refined, distance2):
+    """The similarity of the reference plane that brings refined poses back, in the mean, to the nominal ones.
+
+    Exposures of like quality count equally, bad ones less, misplaced ones not at all.
+    """
+    variance = 1 / np.array([problem.weight[:2, problem.part(i)].sum() for i in range(problem.n_exposures)])
+    weight = 1 / (variance + 10 * np.median(variance))
+    weight[misplaced(problem, distance2)] = 0
+    old, new = [], []
+    for i in range(problem.n_exposures):
+        ny, nx = problem.shapes[i]
+        corners = np.array([[0, 0], [nx, 0], [nx, ny], [0, ny]]) - 0.5
+        old.append(poses.apply(poses.invert(nominal[i]), corners))
+        new.append(poses.apply(poses.invert(refined[i]), corners))
+    return poses.fit_similarity(np.concatenate(old), np.concatenate(new), weights=np.repeat(weight, 4), parity=1)
+
+
+def misplaced(problem, distance2):
+    """Whether the stars of an exposure lie nowhere near their mean positions, shape (n_exposures,).
+
+    Ten times farther than usual, and more than 1 % of the detector, which no distortion known beforehand explains.
+    """
+    typical = np.array([np.sqrt(np.median(distance2[problem.part(i)])) for i in range(problem.n_exposures)])
+    size = np.max(problem.shapes, axis=1)
+    return (typical > 10 * np.median(typical)) & (typical > 0.01 * size)
+
+
+def distances(problem, pose_list, q, positions):
+    """Squared distance (n,) of undistorted positions from their star's mean position, detector pixels."""
+    distance2 = np.empty(q.shape[1])
+    for i, pose in enumerate(pose_list):
+        part = problem.part(i)
+        off = q[:, part].T - poses.apply(pose, positions[:, problem.star[part]].T)
+        distance2[part] = (off**2).sum(axis=1)
+    return distance2
 
 
 def _mean_positions(problem, pose_list, q, weight):
@@ -301,7 +354,7 @@ def _singular_message(problem, s):
     )
 
 
-def _conjugate_gradients(problem, blocks, rows, rhs, target, tolerance=1e-8, max_iterations=500):
+def _conjugate_gradients(problem, blocks, rows, rhs, target, tolerance=1e-3, max_iterations=500):
     """Matrix-free solution of the reduced system on the constraints, preconditioned by the exposure blocks.
 
     Projected conjugate gradients with the constraint preconditioner of Gould, Hribar & Nocedal (2001): every

@@ -3,6 +3,9 @@
 import os
 from pathlib import Path
 
+# the matrices are small: on a busy machine, threads of the linear algebra library only wait for one another
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import matplotlib
 import pytest
 

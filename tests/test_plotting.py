@@ -187,7 +187,7 @@ def test_small_multiples_come_in_pages_of_twelve():
 
 
 def test_unknown_part_is_refused(solution):
-    with pytest.raises(InputError, match="'total' or 'dynamic', got 'static'"):
+    with pytest.raises(InputError, match="'total', 'nonlinear' or 'dynamic', got 'static'"):
         plotting.plot_distortion(solution, solution.names[0], part="static")
 
 

@@ -77,7 +77,7 @@ def test_model_is_the_published_formula():
 def test_jacobian_is_the_finite_difference():
     sim = small(corr=0.3)
     problem = criterion.build(sim.matches, 2, prior=Prior(sim.truth.static))
-    state = solvers.start(problem, np.stack([sim.matches.poses[n] for n in sim.matches.names]))
+    state, _ = solvers.start(problem, np.stack([sim.matches.poses[n] for n in sim.matches.names]))
     blocks = criterion.linearise(problem, state)
 
     def cost(positions, coefficients):

@@ -1,0 +1,54 @@
+"""The compiled loops against their plain twins."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from legdistort import criterion, solvers
+from legdistort.estimation import solve
+from legdistort.priors import Prior
+from legdistort.simulation import simulate_matches
+
+pytest.importorskip("numba", reason="the compiled loops need the extra 'fast'")
+
+RNG = np.random.default_rng(0)
+
+
+def _set(**settings):
+    sim = simulate_matches(
+        n_exposures=9, n_stars=120, seen=0.7, dither=100.0, rotations=RNG.uniform(-50, 50, 9), **settings
+    )
+    # a prior of higher degree than the fit, so that modes that stay fixed are in play
+    return sim, Prior(np.pad(sim.truth.static, ((0, 0), (0, 5))) + 0.01)
+
+
+@pytest.mark.parametrize("settings", [{"sigma": 0.05}, {"sigma": RNG.uniform(0.02, 0.2, (9, 120, 2)), "corr": 0.4}])
+def test_compiled_sums_are_the_plain_ones(monkeypatch, settings):
+    sim, prior = _set(**settings)
+    problem = criterion.build(sim.matches, 3, prior=prior)
+    state, _ = solvers.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
+    plain = criterion.linearise(problem, state)
+    a, y = RNG.normal(size=plain.g_exposure.shape), RNG.normal(size=(2, problem.n_stars))
+    sums = criterion.to_stars(problem, plain, a), criterion.to_exposures(problem, plain, y)
+    monkeypatch.setattr(criterion, "COMPILED_FROM", 0)
+    assert problem.compiled
+    fast = criterion.linearise(problem, state)
+    for name in ("chi2", "residual", "v", "g_star", "u", "g_exposure", "coupling", "values"):
+        expected = getattr(plain, name)
+        tolerance = 1e-6 if name in ("coupling", "values") else 1e-10  # kept in single precision
+        assert_allclose(getattr(fast, name), expected, atol=tolerance * np.abs(expected).max(), err_msg=name)
+    fast_sums = criterion.to_stars(problem, fast, a), criterion.to_exposures(problem, fast, y)
+    for mine, expected in zip(fast_sums, sums, strict=True):
+        assert_allclose(mine, expected, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("direct", [True, False])
+def test_compiled_solution_is_the_plain_one(monkeypatch, direct):
+    sim, prior = _set(sigma=0.05)
+    plain = solve(sim.matches, prior=prior)
+    monkeypatch.setattr(criterion, "COMPILED_FROM", 0)
+    monkeypatch.setattr(solvers, "uses_direct", lambda problem: direct)
+    fast = solve(sim.matches, prior=prior)
+    assert_allclose(fast.positions, plain.positions, atol=1e-6)
+    assert_allclose(fast.coefficients, plain.coefficients, atol=1e-6)
+    assert_allclose(fast.uncertainty.stars, plain.uncertainty.stars, rtol=1e-6, atol=1e-9)
