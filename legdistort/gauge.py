@@ -194,19 +194,23 @@ def _minimal_constraint(motion, error, dynamic, similar, others, box):
     """Rows ``N_i' W_i``: those of all but the common similarities see the departures without their similarity part."""
     inner = others @ (dynamic + error) @ others.transpose(0, 2, 1)
     weight = others.transpose(0, 2, 1) @ np.linalg.solve(inner, others) if others.shape[1] else np.zeros_like(error)
-    pose_weight = _scalar_weights(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
+    weight = _say(error, others)[:, None, None] * weight
+    pose_weight = _say(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
     common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
     pulled = motion.transpose(0, 2, 1)
     rows = np.concatenate([complement(common) @ pulled @ weight, common @ pulled @ pose_weight], axis=1)
     return rows.transpose(1, 0, 2)
 
 
-def _scalar_weights(error, rows):
-    """Weights (n_exposures,): inverse mean variance within `rows`, equal for exposures of like quality."""
+def _say(error, rows):
+    """How much say each exposure has (n_exposures,): 1, fading where the variance exceeds ten times the usual one.
+
+    The scatter of a convention over a bad exposure's errors would move every star for no gain.
+    """
     if not rows.shape[1]:
         return np.ones(len(error))
     own = np.einsum("ika,iab,ikb->ik", rows, error, rows, optimize=True).mean(axis=1)
-    return 1 / (own + 10 * np.median(own))
+    return 1 / (1 + (own / (10 * np.median(own))) ** 2)
 
 
 def reference_box(problem, state):
@@ -254,7 +258,7 @@ def _dynamic_covariance(problem, state, error, motion, others):
     departure = (state.coefficients - problem.prior_mean)[:, :, :n_modes].reshape(problem.n_exposures, -1)
     own = np.einsum("ika,ia->ik", others, departure)
     moved = others @ motion
-    w = _scalar_weights(error, others)
+    w = _say(error, others)
     normal = np.einsum("i,ika,ikb->ab", w, moved, moved, optimize=True)
     common = np.linalg.pinv(normal, rcond=1e-10, hermitian=True) @ np.einsum("i,ika,ik->a", w, moved, own)
     variance = np.einsum("ika,iab,ikb->ik", others, error, others, optimize=True)
@@ -263,13 +267,17 @@ def _dynamic_covariance(problem, state, error, motion, others):
 
 
 def _excess_scatter(a, variance):
-    """Standard deviation per column of a (n, k) beyond the given variances, by bisection."""
-    low, high = np.zeros(a.shape[1]), np.var(a, axis=0) * len(a) + 1e-300
+    """Standard deviation per column of a (n, k) beyond the given variances, by bisection.
+
+    Values ten times less certain than usual would add noise to the answer and nothing else, so they have no say.
+    """
+    counts = variance <= 10 * np.median(variance, axis=0)
+    n = counts.sum(axis=0)
+    low, high = np.zeros(a.shape[1]), (a**2).sum(axis=0) + 1e-300
 
     def excess(extra):
-        w = 1 / (variance + extra + 1e-300)
-        mean = (w * a).sum(axis=0) / w.sum(axis=0)
-        return (w * (a - mean) ** 2).sum(axis=0) - (len(a) - 1)
+        w = counts / (variance + extra + 1e-300)
+        return (w * a**2).sum(axis=0) - (n - 1)
 
     present = excess(low) > 0
     for _ in range(50):

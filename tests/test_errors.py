@@ -1,0 +1,253 @@
+"""Promises about errors: calibration, robustness, errors found on request, the gauge in words."""
+
+import numpy as np
+import pytest
+from astropy import units as u
+from numpy.testing import assert_allclose
+
+from legdistort import performance, solvers
+from legdistort.criterion import build
+from legdistort.estimation import solve
+from legdistort.matches import Matches
+from legdistort.priors import Prior
+from legdistort.simulation import simulate_matches
+
+RNG = np.random.default_rng
+
+
+def carried(sim, solution, prior):
+    """The truth in the gauge and at the poses of a solution: noise-free positions, minimised under its constraints.
+
+    Returns positions (n_stars, 2) and fitted coefficients (n_exposures, 2 n_modes).
+    """
+    problem = build(sim.matches, solution.degree, prior=prior)
+    rows = solution.gauge.orthonormal
+    exact = np.empty_like(problem.xy)
+    for i, name in enumerate(problem.names):
+        part = problem.part(i)
+        exact[:, part] = sim.truth.distort(name, sim.truth.positions[sim.matches.stars[problem.star[part]]]).T
+    problem = type(problem)(**{**vars(problem), "xy": exact, "prior_sigma": None})
+    poses = np.stack([solution.poses[name] for name in solution.names])
+    state = solvers.State(solution.positions.T.copy(), solution.coefficients.copy(), poses)
+    for _ in range(6):
+        blocks = solvers.criterion.linearise(problem, state)
+        departure = (state.coefficients - problem.prior_mean)[:, :, : problem.n_modes].reshape(problem.n_exposures, -1)
+        d_star, d_exposure = solvers.newton_step(problem, blocks, solution.gauge, departure)
+        coefficients = state.coefficients.copy()
+        coefficients[:, :, : problem.n_modes] += d_exposure.reshape(problem.n_exposures, 2, -1)
+        state = solvers.State(state.positions + d_star, coefficients, state.poses)
+    assert np.abs(rows @ (state.coefficients - problem.prior_mean)[:, :, : problem.n_modes].ravel()).max() < 1e-6
+    return state.positions.T, state.coefficients[:, :, : problem.n_modes].reshape(problem.n_exposures, -1)
+
+
+def normalised(difference, covariance):
+    """chi2 of a difference under a singular covariance, and its rank."""
+    values, vectors = np.linalg.eigh(covariance)
+    keep = values > 1e-9 * values[-1]
+    return np.sum((vectors[:, keep].T @ difference) ** 2 / values[keep]), np.count_nonzero(keep)
+
+
+SETTINGS = {
+    "simulation 1": ({}, {}),
+    "dithered, unequal errors": (
+        {"dither": 150.0, "n_stars": 40, "sigma": RNG(0).uniform(0.03, 0.25, (10, 40, 2)), "corr": 0.3}, {}
+    ),
+    "with prior": ({"zero_mean": False, "n_stars": 14}, {"sigma": 0.9}),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_covariances_are_calibrated(setting):
+    """Over 200 realisations the mean chi2 of (estimate - truth) is its degrees of freedom within 5 %."""
+    settings, widths = SETTINGS[setting]
+    stars, coefficients, maps = [], [], []
+    for seed in range(200):
+        sim = simulate_matches(seed=seed, **settings)
+        prior = Prior(sim.truth.static, **widths)
+        solution = solve(sim.matches, prior=prior)
+        positions, a = carried(sim, solution, prior)
+        n = len(positions)
+        covariance = solution.uncertainty.star_matrix
+        chi2, rank = normalised((solution.positions - positions).T.ravel(), covariance)
+        stars.append(chi2 / rank)
+        assert rank <= 2 * n
+        departure = solution.coefficients.reshape(len(a), -1) - a
+        chi2, rank = normalised(departure.ravel(), solution.uncertainty.coefficients)
+        coefficients.append(chi2 / rank)
+        name = solution.names[seed % len(solution.names)]
+        i = solution.index(name)
+        x, y, sigma = solution.sigma_map(name, n=6)
+        grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        mine = solution.correct(name, grid)
+        true = type(solution)(**{**vars_of(solution), "coefficients": _replaced(solution, i, a[i])}).correct(name, grid)
+        with np.errstate(invalid="ignore"):
+            maps.append(np.nanmean(((mine - true) / sigma.reshape(-1, 2)) ** 2))
+    for figures in (stars, coefficients, maps):
+        assert np.mean(figures) == pytest.approx(1, abs=0.05)
+
+
+def vars_of(solution):
+    return {name: getattr(solution, name) for name in solution.__dataclass_fields__}
+
+
+def _replaced(solution, i, a):
+    out = solution.coefficients.copy()
+    out[i] = a.reshape(2, -1)
+    return out
+
+
+@pytest.mark.slow
+def test_absolute_errors_are_right():
+    """Absolute errors, pointing aside, against independent dynamic parts whose mean does not vanish."""
+    measured, reported = [], []
+    for seed in range(200):
+        sim = simulate_matches(seed=seed, zero_mean=False, dither=100.0, sigma=0.05, n_stars=60)
+        solution = solve(sim.matches, prior=Prior(sim.truth.static))
+        true = sim.truth.positions[solution.star_names]
+        measured.append(performance.bias(solution.positions, true, removed="similarity"))
+        reported.append(performance.expected_bias(solution, removed="similarity", absolute=True))
+    ratio = np.sqrt(np.mean(np.square(measured)) / np.mean(np.square(reported)))
+    assert ratio == pytest.approx(1, abs=0.10)
+
+
+def test_simulation_1_is_at_the_bound():
+    """b of 20 seeds at sigma / sqrt(n_im), scatter of new points at the expected figure (paper, Simulation 1)."""
+    b, sigma = [], []
+    grid = np.stack(np.meshgrid(*[np.linspace(0.1 * 2048, 0.9 * 2048, 50) - 0.5] * 2), axis=-1).reshape(-1, 2)
+    for seed in range(20):
+        sim = simulate_matches(seed=seed)
+        solution = solve(sim.matches, prior=Prior(sim.truth.static))
+        b.append(performance.bias(solution.positions, sim.truth.positions[solution.star_names]))
+        rng = RNG(1000 + seed)
+        corrected = np.stack([
+            solution.correct(name, sim.truth.distort(name, grid) + 0.14 * rng.normal(size=grid.shape))
+            for name in solution.names
+        ])  # fmt: skip
+        sigma.append(np.sqrt(np.mean(performance.scatter(corrected) ** 2)))
+    assert np.sqrt(np.mean(np.square(b))) == pytest.approx(0.044, abs=0.004)
+    assert np.sqrt(np.mean(np.square(sigma))) == pytest.approx(0.157, abs=0.010)
+
+
+def _with_mismatches(seed, fraction):
+    sim = simulate_matches(n_stars=80, seed=seed, dither=100.0)
+    table = sim.matches.table.copy()
+    rng = RNG(seed)
+    wrong = rng.random(len(table)) < fraction
+    angle, size = rng.uniform(0, 2 * np.pi, wrong.sum()), rng.uniform(1, 50, wrong.sum())
+    table["x"][wrong] += size * np.cos(angle) * u.pix
+    table["y"][wrong] += size * np.sin(angle) * u.pix
+    return sim, table, wrong
+
+
+def test_gross_mismatches_cost_nothing():
+    """10 % of the positions off by up to 50 px: within 5 % of the data with these taken out by hand."""
+    with_them, without = [], []
+    for seed in range(6):
+        sim, table, wrong = _with_mismatches(seed, 0.1)
+        prior, poses = Prior(sim.truth.static), sim.matches.poses
+        clipped = solve(Matches.from_table(table, shape=(2048, 2048), poses=poses), prior=prior, clip=5)
+        clean = solve(Matches.from_table(table[~wrong], shape=(2048, 2048), poses=poses), prior=prior)
+        assert not np.any(clipped.residuals["used"] & wrong)
+        for solution, out in ((clipped, with_them), (clean, without)):
+            out.append(performance.bias(solution.positions, sim.truth.positions[solution.star_names]))
+    ratio = np.sqrt(np.mean(np.square(with_them)) / np.mean(np.square(without)))
+    assert ratio == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("known_poses", [True, False])
+def test_mismatched_exposure_is_named_and_moves_nobody(known_poses):
+    sim = simulate_matches(seed=1, n_stars=40, dither=100.0)
+    table = sim.matches.table.copy()
+    mine = np.flatnonzero(table["exposure"] == "exp03")
+    order = RNG(1).permutation(len(mine))
+    for column in ("x", "y"):
+        table[column][mine] = table[column][mine][order]
+    poses = sim.matches.poses if known_poses else None
+    prior = Prior(sim.truth.static)
+    solution = solve(Matches.from_table(table, shape=(2048, 2048), poses=poses), prior=prior, clip=5)
+    assert list(solution.left_out) == ["exp03"]
+    assert "mismatched" in solution.left_out["exp03"]
+    clean = solve(
+        Matches.from_table(table[table["exposure"] != "exp03"], shape=(2048, 2048), poses=sim.matches.poses),
+        prior=prior,
+    )
+    error = np.sqrt(np.diag(clean.uncertainty.coefficients)).reshape(len(clean.names), 2, -1)
+    assert np.all(np.abs(solution.coefficients - clean.coefficients) < error)
+
+
+def test_one_noisy_exposure_does_not_blur_the_others():
+    """One of ten exposures with 100 x the errors costs what its data are worth, not more than 10 % beyond."""
+    b, b_without = [], []
+    for seed in range(20):
+        sigma = np.full((10, 30), 0.14)
+        sigma[4] *= 100
+        dynamic = RNG(seed).normal(0, 0.9, (10, 2, 10))
+        sim = _quiet_exposure(seed, sigma, dynamic, 4)
+        table = sim[0].table
+        solution = solve(sim[0], prior=Prior(np.zeros((2, 10))))
+        b.append(performance.bias(solution.positions, sim[1][solution.star_names]))
+        others = table[table["exposure"] != "e4"]
+        without = solve(
+            Matches.from_table(others, shape=(2048, 2048), poses=sim[0].poses), prior=Prior(np.zeros((2, 10)))
+        )
+        b_without.append(performance.bias(without.positions, sim[1][without.star_names]))
+    assert np.sqrt(np.mean(np.square(b)) / np.mean(np.square(b_without))) < 1.1
+
+
+def _quiet_exposure(seed, sigma, dynamic, quiet):
+    """Ten exposures around no static distortion, one without dynamic part, those of the others summing to zero."""
+    from astropy.table import Table
+    from oracle import predict
+
+    dynamic[quiet] = 0
+    others = np.arange(10) != quiet
+    dynamic[others] -= dynamic[others].mean(axis=0)
+    rng = RNG(seed + 500)
+    true = rng.uniform(0, 2047, (30, 2))
+    rows = []
+    for i in range(10):
+        xy = predict(true, dynamic[i], np.eye(2, 3), (2048, 2048)) + sigma[i][:, None] * rng.normal(size=(30, 2))
+        rows += [(f"e{i}", j, *xy[j], sigma[i, j], sigma[i, j]) for j in range(30)]
+    table = Table(rows=rows, names=["exposure", "star", "x", "y", "x_err", "y_err"])
+    poses = {f"e{i}": np.eye(2, 3) for i in range(10)}
+    return Matches.from_table(table, shape=(2048, 2048), poses=poses), true
+
+
+def test_errors_found_on_request():
+    sim = simulate_matches(sigma=0.1, seed=1, n_stars=60)
+    table = sim.matches.table.copy()
+    rng = RNG(0)
+    for axis in "xy":  # a systematic that the stated errors do not know
+        table[axis] += 0.1 * rng.normal(size=len(table)) * u.pix
+    matches = Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses)
+    prior = Prior(sim.truth.static)
+    stated, scaled, floored = (solve(matches, prior=prior, errors=kind) for kind in ("stated", "scale", "floor"))
+    assert stated.settings["error_scale"] == 1
+    assert scaled.settings["error_scale"] == pytest.approx(np.sqrt(stated.chi2 / stated.dof))
+    assert_allclose(scaled.stars["x_err"].value, stated.stars["x_err"].value * scaled.settings["error_scale"])
+    assert floored.settings["error_floor"] == pytest.approx(0.1, abs=0.01)
+    assert floored.chi2 / floored.dof == pytest.approx(1, abs=0.01)
+    quiet = solve(sim.matches, prior=prior, errors="floor")
+    assert quiet.settings["error_floor"] == 0 or quiet.settings["error_floor"] < 0.03
+
+
+def test_gauge_says_what_pinned_what():
+    sim = simulate_matches(seed=1)
+    prior = Prior(sim.truth.static, static_sigma=0.05)
+    text = str(solve(sim.matches, prior=prior).gauge)
+    for words in ("20 modes, 6 of them exactly", "shift, rotation, scale", "nominal poses", "shear", "degree 3",
+                  "smallest dynamic part", "uncertainty of the static distortion"):  # fmt: skip
+        assert words in text
+    assert "prior widths" in str(solve(sim.matches, prior=Prior(sim.truth.static, sigma=0.9)).gauge)
+    assert "sum to zero" in str(solve(sim.matches, prior=prior, gauge="mean").gauge)
+
+
+def test_static_uncertainty_does_not_average_down():
+    sim = simulate_matches(seed=1)
+    tight = solve(sim.matches, prior=Prior(sim.truth.static))
+    loose = solve(sim.matches, prior=Prior(sim.truth.static, static_sigma=[0, 0, 0] + [0.3] * 7))
+    assert_allclose(loose.stars["x_err"].value, tight.stars["x_err"].value)
+    added = loose.hidden_variance(loose.positions) - tight.hidden_variance(tight.positions)
+    # 7 modes of 0.3 px, each of mean square 1/4 over the field
+    assert np.mean(added) == pytest.approx(7 * 0.3**2 / 4, rel=0.35)
