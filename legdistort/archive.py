@@ -97,7 +97,7 @@ def _plain_columns(table):
     others = [name for name in table.colnames if not isinstance(table[name], (Column, u.Quantity))]
     if others:
         warnings.warn(
-            f"the column{'s' * (len(others) > 1)} {', '.join(others)} of the observations hold no plain numbers or text: "
+            f"column{'s' * (len(others) > 1)} {', '.join(others)} of the observations: neither numbers nor text, "
             "left out of the file",
             AssumptionWarning,
             stacklevel=4,

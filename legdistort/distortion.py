@@ -131,6 +131,9 @@ class Inverse:
     error: float
     valid: tuple
 
+    def __repr__(self):
+        return f"<Inverse: degree {self.tensors.shape[1] - 1}, error {self.error:.1e} px>"
+
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
@@ -161,6 +164,10 @@ class Distortion:
     def degree(self):
         """Total degree."""
         return basis.degree_of(self.coefficients.shape[1])
+
+    def __repr__(self):
+        ny, nx = self.shape
+        return f"<Distortion{f' of {self.name}' if self.name else ''}: degree {self.degree}, {nx} x {ny} px>"
 
     def __call__(self, q):
         """Undistorted pixels (n, 2) -> detector pixels (n, 2)."""
@@ -209,7 +216,8 @@ class Distortion:
     def _raise_fold(self, place, what):
         raise FoldError(
             f"the distortion{f' of exposure {self.name}' if self.name else ''} {what} near pixel "
-            f"({round(place[0])}, {round(place[1])}): two places fall on one; too few stars there for degree {self.degree}?"
+            f"({round(place[0])}, {round(place[1])}): two places fall on one; too few stars there for "
+            f"degree {self.degree}?"
         )
 
     def check_fold(self):

@@ -182,19 +182,26 @@ def make(kind, problem, state, blocks):
     others = np.stack([complement(rows) for rows in similar])
     similar = np.stack(similar)
     error = _conditional_errors(blocks.u_data)
+    held = problem.prior_sigma is not None
     dynamic = _dynamic_covariance(problem, state, error, motion, others)
     if kind == "mean":
         constraint = np.broadcast_to(np.eye(motion.shape[1])[:, None], (motion.shape[1], *motion.shape[:2])).copy()
     else:
-        constraint = _minimal_constraint(motion, error, dynamic, similar, others, box)
-    return Gauge(kind, constraint, motion, dynamic, box, problem.static_sigma, problem.prior_sigma is not None)
+        constraint = _minimal_constraint(motion, error, dynamic, similar, others, box, held=held)
+    return Gauge(kind, constraint, motion, dynamic, box, problem.static_sigma, held)
 
 
-def _minimal_constraint(motion, error, dynamic, similar, others, box):
-    """Rows ``N_i' W_i``: those of all but the common similarities see the departures without their similarity part."""
-    inner = others @ (dynamic + error) @ others.transpose(0, 2, 1)
+def _minimal_constraint(motion, error, dynamic, similar, others, box, *, held):
+    """Rows ``N_i' W_i``: those of all but the common similarities see the departures without their similarity part.
+
+    With prior widths (`held`) the weight is that of the prior alone: the constraint is then where the prior by itself
+    would settle, and the covariance under it that of truths drawn from the prior.
+    """
+    spread = dynamic if held else dynamic + error
+    inner = others @ spread @ others.transpose(0, 2, 1)
     weight = others.transpose(0, 2, 1) @ np.linalg.solve(inner, others) if others.shape[1] else np.zeros_like(error)
-    weight = _say(error, others)[:, None, None] * weight
+    if not held:
+        weight = _say(error, others)[:, None, None] * weight
     pose_weight = _say(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
     common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
     pulled = motion.transpose(0, 2, 1)

@@ -119,6 +119,9 @@ class TangentPlane:
     lat: float
     matrix: np.ndarray
 
+    def __repr__(self):
+        return f"<TangentPlane: {self.lon:.5f} {self.lat:+.5f} deg, {self.pixel_scale:.4f} arcsec/px>"
+
     def model(self):
         """The astropy model (x, y) [pix] -> (ra, dec) [deg], stock parts only, inverse included."""
         m = np.asarray(self.matrix, dtype=float)

@@ -156,7 +156,8 @@ class Solution:
         """Reference plane -> detector pixels as an astropy compound model with inverse."""
         from .wcs import exposure_model
 
-        return exposure_model(self.poses[name], self.distortion(name))
+        distortion = self.distortion(name)
+        return exposure_model(self.poses[name], distortion)
 
     def wcs(self, name):
         """The gwcs of an exposure: detector -> undistorted -> reference -> icrs (the last if the sky is known)."""
@@ -204,12 +205,12 @@ class Solution:
         sigma : ndarray, shape (n_y, n_x, 2)
             Standard deviation of the corrected position per axis, reference-plane pixels.
         """
+        distortion = self.distortion(name)
         ny, nx = self.shapes[name]
         step = max(nx, ny) / n
         x = np.linspace(-0.5, nx - 0.5, max(2, round(nx / step)))
         y = np.linspace(-0.5, ny - 0.5, max(2, round(ny / step)))
         grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        distortion = self.distortion(name)
         q = distortion.invert(grid)
         b = basis.values(self.degree, *basis.normalize(q, self.shapes[name]))
         m = len(b)

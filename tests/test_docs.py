@@ -1,0 +1,111 @@
+"""The README and the documentation say what is so: their Python runs, their commands are the ones checked."""
+
+import re
+import shlex
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import legdistort
+from legdistort import cli
+from legdistort.demo import run_demo
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def blocks(page, language):
+    """Fenced code blocks of a page in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory):
+    """Folder with ``demo`` as the small demonstration leaves it, and its frames as ``frames``."""
+    folder = tmp_path_factory.mktemp("docs")
+    run_demo(out=folder / "demo", small=True)
+    (folder / "frames").symlink_to(folder / "demo" / "frames")
+    return folder
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES[1:] if blocks(page, "python")], ids=lambda page: page.name)
+def test_python_on_the_page_runs_as_printed(page, night, monkeypatch):
+    monkeypatch.chdir(night)
+    namespace = {}
+    for code in blocks(page, "python"):
+        exec(compile(code, page.name, "exec"), namespace)  # one page is one session
+
+
+def test_readme_example_is_six_lines_and_gives_a_mosaic(night, monkeypatch):
+    monkeypatch.chdir(night)
+    (example,) = blocks(ROOT / "README.md", "python")
+    assert len(example.strip().splitlines()) == 6
+    (night / "mosaic.fits").unlink(missing_ok=True)
+    exec(example, {})
+    assert (night / "mosaic.fits").stat().st_size > 1e6
+
+
+def commands():
+    """Every ``legdistort`` command of the README and the documentation, as (page, arguments)."""
+    for page in PAGES:
+        for block in blocks(page, "sh"):
+            for line in block.splitlines():
+                for part in line.split("#")[0].split("&&"):
+                    words = shlex.split(part)
+                    if words and words[0] == "legdistort":
+                        yield pytest.param(words[1:], id=f"{page.stem}:{words[1]}")
+
+
+@pytest.mark.parametrize("arguments", list(commands()))
+def test_commands_are_understood(arguments):
+    assert callable(cli._parser().parse_args(arguments).function)
+
+
+def test_every_command_is_documented():
+    headings = re.findall(r"^## (\S+)$", (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8"), re.MULTILINE)
+    (commands_,) = (a.choices for a in cli._parser()._actions if a.choices and "run" in a.choices)
+    assert sorted(headings) == sorted(commands_)
+
+
+@pytest.mark.parametrize("command", ["pip install . && legdistort demo --out demo", "pip install '.[test]' && pytest"])
+def test_readme_has_each_of_the_two_commands_once(command):
+    assert sum(line == command for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()) == 1
+
+
+def test_the_check_script_takes_its_commands_from_the_readme():
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    endings = re.findall(r"\$\(readme_command '(.*?)'\)", script)
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert sorted(endings) == ["&& legdistort demo --out demo", "&& pytest"]
+    for ending in endings:
+        assert sum(line.startswith("pip install ") and line.endswith(ending) for line in lines) == 1
+    assert script.count('bash -c "$') == 2
+
+
+def test_versions_agree():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGES.md").read_text(encoding="utf-8"), re.MULTILINE).group(1)
+    cited = re.search(r"^version: (\S+)", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE).group(1)
+    assert newest == cited == version == legdistort.__version__
+
+
+def test_every_public_name_is_in_the_reference():
+    reference = (ROOT / "docs" / "api.rst").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^\.\. auto(?:function|class):: (\w+)$", reference, re.MULTILINE))
+    listed |= {"LegdistortError", "LegdistortWarning"}  # with their module
+    assert "automodule:: legdistort.exceptions" in reference
+    assert set(legdistort.__all__) == listed
+
+
+def test_links_and_pictures_exist():
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
+        for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+            if not target.startswith("http"):
+                assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_pictures_are_small():
+    for picture in (ROOT / "docs" / "images").glob("*"):
+        assert picture.suffix == ".png"
+        assert picture.stat().st_size < 200_000

@@ -1,0 +1,254 @@
+"""The package as a whole: its face, its plan, and that its files need nothing of it."""
+
+import ast
+import inspect
+import json
+import os
+import subprocess
+import sys
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units as u
+from numpy.testing import assert_allclose
+
+import legdistort
+from legdistort.archive import write_wcs
+from legdistort.demo import __doc__ as _demo_doc  # noqa: F401  (modules import without side effects)
+from legdistort.estimation import solve
+from legdistort.exceptions import LegdistortError, LegdistortWarning
+from legdistort.exposures import Exposure
+from legdistort.matches import Matches
+from legdistort.poses import TangentPlane
+from legdistort.priors import Prior
+from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
+
+PACKAGE = Path(legdistort.__file__).parent
+MODULES = sorted(PACKAGE.glob("*.py"))
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return simulate_gsaoi_matches(small=True, seed=4)
+
+
+@pytest.fixture(scope="module")
+def solution(simulation):
+    return solve(simulation.matches, prior=Prior(simulation.truth.static))
+
+
+# --- the face ----------------------------------------------------------------------------------------------------
+
+
+def public_members():
+    for name in legdistort.__all__:
+        thing = getattr(legdistort, name)
+        yield name, thing
+        if inspect.isclass(thing):
+            for key, member in vars(thing).items():
+                documented = inspect.isfunction(member) or isinstance(member, (property, classmethod, staticmethod))
+                if not key.startswith("_") and documented:
+                    yield f"{name}.{key}", member
+
+
+@pytest.mark.parametrize(("name", "thing"), list(public_members()), ids=lambda x: x if isinstance(x, str) else "")
+def test_every_public_name_is_explained(name, thing):
+    assert len((inspect.getdoc(thing) or "").split()) >= 2, name
+
+
+@pytest.mark.parametrize("name", legdistort.__all__)
+def test_docstrings_name_all_parameters(name):
+    thing = getattr(legdistort, name)
+    if inspect.isclass(thing) and name != "Prior":
+        return
+    parameters = [p for p in inspect.signature(thing).parameters.values() if p.kind is not p.VAR_KEYWORD]
+    for parameter in parameters:
+        assert parameter.name in inspect.getdoc(thing), f"{name} does not explain {parameter.name}"
+    positional = [p for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
+    assert len(positional) <= 2, f"{name}: keyword-only after the first argument or two"
+
+
+def test_names_are_sorted_and_there():
+    assert list(legdistort.__all__) == sorted(legdistort.__all__)
+    assert legdistort.__version__
+
+
+def test_all_errors_are_caught_by_one_name():
+    from legdistort import exceptions
+
+    for name, thing in vars(exceptions).items():
+        if inspect.isclass(thing) and thing.__module__ == exceptions.__name__:
+            assert issubclass(thing, (LegdistortError, LegdistortWarning)), name
+            assert thing.__doc__
+
+
+def test_nouns_explain_themselves(simulation, solution):
+    shape = next(iter(simulation.matches.shapes.values()))
+    n, n_stars = len(simulation.matches.table), len(simulation.matches.stars)
+    assert repr(simulation.matches) == f"<Matches: {n} observations of {n_stars} stars in 6 exposures>"
+    assert repr(solution) == (
+        f"<Solution: 6 exposures, {n_stars} stars, degree 3, "
+        f"chi2 {solution.chi2:.1f} for {solution.dof} degrees of freedom>"
+    )
+    assert repr(solution.gauge) == "<Gauge 'minimal': 20 constraints, 6 exposures>"
+    name = solution.names[0]
+    assert repr(solution.distortion(name)) == f"<Distortion of {name}: degree 3, {shape[1]} x {shape[0]} px>"
+    assert repr(solution.distortion(name).inverse).startswith("<Inverse: degree ")
+    assert repr(Prior(np.zeros((2, 6)), sigma=1)) == "<Prior: degree 2, 6 modes an axis, sigma given>"
+    assert repr(TangentPlane(10, -5, np.eye(2, 3) / 3600)) == "<TangentPlane: 10.00000 -5.00000 deg, 1.0000 arcsec/px>"
+    image = Exposure(name="e1", data=np.zeros((20, 30)))
+    assert repr(image).startswith("<Exposure 'e1': 30 x 20 px, ")
+    for thing in (simulation, simulation.truth, solution.distortion(name).inverse, image):
+        assert len(repr(thing)) < 150
+        assert "array" not in repr(thing)
+
+
+def test_printed_solution_is_a_table(solution):
+    text = str(solution)
+    lines = text.splitlines()
+    assert lines[0] == repr(solution)[1:-1]
+    for name in solution.names:
+        assert sum(line.startswith(name) for line in lines) == 1
+    header = next(line for line in lines if line.startswith("exposure"))
+    assert " ".join(header.split()) == "exposure stars shift x shift y rotation scale rms x rms y distortion"
+    row = next(line for line in lines if line.startswith(solution.names[0]))
+    assert len(row) == len(header)
+    assert all(len(line) <= 120 for line in lines if not line.startswith("gauge"))
+
+
+@pytest.mark.parametrize(("kind", "words"), [("minimal", "smallest dynamic part"), ("mean", "that sum to zero")])
+def test_gauge_says_in_words_what_is_not_known(simulation, kind, words):
+    mean = simulation.truth.static
+    solution = solve(simulation.matches, prior=Prior(mean, static_sigma=0.1), gauge=kind)
+    text = str(solution.gauge)
+    assert text.startswith(f"Gauge {kind!r}. A map of the reference plane of degree 3 that every exposure takes back")
+    assert "20 modes, 6 of them exactly" in text
+    rows = [line for line in text.splitlines() if line.endswith(")") or "nominal poses" in line]
+    assert [line[:24].strip() for line in rows] == ["shift, rotation, scale", "shear", "degree 2", "degree 3"]
+    assert sum(int(line[24:31]) for line in rows) == 20
+    assert "not known" in rows[0]
+    assert all(words in line for line in rows[1:])
+    assert "and the uncertainty of the static distortion" in text
+    assert solution.gauge.sentence in str(solution)
+    assert words in solution.gauge.sentence
+    # the figure quoted is the dynamic rms over the detector, per axis, that was put in (similarities left out)
+    put_in = np.sqrt((simulation.truth.dynamic[:, :, 3:] ** 2).sum(axis=2).mean()) / 2
+    stated = float(text.split("mean by ")[1].split()[0])
+    assert stated == pytest.approx(put_in, rel=0.5)
+    prior = solve(simulation.matches, prior=Prior(mean, sigma=0.5), gauge=kind)
+    assert "and the prior widths" in str(prior.gauge)
+    assert "uncertainty of the static" not in str(prior.gauge)
+
+
+def test_results_cannot_be_assigned_to(solution):
+    with pytest.raises(AttributeError):
+        solution.degree = 4
+    with pytest.raises(AttributeError):
+        solution.gauge.kind = "mean"
+
+
+def test_unknown_exposures_are_named(solution):
+    for call in (
+        lambda: solution.correct("nobody", [[1, 1]]),
+        lambda: solution.distort("nobody", [[1, 1]]),
+        lambda: solution.wcs("nobody"),
+        lambda: solution.model("nobody"),
+        lambda: solution.sigma_map("nobody"),
+    ):
+        with pytest.raises(LegdistortError, match=r"no exposure 'nobody' in the solution; it has .*, "):
+            call()
+    sim = simulate_matches(n_exposures=3, n_stars=20, degree=1)
+    matches = Matches(sim.matches.table, sim.matches.shapes, sim.matches.poses, None, {"dark": "no stars were found"})
+    with pytest.raises(LegdistortError, match=r"no exposure 'dark' in the solution: it was left out \(no stars"):
+        solve(matches, degree=1).wcs("dark")
+
+
+# --- the plan ----------------------------------------------------------------------------------------------------
+
+
+def top_level_imports(path):
+    """Modules of the package that a module imports when it is imported itself."""
+    names = {p.stem for p in MODULES}
+    found = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom) and node.level == 1:
+            found |= {node.module.split(".")[0]} if node.module else {a.name for a in node.names}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "legdistort":
+            pytest.fail(f"{path.name} imports {node.module} by its full name; use a relative import")
+    return found & names
+
+
+def test_modules_import_strictly_downward():
+    graph = {path.stem: top_level_imports(path) for path in MODULES if path.stem != "__init__"}
+    order = list(TopologicalSorter(graph).static_order())  # raises CycleError, naming the circle
+    assert set(order) == set(graph)
+    ground = {"exceptions", "basis", "poses", "catalogs", "files"}
+    for name in ground:
+        assert graph[name] <= ground, f"{name} is on the ground floor"
+    for name, below in graph.items():
+        assert not below & {"cli", "pipeline", "demo"} or name in {"cli", "pipeline", "demo", "__main__"}, name
+
+
+def test_importing_is_quiet_and_light():
+    """No picture library, no warnings, no output."""
+    code = "import legdistort, sys; assert 'matplotlib' not in sys.modules, 'matplotlib is imported at the door'"
+    run = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: p.stem)
+def test_modules_have_a_purpose_and_never_print(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    assert ast.get_docstring(tree)
+    if path.stem not in ("cli", "demo"):
+        calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
+        assert not [n.lineno for n in calls if n.func.id == "print"]
+
+
+# --- files without us --------------------------------------------------------------------------------------------
+
+READER = """
+import asdf, importlib.util, json, sys, warnings
+warnings.simplefilter("error")
+assert importlib.util.find_spec("legdistort") is None, "legdistort is installed here"
+out = {}
+for path in sys.argv[2:]:
+    points = json.load(open(sys.argv[1]))
+    with asdf.open(path) as file:
+        wcs = file["meta"]["wcs"]
+        sky = wcs.pixel_to_world(*points)
+        back = wcs.get_transform("reference", "detector")(*wcs.get_transform("detector", "reference")(*points))
+        out[file["meta"]["exposure"]] = [sky.ra.deg.tolist(), sky.dec.deg.tolist(), [list(map(float, b)) for b in back]]
+print(json.dumps(out))
+"""
+
+
+@pytest.mark.slow
+def test_files_open_with_gwcs_alone(solution, tmp_path):
+    """In a fresh environment with ``pip install gwcs`` and nothing else, the same sky to 1e-9 degrees."""
+    python = tmp_path / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True, capture_output=True)
+    env = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
+    pip = [python, "-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--quiet", "gwcs"]
+    got = subprocess.run(pip, capture_output=True, text=True, env=env, check=False)
+    if got.returncode and any(w in got.stderr for w in ("Could not find a version", "Connection", "Temporary failure")):
+        pytest.skip(f"the package index cannot be reached: {got.stderr.strip().splitlines()[-1]}")
+    assert got.returncode == 0, got.stderr
+    (tmp_path / "wcs").mkdir()
+    paths = [write_wcs(solution, name, tmp_path / "wcs" / f"{name}.asdf") for name in solution.names]
+    ny, nx = solution.shapes[solution.names[0]]
+    x, y = np.random.default_rng(0).uniform([[0], [0]], [[nx - 1], [ny - 1]], (2, 200))
+    (tmp_path / "points.json").write_text(json.dumps([x.tolist(), y.tolist()]))
+    command = [python, "-I", "-c", READER, tmp_path / "points.json", *paths]
+    read = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=env, check=False)
+    assert read.returncode == 0, read.stderr
+    seen = json.loads(read.stdout)
+    assert set(seen) == set(solution.names)
+    for name, (ra, dec, back) in seen.items():
+        ours = solution.wcs(name).pixel_to_world(x, y)
+        exact = solution.sky.to_sky(solution.correct(name, np.column_stack([x, y])))
+        assert_allclose([ra, dec], [ours.ra.deg, ours.dec.deg], rtol=0, atol=1e-9)
+        assert_allclose([ra, dec], [exact.ra.to_value(u.deg), exact.dec.to_value(u.deg)], rtol=0, atol=1e-9)
+        assert_allclose(back, [x, y], rtol=0, atol=1e-6)

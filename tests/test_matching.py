@@ -1,0 +1,455 @@
+"""Matching: synthetic fields of known truth, headers that lie, frames that do not belong, two real sets."""
+
+import numpy as np
+import pytest
+from astropy.table import QTable, Table, vstack
+from astropy.wcs import WCS
+
+from legdistort import basis, poses
+from legdistort.association import Group, interlink, label_stars, tie
+from legdistort.asterisms import offset_candidates, triangle_candidates
+from legdistort.exceptions import AssumptionWarning, InputError, MatchError
+from legdistort.exposures import Exposure
+from legdistort.matching import match
+from legdistort.registration import Registration, register
+from legdistort.warps import StarList, Warp
+
+SHAPE = (2048, 2048)
+
+
+def rotation(degrees, flip=False):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s], [s, c]]) @ np.diag([-1 if flip else 1, 1])
+
+
+def distortion(rng, shape, peak):
+    """Random modes of degree 2 and 3, at most `peak` pixels."""
+    coefficients = rng.normal(size=(10, 2)) * (np.arange(10) > 2)[:, None]
+    u, v = np.meshgrid(*[np.linspace(-1, 1, 21)] * 2)
+    coefficients *= peak / np.abs(basis.values(3, u.ravel(), v.ravel()).T @ coefficients).max()
+    return lambda xy: xy + basis.values(3, *basis.normalize(xy, shape)).T @ coefficients
+
+
+def make_field(
+    n_stars, rotations, offsets, *, seed=0, shape=SHAPE, common=0.7, spurious=0.2, peak=20.0, flips=None, depth=None
+):
+    """Detections of exposures turned by `rotations` [deg] about the detector's middle and shifted by `offsets` [pix].
+
+    Of `n_stars` on a detector each exposure has sqrt(common), and `spurious` times as many false ones.
+    The column ``truth`` says which is which (-1: false).
+    """
+    rng = np.random.default_rng(seed)
+    size = np.array(shape[::-1])
+    reach = 1.3 * size.max()
+    n = int(n_stars * (2 * reach) ** 2 / size.prod())
+    sky, flux = rng.uniform(-reach, reach, (n, 2)), 10 ** rng.exponential(0.6, n)
+    distort = distortion(rng, shape, peak)
+    tables = []
+    for k, (angle, offset) in enumerate(zip(rotations, offsets, strict=True)):
+        q = sky @ rotation(angle, bool(flips and flips[k])).T + offset + (size - 1) / 2
+        seen = np.all((q > -0.5) & (q < size - 0.5), axis=1) & (rng.random(n) < np.sqrt(common))
+        seen &= flux > (np.quantile(flux, 1 - depth[k]) if depth else 0)
+        ids = np.flatnonzero(seen)
+        xy = distort(q[ids]) + rng.normal(0, 0.05, (len(ids), 2))
+        false = int(spurious * len(ids))
+        xy = np.concatenate([xy, rng.uniform(-0.5, size - 0.5, (false, 2))])
+        flux_here = np.concatenate([flux[ids] * rng.lognormal(0, 0.1, len(ids)), rng.choice(flux, false)])
+        ids = np.concatenate([ids, np.full(false, -1)])
+        order = rng.permutation(len(ids))
+        tables.append(detections(f"e{k:02d}", xy[order], flux=flux_here[order], truth=ids[order]))
+    return vstack(tables)
+
+
+def detections(name, xy, **columns):
+    table = Table({"exposure": np.full(len(xy), name), "x": xy[:, 0], "y": xy[:, 1]})
+    table["x_err"] = table["y_err"] = 0.05
+    for key, value in columns.items():
+        table[key] = value
+    return table
+
+
+def recall_and_purity(table, matches, min_exposures=4):
+    """Part of the detections of stars in enough exposures that was recovered, and part of the rows that is right."""
+    truth, times = np.unique(table["truth"][table["truth"] >= 0], return_counts=True)
+    wanted = np.isin(table["truth"], truth[times >= min_exposures]).sum()
+    star, truth = np.asarray(matches.table["star"]), np.asarray(matches.table["truth"])
+    right = 0
+    for s in np.unique(star):
+        values, times = np.unique(truth[star == s], return_counts=True)
+        right += times[times.argmax()] if values[times.argmax()] >= 0 else 0
+    return right / wanted, right / len(star)
+
+
+def assert_good(table, matches, min_exposures=4, recall=0.95, purity=0.99):
+    got = recall_and_purity(table, matches, min_exposures)
+    assert got[0] > recall
+    assert got[1] > purity
+    pairs = list(zip(matches.table["exposure"], matches.table["star"], strict=True))
+    assert len(set(pairs)) == len(pairs)
+
+
+def six_poses(angle, offset, seed=0):
+    rng = np.random.default_rng(seed)
+    shifts = rng.uniform(-0.5, 0.5, (6, 2)) * offset
+    shifts[1] = shifts[0] + offset * np.array([1, rng.uniform(-1, 1)])
+    return [0, angle, -angle, angle / 2, 0, angle], shifts
+
+
+CELLS = [(n, angle, offset) for n in (40, 100, 1000) for angle in (0.2, 2, 30, 180) for offset in (20, 300)]
+
+
+@pytest.mark.parametrize("cell", [cell for cell in CELLS if cell[2] == 300], ids=str)
+def test_field(cell):
+    n, angle, offset = cell
+    table = make_field(n, *six_poses(angle, offset), seed=int(angle))
+    assert_good(table, match(table, shape=SHAPE))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cell", CELLS, ids=str)
+def test_twelve_fields(cell):
+    n, angle, offset = cell
+    for seed in range(12):
+        table = make_field(n, *six_poses(angle, offset, seed), seed=seed)
+        assert_good(table, match(table, shape=SHAPE), recall=0.94 if n == 40 else 0.95)
+
+
+@pytest.mark.parametrize(("n", "angle", "seed"), [(1000, 4, 2), (200, 10, 3)])
+def test_angles_at_which_a_plain_vote_holds_in_a_corner_only(n, angle, seed):
+    table = make_field(n, *six_poses(angle, 200, seed), seed=seed + 50)
+    assert_good(table, match(table, shape=SHAPE))
+
+
+def test_few_stars_half_of_them_missing_or_false():
+    table = make_field(20, *six_poses(0.5, 100), seed=3, common=0.8, spurious=0.5)
+    assert_good(table, match(table, shape=SHAPE), recall=0.9, purity=0.97)
+
+
+def test_without_fluxes():
+    table = make_field(200, *six_poses(30, 300), seed=5)
+    table.remove_column("flux")
+    matches = match(table, shape=SHAPE)
+    assert_good(table, matches)
+    x = [np.mean(matches.table["x"][matches.table["star"] == s]).value for s in matches.stars]
+    assert np.all(np.diff(x) >= 0)
+
+
+def test_large_offsets_and_scale():
+    shifts = np.array([[0, 0], [1200, 0], [0, 1200], [600, 600], [1200, 1200], [300, -100]])
+    table = make_field(300, [0, 0.3, 10, 0, 0, -20], shifts, seed=2)
+    third = table["exposure"] == "e02"
+    for c in ("x", "y"):
+        table[c][third] = table[c][third] * 1.04
+    matches = match(table, shape=(2200, 2200))
+    assert_good(table, matches)
+    scales = {n: poses.describe(p)["scale"] for n, p in matches.poses.items()}
+    assert scales["e02"] / scales["e00"] == pytest.approx(1.04, abs=0.02)  # the distortion has a say in it
+
+
+@pytest.mark.parametrize("angles", [[0, 90, 180, 270, 0, 90], [10, 10, -120, 77, 5, 200]], ids=["rolls", "any"])
+def test_flips(angles):
+    table = make_field(150, angles, np.zeros((6, 2)), seed=4, flips=[0, 1, 0, 1, 0, 0])
+    matches = match(table, shape=SHAPE)
+    assert_good(table, matches)
+    parities = [poses.describe(matches.poses[f"e{k:02d}"])["parity"] for k in range(6)]
+    assert np.array_equal(np.array(parities) * parities[0], [1, -1, 1, -1, 1, 1])
+
+
+def test_depths_differ():
+    table = make_field(600, *six_poses(20, 200), seed=6, depth=[1, 0.2, 1, 0.5, 0.2, 1])
+    assert_good(table, match(table, shape=SHAPE))
+
+
+def test_noise_frame_is_left_out_by_name():
+    table = make_field(200, *six_poses(0.5, 100), seed=1)
+    xy = np.random.default_rng(9).uniform(0, 2047, (30, 2))
+    noise = detections("noise", xy, flux=np.linspace(1, 50, 30), truth=-np.ones(30, int))
+    matches = match(vstack([noise, table]), shape=SHAPE)
+    assert list(matches.left_out) == ["noise"]
+    assert "better than chance" in matches.left_out["noise"]
+    assert "noise" not in matches.names
+    assert_good(table, matches)
+
+
+def test_bad_frame_of_many_detections_poisons_nothing():
+    table = make_field(200, *six_poses(0.5, 100), seed=1)
+    clean = match(table, shape=SHAPE)
+    xy = np.random.default_rng(9).uniform(0, 2047, (400, 2))
+    matches = match(vstack([table, detections("bad", xy, flux=1.0, truth=-1)]), shape=SHAPE)
+    assert list(matches.left_out) == ["bad"]
+    assert len(matches.table) == len(clean.table)
+
+
+def test_exposure_with_too_few_detections_is_left_out():
+    table = make_field(100, *six_poses(0.5, 100), seed=1)
+    poor = detections("poor", np.array([[3.0, 4], [50, 60]]), flux=1.0, truth=-1)
+    matches = match(vstack([table, poor]), shape=SHAPE)
+    assert "only 2 usable detections" in matches.left_out["poor"]
+
+
+def test_unrelated_lists_do_not_match():
+    rng = np.random.default_rng(8)
+    for n, m in [(30, 200), (20, 20), (100, 100), (200, 200)]:
+        for _ in range(2):
+            lists = [StarList(rng.uniform(0, 2048, (k, 2)), np.full(k, 0.1), SHAPE, rng.random(k)) for k in (n, m)]
+            assert register(*lists) is None
+
+
+def test_two_groups():
+    one = make_field(60, *six_poses(0.5, 100), seed=1)
+    other = make_field(60, *six_poses(0.5, 100), seed=2)
+    other["exposure"] = [name.replace("e", "f") for name in other["exposure"]]
+    with pytest.raises(MatchError, match=r"2 groups .* e00, e01, .*; f00, f01"):
+        match(vstack([one, other]), shape=SHAPE)
+
+
+def test_hot_pixels_do_not_become_stars():
+    table = make_field(100, *six_poses(0.1, 120), seed=7, spurious=0)
+    hot = np.random.default_rng(1).uniform(0, 2047, (90, 2))
+    rng = np.random.default_rng(2)
+    hots = [detections(f"e{k:02d}", hot + rng.normal(0, 0.02, hot.shape), flux=1e4, truth=-1) for k in range(6)]
+    table = vstack([table, *hots])
+    matches = match(table, shape=SHAPE)
+    assert_good(table, matches)
+    assert np.mean(matches.table["truth"] < 0) < 0.01
+
+
+def test_hot_pixels_under_a_slow_drift():
+    shifts = 0.35 * np.arange(12)[:, None] * np.array([1, 0.4])
+    table = make_field(100, np.zeros(12), shifts, seed=7, spurious=0, peak=2)
+    hot = np.random.default_rng(1).uniform(0, 2047, (40, 2))
+    table = vstack([table, *[detections(f"e{k:02d}", hot, flux=20.0, truth=-2 - np.arange(40)) for k in range(12)]])
+    matches = match(table, shape=SHAPE, tolerance=0.5)
+    assert np.mean(matches.table["truth"] < 0) < 0.01
+    assert_good(table, matches)
+
+
+def test_undithered_exposures_keep_all_stars():
+    table = make_field(100, np.zeros(6), np.zeros((6, 2)), seed=7)
+    assert_good(table, match(table, shape=SHAPE))
+
+
+def header(angle, offset, *, flip=False, scale=0.02 / 3600, error=(0, 0)):
+    """TAN header of an exposure of `make_field`: detector = R sky + offset, sky y to the north, x to the west."""
+    w = WCS(naxis=2)
+    w.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    w.wcs.crval = [84.0, -69.0]
+    w.wcs.crpix = (np.array(SHAPE[::-1]) - 1) / 2 + offset + error + 1
+    w.wcs.cd = scale * np.diag([-1, 1]) @ np.linalg.inv(rotation(angle, flip))
+    return w
+
+
+def exposure(name, wcs):
+    data = np.broadcast_to(np.float32(0), SHAPE)
+    return Exposure(name, data, wcs=wcs)
+
+
+def header_case(errors, *, n=80, angles=(0, 90, 180, 40, 3, 0), wrong=()):
+    rng = np.random.default_rng(3)
+    shifts = rng.uniform(-200, 200, (6, 2))
+    table = make_field(n, angles, shifts, seed=8, peak=5)
+    headers = [header(a, s, error=e) for a, s, e in zip(angles, shifts, errors, strict=True)]
+    for k in wrong:
+        headers[k] = header(angles[k] + 77 * (k + 1), shifts[k] + 1500 * (k % 3))
+    return table, [exposure(f"e{k:02d}", w) for k, w in enumerate(headers)], shifts
+
+
+def test_headers_give_poses_and_sky():
+    errors = np.random.default_rng(5).normal(0, 10, (6, 2))
+    errors -= errors.mean(axis=0)
+    angles = (0, 0, 0, 0, 0, 0)
+    table, exposures, shifts = header_case(errors, angles=angles)
+    matches = match(table, exposures=exposures)
+    assert_good(table, matches)
+    assert set(matches.shapes.values()) == {SHAPE}
+    # headers are 10 px off at random, their mean is right; relative to one another the matches decide
+    offsets = np.array([matches.poses[f"e{k:02d}"][:, 2] for k in range(6)])
+    np.testing.assert_allclose(offsets - offsets[0], shifts - shifts[0], atol=1.5)
+    centre = matches.sky.to_sky(
+        poses.apply(poses.invert(matches.poses["e00"]), np.array([[1023.5, 1023.5] + shifts[0]]))
+    )
+    assert (
+        centre.separation(header(0, shifts[0]).pixel_to_world(*(np.array([1023.5, 1023.5]) + shifts[0]))).arcsec < 0.04
+    )
+    assert matches.sky.pixel_scale == pytest.approx(0.02, rel=1e-3)
+    first = poses.describe(matches.poses["e00"])
+    assert first["parity"] == 1
+    assert abs(first["rotation"]) < 0.2
+
+
+def test_rolled_frames_with_headers():
+    table, exposures, _ = header_case(np.random.default_rng(5).normal(0, 15, (6, 2)))
+    matches = match(table, exposures=exposures)
+    assert_good(table, matches)
+    turned = poses.describe(matches.poses["e01"])["rotation"] - poses.describe(matches.poses["e00"])["rotation"]
+    assert turned == pytest.approx(90, abs=0.3)
+
+
+def test_one_wrong_header_does_no_harm():
+    table, exposures, _ = header_case(np.zeros((6, 2)), wrong=[2])
+    matches = match(table, exposures=exposures)
+    assert_good(table, matches)
+    back = poses.apply(poses.invert(matches.poses["e00"]), np.array([[1023.5, 1023.5]]))
+    separation = matches.sky.to_sky(back)[0].separation(exposures[0].wcs.pixel_to_world(1023.5, 1023.5))
+    assert separation.arcsec < 0.1
+
+
+def test_headers_all_wrong_are_ignored_with_a_warning():
+    table, exposures, _ = header_case(np.zeros((6, 2)), wrong=range(6))
+    with pytest.warns(AssumptionWarning, match="header WCSs contradict"):
+        matches = match(table, exposures=exposures)
+    assert_good(table, matches)
+    assert matches.sky is None
+
+
+def test_some_exposures_without_wcs():
+    table, exposures, _ = header_case(np.zeros((6, 2)))
+    exposures = [e if k % 2 else exposure(e.name, None) for k, e in enumerate(exposures)]
+    matches = match(table, exposures=exposures)
+    assert_good(table, matches)
+    assert matches.sky is not None
+
+
+def test_min_exposures_and_columns():
+    table = make_field(100, *six_poses(0.5, 100), seed=1)
+    sizes = {k: len(match(table, shape=SHAPE, min_exposures=k).stars) for k in (2, 4, 6)}
+    assert sizes[2] > sizes[4] > sizes[6] > 10
+    renamed = Table(table, copy=True)
+    renamed.rename_columns(["exposure", "x_err"], ["frame", "sx"])
+    matches = match(renamed, shape=SHAPE, columns={"exposure": "frame", "x_err": "sx"})
+    assert len(matches.stars) == sizes[4]
+    assert "sx" in renamed.colnames
+
+
+def test_result():
+    table = make_field(100, *six_poses(0.5, 100), seed=1)
+    table["xy_corr"] = 0.1
+    before = Table(table, copy=True)
+    matches = match(table, shape=SHAPE)
+    assert table.colnames == before.colnames
+    assert all(np.all(table[c] == before[c]) for c in table.colnames)
+    assert isinstance(matches.table, QTable)
+    assert {"star", "xy_corr", "truth"} <= set(matches.table.colnames)
+    assert np.array_equal(matches.stars, np.arange(len(matches.stars)))
+    fluxes = [np.sort(matches.table["flux"][matches.table["star"] == s]) for s in matches.stars]
+    flux = [f[len(f) // 2] for f in fluxes]
+    assert np.all(np.diff(flux) <= 0)
+    again = match(table[::-1], shape=SHAPE)
+    assert recall_and_purity(table, again) == recall_and_purity(table, matches)
+
+
+def test_flags():
+    table = make_field(100, *six_poses(0.5, 100), seed=1)
+    table["flags"] = np.where(np.arange(len(table)) % 10 == 0, 2, 0)
+    assert np.all(match(table, shape=SHAPE, reject_flags=2).table["flags"] == 0)
+    assert np.any(match(table, shape=SHAPE, reject_flags=1).table["flags"] == 2)
+
+
+def test_bad_arguments():
+    table = make_field(40, *six_poses(0.5, 100), seed=1)
+    three = table[np.isin(table["exposure"], ["e00", "e01", "e02"])]
+    with pytest.raises(InputError, match=r"3 exposures .* use min_exposures=3"):
+        match(three, shape=SHAPE)
+    with pytest.raises(MatchError, match="only one exposure"):
+        match(table[table["exposure"] == "e00"], shape=SHAPE)
+    with pytest.raises(InputError, match="min_exposures must be"):
+        match(table, shape=SHAPE, min_exposures=1)
+    with pytest.raises(InputError, match="tolerance must be a positive"):
+        match(table, shape=SHAPE, tolerance=-1)
+    with pytest.raises(InputError, match=r"'e05'.*not among exposures"):
+        match(table, exposures=[exposure(f"e{k:02d}", None) for k in range(5)])
+    with pytest.raises(InputError, match="no entry for exposure 'e05'"):
+        match(table, shape={f"e{k:02d}": SHAPE for k in range(5)})
+    with pytest.raises(InputError, match="lacks the column"):
+        match(table["exposure", "x", "y"], shape=SHAPE)
+    with pytest.warns(AssumptionWarning, match="no shape given: every exposure is taken as 20[0-9]+ x 20"):
+        match(table)
+
+
+def test_no_star_in_enough_exposures():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 2047, (4, 30, 2))
+    chain = [np.concatenate([xy[k], xy[(k + 1) % 4]]) for k in range(4)]  # every star in two of four exposures
+    table = vstack([detections(f"e{k}", c) for k, c in enumerate(chain)])
+    with pytest.raises(MatchError, match="no star was found in min_exposures=4 exposures, the best in 2"):
+        match(table, shape=SHAPE)
+
+
+def test_candidates_hold_the_truth():
+    rng = np.random.default_rng(0)
+    source = rng.uniform(0, 1000, (80, 2))
+    true = np.column_stack([1.03 * rotation(130, flip=True), [800.0, -200.0]])
+    target = poses.apply(true, source[20:]) + rng.normal(0, 1, (60, 2))
+    best = triangle_candidates(source, target)[0]
+    assert np.abs(poses.apply(best, source) - poses.apply(true, source)).max() < 10
+    shifts = offset_candidates(source, source[30:] + [313.0, -70], size=1000)
+    assert min(np.abs(s - [313, -70]).max() for s in shifts) < 1
+
+
+def test_contradictory_pairs_are_taken_apart():
+    def paired(source, target, distance):
+        warp = Warp.from_pose(poses.identity(), SHAPE)
+        return Registration(np.array(source), np.array(target), np.array(distance), warp, 1.0, 99.0)
+
+    # detections 0 of three exposures are one star, detections 1 another; one bad pair joins the two
+    good = {
+        (0, 1): paired([0, 1], [0, 1], [0.1, 0.1]),
+        (0, 2): paired([0, 1], [0, 1], [0.1, 0.1]),
+        (1, 2): paired([0, 1], [0, 1], [0.1, 0.1]),
+    }
+    bad = {**good, (1, 2): paired([0, 1], [1, 0], [0.9, 0.9])}
+    for registrations in (good, bad):
+        a, b, c = label_stars([3, 2, 2], registrations)
+        assert a[0] == b[0] == c[0] != a[1] == b[1] == c[1]
+        assert a[2] == -1
+
+
+def test_exposure_tied_by_mistake_is_found_out():
+    table = make_field(100, *six_poses(0, 50), seed=1)
+    rng = np.random.default_rng(0)
+    positions = [np.column_stack([t["x"], t["y"]]) for t in table.group_by("exposure").groups]
+    lists = [StarList(xy, np.full(len(xy), 0.1), SHAPE) for xy in [*positions, rng.uniform(0, 2047, (90, 2))]]
+    (group,) = tie(lists[:6], lambda i, j: None)
+    false = Registration(np.arange(30), np.arange(30), np.zeros(30), Warp.from_pose(poses.identity(), SHAPE), 1.0, 99.0)
+    tied = Group({**group.poses, 6: poses.identity()}, {**group.registrations, (0, 6): false})
+    registrations, misfits = interlink(lists, tied)
+    assert list(misfits) == [6]
+    assert misfits[6] == "it agrees with only 1 of 6 exposures that it should overlap"
+    assert len(registrations) == 15 + 1
+
+
+def test_real_star_lists(shared_data):
+    lists = []
+    for name in "ABCD":
+        table = Table.read(shared_data / "keck_nirc2_onc_bn" / f"{name}.lis", format="ascii.commented_header")
+        table["exposure"] = name
+        lists.append(table)
+    table = vstack(lists, metadata_conflicts="silent")
+    table["xe"], table["ye"] = np.maximum(table["xe"], 0.01), np.maximum(table["ye"], 0.01)
+    matches = match(table, shape=(1024, 1024), min_exposures=3, columns={"x_err": "xe", "y_err": "ye"})
+    assert matches.names == ("A", "B", "C", "D")
+    assert len(matches.stars) >= 70
+    shift = [poses.describe(matches.poses[n])["dx"] for n in "ABCD"]
+    assert abs(abs(shift[1] - shift[2]) - 250) < 3
+
+
+def test_real_frames(shared_data):
+    photutils = pytest.importorskip("photutils.detection")
+    from astropy.io import fits
+
+    paths = sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fit*"))
+    tables = []
+    for path in paths:
+        data = fits.getdata(path).astype(float)
+        data -= np.median(data)
+        noise = 1.48 * np.median(np.abs(data))
+        found = photutils.DAOStarFinder(threshold=12 * noise, fwhm=2.0, n_brightest=250)(data)
+        xy = np.column_stack([found["x_centroid"], found["y_centroid"]])
+        tables.append(detections(path.name, xy, flux=np.asarray(found["flux"])))
+    matches = match(vstack(tables), shape=data.shape)
+    assert len(matches.names) == 12
+    assert not matches.left_out
+    assert len(matches.stars) >= 100
+    # nothing that stands still on the detector
+    spans = [np.ptp(matches.table["x"][matches.table["star"] == s].value) for s in matches.stars]
+    assert min(spans) > 20

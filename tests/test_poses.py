@@ -1,0 +1,141 @@
+"""The algebra of similarities, and the tangent plane against astropy."""
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.wcs import WCS
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from legdistort import poses
+from legdistort.exceptions import InputError
+
+
+@st.composite
+def similarities(draw):
+    angle = draw(st.floats(-np.pi, np.pi))
+    scale = draw(st.floats(0.01, 100))
+    flip = draw(st.sampled_from([1.0, -1.0]))
+    shift = [draw(st.floats(-3000, 3000)) for _ in range(2)]
+    c, s = np.cos(angle), np.sin(angle)
+    return np.column_stack([scale * np.array([[c, -s], [s, c]]) @ np.diag([1.0, flip]), shift])
+
+
+XY = np.random.default_rng(0).uniform(-1000, 1000, (20, 2))
+
+
+@given(similarities())
+def test_apply_is_mx_plus_t(a):
+    assert_allclose(poses.apply(a, XY)[3], a[:, :2] @ XY[3] + a[:, 2])
+
+
+@given(similarities())
+def test_inverse_undoes(a):
+    assert_allclose(poses.apply(poses.invert(a), poses.apply(a, XY)), XY, atol=1e-8)
+    assert_allclose(poses.compose(a, poses.invert(a))[:, :2], np.eye(2), atol=1e-12)
+
+
+@given(similarities(), similarities(), similarities())
+def test_composition(a, b, c):
+    assert_allclose(poses.apply(poses.compose(a, b), XY), poses.apply(a, poses.apply(b, XY)), rtol=1e-10, atol=1e-6)
+    left, right = poses.compose(poses.compose(a, b), c), poses.compose(a, poses.compose(b, c))
+    assert_allclose(left, right, rtol=1e-9, atol=1e-6 * np.abs(left).max())
+    assert_allclose(poses.compose(a, poses.identity()), a)
+    assert_allclose(poses.compose(poses.identity(), a), a)
+
+
+@given(similarities())
+def test_similarities_pass_the_check_and_are_described(a):
+    assert_allclose(poses.check(a), a)
+    d = poses.describe(a)
+    turn = np.radians(d["rotation"])
+    m = d["scale"] * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ np.diag([1, d["parity"]])
+    assert_allclose(np.column_stack([m, [d["dx"], d["dy"]]]), a, rtol=1e-9, atol=1e-9 * d["scale"])
+
+
+@given(similarities())
+def test_fit_recovers_a_similarity(a):
+    assert_allclose(poses.fit_similarity(XY, poses.apply(a, XY)), a, rtol=1e-7, atol=1e-7)
+
+
+@given(similarities(), st.integers(0, 99))
+def test_fit_is_the_least_squares_solution(a, seed):
+    """Against a plain design matrix, weighted, with noise."""
+    rng = np.random.default_rng(seed)
+    scale = poses.describe(a)["scale"]
+    target = poses.apply(a, XY) + scale * rng.normal(size=XY.shape)
+    w = rng.uniform(0, 1, len(XY))
+    pose = poses.fit_similarity(XY, target, weights=w)
+    x, y = XY.T
+    one, zero = np.ones(len(XY)), np.zeros(len(XY))
+    parity = poses.describe(a)["parity"]
+    # M = [[p, -q], [q, p]], or [[p, q], [q, -p]] in a mirror
+    design = np.concatenate([np.column_stack([x, -parity * y, one, zero]), np.column_stack([parity * y, x, zero, one])])
+    root = np.sqrt(np.tile(w, 2))
+    p, q, tx, ty = np.linalg.lstsq(design * root[:, None], target.T.ravel() * root, rcond=None)[0]
+    assert_allclose(pose, [[p, -parity * q, tx], [q, parity * p, ty]], rtol=1e-7, atol=1e-7 * scale)
+
+
+def test_parity_can_be_held():
+    mirrored = XY * [-1, 1]
+    assert poses.describe(poses.fit_similarity(XY, mirrored))["parity"] == -1
+    assert poses.describe(poses.fit_similarity(XY, mirrored, parity=1))["parity"] == 1
+    assert poses.describe(poses.fit_similarity(XY, XY, parity=-1))["parity"] == -1
+
+
+@pytest.mark.parametrize(
+    ("source", "weights", "message"),
+    [
+        (XY[:1], None, "needs at least two points, got 1"),
+        (XY[:3], [0, 1, 0], "needs at least two points, got 1"),
+        (np.ones((5, 2)), None, "two distinct points, all are at the same place"),
+    ],
+)
+def test_too_few_points(source, weights, message):
+    with pytest.raises(InputError, match=message):
+        poses.fit_similarity(source, source, weights=weights)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (np.eye(3), r"pose of exp1 must be a finite \(2, 3\) array \[M \| t\], got shape \(3, 3\)"),
+        ([[1, 0, np.nan], [0, 1, 0]], "must be a finite"),
+        ([[1, 0.1, 0], [0, 1, 0]], "is not a similarity .*leave shear to the distortion"),
+        ([[1, 0, 0], [0, 1.01, 0]], "is not a similarity"),
+        (np.zeros((2, 3)), "is not a similarity"),
+    ],
+)
+def test_bad_poses(pose, message):
+    with pytest.raises(InputError, match=message):
+        poses.check(pose, "pose of exp1")
+
+
+def plane(lon=201.3, lat=-47.5, scale=0.02 / 3600, angle=12.0):
+    t = np.radians(angle)
+    m = scale * np.array([[-np.cos(t), np.sin(t)], [np.sin(t), np.cos(t)]])
+    return poses.TangentPlane(lon, lat, np.column_stack([m, -m @ [511.5, 383.5]]))
+
+
+@pytest.mark.parametrize(("lon", "lat"), [(201.3, -47.5), (0.0, 0.0), (359.9999, 60.0), (30.0, 89.999), (30.0, -90.0)])
+def test_tangent_plane_is_a_fits_tan(lon, lat):
+    tp = plane(lon, lat)
+    header = WCS(naxis=2)
+    header.wcs.ctype = "RA---TAN", "DEC--TAN"
+    header.wcs.crval = lon, lat
+    header.wcs.cd = tp.matrix[:, :2]
+    header.wcs.crpix = 512.5, 384.5
+    header.wcs.radesys = "ICRS"
+    expected = SkyCoord(*header.wcs_pix2world(XY, 0).T * u.deg)
+    sky = tp.to_sky(XY)
+    assert sky.separation(expected).max() < 1e-9 * u.arcsec
+    assert sky.frame.name == "icrs"
+    assert_allclose(tp.from_sky(sky), XY, atol=1e-5)
+    assert_allclose(tp.pixel_scale, 0.02)
+
+
+def test_tangent_plane_takes_any_frame():
+    tp = plane()
+    assert_allclose(tp.from_sky(tp.to_sky(XY).galactic), XY, atol=1e-5)
