@@ -87,7 +87,7 @@ def _run(a):
         degree=a.degree,
         prior=_prior(a.prior),
         min_exposures=a.min_exposures,
-        clip=a.clip or None,
+        clip=_clip(a, 5.0),
         measuring={key: value for key, value in measuring.items() if value is not None},
         solving=_solving(a),
         coadding={"method": a.combine, "order": a.order},
@@ -140,7 +140,7 @@ def _solve(a):
     if shape is None:
         raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
     matches = Matches.from_table(table, shape=shape, **Matches.read_meta(table.meta))
-    solution = solve(matches, degree=a.degree, prior=_prior(a.prior), clip=a.clip or None, **_solving(a))
+    solution = solve(matches, degree=a.degree, prior=_prior(a.prior), clip=_clip(a, None), **_solving(a))
     summary = summarise(solution)
     with replacing_folder(a.out) as target:
         write_results(solution, target)
@@ -206,6 +206,13 @@ def _extension(text):
     return int(text) if text is not None and text.lstrip("-").isdigit() else text
 
 
+def _clip(a, default):
+    """The limit asked for, 0 for none; the published scheme has no clipping by default."""
+    if a.clip is None:
+        return None if a.method == "alternating" else default
+    return a.clip or None
+
+
 def _solving(a):
     return {"gauge": a.gauge, "method": a.method, "loss": a.loss, "error_floor": a.error_floor, "errors": a.errors}
 
@@ -223,7 +230,8 @@ def _prior(text):
         return Prior.from_model(model, shape=(2048, 2048), direction="detector_to_reference", degree=5)
     if not Path(text).is_file():
         raise InputError(f"--prior {text}: neither a file nor one of gsaoi-1, gsaoi-2, gsaoi-3, gsaoi-4")
-    return Prior(Solution.read(text).coefficients.mean(axis=0))
+    earlier = Solution.read(text)
+    return Prior(earlier.coefficients.mean(axis=0), shape=earlier.shapes[earlier.names[0]])
 
 
 def _read_table(path, a):
@@ -266,7 +274,7 @@ def _parser():
     _out(p, "folder for the results")
     _detection(p)
     _minimum(p)
-    _fit(p, clip=5.0)
+    _fit(p, clip="5")
     _combination(p)
     p = _command(commands, "measure", _measure, "frames to a table of positions", "frames/*.fits --out stars.ecsv")
     _frames(p)
@@ -284,7 +292,7 @@ def _parser():
     p.add_argument("table", metavar="TABLE", help="exposure, star, x, y, x_err, y_err")
     _out(p, "folder for the results")
     _table(p)
-    _fit(p, clip=None)
+    _fit(p, clip="no clipping")
     p = _command(commands, "coadd", _coadd, "frames and a solution to a mosaic",
                  "frames/*.fits --solution results/solution.asdf --out mosaic.fits")  # fmt: skip
     _frames(p)
@@ -351,7 +359,7 @@ def _fit(p, *, clip):
     p.add_argument("--gauge", choices=("minimal", "mean"), default="minimal", help="see the docs (default minimal)")
     p.add_argument("--method", choices=("joint", "alternating"), default="joint", help="(default joint)")
     p.add_argument("--loss", choices=("linear", "huber", "cauchy"), default="linear", help="(default linear)")
-    p.add_argument("--clip", type=float, default=clip, help=f"leave out beyond so many sigma (default {clip or 'no'})")
+    p.add_argument("--clip", type=float, help=f"leave out what deviates by more sigma; 0: nothing (default {clip})")
     p.add_argument("--errors", choices=("stated", "scale", "floor"), default="stated", help="(default stated)")
     p.add_argument("--error-floor", type=float, default=0.0, help="pixels, added in quadrature to every error")
 

@@ -182,6 +182,12 @@ def build(matches, degree, *, prior=None, error_floor=0.0):
     var_x, var_y, cov = (obs.covariance[order] + [error_floor**2, error_floor**2, 0.0]).T
     weight = np.stack([var_y, var_x, -cov]) / (var_x * var_y - cov**2)
     priors = _priors(matches, prior, counts, obs.exposure)
+    for name, p in zip(matches.names, priors, strict=True):
+        if p is not None and p.shape is not None and tuple(p.shape) != tuple(matches.shapes[name]):
+            raise InputError(
+                f"the prior belongs to a detector of shape {tuple(p.shape)} (ny, nx), exposure {name} has "
+                f"{tuple(matches.shapes[name])}; give the prior of this detector"
+            )
     n_fit = basis.n_modes(degree)
     top = max([degree, *(p.degree for p in priors if p is not None)])
     mean = np.zeros((len(priors), 2, basis.n_modes(top)))

@@ -20,7 +20,7 @@ import numpy as np
 from . import basis, poses
 from .criterion import State, complement
 from .exceptions import InputError, SolveError
-from .priors import similarity_basis, similarity_part
+from .priors import dynamic_basis, similarity_basis, similarity_part
 
 KINDS = ("minimal", "mean")
 #: Below this the constraints of the "mean" gauge leave a direction free.
@@ -156,8 +156,8 @@ class Gauge:
             " and the uncertainty of the static distortion" if self.static_sigma is not None else ""
         )
         lines.append(
-            f"Absolute errors (rms over the field, per axis) come from {source}; single exposures depart from the prior "
-            f"mean by {dynamic:.2g} px rms per axis. No external reference was used."
+            f"Absolute errors (rms over the field, per axis) come from {source}; single exposures depart from the "
+            f"prior mean by {dynamic:.2g} px rms per axis. No external reference was used."
         )
         return "\n".join(lines)
 
@@ -179,7 +179,7 @@ def make(kind, problem, state, blocks):
     if kind == "mean":
         _check_mean(motion)
     similar = [similarity_basis(shape, problem.n_modes) for shape in problem.shapes]
-    others = np.stack([complement(rows) for rows in similar])
+    others = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])
     similar = np.stack(similar)
     error = _conditional_errors(blocks.u_data)
     held = problem.prior_sigma is not None
@@ -269,8 +269,21 @@ def _dynamic_covariance(problem, state, error, motion, others):
     normal = np.einsum("i,ika,ikb->ab", w, moved, moved, optimize=True)
     common = np.linalg.pinv(normal, rcond=1e-10, hermitian=True) @ np.einsum("i,ika,ik->a", w, moved, own)
     variance = np.einsum("ika,iab,ikb->ik", others, error, others, optimize=True)
-    scatter = _excess_scatter(own - moved @ common, variance)
+    scatter = _pooled(_excess_scatter(own - moved @ common, variance), problem.n_exposures - 1)
     return others.transpose(0, 2, 1) * scatter**2 @ others
+
+
+def _pooled(scatter, n_free):
+    """Scatter per mode, shears first, drawn towards the rms of its degree by the weight of three exposures.
+
+    A handful of exposures tells the scatter of a single mode badly, and weights that follow its noise make reported
+    errors too small.
+    """
+    degree = np.repeat(np.arange(basis.MAX_DEGREE + 1), np.arange(basis.MAX_DEGREE + 1) + 1)[3 : len(scatter) // 2 + 2]
+    degree = np.concatenate([[1, 1], degree, degree])[: len(scatter)]
+    number = np.bincount(degree)[degree]
+    usual = np.bincount(degree, scatter**2)[degree] / number
+    return np.sqrt((n_free * scatter**2 + 3 * usual) / (n_free + 3))
 
 
 def _excess_scatter(a, variance):

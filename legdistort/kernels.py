@@ -220,9 +220,7 @@ def linearise(problem, state):
 
 def to_stars(problem, blocks, a):
     """Twin of `legdistort.criterion.to_stars`."""
-    sums = _to_stars(
-        get_num_threads(), problem.start, problem.star, blocks.values, blocks.coupling, a, problem.n_stars
-    )
+    sums = _to_stars(get_num_threads(), problem.start, problem.star, blocks.values, blocks.coupling, a, problem.n_stars)
     return sums.sum(axis=0).T.copy()
 
 

@@ -317,10 +317,14 @@ def estimate_poses(exposure, star, xy, *, names=None):
 
 def _refine_poses(pose_list, rows, star, xy, n_sweeps=3):
     """Refit every pose to the mean of all, the first one's plane held by the mean of the poses."""
+    ends = np.array([xy.min(axis=0), xy.max(axis=0)])
     for _ in range(n_sweeps):
         back = np.empty_like(xy)
         for pose, r in zip(pose_list, rows, strict=True):
             back[r] = poses.apply(poses.invert(pose), xy[r])
         mean = _star_means(back, star, star.max() + 1)
-        pose_list = [robust_similarity(mean[star[r]], xy[r]) for r in rows]
+        refined = [robust_similarity(mean[star[r]], xy[r]) for r in rows]
+        old, new = ([poses.apply(poses.invert(p), ends) for p in pair] for pair in (pose_list, refined))
+        common = poses.fit_similarity(np.concatenate(old), np.concatenate(new), parity=1)
+        pose_list = [poses.compose(pose, common) for pose in refined]
     return pose_list

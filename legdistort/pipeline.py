@@ -116,7 +116,8 @@ def run(
         with _timed(timings, "write"):
             write_results(solution, target)
             mosaic.write(target / "mosaic.fits")
-        summary = summarise(solution, timings=timings) | {"fwhm_ratio": fwhm_ratio(mosaic, solution)}
+            sharpness = fwhm_ratio(mosaic, solution)
+        summary = summarise(solution, timings=timings) | {"fwhm_ratio": sharpness}
         write_report(target / "report.html", solution, mosaic=mosaic, summary=summary)
         (target / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     return Run(out, solution, mosaic, summary)
@@ -158,9 +159,10 @@ def fwhm_ratio(mosaic, solution):
     table = solution.observations
     if "fwhm" not in table.colnames or mosaic.offset is None:
         return None
+    image = Exposure(name="mosaic", data=mosaic.data, mask=~np.isfinite(mosaic.data))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AssumptionWarning)  # of the errors, which are not used
-        stacked = measure([Exposure(name="mosaic", data=mosaic.data, mask=~np.isfinite(mosaic.data))])
+        stacked = measure([image], max_stars=500)
     stacked = stacked[(stacked["flags"] & UNUSABLE) == 0]
     if len(stacked) == 0:
         return None

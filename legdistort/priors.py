@@ -35,6 +35,8 @@ class Prior:
         what the data cannot tell. None leaves the exposures free. Zero keeps a mode at the mean.
     static_sigma : array_like, optional
         Uncertainty of the mean itself, same forms. It is common to all exposures and does not average down.
+    shape : tuple, optional
+        ``(ny, nx)`` of the detector it belongs to; solving exposures of another shape with it is then an error.
 
     Attributes
     ----------
@@ -52,10 +54,11 @@ class Prior:
     mean: np.ndarray
     sigma: np.ndarray | None
     static_sigma: np.ndarray | None
+    shape: tuple | None
     truncation: float
     plane: np.ndarray | None
 
-    def __init__(self, mean, *, sigma=None, static_sigma=None, truncation=0.0, plane=None):
+    def __init__(self, mean, *, sigma=None, static_sigma=None, shape=None, truncation=0.0, plane=None):
         mean = np.array(mean, dtype=float)
         if mean.ndim != 2 or mean.shape[0] != 2:
             raise InputError(f"mean must have shape (2, n_modes), x then y, got {mean.shape}")
@@ -67,7 +70,9 @@ class Prior:
             for value, name in ((sigma, "sigma"), (static_sigma, "static_sigma"))
         ]
         for name, value in zip(
-            ("mean", "sigma", "static_sigma", "truncation", "plane"), (mean, *widths, truncation, plane), strict=True
+            ("mean", "sigma", "static_sigma", "shape", "truncation", "plane"),
+            (mean, *widths, shape, truncation, plane),
+            strict=True,
         ):
             object.__setattr__(self, name, value)
 
@@ -128,7 +133,7 @@ class Prior:
         q = poses.apply(pose, to_plane.plane)
         left = to_plane.pixels - q - (mean @ basis.values(degree, *basis.normalize(q, shape))).T
         truncation = float(np.hypot(*left.T).max())
-        return cls(mean, sigma=sigma, static_sigma=static_sigma, truncation=truncation, plane=pose)
+        return cls(mean, sigma=sigma, static_sigma=static_sigma, shape=tuple(shape), truncation=truncation, plane=pose)
 
 
 class _Plane:
@@ -207,6 +212,22 @@ def similarity_basis(shape, n):
         rows[3, 0, 2], rows[3, 1, 1] = -ny, nx
     rows = rows.reshape(len(rows), -1)
     return rows / np.linalg.norm(rows, axis=1)[:, None]
+
+
+def dynamic_basis(shape, n):
+    """Orthonormal coefficient vectors of all but the similarities, shape (2 * n_modes - 4 or - 2, 2 * n_modes).
+
+    Two shears first, then the modes of degree 2 and more as they are, x before y.
+    """
+    if n < 3:
+        return np.zeros((0, 2 * n))
+    ny, nx = shape
+    shears = np.zeros((2, 2, n))
+    shears[0, 0, 1], shears[0, 1, 2] = ny, -nx
+    shears[1, 0, 2], shears[1, 1, 1] = nx, ny
+    shears = shears.reshape(2, -1) / np.hypot(nx, ny)
+    unit = np.eye(2 * n).reshape(2 * n, 2, n)
+    return np.concatenate([shears, unit[np.r_[3:n, n + 3 : 2 * n]].reshape(-1, 2 * n)])
 
 
 def similarity_part(coefficients, shape):

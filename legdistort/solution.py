@@ -1,5 +1,6 @@
 """The result of `solve`: positions, distortions, their errors, and everything made from them."""
 
+import textwrap
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -149,7 +150,9 @@ class Solution:
 
     def correct(self, name, xy):
         """Detector pixels (n, 2) -> reference positions (n, 2), exact (section 3.3, criterion J_3)."""
-        q = self.distortion(name).invert(np.atleast_2d(np.asarray(xy, dtype=float)))
+        distortion = self.distortion(name)
+        distortion.check_fold()
+        q = distortion.invert(np.atleast_2d(np.asarray(xy, dtype=float)))
         return poses.apply(poses.invert(self.poses[name]), q)
 
     def model(self, name):
@@ -253,7 +256,7 @@ class Solution:
         lines = [
             repr(self)[1:-1],
             f"status  {self.status}",
-            f"gauge   {self.gauge.sentence}",
+            *textwrap.wrap(self.gauge.sentence, 110, initial_indent="gauge   ", subsequent_indent=" " * 8),
             f"rms     {self.rms[0]:.4f}, {self.rms[1]:.4f} px in x, y; "
             f"{np.count_nonzero(used)} of {len(used)} observations used",
             "",

@@ -40,7 +40,7 @@ def test_python_on_the_page_runs_as_printed(page, night, monkeypatch):
 def test_readme_example_is_six_lines_and_gives_a_mosaic(night, monkeypatch):
     monkeypatch.chdir(night)
     (example,) = blocks(ROOT / "README.md", "python")
-    assert len(example.strip().splitlines()) == 6
+    assert len([line for line in example.splitlines() if line]) == 6
     (night / "mosaic.fits").unlink(missing_ok=True)
     exec(example, {})
     assert (night / "mosaic.fits").stat().st_size > 1e6
