@@ -460,12 +460,12 @@ class TestFile:
         mosaic = plain()[-1]
         path = tmp_path / "m.fits"
         path.write_text("precious")
-        with pytest.raises(InputError, match=r"m.fits exists; give overwrite=True"):
+        with pytest.raises(InputError, match=r"m\.fits exists already; give overwrite=True"):
             mosaic.write(path)
         assert path.read_text() == "precious"
         mosaic.write(path, overwrite=True)
         assert fits.getdata(path).shape == mosaic.shape
-        with pytest.raises(InputError, match="no such folder"):
+        with pytest.raises(InputError, match="does not exist; make it first"):
             mosaic.write(tmp_path / "none" / "m.fits")
 
     def test_repr_shows_counts(self):

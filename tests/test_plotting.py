@@ -51,7 +51,7 @@ def make_solution(
         chi2=1432.1,
         dof=1380,
         status="converged after 4 iterations",
-        gauge="minimal",
+        gauge=SimpleNamespace(sentence="minimal: by convention"),
         uncertainty=None,
         left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},
     )

@@ -217,7 +217,7 @@ def test_solved_set_gives_a_page(tmp_path):
         path = report.write_report(tmp_path / "report.html", solution)
     page = Page(path.read_text(encoding="utf-8"))
     assert set(solution.names) <= set(page.cells)
-    assert page.row("Gauge")[1] == str(solution.gauge)
+    assert page.row("Gauge")[1] == solution.gauge.sentence
     with Image.open(BytesIO(base64.b64decode(page.references[0].split(",")[1]))) as image:
         assert image.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
     assert pyplot.get_fignums() == before

@@ -1,0 +1,125 @@
+"""Make the pictures of the README and the documentation: ``python docs/make_figures.py`` (about a minute).
+
+Everything is seeded and goes through the public functions, so the pictures show what a user gets.
+"""
+
+import tempfile
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+from astropy import units as u
+from PIL import Image
+
+import legdistort as ld
+from legdistort import plotting, poses
+from legdistort.demo import run_demo
+from legdistort.distortion import Distortion
+
+IMAGES = Path(__file__).parent / "images"
+BLUE, GREEN, ORANGE = "#0072B2", "#009E73", "#D55E00"
+MAGNIFIED = 80
+
+
+def main():
+    """Run both demonstrations and draw."""
+    IMAGES.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        night = run_demo(out=Path(folder) / "night")
+        save(before_after(night.solution), "before_after.png", colours=256)
+        small = run_demo(out=Path(folder) / "small", small=True)
+        draw_first_mosaic(small)
+
+
+def before_after(solution):
+    """Arrows from the mean of each star to its single positions: similarities alone, static part removed, solved."""
+    fig, panels = plt.subplots(1, 3, figsize=(11, 4.3), sharex=True, sharey=True, layout="constrained")
+    steps = {
+        "Shift, rotation and scale only": (aligned(solution), ORANGE),
+        "Known static distortion removed": (aligned(solution, static=True), GREEN),
+        "Every distortion solved": (by_star(solution, solution.correct), BLUE),
+    }
+    for ax, (title, (positions, colour)) in zip(panels, steps.items(), strict=True):
+        mean = np.nanmean(positions, axis=0)
+        away = positions - mean
+        start = np.broadcast_to(mean, positions.shape)
+        arrows = ax.quiver(
+            *start.reshape(-1, 2).T,
+            *away.reshape(-1, 2).T,
+            angles="xy",
+            scale_units="xy",
+            scale=1 / MAGNIFIED,
+            width=0.0028,
+            color=colour,
+        )
+        ax.quiverkey(arrows, 0.84, 1.03, 1, "1 px", labelpos="E", coordinates="axes")
+        ax.set(xlabel="x [px]", aspect="equal")
+        rms = np.sqrt(np.nanmean(away**2))
+        ax.set_title(f"{title}\n{rms:.3f} px rms per axis", loc="left", fontsize="medium")
+    panels[0].set_ylabel("y [px]")
+    return fig
+
+
+def aligned(solution, *, static=False):
+    """Positions (n_exposures, n_stars, 2) carried to the reference plane by similarities fitted to them."""
+    table = solution.observations.copy()
+    if static:
+        for name, coefficients in zip(solution.names, solution.prior_mean, strict=True):
+            rows = table["exposure"] == name
+            xy = np.column_stack([table["x"][rows].value, table["y"][rows].value])
+            undistorted = Distortion(coefficients, solution.shapes[name]).invert(xy)
+            table["x"][rows], table["y"][rows] = undistorted.T * u.pix
+    matches = ld.Matches.from_table(table, shape=solution.shapes)  # estimates the similarities from the positions
+    back = {name: poses.invert(matches.poses[name]) for name in solution.names}
+    return by_star(solution, lambda name, xy: poses.apply(back[name], xy), table=table)
+
+
+def by_star(solution, to_reference, *, table=None):
+    """Used positions (n_exposures, n_stars, 2) in the reference plane, NaN where a star was not used."""
+    table = solution.observations if table is None else table
+    out = np.full((len(solution.names), len(solution.star_names), 2), np.nan)
+    for i, name in enumerate(solution.names):
+        rows = table[(table["exposure"] == name) & table["used"]]
+        xy = np.column_stack([rows["x"].value, rows["y"].value])
+        out[i, np.searchsorted(solution.star_names, rows["star"])] = to_reference(name, xy)
+    return out
+
+
+def draw_first_mosaic(run):
+    """Pictures of the page "First mosaic"."""
+    solution, first = run.solution, run.solution.names[0]
+    fig, panels = plt.subplots(1, 2, figsize=(10, 5), layout="constrained")
+    plotting.plot_residuals(solution, ax=panels[0])
+    plotting.plot_scatter(solution, ax=panels[1])
+    save(fig, "residuals.png")
+
+    fig, panels = plt.subplots(1, 2, figsize=(10, 5), layout="constrained")
+    plotting.plot_distortion(solution, first, scale=None, ax=panels[0])
+    plotting.plot_distortion(solution, first, part="dynamic", scale=None, ax=panels[1])
+    save(fig, "distortion.png")
+
+    fig, panels = plt.subplots(1, 2, figsize=(10, 4.6), layout="constrained")
+    plotting.plot_sigma_map(*solution.sigma_map(first), ax=panels[0])
+    offset = run.mosaic.offset
+    xy = np.column_stack([solution.stars["x"].value, solution.stars["y"].value]) - offset
+    plotting.plot_mosaic(run.mosaic, stars=xy, ax=panels[1])
+    save(fig, "mosaic.png", colours=256)
+
+
+def save(fig, name, *, colours=64):
+    """Write a figure as a small PNG with a palette."""
+    fig.savefig(IMAGES / name, dpi=100, bbox_inches="tight", pad_inches=0.08)
+    plt.close(fig)
+    image = Image.open(IMAGES / name).convert("RGB")
+    image.quantize(colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(
+        IMAGES / name, optimize=True
+    )
+    print(f"{name}: {(IMAGES / name).stat().st_size / 1024:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
