@@ -42,7 +42,7 @@ class Problem:
     names : tuple of str
     shapes : list of (ny, nx), one an exposure
     n_stars : int
-    order : ndarray of int, shape (n,)
+    order : ndarray of int, shape (n,), or slice
         Row of the table behind every observation.
     start : ndarray of int, shape (n_exposures + 1,)
         Observations ``start[i]:start[i + 1]`` belong to exposure i.
@@ -61,7 +61,7 @@ class Problem:
     names: tuple
     shapes: list
     n_stars: int
-    order: np.ndarray
+    order: np.ndarray | slice
     start: np.ndarray
     star: np.ndarray
     xy: np.ndarray
@@ -177,10 +177,12 @@ def build(matches, degree, *, prior=None, error_floor=0.0):
     if not (np.isfinite(error_floor) and error_floor >= 0):
         raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
     obs = matches.observations
-    order = np.lexsort((obs.star, obs.exposure))
+    order = _order(obs)
     counts = np.bincount(obs.exposure, minlength=len(matches.names))
-    var_x, var_y, cov = (obs.covariance[order] + [error_floor**2, error_floor**2, 0.0]).T
-    weight = np.stack([var_y, var_x, -cov]) / (var_x * var_y - cov**2)
+    var_x, var_y, cov = (column[order] for column in obs.covariance.T)
+    var_x, var_y = var_x + error_floor**2, var_y + error_floor**2
+    determinant = var_x * var_y - cov**2
+    weight = np.stack([var_y / determinant, var_x / determinant, -cov / determinant])
     priors = _priors(matches, prior, counts, obs.exposure)
     for name, p in zip(matches.names, priors, strict=True):
         if p is not None and p.shape is not None and tuple(p.shape) != tuple(matches.shapes[name]):
@@ -214,12 +216,18 @@ def build(matches, degree, *, prior=None, error_floor=0.0):
         order=order,
         start=np.concatenate([[0], np.cumsum(counts)]),
         star=obs.star[order],
-        xy=np.ascontiguousarray(obs.xy[order].T),
+        xy=np.stack([column[order] for column in obs.xy.T]),
         weight=weight,
         prior_mean=mean,
         prior_sigma=None if free.all() else sigma,
         static_sigma=_static_sigma(priors, degree),
     )
+
+
+def _order(obs):
+    """Rows by exposure, then star; a slice of all of them where the table comes that way."""
+    key = obs.exposure.astype(np.int64) * (obs.star.max() + 1) + obs.star
+    return slice(None) if np.all(key[1:] > key[:-1]) else np.argsort(key, kind="stable")
 
 
 def _static_sigma(priors, degree):

@@ -6,9 +6,10 @@ from functools import cached_property
 
 import numpy as np
 from astropy import units as u
+from astropy.table import QTable
 from scipy.optimize import brentq
 
-from . import criterion, outliers, solvers
+from . import criterion, outliers, solvers, starting
 from .exceptions import InputError
 from .solution import Solution
 from .uncertainty import Uncertainty
@@ -166,7 +167,7 @@ def _fit(matches, error_floor, options):
     problem = criterion.build(matches, options["degree"], prior=options["prior"], error_floor=error_floor)
     nominal = np.stack([matches.poses[name] for name in matches.names])
     robust = clip is not None or loss != "linear"
-    start, misplaced = solvers.start(problem, nominal, robust=robust)
+    start, misplaced = starting.start(problem, nominal, robust=robust)
     if robust and misplaced.any():
         reason = "its stars lie nowhere near where the other exposures put them (mismatched, or not this field?)"
         return _fit_without(
@@ -211,7 +212,7 @@ def _fit_with_floor(matches, fit, options):
 def _solution(fit, scale, settings):
     """Bring the solver's arrays back into the order and the words of the user."""
     matches, problem, result = fit.matches, fit.problem, fit.result
-    table = matches.table.copy()
+    table = QTable(matches.table, copy=False)
     back = np.empty_like(fit.blocks.residual)
     back[:, problem.order] = fit.blocks.residual
     table["dx"], table["dy"] = back * u.pix

@@ -25,6 +25,7 @@ from .priors import dynamic_basis, similarity_basis, similarity_part
 KINDS = ("minimal", "mean")
 #: Below this the constraints of the "mean" gauge leave a direction free.
 _MEAN_LIMIT = 1e-3
+_CORNERS = np.array([[-1, 1, 1, -1.0], [-1, -1, 1, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,12 +176,11 @@ def make(kind, problem, state, blocks):
     if kind not in KINDS:
         raise InputError(f"gauge must be one of {', '.join(map(repr, KINDS))}, got {kind!r}")
     box = reference_box(problem, state)
-    motion = np.stack([_motion(problem, state.poses[i], i, box) for i in range(problem.n_exposures)])
+    motion = _motion(problem, state.poses, box)
     if kind == "mean":
         _check_mean(motion)
-    similar = [similarity_basis(shape, problem.n_modes) for shape in problem.shapes]
-    others = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])
-    similar = np.stack(similar)
+    similar = _by_shape(similarity_basis, problem)
+    others = _by_shape(dynamic_basis, problem)
     error = _conditional_errors(blocks.u_data)
     held = problem.prior_sigma is not None
     dynamic = _dynamic_covariance(problem, state, error, motion, others)
@@ -226,21 +226,29 @@ def reference_box(problem, state):
     scale = np.sqrt(np.abs(np.linalg.det(state.poses[:, :, :2])))
     usual = np.abs(np.log(scale / np.median(scale))) < np.log(2)  # a mismatched exposure may have any scale
     for shape, pose in zip(np.array(problem.shapes)[usual], state.poses[usual], strict=True):
-        ends = basis.denormalize(np.array([-1, 1, 1, -1.0]), np.array([-1, -1, 1, 1.0]), shape)
+        ends = basis.denormalize(_CORNERS[0], _CORNERS[1], tuple(shape))
         corners.append(poses.apply(poses.invert(pose), ends))
     corners = np.concatenate(corners)
     low, high = corners.min(axis=0), corners.max(axis=0)
     return np.stack([(low + high) / 2, (high - low) / 2])
 
 
-def _motion(problem, pose, i, box):
+def _by_shape(function, problem):
+    """``function(shape, n_modes)`` of every exposure, computed once a shape, stacked."""
+    made = {shape: function(shape, problem.n_modes) for shape in set(problem.shapes)}
+    return np.stack([made[shape] for shape in problem.shapes])
+
+
+def _motion(problem, pose_list, box):
     """N_i, to first order in the distortion: a displacement g of the reference plane moves q by R g(T^-1 q)."""
-    shape, degree = problem.shapes[i], problem.degree
+    degree, size = problem.degree, problem.n_modes
     u, v, w = basis.quadrature(degree)
-    back = poses.apply(poses.invert(pose), basis.denormalize(u, v, shape))
-    reference = basis.values(degree, *((back - box[0]) / box[1]).T)
-    mixing = (basis.values(degree, u, v) * w) @ reference.T
-    return np.kron(pose[:, :2], mixing)
+    nodes = _by_shape(lambda shape, _: basis.denormalize(u, v, shape), problem)
+    linear = pose_list[:, :, :2]
+    back = (nodes - pose_list[:, None, :, 2]) @ np.linalg.inv(linear).transpose(0, 2, 1)
+    reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
+    mixing = np.einsum("mk,nik->imn", basis.values(degree, u, v) * w, reference, optimize=True)
+    return np.einsum("iab,imn->iambn", linear, mixing).reshape(-1, 2 * size, 2 * size)
 
 
 def _conditional_errors(u_data):
@@ -331,23 +339,32 @@ def absorb_similarities(problem, state):
     float
         Largest move of a detector corner, pixels.
     """
-    coefficients, pose_list = state.coefficients.copy(), state.poses.copy()
-    degree, n_modes = basis.degree_of(coefficients.shape[2]), problem.n_modes
+    n_modes = problem.n_modes
+    degree = basis.degree_of(state.coefficients.shape[2])
     u, v, w = basis.quadrature(degree)
     project = (basis.values(degree, u, v) * w).T
-    largest = 0.0
-    for i, shape in enumerate(problem.shapes):
-        nodes = basis.denormalize(u, v, shape)
-        ends = basis.denormalize(np.array([-1, 1, 1, -1.0]), np.array([-1, -1, 1, 1.0]), shape)
-        for _ in range(4):
-            shift = similarity_part((coefficients[i] - problem.prior_mean[i])[:, :n_modes], shape)
-            move = np.abs(poses.apply(shift, ends) - ends).max()
-            largest = max(largest, move)
-            if move < 1e-9:
-                break
-            old = poses.apply(poses.invert(shift), nodes)
-            values = basis.values(degree, *basis.normalize(old, shape))
-            changed = ((old - nodes).T + coefficients[i] @ values) @ project
-            coefficients[i, :, :n_modes] = changed[:, :n_modes]
-            pose_list[i] = poses.compose(shift, pose_list[i])
+    nodes = _by_shape(lambda shape, _: basis.denormalize(u, v, shape), problem)
+    ends = _by_shape(lambda shape, _: basis.denormalize(_CORNERS[0], _CORNERS[1], shape), problem)
+    pixels = np.array(problem.shapes)[:, None, ::-1]
+    coefficients, pose_list, largest = state.coefficients.copy(), state.poses, 0.0
+    for _ in range(4):
+        departure = (coefficients - problem.prior_mean)[:, :, :n_modes]
+        shift = similarity_part(departure, problem.shapes)
+        move = float(np.abs(_apply(shift, ends) - ends).max())
+        largest = max(largest, move)
+        if move < 1e-9:
+            break
+        linear = np.linalg.inv(shift[:, :, :2])
+        old = (nodes - shift[:, None, :, 2]) @ linear.transpose(0, 2, 1)
+        values = basis.values(degree, *np.moveaxis((2 * old + 1) / pixels - 1, -1, 0))
+        changed = ((old - nodes).transpose(0, 2, 1) + np.einsum("iam,mik->iak", coefficients, values)) @ project
+        coefficients[:, :, :n_modes] = changed[:, :, :n_modes]
+        turned = shift[:, :, :2] @ pose_list
+        turned[:, :, 2] += shift[:, :, 2]
+        pose_list = turned
     return State(state.positions, coefficients, pose_list), largest
+
+
+def _apply(pose_list, xy):
+    """Poses (n, 2, 3) applied to positions (n, k, 2)."""
+    return xy @ pose_list[:, :, :2].transpose(0, 2, 1) + pose_list[:, None, :, 2]

@@ -189,9 +189,13 @@ def _to_exposures(n_chunks, start, star, values, coupling, stars):
                     sx, sy = stars[0, star[k]], stars[1, star[k]]
                     x[o] = coupling[0, 0, k] * sx + coupling[1, 0, k] * sy
                     y[o] = coupling[0, 1, k] * sx + coupling[1, 1, k] * sy
-                batch = values[:, first : first + size]
-                _dots(batch, x[:size], out[i, 0])
-                _dots(batch, y[:size], out[i, 1])
+                for m in range(n_modes):
+                    row, sum_x, sum_y = values[m, first : first + size], 0.0, 0.0
+                    for o in range(size):
+                        sum_x += row[o] * x[o]
+                        sum_y += row[o] * y[o]
+                    out[i, 0, m] += sum_x
+                    out[i, 1, m] += sum_y
     return out
 
 

@@ -61,18 +61,17 @@ class Matches:
     @cached_property
     def names(self):
         """Exposure names, in the order in which they first appear."""
-        _, first = np.unique(self.table["exposure"], return_index=True)
-        return tuple(str(name) for name in self.table["exposure"][np.sort(first)])
+        return _first_seen(self.table["exposure"])[0]
 
     @cached_property
     def stars(self):
         """Star identifiers, sorted."""
-        return np.unique(self.table["star"])
+        return _ranked(self.table["star"])[0]
 
     @cached_property
     def observations(self):
         """The table as plain arrays (`Observations`)."""
-        return _observations(self.table, self.names, self.stars)
+        return _observations(self.table, _first_seen(self.table["exposure"])[1], _ranked(self.table["star"])[1])
 
     @cached_property
     def positions(self):
@@ -150,10 +149,9 @@ class Matches:
         """
         table = catalogs.check(table, catalogs.MATCHED, "the table of matched positions")
         table["exposure"] = table["exposure"].astype(str)
-        names = tuple(dict.fromkeys(table["exposure"].tolist()))
+        names, exposure_index = _first_seen(table["exposure"])
         shapes = _by_exposure(shape, names)
-        stars, star_index = np.unique(table["star"], return_inverse=True)
-        exposure_index = _index(table["exposure"], names)
+        stars, star_index = _ranked(table["star"])
         _check_duplicates(table, exposure_index, star_index, len(stars))
         _check_connected(exposure_index, star_index, names, len(stars))
         if poses is None:
@@ -162,7 +160,10 @@ class Matches:
             poses = dict(zip(names, pose_list, strict=True))
         else:
             poses = _check_poses(poses, names)
-        return cls(table, shapes, poses, sky, dict(left_out or {}))
+        matches = cls(table, shapes, poses, sky, dict(left_out or {}))
+        matches.__dict__.update(names=names, stars=stars)  # known already
+        matches.__dict__["observations"] = _observations(table, exposure_index, star_index)
+        return matches
 
 
 def _by_exposure(shape, names):
@@ -190,18 +191,30 @@ def _check_poses(given, names):
     return {name: poses.check(given[name], f"pose of exposure {name!r}") for name in names}
 
 
-def _index(column, names):
-    order = {name: i for i, name in enumerate(names)}
-    unique, inverse = np.unique(np.asarray(column), return_inverse=True)
-    return np.array([order[str(name)] for name in unique])[inverse]
+def _first_seen(column):
+    """Distinct names in the order in which they first appear, and the number of each row's name."""
+    column = np.asarray(column)
+    heads = np.flatnonzero(np.concatenate([[True], column[1:] != column[:-1]]))  # tables come in runs of one exposure
+    numbers = {}
+    run = [numbers.setdefault(str(name), len(numbers)) for name in column[heads]]
+    return tuple(numbers), np.repeat(run, np.diff(np.append(heads, len(column))))
 
 
-def _observations(table, names, stars):
+def _ranked(column):
+    """Distinct stars, sorted, and the rank of each row's star; a table look-up where stars are small integers."""
+    column = np.asarray(column)
+    if column.dtype.kind in "iu" and len(column) and column.min() >= 0 and column.max() < 4 * len(column) + 1000:
+        present = np.bincount(column.astype(np.int64)) > 0
+        return np.flatnonzero(present).astype(column.dtype), (np.cumsum(present) - 1)[column]
+    return np.unique(column, return_inverse=True)
+
+
+def _observations(table, exposure, star):
     x_err, y_err = table["x_err"].to_value(u.pix), table["y_err"].to_value(u.pix)
     corr = np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else np.zeros(len(table))
     return Observations(
-        exposure=_index(table["exposure"], names),
-        star=np.searchsorted(stars, table["star"]),
+        exposure=exposure,
+        star=star,
         xy=np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)]),
         covariance=np.column_stack([x_err**2, y_err**2, corr * x_err * y_err]),
     )
@@ -209,6 +222,8 @@ def _observations(table, names, stars):
 
 def _check_duplicates(table, exposure, star, n_stars):
     key = exposure.astype(np.int64) * n_stars + star
+    if np.all(key[1:] > key[:-1]):
+        return
     order = np.argsort(key, kind="stable")
     same = np.flatnonzero(np.diff(key[order]) == 0)
     if len(same):

@@ -230,21 +230,29 @@ def dynamic_basis(shape, n):
     return np.concatenate([shears, unit[np.r_[3:n, n + 3 : 2 * n]].reshape(-1, 2 * n)])
 
 
-def similarity_part(coefficients, shape):
-    """The similarity closest to ``q + A b(q)``, as a pose (2, 3) in the detector's pixels.
+def similarity_part(coefficients, shapes):
+    """The similarity closest to ``q + A b(q)``, as a pose (..., 2, 3) in the detector's pixels.
 
     Parameters
     ----------
-    coefficients : ndarray, shape (2, n_modes)
+    coefficients : ndarray, shape (..., 2, n_modes)
+    shapes : tuple, or list of tuples
+        ``(ny, nx)``; one for all, or one for each.
     """
-    n = coefficients.shape[1]
-    rows = similarity_basis(shape, n)
-    part = (rows.T @ (rows @ coefficients.ravel())).reshape(2, n)
-    ny, nx = shape
-    pose = poses.identity()
-    pose[:, 2] = part[:, 0] / 2  # b_0 = 1/2
-    if n >= 3:
-        slope = np.sqrt(3) / 2 * part[:, 1:3] * [2 / nx, 2 / ny]  # per pixel
-        pose[:, :2] += slope
-        pose[:, 2] -= slope @ [(nx - 1) / 2, (ny - 1) / 2]
+    size = np.broadcast_to(np.array(shapes)[..., ::-1], (*coefficients.shape[:-2], 2)).astype(float)  # nx, ny
+    pose = np.zeros((*coefficients.shape[:-1], 3))
+    pose[..., 0, 0] = pose[..., 1, 1] = 1
+    pose[..., 2] = coefficients[..., 0] / 2  # b_0 = 1/2
+    if coefficients.shape[-1] >= 3:
+        # scale and rotation per pixel: coefficients s nx/sqrt(3), s ny/sqrt(3) in modes 1 (x) and 2 (y), by projection
+        (xx, xy), (yx, yy) = np.moveaxis(coefficients[..., 1:3], (-2, -1), (0, 1))
+        nx, ny = np.moveaxis(size, -1, 0)
+        norm = np.sqrt(3) / (nx**2 + ny**2)
+        scale, turn = (nx * xx + ny * yy) * norm, (nx * yx - ny * xy) * norm
+        pose[..., 0, 0] += scale
+        pose[..., 1, 1] += scale
+        pose[..., 0, 1], pose[..., 1, 0] = -turn, turn
+        middle = (size - 1) / 2
+        pose[..., 0, 2] -= scale * middle[..., 0] - turn * middle[..., 1]
+        pose[..., 1, 2] -= turn * middle[..., 0] + scale * middle[..., 1]
     return pose

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from . import criterion, poses
+from . import criterion
 from . import gauge as gauges
 from .criterion import State
-from .distortion import Distortion
-from .exceptions import ConvergenceWarning, FoldError, InputError, SolveError
+from .exceptions import ConvergenceWarning, InputError, SolveError
 
 log = logging.getLogger(__name__)
 
@@ -56,117 +55,12 @@ class Result:
     robust: np.ndarray
 
 
-def start(problem, nominal, *, n_sweeps=3, robust=False):
-    """Start values: coefficients at the prior mean, poses refined to one another, positions their weighted mean.
-
-    Parameters
-    ----------
-    problem : Problem
-    nominal : ndarray, shape (n_exposures, 2, 3)
-    n_sweeps : int
-    robust : bool
-        Give deviant observations less weight, so that mismatched exposures do not drag the others along.
-
-    Returns
-    -------
-    State
-    ndarray of bool, shape (n_exposures,)
-        Exposures that are `misplaced`.
-
-    Raises
-    ------
-    SolveError
-        If the prior cannot be inverted at the observed positions.
-    """
-    q = problem.xy.copy()
-    for i, shape in enumerate(problem.shapes):
-        if np.any(problem.prior_mean[i]):
-            part = problem.part(i)
-            try:
-                q[:, part] = Distortion(problem.prior_mean[i], shape, problem.names[i]).invert(q[:, part].T).T
-            except FoldError as error:
-                raise SolveError(f"the prior is not usable: {error}") from None
-    full = problem.weight[:2].sum(axis=0) / 2
-    current, weight = np.array(nominal, dtype=float), full
-    n_sweeps *= 5 if robust else 1
-    for sweep in range(n_sweeps + 1):
-        positions = _mean_positions(problem, current, q, weight)
-        if sweep == n_sweeps:
-            break
-        if robust:
-            distance2 = distances(problem, current, q, positions)
-            weight = full / (1 + distance2 / (2 * np.median(distance2) + 1e-12))
-        for i in range(problem.n_exposures):
-            part = problem.part(i)
-            own = problem.star[part]
-            if np.count_nonzero(weight[part]) > 1:
-                parity = 1 if np.linalg.det(current[i, :, :2]) > 0 else -1
-                current[i] = poses.fit_similarity(
-                    positions[:, own].T, q[:, part].T, weights=weight[part], parity=parity
-                )
-    distance2 = distances(problem, current, q, positions)
-    common = _common_similarity(problem, nominal, current, distance2)
-    current = np.stack([poses.compose(pose, common) for pose in current])
-    positions = poses.apply(poses.invert(common), positions.T).T
-    return State(positions, problem.prior_mean.copy(), current), misplaced(problem, distance2)
-
-
-def _common_similarity(problem, nominal, refined, distance2):
-    """The similarity of the reference plane that brings refined poses back, in the mean, to the nominal ones.
-
-    Exposures of like quality count equally, bad ones less, misplaced ones not at all.
-    """
-    variance = 1 / np.array([problem.weight[:2, problem.part(i)].sum() for i in range(problem.n_exposures)])
-    weight = 1 / (variance + 10 * np.median(variance))
-    weight[misplaced(problem, distance2)] = 0
-    old, new = [], []
-    for i in range(problem.n_exposures):
-        ny, nx = problem.shapes[i]
-        corners = np.array([[0, 0], [nx, 0], [nx, ny], [0, ny]]) - 0.5
-        old.append(poses.apply(poses.invert(nominal[i]), corners))
-        new.append(poses.apply(poses.invert(refined[i]), corners))
-    return poses.fit_similarity(np.concatenate(old), np.concatenate(new), weights=np.repeat(weight, 4), parity=1)
-
-
-def misplaced(problem, distance2):
-    """Whether the stars of an exposure lie nowhere near their mean positions, shape (n_exposures,).
-
-    Ten times farther than usual, and more than 1 % of the detector, which no distortion known beforehand explains.
-    """
-    typical = np.array([np.sqrt(np.median(distance2[problem.part(i)])) for i in range(problem.n_exposures)])
-    size = np.max(problem.shapes, axis=1)
-    return (typical > 10 * np.median(typical)) & (typical > 0.01 * size)
-
-
-def distances(problem, pose_list, q, positions):
-    """Squared distance (n,) of undistorted positions from their star's mean position, detector pixels."""
-    distance2 = np.empty(q.shape[1])
-    for i, pose in enumerate(pose_list):
-        part = problem.part(i)
-        off = q[:, part].T - poses.apply(pose, positions[:, problem.star[part]].T)
-        distance2[part] = (off**2).sum(axis=1)
-    return distance2
-
-
-def _mean_positions(problem, pose_list, q, weight):
-    sums, total = np.zeros((2, problem.n_stars)), np.zeros(problem.n_stars)
-    for i, pose in enumerate(pose_list):
-        part = problem.part(i)
-        star = problem.star[part]
-        sums[:, star] += weight[part] * poses.apply(poses.invert(pose), q[:, part].T).T
-        total[star] += weight[part]
-    with np.errstate(invalid="ignore"):
-        return np.where(total > 0, sums / np.where(total > 0, total, 1), 0.0)
-
-
 def loss_factors(squares, loss):
     """Weight factors of iteratively reweighted least squares for the squared normalised residuals (n,).
 
     The loss works at the observed scale if that is larger than the stated errors (median of the squares
     against its expectation for two axes, 2 ln 2).
     """
-    if loss == "linear":
-        return np.ones_like(squares)
     seen = squares[squares > 0]
     scale2 = max(1.0, np.median(seen) / (2 * np.log(2))) if len(seen) else 1.0
     s = squares / (scale2 * _TUNING[loss] ** 2)
@@ -180,7 +74,7 @@ def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iteration
     ----------
     problem : Problem
     state : State
-        Start values, see `start`.
+        Start values, see `legdistort.starting.start`.
     gauge : {"minimal", "mean"}
     loss : {"linear", "huber", "cauchy"}
     max_iterations : int
@@ -199,8 +93,10 @@ def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iteration
     if loss not in LOSSES:
         raise InputError(f"loss must be one of {', '.join(map(repr, LOSSES))}, got {loss!r}")
     state, _ = gauges.absorb_similarities(problem, state)
-    factors = loss_factors(criterion.squares(problem, criterion.residuals(problem, state)), loss)
-    weighted = problem if loss == "linear" else problem.scaled(factors)
+    factors, weighted = np.ones(problem.xy.shape[1]), problem
+    if loss != "linear":
+        factors = loss_factors(criterion.squares(problem, criterion.residuals(problem, state)), loss)
+        weighted = problem.scaled(factors)
     blocks = criterion.linearise(weighted, state)
     history, converged = [], False
     for iteration in range(1, max_iterations + 1):
@@ -410,7 +306,7 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=1000, t
     ----------
     problem : Problem
     state : State
-        The static distortion as starting point, see `start`.
+        The static distortion as starting point, see `legdistort.starting.start`.
     gauge : {"minimal", "mean"}
         Convention in which errors are reported.
     max_iterations : int

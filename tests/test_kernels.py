@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from legdistort import criterion, solvers
+from legdistort import criterion, solvers, starting
 from legdistort.estimation import solve
 from legdistort.priors import Prior
 from legdistort.simulation import simulate_matches
@@ -26,7 +26,7 @@ def _set(**settings):
 def test_compiled_sums_are_the_plain_ones(monkeypatch, settings):
     sim, prior = _set(**settings)
     problem = criterion.build(sim.matches, 3, prior=prior)
-    state, _ = solvers.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
+    state, _ = starting.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
     plain = criterion.linearise(problem, state)
     a, y = RNG.normal(size=plain.g_exposure.shape), RNG.normal(size=(2, problem.n_stars))
     sums = criterion.to_stars(problem, plain, a), criterion.to_exposures(problem, plain, y)

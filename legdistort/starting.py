@@ -1,0 +1,124 @@
+"""Start values of a minimisation, and exposures that are too far off to take part in one."""
+
+import numpy as np
+
+from . import poses
+from .criterion import State
+from .distortion import Distortion
+from .exceptions import FoldError, SolveError
+
+
+def start(problem, nominal, *, n_sweeps=1, robust=False):
+    """Start values: coefficients at the prior mean, poses refined to one another, positions their weighted mean.
+
+    Parameters
+    ----------
+    problem : Problem
+    nominal : ndarray, shape (n_exposures, 2, 3)
+    n_sweeps : int
+    robust : bool
+        Give deviant observations less weight, so that mismatched exposures do not drag the others along.
+
+    Returns
+    -------
+    State
+    ndarray of bool, shape (n_exposures,)
+        Exposures that are `misplaced`.
+
+    Raises
+    ------
+    SolveError
+        If the prior cannot be inverted at the observed positions.
+    """
+    q = _undistorted(problem)
+    full = problem.weight[:2].sum(axis=0) / 2
+    current, weight = np.array(nominal, dtype=float), full
+    n_sweeps *= 12 if robust else 1
+    for sweep in range(n_sweeps + 1):
+        positions = _mean_positions(problem, current, q, weight)
+        if sweep == n_sweeps:
+            break
+        if robust:
+            distance2 = distances(problem, current, q, positions)
+            weight = full / (1 + distance2 / (2 * np.median(distance2) + 1e-12))
+        for i in range(problem.n_exposures):
+            part = problem.part(i)
+            own = problem.star[part]
+            if np.count_nonzero(weight[part]) > 1:
+                parity = 1 if np.linalg.det(current[i, :, :2]) > 0 else -1
+                current[i] = poses.fit_similarity(
+                    positions[:, own].T, q[:, part].T, weights=weight[part], parity=parity
+                )
+    distance2 = distances(problem, current, q, positions)
+    common = _common_similarity(problem, nominal, current, distance2)
+    current = np.stack([poses.compose(pose, common) for pose in current])
+    positions = poses.apply(poses.invert(common), positions.T).T
+    return State(positions, problem.prior_mean.copy(), current), misplaced(problem, distance2)
+
+
+def _undistorted(problem):
+    """Positions (2, n) with the prior distortion taken out to second order, which is enough for a start."""
+    q, checked = problem.xy.copy(), set()
+    for i, (shape, mean) in enumerate(zip(problem.shapes, problem.prior_mean, strict=True)):
+        if not np.any(mean):
+            continue
+        distortion = Distortion(mean, shape, problem.names[i])
+        if (shape, mean.tobytes()) not in checked:
+            checked.add((shape, mean.tobytes()))
+            try:
+                distortion.check_fold()
+            except FoldError as error:
+                raise SolveError(f"the prior is not usable: {error}") from None
+        x = problem.xy[:, problem.part(i)].T
+        guess = 2 * x - distortion(x)
+        q[:, problem.part(i)] = (x - distortion(guess) + guess).T
+    return q
+
+
+def _common_similarity(problem, nominal, refined, distance2):
+    """The similarity of the reference plane that brings refined poses back, in the mean, to the nominal ones.
+
+    Exposures of like quality count equally, bad ones less, misplaced ones not at all.
+    """
+    variance = 1 / np.array([problem.weight[:2, problem.part(i)].sum() for i in range(problem.n_exposures)])
+    weight = 1 / (variance + 10 * np.median(variance))
+    weight[misplaced(problem, distance2)] = 0
+    old, new = [], []
+    for i in range(problem.n_exposures):
+        ny, nx = problem.shapes[i]
+        corners = np.array([[0, 0], [nx, 0], [nx, ny], [0, ny]]) - 0.5
+        old.append(poses.apply(poses.invert(nominal[i]), corners))
+        new.append(poses.apply(poses.invert(refined[i]), corners))
+    return poses.fit_similarity(np.concatenate(old), np.concatenate(new), weights=np.repeat(weight, 4), parity=1)
+
+
+def misplaced(problem, distance2):
+    """Whether the stars of an exposure lie nowhere near their mean positions, shape (n_exposures,).
+
+    Ten times farther than usual, and more than 1 % of the detector, which no distortion known beforehand explains.
+    """
+    typical = np.array([np.sqrt(np.median(distance2[problem.part(i)])) for i in range(problem.n_exposures)])
+    size = np.max(problem.shapes, axis=1)
+    return (typical > 10 * np.median(typical)) & (typical > 0.01 * size)
+
+
+def distances(problem, pose_list, q, positions):
+    """Squared distance (n,) of undistorted positions from their star's mean position, detector pixels."""
+    distance2 = np.empty(q.shape[1])
+    for i, pose in enumerate(pose_list):
+        part = problem.part(i)
+        off = q[:, part].T - poses.apply(pose, positions[:, problem.star[part]].T)
+        distance2[part] = (off**2).sum(axis=1)
+    return distance2
+
+
+def _mean_positions(problem, pose_list, q, weight):
+    """Weighted mean (2, n_stars) of undistorted positions carried back to the reference plane."""
+    back = np.empty_like(q)
+    for i, pose in enumerate(pose_list):
+        part = problem.part(i)
+        inverse = poses.invert(pose)
+        back[:, part] = inverse[:, :2] @ q[:, part] + inverse[:, 2:]
+    total = np.bincount(problem.star, weight, problem.n_stars)
+    sums = np.stack([np.bincount(problem.star, weight * axis, problem.n_stars) for axis in back])
+    return np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
