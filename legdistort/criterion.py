@@ -28,7 +28,13 @@ COMPILED_FROM = 30_000
 
 @cache
 def _numba_found():
-    return find_spec("numba") is not None
+    """Whether the extra ``fast`` is installed."""
+    return find_spec("numba") is not None and find_spec("threadpoolctl") is not None
+
+
+def is_compiled(n):
+    """Whether the compiled loops of `legdistort.kernels` serve a problem of n observations."""
+    return n >= COMPILED_FROM and _numba_found()
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +84,7 @@ class Problem:
     @property
     def compiled(self):
         """Whether the compiled loops of `legdistort.kernels` serve this problem."""
-        return self.xy.shape[1] >= COMPILED_FROM and _numba_found()
+        return is_compiled(self.xy.shape[1])
 
     @property
     def n_exposures(self):

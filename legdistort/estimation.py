@@ -1,6 +1,7 @@
 """`solve`: from matched positions to a `Solution`."""
 
 import logging
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -93,7 +94,8 @@ def solve(
         "clip": clip,
         "limit": {} if max_iterations is None else {"max_iterations": max_iterations},
     }
-    fit = _fit(matches, error_floor, options)
+    with _threads(matches):
+        fit = _fit(matches, error_floor, options)
     if errors == "floor":
         fit = _fit_with_floor(matches, fit, options)
     log.info("%s; chi2 %.1f for %d degrees of freedom", fit.result.status, fit.chi2, fit.dof)
@@ -110,6 +112,15 @@ def solve(
         "prior": prior is not None,
     }
     return _solution(fit, scale, settings)
+
+
+def _threads(matches):
+    """One thread for linear algebra while the compiled loops use them all; nothing special otherwise."""
+    if not criterion.is_compiled(len(matches.table)):
+        return nullcontext()
+    from . import kernels
+
+    return kernels.one_blas_thread()
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,102 @@
+"""Table of the solvers on three data sets: time, peak memory, b, sigma, chi2, each in a process of its own.
+
+Run ``python tests/benchmarks/solver_table.py [--scaling]``. Times are the best of three after a first call (which
+loads compiled code); memory is what the process needed beyond the data and the imports.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+SETS = ("simulation 1", "gsaoi-like", "large")
+SOLVERS = ("joint", "alternating", "scipy")
+
+
+def measure(name, solver, n_exposures, n_stars):
+    """One row: figures of one solver on one set."""
+    import rivals
+    import sets
+
+    from legdistort import Matches, performance, solve, solvers
+
+    warnings.simplefilter("ignore")
+    sim, prior = sets.make(name, n_exposures=n_exposures, n_stars=n_stars)
+    true = sim.truth.positions[sim.matches.stars]
+    table, shape, poses = sim.matches.table, sim.matches.shapes, sim.matches.poses
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    times = []
+    for _ in range(4 if solver == "joint" else 1):
+        begin = time.perf_counter()
+        if solver == "joint":
+            solution = solve(Matches.from_table(table, shape=shape, poses=poses), prior=prior)
+            positions, chi2 = solution.positions, solution.chi2
+        else:
+            problem, start = sets.problem(sim, prior)
+            if solver == "scipy":
+                state, chi2 = rivals.solve_scipy(problem, start)
+            else:
+                result = solvers.solve_alternating(problem, start, max_iterations=300)
+                state, chi2 = result.state, result.blocks.chi2
+            positions = state.positions.T
+        times.append(time.perf_counter() - begin)
+    memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    row = {
+        "set": name,
+        "solver": solver,
+        "n_obs": len(table),
+        "seconds": min(times[1:] or times),
+        "MB": memory,
+        "b": performance.bias(positions, true, removed=3),
+        "chi2": chi2,
+    }
+    if solver == "joint":
+        row["sigma"] = float(performance.scatter(performance.corrected_positions(solution)).mean())
+        begin = time.perf_counter()
+        _ = solution.stars
+        row["covariance"] = time.perf_counter() - begin
+    return row
+
+
+def run(*arguments):
+    """A row from a process of its own."""
+    command = [sys.executable, __file__, "--row", *map(str, arguments)]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
+
+
+def show(row):
+    """One line of the table."""
+    extra = f" covariance {row['covariance']:.2f} s" if "covariance" in row else ""
+    sigma = f"{row['sigma']:.4f}" if "sigma" in row else "-"
+    print(
+        f"{row['set']:14s} {row['solver']:12s} {row['n_obs']:9d} {row['seconds']:9.3f} s {row['MB']:8.0f} MB "
+        f"b {row['b']:.4f}  sigma {sigma}  chi2 {row['chi2']:.1f}{extra}",
+        flush=True,
+    )
+
+
+def main():
+    """Print the table, or with --scaling the time of the joint solver against the number of observations."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--row", nargs=4)
+    parser.add_argument("--scaling", action="store_true")
+    arguments = parser.parse_args()
+    sys.path.insert(0, str(Path(__file__).parent))
+    if arguments.row:
+        name, solver, n_exposures, n_stars = arguments.row
+        print(json.dumps(measure(name, solver, int(n_exposures), int(n_stars))))
+    elif arguments.scaling:
+        for n_exposures, n_stars in ((10, 286), (30, 1000), (100, 3000), (100, 10_000), (300, 10_000), (1000, 10_000)):
+            show(run("large", "joint", n_exposures, n_stars))
+    else:
+        for name in SETS:
+            for solver in SOLVERS:
+                show(run(name, solver, 100, 10_000))
+
+
+if __name__ == "__main__":
+    main()
