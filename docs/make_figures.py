@@ -4,6 +4,7 @@ Everything is seeded and goes through the public functions, so the pictures show
 """
 
 import tempfile
+import warnings
 from pathlib import Path
 
 import matplotlib
@@ -16,7 +17,7 @@ from astropy import units as u
 from PIL import Image
 
 import legdistort as ld
-from legdistort import plotting, poses
+from legdistort import criterion, performance, plotting, poses, solvers, starting
 from legdistort.demo import run_demo
 from legdistort.distortion import Distortion
 
@@ -28,11 +29,47 @@ MAGNIFIED = 80
 def main():
     """Run both demonstrations and draw."""
     IMAGES.mkdir(exist_ok=True)
+    save(sweeps(), "sweeps.png")
     with tempfile.TemporaryDirectory() as folder:
         night = run_demo(out=Path(folder) / "night")
         save(before_after(night.solution), "before_after.png", colours=256)
         small = run_demo(out=Path(folder) / "small", small=True)
         draw_first_mosaic(small)
+
+
+def sweeps(n_sweeps=300, n_seeds=10):
+    """Error of the star positions against iterations of the two solvers, Simulation 1 of the paper, rms of ten seeds."""
+    curves = {"alternating": [], "joint": []}
+    for seed in range(n_seeds):
+        sim = ld.simulate_matches(seed=seed)
+        true = sim.truth.positions
+        problem = criterion.build(sim.matches, 3, prior=ld.Prior(sim.truth.static))
+        start, _ = starting.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
+        for name, solver, n in (
+            ("alternating", solvers.solve_alternating, n_sweeps),
+            ("joint", solvers.solve_joint, 4),
+        ):
+            state, curve = start, []
+            for _ in range(n):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # one step at a time never converges
+                    state = solver(problem, state, max_iterations=1).state
+                positions = state.positions.T
+                curve.append([performance.bias(positions, true), performance.bias(positions, true, removed=3)])
+            curves[name].append(curve)
+    fig, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
+    for name, colour in (("alternating", ORANGE), ("joint", BLUE)):
+        rms = np.sqrt(np.mean(np.square(curves[name]), axis=0))
+        n = np.arange(1, len(rms) + 1)
+        ax.plot(n, rms[:, 0], "-", color=colour, marker="o" if len(n) < 10 else None, label=f"{name}, as it stands")
+        ax.plot(n, rms[:, 1], "--", color=colour, marker="s" if len(n) < 10 else None,
+                label=f"{name}, common cubic map removed")  # fmt: skip
+    ax.axhline(0.14 / np.sqrt(10), color="0.6", linewidth=1)
+    ax.text(1.05, 0.14 / np.sqrt(10) * 0.985, "0.14 px / √10", color="0.4", va="top", fontsize="small")
+    ax.set(xscale="log", xlabel="sweeps, or iterations", ylabel="error b of the star positions, per axis [px]")
+    ax.set_ylim(0.03, None)
+    ax.legend(fontsize="small", frameon=False)
+    return fig
 
 
 def before_after(solution):
