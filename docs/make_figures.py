@@ -38,7 +38,7 @@ def main():
 
 
 def sweeps(n_sweeps=300, n_seeds=10):
-    """Error of the star positions against iterations of the two solvers, Simulation 1 of the paper, rms of ten seeds."""
+    """Error of the star positions against iterations of the two solvers, rms of ten seeds of Simulation 1."""
     curves = {"alternating": [], "joint": []}
     for seed in range(n_seeds):
         sim = ld.simulate_matches(seed=seed)
