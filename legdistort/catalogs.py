@@ -197,5 +197,5 @@ def read_table(path, *, columns=None):
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     if "exposure" not in table.colnames:
-        table["exposure"] = path.name.split(".")[0]
+        table["exposure"] = path.stem if path.suffix else path.name
     return table

@@ -5,8 +5,12 @@ import json
 import logging
 import sys
 import warnings
+from contextlib import nullcontext
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from .exceptions import InputError, LegdistortError, LegdistortWarning
 
@@ -22,7 +26,8 @@ def main(argv=None):
             warnings.simplefilter("ignore")  # of other packages
             warnings.simplefilter("default", LegdistortWarning)
             warnings.showwarning = lambda message, *_, **__: log.warning("%s", message)
-            arguments.function(arguments)
+            with logging_redirect_tqdm([log]) if _progress(arguments) else nullcontext():  # bars stay whole
+                arguments.function(arguments)
     except LegdistortError as error:
         if arguments.debug:
             raise
@@ -117,9 +122,16 @@ def _match(a):
 
     from .matching import match
 
-    table = vstack([_read_table(path, a) for path in a.tables], metadata_conflicts="silent")
-    shape = tuple(a.shape) if a.shape else table.meta.get("shapes")
-    matches = match(table, shape=shape, min_exposures=a.min_exposures)
+    tables = [_read_table(path, a) for path in a.tables]
+    names = [name for table in tables for name in set(table["exposure"])]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
+    table = vstack(tables, metadata_conflicts="silent")
+    shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
+    matches = match(table, shape=tuple(a.shape) if a.shape else shapes or None, min_exposures=a.min_exposures)
+    empty = {name: "no star was detected in it" for name in shapes if name not in names}
+    matches = replace(matches, left_out=matches.left_out | empty)
     out = matches.table.copy()
     out.meta = matches.to_meta()
     _write_table(out, a)
@@ -131,7 +143,7 @@ def _solve(a):
     from .estimation import solve
     from .files import replacing_folder
     from .matches import Matches
-    from .pipeline import check_folder, summarise, write_results
+    from .pipeline import check_folder, summarise, write_results, write_summary
     from .report import write_report
 
     check_folder(a.out, a.overwrite)
@@ -145,6 +157,8 @@ def _solve(a):
     with replacing_folder(a.out) as target:
         write_results(solution, target)
         write_report(target / "report.html", solution, summary=summary)
+        write_summary(target / "summary.json", summary)
+    (a.out / "mosaic.fits").unlink(missing_ok=True)  # of an earlier run: it does not belong to this solution
     _report(a, solution, summary)
 
 
@@ -203,7 +217,12 @@ def _say(a, sentence, figures):
 
 
 def _extension(text):
-    return int(text) if text is not None and text.lstrip("-").isdigit() else text
+    if text is None:
+        return None
+    name, comma, number = text.partition(",")
+    if comma and number.isdigit():
+        return name, int(number)
+    return int(text) if text.isdigit() else text
 
 
 def _clip(a, default):
@@ -328,7 +347,7 @@ def _out(p, what):
 
 def _frames(p):
     p.add_argument("frames", nargs="+", metavar="FRAME", help="FITS files, plain or compressed")
-    p.add_argument("--ext", help="extension by number or name")
+    p.add_argument("--ext", help="extension: number, name, or NAME,VERSION")
 
 
 def _night(p):
@@ -365,7 +384,7 @@ def _fit(p, *, clip):
 
 
 def _combination(p):
-    p.add_argument("--combine", choices=("mean", "median", "clipped"), default="mean", help="(default mean)")
+    p.add_argument("--combine", choices=("mean", "median", "clipped"), default="clipped", help="(default clipped)")
     p.add_argument("--order", type=int, default=3, help="of the interpolating spline (default 3)")
 
 

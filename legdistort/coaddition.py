@@ -326,7 +326,7 @@ def _given_grid(grid, solution):
     if solution.sky is None:
         raise InputError(
             "the solution is not tied to the sky, so it cannot be put on a celestial grid; "
-            "give a reference with ra and dec when solving, or grid=None"
+            "measure frames with a header WCS, or give grid=None"
         )
     return Grid(tuple(int(n) for n in wcs.array_shape), wcs, None, solution.sky)
 

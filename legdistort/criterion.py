@@ -15,6 +15,7 @@ Arrays are ordered by exposure, coordinates first, so that every sweep reads mem
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib.util import find_spec
+from numbers import Real
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from . import basis
 from .exceptions import InputError, SolveError
 from .priors import Prior, similarity_basis
 
+#: A prior width of zero holds a mode to this, pixels.
+SMALLEST_WIDTH = 1e-6
 #: Number of observations from which compiled loops are used, if numba is installed.
 COMPILED_FROM = 30_000
 
@@ -180,7 +183,7 @@ def build(matches, degree, *, prior=None, error_floor=0.0):
         Naming an exposure with fewer stars than modes and no prior to make up for it.
     """
     degree = basis.check_degree(degree)
-    if not (np.isfinite(error_floor) and error_floor >= 0):
+    if not (isinstance(error_floor, Real) and np.isfinite(error_floor) and error_floor >= 0):
         raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
     obs = matches.observations
     order = _order(obs)
@@ -258,8 +261,10 @@ def _priors(matches, prior, counts, exposure):
     out = []
     for name in matches.names:
         key = name if name in prior else detectors.get(name)
-        if key not in prior:
-            raise InputError(f"prior has no entry for exposure {name} (nor for its detector {key!r})")
+        if not isinstance(prior.get(key), Prior | None) or key not in prior:
+            raise InputError(
+                f"prior must have a Prior for exposure {name} or its detector {key}, got {prior.get(key)!r}"
+            )
         out.append(prior[key])
     return out
 
@@ -272,8 +277,7 @@ def prior_precision(problem, i):
     n = 2 * problem.n_modes
     if not problem.is_held(i):
         return np.zeros((n, n))
-    # a width of zero or infinity stands for "held" and "free" at 1e-6 and 1e6 px
-    sigma = np.clip(problem.prior_sigma[i].ravel(), 1e-6, 1e6)
+    sigma = np.clip(problem.prior_sigma[i].ravel(), SMALLEST_WIDTH, 1e6)  # infinity stands for free
     others = complement(similarity_basis(problem.shapes[i], problem.n_modes))
     return others.T @ np.linalg.solve(others * sigma**2 @ others.T, others)
 
@@ -373,83 +377,3 @@ def _sums(problem, state):
         u[i, n_modes:, n_modes:] = (b * w[1]) @ b.T if problem.unequal else u[i, :n_modes, :n_modes]
         u[i, :n_modes, n_modes:] = u[i, n_modes:, :n_modes] = (b * w[2]) @ b.T if problem.unequal else 0.0
     return values, coupling, residual, v, g_star, u, g_exposure
-
-
-def inverse_star_blocks(v):
-    """Inverse (3, n_stars) of symmetric 2 x 2 blocks; zero for a star without observations."""
-    determinant = v[0] * v[1] - v[2] ** 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        out = np.stack([v[1], v[0], -v[2]]) / determinant
-    out[:, determinant <= 0] = 0
-    return out
-
-
-def symmetric_times(block, x):
-    """Symmetric 2 x 2 blocks (3, n) times vectors (2, n)."""
-    return np.stack([block[0] * x[0] + block[2] * x[1], block[2] * x[0] + block[1] * x[1]])
-
-
-def to_stars(problem, blocks, a):
-    """E a: coefficients (n_exposures, 2 n_modes) -> stars (2, n_stars)."""
-    if problem.compiled:
-        from . import kernels
-
-        return kernels.to_stars(problem, blocks, a)
-    out = np.zeros((2, problem.n_stars))
-    n_modes = problem.n_modes
-    for i in range(problem.n_exposures):
-        part = problem.part(i)
-        t = a[i].reshape(2, n_modes) @ blocks.values[:, part]
-        f = blocks.coupling[:, :, part]
-        out[:, problem.star[part]] += f[:, 0] * t[0] + f[:, 1] * t[1]
-    return out
-
-
-def to_exposures(problem, blocks, y):
-    """E' y: stars (2, n_stars) -> coefficients (n_exposures, 2 n_modes)."""
-    if problem.compiled:
-        from . import kernels
-
-        return kernels.to_exposures(problem, blocks, y)
-    out = np.empty((problem.n_exposures, 2 * problem.n_modes))
-    for i in range(problem.n_exposures):
-        part = problem.part(i)
-        z, f = y[:, problem.star[part]], blocks.coupling[:, :, part]
-        out[i] = ((f[0] * z[0] + f[1] * z[1]) @ blocks.values[:, part].T).ravel()
-    return out
-
-
-def reduced_matrix(problem, blocks):
-    """Schur complement ``S = U - E' V^-1 E`` with the stars eliminated, shape (n_unknowns, n_unknowns).
-
-    The product is taken over blocks of stars, each a dense matrix product.
-    """
-    size = 2 * problem.n_modes
-    n = problem.n_exposures * size
-    out = np.zeros((n, n))
-    for i in range(problem.n_exposures):
-        out[i * size : (i + 1) * size, i * size : (i + 1) * size] = blocks.u[i]
-    for factor in star_factors(problem, blocks):
-        out -= factor @ factor.T
-    return out
-
-
-def star_factors(problem, blocks, *, n_block=512):
-    """Yield ``E' L`` for blocks of stars, with ``L L' = V^-1``: arrays (n_unknowns, 2 n_block)."""
-    size = 2 * problem.n_modes
-    inverse = inverse_star_blocks(blocks.v)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        l00 = np.sqrt(inverse[0])
-        l10 = np.where(l00 > 0, inverse[2] / l00, 0)
-        l11 = np.sqrt(np.maximum(inverse[1] - l10**2, 0))
-    for first in range(0, problem.n_stars, n_block):
-        last = min(first + n_block, problem.n_stars)
-        factor = np.zeros((problem.n_exposures * size, 2, last - first))
-        for i in range(problem.n_exposures):
-            lo, hi = problem.start[i] + np.searchsorted(problem.star[problem.part(i)], [first, last])
-            star, f, b = problem.star[lo:hi], blocks.coupling[:, :, lo:hi], blocks.values[:, lo:hi]
-            column = [f[0] * l00[star] + f[1] * l10[star], f[1] * l11[star]]  # each (axis, n)
-            for k in (0, 1):
-                rows = (column[k][:, None, :] * b).reshape(size, -1)
-                factor[i * size : (i + 1) * size, k, star - first] = rows
-        yield factor.reshape(len(factor), -1)

@@ -1,6 +1,5 @@
 """A simulated night run through the whole road and compared with its truth."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ from scipy.spatial import cKDTree
 from . import performance
 from .files import replacing
 from .instruments import gsaoi_static
-from .pipeline import check_folder, run
+from .pipeline import check_folder, run, write_summary
 from .priors import Prior
 from .simulation import simulate_exposures
 
@@ -50,7 +49,7 @@ def run_demo(*, out, small=False, seed=0, overwrite=False, progress=False):
     result = run(paths, out=out, prior=prior, overwrite=overwrite, progress=progress)
     result.summary.update(compare(result.solution, night.truth, seed=seed))
     with replacing(out / "summary.json", overwrite=True) as temporary:
-        temporary.write_text(json.dumps(result.summary, indent=1) + "\n")
+        write_summary(temporary, result.summary)
     return result
 
 

@@ -4,14 +4,17 @@ import logging
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 from scipy.optimize import brentq
 
-from . import criterion, outliers, solvers, starting
+from . import basis, criterion, outliers, solvers, starting
 from .exceptions import InputError
+from .gauge import KINDS
+from .matches import Matches
 from .solution import Solution
 from .uncertainty import Uncertainty
 
@@ -51,7 +54,8 @@ def solve(
     method : {"joint", "alternating"}
         Gauss-Newton on all unknowns, or the scheme of the paper.
     loss : {"linear", "huber", "cauchy"}
-        Robust losses give deviant observations less weight.
+        Robust losses give deviant observations less weight. Against many gross mismatches "huber" is too mild: use
+        `clip`, or "cauchy".
     clip : float, optional
         Leave out observations whose residual exceeds this many standard errors (at the observed scale, if
         that is larger than the stated errors); they are listed in ``residuals["used"]``.
@@ -73,18 +77,14 @@ def solve(
     SolveError
         If an exposure has fewer stars than modes, or the unknowns are not determined.
     """
-    if method not in METHODS:
-        raise InputError(f"method must be one of {', '.join(map(repr, METHODS))}, got {method!r}")
-    if method == "alternating" and (loss != "linear" or clip is not None):
-        raise InputError("method='alternating' is the published scheme: it takes neither loss nor clip")
-    if loss not in solvers.LOSSES:
-        raise InputError(f"loss must be one of {', '.join(map(repr, solvers.LOSSES))}, got {loss!r}")
-    if errors not in ERRORS:
-        raise InputError(f"errors must be one of {', '.join(map(repr, ERRORS))}, got {errors!r}")
-    if errors == "floor" and error_floor:
-        raise InputError("errors='floor' finds the error floor itself: leave error_floor out")
-    if clip is not None and not clip > 1:
-        raise InputError(f"clip must be a number of standard errors above 1, got {clip!r}")
+    check_options(
+        degree=degree, gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
+        max_iterations=max_iterations,
+    )  # fmt: skip
+    if not isinstance(matches, Matches):
+        raise InputError(
+            f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
+        )
     options = {
         "degree": degree,
         "prior": prior,
@@ -112,6 +112,32 @@ def solve(
         "prior": prior is not None,
     }
     return _solution(fit, scale, settings)
+
+
+def check_options(*, degree=3, gauge="minimal", method="joint", loss="linear", clip=None, error_floor=0.0,
+                  errors="stated", max_iterations=None):  # fmt: skip
+    """Raise `InputError` for options of `solve` that are out of range or contradict one another."""
+    basis.check_degree(degree)
+    if gauge not in KINDS:
+        raise InputError(f"gauge must be one of {', '.join(map(repr, KINDS))}, got {gauge!r}")
+    if not (isinstance(error_floor, Real) and np.isfinite(error_floor) and error_floor >= 0):
+        raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
+    if method not in METHODS:
+        raise InputError(f"method must be one of {', '.join(map(repr, METHODS))}, got {method!r}")
+    if method == "alternating" and (loss != "linear" or clip is not None):
+        raise InputError("method='alternating' is the published scheme: it takes neither loss nor clip")
+    if loss not in solvers.LOSSES:
+        raise InputError(f"loss must be one of {', '.join(map(repr, solvers.LOSSES))}, got {loss!r}")
+    if errors not in ERRORS:
+        raise InputError(f"errors must be one of {', '.join(map(repr, ERRORS))}, got {errors!r}")
+    if errors != "stated" and loss != "linear":
+        raise InputError(f"errors={errors!r} compares chi2 with its expectation, which loss={loss!r} changes; use clip")
+    if errors == "floor" and error_floor:
+        raise InputError("errors='floor' finds the error floor itself: leave error_floor out")
+    if max_iterations is not None and not (isinstance(max_iterations, int) and max_iterations > 0):
+        raise InputError(f"max_iterations must be a positive integer, got {max_iterations!r}")
+    if clip is not None and not (isinstance(clip, Real) and clip > 1):
+        raise InputError(f"clip must be a number of standard errors above 1, got {clip!r}")
 
 
 def _threads(matches):
@@ -162,7 +188,8 @@ class _Fit:
         """Degrees of freedom: the directions fixed by the gauge are no unknowns, and a prior does part of the work."""
         problem = self.problem
         n_stars = np.count_nonzero(self.blocks.v[0] > 0)
-        n_free = 2 * n_stars + (problem.n_exposures - 1) * 2 * problem.n_modes
+        n_modes = max(problem.n_modes, 2)  # at degree 0 the poses still fit rotation and scale: 4 in all
+        n_free = 2 * n_stars + (problem.n_exposures - 1) * 2 * n_modes
         if problem.prior_sigma is not None:
             size = 2 * problem.n_modes
             blocks = self.uncertainty.coefficients.reshape(problem.n_exposures, size, problem.n_exposures, size)

@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from . import basis, poses
-from .criterion import State, complement
+from .criterion import SMALLEST_WIDTH, State, complement
 from .exceptions import InputError, SolveError
 from .priors import dynamic_basis, similarity_basis, similarity_part
 
@@ -182,26 +182,25 @@ def make(kind, problem, state, blocks):
     similar = _by_shape(similarity_basis, problem)
     others = _by_shape(dynamic_basis, problem)
     error = _conditional_errors(blocks.u_data)
-    held = problem.prior_sigma is not None
+    held = np.array([problem.is_held(i) for i in range(problem.n_exposures)])
     dynamic = _dynamic_covariance(problem, state, error, motion, others)
     if kind == "mean":
         constraint = np.broadcast_to(np.eye(motion.shape[1])[:, None], (motion.shape[1], *motion.shape[:2])).copy()
     else:
         constraint = _minimal_constraint(motion, error, dynamic, similar, others, box, held=held)
-    return Gauge(kind, constraint, motion, dynamic, box, problem.static_sigma, held)
+    return Gauge(kind, constraint, motion, dynamic, box, problem.static_sigma, bool(held.any()))
 
 
 def _minimal_constraint(motion, error, dynamic, similar, others, box, *, held):
     """Rows ``N_i' W_i``: those of all but the common similarities see the departures without their similarity part.
 
-    With prior widths (`held`) the weight is that of the prior alone: the constraint is then where the prior by itself
-    would settle, and the covariance under it that of truths drawn from the prior.
+    With prior widths (exposures `held`) the weight is that of the prior alone: the constraint is then where the prior
+    by itself would settle, and the covariance under it that of truths drawn from the prior.
     """
-    spread = dynamic if held else dynamic + error
+    spread = dynamic + np.where(held, 0, 1)[:, None, None] * error
     inner = others @ spread @ others.transpose(0, 2, 1)
     weight = others.transpose(0, 2, 1) @ np.linalg.solve(inner, others) if others.shape[1] else np.zeros_like(error)
-    if not held:
-        weight = _say(error, others)[:, None, None] * weight
+    weight = np.where(held, 1, _say(error, others))[:, None, None] * weight
     pose_weight = _say(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
     common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
     pulled = motion.transpose(0, 2, 1)
@@ -266,10 +265,6 @@ def _dynamic_covariance(problem, state, error, motion, others):
     that makes the weighted scatter what it should be (Paule & Mandel 1982).
     """
     n_modes = problem.n_modes
-    if problem.prior_sigma is not None:
-        variance = np.minimum(problem.prior_sigma.reshape(problem.n_exposures, -1), 1e6) ** 2
-        inner = others * variance[:, None, :] @ others.transpose(0, 2, 1)
-        return others.transpose(0, 2, 1) @ inner @ others
     departure = (state.coefficients - problem.prior_mean)[:, :, :n_modes].reshape(problem.n_exposures, -1)
     own = np.einsum("ika,ia->ik", others, departure)
     moved = others @ motion
@@ -278,7 +273,13 @@ def _dynamic_covariance(problem, state, error, motion, others):
     common = np.linalg.pinv(normal, rcond=1e-10, hermitian=True) @ np.einsum("i,ika,ik->a", w, moved, own)
     variance = np.einsum("ika,iab,ikb->ik", others, error, others, optimize=True)
     scatter = _pooled(_excess_scatter(own - moved @ common, variance), problem.n_exposures - 1)
-    return others.transpose(0, 2, 1) * scatter**2 @ others
+    out = others.transpose(0, 2, 1) * scatter**2 @ others
+    for i in range(problem.n_exposures):
+        if problem.is_held(i):
+            width = problem.prior_sigma[i].ravel()
+            given = np.where(np.isfinite(width), np.maximum(width, SMALLEST_WIDTH) ** 2, np.diag(out[i]))
+            out[i] = others[i].T @ (others[i] * given @ others[i].T) @ others[i]
+    return out
 
 
 def _pooled(scatter, n_free):

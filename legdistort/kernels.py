@@ -239,13 +239,13 @@ def linearise(problem, state):
 
 
 def to_stars(problem, blocks, a):
-    """Twin of `legdistort.criterion.to_stars`."""
+    """Twin of `legdistort.elimination.to_stars`."""
     sums = _to_stars(get_num_threads(), problem.start, problem.star, blocks.values, blocks.coupling, a, problem.n_stars)
     return sums.sum(axis=0).T.copy()
 
 
 def to_exposures(problem, blocks, y):
-    """Twin of `legdistort.criterion.to_exposures`."""
+    """Twin of `legdistort.elimination.to_exposures`."""
     out = _to_exposures(
         get_num_threads(), problem.start, problem.star, blocks.values, blocks.coupling, np.ascontiguousarray(y)
     )

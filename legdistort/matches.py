@@ -124,7 +124,7 @@ class Matches:
         return f"<Matches: {len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures>"
 
     @classmethod
-    def from_table(cls, table, *, shape, poses=None, sky=None, left_out=None):
+    def from_table(cls, table, *, shape, poses=None, columns=None, sky=None, left_out=None):
         """Matches from anybody's table.
 
         Parameters
@@ -136,6 +136,8 @@ class Matches:
             ``(ny, nx)``, or that by exposure.
         poses : dict, optional
             ``{exposure: (2, 3)}``, reference -> undistorted pixels; estimated from the positions if not given.
+        columns : dict, optional
+            ``{our name: name in the table}``, for example ``{"star": "name", "x_err": "xe"}``.
         sky : `~legdistort.poses.TangentPlane`, optional
         left_out : dict, optional
             Passed on.
@@ -147,10 +149,16 @@ class Matches:
         MatchError
             For one exposure only, or exposures in groups without a common star.
         """
+        if columns:
+            table = catalogs.rename(table, columns)
         table = catalogs.check(table, catalogs.MATCHED, "the table of matched positions")
         table["exposure"] = table["exposure"].astype(str)
         names, exposure_index = _first_seen(table["exposure"])
+        for name in names:
+            if not name.strip(". ") or "/" in name or "\\" in name:
+                raise InputError(f"exposure {name!r} cannot be the name of a file; rename it (no slashes, not empty)")
         shapes = _by_exposure(shape, names)
+        _check_inside(table, exposure_index, names, shapes)
         stars, star_index = _ranked(table["star"])
         _check_duplicates(table, exposure_index, star_index, len(stars))
         _check_connected(exposure_index, star_index, names, len(stars))
@@ -232,6 +240,21 @@ def _check_duplicates(table, exposure, star, n_stars):
             f"star {table['star'][rows[0]]} stands {'twice' if len(same) == 1 else 'more than once'} in exposure "
             f"{table['exposure'][rows[0]]} (rows {rows[0]} and {rows[1]}; {len(same)} such rows in all); "
             "keep one position of a star in an exposure"
+        )
+
+
+def _check_inside(table, exposure, names, shapes):
+    """Positions belong on their detector, give or take a tenth of its size."""
+    size = np.array([shapes[name][::-1] for name in names])[exposure]
+    xy = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
+    out = ((xy < -0.1 * size) | (xy > 1.1 * size)).any(axis=1)
+    if out.any():
+        row = int(np.flatnonzero(out)[0])
+        name = names[exposure[row]]
+        raise InputError(
+            f"{np.count_nonzero(out)} positions lie outside their detector; the first is row {row}, star "
+            f"{table['star'][row]} of exposure {name} at ({xy[row, 0]:.0f}, {xy[row, 1]:.0f}) px, where the shape is "
+            f"{shapes[name]} (ny, nx): correct the shape or the position"
         )
 
 
@@ -323,11 +346,19 @@ def estimate_poses(exposure, star, xy, *, names=None):
                 f"exposure {names[best]} shares {len(r)} star{'s' * (len(r) != 1)} with the other exposures; its shift "
                 "and rotation need at least 2: give poses, or leave it out"
             )
-        found[best] = robust_similarity(sums[star[r]] / counts[star[r], None], xy[r])
+        mean = sums[star[r]] / counts[star[r], None]
+        found[best] = robust_similarity(mean, xy[r])
+        off = np.hypot(*(poses.apply(found[best], mean) - xy[r]).T)
+        if np.median(off) > 0.05 * np.ptp(xy[r], axis=0).max():
+            continue  # mismatched: it gets a pose, but has no say in those of the others
         back = poses.apply(poses.invert(found[best]), xy[rows[best]])
         np.add.at(sums, star[rows[best]], back)
         np.add.at(counts, star[rows[best]], 1)
     return _refine_poses([found[i] for i in range(n_exposures)], rows, star, xy)
+
+
+def _scales(pose_list):
+    return np.sqrt(np.abs(np.linalg.det(np.stack(pose_list)[:, :, :2])))
 
 
 def _refine_poses(pose_list, rows, star, xy, n_sweeps=3):
@@ -340,6 +371,9 @@ def _refine_poses(pose_list, rows, star, xy, n_sweeps=3):
         mean = _star_means(back, star, star.max() + 1)
         refined = [robust_similarity(mean[star[r]], xy[r]) for r in rows]
         old, new = ([poses.apply(poses.invert(p), ends) for p in pair] for pair in (pose_list, refined))
-        common = poses.fit_similarity(np.concatenate(old), np.concatenate(new), parity=1)
+        usual = np.abs(np.log(_scales(refined) / np.median(_scales(refined)))) < np.log(1.5)
+        old, new = (np.concatenate([pair for pair, keep in zip(ends_of, usual, strict=True) if keep])
+                    for ends_of in (old, new))  # fmt: skip
+        common = robust_similarity(old, new)
         pose_list = [poses.compose(pose, common) for pose in refined]
     return pose_list

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from . import criterion, solvers
+from . import criterion, elimination, solvers
 from .exceptions import ConvergenceWarning
 
 #: Rounds of rejection after the robust start; each only takes away.
@@ -72,7 +72,7 @@ def deviations(problem, weighted, blocks):
         Of the weighted problem.
     """
     leverage = np.zeros(problem.xy.shape[1])
-    star_inverse, n_modes = criterion.inverse_star_blocks(blocks.v), problem.n_modes
+    star_inverse, n_modes = elimination.inverse_star_blocks(blocks.v), problem.n_modes
     for i in range(problem.n_exposures):
         part = problem.part(i)
         w, f, b = weighted.weight[:, part], blocks.coupling[:, :, part], blocks.values[:, part]

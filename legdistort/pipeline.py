@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import time
 import warnings
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from . import archive, performance
 from .coaddition import coadd
-from .estimation import solve
+from .estimation import check_options, solve
 from .exceptions import AssumptionWarning, InputError, MatchError
 from .exposures import Exposure, read_exposures
 from .files import replacing_folder
@@ -99,10 +100,16 @@ def run(
     """
     out = Path(out)
     check_folder(out, overwrite)
+    check_options(degree=degree, clip=clip, **(solving or {}))
     timings = {}
     with _timed(timings, "read"):
         exposures = read_exposures(paths, ext=ext, progress=progress)
         _check_shapes(exposures)
+        if min_exposures > len(exposures):
+            raise InputError(
+                f"min_exposures is {min_exposures}, but there are {len(exposures)} exposures: "
+                f"give min_exposures={len(exposures)} (--min-exposures) or less"
+            )
     with _timed(timings, "measure"):
         detections = measure(exposures, progress=progress, **(measuring or {}))
     with _timed(timings, "match"):
@@ -119,7 +126,7 @@ def run(
             sharpness = fwhm_ratio(mosaic, solution)
         summary = summarise(solution, timings=timings) | {"fwhm_ratio": sharpness}
         write_report(target / "report.html", solution, mosaic=mosaic, summary=summary)
-        (target / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+        write_summary(target / "summary.json", summary)
     return Run(out, solution, mosaic, summary)
 
 
@@ -130,6 +137,11 @@ def write_results(solution, target):
     (target / "wcs").mkdir()
     for name in solution.names:
         archive.write_wcs(solution, name, target / "wcs" / f"{name}.asdf")
+
+
+def write_summary(path, summary):
+    """Write figures as JSON."""
+    Path(path).write_text(json.dumps(summary, indent=1) + "\n")
 
 
 def summarise(solution, *, timings=None):
@@ -184,6 +196,9 @@ def check_folder(out, overwrite):
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; give a folder for the results")
+    parent = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
+    if not os.access(parent, os.W_OK):
+        raise InputError(f"{out} cannot be written: no permission in {parent}; give another folder")
     if (out / "solution.asdf").exists() and not overwrite:
         raise InputError(f"{out} already holds a run; give overwrite=True (--overwrite) or another folder")
 

@@ -16,7 +16,6 @@ from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 from astropy.wcs.wcsapi import BaseLowLevelWCS
 from numpy.polynomial.chebyshev import chebvander
-from reproject import reproject_adaptive, reproject_exact, reproject_interp
 from scipy.ndimage import map_coordinates
 
 from . import poses
@@ -290,18 +289,20 @@ def resample(planes, pixel_map, *, algorithm="interp", order=1):
     ndarray, shape (k, my, mx)
         NaN outside the detector.
     """
+    import reproject  # brings dask along, which takes a third of a second
+
     options = {"shape_out": (len(planes), *pixel_map.area.shape), "return_footprint": False}
     if algorithm == "exact":
         scale = 1 / max(pixel_map.area.shape)
         wcs_in, wcs_out = _TableWCS(to_world=pixel_map.corners, scale=scale), _TableWCS(scale=scale)
-        out = reproject_exact((planes, wcs_in), wcs_out, **options)
+        out = reproject.reproject_exact((planes, wcs_in), wcs_out, **options)
     else:
         options["roundtrip_coords"] = False
         if algorithm == "interp":
-            out = reproject_interp((planes, _TableWCS(pixel_map.xy)), _TableWCS(), order=order, **options)
+            out = reproject.reproject_interp((planes, _TableWCS(pixel_map.xy)), _TableWCS(), order=order, **options)
         else:  # asks one pixel beyond the grid, which is extrapolated linearly
             wider = np.pad(pixel_map.xy, ((0, 0), (1, 1), (1, 1)), mode="reflect", reflect_type="odd")
-            out = reproject_adaptive((planes, _TableWCS(wider, margin=1)), _TableWCS(), **options)
+            out = reproject.reproject_adaptive((planes, _TableWCS(wider, margin=1)), _TableWCS(), **options)
     out[:, ~pixel_map.inside] = np.nan
     return out
 

@@ -86,9 +86,9 @@ class Solution:
         table = QTable({"star": self.star_names, "x": self.positions[:, 0] * u.pix, "y": self.positions[:, 1] * u.pix})
         variance = self.uncertainty.stars
         hidden = self.hidden_variance(self.positions)
-        for k, axis in enumerate("xy"):
-            table[f"{axis}_err"] = np.sqrt(variance[k]) * u.pix
-            table[f"{axis}_err_abs"] = np.sqrt(variance[k] + hidden[:, k]) * u.pix
+        for suffix, extra in (("err", np.zeros_like(hidden)), ("err_abs", hidden)):
+            for k, axis in enumerate("xy"):
+                table[f"{axis}_{suffix}"] = np.sqrt(variance[k] + extra[:, k]) * u.pix
         table["xy_corr"] = variance[2] / np.sqrt(variance[0] * variance[1])
         used = self.observations[self.observations["used"]]
         index = np.searchsorted(self.star_names, used["star"])

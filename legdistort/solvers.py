@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from . import criterion
+from . import criterion, elimination
 from . import gauge as gauges
 from .criterion import State
 from .exceptions import ConvergenceWarning, InputError, SolveError
@@ -139,7 +139,7 @@ def _departure(problem, state):
 
 def _step_size(blocks, d_star, d_exposure):
     """Rms step in standard errors, from the diagonal blocks (stars and exposures conditionally on each other)."""
-    stars = (criterion.symmetric_times(blocks.v, d_star) * d_star).sum()
+    stars = (elimination.symmetric_times(blocks.v, d_star) * d_star).sum()
     exposures = np.einsum("ia,iab,ib->", d_exposure, blocks.u, d_exposure)
     return float(np.sqrt((stars + exposures) / (d_star.size + d_exposure.size)))
 
@@ -181,16 +181,16 @@ def newton_step(problem, blocks, gauge, departure, *, accuracy=1e-10):
     d_star : ndarray, shape (2, n_stars)
     d_exposure : ndarray, shape (n_exposures, 2 n_modes)
     """
-    inverse = criterion.inverse_star_blocks(blocks.v)
-    alone = criterion.symmetric_times(inverse, blocks.g_star)
-    rhs = (blocks.g_exposure - criterion.to_exposures(problem, blocks, alone)).ravel()
+    inverse = elimination.inverse_star_blocks(blocks.v)
+    alone = elimination.symmetric_times(inverse, blocks.g_star)
+    rhs = (blocks.g_exposure - elimination.to_exposures(problem, blocks, alone)).ravel()
     target = -gauge.violation(departure)
     if uses_direct(problem):
         d = ReducedSystem(problem, blocks, gauge).solve(rhs, target)
     else:
         d = _conjugate_gradients(problem, blocks, gauge.orthonormal, rhs, target, tolerance=accuracy)
     d = d.reshape(problem.n_exposures, -1)
-    d_star = alone - criterion.symmetric_times(inverse, criterion.to_stars(problem, blocks, d))
+    d_star = alone - elimination.symmetric_times(inverse, elimination.to_stars(problem, blocks, d))
     return d_star, d
 
 
@@ -210,7 +210,7 @@ class ReducedSystem:
     """
 
     def __init__(self, problem, blocks, gauge):
-        s = criterion.reduced_matrix(problem, blocks)
+        s = elimination.reduced_matrix(problem, blocks)
         self.rows = gauge.orthonormal
         s += np.mean(np.diag(s)) * self.rows.T @ self.rows  # lifts the gauge directions; undone by the multipliers
         # unit diagonal: coefficients of bright and faint exposures then compare
@@ -260,14 +260,14 @@ def _conjugate_gradients(problem, blocks, rows, rhs, target, *, tolerance, max_i
     Projected conjugate gradients with the constraint preconditioner of Gould, Hribar & Nocedal (2001): every
     iterate satisfies ``rows d = target``.
     """
-    inverse = criterion.inverse_star_blocks(blocks.v)
+    inverse = elimination.inverse_star_blocks(blocks.v)
     block_inverse = np.linalg.inv(blocks.u)
     shape = blocks.g_exposure.shape
 
     def multiply(d):
-        y = criterion.symmetric_times(inverse, criterion.to_stars(problem, blocks, d.reshape(shape)))
+        y = elimination.symmetric_times(inverse, elimination.to_stars(problem, blocks, d.reshape(shape)))
         d = d.reshape(shape)
-        return (np.einsum("iab,ib->ia", blocks.u, d) - criterion.to_exposures(problem, blocks, y)).ravel()
+        return (np.einsum("iab,ib->ia", blocks.u, d) - elimination.to_exposures(problem, blocks, y)).ravel()
 
     def block_solve(r):
         return np.einsum("iab,ib->ia", block_inverse, r.reshape(shape)).ravel()
@@ -326,7 +326,7 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=1000, t
     for _sweep in range(1, max_iterations + 1):
         before = state
         for _ in range(3):  # stars given A: a few Newton steps, each star by itself
-            step = criterion.symmetric_times(criterion.inverse_star_blocks(blocks.v), blocks.g_star)
+            step = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
             state = State(state.positions + step, state.coefficients, state.poses)
             blocks = criterion.linearise(problem, state)
             if np.abs(step).max() < 1e-9:

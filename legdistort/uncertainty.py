@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from . import criterion, solvers
+from . import elimination, solvers
 from .exceptions import AssumptionWarning
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
@@ -53,13 +53,13 @@ class Uncertainty:
     def stars(self):
         """Covariance xx, yy, xy of every star's position in the gauge, shape (3, n_stars), px^2."""
         problem, blocks = self._problem, self._blocks
-        inverse = criterion.inverse_star_blocks(blocks.v)
+        inverse = elimination.inverse_star_blocks(blocks.v)
         with np.errstate(divide="ignore", invalid="ignore"):
             l00 = np.sqrt(inverse[0])
             l10 = np.where(l00 > 0, inverse[2] / l00, 0)
             l11 = np.sqrt(np.maximum(inverse[1] - l10**2, 0))
         inner = np.concatenate(
-            [_block_diagonal(factor, self.coefficients) for factor in criterion.star_factors(problem, blocks)], axis=1
+            [_block_diagonal(factor, self.coefficients) for factor in elimination.star_factors(problem, blocks)], axis=1
         )
         c00, c11, c01 = inner / self._scale**2
         extra_xx = l00**2 * c00
@@ -73,7 +73,7 @@ class Uncertainty:
     def star_matrix(self):
         """Covariance between all star positions in the gauge, shape (2 n_stars,) squared, px^2; all x first."""
         problem, blocks = self._problem, self._blocks
-        inverse = criterion.inverse_star_blocks(blocks.v)
+        inverse = elimination.inverse_star_blocks(blocks.v)
         n = problem.n_stars
         alone = np.zeros((2, n, 2, n))
         index = np.arange(n)

@@ -131,7 +131,7 @@ def test_files_give_the_table_back(tmp_path, ending):
 
 def test_a_list_without_exposures_is_one_exposure(tmp_path):
     table(exposure=None).write(tmp_path / "night1.lis.txt", format="ascii.basic")
-    assert set(catalogs.read_table(tmp_path / "night1.lis.txt")["exposure"]) == {"night1"}
+    assert set(catalogs.read_table(tmp_path / "night1.lis.txt")["exposure"]) == {"night1.lis"}
 
 
 @pytest.mark.parametrize(("name", "n"), [("A", 135), ("B", None), ("C", None), ("D", None)])

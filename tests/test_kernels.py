@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from legdistort import criterion, solvers, starting
+from legdistort import criterion, elimination, solvers, starting
 from legdistort.estimation import solve
 from legdistort.priors import Prior
 from legdistort.simulation import simulate_matches
@@ -29,7 +29,7 @@ def test_compiled_sums_are_the_plain_ones(monkeypatch, settings):
     state, _ = starting.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
     plain = criterion.linearise(problem, state)
     a, y = RNG.normal(size=plain.g_exposure.shape), RNG.normal(size=(2, problem.n_stars))
-    sums = criterion.to_stars(problem, plain, a), criterion.to_exposures(problem, plain, y)
+    sums = elimination.to_stars(problem, plain, a), elimination.to_exposures(problem, plain, y)
     monkeypatch.setattr(criterion, "COMPILED_FROM", 0)
     assert problem.compiled
     fast = criterion.linearise(problem, state)
@@ -37,7 +37,7 @@ def test_compiled_sums_are_the_plain_ones(monkeypatch, settings):
         expected = getattr(plain, name)
         tolerance = 1e-6 if name in ("coupling", "values") else 1e-10  # kept in single precision
         assert_allclose(getattr(fast, name), expected, atol=tolerance * np.abs(expected).max(), err_msg=name)
-    fast_sums = criterion.to_stars(problem, fast, a), criterion.to_exposures(problem, fast, y)
+    fast_sums = elimination.to_stars(problem, fast, a), elimination.to_exposures(problem, fast, y)
     for mine, expected in zip(fast_sums, sums, strict=True):
         assert_allclose(mine, expected, atol=1e-6 * np.abs(expected).max())
 
