@@ -83,7 +83,8 @@ def run(
     clip : float or None
         Leave out observations beyond this many standard errors.
     measuring, matching, solving, coadding : dict, optional
-        Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`.
+        Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`. The stack is ``"clipped"`` here:
+        hot pixels and cosmic rays do not get into it.
     overwrite : bool
         Replace the results of an earlier run.
     progress : bool
@@ -118,7 +119,7 @@ def run(
         solution = solve(matches, degree=degree, prior=prior, clip=clip, **(solving or {}))
     with _timed(timings, "coadd"):
         kept = [exposure for exposure in exposures if exposure.name in solution.names]
-        mosaic = coadd(kept, solution, progress=progress, **(coadding or {}))
+        mosaic = coadd(kept, solution, progress=progress, **({"method": "clipped"} | (coadding or {})))
     with replacing_folder(out) as target:
         with _timed(timings, "write"):
             write_results(solution, target)
