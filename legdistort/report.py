@@ -251,7 +251,7 @@ def _distortion_figures(solution):
     which = "each exposure" if len(names) == len(solution.names) else f"the {len(names)} exposures that depart most"
     part = "nonlinear" if solution.coefficients.shape[2] > 3 else "total"  # shears would hide the rest
     gentle = plotting.distortion_scale(solution, names, part=part)  # largest displacement a tenth of the detector
-    scale = 50 if gentle >= 20 else gentle
+    scale = 50 if gentle >= 10 else gentle
     text = (
         f"Distortion of {which}{', without its linear part' * (part == 'nonlinear')}, magnified {scale:g} times: "
         "a regular grid (grey) as the detector sees it; a panel unlike the others, or lines that cross or crowd at an "

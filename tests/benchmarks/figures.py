@@ -44,11 +44,9 @@ def gsaoi(n_seeds=50):
                 performance.expected_bias(solution, removed="similarity", absolute=True),
             ]
         )
-    b, bound, absolute, reported = rms(np.array(rows).T[0]), *(rms(column) for column in np.array(rows).T[1:])
-    print(
-        f"GSAOI-like, {n_seeds} seeds: b {b:.4f} px, bound {bound:.4f}, ratio {b / bound:.3f}; absolute {absolute:.4f},"
-    )
-    print(f"  reported {reported:.4f}, ratio {absolute / reported:.3f}")
+    b, bound, absolute, reported = (rms(column) for column in zip(*rows, strict=True))
+    print(f"GSAOI-like, {n_seeds} seeds: b {b:.4f} px, bound {bound:.4f}, ratio {b / bound:.3f}")
+    print(f"  absolute {absolute:.4f} px, reported {reported:.4f}, ratio {absolute / reported:.3f}")
 
 
 if __name__ == "__main__":
