@@ -85,6 +85,7 @@ def match(
     shapes = _shapes(table, names, named, shape)
     if "flags" in table.colnames:
         table = table[(np.asarray(table["flags"]).astype(int) & int(reject_flags)) == 0]
+    table = _without_repetitions(table)
     headers = _Headers({n: e.wcs for n, e in (named or {}).items() if e.wcs is not None}, shapes)
 
     rows = {name: np.flatnonzero(table["exposure"] == name) for name in names}
@@ -97,6 +98,15 @@ def match(
         star[rows[name]] = labels
     table, star = _keep_common(table, star, min_exposures, left_out)
     return _finish(table, star, shapes, headers, left_out)
+
+
+def _without_repetitions(table):
+    """The table without rows that repeat a position of the same exposure: they would pass for two blended stars."""
+    place = np.rec.fromarrays([table["exposure"], table["x"].value, table["y"].value])
+    first = np.sort(np.unique(place, return_index=True)[1])
+    if len(first) < len(table):
+        logger.warning("%d detections stand twice at the very same place; one of each is kept", len(table) - len(first))
+    return table[first]
 
 
 def _check_arguments(table, names, min_exposures, tolerance):

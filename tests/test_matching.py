@@ -12,6 +12,7 @@ from legdistort.exceptions import AssumptionWarning, InputError, MatchError
 from legdistort.exposures import Exposure
 from legdistort.matching import match
 from legdistort.registration import Registration, register
+from legdistort.simulation import simulate_matches
 from legdistort.warps import StarList, Warp
 
 SHAPE = (2048, 2048)
@@ -453,3 +454,12 @@ def test_real_frames(shared_data):
     # nothing that stands still on the detector
     spans = [np.ptp(matches.table["x"][matches.table["star"] == s].value) for s in matches.stars]
     assert min(spans) > 20
+
+
+def test_repeated_rows_count_once(caplog):
+    sim = simulate_matches(n_stars=40, dither=50.0, seed=3)
+    table = sim.matches.table["exposure", "x", "y", "x_err", "y_err"]
+    whole = match(table, shape=(2048, 2048))
+    again = match(vstack([table, table[:5]]), shape=(2048, 2048))
+    assert len(again.table) == len(whole.table)
+    assert "5 detections stand twice" in caplog.text
