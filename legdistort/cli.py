@@ -5,7 +5,7 @@ import json
 import logging
 import sys
 import warnings
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -20,9 +20,8 @@ log = logging.getLogger("legdistort")
 def main(argv=None):
     """Run the command line; returns the exit status: 0, 1 for a failed run, 2 for wrong usage."""
     arguments = _parser().parse_args(argv)
-    _set_up_logging(arguments)
     try:
-        with warnings.catch_warnings():
+        with _logging(arguments), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of other packages
             warnings.simplefilter("default", LegdistortWarning)
             warnings.showwarning = lambda message, *_, **__: log.warning("%s", message)
@@ -47,13 +46,20 @@ def main(argv=None):
     return 0
 
 
-def _set_up_logging(arguments):
+@contextmanager
+def _logging(arguments):
+    """The log of the package on stderr while a command runs; afterwards as it was, for callers of `main`."""
+    before = log.handlers[:], log.propagate, log.level
     level = logging.WARNING if arguments.quiet else logging.INFO
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(message)s"))
-    log.handlers[:] = [handler]
-    log.propagate = False
+    log.handlers[:], log.propagate = [handler], False
     log.setLevel(logging.DEBUG if arguments.debug else level)
+    try:
+        yield
+    finally:
+        log.handlers[:], log.propagate = before[:2]
+        log.setLevel(before[2])
 
 
 def _progress(arguments):
