@@ -163,6 +163,12 @@ class Blocks:
         return self.chi2 + self.penalty
 
 
+def check_error_floor(error_floor):
+    """Raise `InputError` if the floor is not a finite number of pixels, 0 or more."""
+    if not (isinstance(error_floor, Real) and np.isfinite(error_floor) and error_floor >= 0):
+        raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
+
+
 def build(matches, degree, *, prior=None, error_floor=0.0):
     """The problem posed by `legdistort.matches.Matches`.
 
@@ -183,8 +189,7 @@ def build(matches, degree, *, prior=None, error_floor=0.0):
         Naming an exposure with fewer stars than modes and no prior to make up for it.
     """
     degree = basis.check_degree(degree)
-    if not (isinstance(error_floor, Real) and np.isfinite(error_floor) and error_floor >= 0):
-        raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
+    check_error_floor(error_floor)
     obs = matches.observations
     order = _order(obs)
     counts = np.bincount(obs.exposure, minlength=len(matches.names))

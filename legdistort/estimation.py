@@ -12,7 +12,7 @@ from astropy.table import QTable
 from scipy.optimize import brentq
 
 from . import basis, criterion, outliers, solvers, starting
-from .exceptions import InputError
+from .exceptions import InputError, check_choice
 from .gauge import KINDS
 from .matches import Matches
 from .solution import Solution
@@ -96,8 +96,8 @@ def solve(
     }
     with _threads(matches):
         fit = _fit(matches, error_floor, options)
-    if errors == "floor":
-        fit = _fit_with_floor(matches, fit, options)
+        if errors == "floor":
+            fit = _fit_with_floor(matches, fit, options)
     log.info("%s; chi2 %.1f for %d degrees of freedom", fit.result.status, fit.chi2, fit.dof)
     scale = np.sqrt(fit.chi2 / fit.dof) if errors == "scale" and fit.dof > 0 else 1.0
     settings = {
@@ -118,18 +118,13 @@ def check_options(*, degree=3, gauge="minimal", method="joint", loss="linear", c
                   errors="stated", max_iterations=None):  # fmt: skip
     """Raise `InputError` for options of `solve` that are out of range or contradict one another."""
     basis.check_degree(degree)
-    if gauge not in KINDS:
-        raise InputError(f"gauge must be one of {', '.join(map(repr, KINDS))}, got {gauge!r}")
-    if not (isinstance(error_floor, Real) and np.isfinite(error_floor) and error_floor >= 0):
-        raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
-    if method not in METHODS:
-        raise InputError(f"method must be one of {', '.join(map(repr, METHODS))}, got {method!r}")
+    check_choice(gauge, KINDS, "gauge")
+    criterion.check_error_floor(error_floor)
+    check_choice(method, METHODS, "method")
     if method == "alternating" and (loss != "linear" or clip is not None):
         raise InputError("method='alternating' is the published scheme: it takes neither loss nor clip")
-    if loss not in solvers.LOSSES:
-        raise InputError(f"loss must be one of {', '.join(map(repr, solvers.LOSSES))}, got {loss!r}")
-    if errors not in ERRORS:
-        raise InputError(f"errors must be one of {', '.join(map(repr, ERRORS))}, got {errors!r}")
+    check_choice(loss, solvers.LOSSES, "loss")
+    check_choice(errors, ERRORS, "errors")
     if errors != "stated" and loss != "linear":
         raise InputError(f"errors={errors!r} compares chi2 with its expectation, which loss={loss!r} changes; use clip")
     if errors == "floor" and error_floor:

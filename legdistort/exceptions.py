@@ -25,6 +25,12 @@ class FoldError(LegdistortError, ValueError):
     """A distortion maps two places onto one; lower the degree or look at the exposure named."""
 
 
+def check_choice(value, allowed, name):
+    """Raise `InputError` naming the argument if `value` is not one of the words allowed."""
+    if value not in allowed:
+        raise InputError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+
+
 class LegdistortWarning(UserWarning):
     """Base of every warning of the package."""
 

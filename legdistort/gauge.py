@@ -19,7 +19,7 @@ import numpy as np
 
 from . import basis, poses
 from .criterion import SMALLEST_WIDTH, State, complement
-from .exceptions import InputError, SolveError
+from .exceptions import SolveError, check_choice
 from .priors import dynamic_basis, similarity_basis, similarity_part
 
 KINDS = ("minimal", "mean")
@@ -173,8 +173,7 @@ def make(kind, problem, state, blocks):
     SolveError
         If the "mean" gauge leaves a direction free, as for rolls that cancel.
     """
-    if kind not in KINDS:
-        raise InputError(f"gauge must be one of {', '.join(map(repr, KINDS))}, got {kind!r}")
+    check_choice(kind, KINDS, "gauge")
     box = reference_box(problem, state)
     motion = _motion(problem, state.poses, box)
     if kind == "mean":

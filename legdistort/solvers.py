@@ -15,7 +15,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from . import criterion, elimination
 from . import gauge as gauges
 from .criterion import State
-from .exceptions import ConvergenceWarning, InputError, SolveError
+from .exceptions import ConvergenceWarning, SolveError, check_choice
 
 log = logging.getLogger(__name__)
 
@@ -90,8 +90,7 @@ def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iteration
     SolveError
         If the unknowns are not determined.
     """
-    if loss not in LOSSES:
-        raise InputError(f"loss must be one of {', '.join(map(repr, LOSSES))}, got {loss!r}")
+    check_choice(loss, LOSSES, "loss")
     state, _ = gauges.absorb_similarities(problem, state)
     factors, weighted = np.ones(problem.xy.shape[1]), problem
     if loss != "linear":
