@@ -140,7 +140,8 @@ def check(table, contract, what):
             out[name] = labels(table, name)
         elif name in contract:
             column = values(table, name, unit)
-            out[name] = column * unit if unit is not None else column
+            column = column if unit is None else u.Quantity(column, unit, copy=False)
+            out.add_column(column, name=name, copy=False)  # `values` made a copy already
         else:
             out[name] = table[name]
     for name in ("x", "y"):

@@ -220,13 +220,11 @@ def _say(error, rows):
 
 def reference_box(problem, state):
     """Centre and half size (2, 2) of the box of the reference plane that all detectors cover."""
-    corners = []
     scale = np.sqrt(np.abs(np.linalg.det(state.poses[:, :, :2])))
     usual = np.abs(np.log(scale / np.median(scale))) < np.log(2)  # a mismatched exposure may have any scale
-    for shape, pose in zip(np.array(problem.shapes)[usual], state.poses[usual], strict=True):
-        ends = basis.denormalize(_CORNERS[0], _CORNERS[1], tuple(shape))
-        corners.append(poses.apply(poses.invert(pose), ends))
-    corners = np.concatenate(corners)
+    ends = _by_shape(lambda shape, _: basis.denormalize(_CORNERS[0], _CORNERS[1], shape), problem)[usual]
+    pose_list = state.poses[usual]
+    corners = _apply_inverse(pose_list, ends).reshape(-1, 2)
     low, high = corners.min(axis=0), corners.max(axis=0)
     return np.stack([(low + high) / 2, (high - low) / 2])
 
@@ -243,7 +241,7 @@ def _motion(problem, pose_list, box):
     u, v, w = basis.quadrature(degree)
     nodes = _by_shape(lambda shape, _: basis.denormalize(u, v, shape), problem)
     linear = pose_list[:, :, :2]
-    back = (nodes - pose_list[:, None, :, 2]) @ np.linalg.inv(linear).transpose(0, 2, 1)
+    back = _apply_inverse(pose_list, nodes)
     reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
     mixing = np.einsum("mk,nik->imn", basis.values(degree, u, v) * w, reference, optimize=True)
     return np.einsum("iab,imn->iambn", linear, mixing).reshape(-1, 2 * size, 2 * size)
@@ -368,3 +366,8 @@ def absorb_similarities(problem, state):
 def _apply(pose_list, xy):
     """Poses (n, 2, 3) applied to positions (n, k, 2)."""
     return xy @ pose_list[:, :, :2].transpose(0, 2, 1) + pose_list[:, None, :, 2]
+
+
+def _apply_inverse(pose_list, xy):
+    """Positions (n, k, 2) carried back through poses (n, 2, 3)."""
+    return (xy - pose_list[:, None, :, 2]) @ np.linalg.inv(pose_list[:, :, :2]).transpose(0, 2, 1)

@@ -6,7 +6,6 @@ from functools import cached_property
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from . import catalogs, poses
@@ -245,7 +244,12 @@ def _check_duplicates(table, exposure, star, n_stars):
 
 def _check_inside(table, exposure, names, shapes):
     """Positions belong on their detector, give or take a tenth of its size."""
-    size = np.array([shapes[name][::-1] for name in names])[exposure]
+    sizes = np.array([shapes[name][::-1] for name in names])
+    ends = np.array([[table[k].value.min(), table[k].value.max()] for k in ("x", "y")])
+    smallest = sizes.min(axis=0)
+    if np.all(ends[:, 0] >= -0.1 * smallest) and np.all(ends[:, 1] <= 1.1 * smallest):
+        return
+    size = sizes[exposure]
     xy = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
     out = ((xy < -0.1 * size) | (xy > 1.1 * size)).any(axis=1)
     if out.any():
@@ -264,12 +268,15 @@ def _check_connected(exposure, star, names, n_stars):
             f"only one exposure ({names[0]}): the distortion is found from the differences between exposures, "
             "give at least two of the same field"
         )
-    n = len(names) + n_stars
-    graph = coo_array((np.ones(len(star)), (exposure, star + len(names))), shape=(n, n))
-    count, group = connected_components(graph, directed=False)
+    # tie every exposure to the first one of each of its stars: the same groups as all pairs, in a small graph
+    n = len(names)
+    first = np.full(n_stars, n)
+    np.minimum.at(first, star, exposure)
+    tied = np.zeros((n, n), dtype=bool)
+    tied[exposure, first[star]] = True
+    count, group = connected_components(tied, directed=False)
     if count > 1:
-        groups = [[name for name, g in zip(names, group, strict=False) if g == label] for label in range(count)]
-        groups = [g for g in groups if g]
+        groups = [[name for name, g in zip(names, group, strict=True) if g == label] for label in range(count)]
         listed = "; ".join(_shorten(g) for g in groups)
         raise MatchError(
             f"the exposures form {len(groups)} groups with no star in common: {listed}; solve each group by itself"

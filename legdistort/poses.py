@@ -94,13 +94,37 @@ def fit_similarity(source, target, *, weights=None, parity=None):
     if power == 0:
         raise InputError("a similarity needs at least two distinct points, all are at the same place")
     cross = (w[:, None] * dt).T @ ds / power  # M = argmin |dt - M ds|^2 within the similarities
-    keep = np.array([cross[0, 0] + cross[1, 1], cross[1, 0] - cross[0, 1]])
-    flip = np.array([cross[0, 0] - cross[1, 1], cross[1, 0] + cross[0, 1]])
+    keep, flip = (np.hypot(*part) for part in _turns(cross))
     if parity is None:
-        parity = 1 if keep @ keep >= flip @ flip else -1
-    a, b = keep if parity > 0 else flip
-    m = np.array([[a, -b], [b, a]]) if parity > 0 else np.array([[a, b], [b, -a]])
-    return np.column_stack([m, mean_t - m @ mean_s])
+        parity = 1 if keep >= flip else -1
+    return similarity_of(mean_s, mean_t, cross, parity)
+
+
+def similarity_of(mean_s, mean_t, cross, parity):
+    """Least-squares similarities from the moments of their points.
+
+    Parameters
+    ----------
+    mean_s, mean_t : ndarray, shape (..., 2)
+        Weighted mean of source and target.
+    cross : ndarray, shape (..., 2, 2)
+        Weighted sum of target times source about their means, over the sum of squares of the source.
+    parity : ndarray of 1 or -1, shape (...)
+
+    Returns
+    -------
+    ndarray, shape (..., 2, 3)
+    """
+    a, b = np.where(np.asarray(parity) > 0, *_turns(cross))
+    m = np.stack([np.stack([a, -b * parity], axis=-1), np.stack([b, a * parity], axis=-1)], axis=-2)
+    shift = mean_t - np.einsum("...ab,...b->...a", m, mean_s)
+    return np.concatenate([m, shift[..., None]], axis=-1)
+
+
+def _turns(cross):
+    """Scale times cosine and sine of the best rotation, and of the best rotation after a flip of y."""
+    (xx, xy), (yx, yy) = np.moveaxis(cross, (-2, -1), (0, 1))
+    return np.stack([xx + yy, yx - xy]), np.stack([xx - yy, yx + xy])
 
 
 @dataclass(frozen=True, eq=False)

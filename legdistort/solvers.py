@@ -67,7 +67,7 @@ def loss_factors(squares, loss):
     return 1 / np.maximum(1, np.sqrt(s)) if loss == "huber" else 1 / (1 + s)
 
 
-def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iterations=50, tolerance=1e-4):
+def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iterations=50, tolerance=5e-5):
     """Gauss-Newton on all unknowns under the constraints of the gauge.
 
     Parameters
@@ -79,7 +79,7 @@ def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iteration
     loss : {"linear", "huber", "cauchy"}
     max_iterations : int
     tolerance : float
-        Converged when the step is below this many standard errors, rms over the unknowns.
+        Converged when the next step would be below this many standard errors, rms over the unknowns; it is not taken.
 
     Returns
     -------
@@ -101,27 +101,29 @@ def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iteration
     for iteration in range(1, max_iterations + 1):
         convention = gauges.make(gauge, weighted, state, blocks)
         d_star, d_exposure = newton_step(weighted, blocks, convention, _departure(problem, state), accuracy=accuracy)
-        state, blocks, moved = _advance(weighted, state, blocks, d_star, d_exposure)
         size, last = _step_size(blocks, d_star, d_exposure), size
-        if size > 0.1 * last:  # slow: exposures hang together weakly, and the inner iterations must be more exact
-            accuracy = max(0.01 * accuracy, 1e-10)
         history.append(
             {
                 "cost": blocks.cost,
                 "d_positions": float(np.abs(d_star).max()),
                 "d_coefficients": float(np.abs(d_exposure).max()),
-                "d_poses": moved,
                 "step": size,
             }
         )
         log.debug("iteration %d: J = %.8g, step %.2g standard errors", iteration, blocks.cost, size)
+        if size < tolerance:
+            converged = True
+            break
+        if size > 0.1 * last:  # slow: exposures hang together weakly, and the inner iterations must be more exact
+            accuracy = max(0.01 * accuracy, 1e-10)
+        cost, blocks = blocks.cost, None  # makes room for the next
+        state, blocks = _advance(weighted, state, cost, d_star, d_exposure)
         if loss != "linear":
             factors = loss_factors(criterion.squares(problem, blocks.residual), loss)
             weighted = problem.scaled(factors)
             blocks = criterion.linearise(weighted, state)
-        if size < tolerance:
-            converged = True
-            break
+    if not converged:
+        convention = gauges.make(gauge, weighted, state, blocks)
     status = f"converged after {iteration} iterations"
     if not converged:
         status = (
@@ -143,7 +145,7 @@ def _step_size(blocks, d_star, d_exposure):
     return float(np.sqrt((stars + exposures) / (d_star.size + d_exposure.size)))
 
 
-def _advance(problem, state, blocks, d_star, d_exposure):
+def _advance(problem, state, cost, d_star, d_exposure):
     """Take the step, halved while it makes J much larger, and hand the similarities to the poses."""
     n_modes = problem.n_modes
     for halving in range(10):
@@ -151,11 +153,11 @@ def _advance(problem, state, blocks, d_star, d_exposure):
         coefficients = state.coefficients.copy()
         coefficients[:, :, :n_modes] += factor * d_exposure.reshape(-1, 2, n_modes)
         tried = State(state.positions + factor * d_star, coefficients, state.poses)
-        tried, moved = gauges.absorb_similarities(problem, tried)
+        tried, _ = gauges.absorb_similarities(problem, tried)
         new = criterion.linearise(problem, tried)
         # the constraints may cost a little J along directions that are only nearly free
-        if new.cost <= 1.5 * blocks.cost + 10 * problem.xy.size:
-            return tried, new, moved
+        if new.cost <= 1.5 * cost + 10 * problem.xy.size:
+            return tried, new
     raise SolveError(
         "the minimisation diverges: no step, however short, keeps the residuals in bounds; the start is too far off "
         "(wrong poses or many mismatched stars?)"
@@ -181,16 +183,13 @@ def newton_step(problem, blocks, gauge, departure, *, accuracy=1e-10):
     d_exposure : ndarray, shape (n_exposures, 2 n_modes)
     """
     inverse = elimination.inverse_star_blocks(blocks.v)
+    target = -gauge.violation(departure)
+    if not uses_direct(problem):
+        return _conjugate_gradients(problem, blocks, gauge.orthonormal, target, tolerance=accuracy)
     alone = elimination.symmetric_times(inverse, blocks.g_star)
     rhs = (blocks.g_exposure - elimination.to_exposures(problem, blocks, alone)).ravel()
-    target = -gauge.violation(departure)
-    if uses_direct(problem):
-        d = ReducedSystem(problem, blocks, gauge).solve(rhs, target)
-    else:
-        d = _conjugate_gradients(problem, blocks, gauge.orthonormal, rhs, target, tolerance=accuracy)
-    d = d.reshape(problem.n_exposures, -1)
-    d_star = alone - elimination.symmetric_times(inverse, elimination.to_stars(problem, blocks, d))
-    return d_star, d
+    d = ReducedSystem(problem, blocks, gauge).solve(rhs, target).reshape(problem.n_exposures, -1)
+    return alone - elimination.symmetric_times(inverse, elimination.to_stars(problem, blocks, d)), d
 
 
 def uses_direct(problem):
@@ -253,20 +252,32 @@ def _singular_message(problem, s):
     )
 
 
-def _conjugate_gradients(problem, blocks, rows, rhs, target, *, tolerance, max_iterations=1000):
+def _conjugate_gradients(problem, blocks, rows, target, *, tolerance, max_iterations=1000):
     """Matrix-free solution of the reduced system on the constraints, preconditioned by the exposure blocks.
 
     Projected conjugate gradients with the constraint preconditioner of Gould, Hribar & Nocedal (2001): every
-    iterate satisfies ``rows d = target``.
+    iterate satisfies ``rows d = target``. The coupling E d of the iterate is carried along, so that neither the
+    right-hand side nor the stars need a pass of their own.
+
+    Returns
+    -------
+    d_star : ndarray, shape (2, n_stars)
+    d_exposure : ndarray, shape (n_exposures, 2 n_modes)
     """
     inverse = elimination.inverse_star_blocks(blocks.v)
     block_inverse = np.linalg.inv(blocks.u)
     shape = blocks.g_exposure.shape
 
-    def multiply(d):
-        y = elimination.symmetric_times(inverse, elimination.to_stars(problem, blocks, d.reshape(shape)))
-        d = d.reshape(shape)
-        return (np.einsum("iab,ib->ia", blocks.u, d) - elimination.to_exposures(problem, blocks, y)).ravel()
+    def couple(d):
+        return elimination.to_stars(problem, blocks, d.reshape(shape))
+
+    def gradient(own, stars):
+        """``own - E' V^-1 stars``."""
+        back = elimination.to_exposures(problem, blocks, elimination.symmetric_times(inverse, stars))
+        return (own - back).ravel()
+
+    def own(d):
+        return np.einsum("iab,ib->ia", blocks.u, d.reshape(shape))
 
     def block_solve(r):
         return np.einsum("iab,ib->ia", block_inverse, r.reshape(shape)).ravel()
@@ -279,23 +290,27 @@ def _conjugate_gradients(problem, blocks, rows, rhs, target, *, tolerance, max_i
         return z - lifted @ (border @ (rows @ z))
 
     d = lifted @ (border @ target)
-    r = rhs - multiply(d)
+    stars = blocks.g_star - couple(d)
+    r = gradient(blocks.g_exposure - own(d), stars)
     z = precondition(r)
     p, rz = z, r @ z
     goal = max(tolerance**2 * rz, 1e-16 * len(r))  # r'z is in units of chi2: below, only rounding is left
     for count in range(max_iterations):
         if rz <= goal:
             log.debug("conjugate gradients: %d steps", count)
-            return d
-        sp = multiply(p)
+            break
+        ep = couple(p)
+        sp = gradient(own(p), ep)
         step = rz / (p @ sp)
         d = d + step * p
         r = r - step * sp
+        stars = stars - step * ep
         z = precondition(r)
         rz, old = r @ z, rz
         p = z + rz / old * p
-    log.info("conjugate gradients stopped after %d steps at %.1e of the start", max_iterations, np.sqrt(rz))
-    return d
+    else:
+        log.info("conjugate gradients stopped after %d steps at %.1e of the start", max_iterations, np.sqrt(rz))
+    return elimination.symmetric_times(inverse, stars), d.reshape(shape)
 
 
 def solve_alternating(problem, state, *, gauge="minimal", max_iterations=1000, tolerance=1e-5):

@@ -30,59 +30,81 @@ def start(problem, nominal, *, n_sweeps=1, robust=False):
     SolveError
         If the prior cannot be inverted at the observed positions.
     """
-    q = _undistorted(problem)
+    _check_prior(problem)
+    q = undistorted(problem)
     full = problem.weight[:2].sum(axis=0) / 2
     current, weight = np.array(nominal, dtype=float), full
     n_sweeps *= 12 if robust else 1
     for sweep in range(n_sweeps + 1):
-        positions = _mean_positions(problem, current, q, weight)
+        positions = mean_positions(problem, current, q, weight)
         if sweep == n_sweeps:
             break
         if robust:
             distance2 = distances(problem, current, q, positions)
             weight = full / (1 + distance2 / (2 * np.median(distance2) + 1e-12))
-        for i in range(problem.n_exposures):
-            part = problem.part(i)
-            own = problem.star[part]
-            if np.count_nonzero(weight[part]) > 1:
-                parity = 1 if np.linalg.det(current[i, :, :2]) > 0 else -1
-                current[i] = poses.fit_similarity(
-                    positions[:, own].T, q[:, part].T, weights=weight[part], parity=parity
-                )
-    distance2 = distances(problem, current, q, positions)
-    common = _common_similarity(problem, nominal, current, distance2)
+        current = refine(problem, current, q, positions, weight)
+    astray = misplaced(problem, distances(problem, current, q, positions))
+    common = _common_similarity(problem, nominal, current, astray)
     current = np.stack([poses.compose(pose, common) for pose in current])
     positions = poses.apply(poses.invert(common), positions.T).T
-    return State(positions, problem.prior_mean.copy(), current), misplaced(problem, distance2)
+    return State(positions, problem.prior_mean.copy(), current), astray
 
 
-def _undistorted(problem):
-    """Positions (2, n) with the prior distortion taken out to second order, which is enough for a start."""
-    q, checked = problem.xy.copy(), set()
-    for i, (shape, mean) in enumerate(zip(problem.shapes, problem.prior_mean, strict=True)):
-        if not np.any(mean):
+def _check_prior(problem):
+    """Raise `SolveError` if the map of a prior folds."""
+    checked = set()
+    for shape, mean, name in zip(problem.shapes, problem.prior_mean, problem.names, strict=True):
+        key = (shape, mean.tobytes())
+        if key in checked or not np.any(mean):
             continue
-        distortion = Distortion(mean, shape, problem.names[i])
-        if (shape, mean.tobytes()) not in checked:
-            checked.add((shape, mean.tobytes()))
-            try:
-                distortion.check_fold()
-            except FoldError as error:
-                raise SolveError(f"the prior is not usable: {error}") from None
-        x = problem.xy[:, problem.part(i)].T
+        checked.add(key)
+        try:
+            Distortion(mean, shape, name).check_fold()
+        except FoldError as error:
+            raise SolveError(f"the prior is not usable: {error}") from None
+
+
+def undistorted(problem):
+    """Positions (2, n) with the prior distortion taken out to second order, which is enough for a start."""
+    if not np.any(problem.prior_mean):
+        return problem.xy
+    if problem.compiled:
+        from . import kernels
+
+        return kernels.undistorted(problem)
+    q = problem.xy.copy()
+    for i, (shape, mean) in enumerate(zip(problem.shapes, problem.prior_mean, strict=True)):
+        distortion, x = Distortion(mean, shape), problem.xy[:, problem.part(i)].T
         guess = 2 * x - distortion(x)
         q[:, problem.part(i)] = (x - distortion(guess) + guess).T
     return q
 
 
-def _common_similarity(problem, nominal, refined, distance2):
+def refine(problem, pose_list, q, positions, weight):
+    """Poses (n_exposures, 2, 3) that carry star positions (2, n_stars) to undistorted ones q (2, n), parity kept."""
+    parity = np.where(np.linalg.det(pose_list[:, :, :2]) > 0, 1, -1)
+    if problem.compiled:
+        from . import kernels
+
+        fitted = poses.similarity_of(*kernels.moments(problem, q, weight, positions), parity)
+        return np.where(np.isfinite(fitted).all(axis=(1, 2), keepdims=True), fitted, pose_list)
+    out = pose_list.copy()
+    for i in range(problem.n_exposures):
+        part = problem.part(i)
+        source = positions[:, problem.star[part]].T
+        if np.count_nonzero(weight[part]) > 1:
+            out[i] = poses.fit_similarity(source, q[:, part].T, weights=weight[part], parity=parity[i])
+    return out
+
+
+def _common_similarity(problem, nominal, refined, astray):
     """The similarity of the reference plane that brings refined poses back, in the mean, to the nominal ones.
 
     Exposures of like quality count equally, bad ones less, misplaced ones not at all.
     """
     variance = 1 / np.array([problem.weight[:2, problem.part(i)].sum() for i in range(problem.n_exposures)])
     weight = 1 / (variance + 10 * np.median(variance))
-    weight[misplaced(problem, distance2)] = 0
+    weight[astray] = 0
     old, new = [], []
     for i in range(problem.n_exposures):
         ny, nx = problem.shapes[i]
@@ -104,6 +126,10 @@ def misplaced(problem, distance2):
 
 def distances(problem, pose_list, q, positions):
     """Squared distance (n,) of undistorted positions from their star's mean position, detector pixels."""
+    if problem.compiled:
+        from . import kernels
+
+        return kernels.distances(problem, pose_list, q, positions)
     distance2 = np.empty(q.shape[1])
     for i, pose in enumerate(pose_list):
         part = problem.part(i)
@@ -112,13 +138,18 @@ def distances(problem, pose_list, q, positions):
     return distance2
 
 
-def _mean_positions(problem, pose_list, q, weight):
+def mean_positions(problem, pose_list, q, weight):
     """Weighted mean (2, n_stars) of undistorted positions carried back to the reference plane."""
-    back = np.empty_like(q)
-    for i, pose in enumerate(pose_list):
-        part = problem.part(i)
-        inverse = poses.invert(pose)
-        back[:, part] = inverse[:, :2] @ q[:, part] + inverse[:, 2:]
-    total = np.bincount(problem.star, weight, problem.n_stars)
-    sums = np.stack([np.bincount(problem.star, weight * axis, problem.n_stars) for axis in back])
+    inverse = np.stack([poses.invert(pose) for pose in pose_list])
+    if problem.compiled:
+        from . import kernels
+
+        sums, total = kernels.mean_sums(problem, inverse, q, weight)
+    else:
+        back = np.empty_like(q)
+        for i, pose in enumerate(inverse):
+            part = problem.part(i)
+            back[:, part] = pose[:, :2] @ q[:, part] + pose[:, 2:]
+        total = np.bincount(problem.star, weight, problem.n_stars)
+        sums = np.stack([np.bincount(problem.star, weight * axis, problem.n_stars) for axis in back])
     return np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
