@@ -17,10 +17,11 @@ from functools import cached_property
 
 import numpy as np
 
-from . import basis, poses
-from .criterion import SMALLEST_WIDTH, State, complement
+from . import basis
+from .criterion import State, complement
 from .exceptions import SolveError, check_choice
 from .priors import dynamic_basis, similarity_basis, similarity_part
+from .scatter import conditional_errors, dynamic_covariance, say
 
 KINDS = ("minimal", "mean")
 #: Below this the constraints of the "mean" gauge leave a direction free.
@@ -48,6 +49,12 @@ class Gauge:
         Uncertainty of the prior mean itself.
     prior : bool
         Whether the prior has widths, which then pin the modes together with the constraint.
+    told : ndarray, shape (n_told, 2 n_modes), or None
+        Maps of the reference plane, in its modes, that are left to the data, which contradict the convention there.
+    told_covariance : ndarray, shape (n_told, n_told), or None
+        Covariance of the values `told_rows` of the constraints as the data tell them, px^2.
+    values : ndarray, shape (2 n_modes,), or None
+        What the orthonormal constraints are held at: zero, but for the combinations that the data tell.
     """
 
     kind: str
@@ -57,6 +64,9 @@ class Gauge:
     box: np.ndarray
     static_sigma: np.ndarray | None = None
     prior: bool = False
+    told: np.ndarray | None = None
+    told_covariance: np.ndarray | None = None
+    values: np.ndarray | None = None
 
     @property
     def n_constraints(self):
@@ -74,8 +84,34 @@ class Gauge:
         return np.linalg.qr(self.constraint.reshape(self.n_constraints, -1).T)[0].T
 
     def violation(self, departure):
-        """Values of the orthonormal constraints at departures A_i - A_0 (n_exposures, 2 n_modes)."""
-        return self.orthonormal @ departure.ravel()
+        """How far departures A_i - A_0 (n_exposures, 2 n_modes) are from the values of the orthonormal constraints."""
+        return self.orthonormal @ departure.ravel() - (0 if self.values is None else self.values)
+
+    @cached_property
+    def _reach(self):
+        """Reference-plane modes -> values of the orthonormal constraints, shape (2 n_modes, 2 n_modes)."""
+        return self.orthonormal @ self.motion.reshape(-1, self.n_constraints)
+
+    @cached_property
+    def affine(self):
+        """Combinations of the constraints that settle affine maps, of which the data say nothing; orthonormal columns.
+
+        Those of the similarities, which the poses carry, and what the two shears of the reference plane move.
+        """
+        size, n = 2 * self.box[1, ::-1], self.n_constraints // 2
+        similar = self.constraint[-len(similarity_basis(size, n)) :].reshape(-1, self.orthonormal.shape[1])
+        shears = dynamic_basis(size, n)[:2]
+        return np.linalg.qr(np.hstack([self.orthonormal @ similar.T, self._reach @ shears.T]))[0]
+
+    @property
+    def told_rows(self):
+        """Combinations of the constraints that are left to the data, orthonormal columns."""
+        moved = self._reach @ (np.zeros((0, self.n_constraints)) if self.told is None else self.told).T
+        return np.linalg.qr(moved - self.affine @ (self.affine.T @ moved))[0]
+
+    def left_to_data(self, combinations):
+        """Maps of the reference plane (k, 2 n_modes) that stand for combinations of the constraints (2 n_modes, k)."""
+        return np.linalg.solve(self._reach, combinations).T
 
     def modes_at(self, xy):
         """Values (n_modes, n) of the reference-plane modes at reference positions (n, 2)."""
@@ -88,16 +124,20 @@ class Gauge:
         """Covariance (2 n_modes, 2 n_modes) of the reference-plane modes that the convention hides.
 
         The mean dynamic distortion of the set, with the observed scatter per mode, and the uncertainty of
-        the static distortion, if given; both as they pass through the constraint. The similarities,
-        which are a matter of pointing, are left out.
+        the static distortion, if given; both as they pass through the constraint. Where the data tell, their error.
+        The similarities, which are a matter of pointing, are left out.
         """
-        rows = self.constraint.transpose(1, 0, 2)
-        pull = np.linalg.pinv(np.einsum("iab,ibc->ac", rows, self.motion))
-        through = pull @ rows  # coefficients of one exposure -> reference-plane modes
-        out = np.einsum("iab,ibc,idc->ad", through, self.dynamic, through, optimize=True)
+        rows = self.orthonormal.reshape(self.n_constraints, len(self.motion), -1).transpose(1, 0, 2)
+        inside = np.einsum("iab,ibc,idc->ad", rows, self.dynamic, rows, optimize=True)
         if self.static_sigma is not None:
-            common = through.sum(axis=0)
-            out += common * np.ravel(self.static_sigma) ** 2 @ common.T
+            common = rows.sum(axis=0)
+            inside += common * np.ravel(self.static_sigma) ** 2 @ common.T
+        if self.told is not None:
+            told = self.told_rows
+            kept = np.eye(len(inside)) - told @ told.T
+            inside = kept @ inside @ kept + told @ self.told_covariance @ told.T
+        back = np.linalg.pinv(self._reach)
+        out = back @ inside @ back.T
         similar = similarity_basis(2 * self.box[1, ::-1], self.n_constraints // 2)
         keep = np.eye(len(out)) - similar.T @ similar
         return keep @ out @ keep
@@ -128,7 +168,14 @@ class Gauge:
         hidden = np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()]))
         return (
             f"{self.kind}: {self.n_constraints} modes of a map common to all exposures, which the data do not tell, "
-            f"are fixed by {how}; they hide {hidden:.2g} px rms per axis, pointing aside"
+            f"are fixed by {how}{self._told_in_words()}; they hide {hidden:.2g} px rms per axis, pointing aside"
+        )
+
+    def _told_in_words(self):
+        return (
+            ""
+            if self.told is None
+            else f", but for {len(self.told)} that the data do tell, by 5 standard errors or more"
         )
 
     def __repr__(self):
@@ -153,6 +200,11 @@ class Gauge:
                 lines.append(f"{name:24s} {number:6d} {'not known':>15s}  the nominal poses, mean over exposures")
             else:
                 lines.append(f"{name:24s} {number:6d} {f'{error:.2g} px':>15s}  {convention}")
+        if self.told is not None:
+            lines.append(
+                f"The data contradict the constraint along {len(self.told)} combinations of these modes, by 5 standard "
+                "errors or more: there they decide, and the absolute error is theirs."
+            )
         source = "the scatter of single exposures" + (
             " and the uncertainty of the static distortion" if self.static_sigma is not None else ""
         )
@@ -163,8 +215,10 @@ class Gauge:
         return "\n".join(lines)
 
 
-def make(kind, problem, state, blocks):
+def make(kind, problem, state, blocks, *, told=None):
     """The gauge at a state, its weights from the blocks of the criterion and the scatter seen there.
+
+    Maps `told` (n_told, 2 n_modes) of the reference plane are left to the data: see `Gauge`.
 
     Raises
     ------
@@ -180,14 +234,14 @@ def make(kind, problem, state, blocks):
         _check_mean(motion)
     similar = _by_shape(similarity_basis, problem)
     others = _by_shape(dynamic_basis, problem)
-    error = _conditional_errors(blocks.u_data)
-    held = np.array([problem.is_held(i) for i in range(problem.n_exposures)])
-    dynamic = _dynamic_covariance(problem, state, error, motion, others)
+    held = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
+    error = conditional_errors(blocks.u_data, np.where(held[:, None, None], blocks.u_data, blocks.u))
+    dynamic = dynamic_covariance(problem, state, error, motion, others)
     if kind == "mean":
         constraint = np.broadcast_to(np.eye(motion.shape[1])[:, None], (motion.shape[1], *motion.shape[:2])).copy()
     else:
         constraint = _minimal_constraint(motion, error, dynamic, similar, others, box, held=held)
-    return Gauge(kind, constraint, motion, dynamic, box, problem.static_sigma, bool(held.any()))
+    return Gauge(kind, constraint, motion, dynamic, box, problem.static_sigma, bool(held.any()), told)
 
 
 def _minimal_constraint(motion, error, dynamic, similar, others, box, *, held):
@@ -199,23 +253,12 @@ def _minimal_constraint(motion, error, dynamic, similar, others, box, *, held):
     spread = dynamic + np.where(held, 0, 1)[:, None, None] * error
     inner = others @ spread @ others.transpose(0, 2, 1)
     weight = others.transpose(0, 2, 1) @ np.linalg.solve(inner, others) if others.shape[1] else np.zeros_like(error)
-    weight = np.where(held, 1, _say(error, others))[:, None, None] * weight
-    pose_weight = _say(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
+    weight = np.where(held, 1, say(error, others))[:, None, None] * weight
+    pose_weight = say(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
     common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
     pulled = motion.transpose(0, 2, 1)
     rows = np.concatenate([complement(common) @ pulled @ weight, common @ pulled @ pose_weight], axis=1)
     return rows.transpose(1, 0, 2)
-
-
-def _say(error, rows):
-    """How much say each exposure has (n_exposures,): 1, fading where the variance exceeds ten times the usual one.
-
-    The scatter of a convention over a bad exposure's errors would move every star for no gain.
-    """
-    if not rows.shape[1]:
-        return np.ones(len(error))
-    own = np.einsum("ika,iab,ikb->ik", rows, error, rows, optimize=True).mean(axis=1)
-    return 1 / (1 + (own / (10 * np.median(own))) ** 2)
 
 
 def reference_box(problem, state):
@@ -245,72 +288,6 @@ def _motion(problem, pose_list, box):
     reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
     mixing = np.einsum("mk,nik->imn", basis.values(degree, u, v) * w, reference, optimize=True)
     return np.einsum("iab,imn->iambn", linear, mixing).reshape(-1, 2 * size, 2 * size)
-
-
-def _conditional_errors(u_data):
-    """C_i, covariance of the coefficients if the stars were known; huge where the data say nothing."""
-    size = u_data.shape[1]
-    ridge = 1e-12 * np.trace(u_data, axis1=1, axis2=2)[:, None, None] / size + 1e-300
-    return np.linalg.inv(u_data + ridge * np.eye(size))
-
-
-def _dynamic_covariance(problem, state, error, motion, others):
-    """Lambda of every exposure: from the prior if it has widths, else from the scatter seen beyond the errors.
-
-    The common map of the reference plane that fits the departures A_i - A_0 best is taken out first, so that the
-    result does not depend on the gauge of the state; then, mode by mode (shears for the linear ones), the variance
-    that makes the weighted scatter what it should be (Paule & Mandel 1982).
-    """
-    n_modes = problem.n_modes
-    departure = (state.coefficients - problem.prior_mean)[:, :, :n_modes].reshape(problem.n_exposures, -1)
-    own = np.einsum("ika,ia->ik", others, departure)
-    moved = others @ motion
-    w = _say(error, others)
-    normal = np.einsum("i,ika,ikb->ab", w, moved, moved, optimize=True)
-    common = np.linalg.pinv(normal, rcond=1e-10, hermitian=True) @ np.einsum("i,ika,ik->a", w, moved, own)
-    variance = np.einsum("ika,iab,ikb->ik", others, error, others, optimize=True)
-    scatter = _pooled(_excess_scatter(own - moved @ common, variance), problem.n_exposures - 1)
-    out = others.transpose(0, 2, 1) * scatter**2 @ others
-    for i in range(problem.n_exposures):
-        if problem.is_held(i):
-            width = problem.prior_sigma[i].ravel()
-            given = np.where(np.isfinite(width), np.maximum(width, SMALLEST_WIDTH) ** 2, np.diag(out[i]))
-            out[i] = others[i].T @ (others[i] * given @ others[i].T) @ others[i]
-    return out
-
-
-def _pooled(scatter, n_free):
-    """Scatter per mode, shears first, drawn towards the rms of its degree by the weight of three exposures.
-
-    A handful of exposures tells the scatter of a single mode badly, and weights that follow its noise make reported
-    errors too small.
-    """
-    degree = np.repeat(np.arange(basis.MAX_DEGREE + 1), np.arange(basis.MAX_DEGREE + 1) + 1)[3 : len(scatter) // 2 + 2]
-    degree = np.concatenate([[1, 1], degree, degree])[: len(scatter)]
-    number = np.bincount(degree)[degree]
-    usual = np.bincount(degree, scatter**2)[degree] / number
-    return np.sqrt((n_free * scatter**2 + 3 * usual) / (n_free + 3))
-
-
-def _excess_scatter(a, variance):
-    """Standard deviation per column of a (n, k) beyond the given variances, by bisection.
-
-    Values ten times less certain than usual would add noise to the answer and nothing else, so they have no say.
-    """
-    counts = variance <= 10 * np.median(variance, axis=0)
-    n = counts.sum(axis=0)
-    low, high = np.zeros(a.shape[1]), (a**2).sum(axis=0) + 1e-300
-
-    def excess(extra):
-        w = counts / (variance + extra + 1e-300)
-        return (w * a**2).sum(axis=0) - (n - 1)
-
-    present = excess(low) > 0
-    for _ in range(50):
-        middle = (low + high) / 2
-        above = excess(middle) > 0
-        low, high = np.where(above, middle, low), np.where(above, high, middle)
-    return np.sqrt(high * present)
 
 
 def _check_mean(motion):

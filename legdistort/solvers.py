@@ -7,22 +7,17 @@ cameras and stars for points.
 
 import logging
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from . import criterion, elimination
+from . import criterion, elimination, reduction
 from . import gauge as gauges
 from .criterion import State
 from .exceptions import ConvergenceWarning, SolveError, check_choice
 
 log = logging.getLogger(__name__)
 
-#: Up to this many unknown coefficients the reduced matrix is factorised; beyond, conjugate gradients.
-DIRECT_LIMIT = 3000
-#: ... and while building it costs no more than this many multiplications.
-_DIRECT_COST = 4e10
 LOSSES = ("linear", "huber", "cauchy")
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
 
@@ -97,10 +92,12 @@ def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iteration
         factors = loss_factors(criterion.squares(problem, criterion.residuals(problem, state)), loss)
         weighted = problem.scaled(factors)
     blocks = criterion.linearise(weighted, state)
-    history, converged, accuracy, size = [], False, 1e-3, np.inf
+    history, converged, accuracy, size, told = [], False, 1e-3, np.inf, None
     for iteration in range(1, max_iterations + 1):
-        convention = gauges.make(gauge, weighted, state, blocks)
-        d_star, d_exposure = newton_step(weighted, blocks, convention, _departure(problem, state), accuracy=accuracy)
+        convention = gauges.make(gauge, weighted, state, blocks, told=told)
+        system = reduction.reduced_system(weighted, blocks, convention)
+        rows = convention.told_rows
+        d_star, d_exposure = system.step(-convention.violation(_departure(problem, state)), rows, accuracy)
         size, last = _step_size(blocks, d_star, d_exposure), size
         history.append(
             {
@@ -112,18 +109,25 @@ def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iteration
         )
         log.debug("iteration %d: J = %.8g, step %.2g standard errors", iteration, blocks.cost, size)
         if size < tolerance:
-            converged = True
-            break
+            more = system.contradicted(rows) if gauge == "minimal" else rows[:, :0]
+            converged = not more.shape[1]
+            if converged:
+                break
+            log.debug("the data contradict the convention along %d directions", more.shape[1])
+            told, size, accuracy = convention.left_to_data(np.hstack([rows, more])), np.inf, 1e-3
+            continue
         if size > 0.1 * last:  # slow: exposures hang together weakly, and the inner iterations must be more exact
             accuracy = max(0.01 * accuracy, 1e-10)
-        cost, blocks = blocks.cost, None  # makes room for the next
+        cost, blocks, system = blocks.cost, None, None  # makes room for the next
         state, blocks = _advance(weighted, state, cost, d_star, d_exposure)
         if loss != "linear":
             factors = loss_factors(criterion.squares(problem, blocks.residual), loss)
             weighted = problem.scaled(factors)
             blocks = criterion.linearise(weighted, state)
     if not converged:
-        convention = gauges.make(gauge, weighted, state, blocks)
+        convention = gauges.make(gauge, weighted, state, blocks, told=told)
+    if told is not None:
+        convention = _declared(convention, weighted, blocks, _departure(problem, state))
     status = f"converged after {iteration} iterations"
     if not converged:
         status = (
@@ -132,6 +136,14 @@ def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iteration
         )
         warnings.warn(status, ConvergenceWarning, stacklevel=2)
     return Result(state, blocks, convention, converged, status, history, factors)
+
+
+def _declared(convention, problem, blocks, departure):
+    """The gauge held at the values that the data tell, with their covariance: errors relative to it stay relative."""
+    rows = convention.told_rows
+    information = rows.T @ reduction.reduced_system(problem, blocks, convention).information @ rows
+    values = rows @ (rows.T @ (convention.orthonormal @ departure.ravel()))
+    return replace(convention, values=values, told_covariance=np.linalg.inv(information))
 
 
 def _departure(problem, state):
@@ -162,155 +174,6 @@ def _advance(problem, state, cost, d_star, d_exposure):
         "the minimisation diverges: no step, however short, keeps the residuals in bounds; the start is too far off "
         "(wrong poses or many mismatched stars?)"
     )
-
-
-def newton_step(problem, blocks, gauge, departure, *, accuracy=1e-10):
-    """Gauss-Newton step under the constraints of the gauge.
-
-    Parameters
-    ----------
-    problem : Problem
-    blocks : Blocks
-    gauge : Gauge
-    departure : ndarray, shape (n_exposures, 2 n_modes)
-        A_i - A_0 at the current state.
-    accuracy : float
-        Where conjugate gradients may stop, relative to the size of the step.
-
-    Returns
-    -------
-    d_star : ndarray, shape (2, n_stars)
-    d_exposure : ndarray, shape (n_exposures, 2 n_modes)
-    """
-    inverse = elimination.inverse_star_blocks(blocks.v)
-    target = -gauge.violation(departure)
-    if not uses_direct(problem):
-        return _conjugate_gradients(problem, blocks, gauge.orthonormal, target, tolerance=accuracy)
-    alone = elimination.symmetric_times(inverse, blocks.g_star)
-    rhs = (blocks.g_exposure - elimination.to_exposures(problem, blocks, alone)).ravel()
-    d = ReducedSystem(problem, blocks, gauge).solve(rhs, target).reshape(problem.n_exposures, -1)
-    return alone - elimination.symmetric_times(inverse, elimination.to_stars(problem, blocks, d)), d
-
-
-def uses_direct(problem):
-    """Whether the reduced system is small enough to be factorised."""
-    n = problem.n_exposures * 2 * problem.n_modes
-    return n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= _DIRECT_COST
-
-
-class ReducedSystem:
-    """The reduced matrix S, factorised together with the constraints of the gauge.
-
-    Raises
-    ------
-    SolveError
-        If S is singular beyond the gauge, naming the exposures concerned.
-    """
-
-    def __init__(self, problem, blocks, gauge):
-        s = elimination.reduced_matrix(problem, blocks)
-        self.rows = gauge.orthonormal
-        s += np.mean(np.diag(s)) * self.rows.T @ self.rows  # lifts the gauge directions; undone by the multipliers
-        # unit diagonal: coefficients of bright and faint exposures then compare
-        diagonal = np.diag(s).copy()
-        self.scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
-        s *= self.scale[:, None]
-        s *= self.scale
-        try:
-            self.factor = cho_factor(s, lower=True, overwrite_a=False, check_finite=True)
-            if np.diag(self.factor[0]).min() < 1e-7:
-                raise LinAlgError
-        except (LinAlgError, ValueError):
-            raise SolveError(_singular_message(problem, s)) from None
-        self.lifted = self._apply_inverse(self.rows.T)
-        self.border = np.linalg.inv(self.rows @ self.lifted)
-
-    def _apply_inverse(self, b):
-        scale = self.scale if b.ndim == 1 else self.scale[:, None]
-        return scale * cho_solve(self.factor, scale * b)
-
-    def solve(self, rhs, target):
-        """d (n,) that minimises d'Sd/2 - rhs'd with rows d = target."""
-        free = self._apply_inverse(rhs)
-        return free - self.lifted @ (self.border @ (self.rows @ free - target))
-
-    def covariance(self):
-        """Covariance of the coefficients in the gauge, shape (n, n)."""
-        full = self._apply_inverse(np.eye(len(self.scale)))
-        out = full - self.lifted @ self.border @ self.lifted.T
-        return (out + out.T) / 2
-
-
-def _singular_message(problem, s):
-    values, vectors = np.linalg.eigh(np.nan_to_num(s))
-    energy = (vectors[:, 0].reshape(problem.n_exposures, -1) ** 2).sum(axis=1)
-    worst = [problem.names[i] for i in np.argsort(energy)[::-1][:3] if energy[i] > 0.1]
-    return (
-        f"the observations do not determine the distortion of degree {problem.degree} "
-        f"(smallest eigenvalue {values[0]:.1e} of the normalised equations), above all in exposure {', '.join(worst)}: "
-        "lower the degree, add stars, or give a prior with sigma"
-    )
-
-
-def _conjugate_gradients(problem, blocks, rows, target, *, tolerance, max_iterations=1000):
-    """Matrix-free solution of the reduced system on the constraints, preconditioned by the exposure blocks.
-
-    Projected conjugate gradients with the constraint preconditioner of Gould, Hribar & Nocedal (2001): every
-    iterate satisfies ``rows d = target``. The coupling E d of the iterate is carried along, so that neither the
-    right-hand side nor the stars need a pass of their own.
-
-    Returns
-    -------
-    d_star : ndarray, shape (2, n_stars)
-    d_exposure : ndarray, shape (n_exposures, 2 n_modes)
-    """
-    inverse = elimination.inverse_star_blocks(blocks.v)
-    block_inverse = np.linalg.inv(blocks.u)
-    shape = blocks.g_exposure.shape
-
-    def couple(d):
-        return elimination.to_stars(problem, blocks, d.reshape(shape))
-
-    def gradient(own, stars):
-        """``own - E' V^-1 stars``."""
-        back = elimination.to_exposures(problem, blocks, elimination.symmetric_times(inverse, stars))
-        return (own - back).ravel()
-
-    def own(d):
-        return np.einsum("iab,ib->ia", blocks.u, d.reshape(shape))
-
-    def block_solve(r):
-        return np.einsum("iab,ib->ia", block_inverse, r.reshape(shape)).ravel()
-
-    lifted = np.stack([block_solve(row) for row in rows], axis=1)
-    border = np.linalg.inv(rows @ lifted)
-
-    def precondition(r):
-        z = block_solve(r)
-        return z - lifted @ (border @ (rows @ z))
-
-    d = lifted @ (border @ target)
-    stars = blocks.g_star - couple(d)
-    r = gradient(blocks.g_exposure - own(d), stars)
-    z = precondition(r)
-    p, rz = z, r @ z
-    goal = max(tolerance**2 * rz, 1e-16 * len(r))  # r'z is in units of chi2: below, only rounding is left
-    for count in range(max_iterations):
-        if rz <= goal:
-            log.debug("conjugate gradients: %d steps", count)
-            break
-        ep = couple(p)
-        sp = gradient(own(p), ep)
-        step = rz / (p @ sp)
-        d = d + step * p
-        r = r - step * sp
-        stars = stars - step * ep
-        z = precondition(r)
-        rz, old = r @ z, rz
-        p = z + rz / old * p
-    else:
-        log.info("conjugate gradients stopped after %d steps at %.1e of the start", max_iterations, np.sqrt(rz))
-    return elimination.symmetric_times(inverse, stars), d.reshape(shape)
 
 
 def solve_alternating(problem, state, *, gauge="minimal", max_iterations=1000, tolerance=1e-5):

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from . import elimination, solvers
+from . import elimination, reduction
 from .exceptions import AssumptionWarning
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
@@ -37,7 +37,7 @@ class Uncertainty:
         problem, blocks = self._problem, self._blocks
         n = problem.n_exposures * 2 * problem.n_modes
         if n <= DENSE_LIMIT:
-            return self._scale**2 * solvers.ReducedSystem(problem, blocks, self._gauge).covariance()
+            return self._scale**2 * reduction.Direct(problem, blocks, self._gauge).covariance()
         warnings.warn(
             f"{n} coefficients: their covariance is approximated by one block an exposure (stars taken as known)",
             AssumptionWarning,

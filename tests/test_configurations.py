@@ -5,7 +5,7 @@ import pytest
 from astropy.table import Table, vstack
 from oracle import DenseOracle, predict
 
-from legdistort import performance, solvers
+from legdistort import performance, reduction
 from legdistort.estimation import solve
 from legdistort.exceptions import SolveError
 from legdistort.matches import Matches
@@ -47,7 +47,7 @@ MOSAICS = {
 def test_little_overlap_converges_to_the_minimum(monkeypatch, mosaic, direct):
     """At the solution the criterion, written out independently, is flat along every direction the gauge allows."""
     matches, _ = grid_of_pointings(MOSAICS[mosaic])
-    monkeypatch.setattr(solvers, "uses_direct", lambda problem: direct)
+    monkeypatch.setattr(reduction, "uses_direct", lambda problem: direct)
     solution = solve(matches, degree=2)
     assert int(solution.status.split()[2]) <= 10
     assert solution.chi2 / solution.dof == pytest.approx(1, abs=5 * np.sqrt(2 / solution.dof))

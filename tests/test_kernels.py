@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from legdistort import criterion, elimination, solvers, starting
+from legdistort import criterion, elimination, reduction, starting
 from legdistort.estimation import solve
 from legdistort.priors import Prior
 from legdistort.simulation import simulate_matches
@@ -47,7 +47,7 @@ def test_compiled_solution_is_the_plain_one(monkeypatch, direct):
     sim, prior = _set(sigma=0.05)
     plain = solve(sim.matches, prior=prior)
     monkeypatch.setattr(criterion, "COMPILED_FROM", 0)
-    monkeypatch.setattr(solvers, "uses_direct", lambda problem: direct)
+    monkeypatch.setattr(reduction, "uses_direct", lambda problem: direct)
     fast = solve(sim.matches, prior=prior)
     assert_allclose(fast.positions, plain.positions, atol=1e-5)  # both stop within 5e-5 standard errors
     assert_allclose(fast.coefficients, plain.coefficients, atol=1e-5)

@@ -6,7 +6,7 @@ from astropy import units as u
 from numpy.testing import assert_allclose
 from oracle import DenseOracle, predict
 
-from legdistort import criterion, performance, poses, solvers, starting
+from legdistort import criterion, performance, poses, reduction, solvers, starting
 from legdistort.estimation import solve
 from legdistort.exceptions import ConvergenceWarning, InputError, SolveError
 from legdistort.matches import Matches
@@ -112,7 +112,7 @@ def test_alternating_reaches_the_same_minimum():
 def test_conjugate_gradients_give_the_direct_answer(monkeypatch):
     sim = small(n_exposures=7, n_stars=40, sigma=0.05, rotations=None, seen=0.8, min_exposures=3)
     direct = solve(sim.matches, degree=2, prior=Prior(sim.truth.static))
-    monkeypatch.setattr(solvers, "uses_direct", lambda problem: False)
+    monkeypatch.setattr(reduction, "uses_direct", lambda problem: False)
     iterative = solve(sim.matches, degree=2, prior=Prior(sim.truth.static))
     assert_allclose(iterative.positions, direct.positions, atol=1e-6)
     assert_allclose(iterative.coefficients, direct.coefficients, atol=1e-6)

@@ -22,8 +22,9 @@ def measure(name, solver, n_exposures, n_stars):
     import rivals
     import sets
 
-    from legdistort import Matches, performance, solve, solvers
+    from legdistort import Matches, kernels, performance, solve, solvers  # kernels: imports do not count
 
+    assert kernels
     warnings.simplefilter("ignore")
     sim, prior = sets.make(name, n_exposures=n_exposures, n_stars=n_stars)
     true = sim.truth.positions[sim.matches.stars]
@@ -41,7 +42,7 @@ def measure(name, solver, n_exposures, n_stars):
                 state, chi2 = rivals.solve_scipy(problem, start)
             else:
                 result = solvers.solve_alternating(problem, start, max_iterations=300)
-                state, chi2 = result.state, result.blocks.chi2
+                state, chi2, sweeps = result.state, result.blocks.chi2, len(result.history)
             positions = state.positions.T
         times.append(time.perf_counter() - begin)
     memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
@@ -54,6 +55,8 @@ def measure(name, solver, n_exposures, n_stars):
         "b": performance.bias(positions, true, removed=3),
         "chi2": chi2,
     }
+    if solver == "alternating":
+        row["sweeps"] = sweeps
     if solver == "joint":
         row["sigma"] = float(performance.scatter(performance.corrected_positions(solution)).mean())
         begin = time.perf_counter()
@@ -70,7 +73,8 @@ def run(*arguments):
 
 def show(row):
     """One line of the table."""
-    extra = f" covariance {row['covariance']:.2f} s" if "covariance" in row else ""
+    extra = f"  covariance {row['covariance']:.2f} s" if "covariance" in row else ""
+    extra += f"  {row['sweeps']} sweeps" if "sweeps" in row else ""
     sigma = f"{row['sigma']:.4f}" if "sigma" in row else "-"
     print(
         f"{row['set']:14s} {row['solver']:12s} {row['n_obs']:9d} {row['seconds']:9.3f} s {row['MB']:8.0f} MB "
