@@ -155,7 +155,7 @@ def read_exposures(paths, *, ext=None, progress=False):
         Naming the file: missing, not FITS, truncated, without a 2-D image or the extension wanted,
         without a good pixel, or with the name of another one.
     """
-    sources = _expand(paths)
+    sources = expand_paths(paths)
     exposures = {}
     for i, source in enumerate(tqdm(sources, desc="reading", unit="frame", disable=not progress)):
         with warnings.catch_warnings():  # headers are often a little off the standard; what matters is checked here
@@ -174,8 +174,8 @@ def _origin(exposure):
     return exposure.path if exposure.path is not None else "in memory"
 
 
-def _expand(paths):
-    """The argument of `read_exposures` as a flat list of sources."""
+def expand_paths(paths):
+    """The argument of `read_exposures` as a flat list of sources, patterns expanded."""
     if isinstance(paths, (str, Path, fits.HDUList, CCDData)):
         paths = [paths]
     sources = []
@@ -215,7 +215,7 @@ def _read(source, ext, default):
 
 def _from_hdulist(hdulist, ext, label, path):
     try:
-        hdu = _find(hdulist, ext, label)
+        hdu = find_image(hdulist, ext, label)
         header = hdulist[0].header.copy()
         header.update(hdu.header)
         integer = hdu.header.get("BITPIX", -32) > 0  # before the data are touched: scaling changes it
@@ -227,9 +227,7 @@ def _from_hdulist(hdulist, ext, label, path):
         raise
     except _UNREADABLE as error:
         raise InputError(f"{label}: truncated or damaged, its image cannot be read ({error})") from None
-    name = _base_name(label)
-    if ext is not None:
-        name += "_" + ("".join(str(e) for e in ext) if isinstance(ext, tuple) else str(ext))
+    name = exposure_name(label, ext)
     try:
         wcs = believable_wcs(WCS(header, fobj=hdulist), hdu.shape, name)
     except Exception as error:  # wcslib raises many kinds; a header WCS is a hint, never a must
@@ -238,16 +236,20 @@ def _from_hdulist(hdulist, ext, label, path):
     return _assemble(name, data, header, integer, mask=mask, uncertainty=uncertainty, wcs=wcs, path=path)
 
 
-def _base_name(label):
-    return _SUFFIX.sub("", Path(label).name)
+def exposure_name(path, ext=None):
+    """Name of the exposure in a file, or in one of its extensions (see `read_exposures`)."""
+    name = _SUFFIX.sub("", Path(path).name)
+    if ext is None:
+        return name
+    return name + "_" + ("".join(str(e) for e in ext) if isinstance(ext, tuple) else str(ext))
 
 
 def _is_image(hdu):
     return isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) and len(hdu.shape) > 0
 
 
-def _find(hdulist, ext, label):
-    """The HDU to read."""
+def find_image(hdulist, ext, label):
+    """The HDU to read (see `read_exposures`); `label` names the file in errors."""
     if ext is not None:
         try:
             hdu = hdulist[ext]
@@ -290,7 +292,7 @@ def _siblings(hdulist, hdu, header):
 
 def _from_ccddata(ccd, default):
     header = fits.Header(ccd.header)
-    name = _base_name(str(header.get("FILENAME", default)))
+    name = exposure_name(str(header.get("FILENAME", default)))
     uncertainty = None
     if ccd.uncertainty is not None:
         uncertainty = ccd.uncertainty.represent_as(StdDevUncertainty).array
