@@ -4,12 +4,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import basis, poses
+from . import basis
 from .exceptions import InputError
+
+#: As `sigma` of a `Prior`: to be found from the exposures.
+EVIDENCE = "evidence"
 
 
 def _per_mode(value, n, name):
     """A width given as a number, per mode or per axis and mode -> (2, n_modes), non-negative."""
+    if isinstance(value, str):
+        if name == "sigma" and value == EVIDENCE:
+            return EVIDENCE
+        words = "widths in pixels" + (f", or {EVIDENCE!r}: found from the exposures" if name == "sigma" else "")
+        raise InputError(f"{name} must be {words}, got {value!r}")
     out = np.asarray(value, dtype=float)
     try:
         out = np.broadcast_to(out, (2, n)).copy()
@@ -17,7 +25,7 @@ def _per_mode(value, n, name):
         raise InputError(
             f"{name} must be a number, one per mode ({n},) or per axis and mode (2, {n}), got shape {out.shape}"
         ) from None
-    if not np.all(out >= 0) or not np.all(np.isfinite(out)):
+    if not np.all(out >= 0) or (name != "sigma" and not np.all(np.isfinite(out))):
         raise InputError(f"{name} must be finite and not negative (a standard deviation in pixels), got {value!r}")
     return out
 
@@ -32,11 +40,16 @@ class Prior:
         Static distortion A_0 in the normalised Legendre basis, pixels, x then y (reference -> detector).
     sigma : array_like, optional
         Scatter of single exposures around the mean, pixels: a number, (n_modes,) or (2, n_modes). It shrinks
-        what the data cannot tell. None leaves the exposures free. Zero keeps a mode at the mean.
+        what the data cannot tell. None leaves the exposures free. Zero keeps a mode at the mean, infinity leaves it
+        free. "evidence" lets `legdistort.solve` find it from the exposures, one width a degree
+        (`legdistort.empirical`).
     static_sigma : array_like, optional
         Uncertainty of the mean itself, same forms. It is common to all exposures and does not average down.
     shape : tuple, optional
         ``(ny, nx)`` of the detector it belongs to; solving exposures of another shape with it is then an error.
+    source : str or dict, optional
+        Where it comes from, in words, or item by item (kind, name, direction, files with their checksums); kept with
+        the solution.
 
     Attributes
     ----------
@@ -52,13 +65,14 @@ class Prior:
     """
 
     mean: np.ndarray
-    sigma: np.ndarray | None
+    sigma: np.ndarray | str | None
     static_sigma: np.ndarray | None
     shape: tuple | None
     truncation: float
     plane: np.ndarray | None
+    source: str | dict | None
 
-    def __init__(self, mean, *, sigma=None, static_sigma=None, shape=None, truncation=0.0, plane=None):
+    def __init__(self, mean, *, sigma=None, static_sigma=None, shape=None, truncation=0.0, plane=None, source=None):
         mean = np.array(mean, dtype=float)
         if mean.ndim != 2 or mean.shape[0] != 2:
             raise InputError(f"mean must have shape (2, n_modes), x then y, got {mean.shape}")
@@ -70,8 +84,8 @@ class Prior:
             for value, name in ((sigma, "sigma"), (static_sigma, "static_sigma"))
         ]
         for name, value in zip(
-            ("mean", "sigma", "static_sigma", "shape", "truncation", "plane"),
-            (mean, *widths, shape, truncation, plane),
+            ("mean", "sigma", "static_sigma", "shape", "truncation", "plane", "source"),
+            (mean, *widths, shape, truncation, plane, source),
             strict=True,
         ):
             object.__setattr__(self, name, value)
@@ -81,28 +95,89 @@ class Prior:
         """Total degree of the mean."""
         return basis.degree_of(self.mean.shape[1])
 
+    def describe(self):
+        """Everything but the mean as plain numbers and strings, as files of solutions keep it."""
+        widths = {"sigma": self.sigma, "static_sigma": self.static_sigma}
+        return {
+            "source": self.source,
+            "degree": self.degree,
+            "shape": None if self.shape is None else [int(n) for n in self.shape],
+            "truncation_px": float(self.truncation),
+            **{
+                name: value if value is None or isinstance(value, str) else value.tolist()
+                for name, value in widths.items()
+            },
+        }
+
+    @property
+    def in_numbers(self):
+        """`sigma` as an array, or None.
+
+        Raises
+        ------
+        InputError
+            While it is to be found from the exposures.
+        """
+        if isinstance(self.sigma, str):
+            raise InputError(
+                f"the prior has sigma={self.sigma!r}: solve finds it from exposures; give widths in pixels here"
+            )
+        return self.sigma
+
+    def with_sigma(self, sigma, *, degree=0):
+        """The same prior with another scatter `sigma`, its mean taken as zero from its own degree up to `degree`."""
+        degree = max(self.degree, degree)
+        if np.ndim(sigma):  # of modes beyond those given nothing is known
+            given = np.asarray(sigma, dtype=float)
+            sigma = np.full((*given.shape[:-1], basis.n_modes(degree)), np.inf)
+            sigma[..., : given.shape[-1]] = given[..., : sigma.shape[-1]]
+        known = {name: getattr(self, name) for name in ("shape", "truncation", "plane", "source")}
+        static = None if self.static_sigma is None else basis.change_degree(self.static_sigma, degree)
+        return Prior(basis.change_degree(self.mean, degree), sigma=sigma, static_sigma=static, **known)
+
     def __repr__(self):
         words = [f"degree {self.degree}", f"{self.mean.shape[1]} modes an axis"]
         words += [f"{name} given" for name in ("sigma", "static_sigma") if getattr(self, name) is not None]
         return f"<Prior: {', '.join(words)}>"
 
+    @property
+    def rms(self):
+        """Root mean square of the mean over the detector [pix], x and y."""
+        return np.sqrt((self.mean**2).sum(axis=1)) / 2  # the basis has unit norm on [-1, 1]^2, of area 4
+
     @classmethod
-    def from_model(cls, model, *, shape, direction, origin=0, degree=5, parity=None, sigma=None, static_sigma=None):
-        """Prior from any astropy model or function of a detector's static distortion.
+    def from_model(
+        cls,
+        model,
+        *,
+        shape=None,
+        direction=None,
+        origin=None,
+        frame=None,
+        degree=5,
+        parity=None,
+        sigma=None,
+        static_sigma=None,
+    ):
+        """Prior from a model, WCS, aperture or function of a detector's static distortion.
 
         The map may end in any plane (arcsec, degrees, pixels): the similarity between that plane and the detector
-        is taken out, since it belongs to the pose of an exposure; shear stays.
+        is taken out, since it belongs to the pose of an exposure; shear stays. What ends on the sky, or in V2 and V3,
+        is first projected on the plane that touches the sphere at the centre of the detector.
 
         Parameters
         ----------
-        model : callable
-            ``model(x, y) -> (x, y)`` on arrays, between detector pixels and an undistorted plane.
-        shape : tuple
-            ``(ny, nx)`` of the detector.
-        direction : {"detector_to_reference", "reference_to_detector"}
-            What the model does.
-        origin : {0, 1}
-            Coordinate of the centre of the model's first pixel.
+        model : callable, astropy model, gwcs, `~astropy.wcs.WCS` or SIAF aperture
+            ``model(x, y) -> (x, y)`` on arrays, between detector pixels and an undistorted plane; units are welcome.
+        shape : tuple, optional
+            ``(ny, nx)`` of the detector; needed if the model does not tell.
+        direction : {"detector_to_reference", "reference_to_detector"}, optional
+            What the model does; needed if it does not tell.
+        origin : {0, 1}, optional
+            Coordinate of the centre of the model's first pixel (default 0; WCSs and apertures tell).
+        frame : str, optional
+            Where to end: of a gwcs, the name of a frame (default "undistorted", or else "v2v3", or else the last); of a
+            SIAF aperture "idl" (default) or "tel".
         degree : int
             Total degree of the Legendre series; `truncation` tells what it leaves out.
         parity : {1, -1, None}
@@ -115,88 +190,58 @@ class Prior:
         InputError
             For a wrong direction or origin, or a model that cannot be followed over the detector.
         """
-        if direction not in ("detector_to_reference", "reference_to_detector"):
-            raise InputError(f"direction must be 'detector_to_reference' or 'reference_to_detector', got {direction!r}")
-        if origin not in (0, 1):
-            raise InputError(f"origin must be 0 or 1 (coordinate of the first pixel's centre), got {origin!r}")
-        degree = basis.check_degree(degree)
-        to_plane = _Plane(model, shape, direction, origin)
-        pose = poses.fit_similarity(to_plane.plane, to_plane.pixels, parity=parity)
-        for _ in range(10):
-            mean = basis.project(
-                lambda u, v, pose=pose: to_plane.displacement(basis.denormalize(u, v, shape), pose), degree, degree + 6
-            )
-            shift = similarity_part(mean, shape)
-            pose = poses.compose(shift, pose)
-            if np.abs(poses.apply(shift, to_plane.pixels) - to_plane.pixels).max() < 1e-10:
-                break
-        q = poses.apply(pose, to_plane.plane)
-        left = to_plane.pixels - q - (mean @ basis.values(degree, *basis.normalize(q, shape))).T
-        truncation = float(np.hypot(*left.T).max())
-        return cls(mean, sigma=sigma, static_sigma=static_sigma, shape=tuple(shape), truncation=truncation, plane=pose)
+        from .expansion import expand
+        from .source_objects import describe
+
+        source = describe(model, frame=frame).stated(shape=shape, direction=direction, origin=origin)
+        mean, plane, truncation = expand(source, basis.check_degree(degree), parity)
+        known = {"shape": source.shape, "truncation": truncation, "plane": plane, "source": source.record()}
+        return cls(mean, sigma=sigma, static_sigma=static_sigma, **known)
+
+    @classmethod
+    def from_file(cls, where, *, ext=None, frame=None, **options):
+        """Prior from a file, or a name, of any kind that is recognised.
+
+        Parameters
+        ----------
+        where : str, path, or sequence of two of them
+            ``prior.asdf``, ``solution.asdf`` (the mean of its exposures), or any source of
+            `legdistort.source_files.read_source`: ASDF with a gwcs or a model, FITS headers, two FITS maps, Drizzle
+            coefficients, ``gsaoi-1`` ... ``gsaoi-4``, ``siaf:INSTRUMENT/APERTURE``.
+        ext : int, str or (str, int), optional
+            Extension of FITS files, header of a text, or place in the tree of an ASDF file.
+        frame : str, optional
+        **options
+            As for `from_model`: shape, direction, origin, degree, parity, sigma, static_sigma.
+
+        Raises
+        ------
+        InputError
+            Naming the file, and what to do.
+        """
+        from .prior_files import open_prior
+
+        return open_prior(where, ext=ext, frame=frame, **options)
+
+    def write(self, path, *, overwrite=False):
+        """Write everything to an ASDF file (`legdistort.prior_files`)."""
+        from .prior_files import write_prior
+
+        return write_prior(self, path, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path):
+        """Read what `write` wrote."""
+        from .prior_files import read_prior
+
+        return read_prior(path)
 
 
-class _Plane:
-    """A caller's model as the function plane -> detector pixels (0-based)."""
-
-    def __init__(self, model, shape, direction, origin):
-        self._model, self._origin, self._inverse = model, origin, direction == "reference_to_detector"
-        t = np.linspace(-1, 1, 41)
-        self.pixels = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), shape)
-        if self._inverse:
-            self.plane = self._locate_plane()
-        else:
-            self.plane = self._call(self.pixels + origin)
-        if not np.all(np.isfinite(self.plane)):
-            raise InputError("the model gives values that are not finite on the detector; check shape and origin")
-
-    def _locate_plane(self):
-        """Plane coordinates that fall on the detector: affine steps outward from the origin, then Newton."""
-        corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        size = 1.0
-        for _ in range(30):  # a step in the plane that moves the image by about a pixel
-            moved = np.ptp(self._call(size * corners), axis=0).max()
-            if not 0 < moved < np.inf:
-                raise InputError("the model is not finite, or constant, around the origin of its plane")
-            if 0.1 < moved < 10:
-                break
-            size /= moved
-        plane = size * corners
-        for spread in np.linspace(0.05, 1, 20):  # widen slowly: far from the detector the model means nothing
-            design = np.column_stack([plane, np.ones(len(plane))])
-            affine = np.linalg.lstsq(design, self._call(plane) - self._origin, rcond=None)[0]
-            centre = self.pixels.mean(axis=0)
-            plane = (centre + spread * (self.pixels - centre) - affine[2]) @ np.linalg.inv(affine[:2])
-        step = 0.5 / np.sqrt(abs(np.linalg.det(affine[:2])))
-        return self._newton(lambda w: self._call(w) - self._origin, self.pixels, plane, step)
-
-    def _call(self, xy):
-        return np.stack([np.asarray(a, dtype=float) for a in self._model(xy[:, 0], xy[:, 1])], axis=1)
-
-    def displacement(self, q, pose):
-        """p - q (2, n) of the detector pixels p that see the undistorted pixels q."""
-        w = poses.apply(poses.invert(pose), q)
-        if self._inverse:
-            p = self._call(w) - self._origin
-        else:
-            p = self._newton(lambda p: self._call(p + self._origin), w, q)
-        return (p - q).T
-
-    @staticmethod
-    def _newton(function, target, start, step=0.5):
-        """Solve function(p) = target from start, Jacobian by central differences over `step` (half a pixel)."""
-        p = start
-        for _ in range(40):
-            dx = (function(p + [step, 0]) - function(p - [step, 0])) / (2 * step)
-            dy = (function(p + [0, step]) - function(p - [0, step])) / (2 * step)
-            change = np.linalg.solve(np.stack([dx, dy], axis=2), (target - function(p))[..., None])[..., 0]
-            p = p + change
-            if not np.abs(change).max() > 1e-11 * (1 + np.abs(p).max()):
-                return p
-        raise InputError(
-            f"the model cannot be inverted over the detector (last step {np.abs(change).max():.1e}); "
-            "check direction, shape and origin"
-        )
+def means(prior):
+    """A prior, or dict of priors, without the widths."""
+    if isinstance(prior, dict):
+        return {key: means(each) for key, each in prior.items()}
+    return prior.with_sigma(None) if isinstance(prior, Prior) else prior
 
 
 def similarity_basis(shape, n):
@@ -228,6 +273,12 @@ def dynamic_basis(shape, n):
     shears = shears.reshape(2, -1) / np.hypot(nx, ny)
     unit = np.eye(2 * n).reshape(2 * n, 2, n)
     return np.concatenate([shears, unit[np.r_[3:n, n + 3 : 2 * n]].reshape(-1, 2 * n)])
+
+
+def dynamic_degrees(n):
+    """Degree of every row of `dynamic_basis`, shape (2 * n_modes - 4,)."""
+    degrees = np.add(*basis.orders(basis.degree_of(n)))[3:]
+    return np.concatenate([[1, 1], degrees, degrees]) if n >= 3 else np.zeros(0, dtype=int)
 
 
 def similarity_part(coefficients, shapes):

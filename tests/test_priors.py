@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from astropy.io import fits
 from astropy.modeling import models
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,7 +26,7 @@ def pixels(shape=SHAPE, n=500, seed=0):
 def published(detector):
     """GSAOI as published, 1-based pixel -> arcsec, without the package's own evaluation."""
     cx, cy = gsaoi_polynomials(detector)
-    return lambda x, y: tuple(sum(c[i, j] * x**i * y**j for i in range(4) for j in range(4 - i)) for c in (cx, cy))
+    return lambda x, y: (np.polynomial.polynomial.polyval2d(x, y, cx), np.polynomial.polynomial.polyval2d(x, y, cy))
 
 
 def on_detector(prior, shape, q_of_p):
@@ -63,8 +62,7 @@ def test_origin_and_model_forms_agree(detector):
     assert np.abs(slipped.mean - one.mean).max() > 1e-4
 
 
-@pytest.mark.parametrize("origin", [0, 1])
-@pytest.mark.parametrize("detector", [1, 2, 3, 4])
+@pytest.mark.parametrize(("detector", "origin"), [(2, 0), (4, 1)])
 def test_both_directions_give_the_same_prior(detector, origin):
     """The other direction is served by Newton's method on the published polynomials."""
     forward = published(detector)
@@ -72,7 +70,7 @@ def test_both_directions_give_the_same_prior(detector, origin):
     def backward(xi, eta):
         target = np.column_stack([xi, eta])
         p = np.full_like(target, 1024.0)
-        for _ in range(12):
+        for _ in range(7):
             step = np.array([[0.5, 0], [0, 0.5]])
             columns = [np.column_stack(forward(*(p + e).T)) - np.column_stack(forward(*(p - e).T)) for e in step]
             left = target - np.column_stack(forward(*p.T))
@@ -93,7 +91,7 @@ def test_coarser_detector_sees_the_same_distortion():
     assert_allclose(half.mean, full.mean / 2, atol=1e-7)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(st.floats(-180, 180), st.floats(1e-2, 10), st.sampled_from([1, -1]), st.floats(-1e3, 1e3), st.integers(0, 99))
 def test_the_plane_does_not_matter(angle, scale, parity, shift, seed):
     """Whatever similarity follows the model, the mean is the same; the plane tells the similarity."""
@@ -132,27 +130,6 @@ def test_shear_stays():
     expected = 0.002 * 100 * 2 / np.sqrt(3)
     assert_allclose(prior.mean[0, 2], expected, rtol=5e-3)
     assert_allclose(prior.mean[1, 1], expected, rtol=5e-3)
-
-
-def test_real_maps_of_nirc2(shared_data):
-    """Look-up tables (detector pixel + shift = undistorted pixel) as an interpolated function: 0.14 and 0.26 px rms."""
-    from scipy.interpolate import RectBivariateSpline
-
-    folder = shared_data / "static_distortion" / "nirc2_kai"
-    dx, dy = (fits.getdata(folder / f"nirc2_narrow_{k}geoim_512.fits").astype(float) for k in "xy")
-    grid = np.arange(512)
-    smooth = [RectBivariateSpline(grid, grid, d, kx=3, ky=3) for d in (dx, dy)]
-    prior = Prior.from_model(
-        lambda x, y: (x + smooth[0].ev(y, x), y + smooth[1].ev(y, x)),
-        shape=(512, 512),
-        direction="detector_to_reference",
-        degree=5,
-    )
-    beyond = prior.mean.copy()
-    beyond[:, :3] = 0
-    rms = np.sqrt((beyond**2).sum(axis=1)) / 2
-    assert_allclose(rms, [0.14, 0.26], rtol=0.5)
-    assert 0 < prior.truncation < 1
 
 
 # --- words and refusals ------------------------------------------------------------------------------------------
@@ -196,7 +173,10 @@ def test_bad_arguments(arguments, message):
         ({"direction": "forward"}, "direction must be 'detector_to_reference' or .*, got 'forward'"),
         ({"origin": 2}, r"origin must be 0 or 1 \(coordinate of the first pixel's centre\), got 2"),
         ({"degree": 31}, "degree must be an integer from 0 to 30"),
-        ({"model": lambda x, y: (x, y * np.nan)}, "not finite on the detector; check shape and origin"),
+        (
+            {"model": lambda x, y: (x, y * np.nan)},
+            r"not finite on the detector, the first at pixel \[-0.5, -0.5\]; check shape and origin",
+        ),
         (
             {"model": lambda x, y: (0 * x, 0 * y), "direction": "reference_to_detector"},
             "not finite, or constant, around the origin",

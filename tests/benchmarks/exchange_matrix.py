@@ -1,0 +1,370 @@
+"""Every import and export against an independent reader: ``python tests/benchmarks/exchange_matrix.py``.
+
+A row function yields `Row` objects: the largest distance [pix] between what comes in or goes out here and what the
+reader named says, over the whole detector with edges and corners, and the truncation error of a prior at its degree (of
+a header, the degree it took). It raises `Skip` with the reason when data or a reader are absent. Data:
+``LEGDISTORT_DATA`` or ``../shared/data``.
+"""
+
+import contextlib
+import io
+import json
+import sys
+import tempfile
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import asdf
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS, FITSFixedWarning
+from numpy.polynomial import polynomial
+
+from legdistort import poses
+from legdistort.attachment import attach
+from legdistort.distortion import Distortion
+from legdistort.exceptions import ExportError, LegdistortWarning
+from legdistort.headers import make_header
+from legdistort.priors import Prior
+from legdistort.source_files import read_source
+from legdistort.wcs import exposure_wcs
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import test_headers
+from conftest import data_folder
+
+COLUMNS = "{:40s} {:20s} {:>9s} {:>7s} {:>10s}"
+
+#: Degrees, in extended precision.
+ARCSEC = np.longdouble(1) / 3600
+
+
+@dataclass
+class Row:
+    """One line of the table; errors in pixels, NaN and None where they mean nothing."""
+
+    what: str
+    reader: str
+    error: float
+    degree: int | None = None
+    truncation: float = np.nan
+
+    def __str__(self):
+        degree = "" if self.degree is None else str(self.degree)
+        truncation = "" if np.isnan(self.truncation) else f"{self.truncation:.1e}"
+        return COLUMNS.format(self.what, self.reader, f"{self.error:.1e}", degree, truncation)
+
+
+class Skip(Exception):
+    """A row that cannot be made here, with the reason."""
+
+
+# -- pieces
+
+
+def data(*parts):
+    """Path of real data."""
+    if data_folder() is None:
+        raise Skip("real data absent: set LEGDISTORT_DATA")
+    return data_folder().joinpath(*parts)
+
+
+def grid(shape, n=60):
+    """Pixels x, y over the detector, edges and corners included."""
+    ny, nx = shape
+    x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, n), np.linspace(-0.5, ny - 0.5, n))
+    return x.ravel(), y.ravel()
+
+
+def on_plane(sky, centre):
+    """Gnomonic projection [deg] of (lon, lat) [deg] about a centre, by the textbook in extended precision."""
+    lon, lat, lon0, lat0 = (np.radians(np.asarray(a, dtype=np.longdouble)) for a in (*sky, *centre))
+    ahead = np.sin(lat0) * np.sin(lat) + np.cos(lat0) * np.cos(lat) * np.cos(lon - lon0)
+    up = np.cos(lat0) * np.sin(lat) - np.sin(lat0) * np.cos(lat) * np.cos(lon - lon0)
+    return np.degrees([np.cos(lat) * np.sin(lon - lon0) / ahead, up / ahead])
+
+
+def imported(what, reader, where, plane, *, degree=5, **options):
+    """Row of a source; ``plane(x, y)`` is what the reader says, with 0-based pixels, on the plane of the source."""
+    prior = Prior.from_file(where, degree=degree, **options)
+    told = {key: value for key, value in options.items() if key not in ("ext", "frame")}
+    source = read_source(where, ext=options.get("ext"), frame=options.get("frame")).stated(**told)
+    x, y = grid(source.shape)
+    off = np.array(source.on_plane()(x + source.origin, y + source.origin)) - plane(x, y)
+    scale = poses.describe(prior.plane)["scale"]  # pixels for a unit of the plane
+    return Row(what, reader, float(scale * np.hypot(*off).max()), degree, prior.truncation)
+
+
+def imported_sky(what, reader, where, sky, *, shape, unit=1.0, **options):
+    """The same where the reader ends in longitude and latitude, of so many degrees a unit."""
+    middle = [np.array([(n - 1) / 2]) for n in shape[::-1]]
+    unit = np.longdouble(unit)
+    centre = [unit * np.ravel(a)[0] for a in sky(*middle)]
+
+    def plane(x, y):
+        return on_plane([unit * np.asarray(a) for a in sky(x, y)], centre) / unit
+
+    return imported(what, reader, where, plane, shape=shape, **options)
+
+
+def by_ast(header):
+    """Pixel -> sky [deg] of a FITS header by AST, the library of DS9."""
+    try:
+        from starlink import Ast
+    except ImportError:
+        raise Skip("starlink-pyast is not installed") from None
+    frames = Ast.FitsChan([card.image for card in header.cards]).read()
+
+    def sky(x, y):
+        return np.degrees(frames.tran([np.asarray(x) + 1, np.asarray(y) + 1]))
+
+    return sky
+
+
+def header(ctype, n=1024):
+    """A header with some 20 px of distortion, near RA = 0."""
+    out = fits.Header({"NAXIS": 2, "NAXIS1": n, "NAXIS2": n, "CTYPE1": f"RA---{ctype}", "CTYPE2": f"DEC--{ctype}"})
+    out.update({"CRPIX1": n / 2, "CRPIX2": n / 2, "CRVAL1": 0.001, "CRVAL2": 40.0})
+    out.update({"CUNIT1": "deg", "CUNIT2": "deg", "CD1_1": -3e-5, "CD1_2": 0.0, "CD2_1": 0.0, "CD2_2": 3e-5})
+    if ctype == "TPV":
+        out.update({"PV1_0": 0.0, "PV1_1": 1.0, "PV1_4": 1.5, "PV1_7": 90.0})
+        out.update({"PV2_0": 0.0, "PV2_1": 1.0, "PV2_4": -2.0, "PV2_10": 60.0})
+    else:
+        out.update({"A_ORDER": 3, "B_ORDER": 3, "A_2_0": 4e-5, "A_1_2": 8e-8, "B_1_1": -5e-5, "B_0_3": 9e-8})
+    return out
+
+
+# -- rows
+
+
+def astropy_models():
+    """GSAOI, against powers in plain numpy."""
+    table = json.loads(data("static_distortion", "gsaoi_dragons", "gsaoi_static_distortion.json").read_text())
+    for detector in range(4):
+        parts = [part["parameters"][detector] for part in table["forward"]]
+
+        def plane(x, y, parts=parts):
+            x, y = x + 1, y + 1
+            return [
+                sum(c * x ** int(k[1]) * y ** int(k[3]) for p in parts for k, c in p[axis].items()) for axis in "xy"
+            ]
+
+        yield imported(f"astropy model, GSAOI detector {detector + 1}", "numpy", f"gsaoi-{detector + 1}", plane)
+
+
+def gwcs_files():
+    """Every frame that a file of JWST and Roman can end in, against gwcs."""
+    shapes = {"nircamwcs": (2048, 2048), "miriwcs": (1024, 1032), "roman_wcs": (5000, 5000)}
+    for name, shape in shapes.items():
+        path = data("gwcs_interop", f"{name}.asdf")
+        with asdf.open(path, memmap=False, lazy_load=False) as file:
+            wcs = file["roman"]["wcs"] if "roman" in file.tree else file["wcs"]
+        wcs.bounding_box = None
+        for frame in wcs.available_frames[1:]:
+            sky = wcs.get_transform(wcs.available_frames[0], frame)
+            options = {"shape": shape, "unit": ARCSEC if frame == "v2v3" else 1.0, "frame": frame}
+            yield imported_sky(f"gwcs, {name}, to {frame}", "gwcs", path, sky, **options)
+
+
+def reference_file():
+    """The distortion reference file of MIRI, against the matrices in FITS that it was made from."""
+    folder = data("static_distortion", "miri_miricoord")
+    with fits.open(folder / "MIRI_FM_MIRIMAGE_DISTORTION_SS.09.00.fits") as hdulist:
+        mi, ai, bi, ti = (hdulist[f"{key} matrix"].data for key in ("MI", "AI", "BI", "TI"))
+
+    def sky(x, y):
+        row, column, one = mi @ [y, x - 4, np.ones_like(x)]  # columns are counted from the first one in light
+        return (ti @ [*(polynomial.polyval2d(row, column, c) for c in (ai, bi)), one])[:2]
+
+    path = folder / "jwst_miri_imager_distortion_flt9.asdf"
+    yield imported_sky("reference file, MIRI imager", "FITS matrices", path, sky, shape=(1024, 1032), unit=ARCSEC)
+
+
+def hst_header():
+    """SIP of ACS/WFC; the look-up tables are not in the text."""
+    path = data("gwcs_interop", "acs_wfc.hdr")
+    head = fits.Header.fromtextfile(path)
+    tables = {card.keyword for card in head.cards if card.keyword.startswith(("CPDIS", "D2IMDIS", "DP", "D2IM1"))}
+    for keyword in tables:
+        head.remove(keyword, remove_all=True)
+    wcs = WCS(head)
+    sky = lambda x, y: wcs.all_pix2world(x, y, 0)  # noqa: E731
+    yield imported_sky("FITS header text, HST ACS, SIP", "astropy.wcs", path, sky, shape=(2048, 4096))
+
+
+def fits_headers():
+    """SIP and TPV in FITS files, by two libraries each."""
+    for ctype in ("TAN-SIP", "TPV"):
+        head = header(ctype)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "a.fits")
+            fits.PrimaryHDU(np.zeros((1024, 1024), np.uint8), head).writeto(path)
+            wcs = WCS(head)
+            sky = lambda x, y, wcs=wcs: wcs.all_pix2world(x, y, 0)  # noqa: E731
+            for reader, of in (("astropy.wcs", sky), ("AST", by_ast(head))):
+                yield imported_sky(f"FITS header, {ctype}", reader, path, of, shape=(1024, 1024))
+
+
+def maps():
+    """Shifts of NIRC2, against the pixels of the maps."""
+    paths = [data("static_distortion", "nirc2_kai", f"nirc2_narrow_{k}geoim_512.fits") for k in "xy"]
+    shifts = np.array([fits.getdata(path) for path in paths], dtype=float)
+    y, x = np.indices(shifts.shape[1:]).astype(float)
+    seen = np.array(read_source(paths).stated().on_plane()(x.ravel(), y.ravel())).reshape(shifts.shape)
+    error = np.hypot(*(seen - [x, y] - shifts)).max()
+    yield Row("two FITS maps, NIRC2", "numpy, every pixel", error, 7, Prior.from_file(paths, degree=7).truncation)
+
+
+def coefficients():
+    """Drizzle coefficients of NIRC2, against powers in plain numpy."""
+    for path in sorted(data("static_distortion", "nirc2_kai").glob("*.coeffs.txt")):
+        words = [word for line in path.read_text().splitlines() if line[:1] != "#" for word in line.split()]
+        cs = np.array(words[2:] if words[0] == "poly" else words[1:], dtype=float).reshape(2, -1)
+        order = [(n - k, k) for n in range(6) for k in range(n + 1)]
+
+        def plane(x, y, cs=cs, order=order):
+            x, y = x - 512, y - 512
+            return [sum(a * x**i * y**j for a, (i, j) in zip(c, order, strict=False)) for c in cs]
+
+        name = path.name.removesuffix(".coeffs.txt")
+        yield imported(f"Drizzle coefficients, {name}", "numpy", path, plane, shape=(1024, 1024))
+
+
+def apertures():
+    """SIAF, against pysiaf."""
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            import pysiaf
+    except ImportError:
+        raise Skip("pysiaf is not installed") from None
+    for instrument, name in (
+        ("NIRCam", "NRCA1_FULL"),
+        ("NIRISS", "NIS_CEN"),
+        ("MIRI", "MIRIM_FULL"),
+        ("FGS", "FGS1_FULL"),
+    ):
+        aperture = pysiaf.Siaf(instrument)[name]
+        plane = lambda x, y, aperture=aperture: aperture.sci_to_idl(x + 1, y + 1)  # noqa: E731
+        yield imported(f"SIAF, {instrument} {name}", "pysiaf", f"siaf:{instrument}/{name}", plane)
+
+
+def own_wcs():
+    """The gwcs of an exposure of ours, from ASDF and from the ASDF extension of FITS, against the distortion in it."""
+    mean = np.zeros((2, 10))
+    mean[:, 3:] = np.random.default_rng(1).normal(0, 3, (2, 7))
+    d = Distortion(mean, (512, 512))
+    sky = poses.TangentPlane(0.0, 89.9, np.array([[-1e-5, 0, 0], [0, 1e-5, 0]]))
+    tree = {"meta": {"wcs": exposure_wcs("a", poses.identity(), d, sky)}}
+    with tempfile.TemporaryDirectory() as folder:
+        paths = Path(folder, "a.asdf"), Path(folder, "a.fits")
+        asdf.AsdfFile(tree, version="1.5.0").write_to(paths[0])
+        raw = np.frombuffer(paths[0].read_bytes(), np.uint8)
+        table = fits.BinTableHDU.from_columns(
+            [fits.Column("ASDF_METADATA", f"{raw.size}B", array=raw[None])], name="ASDF"
+        )
+        fits.HDUList([fits.PrimaryHDU(), table]).writeto(paths[1])
+        exact = lambda x, y: d.invert(np.column_stack([x, y])).T  # noqa: E731
+        for path in paths:
+            yield imported(f"our WCS of an exposure, {path.suffix[1:]}", "Newton's method", path, exact, degree=3)
+
+
+def prior_file():
+    """A prior written and read, against itself in memory."""
+    prior = Prior.from_file("gsaoi-1")
+    with tempfile.TemporaryDirectory() as folder:
+        again = Prior.read(prior.write(Path(folder, "prior.asdf")))
+    yield Row("prior.asdf", "in memory", float(np.abs(again.mean - prior.mean).max()), 5, again.truncation)
+
+
+# -- exports: the distortion of an exposure, 1100 x 700 px, as other software reads it
+
+
+def exported(reader, read):
+    """Rows of one reader: ``read(solution, header) -> ra, dec`` [deg] of pixels, for headers of several distortions."""
+    make = test_headers.geometries()
+    for kind in ("sip", "tpv"):
+        for degree, peak in ((3, 5), (3, 20), (3, 100), (5, 5), (5, 20)):
+            solution = make(degree, peak)
+            for allowed in (1e-3, 1e-2, 1e-1):  # strong distortions are beyond SIP and TPV
+                with contextlib.suppress(ExportError):
+                    header = make_header(solution, "a", kind=kind, max_error=allowed)
+                    break
+            p, _, _ = test_headers.detector(solution, "a")
+            back = test_headers.pixels_of(solution, "a", *read(header, p))
+            what = f"{kind.upper()} header, degree {degree}, {peak} px"
+            yield Row(what, reader, test_headers.largest(back, p), header.get("A_ORDER"))
+
+
+def headers_in_astropy():
+    """Our FITS headers as astropy.wcs reads them."""
+    yield from exported("astropy.wcs", lambda header, p: WCS(header).all_pix2world(p, 0).T)
+
+
+def headers_in_ast():
+    """Our FITS headers as AST reads them, the library behind DS9."""
+    try:
+        import starlink.Ast as ast
+    except ImportError:
+        raise Skip("starlink-pyast is not installed") from None
+
+    def read(header, p):
+        channel = ast.FitsChan()
+        for card in header.cards:
+            channel.putfits(str(card), False)
+        channel.clear("Card")
+        return np.degrees(channel.read().tran((p + 1).T))
+
+    yield from exported("AST", read)
+
+
+def tables_in_fits():
+    """The exact gwcs in the ASDF table of a FITS file, as stdatamodels reads it."""
+    try:
+        from stdatamodels import asdf_in_fits
+    except ImportError:
+        raise Skip("stdatamodels is not installed") from None
+    solution = test_headers.geometries()(5, 20)
+    p, _, _ = test_headers.detector(solution, "a")
+    with tempfile.TemporaryDirectory() as folder:
+        frame = Path(folder, "a.fits")
+        fits.PrimaryHDU(np.zeros(test_headers.SHAPE, np.int16)).writeto(frame)
+        attach(solution, [frame], in_place=True)
+        with asdf_in_fits.open(frame) as file:
+            sky = file["meta"]["wcs"](*p.T)
+    yield Row("ASDF table in FITS, degree 5, 20 px", "stdatamodels",
+              test_headers.largest(test_headers.pixels_of(solution, "a", *sky), p), 5)  # fmt: skip
+
+
+IMPORTS = [
+    astropy_models,
+    gwcs_files,
+    reference_file,
+    hst_header,
+    fits_headers,
+    maps,
+    coefficients,
+    apertures,
+    own_wcs,
+    prior_file,
+]
+EXPORTS = [headers_in_astropy, headers_in_ast, tables_in_fits]
+
+
+def main(functions=(*IMPORTS, *EXPORTS)):
+    """Print the rows of all functions, or why there are none."""
+    print(COLUMNS.format("what", "against", "error px", "degree", "trunc. px"))
+    for function in functions:
+        try:
+            for row in function():
+                print(row, flush=True)
+        except Skip as reason:
+            print(f"{function.__name__}: skipped, {reason}")
+
+
+if __name__ == "__main__":
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LegdistortWarning)
+        warnings.simplefilter("ignore", fits.verify.VerifyWarning)
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        main()
