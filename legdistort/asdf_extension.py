@@ -1,13 +1,13 @@
-"""Tells asdf to write `FastLegendre2D` as the stock Legendre2D, so that files need nothing of ours to be read."""
+"""Tells asdf to write our models as the stock ones of the same function: files need nothing of ours to be read."""
 
 from asdf.extension import Converter, Extension
 
 
-class FastLegendreConverter(Converter):
+class StockConverter(Converter):
     """Defers to the converter of the stock model."""
 
     tags = ()
-    types = ("legdistort.distortion.FastLegendre2D",)
+    types = ("legdistort.distortion.FastLegendre2D", "legdistort.wcs.Similarity2D")
 
     def select_tag(self, obj, tags, ctx):
         """None: asdf then looks for the type that `to_yaml_tree` returns."""
@@ -19,14 +19,14 @@ class FastLegendreConverter(Converter):
 
     def from_yaml_tree(self, node, tag, ctx):
         """Never called: files hold the stock model only."""
-        raise TypeError("FastLegendre2D is never written")
+        raise TypeError("files hold stock models only")
 
 
 class LegdistortExtension(Extension):
     """Write-only extension; it leaves no trace in files."""
 
     extension_uri = "asdf://legdistort/extensions/legdistort-1.0.0"
-    converters = (FastLegendreConverter(),)
+    converters = (StockConverter(),)
     tags = ()
 
 

@@ -1,7 +1,5 @@
 """The column contract of every table that enters or leaves, checked in one place."""
 
-from pathlib import Path
-
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable, Table
@@ -35,6 +33,36 @@ DETECTED = {
     "flags": (None, False),
 }
 
+#: Columns of a table of stars: name -> (UCD of the Virtual Observatory, meaning). Names of sky columns are Gaia's.
+STARS = {
+    "star": ("meta.id;meta.main", "name or number of the star"),
+    "x": ("pos.cartesian.x", "distortion-free position in the reference plane, pixels from 0"),
+    "y": ("pos.cartesian.y", "distortion-free position in the reference plane, pixels from 0"),
+    "x_err": ("stat.error;pos.cartesian.x", "standard deviation in the gauge of the solution"),
+    "y_err": ("stat.error;pos.cartesian.y", "standard deviation in the gauge of the solution"),
+    "x_err_abs": ("stat.error;pos.cartesian.x", "standard deviation with what the gauge hides, pointing aside"),
+    "y_err_abs": ("stat.error;pos.cartesian.y", "standard deviation with what the gauge hides, pointing aside"),
+    "xy_corr": ("stat.correlation;pos.cartesian", "correlation of x_err and y_err"),
+    "n": ("meta.number;obs", "observations used"),
+    "flux": ("phot.flux;stat.mean", "mean over the exposures"),
+    "ra": ("pos.eq.ra;meta.main", "right ascension, ICRS"),
+    "dec": ("pos.eq.dec;meta.main", "declination, ICRS"),
+    "ra_error": ("stat.error;pos.eq.ra", "standard deviation of ra times cos(dec), in the gauge of the solution"),
+    "dec_error": ("stat.error;pos.eq.dec", "standard deviation of dec, in the gauge of the solution"),
+    "ra_dec_corr": ("stat.correlation;pos.eq", "correlation of ra_error and dec_error"),
+    "ra_error_abs": ("stat.error;pos.eq.ra", "the same with what the gauge hides, pointing aside"),
+    "dec_error_abs": ("stat.error;pos.eq.dec", "the same with what the gauge hides, pointing aside"),
+}
+
+
+def describe_stars(table):
+    """Give the columns of a table of stars their UCDs and meanings (`STARS`); returns the table."""
+    for name in table.colnames:
+        if name in STARS:
+            ucd, table[name].info.description = STARS[name]
+            table[name].info.meta = {"ucd": ucd}
+    return table
+
 
 def values(table, column, unit=None):
     """A column as a plain float array in `unit`; columns without a unit are taken as they are.
@@ -45,9 +73,11 @@ def values(table, column, unit=None):
         If the column's unit cannot be converted.
     """
     data = table[column]
-    if np.ma.isMaskedArray(data) and np.ma.is_masked(data):
-        data = data.astype(float).filled(np.nan)
+    if data.ndim != 1:
+        raise InputError(f"column {column!r} must hold one number a row, it has shape {data.shape}")
     try:
+        if np.ma.isMaskedArray(data) and np.ma.is_masked(data):
+            data = data.astype(float).filled(np.nan)
         if getattr(data, "unit", None) is not None and unit is not None:
             data = u.Quantity(data).to_value(unit)
         return np.array(data, dtype=float)
@@ -64,8 +94,10 @@ def labels(table, column):
             f"{int(np.argmax(missing))}; fill them or leave these rows out"
         )
     data = np.asarray(table[column])
+    if data.ndim != 1:
+        raise InputError(f"column {column!r} must hold one name a row, it has shape {data.shape}")
     if data.dtype.kind == "S":
-        data = np.char.decode(data)
+        data = np.char.decode(data, "utf-8", "replace")
     if data.dtype.kind == "O":
         data = data.astype(str)
     if data.dtype.kind not in "iuU":
@@ -161,42 +193,3 @@ def check(table, contract, what):
         if bad.any():
             raise InputError(f"{what}: " + _rows(bad, out, "xy_corr is not inside (-1, 1)"))
     return out
-
-
-def read_table(path, *, columns=None):
-    """Read a table of positions from a file.
-
-    ``.ecsv``, ``.fits`` and ``.csv`` by their ending, anything else as text with a header line (commented
-    or not). A table without a column ``exposure`` is taken for one exposure, named after the file.
-
-    Parameters
-    ----------
-    path : str or path
-    columns : dict, optional
-        ``{contract name: name in the file}``, see `rename`.
-
-    Raises
-    ------
-    InputError
-        Naming the file.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    formats = {".ecsv": ["ascii.ecsv"], ".fits": ["fits"], ".csv": ["ascii.csv"]}
-    errors = []
-    for kind in formats.get(path.suffix.lower(), ["ascii.commented_header", "ascii"]):
-        try:
-            table = Table.read(path, format=kind)
-            break
-        except Exception as error:  # readers raise what they like
-            errors.append(str(error).strip().splitlines()[0])
-    else:
-        raise InputError(f"{path} cannot be read as a table: {errors[-1]}")
-    try:
-        table = rename(table, columns or {})
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    if "exposure" not in table.colnames:
-        table["exposure"] = path.stem if path.suffix else path.name
-    return table

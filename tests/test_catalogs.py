@@ -9,6 +9,7 @@ from numpy.testing import assert_array_equal
 
 from legdistort import catalogs
 from legdistort.exceptions import InputError
+from legdistort.table_files import read_table
 
 
 def table(**changes):
@@ -123,7 +124,7 @@ def test_files_give_the_table_back(tmp_path, ending):
         given.write(path, format="fits" if ending == "fits" else "ascii.ecsv")
     else:
         given.write(path, format="ascii.csv" if ending == "csv" else "ascii.commented_header")
-    out = check(catalogs.read_table(path))
+    out = check(read_table(path))
     assert out.colnames == given.colnames
     for name in given.colnames:
         assert_array_equal(out[name], given[name])
@@ -131,13 +132,13 @@ def test_files_give_the_table_back(tmp_path, ending):
 
 def test_a_list_without_exposures_is_one_exposure(tmp_path):
     table(exposure=None).write(tmp_path / "night1.lis.txt", format="ascii.basic")
-    assert set(catalogs.read_table(tmp_path / "night1.lis.txt")["exposure"]) == {"night1.lis"}
+    assert set(read_table(tmp_path / "night1.lis.txt")["exposure"]) == {"night1.lis"}
 
 
 @pytest.mark.parametrize(("name", "n"), [("A", 135), ("B", None), ("C", None), ("D", None)])
 def test_real_lists_of_keck(shared_data, name, n):
     path = shared_data / "keck_nirc2_onc_bn" / f"{name}.lis"
-    out = check(catalogs.read_table(path, columns={"star": "name", "x_err": "xe", "y_err": "ye"}))
+    out = check(read_table(path, columns={"star": "name", "x_err": "xe", "y_err": "ye"}))
     lines = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
     assert len(out) == len(lines)
     assert n is None or len(out) == len(lines) >= 100
@@ -149,24 +150,24 @@ def test_real_lists_of_keck(shared_data, name, n):
 
 def test_real_lists_of_many_epochs(shared_data):
     for path in sorted((shared_data / "keck_nirc2_ob150029").glob("*.lis")):
-        out = catalogs.read_table(path, columns={"star": "name", "x_err": "xe", "y_err": "ye"})
+        out = read_table(path, columns={"star": "name", "x_err": "xe", "y_err": "ye"})
         assert 200 < len(check(out)) < 520
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("broken.ecsv", "not a table", r"broken\.ecsv cannot be read as a table"),
-        ("broken.fits", "not a table", r"broken\.fits cannot be read as a table"),
+        ("broken.ecsv", "not a table", r"broken\.ecsv: cannot be read as a table"),
+        ("broken.fits", "not a table", r"broken\.fits: cannot be read as a table"),
         ("wrong.csv", "a,b\n1,2\n", r"wrong\.csv: no column 'name' to use as 'star'; the table has a, b"),
     ],
 )
 def test_bad_files_are_named(tmp_path, name, content, message):
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError, match=message):
-        catalogs.read_table(tmp_path / name, columns={"star": "name"})
+        read_table(tmp_path / name, columns={"star": "name"})
 
 
 def test_absent_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"none\.csv: no such file"):
-        catalogs.read_table(tmp_path / "none.csv")
+        read_table(tmp_path / "none.csv")
