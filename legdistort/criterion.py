@@ -15,16 +15,15 @@ Arrays are ordered by exposure, coordinates first, so that every sweep reads mem
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib.util import find_spec
-from numbers import Real
 
 import numpy as np
 
 from . import basis
-from .exceptions import InputError, SolveError
-from .priors import Prior, similarity_basis
+from .priors import dynamic_basis
+from .unknowns import Unknowns
 
-#: A prior width of zero holds a mode to this, pixels.
-SMALLEST_WIDTH = 1e-6
+#: Weight on steps along directions that are fixed, relative to that of the data.
+_HOLD = 1e4
 #: Number of observations from which compiled loops are used, if numba is installed.
 COMPILED_FROM = 30_000
 
@@ -38,6 +37,10 @@ def _numba_found():
 def is_compiled(n):
     """Whether the compiled loops of `legdistort.kernels` serve a problem of n observations."""
     return n >= COMPILED_FROM and _numba_found()
+
+
+#: Smallest uncertainty of a static distortion that takes part in a fit, pixels.
+_SMALLEST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +67,10 @@ class Problem:
     prior_sigma : ndarray, shape (n_exposures, 2, n_modes), or None
     static_sigma : ndarray, shape (2, n_modes), or None
         Uncertainty of the prior mean; of several priors the largest.
+    own_degree : int or None
+        Up to this degree exposures have modes of their own; None: nothing is shared. See `Unknowns`.
+    group : ndarray of int, shape (n_exposures,)
+        Detector of every exposure; exposures of one share what is not their own.
     """
 
     degree: int
@@ -78,6 +85,8 @@ class Problem:
     prior_mean: np.ndarray
     prior_sigma: np.ndarray | None = None
     static_sigma: np.ndarray | None = None
+    own_degree: int | None = None
+    group: np.ndarray | int = 0
 
     @cached_property
     def unequal(self):
@@ -94,14 +103,41 @@ class Problem:
         """Number of exposures."""
         return len(self.shapes)
 
+    @cached_property
+    def unknowns(self):
+        """The unknown coefficients as one vector."""
+        return Unknowns(self.degree, self.own_degree, self.group, self.shapes)
+
+    @property
+    def has_prior(self):
+        """Whether widths of a prior take part in J."""
+        return self.prior_sigma is not None or (self.unknowns.shared and self.static_sigma is not None)
+
     @property
     def n_modes(self):
         """Number of fitted modes per axis."""
         return basis.n_modes(self.degree)
 
-    def is_held(self, i):
-        """Whether the prior has widths for exposure i, so that it may have fewer stars than modes."""
-        return self.prior_sigma is not None and bool(np.isfinite(self.prior_sigma[i]).any())
+    def has_widths(self, i):
+        """Whether the prior has widths for exposure i: neither infinite, which is free, nor zero, which is `fixed`."""
+        if self.prior_sigma is None:
+            return False
+        return bool(np.any((self.prior_sigma[i] > 0) & np.isfinite(self.prior_sigma[i])))
+
+    def n_free(self, i):
+        """Number of modes (of the axis that has more) without a prior width: stars that exposure i needs at least."""
+        return self.n_modes if self.prior_sigma is None else int(np.isinf(self.prior_sigma[i]).sum(axis=1).max())
+
+    @cached_property
+    def fixed(self):
+        """Directions of every exposure's coefficients that stay at the prior mean, for its width is zero there.
+
+        List of orthonormal rows (n_fixed, 2 n_modes); None if nothing is fixed.
+        """
+        if self.prior_sigma is None or np.all(self.prior_sigma > 0):
+            return None
+        rows = [dynamic_basis(shape, self.n_modes) for shape in self.shapes]
+        return [r[~np.any((r != 0) & (s.ravel() > 0), axis=1)] for r, s in zip(rows, self.prior_sigma, strict=True)]
 
     def part(self, i):
         """Observations of exposure i, as a slice."""
@@ -163,128 +199,21 @@ class Blocks:
         return self.chi2 + self.penalty
 
 
-def check_error_floor(error_floor):
-    """Raise `InputError` if the floor is not a finite number of pixels, 0 or more."""
-    if not (isinstance(error_floor, Real) and np.isfinite(error_floor) and error_floor >= 0):
-        raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
-
-
-def build(matches, degree, *, prior=None, error_floor=0.0):
-    """The problem posed by `legdistort.matches.Matches`.
-
-    Parameters
-    ----------
-    matches : Matches
-    degree : int
-    prior : Prior or dict, optional
-        One for all exposures, or by ``detector`` or exposure name.
-    error_floor : float
-        Pixels, added in quadrature to every position error.
-
-    Raises
-    ------
-    InputError
-        For a bad degree, floor or prior.
-    SolveError
-        Naming an exposure with fewer stars than modes and no prior to make up for it.
-    """
-    degree = basis.check_degree(degree)
-    check_error_floor(error_floor)
-    obs = matches.observations
-    order = _order(obs)
-    counts = np.bincount(obs.exposure, minlength=len(matches.names))
-    var_x, var_y, cov = (column[order] for column in obs.covariance.T)
-    var_x, var_y = var_x + error_floor**2, var_y + error_floor**2
-    determinant = var_x * var_y - cov**2
-    weight = np.stack([var_y / determinant, var_x / determinant, -cov / determinant])
-    priors = _priors(matches, prior, counts, obs.exposure)
-    for name, p in zip(matches.names, priors, strict=True):
-        if p is not None and p.shape is not None and tuple(p.shape) != tuple(matches.shapes[name]):
-            raise InputError(
-                f"the prior belongs to a detector of shape {tuple(p.shape)} (ny, nx), exposure {name} has "
-                f"{tuple(matches.shapes[name])}; give the prior of this detector"
-            )
-    n_fit = basis.n_modes(degree)
-    top = max([degree, *(p.degree for p in priors if p is not None)])
-    mean = np.zeros((len(priors), 2, basis.n_modes(top)))
-    sigma = np.full((len(priors), 2, n_fit), np.inf)
-    for i, p in enumerate(priors):
-        if p is not None:
-            mean[i, :, : p.mean.shape[1]] = p.mean
-            if p.sigma is not None:
-                given = p.sigma[:, :n_fit]
-                sigma[i, :, : given.shape[1]] = given
-    free = np.isinf(sigma).all(axis=(1, 2))
-    for name, count, is_free in zip(matches.names, counts, free, strict=True):
-        if is_free and count < n_fit:
-            raise SolveError(
-                f"exposure {name} has {count} stars, fewer than the {n_fit} modes of degree {degree}: "
-                f"lower the degree (at most {_highest_degree(count)} here), give a prior with sigma, "
-                "or leave the exposure out"
-            )
-    return Problem(
-        degree=degree,
-        names=matches.names,
-        shapes=[matches.shapes[name] for name in matches.names],
-        n_stars=len(matches.stars),
-        order=order,
-        start=np.concatenate([[0], np.cumsum(counts)]),
-        star=obs.star[order],
-        xy=np.stack([column[order] for column in obs.xy.T]),
-        weight=weight,
-        prior_mean=mean,
-        prior_sigma=None if free.all() else sigma,
-        static_sigma=_static_sigma(priors, degree),
-    )
-
-
-def _order(obs):
-    """Rows by exposure, then star; a slice of all of them where the table comes that way."""
-    key = obs.exposure.astype(np.int64) * (obs.star.max() + 1) + obs.star
-    return slice(None) if np.all(key[1:] > key[:-1]) else np.argsort(key, kind="stable")
-
-
-def _static_sigma(priors, degree):
-    given = [p.static_sigma for p in priors if p is not None and p.static_sigma is not None]
-    return np.max([basis.change_degree(sigma, degree) for sigma in given], axis=0) if given else None
-
-
-def _highest_degree(count):
-    return max(d for d in range(basis.MAX_DEGREE + 1) if basis.n_modes(d) <= max(count, 1))
-
-
-def _priors(matches, prior, counts, exposure):
-    """One prior (or None) per exposure."""
-    if prior is None or isinstance(prior, Prior):
-        return [prior] * len(matches.names)
-    if not isinstance(prior, dict):
-        raise InputError(f"prior must be a Prior or a dict of them, got {type(prior).__name__}")
-    detectors = {}
-    if "detector" in matches.table.colnames:
-        names, first = np.unique(exposure, return_index=True)
-        detectors = {matches.names[i]: matches.table["detector"][k] for i, k in zip(names, first, strict=True)}
-    out = []
-    for name in matches.names:
-        key = name if name in prior else detectors.get(name)
-        if not isinstance(prior.get(key), Prior | None) or key not in prior:
-            raise InputError(
-                f"prior must have a Prior for exposure {name} or its detector {key}, got {prior.get(key)!r}"
-            )
-        out.append(prior[key])
-    return out
-
-
 def prior_precision(problem, i):
-    """Inverse prior covariance (2 n_modes, 2 n_modes) of exposure i; none along its similarities.
+    """Inverse prior covariance (2 n_modes, 2 n_modes) of exposure i; none along its similarities and what is fixed.
 
     A similarity of the coefficients is a change of the pose, which has no prior.
     """
     n = 2 * problem.n_modes
-    if not problem.is_held(i):
-        return np.zeros((n, n))
-    sigma = np.clip(problem.prior_sigma[i].ravel(), SMALLEST_WIDTH, 1e6)  # infinity stands for free
-    others = complement(similarity_basis(problem.shapes[i], problem.n_modes))
-    return others.T @ np.linalg.solve(others * sigma**2 @ others.T, others)
+    out = np.zeros((n, n))
+    if problem.unknowns.shared and problem.static_sigma is not None:
+        out = problem.unknowns.common_precision(np.maximum(problem.static_sigma.ravel(), _SMALLEST))[i]
+    if not problem.has_widths(i):
+        return out
+    sigma = np.minimum(problem.prior_sigma[i].ravel(), 1e6)  # infinity stands for free
+    others = dynamic_basis(problem.shapes[i], problem.n_modes)
+    others = others[np.any((others != 0) & (sigma > 0), axis=1)]
+    return out + others.T @ np.linalg.solve(others * sigma**2 @ others.T, others)
 
 
 def complement(rows):
@@ -345,7 +274,7 @@ def linearise(problem, state):
         values, coupling, residual, v, g_star, u, g_exposure = _sums(problem, state)
         chi2 = float(squares(problem, residual).sum())
     u_data, penalty = u, 0.0
-    if problem.prior_sigma is not None:
+    if problem.has_prior:
         u = u.copy()
         for i in range(problem.n_exposures):
             precision = prior_precision(problem, i)
@@ -353,6 +282,10 @@ def linearise(problem, state):
             u[i] += precision
             g_exposure[i] -= precision @ departure
             penalty += float(departure @ precision @ departure)
+            if problem.fixed is not None:
+                rows = problem.fixed[i]
+                u[i] += _HOLD * np.trace(u_data[i]) / len(departure) * rows.T @ rows
+                g_exposure[i] -= rows.T @ (rows @ g_exposure[i])
     return Blocks(chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values)
 
 

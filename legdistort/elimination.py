@@ -52,12 +52,10 @@ def reduced_matrix(problem, blocks):
 
     The product is taken over blocks of stars, each a dense matrix product.
     """
-    size = 2 * problem.n_modes
-    n = problem.n_exposures * size
-    out = np.zeros((n, n))
-    for i in range(problem.n_exposures):
-        out[i * size : (i + 1) * size, i * size : (i + 1) * size] = blocks.u[i]
+    unknowns = problem.unknowns
+    out = unknowns.matrix(blocks.u)
     for factor in star_factors(problem, blocks):
+        factor = unknowns.gather(factor.reshape(*blocks.g_exposure.shape, -1))
         out -= factor @ factor.T
     return out
 

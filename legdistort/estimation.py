@@ -1,27 +1,20 @@
 """`solve`: from matched positions to a `Solution`."""
 
 import logging
-from contextlib import nullcontext
-from dataclasses import dataclass
-from functools import cached_property
-from numbers import Real
+import warnings
 
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable
-from scipy.optimize import brentq
 
-from . import basis, criterion, outliers, solvers, starting
-from .exceptions import InputError, check_choice
-from .gauge import KINDS
+from . import anchoring, empirical, fits, forms, influence, provenance, selection
+from .exceptions import AssumptionWarning, InputError, LegdistortWarning
 from .matches import Matches
+from .options import check_options, check_reference, own_degree
 from .solution import Solution
 from .uncertainty import Uncertainty
 
 log = logging.getLogger(__name__)
-
-METHODS = ("joint", "alternating")
-ERRORS = ("stated", "scale", "floor")
 
 
 def solve(
@@ -29,6 +22,9 @@ def solve(
     *,
     degree=3,
     prior=None,
+    model=None,
+    static=None,
+    exposure_degree=None,
     gauge="minimal",
     method="joint",
     loss="linear",
@@ -36,6 +32,10 @@ def solve(
     error_floor=0.0,
     errors="stated",
     max_iterations=None,
+    validate=None,
+    reference=None,
+    epoch=None,
+    pixel_scale=None,
 ):
     """Estimate all star positions and all distortions at once.
 
@@ -45,10 +45,25 @@ def solve(
     Parameters
     ----------
     matches : Matches
-    degree : int
-        Total degree of the Legendre series, 0 to 30.
+    degree : int or "auto"
+        Total degree of the Legendre series, 0 to 30; or the one up to 6 whose distortions serve stars best that are
+        left out of the fit (`legdistort.selection`).
     prior : Prior or dict, optional
         Static distortion; one, or by ``detector`` or exposure name. None starts from no distortion.
+    model : `~astropy.modeling.Model`, optional
+        Form of the distortion of every exposure, undistorted -> detector pixels, instead of `degree` and `prior`:
+        ``Identity(2) + (Mapping((0, 1, 0, 1)) | Legendre2D & Legendre2D)``, with a static part added if there is one.
+        Its Legendre coefficients are fitted, those marked as ``fixed`` keep their values; the values of all are the
+        static distortion from which exposures depart. `Solution.model` then gives it back fitted. A similarity in
+        front is replaced by the pose of each exposure. Poses also carry shift, rotation and scale: their part of the
+        coefficients c0_0, c1_0 and c0_1 stays as given.
+    static : {None, "fit"}
+        "fit": one static distortion for all exposures of a detector (column ``detector``, else all of one shape), and
+        for each exposure its pose and the modes up to `exposure_degree` alone: the self-calibration of a camera from
+        its own dithers and rolls (Anderson & King 2003). A prior is where it starts, and with ``static_sigma``
+        what holds it.
+    exposure_degree : int, optional
+        With ``static="fit"``: 0 leaves an exposure shift, rotation and scale, 1 (default) an affine map, and so on.
     gauge : {"minimal", "mean"}
         Convention for what the data cannot tell, see `legdistort.gauge`.
     method : {"joint", "alternating"}
@@ -65,6 +80,19 @@ def solve(
         Take the stated errors as they are; or scale the reported errors by sqrt(chi2/dof); or find the error floor
         that makes chi2 its degrees of freedom (zero if it is smaller already). What was found is in ``settings``.
     max_iterations : int, optional
+    validate : float, optional
+        Keep this fraction of the stars, 0 to 0.5, out of everything, and report their scatter beside the one to be
+        expected: ``settings["validation"]``. They are not in the tables of the solution.
+    reference : `~astropy.table.Table` or path, optional
+        Positions with errors that tie shift, rotation and scale, and the maps that the exposures do not tell; relative
+        positions stay as precise as they are. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error`` [mas]
+        and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``ref_epoch`` [yr] and correlations,
+        as in the Gaia catalogue; or ``x``, ``y``, ``x_err``, ``y_err`` in pixels of the reference plane; and perhaps
+        ``star``, the stars of the matches, which are otherwise found by their positions.
+    epoch : float or `~astropy.time.Time`, optional
+        Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
+    pixel_scale : float, optional
+        Arcsec, about; helps to find the stars where no header tells the sky.
 
     Returns
     -------
@@ -79,29 +107,39 @@ def solve(
     """
     check_options(
         degree=degree, gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
-        max_iterations=max_iterations,
+        max_iterations=max_iterations, validate=validate, static=static, exposure_degree=exposure_degree,
     )  # fmt: skip
+    if degree == selection.AUTO and model is not None:
+        raise InputError("a model has its degree: leave degree='auto' out")
+    catalogue, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
     if not isinstance(matches, Matches):
         raise InputError(
             f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
         )
+    form = None if model is None else forms.read(model, matches, degree=degree, prior=prior, gauge=gauge)
+    degree = degree if form is None else form.degree
     options = {
         "degree": degree,
-        "prior": prior,
+        "prior": prior if form is None else form.prior(),
+        "own_degree": None if degree == selection.AUTO else own_degree(static, exposure_degree, degree, method),
         "gauge": gauge,
         "method": method,
         "loss": loss,
         "clip": clip,
         "limit": {} if max_iterations is None else {"max_iterations": max_iterations},
+        "scale": errors == "scale",
     }
-    with _threads(matches):
-        fit = _fit(matches, error_floor, options)
+    matches, kept_out = (matches, None) if validate is None else selection.hold_out(matches, validate)
+    with fits.threads(matches):
+        chosen = _choose(matches, error_floor, options) if degree == selection.AUTO else None
+        fit = fits.estimate(matches, error_floor, options)
         if errors == "floor":
-            fit = _fit_with_floor(matches, fit, options)
+            fit = fits.estimate_with_floor(matches, fit, options)
     log.info("%s; chi2 %.1f for %d degrees of freedom", fit.result.status, fit.chi2, fit.dof)
     scale = np.sqrt(fit.chi2 / fit.dof) if errors == "scale" and fit.dof > 0 else 1.0
     settings = {
-        "degree": int(degree),
+        "degree": int(options["degree"]),
+        "selection": chosen,
         "gauge": gauge,
         "method": method,
         "loss": loss,
@@ -109,140 +147,63 @@ def solve(
         "errors": errors,
         "error_floor": float(fit.error_floor),
         "error_scale": float(scale),
-        "prior": prior is not None,
+        "prior": _describe(prior),
+        "model": None if form is None else form.describe(),
+        "widths": empirical.describe(prior, fit.widths, scale),
+        "effective_modes": dict(zip(fit.problem.names, fit.effective_modes.round(3).tolist(), strict=True)),
+        "departure_ratio": influence.departure_ratio(fit.problem, fit.result.gauge, fit.blocks, fit.uncertainty),
+        "static": static,
+        "exposure_degree": options["own_degree"],
     }
-    return _solution(fit, scale, settings)
+    _warn_of_untold(fit)
+    if catalogue is not None:
+        with fits.threads(matches):
+            fit = anchoring.tie_to(fit, catalogue, options, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
+    settings |= anchoring.describe(fit, catalogue, matches.sky)
+    solution = _solution(fit, scale, settings, form)
+    if kept_out is not None:
+        settings["validation"] = selection.validation(solution, kept_out, validate)
+    return solution
 
 
-def check_options(*, degree=3, gauge="minimal", method="joint", loss="linear", clip=None, error_floor=0.0,
-                  errors="stated", max_iterations=None):  # fmt: skip
-    """Raise `InputError` for options of `solve` that are out of range or contradict one another."""
-    basis.check_degree(degree)
-    check_choice(gauge, KINDS, "gauge")
-    criterion.check_error_floor(error_floor)
-    check_choice(method, METHODS, "method")
-    if method == "alternating" and (loss != "linear" or clip is not None):
-        raise InputError("method='alternating' is the published scheme: it takes neither loss nor clip")
-    check_choice(loss, solvers.LOSSES, "loss")
-    check_choice(errors, ERRORS, "errors")
-    if errors != "stated" and loss != "linear":
-        raise InputError(f"errors={errors!r} compares chi2 with its expectation, which loss={loss!r} changes; use clip")
-    if errors == "floor" and error_floor:
-        raise InputError("errors='floor' finds the error floor itself: leave error_floor out")
-    if max_iterations is not None and not (isinstance(max_iterations, int) and max_iterations > 0):
-        raise InputError(f"max_iterations must be a positive integer, got {max_iterations!r}")
-    if clip is not None and not (isinstance(clip, Real) and clip > 1):
-        raise InputError(f"clip must be a number of standard errors above 1, got {clip!r}")
+def _choose(matches, error_floor, options):
+    """Put the degree that serves best into the options, and return how it was found."""
+
+    def fit(part, degree):
+        trial = fits.estimate(part, error_floor, options | {"degree": degree, "trial": True})
+        return _solution(trial, 1.0, {"error_floor": error_floor}, None)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LegdistortWarning)  # of fits that are thrown away
+        chosen = selection.choose_degree(matches, fit)
+    options["degree"] = chosen["degree"]
+    if chosen["alarm"]:
+        warnings.warn(f"degree {chosen['sentence']}", AssumptionWarning, stacklevel=3)
+    return chosen
 
 
-def _threads(matches):
-    """One thread for linear algebra while the compiled loops use them all; nothing special otherwise."""
-    if not criterion.is_compiled(len(matches.table)):
-        return nullcontext()
-    from . import kernels
-
-    return kernels.one_blas_thread()
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """One minimisation: what went in (after whole exposures were dropped), and what came out."""
-
-    matches: object
-    problem: criterion.Problem
-    result: solvers.Result
-    used: np.ndarray
-    error_floor: float
-
-    @cached_property
-    def weighted(self):
-        """The problem with the weights that were in force."""
-        if self.used.all() and np.all(self.result.robust == 1):
-            return self.problem
-        return self.problem.scaled(self.used * self.result.robust)
-
-    @cached_property
-    def blocks(self):
-        """The normal equations with these weights."""
-        if self.weighted is self.problem:
-            return self.result.blocks
-        return criterion.linearise(self.weighted, self.result.state)
-
-    @cached_property
-    def uncertainty(self):
-        """Covariances at the stated errors."""
-        return Uncertainty(self.weighted, self.blocks, self.result.gauge)
-
-    @property
-    def chi2(self):
-        """Weighted squares of the used residuals."""
-        return self.blocks.chi2
-
-    @cached_property
-    def dof(self):
-        """Degrees of freedom: the directions fixed by the gauge are no unknowns, and a prior does part of the work."""
-        problem = self.problem
-        n_stars = np.count_nonzero(self.blocks.v[0] > 0)
-        n_modes = max(problem.n_modes, 2)  # at degree 0 the poses still fit rotation and scale: 4 in all
-        n_free = 2 * n_stars + (problem.n_exposures - 1) * 2 * n_modes
-        if problem.prior_sigma is not None:
-            size = 2 * problem.n_modes
-            blocks = self.uncertainty.coefficients.reshape(problem.n_exposures, size, problem.n_exposures, size)
-            n_free -= sum(
-                np.sum(criterion.prior_precision(problem, i) * blocks[i, :, i]) for i in range(problem.n_exposures)
-            )
-        return round(2 * np.count_nonzero(self.used) - n_free)
-
-
-def _fit(matches, error_floor, options):
-    """Minimise; exposures whose stars mostly deviate are dropped by name and the rest is solved again."""
-    gauge, loss, clip, limit = (options[key] for key in ("gauge", "loss", "clip", "limit"))
-    problem = criterion.build(matches, options["degree"], prior=options["prior"], error_floor=error_floor)
-    nominal = np.stack([matches.poses[name] for name in matches.names])
-    robust = clip is not None or loss != "linear"
-    start, misplaced = starting.start(problem, nominal, robust=robust)
-    if robust and misplaced.any():
-        reason = "its stars lie nowhere near where the other exposures put them (mismatched, or not this field?)"
-        return _fit_without(
-            matches, error_floor, {problem.names[i]: reason for i in np.flatnonzero(misplaced)}, options
+def _warn_of_untold(fit):
+    """Say how much of a shared distortion these exposures cannot tell."""
+    if fit.problem.unknowns.shared and (n_weak := fit.result.n_weak):
+        warnings.warn(
+            f"static='fit': {n_weak} of {fit.problem.unknowns.n_common} unknowns of the shared distortion are not told "
+            "by these exposures and stay where the prior has them; dithers with rolls tell more",
+            AssumptionWarning,
+            stacklevel=3,
         )
-    used = np.ones(problem.xy.shape[1], dtype=bool)
-    if options["method"] == "alternating":
-        result = solvers.solve_alternating(problem, start, gauge=gauge, **limit)
-    elif clip is None:
-        result = solvers.solve_joint(problem, start, gauge=gauge, loss=loss, **limit)
-    else:
-        result, used, unfit = outliers.solve_clipped(problem, start, clip=clip, gauge=gauge, loss=loss, **limit)
-        if unfit:
-            return _fit_without(matches, error_floor, unfit, options)
-    return _Fit(matches, problem, result, used, error_floor)
 
 
-def _fit_without(matches, error_floor, unfit, options):
-    """The fit without some exposures, ``{name: reason}``."""
-    for name, reason in unfit.items():
-        log.warning("exposure %s is left out: %s", name, reason)
-    return _fit(matches.without(unfit), error_floor, options)
+def _describe(prior):
+    """A prior as plain numbers and strings, by detector or exposure if it was given so; None if there is none.
+
+    Its mean is in the solution already, by exposure.
+    """
+    if prior is None or not isinstance(prior, dict):
+        return None if prior is None else prior.describe()
+    return {str(name): None if each is None else each.describe() for name, each in prior.items()}
 
 
-def _fit_with_floor(matches, fit, options):
-    """The fit whose error floor makes chi2 its degrees of freedom."""
-    if fit.dof <= 0 or fit.chi2 <= fit.dof:
-        return fit
-    residual = np.sqrt(np.mean(fit.result.blocks.residual[:, fit.used] ** 2))
-    tried = {}
-
-    def excess(log_floor):
-        tried[log_floor] = _fit(matches, np.exp(log_floor), options)
-        return np.log(tried[log_floor].chi2 / tried[log_floor].dof)
-
-    high = np.log(4 * residual)
-    low = high - 12  # a floor of 1e-5 of the residuals is none
-    best = brentq(excess, low, high, xtol=1e-3, maxiter=40) if excess(low) > 0 > excess(high) else high
-    return tried[best] if best in tried else _fit(matches, np.exp(best), options)
-
-
-def _solution(fit, scale, settings):
+def _solution(fit, scale, settings, form):
     """Bring the solver's arrays back into the order and the words of the user."""
     matches, problem, result = fit.matches, fit.problem, fit.result
     table = QTable(matches.table, copy=False)
@@ -258,7 +219,7 @@ def _solution(fit, scale, settings):
         degree=problem.degree,
         shapes=dict(matches.shapes),
         poses=dict(zip(problem.names, result.state.poses, strict=True)),
-        coefficients=result.state.coefficients,
+        coefficients=result.state.coefficients if form is None else form.hold(problem.names, result.state.coefficients),
         prior_mean=problem.prior_mean,
         star_names=np.asarray(matches.stars),
         positions=positions,
@@ -271,4 +232,6 @@ def _solution(fit, scale, settings):
         sky=matches.sky,
         left_out=dict(matches.left_out),
         settings=settings,
+        form=form,
+        provenance=provenance.stamp(),
     )

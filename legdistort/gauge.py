@@ -18,15 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from . import basis
-from .criterion import State, complement
-from .exceptions import SolveError, check_choice
-from .priors import dynamic_basis, similarity_basis, similarity_part
-from .scatter import conditional_errors, dynamic_covariance, say
-
-KINDS = ("minimal", "mean")
-#: Below this the constraints of the "mean" gauge leave a direction free.
-_MEAN_LIMIT = 1e-3
-_CORNERS = np.array([[-1, 1, 1, -1.0], [-1, -1, 1, 1.0]])
+from .priors import dynamic_basis, similarity_basis
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +46,11 @@ class Gauge:
     told_covariance : ndarray, shape (n_told, n_told), or None
         Covariance of the values `told_rows` of the constraints as the data tell them, px^2.
     values : ndarray, shape (2 n_modes,), or None
-        What the orthonormal constraints are held at: zero, but for the combinations that the data tell.
+        What the orthonormal constraints are held at: zero, but for what the data or a reference tell.
+    shears : bool
+        Whether exposures take back shears, of which the data then say nothing.
+    tie : `legdistort.tie.Tie` or None
+        How a reference catalogue measured the maps that the data do not tell.
     """
 
     kind: str
@@ -67,6 +63,8 @@ class Gauge:
     told: np.ndarray | None = None
     told_covariance: np.ndarray | None = None
     values: np.ndarray | None = None
+    shears: bool = True
+    tie: object = None
 
     @property
     def n_constraints(self):
@@ -96,11 +94,12 @@ class Gauge:
     def affine(self):
         """Combinations of the constraints that settle affine maps, of which the data say nothing; orthonormal columns.
 
-        Those of the similarities, which the poses carry, and what the two shears of the reference plane move.
+        Those of the similarities, which the poses carry, and what the two shears of the reference plane move, unless
+        exposures share theirs.
         """
         size, n = 2 * self.box[1, ::-1], self.n_constraints // 2
         similar = self.constraint[-len(similarity_basis(size, n)) :].reshape(-1, self.orthonormal.shape[1])
-        shears = dynamic_basis(size, n)[:2]
+        shears = dynamic_basis(size, n)[: 2 * self.shears]
         return np.linalg.qr(np.hstack([self.orthonormal @ similar.T, self._reach @ shears.T]))[0]
 
     @property
@@ -113,11 +112,17 @@ class Gauge:
         """Maps of the reference plane (k, 2 n_modes) that stand for combinations of the constraints (2 n_modes, k)."""
         return np.linalg.solve(self._reach, combinations).T
 
-    def modes_at(self, xy):
-        """Values (n_modes, n) of the reference-plane modes at reference positions (n, 2)."""
-        degree = basis.degree_of(self.n_constraints // 2)
+    def modes_at(self, xy, n_modes=None):
+        """Values (n_modes, n) of the reference-plane modes, by default of the gauge, at reference positions (n, 2)."""
+        degree = basis.degree_of(self.n_constraints // 2 if n_modes is None else n_modes)
         u, v = ((np.asarray(xy) - self.box[0]) / self.box[1]).T
         return basis.values(degree, u, v)
+
+    def common_map(self, departure):
+        """The map (2 n_modes,) of the reference plane, similarities aside, to which departures A_i - A_0 amount."""
+        similar = similarity_basis(2 * self.box[1, ::-1], self.n_constraints // 2)
+        out = -np.linalg.pinv(self._reach) @ self.orthonormal @ departure.ravel()
+        return out - similar.T @ (similar @ out)
 
     @cached_property
     def absolute_covariance(self):
@@ -125,8 +130,11 @@ class Gauge:
 
         The mean dynamic distortion of the set, with the observed scatter per mode, and the uncertainty of
         the static distortion, if given; both as they pass through the constraint. Where the data tell, their error.
-        The similarities, which are a matter of pointing, are left out.
+        The similarities, which are a matter of pointing, are left out. With a reference it is what that leaves open,
+        similarities included.
         """
+        if self.tie is not None:
+            return self.tie.covariance
         rows = self.orthonormal.reshape(self.n_constraints, len(self.motion), -1).transpose(1, 0, 2)
         inside = np.einsum("iab,ibc,idc->ad", rows, self.dynamic, rows, optimize=True)
         if self.static_sigma is not None:
@@ -148,8 +156,10 @@ class Gauge:
         Returns
         -------
         list of (str, int, float)
-            Name, number of modes, error; the similarities first, with NaN.
+            Name, number of modes, error; the similarities first, NaN unless a reference tells them.
         """
+        if self.tie is not None:
+            return self.tie.errors(2 * self.box[1, ::-1])
         degree = basis.degree_of(self.n_constraints // 2)
         variance = np.diag(self.absolute_covariance).reshape(2, -1).sum(axis=0) / 8  # b_m has mean square 1/4
         rows = [("shift, rotation, scale" if degree else "shift", 4 if degree else 2, np.nan)]
@@ -168,7 +178,12 @@ class Gauge:
         hidden = np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()]))
         return (
             f"{self.kind}: {self.n_constraints} modes of a map common to all exposures, which the data do not tell, "
-            f"are fixed by {how}{self._told_in_words()}; they hide {hidden:.2g} px rms per axis, pointing aside"
+            f"are fixed by {how}{self._told_in_words()}; "
+            + (
+                f"they hide {hidden:.2g} px rms per axis, pointing aside"
+                if self.tie is None
+                else f"{self.tie.sentence}; absolute to {hidden:.2g} px rms per axis"
+            )
         )
 
     def _told_in_words(self):
@@ -195,8 +210,11 @@ class Gauge:
             f"changes nothing in the data: {self.n_constraints} modes, {min(6, self.n_constraints)} of them exactly.",
             f"{'modes':24s} {'number':>6s} {'absolute error':>15s}  pinned by",
         ]
+        measured = {} if self.tie is None else self.tie.words(convention)
         for name, number, error in self.absolute_errors():
-            if np.isnan(error):
+            if name in measured:
+                lines.append(f"{name:24s} {number:6d} {f'{error:.2g} px':>15s}  {measured[name]}")
+            elif np.isnan(error):
                 lines.append(f"{name:24s} {number:6d} {'not known':>15s}  the nominal poses, mean over exposures")
             else:
                 lines.append(f"{name:24s} {number:6d} {f'{error:.2g} px':>15s}  {convention}")
@@ -210,141 +228,7 @@ class Gauge:
         )
         lines.append(
             f"Absolute errors (rms over the field, per axis) come from {source}; single exposures depart from the "
-            f"prior mean by {dynamic:.2g} px rms per axis. No external reference was used."
+            f"prior mean by {dynamic:.2g} px rms per axis. "
+            + ("No external reference was used." if self.tie is None else self.tie.statement)
         )
         return "\n".join(lines)
-
-
-def make(kind, problem, state, blocks, *, told=None):
-    """The gauge at a state, its weights from the blocks of the criterion and the scatter seen there.
-
-    Maps `told` (n_told, 2 n_modes) of the reference plane are left to the data: see `Gauge`.
-
-    Raises
-    ------
-    InputError
-        For an unknown kind.
-    SolveError
-        If the "mean" gauge leaves a direction free, as for rolls that cancel.
-    """
-    check_choice(kind, KINDS, "gauge")
-    box = reference_box(problem, state)
-    motion = _motion(problem, state.poses, box)
-    if kind == "mean":
-        _check_mean(motion)
-    similar = _by_shape(similarity_basis, problem)
-    others = _by_shape(dynamic_basis, problem)
-    held = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
-    error = conditional_errors(blocks.u_data, np.where(held[:, None, None], blocks.u_data, blocks.u))
-    dynamic = dynamic_covariance(problem, state, error, motion, others)
-    if kind == "mean":
-        constraint = np.broadcast_to(np.eye(motion.shape[1])[:, None], (motion.shape[1], *motion.shape[:2])).copy()
-    else:
-        constraint = _minimal_constraint(motion, error, dynamic, similar, others, box, held=held)
-    return Gauge(kind, constraint, motion, dynamic, box, problem.static_sigma, bool(held.any()), told)
-
-
-def _minimal_constraint(motion, error, dynamic, similar, others, box, *, held):
-    """Rows ``N_i' W_i``: those of all but the common similarities see the departures without their similarity part.
-
-    With prior widths (exposures `held`) the weight is that of the prior alone: the constraint is then where the prior
-    by itself would settle, and the covariance under it that of truths drawn from the prior.
-    """
-    spread = dynamic + np.where(held, 0, 1)[:, None, None] * error
-    inner = others @ spread @ others.transpose(0, 2, 1)
-    weight = others.transpose(0, 2, 1) @ np.linalg.solve(inner, others) if others.shape[1] else np.zeros_like(error)
-    weight = np.where(held, 1, say(error, others))[:, None, None] * weight
-    pose_weight = say(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
-    common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
-    pulled = motion.transpose(0, 2, 1)
-    rows = np.concatenate([complement(common) @ pulled @ weight, common @ pulled @ pose_weight], axis=1)
-    return rows.transpose(1, 0, 2)
-
-
-def reference_box(problem, state):
-    """Centre and half size (2, 2) of the box of the reference plane that all detectors cover."""
-    scale = np.sqrt(np.abs(np.linalg.det(state.poses[:, :, :2])))
-    usual = np.abs(np.log(scale / np.median(scale))) < np.log(2)  # a mismatched exposure may have any scale
-    ends = _by_shape(lambda shape, _: basis.denormalize(_CORNERS[0], _CORNERS[1], shape), problem)[usual]
-    pose_list = state.poses[usual]
-    corners = _apply_inverse(pose_list, ends).reshape(-1, 2)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    return np.stack([(low + high) / 2, (high - low) / 2])
-
-
-def _by_shape(function, problem):
-    """``function(shape, n_modes)`` of every exposure, computed once a shape, stacked."""
-    made = {shape: function(shape, problem.n_modes) for shape in set(problem.shapes)}
-    return np.stack([made[shape] for shape in problem.shapes])
-
-
-def _motion(problem, pose_list, box):
-    """N_i, to first order in the distortion: a displacement g of the reference plane moves q by R g(T^-1 q)."""
-    degree, size = problem.degree, problem.n_modes
-    u, v, w = basis.quadrature(degree)
-    nodes = _by_shape(lambda shape, _: basis.denormalize(u, v, shape), problem)
-    linear = pose_list[:, :, :2]
-    back = _apply_inverse(pose_list, nodes)
-    reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
-    mixing = np.einsum("mk,nik->imn", basis.values(degree, u, v) * w, reference, optimize=True)
-    return np.einsum("iab,imn->iambn", linear, mixing).reshape(-1, 2 * size, 2 * size)
-
-
-def _check_mean(motion):
-    """Refuse the "mean" gauge where the mean of N_i loses a direction that single exposures have."""
-    mean = motion.mean(axis=0)
-    power = np.einsum("iba,ibc->ac", motion, motion) / len(motion)
-    ratio = np.linalg.eigvals(np.linalg.solve(power, mean.T @ mean)).real.min()
-    if ratio < _MEAN_LIMIT:
-        raise SolveError(
-            "gauge='mean' leaves a common map of the reference plane free: the orientations of these exposures cancel "
-            f"in the mean (ratio {max(ratio, 0):.1e}), as for rolls of 0, 90, 180 and 270 degrees; use gauge='minimal'"
-        )
-
-
-def absorb_similarities(problem, state):
-    """Move the similarity part of every dynamic distortion into its pose; D_i stays what it is.
-
-    ``q' = S q`` and ``A' b(q') = q - q' + A b(S^-1 q')``, a polynomial of the same degree, so the change is exact
-    (prior modes beyond the fitted degree excepted: they stay with the detector).
-
-    Returns
-    -------
-    State
-    float
-        Largest move of a detector corner, pixels.
-    """
-    n_modes = problem.n_modes
-    degree = basis.degree_of(state.coefficients.shape[2])
-    u, v, w = basis.quadrature(degree)
-    project = (basis.values(degree, u, v) * w).T
-    nodes = _by_shape(lambda shape, _: basis.denormalize(u, v, shape), problem)
-    ends = _by_shape(lambda shape, _: basis.denormalize(_CORNERS[0], _CORNERS[1], shape), problem)
-    pixels = np.array(problem.shapes)[:, None, ::-1]
-    coefficients, pose_list, largest = state.coefficients.copy(), state.poses, 0.0
-    for _ in range(4):
-        departure = (coefficients - problem.prior_mean)[:, :, :n_modes]
-        shift = similarity_part(departure, problem.shapes)
-        move = float(np.abs(_apply(shift, ends) - ends).max())
-        largest = max(largest, move)
-        if move < 1e-9:
-            break
-        linear = np.linalg.inv(shift[:, :, :2])
-        old = (nodes - shift[:, None, :, 2]) @ linear.transpose(0, 2, 1)
-        values = basis.values(degree, *np.moveaxis((2 * old + 1) / pixels - 1, -1, 0))
-        changed = ((old - nodes).transpose(0, 2, 1) + np.einsum("iam,mik->iak", coefficients, values)) @ project
-        coefficients[:, :, :n_modes] = changed[:, :, :n_modes]
-        turned = shift[:, :, :2] @ pose_list
-        turned[:, :, 2] += shift[:, :, 2]
-        pose_list = turned
-    return State(state.positions, coefficients, pose_list), largest
-
-
-def _apply(pose_list, xy):
-    """Poses (n, 2, 3) applied to positions (n, k, 2)."""
-    return xy @ pose_list[:, :, :2].transpose(0, 2, 1) + pose_list[:, None, :, 2]
-
-
-def _apply_inverse(pose_list, xy):
-    """Positions (n, k, 2) carried back through poses (n, 2, 3)."""
-    return (xy - pose_list[:, None, :, 2]) @ np.linalg.inv(pose_list[:, :, :2]).transpose(0, 2, 1)

@@ -229,7 +229,7 @@ def _undistorted(n_chunks, start, xy, coefficients, sizes, orders):
                 x, guess, given = x_[:, :size], out[:, first:last], xy[:, first:last]
                 work = (legendre_[0], legendre_[1], legendre_[2], legendre_[3], b_[:, :size], g_[:, :size])
                 guess[:] = given
-                for sweep in range(2):
+                for _sweep in range(2):
                     x[:] = guess
                     _model(coefficients[i], orders, sizes[i], x, work)
                     guess += given - x

@@ -93,8 +93,7 @@ def unfit_exposures(problem, used):
     for i, name in enumerate(problem.names):
         mine = used[problem.part(i)]
         left = np.count_nonzero(mine)
-        needed = 1 if problem.is_held(i) else problem.n_modes
-        if left < max(len(mine) / 2, needed):
+        if left < max(len(mine) / 2, problem.n_free(i), 1):
             out[name] = (
                 f"{len(mine) - left} of its {len(mine)} stars deviate from the solution of the others "
                 "(mismatched, or not this field?)"

@@ -23,6 +23,8 @@ DIRECT_LIMIT = 3000
 _DIRECT_COST = 4e10
 #: The data overrule the convention along a direction where that gains this much chi2 (five standard errors).
 GAIN = 25.0
+_SURE = 0.01  # curvature, relative to that of the coefficients, of a direction that is none of the gauge
+_WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not told
 _ROUNDING = 1e-9  # smallest curvature that means something, relative to that of the coefficients
 
 
@@ -32,9 +34,9 @@ def reduced_system(problem, blocks, gauge):
 
 
 def uses_direct(problem):
-    """Whether the reduced system is small enough to be factorised."""
-    n = problem.n_exposures * 2 * problem.n_modes
-    return n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= _DIRECT_COST
+    """Whether the reduced system is small enough to be factorised; it always is where exposures share modes."""
+    n = problem.unknowns.size
+    return problem.unknowns.shared or (n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= _DIRECT_COST)
 
 
 class _Reduced:
@@ -47,23 +49,33 @@ class _Reduced:
     gauge : Gauge
     """
 
+    n_weak = 0  # unknowns that the exposures share and that they do not tell
+
     def __init__(self, problem, blocks, gauge):
         self.problem, self.blocks, self.gauge = problem, blocks, gauge
-        self.rows = gauge.orthonormal
+        self.unknowns = problem.unknowns
+        self.rows = self._on_unknowns(gauge)
         self.inverse = elimination.inverse_star_blocks(blocks.v)
+
+    def _on_unknowns(self, gauge):
+        """The constraints as rows on the unknowns; those of the gauge act on the modes up to its own degree."""
+        n, size = len(gauge.motion), self.problem.n_modes
+        rows = gauge.orthonormal.reshape(gauge.n_constraints, n, 2, -1)
+        rows = np.pad(rows, ((0, 0), (0, 0), (0, 0), (0, size - rows.shape[3]))).reshape(-1, n, 2 * size)
+        return self.unknowns.gather(rows.transpose(1, 2, 0)).T
 
     def _couple(self, d):
         """E d, shape (2, n_stars)."""
-        return elimination.to_stars(self.problem, self.blocks, d.reshape(self.blocks.g_exposure.shape))
+        return elimination.to_stars(self.problem, self.blocks, self.unknowns.spread(d))
 
     def _gradient(self, own, stars):
         """``own - E' V^-1 stars``, shape (n,)."""
         moved = elimination.symmetric_times(self.inverse, stars)
-        return (own - elimination.to_exposures(self.problem, self.blocks, moved)).ravel()
+        return self.unknowns.gather(own - elimination.to_exposures(self.problem, self.blocks, moved))
 
     def _own(self, d):
         """U d."""
-        return np.einsum("iab,ib->ia", self.blocks.u, d.reshape(self.blocks.g_exposure.shape))
+        return np.einsum("iab,ib->ia", self.blocks.u, self.unknowns.spread(d))
 
     def _stars(self, stars):
         """Star step V^-1 (g_star - E d)."""
@@ -98,13 +110,28 @@ class _Reduced:
             inside -= across @ np.linalg.solve(told.T @ self.information @ told, across.T)
         curvature, vectors = np.linalg.eigh(inside)
         gain = (vectors.T @ (kept.T @ self.pull)) ** 2 / np.maximum(curvature, _ROUNDING * self.scale)
-        problem, n_stars = self.problem, np.count_nonzero(self.blocks.v[0] > 0)
-        dof = 2 * np.count_nonzero(problem.weight[0]) - 2 * n_stars
-        dof -= (problem.n_exposures - 1) * 2 * problem.n_modes + told.shape[1]
-        if dof <= 0:
-            return kept[:, :0]
-        scale = max(1.0, (self.blocks.chi2 - gain.sum()) / dof)
-        return kept @ vectors[:, gain > GAIN * scale]
+        sure = curvature > _SURE * self.scale
+        if self.gauge.prior:  # widths: the curvature is theirs, and the convention is what they say
+            sure[:] = False
+        rest = (self.blocks.chi2 - gain.sum()) / self.dof if self.dof > 0 else np.inf
+        if rest <= self.explained:
+            sure |= gain > GAIN * max(1.0, rest)
+        return kept @ vectors[:, sure]
+
+    @property
+    def dof(self):
+        """Degrees of freedom under the gauge; widths of a prior and what is left to the data not allowed for."""
+        n_stars = np.count_nonzero(self.blocks.v[0] > 0)
+        return 2 * np.count_nonzero(self.problem.weight[0]) - 2 * n_stars - self.unknowns.size + len(self.rows)
+
+    @property
+    def explained(self):
+        """chi2/dof up to which the data, freed of a part of the convention, count as explained.
+
+        Two, or a tenth of what it is. Else the residuals have another cause, modes that are not fitted, say, which
+        bending the reference plane by hundreds of pixels can reduce as well.
+        """
+        return max(2.0, 0.1 * self.blocks.chi2 / self.dof)
 
 
 class Direct(_Reduced):
@@ -123,9 +150,13 @@ class Direct(_Reduced):
         s += self.scale * self.rows.T @ self.rows  # lifts the gauge directions; undone by the multipliers
         # unit diagonal: coefficients of bright and faint exposures then compare
         diagonal = np.diag(s).copy()
+        if self.unknowns.shared:  # what is left of a common distortion without the stars may be rounding
+            diagonal = np.diag(self.unknowns.matrix(blocks.u) + self.scale * self.rows.T @ self.rows)
         self._unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
         s *= self._unit[:, None]
         s *= self._unit
+        if self.unknowns.shared:
+            self._hold_weak(s)
         try:
             self._factor = cho_factor(s, lower=True, overwrite_a=False, check_finite=True)
             if np.diag(self._factor[0]).min() < 1e-7:
@@ -134,6 +165,25 @@ class Direct(_Reduced):
             raise SolveError(_singular_message(problem, s)) from None
         self._lifted = self._apply_inverse(self.rows.T)
         self._border = np.linalg.inv(self.rows @ self._lifted)
+
+    def _hold_weak(self, s):
+        """Hold what neither dithers nor rolls tell of a common distortion: more rows, that keep to the start.
+
+        Raises
+        ------
+        SolveError
+            If that is all of it.
+        """
+        values, vectors = np.linalg.eigh(s)
+        weak = vectors[:, values < _WEAK]
+        self.n_weak = weak.shape[1]
+        if self.n_weak >= self.unknowns.n_common - 2 * (self.problem.own_degree == 0) * len(set(self.problem.group)):
+            raise SolveError(
+                "static='fit': these exposures cannot tell a distortion that they share from one of the sky; "
+                "dither by a good part of the field and turn the camera, or give a prior with static_sigma"
+            )
+        s += weak @ weak.T
+        self.rows = np.concatenate([self.rows, weak.T / self._unit])
 
     def _apply_inverse(self, b):
         unit = self._unit if b.ndim == 1 else self._unit[:, None]
@@ -145,17 +195,20 @@ class Direct(_Reduced):
 
         Half the curvature of J along them, all else refitted; nothing but rounding along the exact directions.
         """
-        out = self._border - self.scale * np.eye(len(self._border))
+        n = self.gauge.n_constraints
+        out = np.linalg.inv(np.linalg.inv(self._border)[:n, :n]) if self.n_weak else self._border
+        out = out - self.scale * np.eye(n)
         return (out + out.T) / 2
 
     @cached_property
     def pull(self):
         """How the data pull at the values of the constraints (n_constraints,): minus half the slope of J along them."""
-        return self._border @ (self._lifted.T @ self.rhs)
+        return (self._border @ (self._lifted.T @ self.rhs))[: self.gauge.n_constraints]
 
     def solve(self, rhs, target):
         """d (n,) that minimises d'Sd/2 - rhs'd with rows d = target."""
         free = self._apply_inverse(rhs)
+        target = np.pad(target, (0, self.n_weak))
         return free - self._lifted @ (self._border @ (self.rows @ free - target))
 
     def step(self, target, told, accuracy):
@@ -165,18 +218,18 @@ class Direct(_Reduced):
             pull = told.T @ (self.pull - self.information @ target)
             target = target + told @ np.linalg.solve(told.T @ self.information @ told, pull)
         d = self.solve(self.rhs, target)
-        return self._stars(self.blocks.g_star - self._couple(d)), d.reshape(self.blocks.g_exposure.shape)
+        return self._stars(self.blocks.g_star - self._couple(d)), self.unknowns.spread(d)
 
     def covariance(self):
-        """Covariance of the coefficients in the gauge, shape (n, n)."""
+        """Covariance of the coefficients of all exposures in the gauge, shape (n_exposures * 2 n_modes,) squared."""
         full = self._apply_inverse(np.eye(len(self._unit)))
         out = full - self._lifted @ self._border @ self._lifted.T
-        return (out + out.T) / 2
+        return self.unknowns.covariance((out + out.T) / 2)
 
 
 def _singular_message(problem, s):
     values, vectors = np.linalg.eigh(np.nan_to_num(s))
-    energy = (vectors[:, 0].reshape(problem.n_exposures, -1) ** 2).sum(axis=1)
+    energy = (problem.unknowns.spread(vectors[:, 0]) ** 2).sum(axis=1)
     worst = [problem.names[i] for i in np.argsort(energy)[::-1][:3] if energy[i] > 0.1]
     return (
         f"the observations do not determine the distortion of degree {problem.degree} "
@@ -195,17 +248,22 @@ class Iterative(_Reduced):
 
     def __init__(self, problem, blocks, gauge):
         super().__init__(problem, blocks, gauge)
-        self._block_inverse = np.linalg.inv(blocks.u)
-        self.scale = np.einsum("iaa->", blocks.u) / blocks.g_exposure.size
+        self._block_inverses = [np.linalg.inv(block) for block in self.unknowns.blocks(blocks.u)]
+        self.scale = np.einsum("iaa->", blocks.u) / self.unknowns.size
 
     def _block_solve(self, r):
-        return np.einsum("iab,ib->ia", self._block_inverse, r.reshape(self.blocks.g_exposure.shape)).ravel()
+        done, out = 0, []
+        for inverse in self._block_inverses:
+            part = r[done : done + inverse.shape[0] * inverse.shape[1]]
+            out.append(np.einsum("iab,ib->ia", inverse, part.reshape(inverse.shape[:2])).ravel())
+            done += len(part)
+        return np.concatenate(out)
 
     @cached_property
     def _moves(self):
         """Changes of the coefficients (n_constraints, n), each moving one constraint by one, all else fitted."""
         nothing = np.zeros_like(self.blocks.g_exposure), np.zeros_like(self.blocks.g_star)
-        return np.stack([self._solve(*nothing, self.rows, unit, 1e-5)[1].ravel() for unit in np.eye(len(self.rows))])
+        return np.stack([self._solve(*nothing, self.rows, unit, 1e-5)[1] for unit in np.eye(len(self.rows))])
 
     @cached_property
     def information(self):
@@ -224,17 +282,18 @@ class Iterative(_Reduced):
         kept = complement(told.T)
         if told.shape[1]:
             accuracy *= 1e-3  # a small residual is a long way where the curvature is small
-        return self._solve(self.blocks.g_exposure, self.blocks.g_star, kept @ self.rows, kept @ target, accuracy)
+        gradients = self.blocks.g_exposure, self.blocks.g_star
+        stars, d = self._solve(*gradients, kept @ self.rows, kept @ target, accuracy)
+        return stars, self.unknowns.spread(d)
 
     def contradicted(self, told):
         """As for `Direct`, but looked for only where chi2 shows that something is amiss: it takes many passes."""
-        dof = 2 * np.count_nonzero(self.problem.weight[0]) - 2 * self.problem.n_stars - self.blocks.g_exposure.size
-        if self.blocks.chi2 < dof + 5 * np.sqrt(2 * max(dof, 1)):
+        if self.blocks.chi2 < self.dof + 5 * np.sqrt(2 * max(self.dof, 1)):
             return np.zeros((len(self.rows), 0))
         return super().contradicted(told)
 
     def _solve(self, g_exposure, g_star, rows, target, tolerance, *, max_iterations=1000):
-        """Star step (2, n_stars) and coefficient step (n_exposures, 2 n_modes) for gradients, with rows d = target."""
+        """Star step (2, n_stars) and step of the unknown coefficients for gradients, with rows d = target."""
         lifted = np.stack([self._block_solve(row) for row in rows], axis=1)
         border = np.linalg.inv(rows @ lifted)
 
@@ -263,7 +322,7 @@ class Iterative(_Reduced):
             p = z + rz / old * p
         else:
             log.info("conjugate gradients stopped after %d steps at %.1e of the start", max_iterations, np.sqrt(rz))
-        return self._stars(stars), d.reshape(g_exposure.shape)
+        return self._stars(stars), d
 
 
 def newton_step(problem, blocks, gauge, departure, *, accuracy=1e-10):

@@ -3,14 +3,13 @@
 import numpy as np
 
 from . import basis
-from .criterion import SMALLEST_WIDTH
 
 
-def conditional_errors(u_data, u):
-    """C_i, covariance (inverse of u) of the coefficients if the stars were known; huge where the data say nothing."""
+def conditional_errors(u_data):
+    """C_i, covariance of the coefficients if the stars were known; huge where the data say nothing."""
     size = u_data.shape[1]
     ridge = 1e-12 * np.trace(u_data, axis1=1, axis2=2)[:, None, None] / size + 1e-300
-    return np.linalg.inv(u + ridge * np.eye(size))
+    return np.linalg.inv(u_data + ridge * np.eye(size))
 
 
 def dynamic_covariance(problem, state, error, motion, others):
@@ -31,9 +30,9 @@ def dynamic_covariance(problem, state, error, motion, others):
     scatter = _pooled(_excess_scatter(own - moved @ common, variance), problem.n_exposures - 1)
     out = others.transpose(0, 2, 1) * scatter**2 @ others
     for i in range(problem.n_exposures):
-        if problem.is_held(i):
+        if problem.has_widths(i):
             width = problem.prior_sigma[i].ravel()
-            given = np.where(np.isfinite(width), np.maximum(width, SMALLEST_WIDTH) ** 2, np.diag(out[i]))
+            given = np.where(np.isfinite(width) & (width > 0), width**2, np.diag(out[i]))
             out[i] = others[i].T @ (others[i] * given @ others[i].T) @ others[i]
     return out
 

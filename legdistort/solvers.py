@@ -5,16 +5,17 @@ the gauge and substitutes back: the structure of bundle adjustment (Triggs et al
 cameras and stars for points.
 """
 
+import contextlib
 import logging
 import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import criterion, elimination, reduction
-from . import gauge as gauges
+from . import basis, conventions, criterion, elimination, reduction
 from .criterion import State
 from .exceptions import ConvergenceWarning, SolveError, check_choice
+from .gauge import Gauge
 
 log = logging.getLogger(__name__)
 
@@ -39,15 +40,18 @@ class Result:
         J, the largest changes of positions and coefficients [pix], one entry an iteration.
     robust : ndarray, shape (n,)
         Factors on the weights from the loss (ones for a linear one).
+    n_weak : int
+        Unknowns of a distortion common to all exposures that these do not tell.
     """
 
     state: State
     blocks: criterion.Blocks
-    gauge: gauges.Gauge
+    gauge: Gauge
     converged: bool
     status: str
     history: list
     robust: np.ndarray
+    n_weak: int = 0
 
 
 def loss_factors(squares, loss):
@@ -62,7 +66,7 @@ def loss_factors(squares, loss):
     return 1 / np.maximum(1, np.sqrt(s)) if loss == "huber" else 1 / (1 + s)
 
 
-def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iterations=50, tolerance=5e-5):
+def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", max_iterations=50, tolerance=5e-5):
     """Gauss-Newton on all unknowns under the constraints of the gauge.
 
     Parameters
@@ -71,6 +75,8 @@ def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iteration
     state : State
         Start values, see `legdistort.starting.start`.
     gauge : {"minimal", "mean"}
+    common : ndarray, shape (2 n_modes,), optional
+        Map of the reference plane at which to hold what the data do not tell, see `legdistort.conventions.make`.
     loss : {"linear", "huber", "cauchy"}
     max_iterations : int
     tolerance : float
@@ -86,68 +92,109 @@ def solve_joint(problem, state, *, gauge="minimal", loss="linear", max_iteration
         If the unknowns are not determined.
     """
     check_choice(loss, LOSSES, "loss")
-    state, _ = gauges.absorb_similarities(problem, state)
-    factors, weighted = np.ones(problem.xy.shape[1]), problem
-    if loss != "linear":
-        factors = loss_factors(criterion.squares(problem, criterion.residuals(problem, state)), loss)
-        weighted = problem.scaled(factors)
-    blocks = criterion.linearise(weighted, state)
-    history, converged, accuracy, size, told = [], False, 1e-3, np.inf, None
-    for iteration in range(1, max_iterations + 1):
-        convention = gauges.make(gauge, weighted, state, blocks, told=told)
-        system = reduction.reduced_system(weighted, blocks, convention)
-        rows = convention.told_rows
-        d_star, d_exposure = system.step(-convention.violation(_departure(problem, state)), rows, accuracy)
-        size, last = _step_size(blocks, d_star, d_exposure), size
-        history.append(
-            {
-                "cost": blocks.cost,
-                "d_positions": float(np.abs(d_star).max()),
-                "d_coefficients": float(np.abs(d_exposure).max()),
-                "step": size,
-            }
-        )
-        log.debug("iteration %d: J = %.8g, step %.2g standard errors", iteration, blocks.cost, size)
-        if size < tolerance:
-            more = system.contradicted(rows) if gauge == "minimal" else rows[:, :0]
-            converged = not more.shape[1]
-            if converged:
-                break
-            log.debug("the data contradict the convention along %d directions", more.shape[1])
-            told, size, accuracy = convention.left_to_data(np.hstack([rows, more])), np.inf, 1e-3
-            continue
-        if size > 0.1 * last:  # slow: exposures hang together weakly, and the inner iterations must be more exact
-            accuracy = max(0.01 * accuracy, 1e-10)
-        cost, blocks, system = blocks.cost, None, None  # makes room for the next
-        state, blocks = _advance(weighted, state, cost, d_star, d_exposure)
-        if loss != "linear":
-            factors = loss_factors(criterion.squares(problem, blocks.residual), loss)
-            weighted = problem.scaled(factors)
-            blocks = criterion.linearise(weighted, state)
-    if not converged:
-        convention = gauges.make(gauge, weighted, state, blocks, told=told)
-    if told is not None:
-        convention = _declared(convention, weighted, blocks, _departure(problem, state))
-    status = f"converged after {iteration} iterations"
-    if not converged:
+    state, _ = conventions.absorb_similarities(problem, state)
+    run = _Descent(problem, state, gauge=gauge, common=common, loss=loss)
+    run.descend(max_iterations, tolerance)
+    while run.converged and (freer := run.freer()) is not None:
+        with contextlib.suppress(SolveError):
+            freer.descend(max_iterations, tolerance)
+        if not (freer.converged and freer.is_explained(run)):
+            break
+        run = freer
+    convention = run.convention
+    if convention.told is not None:
+        convention = _declared(convention, run.weighted, run.blocks, _departure(problem, run.state))
+    status = f"converged after {len(run.history)} iterations"
+    if not run.converged:
         status = (
-            f"not converged after {max_iterations} iterations: the last step was {size:.2g} standard errors; "
-            "look for mismatched stars (loss='cauchy'), or lower the degree"
+            f"not converged after {max_iterations} iterations: the last step was {run.history[-1]['step']:.2g} "
+            "standard errors; look for mismatched stars (loss='cauchy'), or lower the degree"
         )
         warnings.warn(status, ConvergenceWarning, stacklevel=2)
-    return Result(state, blocks, convention, converged, status, history, factors)
+    return Result(run.state, run.blocks, convention, run.converged, status, run.history, run.factors, run.system.n_weak)
+
+
+class _Descent:
+    """Gauss-Newton iterations under one set of constraints."""
+
+    def __init__(self, problem, state, *, gauge, common, loss, told=None, history=()):
+        self.problem, self.state, self.settings = problem, state, {"gauge": gauge, "common": common, "loss": loss}
+        self.told, self.history, self.converged = told, list(history), False
+        self._reweight(criterion.residuals(problem, state) if loss != "linear" else None)
+        self.blocks = criterion.linearise(self.weighted, state)
+        self._prepare()
+
+    def _reweight(self, residuals):
+        if self.settings["loss"] == "linear":
+            self.factors, self.weighted = np.ones(self.problem.xy.shape[1]), self.problem
+            return
+        self.factors = loss_factors(criterion.squares(self.problem, residuals), self.settings["loss"])
+        self.weighted = self.problem.scaled(self.factors)
+
+    def _prepare(self):
+        """The gauge and the reduced system at the current state."""
+        gauge, common = self.settings["gauge"], self.settings["common"]
+        self.convention = conventions.make(gauge, self.weighted, self.state, self.blocks, told=self.told, common=common)
+        self.system = reduction.reduced_system(self.weighted, self.blocks, self.convention)
+
+    def descend(self, max_iterations, tolerance):
+        """Iterate until the next step would be below `tolerance`."""
+        accuracy, size = 1e-3, np.inf
+        for _ in range(max_iterations):
+            target = -self.convention.violation(_departure(self.problem, self.state))
+            d_star, d_exposure = self.system.step(target, self.convention.told_rows, accuracy)
+            size, last = _step_size(self.blocks, d_star, d_exposure), size
+            self.history.append(
+                {
+                    "cost": self.blocks.cost,
+                    "d_positions": float(np.abs(d_star).max()),
+                    "d_coefficients": float(np.abs(d_exposure).max()),
+                    "step": size,
+                }
+            )
+            log.debug("J = %.8g, step %.2g standard errors", self.blocks.cost, size)
+            if size < tolerance:
+                self.converged = True
+                return
+            if size > 0.1 * last:  # slow: exposures hang together weakly, and inner iterations must be more exact
+                accuracy = max(0.01 * accuracy, 1e-10)
+            cost, self.blocks, self.system = self.blocks.cost, None, None  # makes room for the next
+            self.state, self.blocks = _advance(self.weighted, self.state, cost, d_star, d_exposure)
+            if self.settings["loss"] != "linear":
+                self._reweight(self.blocks.residual)
+                self.blocks = criterion.linearise(self.weighted, self.state)
+            self._prepare()
+
+    def freer(self):
+        """The same, less what the data contradict of the convention; None if they contradict nothing."""
+        if self.settings["gauge"] != "minimal" or self.settings["common"] is not None:
+            return None
+        rows = self.convention.told_rows
+        more = self.system.contradicted(rows)
+        if not more.shape[1]:
+            return None
+        log.debug("the data contradict the convention along %d directions", more.shape[1])
+        told = self.convention.left_to_data(np.hstack([rows, more]))
+        return _Descent(self.problem, self.state, told=told, history=self.history, **self.settings)
+
+    def is_explained(self, before):
+        """Whether the data are explained now, or the distortion is shared and the convention plainly not needed."""
+        return self.problem.unknowns.shared or self.blocks.chi2 <= self.system.dof * before.system.explained
 
 
 def _declared(convention, problem, blocks, departure):
     """The gauge held at the values that the data tell, with their covariance: errors relative to it stay relative."""
     rows = convention.told_rows
     information = rows.T @ reduction.reduced_system(problem, blocks, convention).information @ rows
-    values = rows @ (rows.T @ (convention.orthonormal @ departure.ravel()))
+    held = np.zeros(len(rows)) if convention.values is None else convention.values
+    values = held + rows @ (rows.T @ (convention.orthonormal @ departure.ravel() - held))
     return replace(convention, values=values, told_covariance=np.linalg.inv(information))
 
 
 def _departure(problem, state):
-    return (state.coefficients - problem.prior_mean)[:, :, : problem.n_modes].reshape(problem.n_exposures, -1)
+    """A_i - A_0 in the modes of the gauge, (n_exposures, 2 n_modes)."""
+    n_modes = basis.n_modes(problem.unknowns.gauge_degree)
+    return (state.coefficients - problem.prior_mean)[:, :, :n_modes].reshape(problem.n_exposures, -1)
 
 
 def _step_size(blocks, d_star, d_exposure):
@@ -165,7 +212,7 @@ def _advance(problem, state, cost, d_star, d_exposure):
         coefficients = state.coefficients.copy()
         coefficients[:, :, :n_modes] += factor * d_exposure.reshape(-1, 2, n_modes)
         tried = State(state.positions + factor * d_star, coefficients, state.poses)
-        tried, _ = gauges.absorb_similarities(problem, tried)
+        tried, _ = conventions.absorb_similarities(problem, tried)
         new = criterion.linearise(problem, tried)
         # the constraints may cost a little J along directions that are only nearly free
         if new.cost <= 1.5 * cost + 10 * problem.xy.size:
@@ -226,9 +273,9 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=1000, t
             "drift along directions that the data do not tell; method='joint' fixes these"
         )
         warnings.warn(status, ConvergenceWarning, stacklevel=2)
-    state, _ = gauges.absorb_similarities(problem, state)
+    state, _ = conventions.absorb_similarities(problem, state)
     blocks = criterion.linearise(problem, state)
-    convention = gauges.make(gauge, problem, state, blocks)
+    convention = conventions.make(gauge, problem, state, blocks)
     return Result(state, blocks, convention, converged, status, history, np.ones(problem.xy.shape[1]))
 
 

@@ -6,11 +6,11 @@ from astropy import units as u
 from numpy.testing import assert_allclose
 
 from legdistort import performance, poses, reduction, solvers
-from legdistort.criterion import build
 from legdistort.distortion import Distortion
 from legdistort.estimation import solve
 from legdistort.matches import Matches
 from legdistort.priors import Prior
+from legdistort.problems import build
 from legdistort.simulation import simulate_matches
 
 RNG = np.random.default_rng

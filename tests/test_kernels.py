@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from legdistort import criterion, elimination, reduction, starting
+from legdistort import criterion, elimination, problems, reduction, starting
 from legdistort.estimation import solve
 from legdistort.priors import Prior
 from legdistort.simulation import simulate_matches
@@ -25,7 +25,7 @@ def _set(**settings):
 @pytest.mark.parametrize("settings", [{"sigma": 0.05}, {"sigma": RNG.uniform(0.02, 0.2, (9, 120, 2)), "corr": 0.4}])
 def test_compiled_sums_are_the_plain_ones(monkeypatch, settings):
     sim, prior = _set(**settings)
-    problem = criterion.build(sim.matches, 3, prior=prior)
+    problem = problems.build(sim.matches, 3, prior=prior)
     state, _ = starting.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
     plain = criterion.linearise(problem, state)
     a, y = RNG.normal(size=plain.g_exposure.shape), RNG.normal(size=(2, problem.n_stars))
@@ -57,7 +57,7 @@ def test_compiled_solution_is_the_plain_one(monkeypatch, direct):
 @pytest.mark.parametrize("robust", [True, False])
 def test_compiled_start_is_the_plain_one(monkeypatch, robust):
     sim, prior = _set(sigma=0.05, flips=[i in (1, 4) for i in range(9)])
-    problem = criterion.build(sim.matches, 3, prior=prior)
+    problem = problems.build(sim.matches, 3, prior=prior)
     nominal = np.stack([sim.matches.poses[name] for name in sim.matches.names])
     nominal[:, :, 2] += RNG.normal(scale=3, size=(9, 2))
     plain, astray = starting.start(problem, nominal, robust=robust)

@@ -6,7 +6,7 @@ from astropy import units as u
 from numpy.testing import assert_allclose
 from oracle import DenseOracle, predict
 
-from legdistort import criterion, performance, poses, reduction, solvers, starting
+from legdistort import criterion, performance, poses, problems, reduction, starting
 from legdistort.estimation import solve
 from legdistort.exceptions import ConvergenceWarning, InputError, SolveError
 from legdistort.matches import Matches
@@ -76,7 +76,7 @@ def test_model_is_the_published_formula():
 
 def test_jacobian_is_the_finite_difference():
     sim = small(corr=0.3)
-    problem = criterion.build(sim.matches, 2, prior=Prior(sim.truth.static))
+    problem = problems.build(sim.matches, 2, prior=Prior(sim.truth.static))
     state, _ = starting.start(problem, np.stack([sim.matches.poses[n] for n in sim.matches.names]))
     blocks = criterion.linearise(problem, state)
 
