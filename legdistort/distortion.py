@@ -5,10 +5,12 @@ detector coordinates). D is exact; the opposite direction has no closed form and
 Legendre tensor whose degree is raised until the round trip holds.
 """
 
+import sys
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from astropy import units as u
 from astropy.modeling import models
 
 from . import basis
@@ -26,8 +28,9 @@ class FastLegendre2D(models.Legendre2D):
     """`~astropy.modeling.models.Legendre2D` that is thread-safe, keeps no work arrays and knows where it is valid.
 
     The stock model stores its recurrence in attributes: two threads that evaluate one instance corrupt each
-    other, and full-size arrays stay behind. Only the evaluation differs; parameters, fitting and
-    serialisation are those of `Legendre2D`, and ASDF files hold the stock model.
+    other, and full-size arrays stay behind. Its derivatives forget the domain, so that astropy's non-linear fitters
+    end at wrong coefficients; here they are right. Positions may be quantities in pixels, and so is then the value.
+    Parameters and serialisation are those of `Legendre2D`, and ASDF files hold the stock model.
 
     Attributes
     ----------
@@ -43,7 +46,8 @@ class FastLegendre2D(models.Legendre2D):
         shape = (self.y_degree + 1, self.x_degree + 1)
         c = np.array([np.asarray(c, dtype=float).reshape(-1)[0] for c in coeffs]).reshape(shape)
         c /= np.outer(basis.norm(np.arange(shape[0])), basis.norm(np.arange(shape[1])))
-        x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
+        given = x if isinstance(x, u.Quantity) else y
+        x, y = np.broadcast_arrays(to_pixels(x), to_pixels(y))
         out = np.empty(x.shape)
         flat_x, flat_y, flat = x.reshape(-1), y.reshape(-1), out.reshape(-1)
         for start in range(0, flat.size, _CHUNK):
@@ -51,9 +55,20 @@ class FastLegendre2D(models.Legendre2D):
             px = basis.legendre(self.x_degree, _to_window(flat_x[part], self.x_domain, self.x_window))
             py = basis.legendre(self.y_degree, _to_window(flat_y[part], self.y_domain, self.y_window))
             np.einsum("jn,jn->n", c @ px, py, out=flat[part])
-        if self.valid is not None:
-            out[outside(self.valid, x, y)] = np.nan
-        return out
+            if self.valid is not None:
+                flat[part][outside(self.valid, flat_x[part], flat_y[part])] = np.nan
+        return like(given, out)
+
+    def fit_deriv(self, x, y, *params):
+        """Derivatives with respect to the coefficients, shape (n, n_coefficients).
+
+        As for the stock model x and y are positions in the window. But only astropy's linear fitter hands over those;
+        its non-linear fitters and sums of models hand over plain positions, which are mapped here.
+        """
+        if sys._getframe(1).f_code.co_name in ("_wrap_deriv", "_calc_compound_deriv"):
+            x = _to_window(x, self.x_domain, self.x_window)
+            y = _to_window(y, self.y_domain, self.y_window)
+        return super().fit_deriv(x, y, *params)
 
     def stock(self):
         """The same function as a plain `~astropy.modeling.models.Legendre2D`."""
@@ -65,11 +80,29 @@ class FastLegendre2D(models.Legendre2D):
             x_window=self.x_window,
             y_window=self.y_window,
             name=self.name,
+            fixed=self.fixed,
             **dict(zip(self.param_names, self.parameters, strict=True)),
         )
 
 
+def to_pixels(x):
+    """Plain float array of positions given as numbers, or as a quantity in pixels; `InputError` for another unit."""
+    if not isinstance(x, u.Quantity):
+        return np.asarray(x, dtype=float)
+    try:
+        return np.asarray(x.to_value(u.pix), dtype=float)
+    except u.UnitConversionError:
+        raise InputError(f"positions must be in pixels, got {x.unit}") from None
+
+
+def like(given, pixels):
+    """Pixels as a quantity if what was given is one."""
+    return pixels * u.pix if isinstance(given, u.Quantity) else pixels
+
+
 def _to_window(x, domain, window):
+    if domain is None:
+        return x
     (d0, d1), (w0, w1) = domain, window
     return w0 + (x - d0) * ((w1 - w0) / (d1 - d0))
 
@@ -86,16 +119,19 @@ def displacement_model(tensors, shape, *, valid=None, name=None):
     Parameters
     ----------
     tensors : array_like, shape (2, n, n)
-        Coefficients ``[axis, i, j]`` of the un-normalised ``P_i(u) P_j(v)``, pixels.
+        Coefficients ``[axis, i, j]`` of the un-normalised ``P_i(u) P_j(v)``, pixels. Where none of total degree n and
+        more is there, these are marked as fixed for fitters.
     shape : tuple
         ``(ny, nx)`` of the detector.
     valid : tuple, optional
         See `FastLegendre2D`.
     """
     ny, nx = shape
-    parts = []
+    parts, tensors = [], np.asarray(tensors, dtype=float)
+    degree = tensors.shape[1] - 1
+    above = np.argwhere(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) > degree)
+    fixed = {} if np.any(tensors[:, above[:, 0], above[:, 1]]) else {f"c{i}_{j}": True for i, j in above}
     for axis, tensor in zip("xy", tensors, strict=True):
-        degree = len(tensor) - 1
         part = FastLegendre2D(
             degree,
             degree,
@@ -104,6 +140,7 @@ def displacement_model(tensors, shape, *, valid=None, name=None):
             x_window=(-1, 1),
             y_window=(-1, 1),
             name=f"d{axis}",
+            fixed=fixed,
             **{f"c{i}_{j}": float(tensor[i][j]) for i in range(degree + 1) for j in range(degree + 1)},
         )
         part.valid = valid
@@ -199,18 +236,31 @@ class Distortion:
             Naming the worst place, if some points do not converge.
         """
         p = np.asarray(p, dtype=float)
-        q = 2 * p - self(p)
-        for _ in range(max_iterations):
-            value, jacobian = self._value_and_jacobian(q)
-            with np.errstate(invalid="ignore", over="ignore"):
-                step = _solve2(jacobian, p - value)
-                q = q + step
-            if not np.nanmax(np.abs(step), initial=0) > tolerance:
-                break
+        size = _CHUNK // 2
+        blocks = [self._newton(p[k : k + size], tolerance, max_iterations) for k in range(0, len(p), size)]
+        q = np.concatenate(blocks) if blocks else p.copy()
         wrong = ~(np.abs(self(q) - p).max(axis=1) < max(1e-8, tolerance))
         wrong &= np.isfinite(p).all(axis=1)
         if wrong.any():
             self._raise_fold(p[wrong][0], "cannot be inverted")
+        return q
+
+    def _newton(self, p, tolerance, max_iterations):
+        """Newton's method; the Jacobian is kept while every step is ten times shorter than the one before."""
+        q, jacobian, size = 2 * p - self(p), None, np.inf
+        for _ in range(max_iterations):
+            with np.errstate(invalid="ignore", over="ignore"):
+                if jacobian is None:
+                    value, jacobian = self._value_and_jacobian(q)
+                else:
+                    value = self(q)
+                step = _solve2(jacobian, p - value)
+                q = q + step
+            last, size = size, np.nanmax(np.abs(step), initial=0)
+            if not size > tolerance:
+                break
+            if size > 0.1 * last:
+                jacobian = None
         return q
 
     def _raise_fold(self, place, what):
@@ -264,9 +314,33 @@ class Distortion:
     def round_trip_error(self, tensors, p=None):
         """Largest ``|D(E(p)) - p|`` [pix] of an inverse E given by its displacement tensors, over check points."""
         p = _check_points(self.shape) if p is None else p
+        return float(np.abs(self(self._corrected(tensors, p)) - p).max())
+
+    def _corrected(self, tensors, p):
+        """Detector pixels (n, 2) -> undistorted pixels by the displacement tensors of an inverse."""
         u, v = basis.normalize(p, self.shape)
-        shift = np.stack([np.polynomial.legendre.legval2d(u, v, t) for t in tensors], axis=-1)
-        return float(np.abs(self(p + shift) - p).max())
+        return p + np.stack([np.polynomial.legendre.legval2d(u, v, t) for t in tensors], axis=-1)
+
+    def adopt(self, inverse):
+        """Take over an inverse that was certified earlier, after checking its certificate again.
+
+        Raises
+        ------
+        InputError
+            If the round-trip error is not the one certified, or the region of validity not the image of the detector.
+        """
+        p = _check_points(self.shape)
+        q = self._corrected(inverse.tensors, p)
+        error, box = np.abs(self(q) - p).max(), _valid_box(q, self.shape)
+        whose = f"the inverse of the distortion{f' of exposure {self.name}' if self.name else ''}"
+        if not (abs(error - inverse.error) <= 1e-9 and error <= TOLERANCE):
+            raise InputError(
+                f"{whose} misses by {error:.3g} px where {inverse.error:.3g} px was certified: coefficients or inverse "
+                "were changed since; solve again, or take the file as it was written"
+            )
+        if not np.allclose(box, inverse.valid, rtol=0, atol=1e-3):
+            raise InputError(f"{whose} is said to be valid in {inverse.valid}, but the detector's image lies in {box}")
+        self.__dict__["inverse"] = inverse
 
     def model(self):
         """D as an astropy compound model (undistorted -> detector pixels) with the certified inverse attached."""

@@ -2,18 +2,26 @@
 
 import copy
 import pickle
+import subprocess
+import sys
+import warnings
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
 
 import asdf
 import numpy as np
 import pytest
 from astropy import units as u
-from astropy.modeling import CompoundModel, models
+from astropy.modeling import CompoundModel, fitting, models
+from astropy.modeling.separable import separability_matrix
 from numpy.testing import assert_allclose, assert_array_equal
 
 from legdistort import poses
 from legdistort.archive import write_wcs
 from legdistort.distortion import FastLegendre2D
 from legdistort.estimation import solve
+from legdistort.exceptions import InputError
 from legdistort.matches import Matches
 from legdistort.priors import Prior
 from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
@@ -146,6 +154,212 @@ def test_wcs_of_real_polynomials():
         expected = sim.matches.sky.to_sky(solution.correct(name, p))
         assert solution.wcs(name).pixel_to_world(*p.T).separation(expected).max() < 1e-7 * u.arcsec
     assert solution.max_inverse_error <= 1e-6
+
+
+# --- an ordinary astropy model --------------------------------------------------------------------------------------
+
+
+def valid_boxes(model):
+    return [part.valid for part in legendres(model)]
+
+
+@pytest.mark.parametrize(
+    "remake", [copy.copy, copy.deepcopy, lambda m: m.copy(), lambda m: pickle.loads(pickle.dumps(m))]
+)
+def test_copies_know_where_they_are_valid(solution, remake):
+    name = solution.names[3]
+    model = solution.model(name)
+    again = remake(model)
+    p = detector_points(solution, name)
+    x = solution.correct(name, p)
+    assert_array_equal(again(*x.T), model(*x.T))
+    assert_array_equal(again.inverse(*p.T), model.inverse(*p.T))
+    assert valid_boxes(again) == valid_boxes(model)
+    assert np.isnan(again(1e5, 1e5)).all()
+    assert again.name == model.name
+    assert again.fixed == model.fixed
+
+
+def test_sums_and_pairs(solution):
+    model, x = solution.model(solution.names[1]), solution.correct(solution.names[1], [[300.0, 200.0], [900.0, 600.0]])
+    value = np.array(model(*x.T))
+    assert_allclose(np.array((model + models.Identity(2))(*x.T)), value + x.T)
+    assert_allclose(np.array((model & models.Scale(3.0))(*x.T, [1, 2])), [*value, [3, 6]])
+    assert_allclose(np.array((model & models.Scale(3.0)).inverse(*value, [3, 6])), [*x.T, [1, 2]], atol=1e-6)
+    assert_allclose(np.array((model.inverse | model)(*value)), value, atol=1e-6)
+    assert_allclose(np.array((model.inverse | model).inverse(*value)), value, atol=1e-6)
+
+
+def test_both_outputs_depend_on_both_inputs(solution):
+    model = solution.model(solution.names[0])
+    for each in (model, model.inverse, solution.distortion(solution.names[0]).model()):
+        assert_array_equal(separability_matrix(each), np.ones((2, 2), dtype=bool))
+    assert_array_equal(
+        separability_matrix(model & models.Scale(2)), [[True, True, False], [True, True, False], [False, False, True]]
+    )
+
+
+def test_quantities_in_quantities_out(solution):
+    name = solution.names[2]
+    model, distortion = solution.model(name), solution.distortion(name)
+    p = detector_points(solution, name)[:-4]
+    x = solution.correct(name, p)
+    for function, at in ((model, x), (model.inverse, p), (distortion.model(), poses.apply(solution.poses[name], x))):
+        plain, unit = function(*at.T), function(*(at * u.pix).T)
+        assert_array_equal(u.Quantity(unit).to_value(u.pix), plain)
+        with pytest.raises(InputError, match="positions must be in pixels, got deg"):
+            function(*(at * u.deg).T)
+    for function, at in ((solution.correct, p), (solution.distort, x)):
+        unit = function(name, at * u.pix)
+        assert unit.unit == u.pix
+        assert_array_equal(unit.value, function(name, at))
+        assert not isinstance(function(name, at), u.Quantity)
+        with pytest.raises(InputError, match="positions must be in pixels, got arcsec"):
+            function(name, at * u.arcsec)
+
+
+def test_matches_take_any_unit_that_is_pixels(solution):
+    sim = simulate_matches(n_stars=40, n_exposures=3, shape=(400, 300), degree=1, static=1, seed=1).matches
+    thousandth = u.def_unit("mpx", 1e-3 * u.pix)
+    table = sim.table.copy()
+    for name in ("x", "y", "x_err", "y_err"):
+        table[name] = table[name].to(thousandth)
+    matches = Matches.from_table(table, shape=(400, 300), poses=sim.poses)
+    assert_allclose(matches.observations.xy, sim.observations.xy, rtol=1e-12)
+    table["x"] = table["x"].value * u.arcsec
+    with pytest.raises(InputError, match="column 'x' cannot be read as numbers in pix"):
+        Matches.from_table(table, shape=(400, 300))
+
+
+@pytest.mark.parametrize("fitter", [fitting.LinearLSQFitter, fitting.TRFLSQFitter, fitting.LevMarLSQFitter])
+def test_a_series_is_fitted_by_astropy(fitter):
+    """The derivatives of the stock model forget its domain in non-linear fits, and the coefficients go astray."""
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform([[0], [0]], [[1199], [699]], (2, 200))
+    box = {"x_domain": (-0.5, 1199.5), "y_domain": (-0.5, 699.5)}
+    truth = models.Legendre2D(3, 2, **box, **{f"c{i}_{j}": rng.normal() for i in range(4) for j in range(3)})
+    start = FastLegendre2D(3, 2, **box, fixed={"c1_1": True}, c1_1=truth.c1_1.value)
+    start.valid = (-10.0, 1210.0, -10.0, 710.0)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Model is linear")  # advice, when a non-linear fitter is used
+        fitted = fitter()(start, x, y, truth(x, y), weights=rng.uniform(1, 2, 200))
+        both = start + FastLegendre2D(0, 0, **box, fixed={"c0_0": True})
+        total = fitted if fitter is fitting.LinearLSQFitter else fitter()(both, x, y, truth(x, y))
+    assert_allclose(fitted.parameters, truth.parameters, rtol=0, atol=1e-9)
+    assert_allclose(total.parameters[:12], truth.parameters, rtol=0, atol=1e-9)
+    assert type(fitted) is FastLegendre2D
+    assert fitted.valid == start.valid
+
+
+def test_derivatives_are_those_of_the_stock_model():
+    box = {"x_domain": (-0.5, 99.5), "y_domain": (-0.5, 49.5)}
+    x, y = np.random.default_rng(0).uniform(-1, 1, (2, 20))
+    ours, stock = (cls(2, 3, **box) for cls in (FastLegendre2D, models.Legendre2D))
+    assert_array_equal(ours.fit_deriv(x, y, *ours.parameters), stock.fit_deriv(x, y, *stock.parameters))
+
+
+@pytest.mark.parametrize("fitter", [fitting.TRFLSQFitter, fitting.LevMarLSQFitter])
+def test_the_model_of_an_exposure_is_fitted_by_astropy(solution, fitter):
+    """One axis at a time, since astropy's fitters know one output only. The pose stays; stars may be at the edge."""
+    name = solution.names[2]
+    model, x = solution.model(name), solution.correct(name, detector_points(solution, name))
+    moved = np.array(model(*x.T)) + np.array([[0.3], [0.2]]) + 1e-4 * x.T
+    for axis in (0, 1):
+        start = model.copy()
+        for parameter in start.param_names:
+            if parameter.endswith("_34"[2 - axis]):  # of the other axis
+                getattr(start, parameter).fixed = True
+        fitted = fitter()(start | models.Mapping((axis,), n_inputs=2), *x.T, moved[axis])
+        assert_allclose(fitted(*x.T), moved[axis], rtol=0, atol=1e-5)
+        assert_array_equal(fitted.parameters[:6], model.parameters[:6])
+        assert getattr(fitted, f"c3_3_{3 + axis}") == 0
+
+
+def test_our_fitter_takes_it_whole(solution):
+    name = solution.names[2]
+    model, x = solution.model(name), solution.correct(name, detector_points(solution, name))
+    moved = np.array(model(*x.T)) + np.array([[0.3], [0.2]]) + 1e-4 * x.T
+    fitted = fitting.LegendreDistortionFitter()(model, *x.T, *moved)
+    assert_allclose(np.array(fitted(*x.T)), moved, rtol=0, atol=1e-9)
+    assert valid_boxes(fitted) == valid_boxes(model)[:2]
+
+
+# --- many at once ----------------------------------------------------------------------------------------------------
+
+
+def evaluate(wcs, seed):
+    """Both directions on points of the detector."""
+    p = np.random.default_rng(seed).uniform([[0], [0]], [[1199], [699]], (2, 50_000))
+    reference = wcs.get_transform("detector", "reference")(*p)
+    return np.array([*reference, *wcs.get_transform("reference", "detector")(*reference), *wcs(*p)])
+
+
+def test_eight_threads_agree(solution):
+    wcs = solution.wcs(solution.names[1])
+    expected = [evaluate(wcs, seed) for seed in range(4)]
+    with ThreadPoolExecutor(8) as pool:
+        for seed, value in zip(list(range(4)) * 4, pool.map(evaluate, [wcs] * 16, list(range(4)) * 4), strict=True):
+            assert_array_equal(value, expected[seed])
+
+
+@pytest.mark.slow
+def test_eight_processes_agree(solution):
+    wcs = solution.wcs(solution.names[1])
+    with ProcessPoolExecutor(8, mp_context=get_context("spawn")) as pool:
+        for seed, value in enumerate(pool.map(evaluate, [wcs] * 8, range(8))):
+            assert_array_equal(value, evaluate(wcs, seed))
+
+
+MEMORY = """
+import ctypes, gc, os, pickle, sys
+import numpy as np
+
+def resident():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+with open(sys.argv[1], "rb") as file:
+    wcs = pickle.load(file)
+size = os.path.getsize(sys.argv[1])
+back = wcs.get_transform("reference", "detector")
+back(*wcs.get_transform("detector", "reference")(np.arange(9.0), np.arange(9.0)))
+wcs(np.arange(9.0), np.arange(9.0))
+gc.collect()
+before = resident()
+grid = np.meshgrid(np.arange(2048.0), np.arange(2048.0))
+assert np.isfinite(back(*wcs.get_transform("detector", "reference")(*grid))).all()
+assert np.isfinite(wcs(*grid)).all()
+gc.collect()
+once = resident() - before - 2 * grid[0].nbytes / 1e6
+wcs.invert(*wcs(*grid))
+wcs(*grid)
+del grid
+gc.collect()
+assert len(pickle.dumps(wcs)) < 1.1 * size, "the model has grown"
+try:
+    ctypes.CDLL("libc.so.6").malloc_trim(0)  # what the allocator keeps for the next call is not ours
+except OSError:
+    pass
+print(once, resident() - before)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
+def test_nothing_stays_in_memory(tmp_path):
+    """After an evaluation of 2048 x 2048 pixels both ways, by the figure of the operating system."""
+    sim = simulate_matches(n_stars=40, n_exposures=3, seed=3)
+    sky = poses.TangentPlane(10.0, 20.0, np.array([[-1.0, 0, 1024.0], [0, 1.0, -1024.0]]) / 36000)
+    solution = solve(
+        Matches(sim.matches.table, sim.matches.shapes, sim.matches.poses, sky), prior=Prior(sim.truth.static)
+    )
+    (tmp_path / "wcs.pickle").write_bytes(pickle.dumps(solution.wcs(solution.names[0])))
+    command = [sys.executable, "-c", MEMORY, str(tmp_path / "wcs.pickle")]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    once, at_last = map(float, run.stdout.split())
+    assert once < 10
+    assert at_last < 3
 
 
 # --- files -------------------------------------------------------------------------------------------------------
