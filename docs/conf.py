@@ -11,7 +11,7 @@ copyright = f"2026, {author}"
 version = release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "paper/table.md"]
 default_role = "py:obj"
 suppress_warnings = ["config.cache"]
 

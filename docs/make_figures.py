@@ -17,7 +17,7 @@ from astropy import units as u
 from PIL import Image
 
 import legdistort as ld
-from legdistort import criterion, performance, plotting, poses, solvers, starting
+from legdistort import performance, plotting, poses, problems, solvers, starting
 from legdistort.demo import run_demo
 from legdistort.distortion import Distortion
 
@@ -30,6 +30,7 @@ def main():
     """Run both demonstrations and draw."""
     IMAGES.mkdir(exist_ok=True)
     save(sweeps(), "sweeps.png")
+    save(planned(), "planning.png", colours=256)
     with tempfile.TemporaryDirectory() as folder:
         night = run_demo(out=Path(folder) / "night")
         save(before_after(night.solution), "before_after.png", colours=256)
@@ -43,7 +44,7 @@ def sweeps(n_sweeps=300, n_seeds=10):
     for seed in range(n_seeds):
         sim = ld.simulate_matches(seed=seed)
         true = sim.truth.positions
-        problem = criterion.build(sim.matches, 3, prior=ld.Prior(sim.truth.static))
+        problem = problems.build(sim.matches, 3, prior=ld.Prior(sim.truth.static))
         start, _ = starting.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
         for name, solver, n in (
             ("alternating", solvers.solve_alternating, n_sweeps),
@@ -145,6 +146,13 @@ def draw_first_mosaic(run):
     xy = np.column_stack([solution.stars["x"].value, solution.stars["y"].value]) - offset
     plotting.plot_mosaic(run.mosaic, stars=xy, ax=panels[1])
     save(fig, "mosaic.png", colours=256)
+
+
+def planned():
+    """The map of a planned set of exposures, as on the page that explains it."""
+    fig, ax = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
+    ld.predict(n_exposures=11, n_stars=80, sigma=0.02, degree=3, dithers=200).plot(ax=ax)
+    return fig
 
 
 def save(fig, name, *, colours=64):

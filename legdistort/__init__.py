@@ -5,37 +5,44 @@ of every star and the distortion of every exposure (Bernard et al. 2017), and ha
 gwcs objects, ASDF files and a co-added image.
 """
 
+from importlib import import_module
 from importlib.metadata import version
 
-from .coaddition import coadd
-from .estimation import solve
-from .exceptions import LegdistortError, LegdistortWarning
-from .exposures import Exposure, read_exposures
-from .matches import Matches
-from .matching import match
-from .measurement import measure
-from .mosaics import Mosaic
-from .pipeline import run
-from .priors import Prior
-from .simulation import simulate_exposures, simulate_matches
-from .solution import Solution
+import astropy.modeling.fitting  # noqa: F401  (it loads our fitter: before that is being imported by anybody else)
 
 __version__ = version("legdistort")
 
-__all__ = [
-    "Exposure",
-    "LegdistortError",
-    "LegdistortWarning",
-    "Matches",
-    "Mosaic",
-    "Prior",
-    "Solution",
-    "coadd",
-    "match",
-    "measure",
-    "read_exposures",
-    "run",
-    "simulate_exposures",
-    "simulate_matches",
-    "solve",
-]
+# Loaded when first asked for: astropy.modeling looks into this package for a fitter while it is itself half imported,
+# and a program that only fits models should not wait for the rest.
+_PLACES = {
+    "Exposure": "exposures",
+    "LegdistortError": "exceptions",
+    "LegdistortWarning": "exceptions",
+    "Matches": "matches",
+    "Mosaic": "mosaics",
+    "Prior": "priors",
+    "Solution": "solution",
+    "coadd": "coaddition",
+    "match": "matching",
+    "measure": "measurement",
+    "predict": "prediction",
+    "read_exposures": "exposures",
+    "read_wcs": "archive",
+    "run": "pipeline",
+    "simulate_exposures": "simulation",
+    "simulate_matches": "simulation",
+    "solve": "estimation",
+}
+
+__all__ = sorted(_PLACES)
+
+
+def __getattr__(name):
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(f".{_PLACES[name]}", __name__), name)
+    return value
+
+
+def __dir__():
+    return sorted({*globals(), *__all__})

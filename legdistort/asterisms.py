@@ -123,6 +123,33 @@ def triangle_candidates(source, target, *, n_neighbours=7, n_best=6):
     return out
 
 
+def scale_candidates(source, target, *, n_best=3):
+    """Scales, target over source, on which many pairs of triangles of like shape agree, best first.
+
+    Parameters
+    ----------
+    source, target : ndarray, shapes (n, 2) and (m, 2)
+    n_best : int
+
+    Returns
+    -------
+    list of float
+    """
+    shape_s, shape_t = (_triangles(xy, 7)[0] for xy in (source, target))
+    pairs = cKDTree(shape_s[:, :2]).query_ball_tree(cKDTree(shape_t[:, :2]), SHAPE_TOLERANCE / 4)
+    steps = [shape_t[others, 2] - own for own, others in zip(shape_s[:, 2], pairs, strict=True) if others]
+    if not steps:
+        return []
+    ratios = np.concatenate(steps) * SCALE_TOLERANCE / SHAPE_TOLERANCE  # logarithms
+    bins = np.arange(ratios.min() - 0.2, ratios.max() + 0.2, SCALE_TOLERANCE / 4)
+    votes = 3 * uniform_filter(np.histogram(ratios, bins)[0].astype(float), 3)
+    expected = uniform_filter(votes, 31)
+    contrast = (votes - expected) / np.sqrt(expected + 1)
+    peaks = np.where(maximum_filter(contrast, 7) == contrast, contrast, -np.inf)
+    best = np.argsort(-peaks)[:n_best]
+    return [float(np.exp((bins[k] + bins[k + 1]) / 2)) for k in best]
+
+
 def _triangles(xy, n_neighbours):
     """Shapes (n, 3) (two ratios of sides, scaled log size) and corners (n, 3), each opposite the shorter side first."""
     k = min(n_neighbours if len(xy) < CROWDED else n_neighbours - 2, len(xy) - 1)

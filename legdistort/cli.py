@@ -12,6 +12,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from . import commands
 from .exceptions import LegdistortError, LegdistortWarning
+from .sources import DIRECTIONS
 
 log = logging.getLogger("legdistort")
 
@@ -78,6 +79,7 @@ def _run(p):
     _minimum(p)
     _fit(p, clip="5")
     _combination(p)
+    p.add_argument("--compare", action="store_true", help="also by shifts, static map and relative polynomial")
 
 
 def _measure(p):
@@ -100,11 +102,61 @@ def _solve(p):
     _fit(p, clip="no clipping")
 
 
+def _prior(p):
+    p.add_argument("sources", nargs="+", metavar="SOURCE", help="a file or name, or the two maps of shifts in x and y")
+    _out(p, "prior (ASDF)")
+    p.add_argument("--shape", type=int, nargs=2, metavar=("NY", "NX"), help="of the detector, where it is not told")
+    p.add_argument("--degree", type=int, help="total degree of the Legendre series (default 5)")
+    p.add_argument("--direction", choices=DIRECTIONS, help="what the source does, where it is not told")
+    p.add_argument("--origin", type=int, choices=(0, 1), help="coordinate of the first pixel (default 0)")
+    p.add_argument("--ext", help="extension of FITS files, header of a text, or place in an ASDF tree")
+    p.add_argument("--frame", help="where to end: frame of a gwcs, or idl or tel of an aperture")
+    p.add_argument("--sigma", type=_width, help="scatter of single exposures around it, pixels, or the word evidence")
+    p.add_argument("--static-sigma", type=float, help="uncertainty of it, pixels")
+
+
 def _coadd(p):
     _frames(p)
     p.add_argument("--solution", required=True, help="solution.asdf")
+    _limit(p)
     _out(p, "mosaic (FITS)")
     _combination(p)
+
+
+def _attach(p):
+    _show(p)
+    _frames(p)
+    where = p.add_mutually_exclusive_group(required=True)
+    where.add_argument("--out", type=Path, help="folder for copies")
+    where.add_argument("--in-place", action="store_true", help="change the frames themselves")
+    form = p.add_mutually_exclusive_group()
+    form.add_argument("--tpv", action="store_true", help="header for SWarp and SCAMP (default: SIP)")
+    form.add_argument("--asdf-only", action="store_true", help="leave the header alone, add the exact WCS")
+    p.add_argument("--max-error", type=float, default=1e-3, help="of the header, pixels (default 0.001)")
+    p.add_argument("--overwrite", action="store_true", help="replace copies and ASDF extensions that exist")
+
+
+def _predict(p):
+    p.add_argument("--n-exposures", type=int, required=True, help="how many")
+    stars = p.add_mutually_exclusive_group(required=True)
+    stars.add_argument("--n-stars", type=int, help="so many, drawn evenly over the field")
+    stars.add_argument("--density", type=float, help="the same, as stars a detector")
+    stars.add_argument("--stars", metavar="TABLE", help="x, y in the reference plane, perhaps x_err, y_err")
+    p.add_argument("--sigma", type=float, help="error of one measured position, pixels (default: x_err, y_err)")
+    p.add_argument("--degree", type=int, default=3, help="total degree to be fitted (default 3)")
+    p.add_argument(
+        "--dither", type=float, default=0.0, metavar="RMS", help="rms length of the shifts, pixels (default 0)"
+    )
+    p.add_argument("--prior", help="known static distortion: see the command prior")
+    p.add_argument("--dynamic", type=float, help="rms of a coefficient from exposure to exposure, pixels")
+    p.add_argument(
+        "--spectrum", type=_spectrum, metavar="DEGREE=RMS,...", help="the same by degree, beyond the fit too"
+    )
+    p.add_argument("--gauge", choices=("minimal", "mean"), default="minimal", help="see the docs (default minimal)")
+    p.add_argument("--seed", type=int, default=0, help="of stars and shifts that are drawn (default 0)")
+    p.add_argument("--plot", type=Path, metavar="FILE.png", help="map of the error over the field")
+    p.add_argument("--overwrite", action="store_true", help="replace a picture that exists")
+    _table(p)
 
 
 def _simulate(p):
@@ -114,6 +166,12 @@ def _simulate(p):
 
 def _show(p):
     p.add_argument("solution", help="solution.asdf")
+    _limit(p)
+
+
+def _stars(p):
+    _show(p)
+    _out(p, "table (.ecsv, .fits, .vot, .xml or .csv)")
 
 
 def _report(p):
@@ -132,13 +190,25 @@ _COMMANDS = {
         _match,
     ),
     "solve": ("matched positions to distortions", "matched.ecsv --degree 2 --out results", _solve),
+    "prior": ("a known static distortion as a file for --prior", "x.fits y.fits --out prior.asdf", _prior),
     "coadd": (
         "frames and a solution to a mosaic",
         "frames/*.fits --solution results/solution.asdf --out mosaic.fits",
         _coadd,
     ),
+    "attach": (
+        "the WCS of a solution into its frames",
+        "results/solution.asdf frames/*.fits --out calibrated",
+        _attach,
+    ),
+    "predict": (
+        "expected errors of a planned set of exposures",
+        "--n-exposures 11 --n-stars 80 --sigma 0.02 --degree 3",
+        _predict,
+    ),
     "simulate": ("frames of a simulated night with their truth", "--out night --small", _simulate),
     "show": ("print a solution", "results/solution.asdf", _show),
+    "stars": ("the stars of a solution as a table", "results/solution.asdf --out stars.fits", _stars),
     "report": ("HTML page of a solution", "results/solution.asdf --out report.html", _report),
 }
 
@@ -173,6 +243,29 @@ def _columns(text):
     return pairs
 
 
+def _word_or(number, word):
+    """Parser of a number, or of one word that stands for another way."""
+
+    def parse(text):
+        try:
+            return text if text == word else number(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor {word!r}") from None
+
+    return parse
+
+
+def _spectrum(text):
+    try:
+        return {int(degree): float(rms) for degree, rms in (item.split("=") for item in text.split(",") if item)}
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form 3=0.9,4=0.1") from None
+
+
+def _width(text):
+    return text if text == "evidence" else float(text)
+
+
 def _out(p, what):
     p.add_argument("--out", required=True, type=Path, help=what)
     p.add_argument("--overwrite", action="store_true", help="replace what an earlier call left")
@@ -200,20 +293,37 @@ def _minimum(p):
     p.add_argument("--min-exposures", type=int, default=4, help="keep stars seen in so many exposures (default 4)")
 
 
+def _limit(p):
+    p.add_argument("--max-bytes", type=int, help="accept arrays of so many bytes, unpacked (default 2147483648)")
+
+
 def _table(p):
     p.add_argument("--columns", type=_columns, default=[], metavar="OURS=THEIRS,...", help="names of columns")
+    p.add_argument("--origin", type=int, choices=(0, 1), help="of pixels in the table (default 0; SExtractor 1)")
     p.add_argument("--shape", type=int, nargs=2, metavar=("NY", "NX"), help="of the detector, pixels")
 
 
 def _fit(p, *, clip):
-    p.add_argument("--degree", type=int, default=3, help="total degree of the distortion (default 3)")
-    p.add_argument("--prior", help="static distortion: gsaoi-1 ... gsaoi-4, or a solution.asdf")
+    p.add_argument("--degree", type=_word_or(int, "auto"), default=3, help="total degree, or auto (default 3)")
+    p.add_argument("--prior", help="known static distortion: see the command prior")
+    p.add_argument(
+        "--prior-sigma",
+        type=_word_or(float, "evidence"),
+        metavar="PIXELS",
+        help="scatter of exposures around it; evidence: found from them",
+    )
+    p.add_argument("--validate", type=float, metavar="FRACTION", help="of the stars, kept out to test the errors")
+    p.add_argument("--static", choices=("fit",), help="fit one static distortion for all exposures of a detector")
+    p.add_argument("--exposure-degree", type=int, help="with --static fit: what every exposure adds (default 1)")
     p.add_argument("--gauge", choices=("minimal", "mean"), default="minimal", help="see the docs (default minimal)")
     p.add_argument("--method", choices=("joint", "alternating"), default="joint", help="(default joint)")
     p.add_argument("--loss", choices=("linear", "huber", "cauchy"), default="linear", help="(default linear)")
     p.add_argument("--clip", type=float, help=f"leave out what deviates by more sigma; 0: nothing (default {clip})")
     p.add_argument("--errors", choices=("stated", "scale", "floor"), default="stated", help="(default stated)")
     p.add_argument("--error-floor", type=float, default=0.0, help="pixels, added in quadrature to every error")
+    p.add_argument("--reference", metavar="TABLE", help="catalogue to tie the positions to, such as one of Gaia")
+    p.add_argument("--epoch", type=float, metavar="YEAR", help="of the exposures, for proper motions (default: header)")
+    p.add_argument("--pixel-scale", type=float, metavar="ARCSEC", help="helps to find the stars without a header WCS")
 
 
 def _combination(p):

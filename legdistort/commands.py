@@ -42,16 +42,22 @@ def do_run(a):
         out=a.out,
         ext=_extension(a.ext),
         degree=a.degree,
-        prior=_prior(a.prior),
+        prior=_prior_with_sigma(a),
         min_exposures=a.min_exposures,
         clip=_clip(a, 5.0),
+        **_tying(a),
         measuring={key: value for key, value in measuring.items() if value is not None},
         solving=_solving(a),
         coadding={"method": a.combine, "order": a.order},
+        compare=a.compare,
         overwrite=a.overwrite,
         progress=wants_progress(a),
     )
     _report(a, result.solution, result.summary)
+    if a.compare and not a.json:
+        print("\nScatter of corrected positions, mean and standard deviation over the stars, px per axis")
+        for name, s in result.summary["comparison"].items():
+            print(f"  {name:24s} {s['mean']:8.4f} {s['std']:8.4f}")
     if not a.json:
         print(f"Results in {a.out}: open {Path(a.out) / 'report.html'}")
 
@@ -60,34 +66,35 @@ def do_measure(a):
     """``legdistort measure``."""
     from .exposures import read_exposures
     from .measurement import measure
+    from .provenance import checksums
 
     given = {key: getattr(a, key) for key in ("fwhm", "threshold", "gain", "read_noise", "saturation")}
     exposures = read_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
     table = measure(exposures, progress=wants_progress(a), **{k: v for k, v in given.items() if v is not None})
     shapes = {e.name: list(e.shape) for e in exposures}
-    table.meta["shapes"] = shapes
+    table.meta |= {"shapes": shapes, "inputs": checksums(a.frames)}
     _write_table(table, a)
     _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
 
 
 def do_match(a):
     """``legdistort match``."""
-    from astropy.table import vstack
-
     from .matching import match
+    from .table_files import stack
 
     tables = [_read_table(path, a) for path in a.tables]
     names = [name for table in tables for name in set(table["exposure"])]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
-    table = vstack(tables, metadata_conflicts="silent")
+    table = stack(tables)
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
     matches = match(table, shape=tuple(a.shape) if a.shape else shapes or None, min_exposures=a.min_exposures)
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
     matches = replace(matches, left_out=matches.left_out | empty)
     out = matches.table.copy()
-    out.meta = matches.to_meta()
+    inputs = {name: checksum for each in tables for name, checksum in each.meta["inputs"].items()}
+    out.meta = matches.to_meta() | {"inputs": inputs}
     _write_table(out, a)
     figures = {"n_exposures": len(matches.names), "n_stars": len(matches.stars), "n_observations": len(out)}
     _say(a, repr(matches)[1:-1], figures | {"left_out": matches.left_out})
@@ -99,6 +106,7 @@ def do_solve(a):
     from .files import replacing_folder
     from .matches import Matches
     from .pipeline import check_folder, summarise, write_results, write_summary
+    from .provenance import with_inputs
     from .report import write_report
 
     check_folder(a.out, a.overwrite)
@@ -107,7 +115,9 @@ def do_solve(a):
     if shape is None:
         raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
     matches = Matches.from_table(table, shape=shape, **Matches.read_meta(table.meta))
-    solution = solve(matches, degree=a.degree, prior=_prior(a.prior), clip=_clip(a, None), **_solving(a))
+    solution = solve(matches, degree=a.degree, prior=_prior_with_sigma(a, a.shape), clip=_clip(a, None),
+                     **_tying(a), **_solving(a))  # fmt: skip
+    solution = with_inputs(solution, table.meta["inputs"])
     summary = summarise(solution)
     with replacing_folder(a.out) as target:
         write_results(solution, target)
@@ -117,18 +127,88 @@ def do_solve(a):
     _report(a, solution, summary)
 
 
+def do_prior(a):
+    """``legdistort prior``."""
+    from .priors import Prior
+
+    prior = Prior.from_file(
+        a.sources,
+        ext=_extension(a.ext),
+        frame=a.frame,
+        shape=a.shape,
+        degree=a.degree,
+        direction=a.direction,
+        origin=a.origin,
+        sigma=a.sigma,
+        static_sigma=a.static_sigma,
+    )
+    prior.write(a.out, overwrite=a.overwrite)
+    rms_x, rms_y = map(float, prior.rms)
+    figures = {"degree": prior.degree, "truncation_px": prior.truncation, "rms_px": [rms_x, rms_y]}
+    figures |= {"shape": prior.shape, "source": prior.source}
+    words = f"degree {prior.degree}, truncation error {prior.truncation:.2g} px"
+    _say(a, f"{words}; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y; {a.out}", figures)
+
+
 def do_coadd(a):
     """``legdistort coadd``."""
     from .coaddition import coadd
     from .exposures import read_exposures
-    from .solution import Solution
 
-    solution = Solution.read(a.solution)
+    solution = _solution(a)
     exposures = read_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
     mosaic = coadd(exposures, solution, method=a.combine, order=a.order, progress=wants_progress(a))
     mosaic.write(a.out, overwrite=a.overwrite)
     figures = {"shape": list(mosaic.shape), "n_exposures": len(mosaic.exposures), "left_out": mosaic.left_out}
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
+
+
+def do_attach(a):
+    """``legdistort attach``."""
+    from .attachment import attach
+
+    done = attach(
+        _solution(a),
+        a.frames,
+        out=a.out,
+        in_place=a.in_place,
+        kind=None if a.asdf_only else "tpv" if a.tpv else "sip",
+        max_error=a.max_error,
+        ext=_extension(a.ext),
+        overwrite=a.overwrite,
+        progress=wants_progress(a),
+    )
+    errors = {item.exposure: {"path": str(item.path)} | item.errors for item in done}
+    _say(a, "\n".join(repr(item)[1:-1].partition(": ")[2] for item in done), errors)
+
+
+def do_predict(a):
+    """``legdistort predict``."""
+    from .files import replacing
+    from .prediction import predict, show
+
+    prediction = predict(
+        n_exposures=a.n_exposures,
+        stars=None if a.stars is None else _read_table(a.stars, a),
+        n_stars=a.n_stars,
+        density=a.density,
+        sigma=a.sigma,
+        degree=a.degree,
+        shape=tuple(a.shape or (2048, 2048)),
+        dithers=a.dither,
+        prior=_prior(a.prior, a.shape),
+        gauge=a.gauge,
+        dynamic=a.dynamic,
+        spectrum=a.spectrum,
+        seed=a.seed,
+    )
+    if a.plot is not None:
+        with replacing(a.plot, overwrite=a.overwrite) as temporary:
+            prediction.plot().figure.savefig(temporary, format="png", dpi=120)
+    plans = prediction.alternatives()
+    rows = [dict(zip(plans.colnames, row, strict=True)) for row in plans.as_array().tolist()]
+    own, *others = ({key: None if value != value else value for key, value in row.items()} for row in rows)  # no NaN
+    _say(a, f"{prediction}\n\n{show(plans)}", own | {"alternatives": others, "failed": plans.meta["failed"]})
 
 
 def do_simulate(a):
@@ -147,19 +227,26 @@ def do_simulate(a):
 def do_show(a):
     """``legdistort show``."""
     from .pipeline import summarise
-    from .solution import Solution
 
-    solution = Solution.read(a.solution)
+    solution = _solution(a)
     _report(a, solution, summarise(solution))
+
+
+def do_stars(a):
+    """``legdistort stars``."""
+    from .table_files import write_stars
+
+    solution = _solution(a)
+    write_stars(solution, a.out, overwrite=a.overwrite)
+    _say(a, f"{len(solution.star_names)} stars in {a.out}", {"n_stars": len(solution.star_names), "out": str(a.out)})
 
 
 def do_report(a):
     """``legdistort report``."""
     from .pipeline import summarise
     from .report import write_report
-    from .solution import Solution
 
-    solution = Solution.read(a.solution)
+    solution = _solution(a)
     write_report(a.out, solution, summary=summarise(solution), overwrite=a.overwrite)
     _say(a, f"report in {a.out}", {"out": str(a.out)})
 
@@ -192,30 +279,43 @@ def _clip(a, default):
 
 
 def _solving(a):
-    return {"gauge": a.gauge, "method": a.method, "loss": a.loss, "error_floor": a.error_floor, "errors": a.errors}
+    names = ("static", "exposure_degree", "gauge", "method", "loss", "error_floor", "errors", "validate")
+    return {name: getattr(a, name) for name in names}
 
 
-def _prior(text):
-    """``gsaoi-2``, or a solution.asdf whose mean distortion serves as the static one."""
-    from .instruments import gsaoi_static
+def _tying(a):
+    return {"reference": a.reference, "epoch": a.epoch, "pixel_scale": a.pixel_scale}
+
+
+def _prior_with_sigma(a, shape=None):
+    """The prior asked for, no static distortion if there is none, with the widths asked for at every degree fitted."""
+    from .priors import EVIDENCE, Prior
+    from .selection import AUTO, HIGHEST
+
+    prior = _prior(a.prior, shape)
+    if a.prior_sigma is None:
+        return prior
+    degree = 0 if a.prior_sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
+    return (prior or Prior([[0.0], [0.0]])).with_sigma(a.prior_sigma, degree=degree)
+
+
+def _prior(text, shape=None):
+    """Whatever `Prior.from_file` recognises."""
     from .priors import Prior
-    from .solution import Solution
 
-    if text is None:
-        return None
-    if text.startswith("gsaoi-") and text[6:] in ("1", "2", "3", "4"):
-        model = gsaoi_static(int(text[6:]))
-        return Prior.from_model(model, shape=(2048, 2048), direction="detector_to_reference", degree=5)
-    if not Path(text).is_file():
-        raise InputError(f"--prior {text}: neither a file nor one of gsaoi-1, gsaoi-2, gsaoi-3, gsaoi-4")
-    earlier = Solution.read(text)
-    return Prior(earlier.coefficients.mean(axis=0), shape=earlier.shapes[earlier.names[0]])
+    return None if text is None else Prior.from_file(text, shape=shape)
 
 
 def _read_table(path, a):
-    from .catalogs import read_table
+    from .table_files import read_table
 
-    return read_table(path, columns=dict(a.columns))
+    return read_table(path, columns=dict(a.columns), origin=a.origin)
+
+
+def _solution(a):
+    from .solution import Solution
+
+    return Solution.read(a.solution, max_bytes=a.max_bytes)
 
 
 def _write_table(table, a):

@@ -109,8 +109,8 @@ def solve(
         degree=degree, gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
         max_iterations=max_iterations, validate=validate, static=static, exposure_degree=exposure_degree,
     )  # fmt: skip
-    if degree == selection.AUTO and model is not None:
-        raise InputError("a model has its degree: leave degree='auto' out")
+    if model is not None and (degree == selection.AUTO or static is not None):
+        raise InputError("a model says what is fitted in every exposure: leave degree='auto' and static out")
     catalogue, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
     if not isinstance(matches, Matches):
         raise InputError(

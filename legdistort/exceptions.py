@@ -25,6 +25,10 @@ class FoldError(LegdistortError, ValueError):
     """A distortion maps two places onto one; lower the degree or look at the exposure named."""
 
 
+class ExportError(LegdistortError, ValueError):
+    """A result does not fit the form asked for; allow a larger error, or choose a form that is exact."""
+
+
 def check_choice(value, allowed, name):
     """Raise `InputError` naming the argument if `value` is not one of the words allowed."""
     if value not in allowed:

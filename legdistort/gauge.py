@@ -187,11 +187,7 @@ class Gauge:
         )
 
     def _told_in_words(self):
-        return (
-            ""
-            if self.told is None
-            else f", but for {len(self.told)} that the data do tell, by 5 standard errors or more"
-        )
+        return "" if self.told is None else f", but for {len(self.told)} that the data do tell"
 
     def __repr__(self):
         return f"<Gauge {self.kind!r}: {self.n_constraints} constraints, {len(self.motion)} exposures>"
@@ -220,8 +216,9 @@ class Gauge:
                 lines.append(f"{name:24s} {number:6d} {f'{error:.2g} px':>15s}  {convention}")
         if self.told is not None:
             lines.append(
-                f"The data contradict the constraint along {len(self.told)} combinations of these modes, by 5 standard "
-                "errors or more: there they decide, and the absolute error is theirs."
+                f"The data tell {len(self.told)} combinations of these modes: they contradict the constraint by 5 "
+                "standard errors or more, or what is fixed cannot take these maps back; there they decide, and the "
+                "absolute error is theirs."
             )
         source = "the scatter of single exposures" + (
             " and the uncertainty of the static distortion" if self.static_sigma is not None else ""

@@ -49,6 +49,8 @@ class Matches:
         Where the reference plane lies on the sky, if that is known.
     left_out : dict
         ``{exposure: reason}`` of exposures that could not be used.
+    epoch : float or None
+        Mean of the exposures, a Julian year, if their headers tell it.
     """
 
     table: QTable
@@ -56,6 +58,7 @@ class Matches:
     poses: dict
     sky: poses.TangentPlane | None = None
     left_out: dict = field(default_factory=dict)
+    epoch: float | None = None
 
     @cached_property
     def names(self):
@@ -97,7 +100,8 @@ class Matches:
             raise MatchError(
                 "no exposure agrees with the others: " + "; ".join(f"{k}: {v}" for k, v in reasons.items())
             )
-        return type(self).from_table(table, shape=self.shapes, poses=kept, sky=self.sky, left_out=left_out)
+        known = {"sky": self.sky, "left_out": left_out, "epoch": self.epoch}
+        return type(self).from_table(table, shape=self.shapes, poses=kept, **known)
 
     def to_meta(self):
         """Shapes, poses and sky as plain lists, for the header of a table file; see `read_meta`."""
@@ -107,23 +111,25 @@ class Matches:
             "poses": {name: self.poses[name].tolist() for name in self.names},
             "sky": None if sky is None else {"lon": sky.lon, "lat": sky.lat, "matrix": sky.matrix.tolist()},
             "left_out": dict(self.left_out),
+            "epoch": self.epoch,
         }
 
     @staticmethod
     def read_meta(meta):
-        """What `to_meta` wrote, as arguments ``poses``, ``sky``, ``left_out`` of `from_table`."""
+        """What `to_meta` wrote, as arguments ``poses``, ``sky``, ``left_out``, ``epoch`` of `from_table`."""
         given, sky = meta.get("poses"), meta.get("sky")
         return {
             "poses": None if given is None else {name: np.array(pose) for name, pose in given.items()},
             "sky": None if sky is None else poses.TangentPlane(sky["lon"], sky["lat"], np.array(sky["matrix"])),
             "left_out": meta.get("left_out"),
+            "epoch": meta.get("epoch"),
         }
 
     def __repr__(self):
         return f"<Matches: {len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures>"
 
     @classmethod
-    def from_table(cls, table, *, shape, poses=None, columns=None, sky=None, left_out=None):
+    def from_table(cls, table, *, shape, poses=None, columns=None, sky=None, left_out=None, epoch=None):
         """Matches from anybody's table.
 
         Parameters
@@ -140,6 +146,8 @@ class Matches:
         sky : `~legdistort.poses.TangentPlane`, optional
         left_out : dict, optional
             Passed on.
+        epoch : float, optional
+            Mean of the exposures, a Julian year.
 
         Raises
         ------
@@ -167,7 +175,7 @@ class Matches:
             poses = dict(zip(names, pose_list, strict=True))
         else:
             poses = _check_poses(poses, names)
-        matches = cls(table, shapes, poses, sky, dict(left_out or {}))
+        matches = cls(table, shapes, poses, sky, dict(left_out or {}), epoch)
         matches.__dict__.update(names=names, stars=stars)  # known already
         matches.__dict__["observations"] = _observations(table, exposure_index, star_index)
         return matches

@@ -13,6 +13,7 @@ from .association import interlink, label_stars, standing, tie
 from .exceptions import AssumptionWarning, InputError, MatchError
 from .matches import Matches, estimate_poses
 from .measurement import UNUSABLE
+from .reference import mean_epoch
 from .warps import StarList
 
 logger = logging.getLogger(__name__)
@@ -97,7 +98,8 @@ def match(
     for name, labels in stars.items():
         star[rows[name]] = labels
     table, star = _keep_common(table, star, min_exposures, left_out)
-    return _finish(table, star, shapes, headers, left_out)
+    epoch = mean_epoch(e.header for e in named.values()) if named else None
+    return _finish(table, star, shapes, headers, left_out, epoch)
 
 
 def _without_repetitions(table):
@@ -225,7 +227,7 @@ def _reasons(left_out):
     return "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
 
 
-def _finish(table, star, shapes, headers, left_out):
+def _finish(table, star, shapes, headers, left_out, epoch):
     names = tuple(dict.fromkeys(table["exposure"].tolist()))
     _, index = np.unique(star, return_inverse=True)
     exposure = np.array([names.index(name) for name in table["exposure"]])
@@ -241,7 +243,7 @@ def _finish(table, star, shapes, headers, left_out):
         found, sky = headers.place(found)
     for name, reason in left_out.items():
         logger.warning("%s is left out: %s", name, reason)
-    return Matches.from_table(table, shape=shapes, poses=found, sky=sky, left_out=left_out)
+    return Matches.from_table(table, shape=shapes, poses=found, sky=sky, left_out=left_out, epoch=epoch)
 
 
 def _number(table, index, xy):

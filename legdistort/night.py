@@ -6,7 +6,7 @@ from datetime import datetime, timedelta
 import numpy as np
 from astropy.io import fits
 
-from . import poses, rendering
+from . import basis, poses, rendering
 from .exceptions import InputError
 from .instruments import GsaoiMap
 from .truth import (
@@ -39,6 +39,9 @@ class Night:
     dynamic_rms : float
         Rms over the detector of the displacement, both axes together, that an exposure adds to the static
         distortion, pixels. Degrees 1 to 3; coefficients of degree l have standard deviations that go as 1/l.
+    residue_rms : float
+        Rms of the same kind, pixels, of a dynamic part of degrees 4 to 6, all modes alike, which a fit of degree 3
+        cannot follow.
     zero_mean : bool
         Subtract the mean over the exposures from these.
     detector : int
@@ -49,6 +52,8 @@ class Night:
         Position errors of the brightest and of the faintest star, pixels; they set the fluxes.
     fwhm, beta, ellipticity : float
         Moffat profile: pixels, exponent, 1 - axis ratio. Exposures scatter about them (5 %, 0, 30 %).
+    halo, halo_fwhm : float
+        Part of the flux that adaptive optics leave in a wide round halo of the same exponent, and its width, pixels.
     sky : float
         ADU a pixel.
     gain, read_noise, saturation : float
@@ -62,6 +67,7 @@ class Night:
     size: int = 2048
     dither: float = 250.0
     dynamic_rms: float = 0.4
+    residue_rms: float = 0.0
     zero_mean: bool = False
     detector: int = 2
     pointing_error: float = 0.3
@@ -69,6 +75,8 @@ class Night:
     fwhm: float = 4.5
     beta: float = 2.8
     ellipticity: float = 0.1
+    halo: float = 0.0
+    halo_fwhm: float = 30.0
     sky: float = 200.0
     gain: float = 2.0
     read_noise: float = 15.0
@@ -80,6 +88,10 @@ class Night:
         lo, hi = self.sigma_range
         if not 0 < lo <= hi:
             raise InputError(f"sigma_range must be (smallest, largest) error in pixels, got {self.sigma_range!r}")
+        if not (0 <= self.halo < 1 and self.residue_rms >= 0):
+            raise InputError(
+                f"halo must be in [0, 1) and residue_rms not negative, got {self.halo!r} and {self.residue_rms!r}"
+            )
 
     @property
     def psf(self):
@@ -87,9 +99,9 @@ class Night:
         return rendering.Moffat(self.fwhm, self.beta)
 
     def position_error(self, flux):
-        """Smallest possible position error [pix] at these fluxes [ADU]."""
+        """Smallest possible position error [pix] at these fluxes [ADU]; a halo only takes flux away."""
         camera = {"sky": self.sky, "gain": self.gain, "read_noise": self.read_noise}
-        return rendering.position_error(flux, psf=self.psf, **camera)
+        return rendering.position_error((1 - self.halo) * np.asarray(flux), psf=self.psf, **camera)
 
 
 #: A night that is rendered and reduced in seconds.
@@ -123,13 +135,14 @@ def draw_night(small, seed, settings):
     instrument = GsaoiMap(night.detector, night.size)
     shape, names = (night.size, night.size), exposure_names(night.n_exposures)
     true_poses = draw_poses(pose_rng, names, shape, night.dither)
+    dynamic = _draw_dynamic(map_rng, night)
     truth = Truth(
         names=names,
         shape=shape,
         positions=np.empty((0, 2)),
         flux=_draw_flux(star_rng, night),
-        static=fit_static(instrument, shape),
-        dynamic=_draw_dynamic(map_rng, night),
+        static=fit_static(instrument, shape, basis.degree_of(dynamic.shape[2])),
+        dynamic=dynamic,
         poses=true_poses,
         nominal_poses=_point_wrongly(pose_rng, true_poses, night.pointing_error / instrument.pixel_scale),
         instrument=instrument,
@@ -147,12 +160,21 @@ def draw_night(small, seed, settings):
 
 
 def _draw_dynamic(rng, night):
-    degree = 3
-    total = np.sum(mode_orders(degree), axis=1)
-    spectrum = np.where(total > 0, 1 / np.maximum(total, 1), 0)
+    low = _draw_degrees(rng, night, night.dynamic_rms, range(1, 4), power=-1)
+    if night.residue_rms == 0:
+        return low
+    high = _draw_degrees(rng, night, night.residue_rms, range(4, 7), power=0)
+    high[:, :, : low.shape[2]] = low
+    return high
+
+
+def _draw_degrees(rng, night, rms, degrees, *, power):
+    """Coefficients of some degrees l, standard deviations as l**power, for this rms displacement of both axes."""
+    total = np.sum(mode_orders(max(degrees)), axis=1)
+    spectrum = np.where(np.isin(total, degrees), np.maximum(total, 1.0) ** power, 0)
     # a coefficient a displaces by a/2 rms over the detector, on each of two axes
-    spectrum *= night.dynamic_rms / np.sqrt(2 * np.sum(spectrum**2) / 4)
-    return draw_coefficients(rng, spectrum, degree, night.n_exposures, "dynamic_rms", zero_mean=night.zero_mean)
+    spectrum *= rms / np.sqrt(2 * np.sum(spectrum**2) / 4)
+    return draw_coefficients(rng, spectrum, max(degrees), night.n_exposures, "dynamic_rms", zero_mean=night.zero_mean)
 
 
 def _point_wrongly(rng, true_poses, error):

@@ -12,15 +12,18 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from . import archive, performance
+from . import archive, baselines, performance, provenance
 from .coaddition import coadd
-from .estimation import check_options, solve
+from .estimation import solve
 from .exceptions import AssumptionWarning, InputError, MatchError
 from .exposures import Exposure, read_exposures
 from .files import replacing_folder
+from .findings import FOUND
 from .matching import match
 from .measurement import UNUSABLE, measure
+from .options import check_options, check_reference
 from .report import write_report
+from .table_files import write_stars
 
 log = logging.getLogger(__name__)
 
@@ -57,10 +60,14 @@ def run(
     prior=None,
     min_exposures=4,
     clip=5.0,
+    reference=None,
+    epoch=None,
+    pixel_scale=None,
     measuring=None,
     matching=None,
     solving=None,
     coadding=None,
+    compare=False,
     overwrite=False,
     progress=False,
 ):
@@ -82,9 +89,14 @@ def run(
         Stars seen in fewer exposures are not used.
     clip : float or None
         Leave out observations beyond this many standard errors.
+    reference, epoch, pixel_scale : optional
+        Catalogue to tie the positions to, see `legdistort.solve`.
     measuring, matching, solving, coadding : dict, optional
         Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`. The stack is ``"clipped"`` here:
         hot pixels and cosmic rays do not get into it.
+    compare : bool
+        Also correct by shifts, by the prior's static distortion and shifts, and by a relative polynomial
+        (`legdistort.baselines`), and report the scatter of all side by side.
     overwrite : bool
         Replace the results of an earlier run.
     progress : bool
@@ -102,6 +114,8 @@ def run(
     out = Path(out)
     check_folder(out, overwrite)
     check_options(degree=degree, clip=clip, **(solving or {}))
+    method = (solving or {}).get("method", "joint")
+    reference, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
     timings = {}
     with _timed(timings, "read"):
         exposures = read_exposures(paths, ext=ext, progress=progress)
@@ -116,7 +130,13 @@ def run(
     with _timed(timings, "match"):
         matches = match(detections, exposures=exposures, min_exposures=min_exposures, **(matching or {}))
     with _timed(timings, "solve"):
-        solution = solve(matches, degree=degree, prior=prior, clip=clip, **(solving or {}))
+        tying = {"reference": reference, "epoch": epoch, "pixel_scale": pixel_scale}
+        solution = solve(matches, degree=degree, prior=prior, clip=clip, **tying, **(solving or {}))
+        solution = provenance.with_inputs(solution, provenance.checksums(paths))
+    comparison = None
+    if compare:
+        with _timed(timings, "compare"):
+            comparison = baselines.compare(matches, solution, prior=prior)
     with _timed(timings, "coadd"):
         kept = [exposure for exposure in exposures if exposure.name in solution.names]
         mosaic = coadd(kept, solution, progress=progress, **({"method": "clipped"} | (coadding or {})))
@@ -126,7 +146,9 @@ def run(
             mosaic.write(target / "mosaic.fits")
             sharpness = fwhm_ratio(mosaic, solution)
         summary = summarise(solution, timings=timings) | {"fwhm_ratio": sharpness}
-        write_report(target / "report.html", solution, mosaic=mosaic, summary=summary)
+        if comparison:
+            summary["comparison"] = {name: performance.scatter_summary(made) for name, made in comparison.items()}
+        write_report(target / "report.html", solution, mosaic=mosaic, summary=summary, comparison=comparison)
         write_summary(target / "summary.json", summary)
     return Run(out, solution, mosaic, summary)
 
@@ -134,7 +156,7 @@ def run(
 def write_results(solution, target):
     """Write ``solution.asdf``, ``stars.ecsv`` and ``wcs/NAME.asdf`` of a solution into an existing folder."""
     solution.write(target / "solution.asdf")
-    solution.stars.write(target / "stars.ecsv", format="ascii.ecsv")
+    write_stars(solution, target / "stars.ecsv")
     (target / "wcs").mkdir()
     for name in solution.names:
         archive.write_wcs(solution, name, target / "wcs" / f"{name}.asdf")
@@ -161,8 +183,11 @@ def summarise(solution, *, timings=None):
         "rms_px": float(np.sqrt(np.mean(solution.rms**2))),
         "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
         "gauge": solution.gauge.sentence,
+        "sky": solution.sky_sentence,
+        "reference": solution.settings.get("reference"),
         "max_inverse_error_px": float(solution.max_inverse_error),
         "left_out": dict(solution.left_out),
+        **{key: found for key in FOUND if (found := solution.settings.get(key)) is not None},
         "timings": {step: round(seconds, 3) for step, seconds in (timings or {}).items()},
     }
 

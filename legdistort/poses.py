@@ -127,6 +127,13 @@ def _turns(cross):
     return np.stack([xx + yy, yx - xy]), np.stack([xx - yy, yx + xy])
 
 
+def _compass(lon, lat):
+    """Unit vectors to the east and to the north at places on the sphere, radians, each (..., 3)."""
+    east = np.stack([-np.sin(lon), np.cos(lon), np.zeros_like(lon)], axis=-1)
+    north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], axis=-1)
+    return east, north
+
+
 @dataclass(frozen=True, eq=False)
 class TangentPlane:
     """Where the reference plane lies on the sky (gnomonic projection).
@@ -162,6 +169,38 @@ class TangentPlane:
         """Reference-plane positions (n, 2) -> `~astropy.coordinates.SkyCoord` (ICRS)."""
         xy = np.asarray(xy, dtype=float)
         return SkyCoord(*self.model()(xy[..., 0], xy[..., 1]) * u.deg, frame="icrs")
+
+    def jacobian(self, xy):
+        """Derivative of (ra cos(dec), dec) [deg] by (x, y) [pix] at reference positions (n, 2), shape (n, 2, 2).
+
+        The direction to a point of the plane is ``s = (s0 + xi e + eta n) / N``; what changes along s itself is of
+        no matter for the directions east and north of s, which are perpendicular to it.
+        """
+        lon, lat = np.radians(self.lon), np.radians(self.lat)
+        plane = np.radians(apply(self.matrix, xy))
+        length = np.sqrt(1 + (plane**2).sum(axis=1))
+        axes = np.stack(_compass(lon, lat))  # e, n of the tangent point
+        towards = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
+        s = (towards + plane @ axes) / length[:, None]
+        lon, lat = np.arctan2(s[:, 1], s[:, 0]), np.arctan2(s[:, 2], np.hypot(s[:, 0], s[:, 1]))
+        return np.stack(_compass(lon, lat), axis=1) @ axes.T @ self.matrix[:, :2] / length[:, None, None]
+
+    def to_sky_errors(self, xy, variance):
+        """Errors on the sky of positions (n, 2) with variances (3, n) ``xx, yy, xy`` [pix^2].
+
+        Returns
+        -------
+        ra_error, dec_error : `~astropy.units.Quantity`
+            Standard deviations of ra cos(dec) and dec, mas.
+        corr : ndarray
+            Their correlation.
+        """
+        jacobian = self.jacobian(xy)
+        covariance = np.moveaxis(np.array([[variance[0], variance[2]], [variance[2], variance[1]]]), -1, 0)
+        covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+        ra_error, dec_error = np.sqrt(covariance[:, 0, 0]), np.sqrt(covariance[:, 1, 1])
+        corr = covariance[:, 0, 1] / (ra_error * dec_error)
+        return (ra_error * u.deg).to(u.mas), (dec_error * u.deg).to(u.mas), corr
 
     def from_sky(self, coordinates):
         """`~astropy.coordinates.SkyCoord` -> reference-plane positions (..., 2); inverse of `to_sky`."""

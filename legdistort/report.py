@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from . import catalogs, plotting, poses
+from . import catalogs, comparison_plots, performance, plotting, poses
 from .exceptions import FoldError
 from .files import replacing
+from .findings import in_words
 
 #: An exposure whose residuals exceed the median by this factor is marked.
 _MARK = 2.0
@@ -41,7 +42,7 @@ footer { margin-top: 2.5rem; font-size: .8rem; color: #51606d; }
 """
 
 
-def write_report(path, solution, *, mosaic=None, summary=None, overwrite=False):
+def write_report(path, solution, *, mosaic=None, summary=None, comparison=None, overwrite=False):
     """Write the report of a run as one self-contained HTML page.
 
     Parameters
@@ -56,6 +57,8 @@ def write_report(path, solution, *, mosaic=None, summary=None, overwrite=False):
         Results of the run that replace or complete what follows from the solution: ``n_exposures``, ``n_stars``,
         ``n_observations``, ``chi2``, ``dof``, ``rms_px``, ``sigma_px``, ``max_inverse_error_px``, ``left_out``
         (``{name: reason}``), ``timings`` (``{step: seconds}``).
+    comparison : dict, optional
+        ``{name: Solution}`` of `legdistort.baselines.compare`: a table and a picture are added.
     overwrite : bool
         Replace a file that exists.
 
@@ -69,11 +72,12 @@ def write_report(path, solution, *, mosaic=None, summary=None, overwrite=False):
         If the file exists and `overwrite` is false, or its folder does not exist.
     """
     with replacing(path, overwrite=overwrite) as temporary:
-        temporary.write_text(render(solution, mosaic=mosaic, summary=summary), encoding="utf-8")
+        page = render(solution, mosaic=mosaic, summary=summary, comparison=comparison)
+        temporary.write_text(page, encoding="utf-8")
     return Path(path)
 
 
-def render(solution, *, mosaic=None, summary=None):
+def render(solution, *, mosaic=None, summary=None, comparison=None):
     """The page of `write_report` as a string."""
     facts = _facts(solution, summary or {})
     title = f"Distortion of {_count(facts['n_exposures'], 'exposure')}"
@@ -86,6 +90,7 @@ def render(solution, *, mosaic=None, summary=None):
         _facts_table(solution, facts),
         "<h2>Exposures</h2>",
         _exposures_table(solution),
+        _comparison(comparison) if comparison else "",
         "<h2>Pictures</h2>",
         _pictures(solution, mosaic),
         f"<footer>Written by legdistort {version('legdistort')}. Pixels count from 0 at the centre of the first; "
@@ -132,6 +137,8 @@ def _facts_table(solution, facts):
     rows["Largest error of an inverse"] = escape(error) if isinstance(error, str) else f"{error:.1e} px"
     rows["Minimisation"] = escape(str(solution.status))
     rows["Gauge"] = escape(solution.gauge.sentence)
+    rows |= {key.capitalize(): escape(sentence) for key, sentence in in_words(solution.settings).items()}
+    rows["Sky"] = escape(solution.sky_sentence)
     rows["Left out"] = (
         "<br>".join(f"{escape(str(n))}: {escape(str(r))}" for n, r in facts["left_out"].items()) or "none"
     )
@@ -182,6 +189,31 @@ def _exposures_table(solution):
         + "\n</tbody></table></div>\n<p><small>Shift, rotation and scale lead from the reference plane to the "
         "detector. Distortion: length of the displacement over the detector, less its mean; dynamic part: the same of "
         f"the departure from the {reference}. Residuals above {_MARK:g} times the median are marked.</small></p>"
+    )
+
+
+def _comparison(comparison):
+    """Scatter of corrected positions by correction: table and picture."""
+    from matplotlib import style
+
+    rows = ""
+    for name, solution in comparison.items():
+        s = performance.scatter_summary(solution)
+        figures = [str(s["n_stars"]), *(f"{s[key]:.4f}" for key in ("mean", "std", "mean_total", "std_total"))]
+        rows += f"<tr><td>{escape(name)}</td>{''.join(f'<td>{figure}</td>' for figure in figures)}</tr>\n"
+    with style.context("default"):
+        picture = _figure(
+            comparison_plots.plot_comparison(comparison, ax=_new_figure(7.0, 5.0).subplots()),
+            "Scatter of every star's corrected positions over the exposures, by correction, with the error of one "
+            "measured position: a correction is as good as the data allow where its marks lie along the curve.",
+        )
+    return (
+        '<h2>Corrections compared</h2>\n<div class="wide"><table class="exposures">\n<thead><tr><th>correction</th>'
+        "<th>stars</th><th>mean<br><small>px per axis</small></th><th>standard deviation<br><small>px per axis</small>"
+        "</th><th>mean<br><small>px, both axes</small></th><th>standard deviation<br><small>px, both axes</small></th>"
+        f"</tr></thead>\n<tbody>\n{rows}</tbody></table></div>\n<p><small>Scatter of corrected positions over the "
+        "exposures, star by star, on the positions that the solution used.</small></p>\n"
+        f"{picture}"
     )
 
 

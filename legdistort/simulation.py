@@ -147,7 +147,7 @@ def simulate_matches(
             "seen must be in (0, 1], corr in (-1, 1), dither and noise not negative, got "
             f"{seen=}, {corr=}, {dither=}, {noise=}"
         )
-    sigma = _errors(sigma, n_exposures, n_stars)
+    sigma = position_errors(sigma, n_exposures, n_stars)
     star_rng, map_rng, pose_rng, noise_rng = np.random.default_rng(seed).spawn(4)
     static = draw_coefficients(map_rng, static, degree, 1, "static")[0]
     dynamic = draw_coefficients(map_rng, dynamic, degree, n_exposures, "dynamic", zero_mean=zero_mean)
@@ -163,7 +163,7 @@ def simulate_matches(
     positions = draw_stars(star_rng, n_stars, footprint(true_poses.values(), shape), inside, least)
     truth = Truth(names, tuple(shape), positions, None, static, dynamic, true_poses, nominal)
     observed = inside(positions) & (noise_rng.random((n_exposures, n_stars)) < seen)
-    return Simulation(_measure(truth, observed, sigma, noise_rng, noise=noise, corr=corr), truth)
+    return Simulation(matches_from(truth, observed, sigma, noise_rng, noise=noise, corr=corr), truth)
 
 
 def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **settings):
@@ -206,7 +206,10 @@ def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **set
             angle=rng.uniform(0, np.pi),
         )
         xy = truth.distort(name, truth.positions)
-        image = rendering.render(truth.shape, xy, truth.flux, psf=psf, sky=night.sky)
+        image = rendering.render(truth.shape, xy, (1 - night.halo) * truth.flux, psf=psf, sky=night.sky)
+        if night.halo:
+            wide = replace(night.psf, fwhm=night.halo_fwhm)
+            image += rendering.render(truth.shape, xy, night.halo * truth.flux, psf=wide)
         if noise:
             image = rendering.add_noise(image, rng, gain=night.gain, read_noise=night.read_noise)
             image = np.rint(np.clip(image, 0, min(night.saturation, 65535))).astype(np.uint16)
@@ -231,10 +234,10 @@ def simulate_gsaoi_matches(*, small=False, seed=0, **settings):
     observed = nights.stars_inside(truth, night, truth.positions)
     observed &= np.count_nonzero(observed, axis=0) >= min(4, night.n_exposures)
     sigma = np.broadcast_to(night.position_error(truth.flux)[None, :, None], (*observed.shape, 2))
-    return Simulation(_measure(truth, observed, sigma, rng, sky=truth.sky), truth)
+    return Simulation(matches_from(truth, observed, sigma, rng, sky=truth.sky), truth)
 
 
-def _errors(sigma, n_exposures, n_stars):
+def position_errors(sigma, n_exposures, n_stars):
     """Errors as (n_exposures, n_stars, 2)."""
     sigma = np.asarray(sigma, dtype=float)
     full = (n_exposures, n_stars, 2)
@@ -249,7 +252,7 @@ def _errors(sigma, n_exposures, n_stars):
     return out
 
 
-def _measure(truth, observed, sigma, rng, *, noise=1.0, corr=0.0, sky=None):
+def matches_from(truth, observed, sigma, rng, *, noise=1.0, corr=0.0, sky=None):
     """Matches from truth: `observed` (n_exposures, n_stars) bool, `sigma` (n_exposures, n_stars, 2) pixels."""
     drawn = rng.normal(size=sigma.shape)
     drawn[..., 1] = corr * drawn[..., 0] + np.sqrt(1 - corr**2) * drawn[..., 1]

@@ -7,10 +7,17 @@ from functools import cached_property
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable
+from astropy.wcs import WCS
 
-from . import basis, poses
-from .distortion import Distortion, outside
+from . import basis, catalogs, poses
+from .distortion import Distortion, like, outside, to_pixels
 from .exceptions import InputError
+from .findings import in_words
+
+
+def _wrapped(key, text):
+    """Lines of at most 110 characters that begin with a key."""
+    return textwrap.wrap(text, 110, initial_indent=f"{key:8s}", subsequent_indent=" " * 8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +60,10 @@ class Solution:
         ``{exposure: reason}``.
     settings : dict
         How `solve` was called.
+    provenance : dict
+        ``created``, ``versions`` of packages and, if files went in, ``inputs`` ``{base name: SHA-256}``.
+    form : `legdistort.forms.Form` or None
+        The model that was given to `solve`. Files do not keep it: `model` then has the usual form, the same function.
     """
 
     names: tuple
@@ -72,23 +83,26 @@ class Solution:
     sky: poses.TangentPlane | None = None
     left_out: dict = field(default_factory=dict)
     settings: dict = field(default_factory=dict)
+    provenance: dict = field(default_factory=dict)
+    form: object = None
 
     # -- tables
 
     @cached_property
     def stars(self):
-        """One row a star: ``star``, ``x``, ``y``, errors [pix], ``n``, mean ``flux`` and ``ra``, ``dec`` if known.
+        """One row a star: ``star``, ``x``, ``y``, errors [pix], ``n``, mean ``flux`` and the sky if known.
 
         ``x_err``, ``y_err`` are relative (in the gauge); ``x_err_abs``, ``y_err_abs`` add what the gauge hides: the
         mean dynamic distortion of the set and the uncertainty of the static one. Pointing, rotation and
-        scale common to all exposures are those of the nominal poses and are not part of these errors.
+        scale common to all exposures are those of the nominal poses and are not part of these errors. On the sky:
+        ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
+        ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue.
         """
         table = QTable({"star": self.star_names, "x": self.positions[:, 0] * u.pix, "y": self.positions[:, 1] * u.pix})
-        variance = self.uncertainty.stars
-        hidden = self.hidden_variance(self.positions)
-        for suffix, extra in (("err", np.zeros_like(hidden)), ("err_abs", hidden)):
+        variance, absolute = self.uncertainty.stars, self.absolute_variance
+        for suffix, each in (("err", variance), ("err_abs", absolute)):
             for k, axis in enumerate("xy"):
-                table[f"{axis}_{suffix}"] = np.sqrt(variance[k] + extra[:, k]) * u.pix
+                table[f"{axis}_{suffix}"] = np.sqrt(each[k]) * u.pix
         table["xy_corr"] = variance[2] / np.sqrt(variance[0] * variance[1])
         used = self.observations[self.observations["used"]]
         index = np.searchsorted(self.star_names, used["star"])
@@ -98,8 +112,11 @@ class Solution:
                 table["flux"] = np.bincount(index, used["flux"], len(table)) / table["n"]
         if self.sky is not None:
             sky = self.sky.to_sky(self.positions)
-            table["ra"], table["dec"] = sky.ra, sky.dec
-        return table
+            table["ra"], table["dec"] = u.Quantity(sky.ra, subok=False), u.Quantity(sky.dec, subok=False)
+            errors = self.sky.to_sky_errors(self.positions, variance)
+            table["ra_error"], table["dec_error"], table["ra_dec_corr"] = errors
+            table["ra_error_abs"], table["dec_error_abs"], _ = self.sky.to_sky_errors(self.positions, absolute)
+        return catalogs.describe_stars(table)
 
     @property
     def residuals(self):
@@ -111,11 +128,30 @@ class Solution:
 
     def hidden_variance(self, xy):
         """Variance (n, 2) [pix^2] that the gauge hides at reference positions (n, 2)."""
-        modes = self.gauge.modes_at(xy)
+        return self._hidden(xy)[:2].T
+
+    def _hidden(self, xy):
+        """xx, yy, xy (3, n)."""
         covariance = self.gauge.absolute_covariance
-        n = len(modes)
-        blocks = covariance[:n, :n], covariance[n:, n:]
-        return np.stack([np.einsum("mj,mk,kj->j", modes, block, modes) for block in blocks], axis=1)
+        n = len(covariance) // 2
+        modes = self.gauge.modes_at(xy, n)
+        blocks = covariance[:n, :n], covariance[n:, n:], covariance[:n, n:]
+        return np.stack([np.einsum("mj,mk,kj->j", modes, block, modes) for block in blocks])
+
+    @property
+    def absolute_variance(self):
+        """Covariance xx, yy, xy (3, n_stars) [pix^2] of the positions, with what the gauge hides."""
+        tie = self.gauge.tie
+        return self.uncertainty.stars + self._hidden(self.positions) + (0 if tie is None else tie.shared)
+
+    @property
+    def effective_modes(self):
+        """``{exposure: number}`` of its modes, both axes together, that the data determine rather than a prior.
+
+        The trace of the influence of the data on the coefficients. Without prior widths it is their number, less what
+        the gauge fixes. None if the solution does not know it.
+        """
+        return self.settings.get("effective_modes")
 
     # -- geometry
 
@@ -141,26 +177,32 @@ class Solution:
         return self._distortions[self.index(name)]
 
     def distort(self, name, xy):
-        """Reference positions (n, 2) -> detector pixels (n, 2); NaN where the exposure does not reach."""
+        """Reference positions (n, 2) -> detector pixels (n, 2); NaN where the exposure does not reach.
+
+        A quantity in pixels gives a quantity.
+        """
         distortion = self.distortion(name)
-        q = poses.apply(self.poses[name], np.atleast_2d(xy))
+        q = poses.apply(self.poses[name], np.atleast_2d(to_pixels(xy)))
         p = distortion(q)
         p[outside(distortion.inverse.valid, q[:, 0], q[:, 1])] = np.nan
-        return p
+        return like(xy, p)
 
     def correct(self, name, xy):
-        """Detector pixels (n, 2) -> reference positions (n, 2), exact (section 3.3, criterion J_3)."""
+        """Detector pixels (n, 2) -> reference positions (n, 2), exact (section 3.3, criterion J_3).
+
+        A quantity in pixels gives a quantity.
+        """
         distortion = self.distortion(name)
         distortion.check_fold()
-        q = distortion.invert(np.atleast_2d(np.asarray(xy, dtype=float)))
-        return poses.apply(poses.invert(self.poses[name]), q)
+        q = distortion.invert(np.atleast_2d(to_pixels(xy)))
+        return like(xy, poses.apply(poses.invert(self.poses[name]), q))
 
     def model(self, name):
         """Reference plane -> detector pixels as an astropy compound model with inverse."""
         from .wcs import exposure_model
 
         distortion = self.distortion(name)
-        return exposure_model(self.poses[name], distortion)
+        return exposure_model(self.poses[name], distortion, self.form)
 
     def wcs(self, name):
         """The gwcs of an exposure: detector -> undistorted -> reference -> icrs (the last if the sky is known)."""
@@ -168,6 +210,34 @@ class Solution:
 
         distortion = self.distortion(name)
         return exposure_wcs(name, self.poses[name], distortion, self.sky)
+
+    def header(self, name, *, kind="sip", max_error=1e-3):
+        """FITS header of an exposure, TAN-SIP or TPV, with its error in it (`legdistort.headers.make_header`)."""
+        from .headers import make_header
+
+        return make_header(self, name, kind=kind, max_error=max_error)
+
+    def fits_wcs(self, name, *, max_error=1e-3):
+        """The nearest `astropy.wcs.WCS` of an exposure, TAN-SIP, for what takes no other (`CCDData`, `Cutout2D`).
+
+        Parameters
+        ----------
+        name : str
+        max_error : float
+            Largest error allowed over the whole detector, pixels.
+
+        Raises
+        ------
+        ExportError
+            If no SIP polynomial is that close, naming the best.
+        InputError
+            If the sky is not known.
+        """
+        from .headers import make_header
+
+        wcs = WCS(make_header(self, name, max_error=max_error))
+        wcs.array_shape = self.shapes[name]
+        return wcs
 
     @property
     def max_inverse_error(self):
@@ -186,7 +256,7 @@ class Solution:
         return np.sqrt(np.diag(self._block(name))).reshape(2, -1)
 
     def _block(self, name, other=None):
-        size = self.gauge.n_constraints
+        size = 2 * basis.n_modes(self.degree)
         i, k = self.index(name), self.index(name if other is None else other)
         return self.uncertainty.coefficients[i * size : (i + 1) * size, k * size : (k + 1) * size]
 
@@ -245,20 +315,40 @@ class Solution:
         used = self.observations["used"]
         return np.array([np.sqrt(np.mean(self.observations[d][used].to_value(u.pix) ** 2)) for d in ("dx", "dy")])
 
+    @property
+    def sky_sentence(self):
+        """Where the reference plane lies on the sky, and how that is known."""
+        if self.sky is None:
+            return "not known: no WCS in the headers that proved right, no reference catalogue with ra, dec"
+        source = {"exposures": "from the headers", "reference": "from the reference"}.get(self.settings.get("sky"), "")
+        tied = ", tied to the reference" if source and self.gauge.tie is not None and "head" in source else ""
+        words = f"tangent point {self.sky.lon:.6f} {self.sky.lat:+.6f} deg, {self.sky.pixel_scale:.5g} arcsec/px"
+        return f"{words}{', ' * bool(source)}{source}{tied}"
+
     def __repr__(self):
         return (
             f"<Solution: {len(self.names)} exposures, {len(self.star_names)} stars, degree {self.degree}, "
             f"chi2 {self.chi2:.1f} for {self.dof} degrees of freedom>"
         )
 
+    def _static_in_words(self):
+        if self.settings.get("static") != "fit":
+            return []
+        own = self.settings["exposure_degree"]
+        mine = f"modes up to degree {own}" if own else "its pose alone"
+        return [f"static  fitted: one distortion for all exposures of a detector, {mine} for every exposure"]
+
     def __str__(self):
         used = self.observations["used"]
         lines = [
             repr(self)[1:-1],
             f"status  {self.status}",
-            *textwrap.wrap(self.gauge.sentence, 110, initial_indent="gauge   ", subsequent_indent=" " * 8),
+            *self._static_in_words(),
+            *_wrapped("gauge", self.gauge.sentence),
+            f"sky     {self.sky_sentence}",
             f"rms     {self.rms[0]:.4f}, {self.rms[1]:.4f} px in x, y; "
             f"{np.count_nonzero(used)} of {len(used)} observations used",
+            *(line for key, text in in_words(self.settings).items() for line in _wrapped(key, text)),
             "",
             f"{'exposure':24s} {'stars':>5s} {'shift x':>9s} {'shift y':>9s} {'rotation':>9s} {'scale':>9s} "
             f"{'rms x':>7s} {'rms y':>7s} {'distortion':>10s}",
@@ -283,8 +373,20 @@ class Solution:
         return write_solution(self, path, overwrite=overwrite)
 
     @classmethod
-    def read(cls, path):
-        """Read what `write` wrote."""
+    def read(cls, path, *, max_bytes=None):
+        """Read what `write` wrote; the certificate of every inverse is checked again.
+
+        Parameters
+        ----------
+        path : str or path
+        max_bytes : int, optional
+            Largest size of the arrays in the file, unpacked; 2 GiB if not given.
+
+        Raises
+        ------
+        InputError
+            For a file that is damaged, too large, no solution, or was changed after it was written.
+        """
         from .archive import read_solution
 
-        return read_solution(path)
+        return read_solution(path, max_bytes=max_bytes)

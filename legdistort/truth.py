@@ -33,7 +33,7 @@ class Truth:
         ADU.
     static : ndarray, shape (2, n_modes)
         Static distortion, normalised Legendre coefficients in pixels. With an `instrument`, which is not a
-        polynomial in this direction, the best fit of degree 3 to it.
+        polynomial in this direction, the best fit to it of the degree of the dynamic part, mostly 3.
     dynamic : ndarray, shape (n_exposures, 2, n_modes)
         What every exposure adds to it.
     poses, nominal_poses : dict

@@ -12,7 +12,7 @@ from legdistort import cli
 from legdistort.demo import run_demo
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs").glob("paper/*.md"))]
 
 
 def blocks(page, language):
@@ -106,6 +106,6 @@ def test_links_and_pictures_exist():
 
 
 def test_pictures_are_small():
-    for picture in (ROOT / "docs" / "images").glob("*"):
+    for picture in (ROOT / "docs" / "images").rglob("*.*"):
         assert picture.suffix == ".png"
         assert picture.stat().st_size < 200_000

@@ -8,10 +8,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from legdistort import matches as module
 from legdistort import poses
-from legdistort.catalogs import read_table
 from legdistort.exceptions import InputError, MatchError
 from legdistort.matches import Matches
 from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
+from legdistort.table_files import read_table
 
 SHAPE = (2048, 2048)
 

@@ -139,3 +139,36 @@ def test_tangent_plane_is_a_fits_tan(lon, lat):
 def test_tangent_plane_takes_any_frame():
     tp = plane()
     assert_allclose(tp.from_sky(tp.to_sky(XY).galactic), XY, atol=1e-5)
+
+
+# --- errors on the sky ---------------------------------------------------------------------------------------------
+
+PLACES = [(0.0, 0.0), (359.9999, -30.0), (83.6, 89.9), (200.0, -90.0), (120.0, 60.0)]
+
+
+@pytest.mark.parametrize(("lon", "lat"), PLACES)
+@pytest.mark.parametrize("flip", [1, -1])
+def test_sky_jacobian_is_the_finite_difference(lon, lat, flip):
+    """Offsets on the sky that a small step in x or y makes, east and north at the place itself."""
+    angle = np.radians(25)
+    m = 2e-3 * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ np.diag([flip, 1.1])
+    plane = poses.TangentPlane(lon, lat, np.column_stack([m, [0.3, -0.2]]))
+    xy = np.random.default_rng(0).uniform(-1500, 1500, (30, 2))  # up to 3 degrees off: far from flat
+    found = plane.jacobian(xy)
+    for k, step in enumerate(np.eye(2) * 0.5):
+        centre, ahead, behind = (plane.to_sky(p) for p in (xy, xy + step, xy - step))
+        east, north = (np.subtract(a.deg, b.deg) for a, b in zip(
+            centre.spherical_offsets_to(ahead), centre.spherical_offsets_to(behind), strict=True))  # fmt: skip
+        assert_allclose(found[:, :, k], np.stack([east, north], axis=1), rtol=0, atol=3e-9)
+
+
+def test_sky_errors_are_those_of_a_cloud_of_points():
+    plane = poses.TangentPlane(30.0, 70.0, np.array([[-1e-3, 5e-4, 0.1], [5e-4, 1e-3, 0.5]]))
+    covariance = np.array([[0.04, 0.01], [0.01, 0.09]])
+    cloud = np.random.default_rng(1).multivariate_normal([800, -300], covariance, 200_000)
+    sky, centre = plane.to_sky(cloud), plane.to_sky(np.array([[800.0, -300.0]]))
+    east, north = (a.to_value(u.mas) for a in centre.spherical_offsets_to(sky))
+    ra_error, dec_error, corr = plane.to_sky_errors(np.array([[800.0, -300.0]]), np.array([[0.04], [0.09], [0.01]]))
+    assert_allclose(ra_error.to_value(u.mas), east.std(), rtol=5e-3)
+    assert_allclose(dec_error.to_value(u.mas), north.std(), rtol=5e-3)
+    assert_allclose(corr, np.corrcoef(east, north)[0, 1], atol=5e-3)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from legdistort import criterion, starting
+from legdistort import problems, starting
 from legdistort.instruments import gsaoi_static
 from legdistort.priors import Prior
 from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
@@ -22,6 +22,6 @@ def make(name, *, n_exposures=100, n_stars=10_000):
 
 def problem(sim, prior, degree=3):
     """The criterion and its start values."""
-    posed = criterion.build(sim.matches, degree, prior=prior)
+    posed = problems.build(sim.matches, degree, prior=prior)
     nominal = np.stack([sim.matches.poses[name] for name in sim.matches.names])
     return posed, starting.start(posed, nominal)[0]
