@@ -1,0 +1,589 @@
+"""A reference catalogue ties what the exposures do not tell, with calibrated errors, and blurs nothing."""
+
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.table import MaskedColumn, QTable, Table
+from astropy.time import Time
+from numpy.testing import assert_allclose
+
+from legdistort import performance
+from legdistort.cli import main
+from legdistort.estimation import solve
+from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.matches import Matches
+from legdistort.poses import TangentPlane
+from legdistort.priors import Prior
+from legdistort.reference import mean_epoch, read_reference, year
+from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
+from legdistort.solution import Solution
+
+RNG = np.random.default_rng
+
+
+def simulate(seed=1, **settings):
+    """Dynamic parts whose mean does not vanish: 0.4 px of a common map that no exposure shows."""
+    usual = {"zero_mean": False, "dither": 100.0, "sigma": 0.05, "n_stars": 60, "n_exposures": 6}
+    return simulate_matches(seed=seed, **(usual | settings))
+
+
+def planar(sim, n, error, *, seed=0, stated=None, named=True):
+    """A reference in the reference plane: the truth of n stars with errors."""
+    rng = RNG([seed, 7])
+    rows = rng.permutation(len(sim.truth.positions))[:n]
+    xy = sim.truth.positions[rows] + error * rng.normal(size=(n, 2))
+    table = Table({"star": rows, "x": xy[:, 0], "y": xy[:, 1]})
+    table["x_err"] = table["y_err"] = float(error if stated is None else stated)
+    if not named:
+        table.remove_column("star")
+    return table
+
+
+def gaia(sim, *, error=0.5, years=5.0, motion=5.0, seed=0):
+    """A catalogue with the columns of Gaia, of an epoch `years` before the exposures of 2021."""
+    rng, n = RNG([seed, 8]), len(sim.truth.positions)
+    sky = sim.truth.sky.to_sky(sim.truth.positions)
+    pm = motion * rng.normal(size=(n, 2))
+    off = (error * rng.normal(size=(n, 2)) - years * pm) / 3.6e6
+    table = Table({"source_id": 10**18 + np.arange(n), "ra": sky.ra.deg + off[:, 0] / np.cos(sky.dec.rad)})
+    table["dec"] = sky.dec.deg + off[:, 1]
+    table["ra_error"] = table["dec_error"] = float(error)
+    table["pmra"], table["pmdec"] = pm.T
+    table["pmra_error"] = table["pmdec_error"] = 0.01
+    table["ref_epoch"] = 2021.0 - years
+    return table
+
+
+def truth(sim, solution):
+    return sim.truth.positions[solution.star_names]
+
+
+def pulls(sim, solution):
+    """Absolute errors, nothing taken out, over those reported (n_stars, 2)."""
+    stars = solution.stars
+    reported = np.column_stack([stars[name].value for name in ("x_err_abs", "y_err_abs")])
+    return (solution.positions - truth(sim, solution)) / reported
+
+
+def separation(sim, solution):
+    """Distances (n_stars,) on the sky from the truth, mas."""
+    true = sim.truth.sky.to_sky(truth(sim, solution))
+    return solution.sky.to_sky(solution.positions).separation(true).to_value("mas")
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return simulate()
+
+
+@pytest.fixture(scope="module")
+def night():
+    return simulate_gsaoi_matches(small=True, seed=4)
+
+
+@pytest.fixture(scope="module")
+def tied(night):
+    return solve(night.matches, prior=Prior(night.truth.static), reference=gaia(night), epoch=2021.0)
+
+
+# --- errors ------------------------------------------------------------------------------------------------------
+
+
+def test_absolute_positions_become_as_good_as_relative_ones(sim):
+    prior = Prior(sim.truth.static)
+    before = solve(sim.matches, prior=prior)
+    after = solve(sim.matches, prior=prior, reference=planar(sim, 60, 0.02))
+    assert performance.bias(before.positions, truth(sim, before)) > 0.2
+    assert performance.bias(after.positions, truth(sim, after)) < 0.025
+    assert np.mean(pulls(sim, after) ** 2) == pytest.approx(1, abs=0.35)
+    assert_allclose(after.stars["x_err"], before.stars["x_err"], rtol=0.02)
+    assert after.chi2 == pytest.approx(before.chi2, abs=5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("n", "error", "settings"),
+    [
+        (60, 0.02, {}),
+        (30, 0.001, {}),
+        (15, 0.05, {}),
+        (4, 0.05, {}),
+        (40, 0.02, {"degree": 1}),
+        (40, 0.02, {"degree": 0, "dynamic": 0.0, "static": 0.0}),
+    ],
+)
+def test_absolute_errors_are_calibrated(n, error, settings):
+    """chi2 of the absolute error under the reported one, over 40 realisations, is 1 within 15 %."""
+    squares = []
+    for seed in range(40):
+        sim = simulate(seed, n_exposures=10, **settings)
+        reference = planar(sim, n, error, seed=seed)
+        solution = solve(
+            sim.matches, degree=settings.get("degree", 3), prior=Prior(sim.truth.static), reference=reference
+        )
+        squares.append(np.mean(pulls(sim, solution) ** 2))
+    assert np.mean(squares) == pytest.approx(1, abs=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("static", [0.5, 1.5])
+def test_errors_are_calibrated_under_a_static_distortion_that_nobody_told(static):
+    squares = []
+    for seed in range(40):
+        sim = simulate(seed, n_exposures=10, static=static)
+        solution = solve(sim.matches, reference=planar(sim, 50, 0.02, seed=seed))
+        squares.append(np.mean(pulls(sim, solution) ** 2))
+    assert np.mean(squares) == pytest.approx(1, abs=0.15)
+
+
+@pytest.mark.parametrize("error", [0.01, 0.1])
+def test_relative_positions_are_not_blurred(error):
+    """Whatever the errors of the reference: after a common map nothing has changed by 1 % of the error."""
+    sim = simulate(dynamic=0.05, static=0.5)
+    prior = Prior(sim.truth.static)
+    before = solve(sim.matches, prior=prior)
+    after = solve(sim.matches, prior=prior, reference=planar(sim, 40, error))
+    changed = performance.bias(after.positions, before.positions, removed=3)
+    assert changed < 0.01 * performance.expected_bias(before, removed=3)
+    assert performance.bias(after.positions, before.positions) > 10 * changed
+
+
+def test_large_maps_change_relative_positions_to_second_order_and_for_the_better():
+    """The product of the map and the gradient of the distortion; where the truth is imposed chi2 falls."""
+    sim = simulate(noise=0.0)
+    prior = Prior(sim.truth.static)
+    before = solve(sim.matches, prior=prior)
+    after = solve(sim.matches, prior=prior, reference=planar(sim, 60, 1e-6))
+    assert performance.bias(after.positions, truth(sim, after)) < 5e-4
+    assert before.chi2 > 100 * after.chi2
+
+
+def test_wrong_reference_is_told():
+    sim = simulate(dynamic=0.05, static=0.5)
+    prior = Prior(sim.truth.static)
+    before = solve(sim.matches, prior=prior)
+    with pytest.warns(AssumptionWarning, match=r"are \d+\.\d times larger than the errors of both say"):
+        after = solve(sim.matches, prior=prior, reference=planar(sim, 60, 0.3, stated=0.01))
+    changed = performance.bias(after.positions, before.positions, removed=3)
+    assert changed < 0.05 * performance.expected_bias(before, removed=3)
+
+
+def test_mismatched_stars_are_rejected_by_name(sim):
+    reference = planar(sim, 40, 0.02)
+    reference["x"][:4] += [3.0, -50.0, 1.0, 200.0]
+    solution = solve(sim.matches, prior=Prior(sim.truth.static), reference=reference)
+    tie = solution.gauge.tie
+    assert sorted(tie.stars[~tie.used]) == sorted(reference["star"][:4])
+    assert_allclose(tie.offsets[~tie.used, 0], [3.0, -50.0, 1.0, 200.0], atol=0.2)
+    assert "4 rejected as mismatched" in str(solution.gauge)
+    assert np.mean(pulls(sim, solution) ** 2) == pytest.approx(1, abs=0.4)
+
+
+def test_permuted_reference_is_the_same(sim):
+    reference = planar(sim, 20, 0.02)
+    prior = Prior(sim.truth.static)
+    first, second = (
+        solve(sim.matches, prior=prior, reference=table)
+        for table in (reference, reference[RNG(0).permutation(len(reference))])
+    )
+    assert_allclose(second.positions, first.positions, atol=1e-9)
+    assert_allclose(second.stars["x_err_abs"], first.stars["x_err_abs"], rtol=1e-9)
+
+
+def test_many_stars_are_treated_one_by_one(sim, monkeypatch):
+    """Beyond `DENSE` stars the covariances between their relative errors are left out: nearly the same."""
+    reference, prior = planar(sim, 40, 0.02), Prior(sim.truth.static)
+    dense = solve(sim.matches, prior=prior, reference=reference)
+    monkeypatch.setattr("legdistort.tie.DENSE", 10)
+    by_star = solve(sim.matches, prior=prior, reference=reference)
+    assert performance.bias(by_star.positions, dense.positions) < 0.3 * performance.expected_bias(dense, absolute=True)
+    assert_allclose(by_star.stars["x_err_abs"], dense.stars["x_err_abs"], rtol=0.15)
+
+
+@pytest.mark.parametrize("options", [{"gauge": "mean"}, {"loss": "cauchy"}, {"clip": 5.0}, {"errors": "scale"}])
+def test_with_other_options(sim, options):
+    solution = solve(sim.matches, prior=Prior(sim.truth.static), reference=planar(sim, 50, 0.02), **options)
+    assert np.mean(pulls(sim, solution) ** 2) == pytest.approx(1, abs=0.35)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_shared_static_distortion(degree):
+    dynamic = 0.0 if degree == 0 else [0.3] * 3 + [0.0] * 7
+    sim = simulate(dynamic=dynamic, dither=250.0, rotations=np.arange(6) * 60.0)
+    free = solve(sim.matches, static="fit", exposure_degree=degree)
+    solution = solve(sim.matches, static="fit", exposure_degree=degree, reference=planar(sim, 40, 0.02))
+    assert np.mean(pulls(sim, solution) ** 2) == pytest.approx(1, abs=0.4)
+    assert solution.chi2 == pytest.approx(free.chi2, abs=5)
+
+
+# --- few stars ---------------------------------------------------------------------------------------------------
+
+
+def test_three_stars_fix_shift_rotation_and_scale(sim):
+    solution = solve(sim.matches, prior=Prior(sim.truth.static), reference=planar(sim, 3, 0.02))
+    text = str(solution.gauge)
+    rows = {line[:24].strip(): line for line in text.splitlines()}
+    assert rows["shift, rotation, scale"].endswith("the reference")
+    assert "the constraint" in rows["degree 3"]
+    assert "No external reference" not in text
+    assert np.mean(pulls(sim, solution) ** 2) < 3
+
+
+def test_one_star_fixes_the_shift(sim):
+    prior = Prior(sim.truth.static)
+    before = solve(sim.matches, prior=prior)
+    solution = solve(sim.matches, prior=prior, reference=planar(sim, 1, 0.001))
+    moved = solution.positions - before.positions
+    assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-9)
+    rows = {line[:24].strip(): line for line in str(solution.gauge).splitlines()}
+    assert rows["shift"].endswith("the reference")
+    assert "not known" in rows["rotation, scale"]
+
+
+def test_two_stars_fix_the_similarity(sim):
+    reference = planar(sim, 2, 0.001)
+    solution = solve(sim.matches, prior=Prior(sim.truth.static), reference=reference)
+    rows = np.searchsorted(solution.star_names, reference["star"])
+    assert_allclose(solution.positions[rows], np.column_stack([reference["x"], reference["y"]]), atol=1e-6)
+    assert "not known" not in str(solution.gauge)
+
+
+def test_too_few_stars_for_an_unknown_static_distortion(sim):
+    with pytest.warns(AssumptionWarning, match="3 stars of the reference do not tell all 10 modes of a static"):
+        solve(sim.matches, reference=planar(sim, 3, 0.02))
+
+
+# --- identification ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shift", [0.0, 40.0])
+def test_positions_are_matched_in_the_plane(sim, shift):
+    prior, reference = Prior(sim.truth.static), planar(sim, 40, 0.02)
+    for name in ("x", "y"):
+        reference[name] += shift
+    named = solve(sim.matches, prior=prior, reference=reference)
+    reference.remove_column("star")
+    found = solve(sim.matches, prior=prior, reference=reference)
+    assert len(found.gauge.tie.stars) == 40
+    assert_allclose(found.positions, named.positions, atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [1, 4])
+def test_few_stars_are_matched_to_their_neighbours(sim, n):
+    reference = planar(sim, n, 0.02)
+    expected = sorted(reference["star"])
+    reference.remove_column("star")
+    solution = solve(sim.matches, prior=Prior(sim.truth.static), reference=reference)
+    assert sorted(solution.gauge.tie.stars) == expected
+
+
+def test_names_may_be_words(sim):
+    table = sim.matches.table.copy()
+    table["star"] = np.array([f"s{star:02d}" for star in table["star"]])
+    matches = Matches.from_table(table, shape=sim.matches.shapes, poses=sim.matches.poses)
+    reference = planar(sim, 30, 0.02)
+    reference["star"] = [f"s{star:02d}" for star in reference["star"]]
+    solution = solve(matches, prior=Prior(sim.truth.static), reference=reference)
+    assert solution.gauge.tie.used.sum() == 30
+
+
+def test_a_reference_in_another_plane_takes_the_solution_along(sim):
+    """Turned by 30 degrees and 1.5 times as large: positions, errors and poses follow, chi2 does not care."""
+    c, s = 1.5 * np.cos(np.pi / 6), 1.5 * np.sin(np.pi / 6)
+    reference, turn = planar(sim, 40, 0.02), np.array([[c, -s], [s, c]])
+    xy = np.column_stack([reference["x"], reference["y"]]) @ turn.T
+    turned = reference.copy()
+    turned["x"], turned["y"] = xy.T
+    turned["x_err"] = turned["y_err"] = 0.03
+    prior = Prior(sim.truth.static)
+    first, second = (solve(sim.matches, prior=prior, reference=table) for table in (reference, turned))
+    assert_allclose(second.positions, first.positions @ turn.T, atol=1e-3)
+    assert_allclose(second.uncertainty.stars[:2].sum(axis=0), 2.25 * first.uncertainty.stars[:2].sum(axis=0), rtol=1e-3)
+    assert second.chi2 == pytest.approx(first.chi2, rel=1e-5)
+
+
+# --- the sky -----------------------------------------------------------------------------------------------------
+
+
+def test_headers_are_corrected_by_gaia(night, tied):
+    free = solve(night.matches, prior=Prior(night.truth.static))
+    assert np.median(separation(night, free)) > 20  # headers are 0.3 arcsec off
+    assert np.median(separation(night, tied)) < 1.0
+    stars = tied.stars
+    assert {"ra", "dec", "ra_error_abs"} <= set(stars.colnames)
+    assert (
+        np.mean((separation(night, tied) / np.hypot(*(stars[f"{k}_error_abs"].value for k in ("ra", "dec")))) ** 2) < 2
+    )
+    assert tied.sky.pixel_scale == free.sky.pixel_scale
+    assert "from the headers, tied to the reference" in str(tied)
+    name = tied.names[0]
+    xy = np.array([[100.0, 200.0], [400.0, 50.0]])
+    sky, true = tied.wcs(name).pixel_to_world(*xy.T), night.truth.sky.to_sky(_corrected(night, name, xy))
+    assert sky.separation(true).max() < 3 * u.mas
+
+
+def _corrected(night, name, xy):
+    """Reference positions of true pixels, by iterating the direct model."""
+    place = xy.copy()
+    for _ in range(60):
+        place = place + (xy - night.truth.distort(name, place))
+    return place
+
+
+@pytest.mark.parametrize("how", ["names", "pattern", "pattern, scale unknown"])
+def test_without_headers_the_reference_gives_the_sky(night, tied, how):
+    """Tangent point, rotation, scale and parity are found: the same positions on the sky as with headers."""
+    matches = Matches.from_table(night.matches.table, shape=night.truth.shape)
+    reference = gaia(night)
+    if how == "names":
+        reference["star"] = np.arange(len(reference))
+    scale = 0.0825 if how == "pattern" else None
+    prior = Prior(night.truth.static)
+    assert "sky     not known" in str(solve(matches, prior=prior))
+    solution = solve(matches, prior=prior, reference=reference, epoch=2021.0, pixel_scale=scale)
+    apart = solution.sky.to_sky(solution.positions).separation(tied.sky.to_sky(tied.positions))
+    assert apart.max() < 0.05 * u.mas
+    assert np.linalg.det(solution.sky.matrix[:, :2]) < 0
+    assert "arcsec/px, from the reference" in solution.sky_sentence
+
+
+def test_proper_motions_matter(night, tied):
+    reference = gaia(night, motion=20.0)
+    moved = solve(
+        night.matches, prior=Prior(night.truth.static), reference=reference, epoch=Time(2021.0, format="jyear")
+    )
+    assert_allclose(separation(night, moved), separation(night, tied), atol=0.2)
+    with pytest.warns(AssumptionWarning, match="motions left out"):
+        still = solve(night.matches, prior=Prior(night.truth.static), reference=reference, epoch=2016.0)
+    assert np.median(separation(night, still)) > 3
+
+
+def test_motion_is_that_of_astropy():
+    """Straight on the sphere, near the pole too, with the covariance of `Gaia` correlations."""
+    table = Table({"ra": [10.0, 359.9999, 45.0], "dec": [5.0, -60.0, 89.9999], "ref_epoch": [2016.0] * 3})
+    table["pmra"], table["pmdec"] = [100.0, -3000.0, 4000.0], [-50.0, 1500.0, 800.0]
+    for name in ("ra_error", "dec_error", "pmra_error", "pmdec_error"):
+        table[name] = 0.1
+    table["ra_pmra_corr"] = 0.5
+    moved = read_reference(table).at(2026.0)
+    expected = SkyCoord(  # at a large distance, so that nothing moves along the line of sight
+        table["ra"] * u.deg, table["dec"] * u.deg, pm_ra_cosdec=table["pmra"] * u.mas / u.yr,
+        pm_dec=table["pmdec"] * u.mas / u.yr, distance=0.1 * u.kpc, obstime=Time(2016.0, format="jyear", scale="tdb"),
+    ).apply_space_motion(Time(2026.0, format="jyear", scale="tdb"))  # fmt: skip
+    assert SkyCoord(*moved.sky.T * u.deg).separation(SkyCoord(expected.ra, expected.dec)).max() < 2e-3 * u.mas
+    assert_allclose(moved.covariance[:, 0, 0], 0.01 + 2 * 10 * 0.5 * 0.01 + 100 * 0.01)
+    assert_allclose(moved.covariance[:, 1, 1], 0.01 + 100 * 0.01)
+
+
+def test_errors_on_the_plane_follow_east_and_north():
+    """ra_error belongs to ra cos(dec); near the pole the ellipse turns with the right ascension."""
+    table = Table({"ra": [0.0, 90.0], "dec": [89.9, 89.9], "ra_error": [3.0] * 2, "dec_error": [1.0] * 2})
+    plane = TangentPlane(0.0, 90.0, np.eye(2, 3) / 3600)  # 1 arcsec a pixel; at the pole xi, eta turn with ra
+    _, covariance = read_reference(table).on_plane(plane)
+    errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) * 1000
+    assert_allclose(errors, [[3, 1], [1, 3]], rtol=1e-4)
+
+
+def test_epoch_of_the_headers():
+    headers = [fits.Header({"MJD-OBS": 59215.0}), fits.Header({"DATE-OBS": "2021-07-02T12:00:00"}), fits.Header()]
+    assert mean_epoch(headers) == pytest.approx((2021.0 + 2021.5) / 2, abs=0.01)
+    assert mean_epoch([fits.Header({"DATE-OBS": "unknown", "MJD-OBS": 0.0})]) is None
+    assert year(Time("2013-01-01")) == pytest.approx(2013.0, abs=0.01)
+
+
+def test_matches_know_the_epoch(night):
+    matches = replace(night.matches, epoch=2021.0)
+    assert Matches.read_meta(matches.to_meta())["epoch"] == 2021.0
+    assert matches.without({matches.names[0]: "not wanted"}).epoch == 2021.0
+    solution = solve(matches, prior=Prior(night.truth.static), reference=gaia(night))
+    assert solution.settings["reference"]["epoch"] == 2021.0
+    assert np.median(separation(night, solution)) < 1.0
+
+
+# --- tables ------------------------------------------------------------------------------------------------------
+
+
+def test_units_masks_and_names_of_vizier(night, tied):
+    plain = gaia(night)
+    table = QTable()
+    table["RA_ICRS"], table["DE_ICRS"] = plain["ra"] * u.deg, (plain["dec"] * u.deg).to(u.rad)
+    table["e_RA_ICRS"], table["e_DE_ICRS"] = plain["ra_error"] / 1000 * u.arcsec, plain["dec_error"] * u.mas
+    table["pmRA"], table["pmDE"] = plain["pmra"] * u.mas / u.yr, plain["pmdec"] * u.mas / u.yr
+    table["e_pmRA"], table["e_pmDE"] = plain["pmra_error"] * u.mas / u.yr, plain["pmdec_error"] * u.mas / u.yr
+    table["ref_epoch"] = plain["ref_epoch"] * u.yr
+    solution = solve(night.matches, prior=Prior(night.truth.static), reference=table, epoch=2021.0)
+    assert_allclose(solution.positions, tied.positions, atol=1e-6)
+
+
+def test_stars_without_motion_serve_at_their_own_epoch_only(night):
+    table = gaia(night)
+    mask = np.zeros(len(table), bool)
+    mask[::3] = True
+    for name in ("pmra", "pmdec", "pmra_error", "pmdec_error"):
+        table[name] = MaskedColumn(table[name], mask=mask)
+    table["ra"][1] = np.nan
+    reference = read_reference(table)
+    assert len(reference) == len(table) - 1
+    assert len(reference.at(2021.0)) == np.count_nonzero(~mask) - 1
+    assert len(reference.at(2016.0)) == len(table) - 1
+    assert repr(reference) == f"<Reference: {len(table) - 1} stars, sky positions, with proper motions>"
+    with pytest.raises(InputError, match="no star of the reference has a proper motion with errors"):
+        reference.subset(mask[np.arange(len(table)) != 1]).at(2021.0)
+
+
+def test_a_file_and_its_command(night, tied, tmp_path, capsys):
+    gaia(night).write(tmp_path / "gaia.ecsv")
+    matched = night.matches.table.copy()
+    matched.meta = night.matches.to_meta()
+    matched.write(tmp_path / "matched.ecsv")
+    command = ["solve", str(tmp_path / "matched.ecsv"), "--reference", str(tmp_path / "gaia.ecsv"), "--epoch", "2021",
+               "--pixel-scale", "0.08", "--out", str(tmp_path / "out"), "--json", "--quiet"]  # fmt: skip
+    assert main(command) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["reference"]["n_stars"] == tied.gauge.tie.used.sum()
+    assert "tied to" in summary["gauge"]
+    assert "tied to the reference" in summary["sky"]
+    assert {"ra", "dec"} <= set(Table.read(tmp_path / "out" / "stars.ecsv").colnames)
+    assert "tangent point" in (tmp_path / "out" / "report.html").read_text()
+    assert main([*command[:-4], "--out", str(tmp_path / "b"), "--reference", str(tmp_path / "none.ecsv")]) == 1
+    assert "none.ecsv: no such file" in capsys.readouterr().err
+
+
+def test_solution_keeps_its_tie(night, tied, tmp_path):
+    read = Solution.read(tied.write(tmp_path / "solution.asdf"))
+    assert str(read) == str(tied)
+    assert str(read.gauge) == str(tied.gauge)
+    assert repr(read.gauge.tie) == repr(tied.gauge.tie)
+    for name in ("x_err_abs", "ra_error_abs"):
+        assert_allclose(read.stars[name], tied.stars[name])
+
+
+def test_stars_of_another_solution_are_a_reference(night, tied):
+    """Their absolute errors count, not the relative ones."""
+    table = tied.stars
+    table.remove_column("star")
+    assert_allclose(
+        np.sqrt(read_reference(table).covariance[:, 0, 0]), table["ra_error_abs"].to_value("mas"), rtol=1e-12
+    )
+    again = solve(night.matches, prior=Prior(night.truth.static), reference=table)
+    assert_allclose(again.positions, tied.positions, atol=5e-3)
+
+
+# --- bad input ---------------------------------------------------------------------------------------------------
+
+
+def replaced(table, name, value):
+    """The table with a column of another type."""
+    table.replace_column(name, [value] * len(table))
+    return table
+
+
+def change(**columns):
+    """A change of a table: columns set, or removed with None."""
+
+    def changed(table):
+        for name, value in columns.items():
+            if value is None:
+                table.remove_column(name)
+            else:
+                table[name] = value
+        return table
+
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (change(x=None), "has neither ra, dec nor x, y; it has star, y, x_err, y_err: rename"),
+        (change(x_err=None), r"lacks x_err, errors of its positions \(pix, standard deviations\); it has star"),
+        (change(x_err=-1.0), "x_err must be positive, got -1 in row 0"),
+        (change(x=np.nan), r"has no row with finite positions and errors \(40 rows\)"),
+        (lambda t: replaced(t, "x", "left"), "the reference: column 'x' cannot be read as numbers"),
+        (change(star=1), "names star 1 more than once"),
+        (change(star=np.arange(40) + 500), "names none of the stars of the exposures: it has 500, 501, 502"),
+        (change(star=RNG(3).permutation(40)), "by name do not lie as they do there"),
+        (lambda t: change(star=None)(change(x=t["x"] + 1e5)(t)), "none of the 40 stars of the reference lies where"),
+        (lambda t: t[:0], "has no row"),
+        (lambda t: "nowhere.ecsv", "nowhere.ecsv: no such file"),
+        (lambda t: 3, "reference must be a table or the path of one, got int"),
+        (lambda t: change(ra=1.0, dec=95.0, ra_error=1.0, dec_error=1.0)(t), "dec must lie in -90 ... 90 degrees"),
+        (lambda t: change(ra=1.0, dec=5.0)(t), "lacks ra_error and dec_error, errors of its positions"),
+        (change(ra=1.0, dec=5.0, ra_error=1.0, dec_error=1.0, pmra=1.0), "one of pmra, pmdec is missing"),
+        (
+            change(ra=1.0, dec=5.0, ra_error=1.0, dec_error=1.0, pmra=1.0, pmdec=1.0),
+            r"has proper motions but no column ref_epoch, the year of its positions",
+        ),
+        (
+            change(ra=1.0, dec=5.0, ra_error=1.0, dec_error=1.0, pmra=1.0, pmdec=1.0, ref_epoch=2016.0),
+            "lacks pmra_error and pmdec_error, errors of its motions",
+        ),
+        (change(xy_corr=3.0), "xy_corr must lie in -1 ... 1, got 3"),
+    ],
+)  # fmt: skip
+def test_bad_tables(sim, made, message):
+    with pytest.raises(InputError, match=message):
+        solve(sim.matches, prior=Prior(sim.truth.static), reference=made(planar(sim, 40, 0.02)))
+
+
+def test_another_field_with_stars_in_it(sim):
+    reference = planar(sim, 40, 0.02, named=False)
+    reference["x"], reference["y"] = RNG(0).uniform(0, 2048, (2, 40))
+    with pytest.raises(
+        InputError, match=r"the nearest two are .* px apart: another field, the wrong columns, or a wrong"
+    ):
+        solve(sim.matches, prior=Prior(sim.truth.static), reference=reference)
+
+
+def test_most_stars_elsewhere():
+    sim = simulate(dynamic=0.02, static=0.5)
+    reference = planar(sim, 40, 0.02)
+    reference["x"][:10] += RNG(1).choice([-1.0, 1.0], 10)
+    reference["x"][10:21] += RNG(2).choice([-50.0, 50.0], 11)
+    with pytest.raises(InputError, match="most of the 40 stars that the reference shares with the exposures lie elsew"):
+        solve(sim.matches, prior=Prior(sim.truth.static), reference=reference)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, r"the epoch of the exposures is not known .* give epoch=, a decimal year or an astropy Time \(--epoch\)"),
+        ({"epoch": 20}, "epoch must be a decimal year, such as 2013.25, or one astropy Time, got 20"),
+        ({"epoch": "2020"}, "epoch must be a decimal year"),
+        ({"epoch": 2021, "pixel_scale": -1}, "pixel_scale must be a positive number of arcsec, got -1"),
+        ({"epoch": 2021, "method": "alternating"}, "it takes no reference"),
+    ],
+)
+def test_bad_options(night, options, message):
+    with pytest.raises(InputError, match=message):
+        solve(night.matches, prior=Prior(night.truth.static), reference=gaia(night), **options)
+
+
+def test_no_sky_and_no_way_to_it(night):
+    matches = Matches.from_table(night.matches.table, shape=night.truth.shape)
+    reference, prior = gaia(night), Prior(night.truth.static)
+    with pytest.raises(
+        InputError, match=r"no WCS, and 4 stars of the reference and .* too few to find one by their pattern"
+    ):
+        solve(matches, prior=prior, reference=reference[:4], epoch=2021)
+    other = reference.copy()
+    other["ra"], other["dec"] = RNG(0).uniform([[84.9], [-69.77]], [[84.93], [-69.76]], (2, len(other)))
+    with pytest.raises(InputError, match=r"the pattern of their .* stars is not that of the"):
+        solve(matches, prior=prior, reference=other, epoch=2021)
+    with pytest.raises(InputError, match=r"at 0\.5 arcsec a pixel: another field"):
+        solve(matches, prior=prior, reference=reference, epoch=2021, pixel_scale=0.5)
+    reference["star"] = np.arange(len(reference))
+    with pytest.raises(InputError, match="2 stars of the reference are too few to tell rotation, scale and parity"):
+        solve(matches, prior=prior, reference=reference[np.isin(reference["star"], matches.stars[:2])], epoch=2021)
+
+
+def test_nothing_is_warned_of_a_good_reference(sim):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solve(sim.matches, reference=planar(sim, 40, 0.02))
