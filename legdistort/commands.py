@@ -64,7 +64,7 @@ def do_run(a):
 
 def do_measure(a):
     """``legdistort measure``."""
-    from .exposures import read_exposures
+    from .exposures import expand_paths, read_exposures
     from .measurement import measure
     from .provenance import checksums
 
@@ -72,7 +72,7 @@ def do_measure(a):
     exposures = read_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
     table = measure(exposures, progress=wants_progress(a), **{k: v for k, v in given.items() if v is not None})
     shapes = {e.name: list(e.shape) for e in exposures}
-    table.meta |= {"shapes": shapes, "inputs": checksums(a.frames)}
+    table.meta |= {"shapes": shapes, "inputs": checksums(expand_paths(a.frames))}
     _write_table(table, a)
     _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
 

@@ -173,7 +173,7 @@ def _choose(matches, error_floor, options):
         trial = fits.estimate(part, error_floor, options | {"degree": degree, "trial": True})
         return _solution(trial, 1.0, {"error_floor": error_floor}, None)
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", LegdistortWarning)  # of fits that are thrown away
         chosen = selection.choose_degree(matches, fit)
     options["degree"] = chosen["degree"]

@@ -16,7 +16,7 @@ from . import archive, baselines, performance, provenance
 from .coaddition import coadd
 from .estimation import solve
 from .exceptions import AssumptionWarning, InputError, MatchError
-from .exposures import Exposure, read_exposures
+from .exposures import Exposure, expand_paths, read_exposures
 from .files import replacing_folder
 from .findings import FOUND
 from .matching import match
@@ -132,7 +132,7 @@ def run(
     with _timed(timings, "solve"):
         tying = {"reference": reference, "epoch": epoch, "pixel_scale": pixel_scale}
         solution = solve(matches, degree=degree, prior=prior, clip=clip, **tying, **(solving or {}))
-        solution = provenance.with_inputs(solution, provenance.checksums(paths))
+        solution = provenance.with_inputs(solution, provenance.checksums(expand_paths(paths)))
     comparison = None
     if compare:
         with _timed(timings, "compare"):

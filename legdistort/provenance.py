@@ -3,6 +3,7 @@
 import datetime
 import hashlib
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,8 +14,13 @@ def stamp():
     """Versions and time, as plain strings: ``created``, ``versions``."""
     return {
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "versions": {name: version(name) for name in PACKAGES},
+        "versions": dict(_versions()),
     }
+
+
+@cache
+def _versions():
+    return {name: version(name) for name in PACKAGES}
 
 
 def checksums(inputs):

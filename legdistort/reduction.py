@@ -113,8 +113,8 @@ class _Reduced:
         sure = curvature > _SURE * self.scale
         if self.gauge.prior:  # widths: the curvature is theirs, and the convention is what they say
             sure[:] = False
-        rest = (self.blocks.chi2 - gain.sum()) / self.dof if self.dof > 0 else np.inf
-        if rest <= self.explained:
+        rest = (self.blocks.chi2 - gain.sum()) / max(self.dof, 1)
+        if self.dof > 0 and rest <= self.explained:
             sure |= gain > GAIN * max(1.0, rest)
         return kept @ vectors[:, sure]
 

@@ -94,7 +94,8 @@ class Solution:
 
         ``x_err``, ``y_err`` are relative (in the gauge); ``x_err_abs``, ``y_err_abs`` add what the gauge hides: the
         mean dynamic distortion of the set and the uncertainty of the static one. Pointing, rotation and
-        scale common to all exposures are those of the nominal poses and are not part of these errors. On the sky:
+        scale common to all exposures are those of the nominal poses and are not part of these errors, unless a
+        reference ties them: then they are. On the sky:
         ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
         ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue.
         """

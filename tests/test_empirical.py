@@ -1,0 +1,428 @@
+"""Widths of a prior found from the exposures, and how many modes the data determine."""
+
+import re
+
+import numpy as np
+import oracle
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial import Delaunay
+
+from legdistort import Matches, Solution, baselines, cli, empirical, performance, solve
+from legdistort.criterion import State
+from legdistort.exceptions import InputError, LegdistortError, SolveError
+from legdistort.prediction import predict
+from legdistort.priors import Prior, dynamic_basis, dynamic_degrees
+from legdistort.simulation import simulate_matches
+
+SHAPE = (2048, 2048)
+SPECTRA = {
+    "flat": [0.9] * 10,
+    "falling": [0.9] * 3 + [0.3] * 3 + [0.1] * 4,
+    "degree 1 only": [0.9] * 3 + [0.0] * 7,
+    "zero": [0.0] * 10,
+}
+
+
+def simulate(n_stars, spectrum="falling", *, seed=0, **options):
+    return simulate_matches(n_stars=n_stars, dynamic=SPECTRA[spectrum], zero_mean=False, seed=seed, **options)
+
+
+def found(sim, **options):
+    return solve(sim.matches, prior=Prior(sim.truth.static, sigma="evidence"), **options)
+
+
+def with_table(sim, change):
+    """The same matches with columns changed in place by ``change(table)``."""
+    table = sim.matches.table.copy()
+    change(table)
+    return Matches.from_table(table, shape=SHAPE, poses=sim.matches.poses)
+
+
+# --- the likelihood ----------------------------------------------------------------------------------------------
+
+
+def design(sim, columns):
+    """Derivatives of all measured coordinates, in their errors, by finite differences of the plain model."""
+    table = sim.matches.table
+    exposure = np.searchsorted(sim.matches.names, table["exposure"])
+    sigma = np.concatenate([table["x_err"].value, table["y_err"].value])
+
+    def model(positions, coefficients):
+        out = np.empty((len(table), 2))
+        for i, name in enumerate(sim.matches.names):
+            rows = exposure == i
+            out[rows] = oracle.predict(positions[table["star"][rows]], coefficients[i], sim.matches.poses[name], SHAPE)
+        return out.T.ravel() / sigma
+
+    base = np.zeros((len(sim.matches.names), 2, 10)) + sim.truth.static
+    start = model(sim.truth.positions, base)
+    out = []
+    for kind, where in columns:
+        positions, coefficients = sim.truth.positions.copy(), base.copy()
+        if kind == "star":
+            positions[where] += 1e-3
+        else:
+            i, direction = where
+            coefficients[i] += 1e-3 * direction.reshape(2, 10)
+        out.append((model(positions, coefficients) - start) / 1e-3)
+    measured = np.concatenate([table["x"].value, table["y"].value]) / sigma
+    return np.array(out).T, measured - start
+
+
+@pytest.fixture(scope="module")
+def likelihoods():
+    """The evidence of a fit, and the restricted likelihood of its data, written out densely."""
+    sim = simulate(8, n_exposures=5, seed=3)
+    dynamic = dynamic_basis(SHAPE, 10)
+    similar = np.linalg.qr(dynamic.T, mode="complete")[0][:, len(dynamic) :].T
+    flat, departure = design(
+        sim,
+        [("star", (j, k)) for j in range(8) for k in (0, 1)]
+        + [("mode", (i, row)) for i in range(5) for row in similar],
+    )
+    random, _ = design(sim, [("mode", (i, row)) for i in range(5) for row in dynamic])
+    vectors, size, _ = np.linalg.svd(flat)
+    null = vectors[:, np.count_nonzero(size > 1e-6 * size[0]) :]
+    projected, random = null.T @ departure, null.T @ random
+    degree = np.tile(dynamic_degrees(10), 5)
+
+    def dense(widths, scale=1.0):
+        covariance = scale**2 * (np.eye(len(null.T)) + random * np.asarray(widths)[degree - 1] ** 2 @ random.T)
+        return (np.linalg.slogdet(covariance)[1] + projected @ np.linalg.solve(covariance, projected)) / 2
+
+    solution = []
+
+    def fit(problem_prior):
+        from legdistort import fits
+
+        options = {"degree": 3, "own_degree": None, "gauge": "minimal", "method": "joint", "loss": "linear"}
+        options |= {"clip": None, "limit": {}, "prior": problem_prior}
+        return fits.minimise(sim.matches, 0.0, options)
+
+    done = fit(Prior(sim.truth.static, sigma=0.5))
+    solution.append(done)
+    labels = np.tile(np.arange(3), (5, 1))
+    evidence = empirical.evidence(done.weighted, done.result.state, labels, done.result.gauge.motion)
+    return evidence, dense
+
+
+@pytest.mark.parametrize("widths", [[0.9, 0.3, 0.1], [0.1, 1.0, 0.5], [2.0, 2.0, 2.0], [1e-3, 0.2, 1e-3]])
+def test_evidence_is_the_restricted_likelihood(likelihoods, widths):
+    evidence, dense = likelihoods
+    reference = [0.5, 0.5, 0.5]
+    ours = evidence.cost(np.log(widths))[0] - evidence.cost(np.log(reference))[0]
+    assert ours == pytest.approx(dense(widths) - dense(reference), rel=0.01, abs=0.05)
+
+
+@pytest.mark.parametrize("widths", [[0.9, 0.3, 0.1], [0.1, 1.0, 0.5]])
+def test_the_scale_of_the_errors_is_profiled_out(likelihoods, widths):
+    evidence, dense = likelihoods
+
+    def best(w):
+        return min(dense(w * s, s) for s in np.exp(np.linspace(-1.5, 1.5, 601)))
+
+    reference = np.full(3, 0.5)
+    ours = evidence.cost(np.log(widths), scale=True)[0] - evidence.cost(np.log(reference), scale=True)[0]
+    assert ours == pytest.approx(best(np.array(widths)) - best(reference), rel=0.07, abs=0.3)
+
+
+@pytest.mark.parametrize("scale", [False, True])
+def test_slope_of_the_evidence(likelihoods, scale):
+    evidence, _ = likelihoods
+    at = np.log([0.7, 0.4, 0.05])
+    slope = [
+        (evidence.cost(at + e, scale=scale)[0] - evidence.cost(at - e, scale=scale)[0]) / 2e-5 for e in 1e-5 * np.eye(3)
+    ]
+    assert_allclose(evidence.cost(at, scale=scale)[1], slope, rtol=1e-5, atol=1e-6)
+
+
+def test_where_the_fit_stood_does_not_matter(likelihoods):
+    """Seen from another state, the same evidence: the gauge and the poses have no say."""
+    evidence, _ = likelihoods
+    sim = simulate(8, n_exposures=5, seed=3)
+    for sigma in (0.05, 5.0):
+        solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma=sigma))
+        problem, gauge = solution.uncertainty._problem, solution.gauge
+        poses = np.stack([solution.poses[name] for name in solution.names])
+        state = State(solution.positions.T, solution.coefficients, poses)
+        labels = np.tile(np.arange(3), (5, 1))
+        other = empirical.evidence(problem, state, labels, gauge.motion)
+        for widths in ([0.9, 0.3, 0.1], [0.1, 1.0, 0.5]):
+            ours, theirs = (e.cost(np.log(widths))[0] - e.cost(np.log([0.5] * 3))[0] for e in (evidence, other))
+            assert ours == pytest.approx(theirs, rel=0.01, abs=0.05)
+
+
+# --- the widths --------------------------------------------------------------------------------------------------
+
+
+def test_widths_are_those_put_in():
+    widths = found(simulate(40, n_exposures=40)).settings["widths"]
+    assert_allclose(widths, [0.9, 0.3, 0.1], rtol=0.15)
+
+
+def test_six_stars_at_degree_3():
+    """Ten modes, six stars: without widths there is no answer; with them it is better than any degree fitted freely."""
+    sim = simulate(6, seed=1)
+    with pytest.raises(SolveError, match="6 stars, fewer than the 10 modes of degree 3"):
+        solve(sim.matches, prior=Prior(sim.truth.static))
+    grid = sim.truth.grid("exp00", 20)
+    inside = grid[Delaunay(sim.truth.positions).find_simplex(grid) >= 0]
+
+    def error(solution):
+        return np.sqrt(np.mean(performance.new_scatter(solution, sim.truth.distort, inside, 0) ** 2))
+
+    free = [error(solve(sim.matches, degree=d, prior=Prior(sim.truth.static))) for d in (0, 1, 2)]
+    assert error(found(sim)) < 0.9 * min(free)
+
+
+def test_modes_that_the_mean_lacks_have_widths_too():
+    sim = simulate(8, n_exposures=12)
+    flat = with_table(sim, lambda table: None)
+    solution = solve(flat, prior=Prior(np.zeros((2, 1)), sigma="evidence"))
+    assert len(solution.settings["widths"]) == 3
+    assert solution.degree == 3
+
+
+def test_what_is_not_there_gets_no_width():
+    sim = simulate(15, "zero")
+    solution = found(sim)
+    assert solution.settings["widths"] == [0, 0, 0]
+    lowest = solve(sim.matches, degree=0, prior=Prior(sim.truth.static))
+    assert_allclose(solution.positions, lowest.positions, atol=1e-3)
+    assert solution.dof == lowest.dof
+
+
+def test_degree_0_has_nothing_that_scatters():
+    solution = found(simulate(6), degree=0)
+    assert solution.settings["widths"] == []
+
+
+def test_order_of_exposures_does_not_matter():
+    sim = simulate(10)
+    order = np.random.default_rng(0).permutation(len(sim.matches.table))
+    turned = Matches.from_table(sim.matches.table[order], shape=SHAPE, poses=sim.matches.poses)
+    prior = Prior(sim.truth.static, sigma="evidence")
+    assert_allclose(solve(turned, prior=prior).settings["widths"], found(sim).settings["widths"], rtol=0.02)
+
+
+def test_errors_known_up_to_a_factor():
+    """Errors stated twice too small: with errors="scale" the widths are what they were."""
+    sim = simulate(15)
+    right = found(sim)
+
+    def halve(table):
+        table["x_err"] /= 2
+        table["y_err"] /= 2
+
+    prior = Prior(sim.truth.static, sigma="evidence")
+    wrong = solve(with_table(sim, halve), prior=prior, errors="scale")
+    again = found(sim, errors="scale")
+    assert_allclose(wrong.settings["widths"], again.settings["widths"], rtol=0.02)
+    assert_allclose(wrong.settings["widths"], right.settings["widths"], rtol=0.1)
+    assert wrong.settings["error_scale"] == pytest.approx(2 * again.settings["error_scale"], rel=0.01)
+
+
+def test_mismatches_do_not_widen_them():
+    sim = simulate(8, "flat", seed=3)
+    bad = np.random.default_rng(0).choice(len(sim.matches.table), 3, replace=False)
+
+    def spoil(table):
+        table["x"][bad] += 30 * table["x"].unit
+
+    matches, prior = with_table(sim, spoil), Prior(sim.truth.static, sigma="evidence")
+    solution = solve(matches, prior=prior, clip=5)
+    assert not solution.residuals["used"][bad].any()
+    assert_allclose(solution.settings["widths"], found(sim).settings["widths"], rtol=0.1)
+    assert_allclose(
+        solve(matches, prior=prior, loss="cauchy").settings["widths"], found(sim).settings["widths"], rtol=0.1
+    )
+
+
+def test_one_prior_one_set_of_widths():
+    """A Prior shared by detectors pools them; one each keeps them apart; numbers stay what they are."""
+    sim = simulate(14)
+
+    def detector(table):
+        table["detector"] = ["even" if int(name[3:]) % 2 == 0 else "odd" for name in table["exposure"]]
+
+    matches, one = with_table(sim, detector), Prior(sim.truth.static, sigma="evidence")
+    pooled = solve(matches, prior={"even": one, "odd": one}).settings["widths"]
+    assert pooled["even"] == pooled["odd"]
+    assert_allclose(pooled["even"], found(sim).settings["widths"], rtol=0.02)
+    apart = solve(matches, prior={"even": one, "odd": Prior(sim.truth.static, sigma="evidence")}).settings["widths"]
+    assert apart["even"] != apart["odd"]
+    mixed = solve(matches, prior={"even": one, "odd": Prior(sim.truth.static, sigma=0.5)}).settings
+    assert mixed["widths"]["odd"] is None
+    assert len(mixed["widths"]["even"]) == 3
+
+
+def test_some_of_many_exposures_are_enough(monkeypatch):
+    sim = simulate(12, n_exposures=30)
+    whole = found(sim).settings["widths"]
+    monkeypatch.setattr(empirical, "MOST", 15 * 20)
+    part = found(sim).settings["widths"]
+    assert part != whole
+    assert_allclose(part, whole, rtol=0.5)
+
+
+def test_with_a_static_distortion_that_is_fitted():
+    spectrum = [0.5] * 3 + [0.0] * 7
+    sim = simulate_matches(
+        n_stars=40, n_exposures=12, dynamic=spectrum, dither=200, rotations=30 * np.arange(12), seed=2
+    )
+    solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma="evidence"), static="fit")
+    assert_allclose(solution.settings["widths"], [0.5], rtol=0.3)
+
+
+# --- the number of modes that the data determine -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_all_of_them_without_widths(degree):
+    sim = simulate(30)
+    solution = solve(sim.matches, degree=degree, prior=Prior(sim.truth.static))
+    n = max(4, (degree + 1) * (degree + 2))
+    assert_allclose(list(solution.effective_modes.values()), n * 0.9, rtol=1e-2)
+
+
+@pytest.mark.parametrize("sigma", [10.0, 0.5, 0.1, 1e-3, 0.0, "evidence"])
+def test_they_and_the_stars_are_the_free_parameters(sigma):
+    sim = simulate(20, "zero")
+    solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma=sigma))
+    number = np.array(list(solution.effective_modes.values()))
+    assert 2 * len(solution.residuals) - 2 * 20 - number.sum() == pytest.approx(solution.dof, abs=0.6)
+    assert np.all((number > 3.5) & (number < 18.1))
+    if sigma == 10.0:
+        assert_allclose(number, 18, atol=0.05)
+    if sigma in (1e-3, 0.0):
+        assert_allclose(number, 3.6, atol=0.05)  # shift, rotation and scale have no prior
+
+
+def test_they_grow_with_the_width_and_the_stars():
+    number = {}
+    for n_stars in (8, 30):
+        sim = simulate(n_stars, "zero")
+        for sigma in (0.05, 0.2, 1.0):
+            solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma=sigma))
+            number[n_stars, sigma] = np.mean(list(solution.effective_modes.values()))
+    for n_stars in (8, 30):
+        assert number[n_stars, 0.05] < number[n_stars, 0.2] < number[n_stars, 1.0]
+    assert number[8, 0.2] < number[30, 0.2]
+
+
+# --- words, files, commands --------------------------------------------------------------------------------------
+
+
+def test_solution_says_what_was_found(tmp_path):
+    solution = found(simulate(10))
+    widths = ", ".join(f"{width:.3g}" for width in solution.settings["widths"])
+    text = " ".join(str(solution).split())
+    assert f"widths scatter of a coefficient, found from the exposures: {widths} px" in text
+    assert re.search(r"modes \d+\.\d to \d+\.\d an exposure, both axes together, are determined by the data", text)
+    solution.write(tmp_path / "solution.asdf")
+    again = Solution.read(tmp_path / "solution.asdf")
+    assert again.settings == solution.settings
+    assert again.effective_modes == solution.effective_modes
+
+
+def test_plain_solution_says_nothing_of_widths():
+    text = str(solve(simulate(20).matches))
+    assert not re.search(r"^(widths|modes|kept|degree) ", text, re.MULTILINE)
+
+
+def test_prior_with_evidence_has_a_file(tmp_path):
+    prior = Prior(np.zeros((2, 6)), sigma="evidence", static_sigma=0.1)
+    prior.write(tmp_path / "prior.asdf")
+    assert Prior.read(tmp_path / "prior.asdf").sigma == "evidence"
+    assert "sigma given" in repr(prior)
+
+
+def test_comparison_takes_such_a_prior():
+    sim = simulate(12)
+    prior = Prior(sim.truth.static, sigma="evidence")
+    assert baselines.compare(sim.matches, solve(sim.matches, prior=prior), prior=prior)
+
+
+def test_with_sigma():
+    prior = Prior(np.ones((2, 3)), static_sigma=0.2, source="here")
+    wide = prior.with_sigma(0.5, degree=2)
+    assert_allclose(wide.mean, [[1, 1, 1, 0, 0, 0]] * 2)
+    assert_allclose(wide.sigma, 0.5)
+    assert_allclose(wide.static_sigma, [[0.2] * 3 + [0] * 3] * 2)
+    assert wide.source == "here"
+    given = prior.with_sigma([1.0, 2.0, 3.0], degree=2)
+    assert_allclose(given.sigma, [[1, 2, 3, np.inf, np.inf, np.inf]] * 2)
+    assert prior.with_sigma(None).sigma is None
+    assert prior.sigma is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"sigma": "evidenz"},
+            "sigma must be widths in pixels, or 'evidence': found from the exposures, got 'evidenz'",
+        ),
+        ({"static_sigma": "evidence"}, "static_sigma must be widths in pixels, got 'evidence'"),
+    ],
+)
+def test_other_words(arguments, message):
+    with pytest.raises(InputError, match=message):
+        Prior(np.zeros((2, 3)), **arguments)
+
+
+def test_a_plan_needs_numbers():
+    with pytest.raises(InputError, match="sigma='evidence': solve finds it from exposures; give widths in pixels"):
+        predict(n_exposures=5, n_stars=20, sigma=0.1, prior=Prior(np.zeros((2, 10)), sigma="evidence"))
+
+
+@pytest.mark.parametrize("arguments", [["--prior-sigma", "evidence"], ["--prior-sigma", "0.9"]])
+def test_command_line(arguments, tmp_path, capsys):
+    sim = simulate(7)
+    table = sim.matches.table.copy()
+    table.meta = sim.matches.to_meta()
+    table.write(tmp_path / "matched.ecsv")
+    command = ["solve", str(tmp_path / "matched.ecsv"), *arguments, "--out", str(tmp_path / "out"), "--json", "--quiet"]
+    assert cli.main(command) == 0
+    figures = capsys.readouterr().out
+    assert '"effective_modes"' in figures
+    assert ('"widths"' in figures) == ("evidence" in arguments)
+
+
+def test_command_line_refuses_other_words(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["solve", "matched.ecsv", "--prior-sigma", "wide", "--out", "out"])
+    assert stop.value.code == 2
+    assert "'wide' is neither a number nor 'evidence'" in capsys.readouterr().err
+
+
+# --- against fixed degrees ---------------------------------------------------------------------------------------
+
+
+def errors(solution, truth, places):
+    """Errors of one solution: stars (similarity removed), and new positions among the stars and all over the field."""
+    scatter = [np.sqrt(np.nanmean(performance.new_scatter(solution, truth.distort, xy, 0) ** 2)) for xy in places]
+    return [performance.bias(solution.positions, truth.positions, removed="similarity"), *scatter]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_stars", [6, 10, 15, 30, 80])
+@pytest.mark.parametrize("spectrum", SPECTRA)
+def test_never_much_worse_than_the_best_fixed_degree(spectrum, n_stars):
+    """Mean errors over seeds; of new positions the errors of the correction alone, which is the hardest test."""
+    rows = []
+    for seed in range(20):
+        sim = simulate(n_stars, spectrum, seed=seed)
+        field = sim.truth.grid("exp00", 20)
+        places = field[Delaunay(sim.truth.positions).find_simplex(field) >= 0], field
+        mine = [errors(found(sim), sim.truth, places)]
+        for degree in range(4):
+            try:
+                fixed = solve(sim.matches, degree=degree, prior=Prior(sim.truth.static))
+                mine.append(errors(fixed, sim.truth, places))
+            except LegdistortError:
+                mine.append([np.inf] * 3)
+        rows.append(mine)
+    ours, *fixed = np.mean(rows, axis=0)
+    assert np.all(ours <= 1.05 * np.min(fixed, axis=0))
