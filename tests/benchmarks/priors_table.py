@@ -54,11 +54,11 @@ def errors(solution, sim, *, noise=0.0):
 
 
 def attempt(sim, prior, degree=3):
-    """The solution, or None."""
+    """Errors of the solution; infinite where there is none, or it folds."""
     try:
-        return solve(sim.matches, degree=degree, prior=prior)
+        return errors(solve(sim.matches, degree=degree, prior=prior), sim)
     except LegdistortError:
-        return None
+        return np.full(3, np.inf)
 
 
 def few_errors(spectrum, n_stars, n_seeds):
@@ -67,8 +67,9 @@ def few_errors(spectrum, n_stars, n_seeds):
     for seed in range(n_seeds):
         sim = simulate(n_stars, spectrum, seed)
         static = sim.truth.static
-        made = [attempt(sim, Prior(static, sigma="evidence")), *(attempt(sim, Prior(static), d) for d in range(4))]
-        rows.append([np.full(3, np.inf) if s is None else errors(s, sim) for s in made])
+        rows.append(
+            [attempt(sim, Prior(static, sigma="evidence")), *(attempt(sim, Prior(static), d) for d in range(4))]
+        )
     return np.mean(rows, axis=0)
 
 
@@ -94,8 +95,9 @@ def wrong_row(name, n_stars, n_seeds, **geometry):
         sim = simulate(n_stars, "falling", seed, **geometry)
         width = np.array(SPECTRA["falling"])
         sign = np.random.default_rng(seed).choice([-1, 1], (2, 10))
-        solution = attempt(sim, WRONG[name](sim.truth.static, width, sign))
-        if solution is None:
+        try:
+            solution = solve(sim.matches, prior=WRONG[name](sim.truth.static, width, sign))
+        except LegdistortError:
             return None
         b, sigma, _ = errors(solution, sim, noise=0.14)
         ratio = solution.settings["departure_ratio"]
