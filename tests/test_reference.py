@@ -119,9 +119,9 @@ def test_absolute_positions_become_as_good_as_relative_ones(sim):
     ],
 )
 def test_absolute_errors_are_calibrated(n, error, settings):
-    """chi2 of the absolute error under the reported one, over 40 realisations, is 1 within 15 %."""
+    """chi2 of the absolute error under the reported one, over 60 realisations, is 1 within 15 %."""
     squares = []
-    for seed in range(40):
+    for seed in range(60):
         sim = simulate(seed, n_exposures=10, **settings)
         reference = planar(sim, n, error, seed=seed)
         solution = solve(
