@@ -209,23 +209,28 @@ class Evidence:
         ndarray, shape (n,)
         """
         low, high = np.log(bounds)
+        square = np.bincount(self.label, (self.pull / np.diag(self.curvature)) ** 2, n)
+        unit = square / np.bincount(self.label, minlength=n)  # variances of that order: where 0 is left if it has to be
         dropped = np.zeros(n, dtype=bool)
 
-        def highest(start):
-            start = np.where(dropped, low, np.clip(start, low, high))
-            limits = [(low, low if gone else high) for gone in dropped]
-            return minimize(lambda w: self.cost(w, scale=scale), start, jac=True, bounds=limits, method="L-BFGS-B")
+        def cost(variance):
+            value, slope = self.cost(np.log(variance * unit) / 2, scale=scale)
+            return value, slope / (2 * variance)
 
-        square = (self.pull / np.diag(self.curvature)) ** 2
-        found = highest(np.log(np.bincount(self.label, square, n) / np.bincount(self.label, minlength=n)) / 2)
+        def highest(start):
+            limits = np.exp(2 * np.array([low * np.ones(n), np.where(dropped, low, high)])) / unit
+            start = np.clip(start, *limits)
+            return minimize(cost, start, jac=True, bounds=list(zip(*limits, strict=True)), method="L-BFGS-B")
+
+        found = highest(np.ones(n))
         while not dropped.all():
-            without = [np.where(np.arange(n) == k, low, found.x) for k in np.flatnonzero(~dropped)]
-            loss = np.array([self.cost(w, scale=scale)[0] for w in without]) - found.fun
+            without = [np.where(np.arange(n) == k, 0, found.x) for k in np.flatnonzero(~dropped)]
+            loss = np.array([cost(np.maximum(v, np.exp(2 * low) / unit))[0] for v in without]) - found.fun
             if loss.min() > PARSIMONY:
                 break
             dropped[np.flatnonzero(~dropped)[loss.argmin()]] = True
             found = highest(without[loss.argmin()])
-        return np.exp(found.x)
+        return np.sqrt(found.x * unit)
 
 
 def evidence(problem, state, labels, motion):

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 #: Up to this many unknown coefficients the reduced matrix is factorised; beyond, conjugate gradients.
 DIRECT_LIMIT = 3000
 #: ... and while building it costs no more than this many multiplications.
-_DIRECT_COST = 4e10
+_DIRECT_COST = 4e9
 #: The data overrule the convention along a direction where that gains this much chi2 (five standard errors).
 GAIN = 25.0
 _SURE = 0.01  # curvature, relative to that of the coefficients, of a direction that is none of the gauge
