@@ -1,5 +1,6 @@
 """Widths of a prior found from the exposures, and how many modes the data determine."""
 
+import itertools
 import re
 
 import numpy as np
@@ -275,6 +276,24 @@ def test_with_a_static_distortion_that_is_fitted():
     assert_allclose(solution.settings["widths"], [0.5], rtol=0.3)
 
 
+def test_the_highest_likelihood_is_found(monkeypatch):
+    """From one start as high as the best of many; two of the widths here once stuck at the lower end."""
+    seen = []
+    plain = empirical.Evidence.best
+
+    def spy(self, n, bounds, *, scale=False):
+        seen.append((self, plain(self, n, bounds, scale=scale)))
+        return seen[-1][1]
+
+    monkeypatch.setattr(empirical.Evidence, "best", spy)
+    monkeypatch.setattr(empirical, "PARSIMONY", 0.01)
+    for seed in (3, 7):
+        found(simulate(8, seed=seed, dither=250))
+    for evidence, widths in seen[1::2]:
+        costs = [evidence.cost(np.log(w))[0] for w in itertools.product([1e-3, 0.1, 0.2, 0.4, 0.7, 1.0], repeat=3)]
+        assert evidence.cost(np.log(widths))[0] < min(costs) + 0.02
+
+
 # --- the number of modes that the data determine -----------------------------------------------------------------
 
 
@@ -426,3 +445,27 @@ def test_never_much_worse_than_the_best_fixed_degree(spectrum, n_stars):
         rows.append(mine)
     ours, *fixed = np.mean(rows, axis=0)
     assert np.all(ours <= 1.05 * np.min(fixed, axis=0))
+
+
+@pytest.mark.slow
+def test_wrong_priors_are_told():
+    """What docs/few_stars.md says of wrong priors, in short; its figures are of tests/benchmarks/priors_table.py."""
+    widths, rows = np.array(SPECTRA["falling"]), []
+    for seed in range(12):
+        sim = simulate(30, seed=seed, dither=250, rotations=36 * np.arange(10))
+        off = 3 * widths * np.random.default_rng(seed).choice([-1, 1], (2, 10))
+        row = []
+        for mean, factor in ((0, 1), (0, 2), (0, 0.5), (off, 1)):
+            solution = solve(sim.matches, prior=Prior(sim.truth.static + mean, sigma=factor * widths))
+            b = performance.bias(solution.positions, sim.truth.positions, removed="similarity")
+            row.append([b, solution.chi2 / solution.dof, solution.settings["departure_ratio"]])
+        rows.append(row)
+    (b, chi2, ratio) = np.mean(rows, axis=0).T
+    assert_allclose([chi2[0], ratio[0]], 1, atol=0.1)
+    assert_allclose(b[1:3], b[0], rtol=0.05)
+    assert ratio[1] < 0.7
+    assert ratio[2] > 1.5
+    assert chi2[2] > chi2[0] + 0.1
+    assert ratio[3] > 2.5
+    assert chi2[3] > chi2[0] + 0.4
+    assert b[3] > 1.1 * b[0]
