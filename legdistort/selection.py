@@ -23,8 +23,10 @@ AUTO = "auto"
 HIGHEST = 6
 #: Parts into which stars are divided; each is left out once.
 N_FOLDS = 10
-#: No further degree is tried when so many in a row are worse than one before.
+#: No further degree is tried when so many in a row are no better than one before.
 N_WORSE = 3
+#: Of degrees whose scores differ by less than this part the lowest is taken.
+TIE = 0.005
 #: Excess of a degree's energy over its noise, in standard deviations of the latter, that raises the alarm.
 ALARM = 5.0
 _OUTLIER = 25.0  # times the usual squared scatter of a star, at every degree: mismatched, it has no say
@@ -184,7 +186,7 @@ def choose_degree(matches, fit):
     Returns
     -------
     dict
-        ``degree``; ``degrees``, those that were tried: as many as the stars allow, until three in a row are worse;
+        ``degree``; ``degrees``, those that were tried: as many as the stars allow, until three in a row are no better;
         ``scores``, the squared scatter of stars kept out over that of their errors; ``n_folds``; ``aliasing``, see
         `folding`; ``alarm``; and all in a ``sentence``.
 
@@ -207,9 +209,9 @@ def choose_degree(matches, fit):
             break
         degrees.append(degree)
         scores = _scores(np.array(squares))
-        if len(scores) - np.argmin(scores) > N_WORSE:
+        degree = int(np.argmax(scores <= (1 + TIE) * scores.min()))
+        if len(scores) - degree > N_WORSE:
             break
-    degree = degrees[int(np.argmin(scores))]
     aliasing = _aliasing(matches, fit, degree)
     alarm = [a for a in aliasing if a["excess"] > ALARM]
     return {
