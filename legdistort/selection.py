@@ -21,8 +21,8 @@ log = logging.getLogger(__name__)
 AUTO = "auto"
 #: Highest degree that is tried.
 HIGHEST = 6
-#: Parts into which stars are divided; each is left out once.
-N_FOLDS = 10
+#: Parts into which stars are divided; each is left out once. So few stars are left out one by one.
+N_FOLDS, FEW = 10, 30
 #: No further degree is tried when so many in a row are no better than one before.
 N_WORSE = 3
 #: Of degrees whose scores differ by less than this part the lowest is taken.
@@ -197,20 +197,20 @@ def choose_degree(matches, fit):
     """
     folds = _folds(matches)
     degrees, squares = [], []
-    for degree in range(HIGHEST + 1):
+    for tried in range(HIGHEST + 1):
         try:
             squares.append(
-                np.concatenate([_squares(fit(_only(matches, ~out), degree), matches.table[out]) for out in folds])
+                np.concatenate([_squares(fit(_only(matches, ~out), tried), matches.table[out]) for out in folds])
             )
         except LegdistortError as error:
-            if degree == 0:
+            if tried == 0:
                 raise
-            log.debug("degree %d is beyond these stars: %s", degree, error)
+            log.debug("degree %d is beyond these stars: %s", tried, error)
             break
-        degrees.append(degree)
+        degrees.append(tried)
         scores = _scores(np.array(squares))
         degree = int(np.argmax(scores <= (1 + TIE) * scores.min()))
-        if len(scores) - degree > N_WORSE:
+        if tried - degree >= N_WORSE:
             break
     aliasing = _aliasing(matches, fit, degree)
     alarm = [a for a in aliasing if a["excess"] > ALARM]
@@ -239,7 +239,8 @@ def _folds(matches):
     seen = np.flatnonzero(np.bincount(star) > 1)
     if len(seen) < 2:
         raise InputError(f"degree={AUTO!r} needs stars that two exposures or more see; there are {len(seen)} of them")
-    parts = np.array_split(np.random.default_rng(0).permutation(seen), min(N_FOLDS, len(seen)))
+    n = len(seen) if len(seen) <= FEW else N_FOLDS
+    parts = np.array_split(np.random.default_rng(0).permutation(seen), n)
     return [np.isin(star, part) for part in parts]
 
 

@@ -184,6 +184,13 @@ def test_no_more_than_the_stars_allow():
     assert chosen["degrees"] == [0, 1, 2]
 
 
+def test_of_equal_degrees_the_lowest():
+    """With widths that are found, degrees that are not there change nothing."""
+    sim = simulate(20, 0.5, 0.5, n_exposures=5)
+    chosen = solve(sim.matches, prior=Prior(sim.truth.static, sigma="evidence"), degree="auto").settings["selection"]
+    assert chosen["degree"] == 1
+
+
 @pytest.mark.slow
 def test_widths_allow_more():
     sim = simulate(8, 0.5, 0.5, 0.3, n_exposures=5)
@@ -335,6 +342,7 @@ def test_expected_scatter_takes_an_error_for_each_position():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::legdistort.exceptions.AssumptionWarning")  # the alarm is not what is tested
 def test_the_choice_costs_little():
     """Mean error of new positions with the degree chosen, against the best of 0 to 4, which is not known."""
     for by_degree in ((0.5,) * 4, (0.5, 0.3, 0.1, 0.05), (0.5, 0.2), (0.0,)):
