@@ -17,7 +17,7 @@ from astropy import units as u
 from PIL import Image
 
 import legdistort as ld
-from legdistort import performance, plotting, poses, problems, solvers, starting
+from legdistort import baselines, performance, plotting, poses, problems, quality, quality_plots, solvers, starting
 from legdistort.demo import run_demo
 from legdistort.distortion import Distortion
 
@@ -34,6 +34,8 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         night = run_demo(out=Path(folder) / "night")
         save(before_after(night.solution), "before_after.png", colours=256)
+        save(stacked(night), "stacks.png", colours=256)
+        save(noise(night.out / "frames" / "exp00.fits"), "noise.png")
         small = run_demo(out=Path(folder) / "small", small=True)
         draw_first_mosaic(small)
 
@@ -127,6 +129,18 @@ def by_star(solution, to_reference, *, table=None):
     return out
 
 
+def stacked(run):
+    """The same stars in stacks made with other corrections."""
+    solution = run.solution
+    matches = ld.Matches.from_table(
+        solution.observations, shape=solution.shapes, poses=solution.poses, sky=solution.sky
+    )
+    comparison = baselines.compare(matches, solution, prior=ld.Prior(solution.prior_mean[0]))
+    frames = ld.open_exposures(str(run.out / "frames" / "*.fits"))
+    stacks = quality.compare_stacks(frames, comparison, mosaic=run.mosaic, method="clipped")
+    return quality_plots.plot_zooms(stacks.zooms)[0, 0].figure
+
+
 def draw_first_mosaic(run):
     """Pictures of the page "First mosaic"."""
     solution, first = run.solution, run.solution.names[0]
@@ -146,6 +160,11 @@ def draw_first_mosaic(run):
     xy = np.column_stack([solution.stars["x"].value, solution.stars["y"].value]) - offset
     plotting.plot_mosaic(run.mosaic, stars=xy, ax=panels[1])
     save(fig, "mosaic.png", colours=256)
+
+
+def noise(frame):
+    """Errors of positions against flux for four widths, by stars put into a frame of the night."""
+    return ld.calibrate_noise(ld.read_exposures(frame), fwhm=[3.5, 4.5, 5.5, 6.5]).plot().figure
 
 
 def planned():

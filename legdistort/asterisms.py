@@ -53,9 +53,8 @@ def offset_candidates(source, target, *, size, n_best=3):
         profiles = [_trapezium(b + cell / 2, b_lo, *s) for b, b_lo, s in zip(bins, low, spans, strict=True)]
         expected = 9 * cell**2 * len(differences) * profiles[0][:, None] * profiles[1][None]
         contrast = (votes - expected) / np.sqrt(expected + 1)
-        peaks = np.where(maximum_filter(contrast, 3) == contrast, contrast, -np.inf)
-        best = np.argsort(peaks, axis=None)[::-1][:n_best]
-        for i, j in zip(*np.unravel_index(best, shape), strict=True):
+        peaks = np.argwhere(maximum_filter(contrast, 3) == contrast)
+        for i, j in peaks[np.argsort(-contrast[tuple(peaks.T)], kind="stable")[:n_best]]:
             near = np.all(np.abs(differences - [bins[0][i] + cell / 2, bins[1][j] + cell / 2]) <= 1.5 * cell, axis=1)
             if near.sum() >= 3:
                 out.append(np.median(differences[near], axis=0))

@@ -31,6 +31,7 @@ DETECTED = {
     "flux_err": (None, False),
     "fwhm": (u.pix, False),
     "flags": (None, False),
+    "crowding": (None, False),
 }
 
 #: Columns of a table of stars: name -> (UCD of the Virtual Observatory, meaning). Names of sky columns are Gaia's.

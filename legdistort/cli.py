@@ -11,8 +11,12 @@ from pathlib import Path
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from . import commands
+from .drizzling import KERNELS
 from .exceptions import LegdistortError, LegdistortWarning
+from .levels import SCALES
+from .resampling import ALGORITHMS
 from .sources import DIRECTIONS
+from .weighting import EXTRAPOLATED, WEIGHTS
 
 log = logging.getLogger("legdistort")
 
@@ -79,6 +83,7 @@ def _run(p):
     _minimum(p)
     _fit(p, clip="5")
     _combination(p)
+    _workers(p)
     p.add_argument("--compare", action="store_true", help="also by shifts, static map and relative polynomial")
 
 
@@ -86,6 +91,19 @@ def _measure(p):
     _frames(p)
     _out(p, "table (ECSV) of detections")
     _detection(p)
+    _workers(p)
+
+
+def _noise(p):
+    _frames(p)
+    _out(p, "table (ECSV) of errors against flux")
+    p.add_argument("--fwhm", type=float, nargs="+", help="of the stars put in, pixels (default: that of the frame's)")
+    p.add_argument("--fluxes", type=float, nargs="+", help="in units of the data (default: chosen by the frame)")
+    p.add_argument("--n-positions", type=int, default=100, help="stars for every flux and width (default 100)")
+    p.add_argument("--seed", type=int, default=0, help="of the random numbers (default 0)")
+    p.add_argument("--plot", type=Path, metavar="FILE.png", help="picture of the curves")
+    _detector(p)
+    _workers(p)
 
 
 def _match(p):
@@ -121,6 +139,7 @@ def _coadd(p):
     _limit(p)
     _out(p, "mosaic (FITS)")
     _combination(p)
+    _workers(p)
 
 
 def _attach(p):
@@ -184,6 +203,7 @@ _COMMANDS = {
     "demo": ("simulate a night, solve it, compare with the truth", "--out demo", _demo),
     "run": ("frames to WCS, mosaic and report", "frames/*.fits --out results --degree 3", _run),
     "measure": ("frames to a table of positions", "frames/*.fits --out stars.ecsv", _measure),
+    "noise": ("error of a position against flux, by injected stars", "frames/a.fits --out noise.ecsv", _noise),
     "match": (
         "tables of positions to matched stars",
         "A.lis B.lis C.lis --columns x_err=xe,y_err=ye --shape 1024 1024 --out matched.ecsv",
@@ -283,6 +303,18 @@ def _night(p):
 
 def _detection(p):
     p.add_argument("--fwhm", type=float, help="of the stars, pixels (default: found)")
+    _detector(p)
+    p.add_argument("--profile", choices=("own", "shared", "linear"), help="shape: of a star, or the whole frame")
+    p.add_argument("--blends", choices=("together", "alone"), help="how stars that touch are fitted (default together)")
+    p.add_argument(
+        "--position-errors",
+        choices=("fit", "injected", "scaled"),
+        default="fit",
+        help="of the fit, or by stars of known position put into the frame (default fit)",
+    )
+
+
+def _detector(p):
     p.add_argument("--threshold", type=float, help="detection limit, signal-to-noise ratio (default 5)")
     p.add_argument("--gain", type=float, help="electrons per ADU (default: header)")
     p.add_argument("--read-noise", type=float, help="electrons (default: header)")
@@ -291,6 +323,11 @@ def _detection(p):
 
 def _minimum(p):
     p.add_argument("--min-exposures", type=int, default=4, help="keep stars seen in so many exposures (default 4)")
+    p.add_argument("--isolation", type=float, help="largest crowding of a star; inf keeps all (default 3)")
+
+
+def _workers(p):
+    p.add_argument("--workers", type=int, metavar="N", help="cores to use (default 1)")
 
 
 def _limit(p):
@@ -329,6 +366,16 @@ def _fit(p, *, clip):
 def _combination(p):
     p.add_argument("--combine", choices=("mean", "median", "clipped"), default="clipped", help="(default clipped)")
     p.add_argument("--order", type=int, default=3, help="of the interpolating spline (default 3)")
+    p.add_argument("--algorithm", choices=ALGORITHMS, default="interp", help="of resampling (default interp)")
+    p.add_argument("--pixfrac", type=float, default=1.0, help="with drizzle: side of the drops (default 1)")
+    p.add_argument(
+        "--kernel", choices=KERNELS, default="square", help="with drizzle: shape of the drops (default square)"
+    )
+    p.add_argument("--weights", choices=(*WEIGHTS, "equal"), default="noise", help="of exposures (default noise)")
+    p.add_argument("--scale", choices=(*SCALES, "none"), default="auto", help="of fluxes (default auto)")
+    p.add_argument(
+        "--extrapolated", choices=EXTRAPOLATED, default="flag", help="pixels outside the stars used (default flag)"
+    )
 
 
 if __name__ == "__main__":

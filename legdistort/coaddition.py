@@ -1,27 +1,31 @@
 """Resample exposures with the solution's distortions and combine them."""
 
 import logging
-import os
 import warnings
-from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import version
 
 import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
-from scipy.sparse.csgraph import connected_components
-from tqdm import tqdm
 
-from .combination import METHODS, combiner
+from .combination import METHODS
+from .drizzling import Drop
 from .exceptions import AssumptionWarning, InputError
+from .levels import bad_pixels, flux_scales, match_backgrounds, saturated_pixels, survey
+from .mapping import Grid, map_exposure, outline
 from .mosaics import Mosaic
-from .resampling import ALGORITHMS, Grid, fill_bad, map_exposure, outline, resample_exposure, trace
+from .parallel import check_workers, each
+from .resampling import ALGORITHMS, fill_bad, rough_pixels, white_gain
+from .scratch import scratch_folder, store
+from .stacking import Layer, Recipe, assemble, check_memory
+from .weighting import EXTRAPOLATED, make_weights, stellar_widths, support
 
 logger = logging.getLogger(__name__)
 
 CONSERVE = ("flux", "surface_brightness")
 _ORDERS = {"nearest-neighbor": 0, "bilinear": 1, "biquadratic": 2, "bicubic": 3}
-_BLOCK = 32  # side of the blocks whose medians stand for the background, px
+_STORED = 5  # bytes a pixel in the scratch folder, about
 _COPIED = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "BUNIT")
 
 
@@ -36,7 +40,12 @@ def coadd(
     conserve="flux",
     match_background=True,
     weights="noise",
-    scale="exptime",
+    scale="auto",
+    extrapolated="flag",
+    pixfrac=1.0,
+    kernel="square",
+    workers=None,
+    scratch=None,
     progress=False,
 ):
     """Co-add exposures on the distortion-free reference plane, or on any celestial WCS.
@@ -44,16 +53,17 @@ def coadd(
     Parameters
     ----------
     exposures : sequence of Exposure
-        The images.
+        The images; or what `legdistort.open_exposures` gives: then they are never all in memory.
     solution : Solution
         With the distortion of every exposure; an exposure without one is left out with a warning.
     method : {'mean', 'median', 'clipped'}
-        Weighted mean; median; or weighted mean of what lies within 4 sigma (plus 30 % of the signal, because
-        images differ in sharpness) of the median, where at least three exposures meet.
+        Weighted mean; median; or weighted mean of what the others confirm, without cosmic rays, hot pixels and trails,
+        where at least three exposures meet (`legdistort.combination.confirmed`).
     order : int or str
         Order of the spline, 0 to 5, or the name that reproject gives it, such as 'bilinear'.
-    algorithm : {'interp', 'adaptive', 'exact'}
-        Which of reproject's algorithms; `order` counts for 'interp' only. 'exact' is fifty times slower.
+    algorithm : {'interp', 'adaptive', 'exact', 'drizzle'}
+        Which of reproject's algorithms, or that of STScI; `order` counts for 'interp' only. 'exact' is fifty times
+        slower. 'drizzle' with `pixfrac` 1 is the same, fast; it needs the extra ``legdistort[drizzle]``.
     grid : `~astropy.wcs.WCS` or `~astropy.io.fits.Header`, optional
         Output grid, with its shape. The default is the reference plane, pixel for pixel, as large as all
         exposures need.
@@ -63,13 +73,29 @@ def coadd(
     match_background : bool
         Bring the backgrounds to one level, by robust differences where exposures overlap. The level is then
         left out of the multiplication for 'flux', so that a flat sky stays flat.
-    weights : {'noise', None} or dict
-        Of the exposures in a mean: 1/sigma^2 of their background noise, equal, or by name.
-    scale : {'exptime', None} or dict
+    weights : {'noise', 'variance', 'exptime', 'seeing', 'sigma_map', None} or dict
+        Of the exposures in a mean: 1/sigma^2 of their background noise; the same by pixel, from the uncertainty planes
+        without the photons of stars; exposure time; 'noise' / FWHM^2; 'noise' times s^2 / (s^2 + e^2), e being
+        the error of the distortion correction (`Solution.sigma_map`) and s = 0.02 FWHM that of a star of
+        signal-to-noise ratio 20; equal; or by name.
+    scale : {'auto', 'exptime', 'stars', None} or dict
         Factors by which data are multiplied: 'exptime' brings all to the mean exposure time if times differ (data
-        in units per second are left alone); none; or by name.
+        in units per second are left alone); 'stars' makes the measured fluxes of common stars agree; 'auto' goes by
+        time unless stars differ from that by more than 2 % and 3 sigma, as through clouds, or times are not known;
+        none; or by name.
+    extrapolated : {'flag', 'mask', 'keep'}
+        Pixels outside the stars used of an exposure, where its distortion is extrapolated (`Solution.supported`): used
+        and flagged in the mosaic; left out; or used.
+    pixfrac, kernel
+        For 'drizzle': side of the drops as a fraction of a pixel, and their shape, 'square', 'turbo' or 'point'.
+    workers : int, optional
+        Threads that share the work. None = the current ``dask.distributed.Client`` if there is one, else this one. The
+        mosaic is the same, bit for bit.
+    scratch : str or path, optional
+        Folder for the pixels of the exposures while work goes on, 4 to 13 bytes for each; the workers of a cluster must
+        see it. The default is that of the system (``TMPDIR``).
     progress : bool
-        Show a progress bar.
+        Show progress bars.
 
     Returns
     -------
@@ -80,49 +106,71 @@ def coadd(
     InputError
         Naming what is wrong: an option, an exposure whose shape is not that of the solution, a grid
         without sky or shape, or larger than the memory, no exposure left, none on the grid.
+    DiskFullError
+        If the disk is full. Nothing is left behind.
     """
-    order = _check_options(method, order, algorithm, conserve)
+    order = _check_options(method, order, algorithm, conserve, extrapolated)
+    drop = Drop(kernel, pixfrac) if algorithm == "drizzle" else None
     frames, left_out = _select(exposures, solution)
-    factors = _scales(frames, scale)
     output = reference_grid([f.name for f in frames], solution) if grid is None else _given_grid(grid, solution)
-    _check_memory(output, frames, method)
-    noise = {f.name: factors[f.name] * _noise(f) for f in frames}
-    weight = _weights(frames, weights, noise)
-    sky = _backgrounds(frames, solution, output, factors)
-    level = float(np.mean(list(sky.values())))
-    combined = combiner(method, output.shape, level)
-    used = []
-    for frame in tqdm(frames, desc="co-adding", unit="frame", disable=not progress):
-        name = frame.name
-        pixel_map = map_exposure(name, solution, output, corners=algorithm == "exact")
-        if pixel_map is None:
-            left_out[name] = "it does not meet the output grid"
-            continue
-        bad, factor = _bad(frame), factors[name]
-        variance = noise[name] ** 2 if frame.uncertainty is None else (factor * frame.uncertainty) ** 2
-        data, variance = resample_exposure(
-            factor * frame.data, bad, variance, pixel_map, algorithm=algorithm, order=order
+    check_memory(output.shape, len(frames), check_workers(workers))
+    maps = {f.name: map_exposure(f.name, solution, output, corners=algorithm in ("exact", "drizzle")) for f in frames}
+    left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
+    frames = [f for f in frames if maps[f.name] is not None]
+    share = {"workers": workers, "threads": True, "progress": progress}
+    with scratch_folder(scratch, _STORED * sum(np.prod(f.shape) for f in frames)) as folder:
+        kept = each(partial(_keep, folder=folder), frames, description="reading", **share)
+        kept = dict(zip([f.name for f in frames], kept, strict=True))
+        masked = {name: "every pixel is masked" for name, found in kept.items() if found is None}
+        _warn(masked)
+        left_out |= masked
+        frames = [f for f in frames if kept[f.name] is not None]
+        if not frames:
+            raise InputError(f"no exposure meets the output grid: {_reasons(left_out)}")
+        factors, origin = flux_scales(frames, scale, solution)
+        surveys = [kept[f.name][1] for f in frames]
+        noise = {s.name: factors[s.name] * s.noise for s in surveys}
+        weight = make_weights(weights, noise, solution, times={f.name: f.exposure_time for f in frames})
+        fwhm = stellar_widths(solution, list(noise))
+        sky = match_backgrounds(surveys, solution, output, factors)
+        level = float(np.mean(list(sky.values())))
+        gains = [white_gain(maps[f.name], algorithm=algorithm, order=order, drop=drop) for f in frames]
+        layers = [
+            Layer(
+                index=i,
+                stored=kept[f.name][0],
+                map=maps[f.name],
+                survey=kept[f.name][1],
+                factor=factors[f.name],
+                variance=noise[f.name] ** 2,
+                sky=sky[f.name] if match_background else None,
+                weight=weight[f.name],
+                fwhm=fwhm and fwhm[f.name],
+                support=None if extrapolated == "keep" else support(f.name, solution),
+                gain=gains[i],
+            )
+            for i, f in enumerate(frames)
+        ]
+        recipe = Recipe(
+            output.shape, method, algorithm, order, conserve, level, extrapolated == "mask", _span(fwhm), drop
         )
-        area = pixel_map.area if conserve == "flux" else 1.0
-        data = (data - sky[name]) * area + level if match_background else data * area
-        combined.add(data, variance * area**2, pixel_map.window, weight[name])
-        used.append(frame)
-    if not used:
-        raise InputError(f"no exposure meets the output grid: {_reasons(left_out)}")
-    data, variance, footprint = combined.result()
-    settings = {"COMBINE": method, "RESAMPLE": f"{algorithm} {order}" if algorithm == "interp" else algorithm}
-    settings |= {"CONSERVE": conserve, "SKYLEVEL": level if match_background else None}
-    header = _header(used, left_out, factors, settings)
-    names = tuple(f.name for f in used)
-    return Mosaic(data, variance, footprint, output.wcs, names, left_out, output.offset, header)
+        planes = assemble(layers, recipe, **share)
+    settings = {"COMBINE": method, "RESAMPLE": _in_words(algorithm, order, drop), "CONSERVE": conserve}
+    settings |= {"SKYLEVEL": level if match_background else None, "FLXSCALE": origin, "EXTRAPOL": extrapolated}
+    settings |= {"WEIGHTS": weights if isinstance(weights, str) else "equal" if weights is None else "given"}
+    settings |= {"NOISECOR": (gains[0] ** -0.5, "noise of sums of many pixels over that by VAR")}
+    header = _header(frames, left_out, factors, settings)
+    names = tuple(f.name for f in frames)
+    return Mosaic(*planes, wcs=output.wcs, exposures=names, left_out=left_out, offset=output.offset, header=header)
 
 
-def _check_options(method, order, algorithm, conserve):
+def _check_options(method, order, algorithm, conserve, extrapolated):
     """The order as an integer, all options being sound."""
     for name, value, allowed in (
         ("method", method, METHODS),
         ("algorithm", algorithm, ALGORITHMS),
         ("conserve", conserve, CONSERVE),
+        ("extrapolated", extrapolated, EXTRAPOLATED),
     ):
         if value not in allowed:
             raise InputError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
@@ -132,10 +180,14 @@ def _check_options(method, order, algorithm, conserve):
     return int(order)
 
 
-def _bad(frame):
-    """Pixels of an exposure that must not be used."""
-    bad = ~np.isfinite(frame.data)
-    return bad if frame.mask is None else bad | frame.mask
+def _span(widths):
+    return (min(widths.values()), max(widths.values())) if widths else None
+
+
+def _in_words(algorithm, order, drop):
+    return {"interp": f"interp {order}", "drizzle": drop and f"drizzle {drop.kernel} {drop.pixfrac:g}"}.get(
+        algorithm, algorithm
+    )
 
 
 def _select(exposures, solution):
@@ -154,130 +206,38 @@ def _select(exposures, solution):
                 f"exposure {frame.name}: its shape {frame.shape} is not that of the solution, "
                 f"{tuple(solution.shapes[frame.name])}; a trimmed or binned image needs a solution of its own"
             )
-        elif _bad(frame).all():
-            left_out[frame.name] = "every pixel is masked"
         else:
             frames.append(frame)
     if not frames:
         raise InputError(f"no exposure to co-add: {_reasons(left_out) or 'the list is empty'}")
-    if left_out:
-        warnings.warn(f"left out of the mosaic: {_reasons(left_out)}", AssumptionWarning, stacklevel=3)
+    _warn(left_out)
     return frames, left_out
+
+
+def _warn(left_out):
+    if left_out:
+        warnings.warn(f"left out of the mosaic: {_reasons(left_out)}", AssumptionWarning, stacklevel=4)
+
+
+def _keep(frame, folder):
+    """The planes of an exposure, put aside, and its survey; None if it has no pixel to use."""
+    exposure = frame.read()
+    bad = bad_pixels(exposure)
+    if bad.all():
+        return None
+    data, variance = fill_bad(exposure.data, bad), None
+    seen, full = survey(exposure, bad=bad, filled=data), saturated_pixels(exposure) & ~bad
+    rough = rough_pixels(data, bad, full, seen.noise)
+    if exposure.uncertainty is not None:
+        variance = np.square(exposure.uncertainty, dtype=np.float32)
+        variance[bad] = np.mean(variance, where=~bad)
+    masks = {"bad": bad, "full": full, "rough": rough}
+    planes = {"data": data, "variance": variance} | {name: mask for name, mask in masks.items() if mask.any()}
+    return store(folder, frame.name, planes), seen
 
 
 def _reasons(left_out):
     return "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
-
-
-def _by_name(argument, given, frames):
-    """A dict of positive numbers by exposure, checked."""
-    for frame in frames:
-        value = given.get(frame.name)
-        if not (isinstance(value, (int, float, np.number)) and np.isfinite(value) and value > 0):
-            raise InputError(f"{argument} of exposure {frame.name} must be a positive number, got {value!r}")
-    return {f.name: float(given[f.name]) for f in frames}
-
-
-def _scales(frames, scale):
-    if isinstance(scale, Mapping):
-        return _by_name("scale", scale, frames)
-    if scale not in ("exptime", None):
-        raise InputError(f"scale must be 'exptime', None or a dict by exposure, got {scale!r}")
-    times = [f.exposure_time for f in frames]
-    same = dict.fromkeys((f.name for f in frames), 1.0)
-    unit = str(frames[0].header.get("BUNIT", "")).replace(" ", "").lower()
-    if scale is None or len(set(times)) == 1 or unit.endswith(("/s", "/sec", "s-1", "s**-1", "s^-1")):
-        return same
-    if None in times:
-        missing = ", ".join(f.name for f in frames if f.exposure_time is None)
-        warnings.warn(
-            f"no exposure time known for {missing}: the exposures are taken to be equally long; "
-            "give scale={name: factor} if they are not",
-            AssumptionWarning,
-            stacklevel=3,
-        )
-        return same
-    return {f.name: np.mean(times) / f.exposure_time for f in frames}
-
-
-def _weights(frames, weights, noise):
-    if isinstance(weights, Mapping):
-        return _by_name("weights", weights, frames)
-    if weights not in ("noise", None):
-        raise InputError(f"weights must be 'noise', None or a dict by exposure, got {weights!r}")
-    if weights is None or min(noise.values()) == 0:
-        return dict.fromkeys(noise, 1.0)
-    best = min(noise.values())
-    return {name: (best / sigma) ** 2 for name, sigma in noise.items()}
-
-
-def _noise(frame):
-    """Background noise: median of the uncertainties, or from the differences of neighbours.
-
-    Stars and gradients hardly touch these differences. Zero if there is none that float32 could hold.
-    """
-    bad = _bad(frame)
-    step = max(1, frame.shape[0] // 512)
-    data = np.where(bad, np.nan, frame.data if frame.uncertainty is None else frame.uncertainty)[::step]
-    if frame.uncertainty is not None:
-        return float(np.nanmedian(data))
-    difference = np.abs(np.diff(data, axis=1))
-    difference = difference[np.isfinite(difference)]
-    if not difference.any():
-        return 0.0
-    # The median of whole numbers is coarse: the rms within 3 sigma of it, 0.987 of that of a Gaussian, is finer.
-    quantum = difference[difference > 0].min()
-    core = difference[difference <= 3 * max(1.4826 * np.median(difference), quantum)]
-    sigma = float(np.sqrt(np.mean(core**2)) / 0.987 / np.sqrt(2))
-    return sigma if sigma > np.finfo(np.float32).eps * np.abs(frame.data[~bad]).max() else 0.0
-
-
-def _backgrounds(frames, solution, output, factors):
-    """Background level of every exposure, by differences of block medians where exposures overlap.
-
-    Levels of exposures that do not overlap, even through others, are their own medians.
-    """
-    ny, nx = output.shape
-    n_points = min(4096, max(400, 400_000 // len(frames)))
-    step = np.sqrt(ny * nx / n_points)
-    gx, gy = np.meshgrid(np.arange(step / 2, nx, step), np.arange(step / 2, ny, step))
-    points = np.stack([gx.ravel(), gy.ravel()], axis=1)
-    samples = np.full((len(frames), len(points)), np.nan)
-    own = np.empty(len(frames))
-    for i, frame in enumerate(frames):
-        blocks = factors[frame.name] * _block_medians(fill_bad(frame.data, _bad(frame)))
-        own[i] = np.median(blocks)
-        xy = trace(points, frame.name, solution, output)[:, :2]
-        inside = np.all((xy >= -0.5) & (xy < np.array(frame.shape[::-1]) - 0.5), axis=1)
-        column, row = ((xy[inside] + 0.5) * np.array(blocks.shape[::-1]) / frame.shape[::-1]).astype(int).T
-        samples[i, inside] = blocks[row, column]
-    return dict(zip([f.name for f in frames], _match_levels(samples, own), strict=True))
-
-
-def _block_medians(data):
-    ny, nx = (max(1, n // _BLOCK) for n in data.shape)
-    rows = np.array_split(np.arange(data.shape[0]), ny)
-    columns = np.array_split(np.arange(data.shape[1]), nx)
-    return np.array([[np.median(data[r[0] : r[-1] + 1, c[0] : c[-1] + 1]) for c in columns] for r in rows])
-
-
-def _match_levels(samples, own):
-    """Levels whose differences are the median differences of all pairs, by least squares; means as in `own`."""
-    n = len(samples)
-    difference, count = np.zeros((n, n)), np.zeros((n, n))
-    for i in range(n):
-        for j in range(i):
-            d = samples[i] - samples[j]
-            d = d[np.isfinite(d)]
-            if d.size:
-                difference[i, j], count[i, j] = np.median(d), d.size
-    difference, count = difference - difference.T, count + count.T
-    laplacian = np.diag(count.sum(axis=1)) - count
-    levels = np.linalg.lstsq(laplacian, (count * difference).sum(axis=1), rcond=1e-12)[0]
-    _, group = connected_components(count > 0, directed=False)
-    for g in np.unique(group):
-        levels[group == g] += (own - levels)[group == g].mean()
-    return levels
 
 
 def reference_grid(names, solution):
@@ -331,22 +291,6 @@ def _given_grid(grid, solution):
     return Grid(tuple(int(n) for n in wcs.array_shape), wcs, None, solution.sky)
 
 
-def _check_memory(output, frames, method):
-    """Refuse what the machine cannot hold."""
-    ny, nx = output.shape
-    per_frame = 100 if method == "mean" else 8 * len(frames) + 100  # bytes a pixel of the largest exposure
-    need = 36 * ny * nx + per_frame * max(np.prod(f.shape) for f in frames)
-    try:
-        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # not a POSIX system
-        memory = 16 << 30
-    if need > memory:
-        raise InputError(
-            f"a mosaic of {nx} x {ny} px from {len(frames)} exposures needs {need / 2**30:.0f} GB, this machine has "
-            f"{memory / 2**30:.0f}; are the poses right? Else use a coarser grid or method='mean'"
-        )
-
-
 def _header(frames, left_out, factors, settings):
     header = fits.Header()
     for key in _COPIED:
@@ -355,7 +299,8 @@ def _header(frames, left_out, factors, settings):
             header[key] = values.pop()
     times = [f.exposure_time for f in frames]
     if None not in times:
-        header["EXPTIME"] = (times[0] * factors[frames[0].name], "[s] exposure time that the values stand for")
+        mean = float(np.mean([time * factors[f.name] for f, time in zip(frames, times, strict=True)]))
+        header["EXPTIME"] = (mean, "[s] exposure time that the values stand for")
         header["TEXPTIME"] = (sum(times), "[s] sum of the exposure times")
     header["NCOMBINE"] = (len(frames), "number of exposures combined")
     for key, value in settings.items():

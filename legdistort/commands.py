@@ -7,6 +7,9 @@ from pathlib import Path
 
 from .exceptions import InputError
 
+#: Arguments of `measure` by which it knows the detector.
+_DETECTOR = ("threshold", "gain", "read_noise", "saturation")
+
 
 def wants_progress(a):
     """Whether progress bars are shown: on a terminal, unless told to be quiet."""
@@ -36,7 +39,6 @@ def do_run(a):
     """``legdistort run``."""
     from .pipeline import run
 
-    measuring = {key: getattr(a, key) for key in ("fwhm", "threshold", "gain", "read_noise", "saturation")}
     result = run(
         a.frames,
         out=a.out,
@@ -46,11 +48,13 @@ def do_run(a):
         min_exposures=a.min_exposures,
         clip=_clip(a, 5.0),
         **_tying(a),
-        measuring={key: value for key, value in measuring.items() if value is not None},
+        measuring=_given(a, "fwhm", "profile", "blends", *_DETECTOR) | {"errors": a.position_errors},
+        matching=_given(a, "isolation"),
         solving=_solving(a),
-        coadding={"method": a.combine, "order": a.order},
+        coadding=_coadding(a),
         compare=a.compare,
         overwrite=a.overwrite,
+        workers=a.workers,
         progress=wants_progress(a),
     )
     _report(a, result.solution, result.summary)
@@ -64,17 +68,40 @@ def do_run(a):
 
 def do_measure(a):
     """``legdistort measure``."""
-    from .exposures import expand_paths, read_exposures
+    from .exposure_files import open_exposures
+    from .exposures import expand_paths
     from .measurement import measure
     from .provenance import checksums
 
-    given = {key: getattr(a, key) for key in ("fwhm", "threshold", "gain", "read_noise", "saturation")}
-    exposures = read_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
-    table = measure(exposures, progress=wants_progress(a), **{k: v for k, v in given.items() if v is not None})
+    exposures = open_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
+    given = _given(a, "fwhm", "profile", "blends", *_DETECTOR) | {"errors": a.position_errors}
+    table = measure(exposures, workers=a.workers, progress=wants_progress(a), **given)
     shapes = {e.name: list(e.shape) for e in exposures}
     table.meta |= {"shapes": shapes, "inputs": checksums(expand_paths(a.frames))}
     _write_table(table, a)
     _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
+
+
+def do_noise(a):
+    """``legdistort noise``."""
+    from .calibration import calibrate_noise
+    from .exposure_files import open_exposures
+    from .files import replacing
+
+    curves = calibrate_noise(
+        open_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a)),
+        **_given(a, "fluxes", "fwhm", "n_positions", "seed"),
+        measuring=_given(a, *_DETECTOR),
+        workers=a.workers,
+        progress=wants_progress(a),
+    )
+    curves.write(a.out, overwrite=a.overwrite)
+    if a.plot is not None:
+        with replacing(a.plot, overwrite=a.overwrite) as temporary:
+            curves.plot().figure.savefig(temporary, format="png", dpi=120)
+    laws = [dict(zip(curves.laws.colnames, row, strict=True)) for row in curves.laws.as_array().tolist()]
+    laws = [{key: value if value == value else None for key, value in law.items()} for law in laws]  # no NaN in JSON
+    _say(a, curves, {"laws": laws, "out": str(a.out)})
 
 
 def do_match(a):
@@ -89,7 +116,8 @@ def do_match(a):
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
     table = stack(tables)
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
-    matches = match(table, shape=tuple(a.shape) if a.shape else shapes or None, min_exposures=a.min_exposures)
+    matches = match(table, shape=tuple(a.shape) if a.shape else shapes or None, min_exposures=a.min_exposures,
+                    **_given(a, "isolation"))  # fmt: skip
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
     matches = replace(matches, left_out=matches.left_out | empty)
     out = matches.table.copy()
@@ -150,14 +178,23 @@ def do_prior(a):
     _say(a, f"{words}; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y; {a.out}", figures)
 
 
+def _coadding(a):
+    return _given(a, "order", "algorithm", "pixfrac", "kernel", "extrapolated") | {
+        "method": a.combine,
+        "weights": None if a.weights == "equal" else a.weights,
+        "scale": None if a.scale == "none" else a.scale,
+    }
+
+
 def do_coadd(a):
     """``legdistort coadd``."""
     from .coaddition import coadd
-    from .exposures import read_exposures
+    from .exposure_files import open_exposures
 
     solution = _solution(a)
-    exposures = read_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
-    mosaic = coadd(exposures, solution, method=a.combine, order=a.order, progress=wants_progress(a))
+    exposures = open_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
+    share = {"workers": a.workers, "progress": wants_progress(a)}
+    mosaic = coadd(exposures, solution, **_coadding(a), **share)
     mosaic.write(a.out, overwrite=a.overwrite)
     figures = {"shape": list(mosaic.shape), "n_exposures": len(mosaic.exposures), "left_out": mosaic.left_out}
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
@@ -260,6 +297,11 @@ def _report(a, solution, summary):
 
 def _say(a, sentence, figures):
     print(json.dumps(figures, indent=1) if a.json else sentence)
+
+
+def _given(a, *names):
+    """Those of the arguments that were given."""
+    return {name: value for name in names if (value := getattr(a, name)) is not None}
 
 
 def _extension(text):

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.stats import SigmaClip
 from photutils.background import Background2D
+from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter
 
 logger = logging.getLogger(__name__)
 
 _CLIPPED = 0.986  # standard deviation of a unit normal after clipping at 3 sigma until nothing changes
 _KERNEL = 0.7  # width relative to the stars: costs 6 % of the signal-to-noise ratio, tells apart closer pairs
+_COVERED = 0.2  # part of a star, by its weight in the detection, on good pixels; in the corners of an image it is 0.25
 #: Pixels over which the sky is taken as constant.
 MESH = 64
 
@@ -49,7 +51,12 @@ def prepare(exposure, *, gain=None, read_noise=None, saturation=None, mesh=MESH)
     saturation = saturation or exposure.saturation
     data = np.where(exposure.mask, 0, exposure.data).astype(np.float32)
     saturated = (data >= saturation) & ~exposure.mask if saturation else np.zeros(data.shape, dtype=bool)
-    sky, rms = _background(data, exposure.mask | saturated, mesh)
+    bad = exposure.mask | saturated
+    sky, rms = _background(data, bad, mesh)
+    if _is_steep(sky, rms, mesh):  # the slope within the meshes has passed for noise
+        sky, _ = _background(data, bad, mesh, steep=True)
+        rest, rms = _background(data - sky, bad, mesh // 2, steep=True)
+        sky += rest
     if exposure.uncertainty is not None:
         variance = np.where(exposure.mask, 1, exposure.uncertainty**2).astype(np.float32)
         return Frame(data - sky, variance, ~exposure.mask, saturated, 0.0, noise_given=True)
@@ -58,35 +65,40 @@ def prepare(exposure, *, gain=None, read_noise=None, saturation=None, mesh=MESH)
     return Frame(data - sky, variance, ~exposure.mask, saturated, 1 / gain if gain else None)
 
 
-def _background(data, mask, mesh):
-    """Sky and its standard deviation, smooth maps."""
+def _background(data, mask, mesh, *, steep=False):
+    """Sky and its standard deviation, smooth maps; of a steep sky no medians of meshes are taken."""
     box = tuple(min(mesh, n) for n in data.shape)
     clip = SigmaClip(sigma=3.0, maxiters=10)
     with warnings.catch_warnings():  # of meshes without good pixels, which are interpolated
         warnings.simplefilter("ignore")
         for exclude in (50.0, 100.0):
             try:
-                found = Background2D(data, box, mask=mask, sigma_clip=clip, exclude_percentile=exclude)
+                found = Background2D(
+                    data, box, mask=mask, sigma_clip=clip, exclude_percentile=exclude, filter_size=1 if steep else 3
+                )
             except ValueError:
                 logger.debug("background: too few good pixels with exclude_percentile=%g", exclude)
             else:
                 rms = found.background_rms_mesh
-                return _enlarge(found.background_mesh, box, data.shape), _enlarge(rms, box, data.shape).clip(rms.min())
+                sky = _enlarge(found.background_mesh, box, data.shape, degree=3 if steep else 1)
+                return sky, _enlarge(rms, box, data.shape).clip(rms.min())
     values = clip(data[~mask] if not mask.all() else data.ravel(), masked=False)
     return np.full_like(data, np.median(values)), np.full_like(data, np.std(values))
 
 
-def _enlarge(mesh, box, shape):
-    """Bilinear interpolation of a mesh to all pixels (the cubic one of photutils takes as long as all the fits)."""
+def _is_steep(sky, rms, mesh):
+    """Whether the sky rises across a mesh by as much as the noise, somewhere."""
+    step = max(1, mesh // 2)
+    coarse, noise = sky[::step, ::step], rms[::step, ::step]
+    return any(np.any(np.abs(np.diff(coarse, axis=i)) > 0.5 * np.delete(noise, 0, axis=i)) for i in (0, 1))
+
+
+def _enlarge(mesh, box, shape, degree=1):
+    """Spline interpolation of a mesh to all pixels (that of photutils takes as long as all the fits)."""
     across = []
     for n_mesh, width, n in zip(mesh.shape, box, shape, strict=True):
-        place = (np.arange(n) + 0.5) / width - 0.5
-        left = np.clip(np.floor(place).astype(int), 0, max(n_mesh - 2, 0))
-        share = place - left if n_mesh > 1 else np.zeros(n)
-        matrix = np.zeros((n, n_mesh), dtype=np.float32)
-        matrix[np.arange(n), left] = 1 - share
-        matrix[np.arange(n), np.minimum(left + 1, n_mesh - 1)] += share.astype(np.float32)
-        across.append(matrix)
+        centres, degree_here = (np.arange(n_mesh) + 0.5) * width - 0.5, min(degree, n_mesh - 1)
+        across.append(make_interp_spline(centres, np.eye(n_mesh), k=degree_here)(np.arange(n)).astype(np.float32))
     return across[0] @ mesh.astype(np.float32) @ across[1].T
 
 
@@ -120,6 +132,8 @@ def detect(frame, fwhm, threshold):
         below = norm * _blur(weight, sigma / np.sqrt(2))
         below = np.maximum(below, 1e-6 * below.max())
     ratio = _blur(frame.signal * weight, sigma) / np.sqrt(below)
+    if not frame.good.all():  # where most of a star would lie on bad pixels the rest tells little
+        ratio[_blur(frame.good.astype(np.float32), sigma / np.sqrt(2)) < _COVERED] = 0
     y, x = np.nonzero(ratio > threshold)
     peak = _is_highest(ratio, x, y, max(1, int(fwhm / 2)))
     x, y = x[peak], y[peak]

@@ -25,6 +25,10 @@ class FoldError(LegdistortError, ValueError):
     """A distortion maps two places onto one; lower the degree or look at the exposure named."""
 
 
+class DiskFullError(LegdistortError, OSError):
+    """No space is left where a file was to be written; nothing is there half-written: make room or write elsewhere."""
+
+
 class ExportError(LegdistortError, ValueError):
     """A result does not fit the form asked for; allow a larger error, or choose a form that is exact."""
 

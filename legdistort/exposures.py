@@ -3,6 +3,7 @@
 import glob
 import logging
 import re
+import threading
 import warnings
 import zlib
 from dataclasses import dataclass, field
@@ -38,6 +39,7 @@ PIXEL_SCALES = (0.0001 / 3600, 0.1)
 REFERENCE_DISTANCE = 20
 
 _SUFFIX = re.compile(r"\.(fits|fit|fts)(\.(gz|fz|bz2|zip))?$", re.IGNORECASE)
+_FILTERS = threading.Lock()  # warning filters belong to the process, not to the thread that changes them
 _UNREADABLE = (OSError, EOFError, TypeError, ValueError, KeyError, IndexError, zlib.error, fits.VerifyError)
 
 
@@ -114,6 +116,10 @@ class Exposure:
         """Image shape ``(ny, nx)``."""
         return self.data.shape
 
+    def read(self):
+        """The exposure itself: it has its pixels already (see `legdistort.open_exposures`)."""
+        return self
+
     def __repr__(self):
         ny, nx = self.shape
         words = [f"{nx} x {ny} px", f"{np.count_nonzero(self.mask)} masked"]
@@ -155,23 +161,27 @@ def read_exposures(paths, *, ext=None, progress=False):
         Naming the file: missing, not FITS, truncated, without a 2-D image or the extension wanted,
         without a good pixel, or with the name of another one.
     """
-    sources = expand_paths(paths)
-    exposures = {}
-    for i, source in enumerate(tqdm(sources, desc="reading", unit="frame", disable=not progress)):
-        with warnings.catch_warnings():  # headers are often a little off the standard; what matters is checked here
+    return [exposure for _, exposure in each_exposure(paths, ext, progress=progress)]
+
+
+def each_exposure(paths, ext, *, progress):
+    """Every source of `read_exposures` and its exposure, one after the other; names are checked."""
+    origins = {}
+    for i, source in enumerate(tqdm(expand_paths(paths), desc="reading", unit="frame", disable=not progress)):
+        with (
+            _FILTERS,
+            warnings.catch_warnings(),
+        ):  # headers are often a little off the standard; what matters is checked
             warnings.simplefilter("ignore", AstropyWarning)
             exposure = _read(source, ext, f"exposure_{i}")
-        if exposure.name in exposures:
+        origin = exposure.path if exposure.path is not None else "in memory"
+        if exposure.name in origins:
             raise InputError(
-                f"two exposures are named {exposure.name!r} ({_origin(exposures[exposure.name])} and "
-                f"{_origin(exposure)}); rename a file, names tell exposures apart"
+                f"two exposures are named {exposure.name!r} ({origins[exposure.name]} and "
+                f"{origin}); rename a file, names tell exposures apart"
             )
-        exposures[exposure.name] = exposure
-    return list(exposures.values())
-
-
-def _origin(exposure):
-    return exposure.path if exposure.path is not None else "in memory"
+        origins[exposure.name] = origin
+        yield source, exposure
 
 
 def expand_paths(paths):

@@ -4,9 +4,28 @@ import os
 import shutil
 import tempfile
 from contextlib import contextmanager
+from errno import EDQUOT, ENOSPC
 from pathlib import Path
 
-from .exceptions import InputError
+from .exceptions import DiskFullError, InputError
+
+
+def is_full(error):
+    """Whether an `OSError` is that of a full disk; writers do not always hand the number of it on."""
+    return error.errno in (ENOSPC, EDQUOT) or "space" in str(error) or "requested and" in str(error)
+
+
+@contextmanager
+def _told_when_full(path):
+    try:
+        yield
+    except OSError as error:
+        if not is_full(error):
+            raise
+        raise DiskFullError(
+            f"No space left on the disk for {path}: nothing was replaced or left half-written; make room, or write "
+            "elsewhere"
+        ) from None
 
 
 @contextmanager
@@ -23,6 +42,8 @@ def replacing(path, *, overwrite=False):
     ------
     InputError
         If `path` is a folder, or exists and `overwrite` is false, or its folder does not exist.
+    DiskFullError
+        If the disk is full.
     """
     path = Path(path)
     if path.is_dir():
@@ -36,8 +57,9 @@ def replacing(path, *, overwrite=False):
     os.close(handle)
     os.unlink(temporary)  # some writers refuse an existing file
     try:
-        yield Path(temporary)
-        os.replace(temporary, path)
+        with _told_when_full(path):
+            yield Path(temporary)
+            os.replace(temporary, path)
     finally:
         Path(temporary).unlink(missing_ok=True)
 
@@ -57,6 +79,8 @@ def replacing_folder(out):
     ------
     InputError
         If `out` is a file.
+    DiskFullError
+        If the disk is full.
     """
     out = Path(out)
     if out.exists() and not out.is_dir():
@@ -64,14 +88,15 @@ def replacing_folder(out):
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".partial-{out.name}-"))
     try:
-        yield temporary
-        out.mkdir(exist_ok=True)
-        for item in temporary.iterdir():
-            target = out / item.name
-            if target.is_dir() and not target.is_symlink():
-                shutil.rmtree(target)
-            elif item.is_dir():
-                target.unlink(missing_ok=True)
-            item.replace(target)
+        with _told_when_full(out):
+            yield temporary
+            out.mkdir(exist_ok=True)
+            for item in temporary.iterdir():
+                target = out / item.name
+                if target.is_dir() and not target.is_symlink():
+                    shutil.rmtree(target)
+                elif item.is_dir():
+                    target.unlink(missing_ok=True)
+                item.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

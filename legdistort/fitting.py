@@ -5,83 +5,42 @@ from enum import IntFlag
 import numpy as np
 
 from . import moffat
-from .detection import detect
+from .blends import fit_groups, group_stars, partner_models
+from .detection import MESH, detect, prepare
+from .pixel_noise import NEIGHBOUR, pixel_noise
+from .profile_fits import HELD, SHAPE_SIGMA, fit
+from .shapes import shape_field
+from .stamps import Stamps
 
 
 class Flag(IntFlag):
     """Bits of the column ``flags``."""
 
     SATURATED = 1  #: a saturated pixel within one FWHM of the centre
-    EDGE = 2  #: the centre lies less than one FWHM from the edge of the image
+    EDGE = 2  #: less than one FWHM from the edge of the image, or beside a gap: a third of its pixels are missing
     HOT = 4  #: much sharper than the stars of the frame: hot pixel or cosmic ray
     NOT_CONVERGED = 8  #: the fit found no position, or one far from the detection
     INSIGNIFICANT = 16  #: the signal-to-noise ratio is below 3
-    BLENDED = 32  #: another detection within two FWHM (its model was subtracted)
+    BLENDED = 32  #: another detection within two FWHM (fitted together with it, or its model was subtracted)
     MASKED = 64  #: bad or outlying pixels within one FWHM of the centre were left out of the fit
-    SHARED_SHAPE = 128  #: too faint or disturbed for a shape of its own: fitted with the median shape of the frame
+    SHARED_SHAPE = 128  #: too faint or disturbed for a shape of its own: fitted with that of the frame
+    DEFORMED = 256  #: the shape is not that of the frame's stars: an unresolved companion, see isolation
 
 
 #: Flags that make a detection useless as a star position.
 UNUSABLE = Flag.SATURATED | Flag.EDGE | Flag.HOT | Flag.NOT_CONVERGED | Flag.INSIGNIFICANT
 
+#: Shapes of stars, and ways to fit those that touch: see `fit_stars`.
+PROFILES, BLENDS = ("own", "shared", "linear"), ("together", "alone")
+
 _FIRST_FWHM = 3.0
-_NEIGHBOUR = 0.05  # a subtracted neighbour leaves residuals of this fraction of itself
-_HELD = np.full(4, 1e-3)  # a prior that holds the shape
 _OUTLIER = 6.0  # standard deviations ...
 _OUTLIER_MODEL = 0.2  # ... plus this fraction of the star itself, which no real profile follows exactly
+#: Limits of the passes: what the first leaves tells the noise, the second prepares the last.
+_FIRST, _MIDDLE, _LAST = {"max_iterations": 20}, {"max_iterations": 20, "tolerance": 1e-2}, {"max_iterations": 40}
+_SHAPELY = 20  # signal-to-noise ratio of stars that tell the shape of all
+_GAP = 1 / 3  # part of the pixels within one FWHM that may be missing
 _POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no star, however sharp, has so little
-
-
-class Stamps:
-    """Square cut-outs around integer positions, and models of all stars laid over each other.
-
-    Parameters
-    ----------
-    frame : `~legdistort.detection.Frame`
-    centres : ndarray of int, shape (n, 2)
-        Central pixels (x, y).
-    half : int
-        Stamps reach from -half to half; models of neighbours twice as far.
-    """
-
-    def __init__(self, frame, centres, half):
-        self.frame, self.centres, self.half = frame, centres, half
-        self.index, self.inside = self._pixels(half)
-        self.index_wide, self.inside_wide = self._pixels(2 * half)
-        offsets = np.abs(np.arange(-2 * half, 2 * half + 1)) <= half
-        self.core = np.flatnonzero(offsets[:, None] & offsets)
-        self.data = self.cut(frame.signal)
-        self.variance = self.cut(frame.variance)
-        self.saturated = self.cut(frame.saturated) & self.inside
-        self.good = self.cut(frame.good) & self.inside & ~self.saturated
-
-    def _pixels(self, half):
-        ny, nx = self.frame.signal.shape
-        dy, dx = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
-        x, y = self.centres[:, :1] + dx, self.centres[:, 1:] + dy
-        inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
-        return np.clip(y, 0, ny - 1) * nx + np.clip(x, 0, nx - 1), inside
-
-    def cut(self, image):
-        """Values of an image in the stamps, (n, npix)."""
-        values = image.ravel()[self.index]
-        return values if values.dtype == bool else values.astype(float)
-
-    def models(self, params, nodes):
-        """Every star on its own stamp, and the sum of all others there; (n, npix) each."""
-        own = moffat.evaluate(params, self.half, nodes)
-        wide = moffat.evaluate(params, 2 * self.half, moffat.CENTRES)  # far from the centre pixels need no integration
-        wide[:, self.core] = own
-        wide[params[:, 2] <= 0] = 0
-        total = np.zeros(self.frame.signal.size)
-        np.add.at(total, self.index_wide[self.inside_wide], wide[self.inside_wide])
-        others = total[self.index] - wide[:, self.core]
-        return own, np.where(self.inside, others, 0.0)
-
-    def near(self, params, radius):
-        """Pixels within a radius of the fitted centres, (n, npix)."""
-        dy, dx = np.mgrid[-self.half : self.half + 1, -self.half : self.half + 1].reshape(2, -1)
-        return np.hypot(dx - params[:, :1], dy - params[:, 1:2]) <= np.maximum(radius, 0.8)
 
 
 def _start(stamps, shape):
@@ -128,6 +87,33 @@ def find_stars(frame, threshold, fwhm=None):
     return centres, shape
 
 
+def locate_stars(exposure, known, *, threshold, fwhm=None):
+    """An exposure prepared for fitting, and its stars: `legdistort.detection.prepare` and `find_stars`.
+
+    Parameters
+    ----------
+    exposure : `~legdistort.exposures.Exposure`
+    known : dict
+        ``gain``, ``read_noise``, ``saturation`` instead of what the exposure says; None: as it says.
+    threshold : float
+        Signal-to-noise ratio.
+    fwhm : float, optional
+        Of the stars [pix], if it is known.
+
+    Returns
+    -------
+    frame : `~legdistort.detection.Frame`
+    centres : ndarray of int, shape (n, 2)
+    shape : ndarray, shape (4,)
+    """
+    frame = prepare(exposure, **known)
+    centres, shape = find_stars(frame, threshold, fwhm)
+    if moffat.fwhm(shape) > MESH / 8:  # stars as wide as that would pass for sky
+        frame = prepare(exposure, **known, mesh=int(8 * moffat.fwhm(shape)))
+        centres, shape = find_stars(frame, threshold, fwhm)
+    return frame, centres, shape
+
+
 def box_half(fwhm):
     """Half the side of the box fitted, without the central pixel."""
     return max(4, int(np.ceil(2 * fwhm)))
@@ -151,8 +137,8 @@ def _fit_once(stamps, shape, nodes):
     """First pass, with the noise of the sky alone; the fit, and `_point_chi2` of the same pixels."""
     start = _start(stamps, shape)
     _, others = stamps.models(start, nodes)
-    data, weights = stamps.data - others, _weights(stamps.good, stamps.variance + (_NEIGHBOUR * others) ** 2)
-    return moffat.fit(data, weights, start, nodes=nodes, centre=shape, max_iterations=20), _point_chi2(data, weights)
+    data, weights = stamps.data - others, _weights(stamps.good, stamps.variance + (NEIGHBOUR * others) ** 2)
+    return fit(data, weights, start, nodes=nodes, centre=shape, **_FIRST), _point_chi2(data, weights)
 
 
 def _point_chi2(data, weights):
@@ -167,71 +153,115 @@ def _point_chi2(data, weights):
         w = weights.copy()
         if drop:
             w[np.arange(n), peak] = 0
-        mean = (w * data).sum(axis=1) / np.maximum(w.sum(axis=1), 1e-300)
+        mean = (w * data).sum(axis=1) / np.maximum(w.sum(axis=1), np.finfo(w.dtype).tiny)
         out.append((w * (data - mean[:, None]) ** 2).sum(axis=1))
     return np.column_stack(out)
 
 
-def fit_stars(stamps, shape):
+def fit_stars(stamps, shape, *, profile="own", blends="together"):
     """Fit all stars of a frame in three passes.
 
     The first knows the noise of the sky alone; the others add the photon noise of the models of the pass
-    before, subtract the models of the neighbours and leave out pixels that follow neither.
+    before, fit stars that touch together, subtract the models of the other neighbours and leave out pixels that
+    follow none.
 
     Parameters
     ----------
-    stamps : Stamps
+    stamps : `~legdistort.stamps.Stamps`
         Around the detections.
     shape : ndarray, shape (4,)
         Of the stars of the frame.
+    profile : {"own", "shared", "linear"}
+        In the last pass every star has a shape of its own, or that of the frame, or one that varies linearly over it.
+    blends : {"together", "alone"}
+        Whether stars within two FWHM of each other are fitted together, with one shape and one background.
 
     Returns
     -------
-    fit : `~legdistort.moffat.Fit`
+    found : `~legdistort.profile_fits.Fit`
+        One row a star.
     flags : ndarray of int, shape (n,)
     snr : ndarray, shape (n,)
         Signal-to-noise ratio of the flux at known shape.
-    dof : ndarray of int, shape (n,)
-        Pixels used less parameters.
     photon : float
         Variance per unit of star light that was used.
     """
-    width = moffat.fwhm(shape)
+    width = float(moffat.fwhm(shape))
     nodes = moffat.quadrature(width)
-    fit, _ = _fit_once(stamps, shape, nodes)
-    sky = stamps.variance if stamps.frame.noise_given else stamps.variance * _sky_factor(stamps, fit, nodes)
-    photon = stamps.frame.photon
-    if photon is None:
-        photon = _photon_noise(stamps, sky, fit, nodes)
-    for iterations in (20, 40):
-        own, others = stamps.models(fit.params, nodes)
-        variance = sky + photon * np.maximum(own + others, 0) + (_NEIGHBOUR * others) ** 2
-        data = stamps.data - others
-        residual = np.abs(data - own - fit.params[:, 7:])
-        good = stamps.good & (residual < _OUTLIER * np.sqrt(variance) + _OUTLIER_MODEL * np.abs(own))
-        weights = _weights(good, variance)
-        fit = moffat.fit(data, weights, fit.params, nodes=nodes, centre=shape, max_iterations=iterations)
-    flags = np.zeros(len(stamps.centres), dtype=int)
-    hot = (moffat.fwhm(fit.params) < 0.6 * width) | _is_hot(stamps, data, good, fit, nodes)
-    wild = _is_wild(fit, width)
-    if wild.any():
-        fit = _share_shape(fit, wild, data, weights, shape=shape, nodes=nodes)
-        hot |= wild & _is_hot(stamps, data, good, fit, nodes)
+    found, _ = _fit_once(stamps, shape, nodes)
+    models = stamps.models(found.params, nodes)
+    noise = pixel_noise(stamps, found, models, nodes)
+    radius = min(2 * width, stamps.half) if blends == "together" else 0.0
+    hot, weights = _is_hot(stamps, found, models, stamps.good), None
+    done = hot & (moffat.fwhm(found.params) < 0.6 * width)
+    centre, sigma = shape, SHAPE_SIGMA
+    for last in (False, True):
+        if last and profile != "own":
+            use = ~hot & ~_is_wild(found, width) & (_ratio(models, weights) > _SHAPELY)
+            xy = stamps.centres + found.params[:, :2]
+            centre, sigma = shape_field(found, xy, use, linear=profile == "linear", fallback=shape), HELD
+        labels = _touching(stamps, found, hot, done, radius)
+        pixels = _, weights = _separate(stamps, found, models, labels, noise, nodes)
+        start = np.where(_is_wild(found, width)[:, None], _start(stamps, shape), found.params)
+        options = {"nodes": nodes, "sigma": sigma, **(_LAST if last else _MIDDLE)}
+        found = fit_groups(found, labels, pixels, start, stamps=stamps, centre=centre, **options)
+        models = stamps.models(found.params, nodes)
+        done = _is_hot(stamps, found, models, weights > 0)
+        hot = done | (hot if sigma is HELD else moffat.fwhm(found.params) < 0.6 * width)
+    wild = np.flatnonzero(_is_wild(found, width) & ~done)
+    if len(wild):
+        known = np.broadcast_to(centre, (len(hot), 4))[wild]
+        found = _share_shape(stamps.data - models[1], weights, found, wild, shape=known, nodes=nodes)
+        models[0][wild] = moffat.evaluate(found.params[wild], stamps.half, nodes)
+        hot[wild] |= _is_hot(stamps, found, models, weights > 0)[wild]
+    snr = _ratio(models, weights)
+    return found, _flags(stamps, found, weights > 0, (wild, hot, snr), width), snr, noise[1]
+
+
+def _ratio(models, weights):
+    """Signal-to-noise ratio of the flux at known shape."""
+    return np.sqrt((weights * models[0] ** 2).sum(axis=1))
+
+
+def _flags(stamps, found, good, troubles, width):
+    wild, hot, snr = troubles
+    flags = np.zeros(len(good), dtype=int)
     flags[wild] |= Flag.SHARED_SHAPE
     flags[hot] |= Flag.HOT
-    flags[_is_wild(fit, width)] |= Flag.NOT_CONVERGED
-    snr = np.sqrt((weights * moffat.evaluate(fit.params, stamps.half, nodes) ** 2).sum(axis=1))
+    flags[_is_wild(found, width)] |= Flag.NOT_CONVERGED
     flags[snr < 3] |= Flag.INSIGNIFICANT
-    near = stamps.near(fit.params, width)
+    near = stamps.near(found.params, width)
     flags[(near & stamps.inside & ~good & ~stamps.saturated).any(axis=1)] |= Flag.MASKED
     flags[(near & stamps.saturated).any(axis=1)] |= Flag.SATURATED
-    return fit, flags, snr, good.sum(axis=1) - 8, photon
+    seen = stamps.inside & stamps.cut(stamps.frame.good)
+    flags[(near & ~seen).sum(axis=1) > _GAP * near.sum(axis=1)] |= Flag.EDGE
+    return flags
 
 
-def _is_hot(stamps, data, good, fit, nodes):
+def _touching(stamps, found, hot, done, radius):
+    """Numbers of the groups to be fitted together, -1 for no fit; what is no star or has lost its peak stays alone."""
+    labels = np.arange(len(hot))
+    stars = ~hot & ~(stamps.saturated & stamps.near(found.params, radius / 2)).any(axis=1)
+    if radius > 0 and stars.any():
+        labels[stars] = len(hot) + group_stars(stamps.centres[stars], radius)
+    return np.where(done, -1, labels)
+
+
+def _separate(stamps, found, models, labels, noise, nodes):
+    """Stamps without the light of other groups, and weights; 0 for pixels that follow no model."""
+    own, others = models
+    sky, photon = noise
+    partners = partner_models(stamps, labels, found.params, nodes)
+    variance = sky + photon * np.maximum(own + others, 0) + (NEIGHBOUR * (others - partners)) ** 2
+    residual = np.abs(stamps.data - own - others - found.params[:, 7:])
+    good = stamps.good & (residual < _OUTLIER * np.sqrt(variance) + _OUTLIER_MODEL * np.abs(own + partners))
+    return stamps.data - (others - partners), _weights(good, variance)
+
+
+def _is_hot(stamps, found, models, good):
     """Stars explained better by one bright pixel than by a profile."""
-    weights = _weights(good, stamps.variance)
-    residual = data - moffat.evaluate(fit.params, stamps.half, nodes) - fit.params[:, 7:]
+    data, weights = stamps.data - models[1], _weights(good, stamps.variance)
+    residual = data - models[0] - found.params[:, 7:]
     return _point_chi2(data, weights)[:, 0] <= (weights * residual**2).sum(axis=1)
 
 
@@ -241,58 +271,10 @@ def _is_wild(fit, width):
     return ~fit.converged | (fit.params[:, 2] <= 0) | (ratio > 3) | (ratio < 1 / 3) | (shift > 1 + 0.5 * width)
 
 
-def _share_shape(fit, which, data, weights, *, shape, nodes):
-    """The fit with some stars fitted anew, their shape held at that of the frame."""
-    start = np.zeros((np.count_nonzero(which), 8))
-    start[:, 2] = np.maximum(fit.params[which, 2], 1e-3 * np.abs(data[which]).max(axis=1))
+def _share_shape(data, weights, found, rows, *, shape, nodes):
+    """The fit with some stars fitted anew and alone, their shape held at that of the frame."""
+    data = data[rows]
+    start = np.zeros((len(rows), 8))
+    start[:, 2] = np.maximum(found.params[rows, 2], 1e-3 * np.abs(data).max(axis=1))
     start[:, 3:7] = shape
-    again = moffat.fit(data[which], weights[which], start, nodes=nodes, centre=shape, sigma=_HELD)
-    merged = {name: getattr(fit, name).copy() for name in ("params", "covariance", "chi2", "converged")}
-    for name, values in merged.items():
-        values[which] = getattr(again, name)
-    return moffat.Fit(**merged)
-
-
-def _residuals(stamps, fit, nodes):
-    """Models of (some) stars and of their neighbours, and squares of what they leave, raised for what a fit absorbs."""
-    own, others = stamps.models(fit.params, nodes)
-    rows = np.unique(np.linspace(0, len(own) - 1, 400).astype(int))
-    _, jac = moffat.evaluate(fit.params[rows], stamps.half, nodes, jacobian=True)
-    absorbed = (jac * (fit.covariance[rows] @ jac)).sum(axis=1) / stamps.variance[rows]
-    square = (stamps.data - own - others - fit.params[:, 7:])[rows] ** 2 / np.maximum(1 - absorbed, 0.1)
-    return rows, own[rows], others[rows], square
-
-
-def _sky_factor(stamps, fit, nodes):
-    """Variance of the sky around the stars, relative to the map: the faint wings of stars raise the latter."""
-    rows, own, others, square = _residuals(stamps, fit, nodes)
-    variance = stamps.variance[rows]
-    dark = stamps.good[rows] & (own + others < 0.5 * np.sqrt(variance))
-    use = fit.converged[rows] & (dark.mean(axis=1) > 0.4)
-    if np.count_nonzero(use) < 20:  # then the map is known better
-        return 1.0
-    # The median of a squared unit normal is 0.4549; unlike the mean it overlooks stars too faint to be detected.
-    return float(np.clip(np.median((square / variance)[dark & use[:, None]]) / 0.4549, 0.5, 2.0))
-
-
-def _photon_noise(stamps, sky, fit, nodes):
-    """Variance per unit of star light, from the residuals of the first pass: the median over the stars.
-
-    The squared residual of a pixel is expected at ``sky variance + photon * model``. Companions too faint to be
-    detected and profiles that do not quite fit raise the value, and the errors with it: on the safe side.
-    """
-    rows, own, others, square = _residuals(stamps, fit, nodes)
-    sky = sky[rows]
-    use = fit.converged & (fit.params[:, 2] > 0) & ~stamps.saturated.any(axis=1)
-    own = np.where(stamps.good[rows] & use[rows, None], own, 0.0)
-    photon = 0.0
-    for _ in range(20):
-        weights = (sky + photon * own + (_NEIGHBOUR * others) ** 2) ** -2.0
-        information = (weights * own**2).sum(axis=1)
-        if not (information > 0).any():
-            break
-        single = (weights * own * (square - sky)).sum(axis=1) / np.maximum(information, 1e-300)
-        order = np.argsort(single)
-        share = np.cumsum(np.sqrt(information[order]))
-        photon = max(float(single[order][np.searchsorted(share, share[-1] / 2)]), 0.0)
-    return photon
+    return found.updated(rows, fit(data, weights[rows], start, nodes=nodes, centre=shape, sigma=HELD))

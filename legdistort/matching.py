@@ -11,6 +11,8 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from . import catalogs, poses
 from .association import interlink, label_stars, standing, tie
 from .exceptions import AssumptionWarning, InputError, MatchError
+from .groups import unite
+from .isolation import LIMIT, is_isolated
 from .matches import Matches, estimate_poses
 from .measurement import UNUSABLE
 from .reference import mean_epoch
@@ -33,6 +35,7 @@ def match(
     columns=None,
     tolerance=None,
     reject_flags=UNUSABLE,
+    isolation=LIMIT,
     progress=False,
 ):
     """Find out which detections are the same star.
@@ -56,9 +59,12 @@ def match(
         ``{name expected: name in the table}``.
     tolerance : float, optional
         Largest distance of two detections of a star after distortions have been fitted for the pair, pixels;
-        by default 5 times the scatter found, with the errors of both detections on top.
+        by default 5 times the scatter found, with the errors of both detections and of the fit on top.
     reject_flags : int
         Detections with any of these bits in ``flags`` are not used.
+    isolation : float or None
+        Largest ``crowding`` of a detection, see `legdistort.isolation`; deformed ones are left out too. They help to
+        find out which star is which all the same. None = all are kept. Tables without the column are taken as they are.
     progress : bool
         Show progress bars.
 
@@ -97,6 +103,10 @@ def match(
     star = np.full(len(table), -1)
     for name, labels in stars.items():
         star[rows[name]] = labels
+    isolated = is_isolated(table, isolation)
+    if not isolated.all():
+        logger.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
+        star[~isolated] = -1
     table, star = _keep_common(table, star, min_exposures, left_out)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
     return _finish(table, star, shapes, headers, left_out, epoch)
@@ -165,12 +175,12 @@ def _associate(lists, names, headers, left_out, *, tolerance, progress):
     def guess(i, j):
         return headers.step(names[i], names[j])
 
-    groups = tie(lists, guess, tolerance=tolerance, progress=progress)
+    groups = unite(lists, tie(lists, guess, tolerance=tolerance, progress=progress), guess, tolerance=tolerance)
     hot = standing(lists, groups[0])
     if any(h.any() for h in hot):
         logger.info("%d detections stand still while the sky moves: hot pixels, not used", sum(h.sum() for h in hot))
         lists = [stars.subset(~h) for stars, h in zip(lists, hot, strict=True)]
-        groups = tie(lists, guess, tolerance=tolerance, progress=progress)
+        groups = unite(lists, tie(lists, guess, tolerance=tolerance, progress=progress), guess, tolerance=tolerance)
     _check_groups(groups, lists, names, left_out)
     registrations, misfits = interlink(lists, groups[0], tolerance=tolerance, progress=progress)
     left_out.update({names[i]: reason for i, reason in misfits.items()})

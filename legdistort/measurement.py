@@ -2,18 +2,22 @@
 
 import logging
 import warnings
+from functools import partial
 
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable, vstack
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from . import moffat
-from .detection import MESH, prepare
-from .exceptions import AssumptionWarning, InputError
-from .exposures import Exposure
-from .fitting import UNUSABLE, Flag, Stamps, box_half, find_stars, fit_stars
+from .exceptions import AssumptionWarning, InputError, check_choice
+from .exposure_files import listed
+from .fitting import BLENDS, PROFILES, UNUSABLE, Flag, box_half, fit_stars, locate_stars
+from .injection import measure_calibrated
+from .isolation import crowding, is_deformed
+from .noise import SOURCES
+from .parallel import each
+from .stamps import Stamps
 
 __all__ = ["UNUSABLE", "Flag", "measure"]
 
@@ -30,9 +34,13 @@ def measure(
     threshold=5.0,
     max_stars=None,
     box=None,
+    profile="own",
+    blends="together",
     gain=None,
     read_noise=None,
     saturation=None,
+    errors="fit",
+    workers=None,
     progress=False,
 ):
     """Detect stars and measure their positions by fitting elliptical Moffat profiles.
@@ -40,7 +48,8 @@ def measure(
     Stars are peaks of the image filtered with a Gaussian of the width of the stars. The profile has eight free
     parameters (`legdistort.moffat`); all stars of a frame are fitted at once, three times: with the noise of the
     sky alone, then twice with the photon noise of the model of the pass before and the models of the
-    neighbours subtracted. (Photon noise taken from the data instead of a model would bias the fit.)
+    neighbours subtracted. (Photon noise taken from the data instead of a model would bias the fit.) In images
+    with stars narrower than 3 pixels the profile is averaged over every pixel.
 
     Pixel variances are ``uncertainty**2`` if the exposure has that plane, else the observed variance of the sky
     (at least that of the read noise) plus ``star light / gain``. Where the fit leaves more than noise (reduced
@@ -49,7 +58,7 @@ def measure(
     Parameters
     ----------
     exposures : Exposure or sequence of Exposure
-        From `legdistort.exposures.read_exposures`.
+        From `legdistort.read_exposures`, or from `legdistort.open_exposures`: then one at a time is in memory.
     fwhm : float, optional
         Full width at half maximum of the stars [pix]; found in every frame if not given.
     threshold : float
@@ -58,8 +67,22 @@ def measure(
         Keep the brightest so many usable detections of every frame, and no others.
     box : int, optional
         Side of the square fitted [pix], odd; by default about 4 FWHM.
+    profile : {"own", "shared", "linear"}
+        Whether every star has a shape of its own, or all have the one that the bright stars of the frame have in the
+        mean, or one that varies linearly over the field: then a star has four free parameters, and stars near the
+        detection limit and fluxes become more precise; ``DEFORMED`` is not flagged.
+    blends : {"together", "alone"}
+        Whether stars within two FWHM of each other are fitted together, with one shape and one background, or one by
+        one with the models of the others subtracted.
     gain, read_noise, saturation : float, optional
         In e-/ADU, e-, ADU; for all exposures instead of what each of them says.
+    errors : {"fit", "injected", "scaled"}
+        Errors of the positions: of the fit; by the noise curve of every exposure at the star's flux, from stars put
+        into it and measured (`legdistort.calibrate_noise`), as in the paper; or those of the fit times the ratio of
+        that curve to what fits of this flux state. The latter two take some seconds a frame.
+    workers : int, optional
+        Processes that share the frames. None = the current ``dask.distributed.Client`` if there is one, else this
+        process. The table is the same.
     progress : bool
         Show a progress bar.
 
@@ -68,8 +91,9 @@ def measure(
     `~astropy.table.QTable`
         One row a detection, brightest first in every exposure: ``exposure``, ``x``, ``y``, ``x_err``, ``y_err`` [pix]
         (0-based, standard deviations), ``xy_corr``, ``flux``, ``flux_err`` (of the whole profile, in units
-        of the data), ``fwhm`` [pix], ``chi2`` (reduced), ``flags`` (bits of `Flag`; see `UNUSABLE`). An
-        exposure in which nothing is found has no rows.
+        of the data), ``fwhm`` [pix], ``chi2`` (reduced), ``flags`` (bits of `Flag`; see `UNUSABLE`),
+        ``crowding`` (how far detected neighbours would pull the position, were their light left in, in standard errors:
+        see `legdistort.isolation`). An exposure in which nothing is found has no rows.
 
     Raises
     ------
@@ -81,16 +105,23 @@ def measure(
     AssumptionWarning
         Once, if exposures lack a gain: the photon noise is then estimated from the residuals of the fits.
     """
-    exposures = [exposures] if isinstance(exposures, Exposure) else list(exposures)
-    _check_arguments(exposures, fwhm, threshold, max_stars, box)
+    exposures = listed(exposures, "measure")
+    _check_arguments(fwhm, threshold, max_stars, box)
+    check_choice(errors, SOURCES, "errors")
+    check_choice(profile, PROFILES, "profile")
+    check_choice(blends, BLENDS, "blends")
     known = {"gain": gain, "read_noise": read_noise, "saturation": saturation}
     for key, value in known.items():
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError(f"{key} must be a positive number, got {value!r}")
+    options = {"max_stars": max_stars, "box": box, "profile": profile, "blends": blends}
+    work = partial(_measure_frame, known=known, fwhm=fwhm, threshold=threshold, **options)
+    if errors != "fit":
+        work = partial(measure_calibrated, measuring=work, source=errors, threshold=threshold, known=known)
+    measured = each(work, exposures, workers=workers, progress=progress, description="measuring")
     tables, assumed = [], {}
-    for exposure in tqdm(exposures, desc="measuring", unit="frame", disable=not progress):
-        table, photon = _measure_frame(exposure, known, fwhm=fwhm, threshold=threshold, max_stars=max_stars, box=box)
-        if len(table) and not (gain or exposure.gain) and exposure.uncertainty is None:
+    for exposure, (table, photon, assuming) in zip(exposures, measured, strict=True):
+        if assuming:
             assumed[exposure.name] = photon
         tables.append(table)
     if assumed:
@@ -99,10 +130,7 @@ def measure(
     return vstack(filled) if filled else _empty()
 
 
-def _check_arguments(exposures, fwhm, threshold, max_stars, box):
-    for exposure in exposures:
-        if not isinstance(exposure, Exposure):
-            raise InputError(f"measure takes exposures as read_exposures gives them, got {type(exposure).__name__}")
+def _check_arguments(fwhm, threshold, max_stars, box):
     if fwhm is not None and not 0.5 <= fwhm <= 200:
         raise InputError(f"fwhm must lie between 0.5 and 200 pixels, got {fwhm!r}")
     if not threshold >= 2:
@@ -126,41 +154,43 @@ def _warn_gain(assumed):
     )
 
 
-def _measure_frame(exposure, known, *, fwhm, threshold, max_stars, box):
-    """Table of the detections of one frame, and the photon noise used [variance / ADU]."""
-    frame, name = prepare(exposure, **known), exposure.name
-    centres, shape = find_stars(frame, threshold, fwhm)
-    if moffat.fwhm(shape) > MESH / 8:  # stars as wide as that would pass for sky
-        frame = prepare(exposure, **known, mesh=int(8 * moffat.fwhm(shape)))
-        centres, shape = find_stars(frame, threshold, fwhm)
+def _measure_frame(exposure, *, known, fwhm, threshold, max_stars, box, **fitting):
+    """Table of the detections of one frame, the photon noise used [variance / ADU], whether that was a guess."""
+    exposure, name = exposure.read(), exposure.name
+    frame, centres, shape = locate_stars(exposure, known, threshold=threshold, fwhm=fwhm)
     if len(centres) == 0:
         logger.warning("%s: no star above %g times the noise", name, threshold)
-        return _empty(), frame.photon
+        return _empty(), frame.photon, False
     if max_stars is not None:
         centres = centres[: 3 * max_stars]  # some will turn out to be hot pixels or saturated
     fwhm = float(moffat.fwhm(shape))
     stamps = Stamps(frame, centres, box // 2 if box else box_half(fwhm))
-    fit, flags, snr, dof, photon = fit_stars(stamps, shape)
-    table = _table(name, stamps, fit, flags=flags, snr=snr, dof=dof)
+    fit, flags, snr, photon = fit_stars(stamps, shape, **fitting)
+    shapes, covariance = fit.params[:, 3:7], fit.covariance[:, 3:7, 3:7]
+    usable = ((flags & UNUSABLE) == 0) & (fitting["profile"] == "own")  # other profiles have nothing to compare
+    deformed = is_deformed(shapes, covariance, snr=snr, usable=usable)
+    table = _table(name, stamps, fit, flags=flags | np.where(deformed, Flag.DEFORMED, 0), snr=snr)
     table = table[_distinct(table, fwhm)]
+    table["crowding"] = crowding(table, fwhm)
     if max_stars is not None:
         table = table[(table["flags"] & UNUSABLE) == 0][:max_stars]
     logger.info("%s: %d detections, FWHM %.2f px", name, len(table), fwhm)
-    return table, photon
+    assumed = len(table) > 0 and not (known["gain"] or exposure.gain) and exposure.uncertainty is None
+    return table, photon, assumed
 
 
 def _empty():
     table = QTable({"exposure": np.zeros(0, dtype="U1")})
     for name in _COLUMNS:
         table[name] = np.zeros(0) * (u.pix if name in _PIXELS else 1)
-    table["flags"] = np.zeros(0, dtype=int)
+    table["flags"], table["crowding"] = np.zeros(0, dtype=int), np.zeros(0)
     return table
 
 
-def _table(name, stamps, fit, *, flags, snr, dof):
+def _table(name, stamps, fit, *, flags, snr):
     """Table of one frame, brightest first; errors scaled where the fit leaves more than noise."""
     ny, nx = stamps.frame.signal.shape
-    dof = np.maximum(dof, 1)
+    dof = np.maximum(fit.dof, 1)
     chi2 = fit.chi2 / dof
     # Three standard deviations of chi2 are allowed for, else chance alone would raise the errors of good fits.
     scale = np.sqrt(np.maximum(1, chi2 - 3 * np.sqrt(2 / dof)))

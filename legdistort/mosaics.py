@@ -6,6 +6,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from .exceptions import InputError
 from .files import replacing
 
 
@@ -20,8 +21,15 @@ class Mosaic:
     variance : ndarray of float32, shape (ny, nx)
         Of each pixel by itself. Interpolation correlates neighbours: the variance of a sum over many pixels is
         larger than the sum of theirs (about 1.3 times at order 3, 2.2 times at order 1).
+    weight : ndarray of float32, shape (ny, nx)
+        Sum of the weights of the exposures that contribute.
     footprint : ndarray of int32, shape (ny, nx)
         Number of exposures that contribute to each pixel.
+    flags : ndarray of uint8, shape (ny, nx)
+        Bits: 1 = the distortion of an exposure that contributes is extrapolated, 2 = saturated in all exposures and
+        used for want of better, 4 = an exposure was rejected (`legdistort.combination.PixelFlag`).
+    context : ndarray of uint32, shape (n, ny, nx)
+        Which these are: bit i % 32 of plane i // 32 is set where ``exposures[i]`` contributes.
     wcs : `~astropy.wcs.WCS`
         TAN if the sky is known, else linear with the reference plane (0-based) as world; or the WCS asked for.
     exposures : tuple of str
@@ -37,7 +45,10 @@ class Mosaic:
 
     data: np.ndarray
     variance: np.ndarray
+    weight: np.ndarray
     footprint: np.ndarray
+    flags: np.ndarray
+    context: np.ndarray
     wcs: WCS
     exposures: tuple
     left_out: dict = field(default_factory=dict)
@@ -54,15 +65,36 @@ class Mosaic:
         left_out = f", {len(self.left_out)} left out" if self.left_out else ""
         return f"<Mosaic: {nx} x {ny} px, {len(self.exposures)} exposures{left_out}>"
 
+    def contributors(self, x, y):
+        """Names of the exposures that contribute to pixel (x, y) of the mosaic, 0-based.
+
+        Raises
+        ------
+        InputError
+            If the mosaic has no such pixel.
+        """
+        ny, nx = self.shape
+        if not (0 <= x < nx and 0 <= y < ny and x == int(x) and y == int(y)):
+            raise InputError(f"pixel ({x}, {y}) is not one of the {nx} x {ny} of the mosaic (x, y from 0)")
+        planes = self.context[:, int(y), int(x)]
+        return tuple(name for i, name in enumerate(self.exposures) if planes[i // 32] >> np.uint32(i % 32) & 1)
+
     def to_hdulist(self):
-        """The FITS file: image (primary HDU, ``SCI``), ``VAR`` and ``FOOTPRINT``, each with the WCS."""
+        """The FITS file: image (primary HDU, ``SCI``), ``VAR``, ``WEIGHT``, ``FOOTPRINT``, ``FLAGS``, ``CONTEXT``.
+
+        Each has the WCS. ``CONTEXT`` has a third axis where there are more than 32 exposures; a bit counts them in the
+        order of the keywords ``IMCMB001``, ``IMCMB002``, ...
+        """
         header = self.header.copy()
         header.update(self.wcs.to_header(relax=True))
         if self.offset is not None:  # IRAF's logical = LTM physical + LTV, 1-based: physical is the reference plane
             for axis, shift in enumerate(self.offset, start=1):
                 header[f"LTM{axis}_{axis}"] = (1.0, "reference-plane pixels are mosaic pixels")
                 header[f"LTV{axis}"] = (-float(shift), "reference plane + LTV = mosaic pixel")
-        planes = {"SCI": self.data, "VAR": self.variance, "FOOTPRINT": self.footprint}
+        context = self.context.view(np.int32)  # the sign is the last bit, as drizzled images have it
+        planes = {"SCI": self.data, "VAR": self.variance, "WEIGHT": self.weight, "FOOTPRINT": self.footprint}
+        planes["FLAGS"] = self.flags
+        planes["CONTEXT"] = context[0] if len(context) == 1 else context
         hdulist = fits.HDUList()
         for name, plane in planes.items():
             hdu = (fits.ImageHDU if hdulist else fits.PrimaryHDU)(plane, header)
@@ -71,7 +103,13 @@ class Mosaic:
         unit = header.get("BUNIT")
         if unit:
             hdulist["VAR"].header["BUNIT"] = f"({unit})**2"
-        hdulist["FOOTPRINT"].header["BUNIT"] = ("", "number of exposures")
+        for name, meaning in (
+            ("WEIGHT", "sum of weights"),
+            ("FOOTPRINT", "number of exposures"),
+            ("FLAGS", "bits: 1 extrapolated, 2 saturated, 4 rejected"),
+            ("CONTEXT", "bits: exposures IMCMBnnn"),
+        ):
+            hdulist[name].header["BUNIT"] = ("", meaning)
         return hdulist
 
     def write(self, path, *, overwrite=False):

@@ -4,23 +4,22 @@ import json
 import logging
 import os
 import time
-import warnings
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from . import archive, baselines, performance, provenance
+from . import archive, baselines, performance, provenance, quality
 from .coaddition import coadd
 from .estimation import solve
-from .exceptions import AssumptionWarning, InputError, MatchError
-from .exposures import Exposure, expand_paths, read_exposures
+from .exceptions import InputError, MatchError
+from .exposure_files import open_exposures
+from .exposures import expand_paths
 from .files import replacing_folder
 from .findings import FOUND
 from .matching import match
-from .measurement import UNUSABLE, measure
+from .measurement import measure
 from .options import check_options, check_reference
 from .report import write_report
 from .table_files import write_stars
@@ -69,6 +68,7 @@ def run(
     coadding=None,
     compare=False,
     overwrite=False,
+    workers=None,
     progress=False,
 ):
     """Solve a set of frames and co-add them.
@@ -96,9 +96,12 @@ def run(
         hot pixels and cosmic rays do not get into it.
     compare : bool
         Also correct by shifts, by the prior's static distortion and shifts, and by a relative polynomial
-        (`legdistort.baselines`), and report the scatter of all side by side.
+        (`legdistort.baselines`), and report the scatter and the sharpness of the stack that each of them leaves.
     overwrite : bool
         Replace the results of an earlier run.
+    workers : int, optional
+        Cores to use. None = the current ``dask.distributed.Client`` if there is one, else one. Results do not depend
+        on it.
     progress : bool
         Show progress bars.
 
@@ -118,7 +121,7 @@ def run(
     reference, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
     timings = {}
     with _timed(timings, "read"):
-        exposures = read_exposures(paths, ext=ext, progress=progress)
+        exposures = open_exposures(paths, ext=ext, progress=progress)
         _check_shapes(exposures)
         if min_exposures > len(exposures):
             raise InputError(
@@ -126,7 +129,8 @@ def run(
                 f"give min_exposures={len(exposures)} (--min-exposures) or less"
             )
     with _timed(timings, "measure"):
-        detections = measure(exposures, progress=progress, **(measuring or {}))
+        share = {"workers": workers, "progress": progress}
+        detections = measure(exposures, **share, **(measuring or {}))
     with _timed(timings, "match"):
         matches = match(detections, exposures=exposures, min_exposures=min_exposures, **(matching or {}))
     with _timed(timings, "solve"):
@@ -137,18 +141,29 @@ def run(
     if compare:
         with _timed(timings, "compare"):
             comparison = baselines.compare(matches, solution, prior=prior)
+    coadding = {"method": "clipped"} | (coadding or {})
     with _timed(timings, "coadd"):
         kept = [exposure for exposure in exposures if exposure.name in solution.names]
-        mosaic = coadd(kept, solution, progress=progress, **({"method": "clipped"} | (coadding or {})))
+        mosaic = coadd(kept, solution, **share, **coadding)
+    with _timed(timings, "assess"):
+        judged = _if_possible(quality.assess, mosaic, solution, exposures=kept)
+    stacks = None
+    if comparison and judged:
+        with _timed(timings, "compare"):
+            stacks = _if_possible(quality.compare_stacks, kept, comparison, mosaic=mosaic, **coadding)
     with replacing_folder(out) as target:
         with _timed(timings, "write"):
             write_results(solution, target)
             mosaic.write(target / "mosaic.fits")
-            sharpness = fwhm_ratio(mosaic, solution)
-        summary = summarise(solution, timings=timings) | {"fwhm_ratio": sharpness}
+        summary = summarise(solution, timings=timings) | {"fwhm_ratio": judged and judged.fwhm_ratio}
+        if judged:
+            summary["quality"] = asdict(judged)
         if comparison:
             summary["comparison"] = {name: performance.scatter_summary(made) for name, made in comparison.items()}
-        write_report(target / "report.html", solution, mosaic=mosaic, summary=summary, comparison=comparison)
+        if stacks:
+            summary["stacks"] = stacks.figures()
+        shown = {"mosaic": mosaic, "summary": summary, "comparison": comparison, "stacks": stacks}
+        write_report(target / "report.html", solution, **shown)
         write_summary(target / "summary.json", summary)
     return Run(out, solution, mosaic, summary)
 
@@ -192,29 +207,13 @@ def summarise(solution, *, timings=None):
     }
 
 
-def fwhm_ratio(mosaic, solution):
-    """FWHM of stars in the mosaic over that in single exposures: median over the brighter half; None if unknown."""
-    table = solution.observations
-    if "fwhm" not in table.colnames or mosaic.offset is None:
+def _if_possible(judge, *args, **kwargs):
+    """What a judgement of the mosaic says, or None: a run does not fail because no star can be measured in it."""
+    try:
+        return judge(*args, **kwargs)
+    except InputError as error:
+        log.warning("no figures of the mosaic's quality: %s", error)
         return None
-    image = Exposure(name="mosaic", data=mosaic.data, mask=~np.isfinite(mosaic.data))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AssumptionWarning)  # of the errors, which are not used
-        stacked = measure([image], max_stars=500)
-    stacked = stacked[(stacked["flags"] & UNUSABLE) == 0]
-    if len(stacked) == 0:
-        return None
-    stars = solution.stars
-    bright = stars[stars["flux"] >= np.nanmedian(stars["flux"])] if "flux" in stars.colnames else stars
-    place = np.column_stack([bright["x"].value, bright["y"].value]) - mosaic.offset
-    distance, found = cKDTree(np.column_stack([stacked["x"].value, stacked["y"].value])).query(place)
-    table = table[table["used"]]
-    ratios = [
-        stacked["fwhm"][k].value / np.nanmedian(table["fwhm"][table["star"] == star].value)
-        for star, k, d in zip(bright["star"], found, distance, strict=True)
-        if d < 2
-    ]
-    return float(np.median(ratios)) if ratios else None
 
 
 def check_folder(out, overwrite):

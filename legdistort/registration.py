@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from . import asterisms
+from . import asterisms, poses
 from .matches import robust_similarity
 from .warps import Warp, allowed_degree, fit_warp
 
@@ -105,6 +105,10 @@ def _spread(source, target, found, tolerance):
     """Grow again from the pairs while that brings more: a seed some degrees off holds in part of the field only."""
     while True:
         p = source.xy[found.source]
+        if len(p) > MOST / 2 and np.all(
+            p.std(axis=0) > 0.95 * source.xy[_inside(source, target, found.warp)].std(axis=0)
+        ):
+            return found
         order = None if source.ranking is not None else outwards(source, p.mean(axis=0))
         grown = grow(source, target, robust_similarity(p, target.xy[found.target]), order)
         again = None if grown is None else settle(source, target, *grown, tolerance=tolerance)
@@ -132,7 +136,7 @@ def continue_from(source, target, rows, columns, *, tolerance=None):
     Registration or None
     """
     p, q = source.xy[rows], target.xy[columns]
-    parity = np.sign(np.linalg.det(robust_similarity(p, q)[:, :2]))
+    parity = np.sign(np.linalg.det(poses.fit_similarity(p, q)[:, :2]))
     weights, degree = np.ones(len(p)), min(allowed_degree(len(p)), 3)
     for _ in range(4):
         warp = fit_warp(p, q, source.shape, degree, weights=weights, width=1.0, parity=parity)
@@ -237,7 +241,8 @@ def grow(source, target, pose, order=None):
             break
         if stage < 5:
             continue
-        radius, strength = _best_radius(warp(source.xy[chosen]), tree, width, len(warp.coefficients))
+        if stage == 5 or n == total:
+            radius, strength = _best_radius(warp(source.xy[chosen]), tree, width, len(warp.coefficients))
         if stage == 5 and strength < 3:
             return None
         if n < total:
@@ -277,7 +282,8 @@ def _strength(predicted, tree, radius, n_modes):
     """How far the number of hits is above chance; local densities of the target allow for crowded places."""
     distance, row = tree.query(predicted, distance_upper_bound=radius)
     hits = len(np.unique(row[np.isfinite(distance)])) - n_modes
-    around = tree.query_ball_point(predicted, 8 * radius, return_length=True).sum()
+    some = predicted[:: len(predicted) // 200 + 1]
+    around = tree.query_ball_point(some, 8 * radius, return_length=True).sum() * len(predicted) / len(some)
     around = max(around - hits, 1) / 64
     return hits * np.log(hits / around) - hits + around if hits > around else 0.0
 
@@ -299,7 +305,8 @@ def settle(source, target, warp, reach, *, tolerance=None):
     Registration or None
     """
     most = np.sqrt(0.03 * target.area / (np.pi * len(target)))
-    n = len(_mutual(warp(source.xy), source, target, min(reach, most), most)[0])
+    some = _thinned(source)
+    n = len(_mutual(warp, some, target, min(reach, most), most)[0])
     highest = allowed_degree(n)
     # with few pairs a lower degree can be the more significant one
     degrees = {0: (0,), 1: (0, 1), 2: (1, 2), 3: (2, 3)}.get(highest, (highest,))
@@ -307,42 +314,58 @@ def settle(source, target, warp, reach, *, tolerance=None):
     return max((f for f in found if f is not None), key=lambda f: (len(f.source), f.strength), default=None)
 
 
+def _thinned(stars):
+    step = -(-len(stars) // MOST)
+    return stars if step == 1 else stars.subset(np.arange(len(stars)) % step == 0)
+
+
 def _settle(source, target, warp, limit, tolerance, degree):
     most = np.sqrt(0.03 * target.area / (np.pi * len(target)))
     parity = np.sign(np.linalg.det(np.diff(warp(np.array([[0.0, 0], [1, 0], [0, 1]])), axis=0)))
+    some = _thinned(source)
     for _ in range(4):
-        i, j, distance = _mutual(warp(source.xy), source, target, limit, most)
+        i, j, distance = _mutual(warp, some, target, limit, most)
         if len(i) < 3 or allowed_degree(len(i)) < degree:
             return None
         scatter = np.median(distance) / 1.18  # the median distance is 1.18 times the scatter per axis
         w = 1 / (1 + (distance / (2 * scatter + 1e-9)) ** 2)
-        warp = fit_warp(source.xy[i], target.xy[j], source.shape, degree, weights=w, width=scatter, parity=parity)
+        warp = fit_warp(some.xy[i], target.xy[j], source.shape, degree, weights=w, width=scatter, parity=parity)
         before, limit = limit, min(max(5 * scatter, 0.5), most, 1.5 * limit)
         if abs(limit - before) < 0.1 * limit:
             break
     limit = limit if tolerance is None else tolerance
     predicted = warp(source.xy)
-    i, j, distance = _mutual(predicted, source, target, limit, max(most, limit), lone=True)
+    i, j, distance = _mutual(warp, source, target, limit, max(most, limit), lone=True)
     strength = _strength(predicted, target.tree, limit, len(warp.coefficients))
-    inside = np.all((predicted > -0.5) & (predicted < np.array(target.shape[::-1]) - 0.5), axis=1)
-    possible = np.mean(inside) * min(len(source), len(target))
+    possible = np.mean(_inside(source, target, warp)) * min(len(source), len(target))
     if strength < MIN_STRENGTH or len(i) < max(5, MIN_SHARE * possible):
         return None
     return Registration(i, j, distance, warp, float(limit), float(strength))
 
 
-def _mutual(predicted, source, target, limit, most, lone=False):
-    """Rows of mutual nearest neighbours and their distances; `lone` leaves out those with a second neighbour."""
+def _inside(source, target, warp):
+    """Which stars of the source a map puts on the target's detector."""
+    predicted = warp(source.xy)
+    return np.all((predicted > -0.5) & (predicted < np.array(target.shape[::-1]) - 0.5), axis=1)
+
+
+def _mutual(warp, source, target, limit, most, lone=False):
+    """Rows of mutual nearest neighbours and their distances; `lone` leaves out those with a second neighbour.
+
+    Where the map extrapolates and errors are large, neighbours may be farther apart than `limit`, never than `most`.
+    """
+    predicted = warp(source.xy)
     forward, j = target.tree.query(predicted, k=2, distance_upper_bound=max(limit, most))
-    backward, i = cKDTree(predicted, balanced_tree=False, compact_nodes=False).query(
-        target.xy, k=2, distance_upper_bound=max(limit, most)
-    )
     rows = np.flatnonzero(np.isfinite(forward[:, 0]))
-    rows = rows[i[j[rows, 0], 0] == rows]
-    cols = j[rows, 0]
-    distance = forward[rows, 0]
-    allowed = np.minimum(np.sqrt(limit**2 + 16 * (source.error[rows] ** 2 + target.error[cols] ** 2)), most)
+    backward, i = cKDTree(predicted, balanced_tree=False, compact_nodes=False).query(
+        target.xy[j[rows, 0]], k=2, distance_upper_bound=max(limit, most)
+    )
+    mutual = i[:, 0] == rows
+    rows, backward = rows[mutual], backward[mutual]
+    cols, distance = j[rows, 0], forward[rows, 0]
+    spread = limit**2 * (1 + warp.leverage(source.xy[rows]))
+    allowed = np.minimum(np.sqrt(spread + 16 * (source.error[rows] ** 2 + target.error[cols] ** 2)), most)
     good = distance <= allowed
     if lone:
-        good &= (forward[rows, 1] > limit) & (backward[cols, 1] > limit)
+        good &= (forward[rows, 1] > limit) & (backward[:, 1] > limit)
     return rows[good], cols[good], distance[good]

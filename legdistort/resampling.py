@@ -1,211 +1,22 @@
-"""One detector image -> the output grid: exact pixel maps on Chebyshev nodes, with reproject as the engine.
+"""Pieces of detector images -> pieces of the output grid, with reproject as the engine.
 
-reproject computes coordinates through the sky for every pixel, four fifths of its time. Here it is handed
-tiny WCS objects whose world *is* the output grid, and a pixel map that was evaluated on a few Chebyshev nodes
-and interpolated by small matrix products: where the output lies on the reference plane the map is a
-polynomial, so this is exact; elsewhere it is checked on random pixels.
+It is handed tiny WCS objects whose world *is* the output grid, and a pixel map (`legdistort.mapping`).
 """
 
-import logging
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
-from astropy.wcs import WCS
 from astropy.wcs.wcsapi import BaseLowLevelWCS
-from numpy.polynomial.chebyshev import chebvander
-from scipy.ndimage import map_coordinates
+from numpy.polynomial.polynomial import polyfit, polyval
+from scipy.ndimage import binary_dilation, map_coordinates
 
-from . import poses
-from .distortion import outside
+from .drizzling import drizzle
 
-logger = logging.getLogger(__name__)
-
-ALGORITHMS = ("interp", "adaptive", "exact")
-_NODES = 24
-_TOLERANCE = 1e-6  # largest error of an interpolated map, px (and relative, for the determinant)
+ALGORITHMS = ("interp", "adaptive", "exact", "drizzle")
 _BAD_WEIGHT = 0.05  # an output pixel with a larger share of bad pixels is left empty
-_CHUNK = 1 << 16
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Pixel grid of a mosaic.
-
-    Attributes
-    ----------
-    shape : tuple
-        ``(ny, nx)``.
-    wcs : `~astropy.wcs.WCS`
-        Celestial, or linear (world = reference plane) if the sky is not known.
-    offset : tuple of int or None
-        ``(ox, oy)``: a pixel (x, y) lies at (x + ox, y + oy) on the reference plane. None = elsewhere on the sky.
-    sky : `~legdistort.poses.TangentPlane` or None
-    """
-
-    shape: tuple
-    wcs: WCS
-    offset: tuple | None = None
-    sky: poses.TangentPlane | None = None
-
-    def to_reference(self, xy):
-        """Output pixels (n, 2) -> reference plane."""
-        if self.offset is not None:
-            return xy + np.array(self.offset)
-        return self.sky.from_sky(self.wcs.pixel_to_world(xy[:, 0], xy[:, 1]))
-
-    def from_reference(self, xy):
-        """Reference plane (n, 2) -> output pixels."""
-        if self.offset is not None:
-            return xy - np.array(self.offset)
-        return np.stack(self.wcs.world_to_pixel(self.sky.to_sky(xy)), axis=-1)
-
-    def pixel_area(self, xy):
-        """Area of output pixels (n, 2), in pixels of the reference plane."""
-        if self.offset is not None:
-            return np.ones(len(xy))
-        step = np.array([0.5, 0.0])
-        dx = self.to_reference(xy + step) - self.to_reference(xy - step)
-        dy = self.to_reference(xy + step[::-1]) - self.to_reference(xy - step[::-1])
-        return np.abs(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0])
-
-
-@dataclass(frozen=True, eq=False)
-class PixelMap:
-    """Where the pixels of a piece of the output grid lie on one detector.
-
-    Attributes
-    ----------
-    window : tuple of slice
-        ``(rows, columns)`` of the piece on the output grid.
-    xy : ndarray, shape (2, ny, nx)
-        Detector pixels.
-    inside : ndarray of bool, shape (ny, nx)
-        Whether they lie within the centres of the outermost ones, and where the distortion is valid.
-    area : ndarray, shape (ny, nx)
-        ``|det dD/dX|`` times the area of an output pixel: detector pixels per output pixel.
-    corners : ndarray or None, shape (2, my + 1, mx + 1)
-        Corners of the detector pixels on the piece, only for the exact algorithm.
-    """
-
-    window: tuple
-    xy: np.ndarray
-    inside: np.ndarray
-    area: np.ndarray
-    corners: np.ndarray | None = None
-
-
-def map_exposure(name, solution, grid, *, corners=False):
-    """The `PixelMap` of an exposure, or None where it does not meet the grid.
-
-    Parameters
-    ----------
-    name : str
-        Of the exposure.
-    solution : Solution
-        With its pose, shape and distortion.
-    grid : Grid
-        The output grid.
-    corners : bool
-        Also map the corners of the detector pixels.
-    """
-    xy = grid.from_reference(solution.correct(name, outline(solution.shapes[name])))
-    low = np.maximum(np.floor(np.nanmin(xy, axis=0)), 0).astype(int)
-    high = np.minimum(np.ceil(np.nanmax(xy, axis=0)) + 1, grid.shape[::-1]).astype(int)
-    if np.any(high <= low):
-        return None
-    shape = tuple((high - low)[::-1])
-    *planes, area = tabulate(lambda p: trace(p, name, solution, grid), low, shape)
-    planes = np.array(planes)
-    valid = solution.distortion(name).inverse.valid
-    ny, nx = solution.shapes[name]
-    # Interpolation needs data on both sides: beyond the outermost centres it would be extrapolation.
-    centres = (-_TOLERANCE, nx - 1 + _TOLERANCE, -_TOLERANCE, ny - 1 + _TOLERANCE)
-    inside = ~(outside(valid, planes[2], planes[3]) | outside(centres, planes[0], planes[1]))
-    window = (slice(low[1], high[1]), slice(low[0], high[0]))
-    edges = None
-    if corners:
-        edges = tabulate(lambda p: _forward(p - 0.5, name, solution, grid) - low, (0, 0), (ny + 1, nx + 1))
-    return PixelMap(window, planes[:2], inside, area, edges)
-
-
-def outline(shape, n=65):
-    """Points along the outermost pixel centres of a detector ``(ny, nx)``, shape (4 n, 2)."""
-    ny, nx = shape
-    t, one = np.linspace(0, 1, n), np.ones(n)
-    sides = [(t, 0 * one), (t, one), (0 * one, t), (one, t)]
-    return np.concatenate([np.stack(s, axis=1) for s in sides]) * [nx - 1, ny - 1]
-
-
-def trace(xy, name, solution, grid):
-    """Exact chain of one exposure at output pixels.
-
-    Parameters
-    ----------
-    xy : ndarray, shape (n, 2)
-        Output pixels.
-    name, solution, grid
-        As for `map_exposure`.
-
-    Returns
-    -------
-    ndarray, shape (n, 5)
-        Detector x, y; undistorted x, y; detector pixels per output pixel. The distortion is not cut at the
-        edge of its validity, so that it stays smooth.
-    """
-    pose, distortion = solution.poses[name], solution.distortion(name)
-    q = poses.apply(pose, grid.to_reference(xy))
-    j = distortion.jacobian(q)
-    determinant = (j[:, 0, 0] * j[:, 1, 1] - j[:, 0, 1] * j[:, 1, 0]) * np.linalg.det(pose[:, :2])
-    return np.column_stack([distortion(q), q, np.abs(determinant) * grid.pixel_area(xy)])
-
-
-def _forward(xy, name, solution, grid):
-    q = solution.distortion(name).invert(xy)
-    return grid.from_reference(poses.apply(poses.invert(solution.poses[name]), q))
-
-
-def tabulate(function, corner, shape):
-    """A smooth function on a grid of pixels, from its values on Chebyshev nodes.
-
-    Parameters
-    ----------
-    function : callable
-        ``function(xy (n, 2)) -> (n, k)``.
-    corner : array_like
-        ``(x, y)`` of the first pixel.
-    shape : tuple
-        ``(ny, nx)``.
-
-    Returns
-    -------
-    ndarray, shape (k, ny, nx)
-        Compared with `function` on 200 random pixels; if they differ by more than 1e-6, every pixel is
-        evaluated instead, which takes a hundred times longer.
-    """
-    ny, nx = shape
-    corner = np.asarray(corner, dtype=float)
-    t = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-    gx, gy = np.meshgrid((t + 1) * nx / 2 - 0.5, (t + 1) * ny / 2 - 0.5)
-    values = function(np.stack([gx.ravel(), gy.ravel()], axis=1) + corner).T.reshape(-1, _NODES, _NODES)
-    weights = np.linalg.inv(chebvander(t, _NODES - 1))
-    wy, wx = (chebvander((np.arange(n) + 0.5) * 2 / n - 1, _NODES - 1) @ weights for n in shape)
-    out = np.empty((len(values), ny, nx))
-    for plane, v in zip(out, values, strict=True):
-        np.matmul(wy, v @ wx.T, out=plane)
-    rng = np.random.default_rng(1)
-    x, y = rng.integers(0, nx, 200), rng.integers(0, ny, 200)
-    exact = function(np.stack([x, y], axis=1) + corner).T
-    if np.all(np.abs(out[:, y, x] - exact) <= _TOLERANCE):
-        return out
-    logger.info("the pixel map is not smooth enough for %d nodes, every pixel is evaluated", _NODES)
-    flat = out.reshape(len(out), -1)
-    for start in range(0, nx * ny, _CHUNK):
-        y, x = np.divmod(np.arange(start, min(start + _CHUNK, nx * ny)), nx)
-        flat[:, start : start + _CHUNK] = function(np.stack([x, y], axis=1) + corner).T
-    return out
 
 
 class _TableWCS(BaseLowLevelWCS):
@@ -277,8 +88,8 @@ def resample(planes, pixel_map, *, algorithm="interp", order=1):
     ----------
     planes : ndarray, shape (k, ny, nx)
         The images.
-    pixel_map : PixelMap
-        With the corners for 'exact'.
+    pixel_map : `~legdistort.mapping.PixelMap`
+        With what the algorithm asks for.
     algorithm : {'interp', 'adaptive', 'exact'}
         One of reproject's.
     order : int
@@ -300,83 +111,214 @@ def resample(planes, pixel_map, *, algorithm="interp", order=1):
         options["roundtrip_coords"] = False
         if algorithm == "interp":
             out = reproject.reproject_interp((planes, _TableWCS(pixel_map.xy)), _TableWCS(), order=order, **options)
-        else:  # asks one pixel beyond the grid, which is extrapolated linearly
-            wider = np.pad(pixel_map.xy, ((0, 0), (1, 1), (1, 1)), mode="reflect", reflect_type="odd")
-            out = reproject.reproject_adaptive((planes, _TableWCS(wider, margin=1)), _TableWCS(), **options)
-    out[:, ~pixel_map.inside] = np.nan
+        else:  # asks one pixel beyond the grid
+            out = reproject.reproject_adaptive((planes, _TableWCS(pixel_map.wider, margin=1)), _TableWCS(), **options)
+    if not pixel_map.inside.all():
+        out[:, ~pixel_map.inside] = np.nan
     return out
 
 
-def resample_exposure(data, bad, variance, pixel_map, *, algorithm="interp", order=3):
-    """An image, its bad pixels and its variance on the output grid, surface brightness conserved.
+@dataclass(frozen=True, eq=False, repr=False)
+class Resampled:
+    """A piece of an exposure on the output grid, surface brightness conserved.
+
+    Attributes
+    ----------
+    data : ndarray, shape (my, mx)
+        NaN where there is nothing.
+    variance : ndarray, shape (my, mx) or (k, my, mx)
+        Of each output pixel by itself; interpolation lowers it and correlates neighbours.
+    full : ndarray of bool or None
+        Where saturated pixels have a share.
+    coverage : ndarray or float
+        Share of the pixel on which something fell, for drizzle.
+    """
+
+    data: np.ndarray
+    variance: np.ndarray
+    full: np.ndarray | None = None
+    coverage: object = 1.0
+
+
+def resample_exposure(data, masks, variance, pixel_map, *, algorithm="interp", order=3, gain=None, drop=None):
+    """A piece of an exposure on the output grid.
 
     Parameters
     ----------
     data : ndarray, shape (ny, nx)
-        The image.
-    bad : ndarray of bool, shape (ny, nx)
-        Replaced by an estimate from their neighbours, so that they do not ring through the spline; output
-        pixels where their share is above 5 % are NaN.
-    variance : ndarray, shape (ny, nx), or float
+        The image, bad pixels replaced (`fill_bad`), so that they do not ring through the spline.
+    masks : dict of ndarray of bool, shape (ny, nx), or None
+        ``bad``: output pixels where their share is above 5 % are NaN (of drizzle, they do not fall). ``full``:
+        saturated ones. ``rough``: where a spline would ring (`rough_pixels`), which are interpolated linearly.
+    variance : ndarray, shape (ny, nx) or (k, ny, nx), or float
         Of independent pixels.
-    pixel_map : PixelMap
+    pixel_map : `~legdistort.mapping.PixelMap`
         Of its exposure.
     algorithm, order
-        See `resample`.
+        See `resample`; or 'drizzle'.
+    gain : float, optional
+        What the algorithm leaves of the variance of white noise (`white_gain`); not for 'interp', where it is known.
+    drop : `~legdistort.drizzling.Drop`, optional
+        For drizzle.
 
     Returns
     -------
-    data, variance : ndarray, shape (my, mx)
-        The variance is that of each output pixel by itself; interpolation lowers it and correlates neighbours.
+    Resampled
     """
-    mean = np.mean(variance, where=~bad) if np.ndim(variance) else float(variance)
-    extra = [bad.astype(np.float32)] if bad.any() else []
-    if np.ndim(variance):
-        extra.append(np.where(bad, mean, variance))
-    if algorithm != "interp":  # their smoothing is measured with white noise of unit variance
-        extra.append(np.random.default_rng(1).standard_normal(data.shape))
-    image = [fill_bad(data, bad)]
-    if algorithm == "interp" and order > 1:
-        out = [*resample(np.array(image), pixel_map, order=order)]
+    masks = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
+    if algorithm == "drizzle":
+        return _drizzle(data, masks, variance, pixel_map, drop)
+    spoilt = [name for name in ("bad", "full") if name in masks]
+    extra = list(np.reshape(variance, (-1, *data.shape)) if np.ndim(variance) else [])
+    if algorithm == "interp" and order > 0:
+        hits = [_hits(masks[name], pixel_map) for name in spoilt]
+        out = [*resample(data[None], pixel_map, order=order)]
         out += [*resample(np.array(extra), pixel_map, order=1)] if extra else []
+        value = out.pop(0)
     else:
-        out = [*resample(np.array(image + extra), pixel_map, algorithm=algorithm, order=order)]
-    value = out.pop(0)
-    gain = _spline_gain(order, pixel_map.xy) if algorithm == "interp" else np.nanvar(out.pop())
-    if bad.any():
-        value[~(out.pop(0) <= _BAD_WEIGHT)] = np.nan
-    return value, gain * (out.pop() if out else mean)
+        shares = [masks[name].astype(np.float32) for name in spoilt]
+        value, *out = resample(np.array([data, *shares, *extra]), pixel_map, algorithm=algorithm, order=order)
+        hits = [~(out.pop(0) <= _BAD_WEIGHT) for _ in spoilt]
+    hits = dict(zip(spoilt, hits, strict=True))
+    if algorithm == "interp":
+        gain = _spline_gain(order, pixel_map.xy)
+    if "rough" in masks and algorithm == "interp" and order > 1:
+        place = [np.clip(np.rint(p), 0, n - 1) for p, n in zip(pixel_map.xy[::-1], data.shape, strict=True)]
+        near = masks["rough"][tuple(np.array(place, dtype=np.intp))] & pixel_map.inside
+        value[near] = map_coordinates(data, pixel_map.xy[::-1, near], order=1, mode="nearest")
+        gain = np.where(near, _spline_gain(1, pixel_map.xy), gain)
+    if "bad" in masks:
+        value[hits["bad"]] = np.nan
+    spread = np.reshape(out, (*np.shape(variance)[:-2], *value.shape)) if out else variance
+    return Resampled(value, gain * spread, hits.get("full"))
+
+
+def _hits(mask, pixel_map):
+    """Where more than 5 % of a linear interpolation come from a mask; evaluated only where it can be."""
+    some = mask.copy()  # whether a pixel, the next, those above: what lies between them is interpolated from these four
+    some[:-1] |= mask[1:]
+    some[:, :-1] |= some[:, 1:].copy()
+    y, x = (np.clip(p, 0, n - 1).astype(np.intp) for p, n in zip(pixel_map.xy[::-1], mask.shape, strict=True))
+    near = some.ravel()[y * mask.shape[1] + x]
+    hits = np.zeros(near.shape, dtype=bool)
+    place = pixel_map.xy[::-1, near]
+    hits[near] = map_coordinates(mask.astype(np.float32), place, order=1, mode="nearest") > _BAD_WEIGHT
+    return hits
+
+
+def _drizzle(data, masks, variance, pixel_map, drop):
+    variances = np.broadcast_to(variance, (*np.shape(variance)[:-2], *data.shape))
+    good = ~masks.get("bad", np.zeros(data.shape, dtype=bool))
+    value, spread, coverage = drizzle(data, good, variances.reshape(-1, *data.shape), pixel_map, drop)
+    full = None
+    if "full" in masks:
+        full = drizzle(masks["full"], good, [], pixel_map, drop)[0] > _BAD_WEIGHT
+    return Resampled(value, np.reshape(spread, (*variances.shape[:-2], *value.shape)), full, coverage)
+
+
+def white_gain(exposure_map, *, algorithm, order=None, drop=None):
+    """What an algorithm leaves of the variance of white noise; found in the middle of an exposure, but for splines.
+
+    The sum over many pixels keeps its variance: it is the inverse of this times the sum of the variances of single
+    pixels, since neighbours are correlated.
+
+    Parameters
+    ----------
+    exposure_map : `~legdistort.mapping.ExposureMap`
+    algorithm, order, drop
+        As for `resample_exposure`.
+
+    Returns
+    -------
+    float
+        The mean over 128 x 128 px of the output.
+    """
+    if algorithm == "interp":
+        fraction = (np.arange(100) + 0.5) / 100
+        return float(polyval(fraction * (1 - fraction), _gain_series(order)).mean() ** 2)
+    middle = tuple(
+        slice(max(s.start, (s.start + s.stop) // 2 - 64), (s.start + s.stop) // 2 + 64) for s in exposure_map.window
+    )
+    for window in (middle, exposure_map.window):  # an exposure may meet the grid with a corner only
+        found = exposure_map.piece(window, margin=24, border=algorithm == "adaptive")
+        if found is not None:
+            noise = np.random.default_rng(1).standard_normal([s.stop - s.start for s in found[1]])
+            if algorithm == "drizzle":
+                return float(np.nanvar(drizzle(noise, np.ones(noise.shape, dtype=bool), [], found[0], drop)[0]))
+            return float(np.nanvar(resample(noise[None], found[0], algorithm=algorithm)))
+    return 1.0
+
+
+def rough_pixels(data, bad, full, noise):
+    """Pixels within five of a saturated one, or of a hole in the slope of a star: splines ring there.
+
+    Parameters
+    ----------
+    data : ndarray, shape (ny, nx)
+        Bad pixels replaced.
+    bad, full : ndarray of bool, shape (ny, nx)
+        Bad pixels and saturated ones.
+    noise : float
+        Of the background: a slope is where data within two pixels differ by more than ten times this; a hole is where
+        most of these pixels are bad. Single bad pixels are replaced well enough.
+
+    Returns
+    -------
+    ndarray of bool, shape (ny, nx)
+    """
+    rough = full.copy()
+    y, x = np.nonzero(bad)
+    if len(y):
+        around = [_around(plane, y, x) for plane in (data, bad)]
+        rough[y, x] = (np.ptp(around[0], axis=0) > 10 * noise) & (around[1].mean(axis=0) > 0.5)
+    return binary_dilation(rough, np.ones((11, 11), dtype=bool)) if rough.any() else rough
+
+
+def _around(plane, y, x):
+    padded = np.pad(plane, 2, mode="edge")
+    return np.stack([padded[y + i, x + k] for i, k in np.ndindex(5, 5)])
 
 
 def fill_bad(data, bad, radius=2):
     """Replace bad pixels by a weighted mean of the good ones near by, or the median of all good ones."""
     if not bad.any():
         return data
-    y, x = np.nonzero(bad)
-    good = np.pad(~bad, radius)
-    padded = np.pad(np.where(bad, 0, data), radius)
+    (y, x), (ny, nx) = np.nonzero(bad), bad.shape
     total, norm = np.zeros(len(x)), np.zeros(len(x))
     for dy, dx in np.ndindex(2 * radius + 1, 2 * radius + 1):
-        weight = np.exp(-((dy - radius) ** 2 + (dx - radius) ** 2) / 2) * good[y + dy, x + dx]
-        total += weight * padded[y + dy, x + dx]
+        near = np.clip(y + dy - radius, 0, ny - 1), np.clip(x + dx - radius, 0, nx - 1)
+        weight = np.exp(-((dy - radius) ** 2 + (dx - radius) ** 2) / 2) * ~bad[near]
+        total += weight * np.where(weight > 0, data[near], 0)
         norm += weight
+    lonely = norm == 0
     out = data.copy()
-    out[y, x] = np.where(norm > 0, total / np.where(norm > 0, norm, 1), np.median(data[~bad]))
+    out[y, x] = total / np.where(lonely, 1, norm)
+    if lonely.any():
+        out[y[lonely], x[lonely]] = np.median(data[~bad])
     return out
 
 
 def _spline_gain(order, xy):
     """Variance of an interpolated pixel for unit white noise, from the fractions of its coordinates."""
-    table = _gain_table(order)
-    index = ((xy - np.floor(xy)) * (len(table) - 1)).astype(np.intp)
-    return table[index[0]] * table[index[1]]
+    fraction = (xy - np.floor(xy)).astype(np.float32)
+    fraction *= 1 - fraction
+    *rest, last = _gain_series(order)
+    gain = np.full_like(fraction, last)
+    for c in reversed(rest):  # in place: three times faster than polyval
+        gain *= fraction
+        gain += np.float32(c)
+    return gain[0] * gain[1]
 
 
 @lru_cache
-def _gain_table(order, n=256, reach=20):
-    """Sum of the squared weights of a spline at n + 1 fractions of a pixel."""
+def _gain_series(order, n=256, reach=20):
+    """Sum of the squared weights of a spline at the fraction f of a pixel, as a polynomial in f (1 - f).
+
+    It is one of that very degree for odd orders; even ones are met to 0.001.
+    """
     impulse = np.zeros(2 * reach + 1)
     impulse[reach] = 1
     fraction = np.linspace(0, 1, n + 1)
     coordinates = reach + np.arange(-reach + 1, reach)[:, None] - fraction
-    return (map_coordinates(impulse, [coordinates], order=order) ** 2).sum(axis=0)
+    gain = (map_coordinates(impulse, [coordinates], order=order) ** 2).sum(axis=0)
+    return polyfit(fraction * (1 - fraction), gain, order if order % 2 else 5)

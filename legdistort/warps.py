@@ -62,15 +62,29 @@ class StarList:
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Polynomial map from one list to another: coefficients (n_modes, 2) in the basis of the source's detector."""
+    """Polynomial map from one list to another: coefficients (n_modes, 2) in the basis of the source's detector.
+
+    `covariance` is that of the coefficients for positions of unit variance, (n_modes, n_modes); None if not known.
+    """
 
     coefficients: np.ndarray
     shape: tuple
+    covariance: np.ndarray | None = None
 
     def __call__(self, xy):
         """Map positions (n, 2)."""
+        return self._design(xy) @ self.coefficients
+
+    def leverage(self, xy):
+        """Variance of mapped positions (n,) over that of the positions fitted; large where the map extrapolates."""
+        if self.covariance is None:
+            return np.zeros(len(xy))
+        design = self._design(xy)
+        return np.einsum("ij,ij->i", design @ self.covariance, design)
+
+    def _design(self, xy):
         degree = basis.degree_of(len(self.coefficients))
-        return basis.values(degree, *basis.normalize(xy, self.shape)).T @ self.coefficients
+        return basis.values(degree, *basis.normalize(xy, self.shape)).T
 
     @classmethod
     def from_pose(cls, pose, shape):
@@ -96,4 +110,5 @@ def fit_warp(p, q, shape, degree, *, weights, width, parity):
     i, j = basis.orders(degree)
     ridge = np.where(i + j > 1, (width / (0.01 * max(shape))) ** 2, 1e-9)
     normal = (design * weights) @ design.T + np.diag(ridge)
-    return Warp(np.linalg.solve(normal, (design * weights) @ q), shape)
+    covariance = np.linalg.inv(normal)
+    return Warp(covariance @ ((design * weights) @ q), shape, covariance)

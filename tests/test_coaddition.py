@@ -1,5 +1,6 @@
 """Co-addition: positions, fluxes, edges and header of mosaics of synthetic frames with a 20 px distortion."""
 
+import itertools
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -10,6 +11,7 @@ from astropy import units as u
 from astropy.coordinates import ICRS, SkyCoord
 from astropy.io import fits
 from astropy.modeling import models
+from astropy.table import QTable
 from astropy.wcs import WCS
 from gwcs import WCS as GWCS
 from scipy.optimize import least_squares
@@ -20,7 +22,8 @@ from legdistort.coaddition import coadd, reference_grid
 from legdistort.distortion import Distortion, outside
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.exposures import Exposure, read_exposures
-from legdistort.resampling import fill_bad, tabulate, trace
+from legdistort.mapping import tabulate, trace
+from legdistort.resampling import fill_bad
 
 SHAPE = (300, 400)
 SIGMA = 1.4  # of the Gaussian stars, px
@@ -35,6 +38,17 @@ class StandIn:
     distortions: dict
     sky: object = None
     left_out: dict = field(default_factory=dict)
+
+    @property
+    def observations(self):
+        """Stars at the corners of all detectors, and their width."""
+        rows = [
+            (name, star, x, y, True, SIGMA * 2.3548)
+            for name, d in self.distortions.items()
+            for star, (x, y) in enumerate(itertools.product((-5, d.shape[1] + 5), (-5, d.shape[0] + 5)))
+        ]
+        units = {"x": u.pix, "y": u.pix, "fwhm": u.pix}
+        return QTable(rows=rows, names=["exposure", "star", "x", "y", "used", "fwhm"], units=units)
 
     @property
     def shapes(self):
@@ -284,7 +298,8 @@ class TestSky:
         grid = reference_grid(list(solution.poses), solution)
         rng = np.random.default_rng(3)
         for name in solution.poses:
-            planes = tabulate(lambda p, name=name: trace(p, name, solution, grid), (0, 0), grid.shape)
+            table = tabulate(lambda p, name=name: trace(p, name, solution, grid), (0, 0), grid.shape)
+            planes = table(slice(0, grid.shape[0]), slice(0, grid.shape[1]))
             y, x = rng.integers(0, 280, (2, 500))
             exact = trace(np.stack([x, y], 1).astype(float), name, solution, grid)
             np.testing.assert_allclose(planes[:, y, x].T, exact, atol=1e-9)
@@ -301,7 +316,7 @@ class TestSky:
             return np.stack([np.sin(3 * p[:, 0]), np.floor(p[:, 1] / 3)], 1)
 
         y, x = np.mgrid[:50, :70]
-        out = tabulate(rough, (5, 6), (50, 70))
+        out = tabulate(rough, (5, 6), (50, 70))(slice(6, 56), slice(5, 75))
         np.testing.assert_allclose(out, np.stack([np.sin(3.0 * (x + 5)), (y + 6) // 3]), atol=1e-12)
 
 
@@ -442,7 +457,7 @@ class TestFile:
         mosaic.write(tmp_path / "m.fits")
         assert [p.name for p in tmp_path.iterdir()] == ["m.fits"]
         with fits.open(tmp_path / "m.fits") as hdulist:
-            assert [h.name for h in hdulist] == ["SCI", "VAR", "FOOTPRINT"]
+            assert [h.name for h in hdulist] == ["SCI", "VAR", "WEIGHT", "FOOTPRINT", "FLAGS", "CONTEXT"]
             header = hdulist[0].header
             assert header["BUNIT"] == "adu"
             assert header["NCOMBINE"] == 4
@@ -481,9 +496,9 @@ class TestBadInput:
             ({"method": "sum"}, "method must be one of 'mean', 'median', 'clipped', got 'sum'"),
             ({"order": 7}, "order must be an integer from 0 to 5"),
             ({"order": "cubic"}, "got 'cubic'"),
-            ({"algorithm": "drizzle"}, "algorithm must be one of"),
+            ({"algorithm": "lanczos"}, "algorithm must be one of"),
             ({"conserve": "mass"}, "conserve must be one of"),
-            ({"weights": "best"}, "weights must be 'noise', None or a dict"),
+            ({"weights": "best"}, "weights must be one of 'noise', .*, None or a dict by exposure, got 'best'"),
             ({"weights": {"frame0": 1}}, "weights of exposure frame1 must be a positive number, got None"),
             ({"scale": {"frame0": -1}}, "scale of exposure frame0"),
             ({"grid": 3}, "grid must be None, an astropy WCS or a FITS header, got int"),

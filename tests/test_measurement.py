@@ -5,98 +5,36 @@ import warnings
 import numpy as np
 import pytest
 from astropy import units as u
+from photutils.psf import SourceGrouper
 from scipy.spatial import cKDTree
+from star_images import (
+    GAIN,
+    READ_NOISE,
+    SKY,
+    errors,
+    identify,
+    image,
+    ladder,
+    observe,
+    on_pixels,
+    positions,
+    scattered,
+    usable,
+)
 
-from legdistort import moffat
+from legdistort import moffat, profile_fits
+from legdistort.blends import group_stars, members
 from legdistort.catalogs import DETECTED, check
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.exposures import Exposure, read_exposures
-from legdistort.measurement import UNUSABLE, Flag, measure
-
-SKY, GAIN, READ_NOISE = 100.0, 2.0, 10.0
-
-
-def profile(dx, dy, fwhm, beta, squash=1.2, theta=0.5):
-    """Moffat profile of unit flux; axes fwhm * squash and fwhm / squash."""
-    k = 2 ** (1 / beta) - 1
-    along, across = dx * np.cos(theta) + dy * np.sin(theta), dy * np.cos(theta) - dx * np.sin(theta)
-    r2 = (2 * along / (fwhm * squash)) ** 2 + (2 * across * squash / fwhm) ** 2
-    return (beta - 1) * 4 * k / (np.pi * fwhm**2) * (1 + k * r2) ** -beta
-
-
-def on_pixels(x, y, columns, rows, *args, sub=5):
-    """The profile averaged over sub x sub points of every pixel."""
-    offsets = (np.arange(sub) + 0.5) / sub - 0.5
-    fine_x, fine_y = (columns[:, None] + offsets).ravel() - x, (rows[:, None] + offsets).ravel() - y
-    return profile(fine_x, fine_y[:, None], *args).reshape(len(rows), sub, len(columns), sub).mean(axis=(1, 3))
-
-
-def image(shape, xy, flux, fwhm, beta=3.0, half=None):
-    out = np.full(shape, SKY)
-    half = half or int(7 * fwhm)
-    for (x, y), f in zip(xy, flux, strict=True):
-        columns = np.arange(max(0, int(x) - half), min(shape[1], int(x) + half + 1))
-        rows = np.arange(max(0, int(y) - half), min(shape[0], int(y) + half + 1))
-        out[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += f * on_pixels(
-            x, y, columns, rows, fwhm, beta, sub=3 if fwhm > 3 else 5
-        )
-    return out
-
-
-def observe(noiseless, rng):
-    electrons = rng.poisson(noiseless * GAIN) + rng.normal(0, READ_NOISE, noiseless.shape)
-    return (electrons / GAIN).astype(np.float32)
-
-
-def scattered(rng, n, size):
-    """Positions on a jittered grid: isolated stars at every pixel phase."""
-    side = int(np.ceil(np.sqrt(n)))
-    grid = (np.stack(np.meshgrid(*[np.arange(side) + 0.5] * 2), axis=-1).reshape(-1, 2) * size / side)[:n]
-    return grid + rng.uniform(-3, 3, grid.shape)
-
-
-def bound(flux, fwhm, beta=3.0, half=20):
-    """Cramer-Rao bound of x and y with eight free parameters, and the signal-to-noise ratio."""
-    pixels = np.arange(-half, half + 1)
-
-    def model(p):
-        return p[2] * on_pixels(p[0], p[1], pixels, pixels, p[3], np.exp(p[4]), p[5], p[6]) + p[7]
-
-    p = np.array([0.2, 0.3, flux, fwhm, np.log(beta), 1.2, 0.5, SKY])
-    variance = model(p) / GAIN + (READ_NOISE / GAIN) ** 2
-    steps = np.diag(1e-4 * np.maximum(1, np.abs(p)))
-    jac = np.array([((model(p + s) - model(p - s)) / (2 * s.sum()) / np.sqrt(variance)).ravel() for s in steps])
-    ratio = np.sqrt(((model(p) - SKY) ** 2 / variance).sum())
-    return np.sqrt(np.diag(np.linalg.inv(jac @ jac.T))[:2]), ratio
-
-
-def positions(table):
-    return np.column_stack([table["x"].value, table["y"].value])
-
-
-def errors(table):
-    return np.column_stack([table["x_err"].value, table["y_err"].value])
-
-
-def identify(table, xy, radius=1.5):
-    """Index of the true star of every row, -1 for none."""
-    distance, index = cKDTree(xy).query(positions(table))
-    return np.where(distance < radius, index, -1)
-
-
-def usable(table):
-    return table[(table["flags"] & UNUSABLE) == 0]
+from legdistort.measurement import Flag, measure
 
 
 @pytest.fixture(scope="module", params=[4.5, 2.0], ids=["fwhm4.5", "fwhm2"])
 def campaign(request):
     """Five frames of 400 stars of known signal-to-noise ratio, and what was measured."""
     fwhm, rng = request.param, np.random.default_rng(11)
-    fluxes = np.geomspace(30, 1e6, 24)
-    bounds, ratios = zip(*(bound(f, fwhm) for f in fluxes), strict=True)
-    ratio = np.geomspace(9, 1000, 400)
-    flux = np.exp(np.interp(np.log(ratio), np.log(ratios), np.log(fluxes)))
-    limit = np.exp([np.interp(np.log(ratio), np.log(ratios), np.log(b)) for b in np.transpose(bounds)]).T
+    ratio, flux, limit = ladder(400, fwhm)
     rows = []
     for i in range(5):
         xy, order = scattered(rng, 400, 800), rng.permutation(400)
@@ -152,6 +90,130 @@ def test_profile_equals_an_independent_rendering(fwhm):
     model = moffat.evaluate(params, 8, nodes)[0].reshape(17, 17) / moffat.flux(params)
     np.testing.assert_allclose(model, truth, atol=1e-3 * truth.max())
     assert moffat.fwhm(params)[0] == pytest.approx(fwhm)
+
+
+@pytest.mark.parametrize("fwhm", [1.0, 1.51, 1.91, 2.0, 2.5, 3.01, 3.5, 6.0])
+def test_no_bias_with_the_phase_of_the_pixels(fwhm):
+    """Stars without noise, at a signal-to-noise ratio of 1000: off by less than a tenth of the error."""
+    flux = ladder(2, fwhm)[1][-1]
+    half, phases = max(4, int(np.ceil(2 * fwhm))), np.linspace(-0.5, 0.4, 6)
+    xy = np.stack(np.meshgrid(phases, phases), axis=-1).reshape(-1, 2)
+    pixels = np.arange(-half, half + 1)
+    light = flux * np.array([on_pixels(x, y, pixels, pixels, fwhm, 3.0, sub=21).ravel() for x, y in xy])
+    weights = 1 / ((light + SKY) / GAIN + (READ_NOISE / GAIN) ** 2)
+    shape = moffat.shape(fwhm)
+    start = np.column_stack([np.zeros((len(xy), 2)), light.max(axis=1), np.tile(shape, (len(xy), 1)), 0 * xy[:, 0]])
+    fit = profile_fits.fit(light, weights, start, nodes=moffat.quadrature(fwhm), centre=shape)
+    error = np.sqrt(np.einsum("nii->ni", fit.covariance)[:, :2])
+    assert np.all(fit.converged)
+    assert np.abs((fit.params[:, :2] - xy) / error).max() < 0.1
+
+
+@pytest.fixture(scope="module")
+def faint():
+    """Two frames of stars near the limit measured with all kinds of shape: {kind: rows}."""
+    rng, out = np.random.default_rng(21), {}
+    ratio, flux, limit = ladder(400, 3.5, 5, 60)
+    for i in range(2):
+        xy, order = scattered(rng, 400, 800), rng.permutation(400)
+        frame = Exposure(f"frame{i}", observe(image((800, 800), xy, flux[order], 3.5), rng), gain=GAIN)
+        for kind in ("own", "shared", "linear"):
+            table = usable(measure(frame, profile=kind, threshold=4))
+            star = identify(table, xy)
+            table, star = table[star >= 0], star[star >= 0]
+            which = order[star]
+            off = positions(table) - xy[star]
+            of_flux = (np.asarray(table["flux"]) / flux[which] - 1)[:, None]
+            columns = [ratio[which, None], off / limit[which], off / errors(table), of_flux, table["flux_err"][:, None]]
+            out.setdefault(kind, []).append(np.column_stack(columns))
+    return {kind: np.concatenate(rows) for kind, rows in out.items()}
+
+
+def test_faint_stars_gain_from_a_shared_shape(faint):
+    def rms(kind, column, low, high):
+        rows = faint[kind]
+        return np.sqrt(np.mean(rows[(rows[:, 0] > low) & (rows[:, 0] < high)][:, column] ** 2))
+
+    for kind in ("shared", "linear"):
+        assert len(faint[kind]) >= len(faint["own"]) - 5
+        assert rms(kind, slice(1, 3), 5, 10) < rms("own", slice(1, 3), 5, 10)
+        # The bound of positions is the same (the shape is even, shifts are odd), fluxes gain at all brightnesses
+        for low, high in ((5, 10), (10, 30), (30, 60)):
+            assert rms(kind, 5, low, high) < 0.7 * rms("own", 5, low, high)
+            assert rms(kind, slice(3, 5), low, high) == pytest.approx(1, abs=0.1)
+
+
+def test_shape_that_varies_over_the_field():
+    """Round in the middle, elongated towards the edges: a linear shape leaves the least, and errors stay true."""
+    rng = np.random.default_rng(6)
+    xy, flux = scattered(rng, 196, 560), 10 ** rng.uniform(3.3, 5, 196)
+    squash = 1 + 0.3 * xy[:, 0] / 560
+    frame = Exposure("f", observe(image((560, 560), xy, flux, 3.5, squash=squash, theta=0 * squash), rng), gain=GAIN)
+    chi2 = {}
+    for kind in ("own", "shared", "linear"):
+        table = usable(measure(frame, profile=kind))
+        z = (positions(table) - xy[identify(table, xy)]) / errors(table)
+        assert np.std(z) == pytest.approx(1, abs=0.1) or kind == "shared"
+        chi2[kind] = np.mean(table["chi2"][:50])
+    assert chi2["own"] < 1.3
+    assert chi2["linear"] < 1.3
+    assert chi2["shared"] > 2
+
+
+def test_blends_fitted_together_are_better():
+    rng = np.random.default_rng(13)
+    fwhm, n, out = 3.5, 225, {}
+    _, flux, _ = ladder(n, fwhm, 80, 300)
+    for i in range(2):
+        first, angle = scattered(rng, n, 640), rng.uniform(0, 2 * np.pi, n)
+        apart = fwhm * rng.uniform(1.5, 1.9, n)[:, None]
+        xy = np.concatenate([first, first + apart * np.column_stack([np.cos(angle), np.sin(angle)])])
+        light = np.concatenate([rng.permutation(flux), rng.permutation(flux)])
+        frame = Exposure(f"f{i}", observe(image((640, 640), xy, light, fwhm), rng), gain=GAIN)
+        for blends in ("together", "alone"):
+            table = usable(measure(frame, blends=blends))
+            star = identify(table, xy)
+            off = (positions(table) - xy[star])[star >= 0]
+            out.setdefault(blends, []).append(np.column_stack([off, off / errors(table)[star >= 0]]))
+            assert np.count_nonzero(star < 0) < 5
+            assert np.mean((table["flags"] & Flag.BLENDED) > 0) > 0.8
+    together, alone = (np.median(np.abs(np.concatenate(out[b])), axis=0) for b in ("together", "alone"))
+    assert np.all(together[:2] < 0.85 * alone[:2])
+    assert np.all(1.4826 * together[2:] < 1.2)
+    assert np.all(1.4826 * alone[2:] > 1.3)
+
+
+def test_isolated_stars_of_a_crowded_field_stay_calibrated():
+    """One star every 4 FWHM: those without another one in 3 FWHM, detected or not."""
+    rng, fwhm, size, z = np.random.default_rng(14), 3.5, 450, []
+    n = int((size / (4 * fwhm)) ** 2)
+    _, flux, _ = ladder(n, fwhm, 8, 500)
+    for i in range(2):
+        xy = rng.uniform(5, size - 5, (n, 2))
+        frame = observe(image((size, size), xy, rng.permutation(flux), fwhm), rng)
+        table = usable(measure(Exposure(f"f{i}", frame, gain=GAIN)))
+        star = identify(table, xy)
+        lonely = cKDTree(xy).query(xy, k=2)[0][:, 1] > 3 * fwhm
+        rows = (star >= 0) & lonely[star]
+        z.append(((positions(table) - xy[star]) / errors(table))[rows])
+    z = np.concatenate(z)
+    assert len(z) > 200
+    assert np.std(z) == pytest.approx(1, abs=0.08)
+
+
+def test_groups_are_those_of_photutils():
+    xy = np.random.default_rng(15).uniform(0, 300, (400, 2))
+    ours, theirs = group_stars(xy, 7.0, largest=400), SourceGrouper(7.0)(*xy.T)
+    pairs = np.unique(np.column_stack([ours, theirs]), axis=0)
+    assert len(pairs) == len(np.unique(ours)) == len(np.unique(theirs))
+    small = group_stars(xy, 30.0, largest=5)
+    assert np.bincount(small).max() <= 5
+    assert sorted(np.concatenate([stars.ravel() for stars in members(small)])) == list(range(400))
+    assert len(group_stars(np.zeros((0, 2)), 3.0)) == 0
+
+
+def test_stars_that_coincide_are_divided_somehow():
+    assert np.bincount(group_stars(np.ones((20, 2)), 3.0, largest=6)).max() <= 6
 
 
 def test_gain_is_found_when_it_is_missing():
@@ -245,6 +307,94 @@ def test_table_keeps_the_contract(troubled):
     assert set(table["exposure"]) == {"troubled"}
 
 
+@pytest.fixture(scope="module")
+def field():
+    """Positions, the sky-free light of 196 stars, and the noise-free frame."""
+    rng = np.random.default_rng(31)
+    xy = scattered(rng, 196, 512)
+    return xy, image((512, 512), xy, rng.permutation(ladder(196, 3.5, 10, 500)[1]), 3.5)
+
+
+def _slope(frame):
+    y, x = np.mgrid[: frame.shape[0], : frame.shape[1]]
+    return frame + 20.0 * x + 10.0 * y
+
+
+def _bowl(frame):
+    return frame + (np.arange(frame.shape[1]) - 250.0) ** 2 / 20
+
+
+def _gap(frame):
+    frame = frame.copy()
+    frame[200:260], frame[:, 300:330] = np.nan, np.nan
+    return frame
+
+
+def _bleeding(frame):
+    x, y = 250, 260
+    frame = np.minimum(frame + image(frame.shape, [(x, y)], [3e6], 3.5) - SKY, 30000)
+    frame[y - 90 : y + 90, x - 1 : x + 2] = 30000
+    return frame
+
+
+def _cosmics(frame):
+    frame, rng = frame.copy(), np.random.default_rng(32)
+    x, y = rng.integers(3, 509, (2, 200))
+    frame[y, x] += rng.uniform(200, 5000, 200)
+    return frame
+
+
+#: What is done to a noisy frame (or, of skies, before the noise), and how many of 196 stars must stay.
+FRAMES = {
+    "unsigned integers": (lambda frame: np.round(frame).astype(np.uint16), False, 190),
+    "big-endian integers": (lambda frame: np.round(frame).astype(">i4"), False, 190),
+    "negative sky": (lambda frame: frame - 3000, False, 190),
+    "steep sky": (_slope, False, 185),
+    "curved sky with its noise": (_bowl, True, 170),
+    "gaps": (_gap, False, 150),
+    "bleeding": (_bleeding, False, 190),
+    "cosmic rays": (_cosmics, False, 175),
+    "units of 1e-18": (lambda frame: frame.astype(float) * 1e-18, False, 190),
+}
+
+
+@pytest.mark.parametrize("kind", FRAMES)
+def test_frames_as_they_come(field, kind):
+    """All kinds: no false star, the errors stay true."""
+    xy, clean = field
+    change, before, least = FRAMES[kind]
+    rng = np.random.default_rng(33)
+    frame = observe(change(clean), rng) if before else change(observe(clean, rng))
+    gain = GAIN * 1e18 if kind == "units of 1e-18" else GAIN
+    table = usable(measure(Exposure(kind, frame, gain=gain, saturation=30000 if kind == "bleeding" else None)))
+    star = identify(table, xy)
+    assert np.count_nonzero(star < 0) <= 1
+    assert len(table) >= least
+    assert np.std(((positions(table) - xy[star]) / errors(table))[star >= 0]) == pytest.approx(1, abs=0.15)
+
+
+def test_stars_on_the_border_say_so():
+    rng = np.random.default_rng(34)
+    across = np.tile([-1.0, 0, 1, 2, 3, 4, 5, 6, 7, 8], 3) + rng.uniform(-0.5, 0.5, 30)
+    xy = np.column_stack([np.arange(20, 500, 16.0), across])
+    table = measure(Exposure("border", observe(image((128, 512), xy, np.full(30, 2e4), 3.5), rng), gain=GAIN))
+    edge = (table["flags"] & Flag.EDGE) > 0
+    np.testing.assert_array_equal(edge, (table["y"].value + 0.5 < table["fwhm"].value))
+    z = (positions(table) - xy[identify(table, xy, 2.5)]) / errors(table)
+    assert np.abs(z[~edge]).max() < 4
+    assert np.count_nonzero(~edge) >= 14
+
+
+def test_data_that_are_no_image():
+    for data in (np.zeros(5), np.zeros((3, 9, 9))):
+        with pytest.raises(InputError, match=r"cube: the data have shape .*, an exposure is one 2-D image"):
+            measure(Exposure("cube", data))
+    with pytest.raises(InputError, match="every pixel is NaN"):
+        Exposure("blank", np.full((9, 9), np.nan))
+    with pytest.raises(InputError, match="every pixel is hidden by the mask"):
+        Exposure("hidden", np.ones((9, 9)), mask=np.ones((9, 9), dtype=bool))
+
+
 def test_noise_alone_gives_almost_nothing():
     rng = np.random.default_rng(1)
     frames = [Exposure(f"n{i}", rng.normal(100, 7, (700, 700)), gain=GAIN) for i in range(4)]
@@ -292,6 +442,8 @@ def test_frames_are_independent_and_inputs_untouched():
         ({"box": 8}, "box must be an odd number of pixels, at least 5, got 8"),
         ({"gain": -1.0}, "gain must be a positive number, got -1.0"),
         ({"saturation": np.inf}, "saturation must be a positive number"),
+        ({"profile": "mine"}, "profile must be one of 'own', 'shared', 'linear', got 'mine'"),
+        ({"blends": "never"}, "blends must be one of 'together', 'alone', got 'never'"),
     ],
 )
 def test_bad_arguments(arguments, message):

@@ -29,7 +29,7 @@ import legdistort as ld
 from legdistort import baselines, performance
 from legdistort.exceptions import LegdistortWarning
 from legdistort.instruments import GsaoiMap
-from legdistort.pipeline import fwhm_ratio
+from legdistort.quality import assess
 
 HERE = Path(__file__).parent
 
@@ -232,7 +232,7 @@ def _stack(plan, twin_, solutions):
     zooms = _zooms(method, static)
     plan.save(figures.stacks(*mosaics, zooms), "stack")
     for mosaic, solution, name in zip(mosaics, (method, static), ("all solved", "static + shift"), strict=True):
-        ratio = fwhm_ratio(mosaic, solution)
+        ratio = assess(mosaic, solution, exposures=twin_.exposures).fwhm_ratio
         yield Row(
             "5.3",
             f"FWHM in the stack over that in an exposure: {name}",

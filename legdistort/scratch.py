@@ -1,0 +1,98 @@
+"""Pixels of exposures on disk while a mosaic is being made: a file for every plane, read by pieces."""
+
+import shutil
+import tempfile
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .exceptions import DiskFullError, InputError
+from .files import is_full
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Stored:
+    """Planes of one exposure in a scratch folder.
+
+    Attributes
+    ----------
+    name : str
+        Of the exposure.
+    paths : dict
+        File of each plane, by its name.
+    """
+
+    name: str
+    paths: dict
+
+    def piece(self, plane, part):
+        """A piece of a plane, by slices of its rows and columns; None if there is no such plane."""
+        if plane not in self.paths:
+            return None
+        # Mapped for this piece alone: what stays mapped counts as memory of the process.
+        return np.array(np.load(self.paths[plane], mmap_mode="r")[part])
+
+
+@contextmanager
+def scratch_folder(parent, need):
+    """A folder for planes that is gone when the block ends, however it ends.
+
+    Parameters
+    ----------
+    parent : str, path or None
+        Where to make it; None = where the system keeps temporary files (``TMPDIR``).
+    need : int
+        Bytes that will be stored.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made there.
+    DiskFullError
+        If the disk is full.
+    """
+    place = Path(tempfile.gettempdir() if parent is None else parent)
+    advice = "give another folder as scratch= (or in the environment, TMPDIR)"
+    try:
+        folder = tempfile.mkdtemp(prefix="legdistort-", dir=place)
+    except OSError as error:
+        raise InputError(f"no scratch folder can be made in {place} ({error.strerror}): {advice}") from None
+    try:
+        free = shutil.disk_usage(place).free
+        if free < need:
+            raise DiskFullError(
+                f"the pixels of the exposures take {need / 2**30:.2g} GB while the mosaic is made, {place} has "
+                f"{free / 2**30:.2g} GB left: {advice}"
+            )
+        yield Path(folder)
+    except OSError as error:
+        if not is_full(error):
+            raise
+        raise DiskFullError(f"No space left on the disk of {place}: {advice}; no mosaic was made") from None
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def store(folder, name, planes):
+    """Store planes of an exposure.
+
+    Parameters
+    ----------
+    folder : path
+        From `scratch_folder`.
+    name : str
+        Of the exposure.
+    planes : dict of ndarray or None
+        By name; None is left out.
+
+    Returns
+    -------
+    Stored
+    """
+    own = Path(tempfile.mkdtemp(dir=folder))  # not by its name, which is free text
+    paths = {plane: own / f"{plane}.npy" for plane, values in planes.items() if values is not None}
+    for plane, path in paths.items():
+        np.save(path, planes[plane])
+    return Stored(name, paths)

@@ -1,0 +1,156 @@
+"""Isolation of stars: the shift that neighbours would cause, and deformed stars, against rendered images."""
+
+import numpy as np
+import pytest
+from astropy.stats import biweight_scale
+from astropy.table import QTable
+from scipy.spatial import cKDTree
+
+import legdistort as ld
+from legdistort import isolation
+from legdistort.exceptions import InputError
+from legdistort.exposures import Exposure
+from legdistort.fitting import Flag
+from legdistort.measurement import UNUSABLE
+from legdistort.rendering import Moffat, add_noise, render
+
+SKY, GAIN, READ_NOISE = 100.0, 2.0, 10.0
+PSF = Moffat(4.5, 3.0)
+
+
+@pytest.mark.parametrize("distance", [1.2, 2.0, 3.0])
+@pytest.mark.parametrize("fwhm", [3.0, 5.0])
+def test_displacement_is_that_of_a_fit_that_knows_no_neighbour(distance, fwhm):
+    """Least squares of one star to a noiseless image of two, linearised at the truth."""
+    half, ratio, turn = int(np.ceil(2 * fwhm)), 0.01, 0.7
+    psf, xy = Moffat(fwhm, 3.0), np.array([half, half], dtype=float)
+    away = distance * fwhm * np.array([np.cos(turn), np.sin(turn)])
+    shape, n = (2 * half + 1,) * 2, (2 * half + 1) ** 2
+
+    def star(at, flux=1.0):
+        return render(shape, [at], [flux], psf=psf).ravel()
+
+    step = np.eye(2) * 1e-3
+    slopes = [(star(xy + s) - star(xy - s)) / 2e-3 for s in step]
+    design = np.column_stack([*slopes, star(xy), np.ones(n)])
+    shift = np.linalg.lstsq(design, star(xy + away, ratio), rcond=None)[0][:2]
+    ours = isolation.displacement([xy, xy + away], [1.0, ratio], fwhm)
+    rtol = 0.15 if distance < 3 else 0.35  # there the box ends: little pull is left, and it hangs on the corners
+    np.testing.assert_allclose(ours[0], shift, atol=rtol * np.hypot(*shift))
+    assert ours[0] @ away > 0  # towards the neighbour
+
+
+def test_displacements_add_as_vectors():
+    xy, flux = np.array([[50.0, 50], [58, 50], [42, 50], [50, 60]]), np.array([1.0, 2.0, 2.0, 0.5])
+    shift = isolation.displacement(xy, flux, 4.0)
+    assert shift[0, 0] == pytest.approx(0, abs=1e-12)  # two equal ones on either side
+    assert shift[0, 1] > 0
+    one = isolation.displacement(xy[[0, 1]], flux[[0, 1]], 4.0)[0]
+    double = isolation.displacement(xy[[0, 1]], [1.0, 4.0], 4.0)[0]
+    np.testing.assert_allclose(double, 2 * one)
+    turned = isolation.displacement(xy[:, ::-1], flux, 4.0)
+    np.testing.assert_allclose(turned, shift[:, ::-1], atol=1e-12)
+    assert (isolation.displacement([[0, 0], [100, 0]], [1, 1], 4.0) == 0).all()
+    dark = isolation.displacement(xy, [1.0, -2.0, 2.0, 0.5], 4.0)
+    assert np.isnan(dark[1]).all()
+    assert dark[0, 0] < 0
+    without = isolation.displacement(xy, flux, 4.0, sources=np.array([True, False, True, True]))
+    np.testing.assert_allclose(without[0], dark[0])
+
+
+def crowded(seed, *, spacing=8.0, size=500):
+    """A frame with one star a (`spacing` FWHM)^2 at random, mean distance to the next one `spacing` / 2 FWHM."""
+    rng = np.random.default_rng(seed)
+    n = int((size / (spacing * PSF.fwhm)) ** 2)
+    xy = rng.uniform(-10, size + 10, (n, 2))
+    low, high = 2000.0**-0.5, 1e6**-0.5  # N(> flux) goes as flux^-1/2
+    flux = (low + rng.uniform(size=n) * (high - low)) ** -2.0
+    image = add_noise(render((size, size), xy, flux, psf=PSF, sky=SKY), rng, gain=GAIN, read_noise=READ_NOISE)
+    table = ld.measure(Exposure(f"crowd{seed}", image, gain=GAIN))
+    table = table[(table["flags"] & UNUSABLE) == 0]
+    found = np.column_stack([table["x"].value, table["y"].value])
+    error = np.column_stack([table["x_err"].value, table["y_err"].value])
+    near = cKDTree(xy).query_ball_point(found, 0.6 * PSF.fwhm)
+    brightest = [max(stars, key=lambda k: flux[k]) if stars else -1 for stars in near]
+    known = np.array(brightest) >= 0
+    return table[known], ((found - xy[brightest]) / error)[known]
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    tables, pulls = zip(*(crowded(seed) for seed in range(8)), strict=True)
+    isolated = np.concatenate([isolation.is_isolated(table) for table in tables])
+    return isolated, np.concatenate(pulls), np.concatenate([table["crowding"] for table in tables])
+
+
+def test_isolated_stars_of_a_crowded_field_have_true_errors(crowd):
+    isolated, pulls, _ = crowd
+    assert 0.75 < isolated.mean() < 0.97  # not at the price of most stars
+    assert biweight_scale(pulls[isolated].ravel()) == pytest.approx(1.0, abs=0.08)
+    assert np.std(pulls[isolated]) < 1.25
+    assert np.std(pulls[~isolated]) > 2 * np.std(pulls[isolated])
+    assert np.mean(np.abs(pulls[isolated]) > 5) < 0.25 * np.mean(np.abs(pulls) > 5)
+
+
+def test_column_and_flag(crowd):
+    _, _, crowding = crowd
+    assert (crowding >= 0).all()
+    assert (crowding == 0).any()
+    assert (crowding > isolation.LIMIT).any()
+
+
+def test_unresolved_pairs_are_deformed_and_single_stars_are_not():
+    rng = np.random.default_rng(4)
+    grid = np.stack(np.meshgrid(*[np.arange(12) * 45 + 30.0] * 2), axis=-1).reshape(-1, 2)
+    xy, flux = grid + rng.uniform(-3, 3, grid.shape), np.full(len(grid), 1e5)
+    pairs = np.arange(0, len(grid), 12)  # one in twelve has a companion of a tenth, half a FWHM away
+    turn = rng.uniform(0, 2 * np.pi, len(pairs))
+    beside = xy[pairs] + 0.55 * PSF.fwhm * np.column_stack([np.cos(turn), np.sin(turn)])
+    light = render((570, 570), [*xy, *beside], [*flux, *np.full(len(pairs), 1e4)], psf=PSF, sky=SKY)
+    image = add_noise(light, rng, gain=GAIN, read_noise=READ_NOISE)
+    table = ld.measure(Exposure("pairs", image, gain=GAIN))
+    star = cKDTree(xy).query(np.column_stack([table["x"].value, table["y"].value]))[1]
+    deformed = (table["flags"] & Flag.DEFORMED) != 0
+    assert deformed[np.isin(star, pairs)].all()
+    assert deformed[~np.isin(star, pairs)].mean() < 0.03
+    assert not isolation.is_isolated(table)[deformed].any()
+
+
+def test_shapes_that_scatter_make_no_star_deformed():
+    """A profile that differs from star to star by much more than the noise of the shapes."""
+    rng = np.random.default_rng(5)
+    shapes = np.array([-1.2, -1.2, 0.0, 1.0]) + 0.1 * rng.standard_normal((200, 4))
+    covariance = np.tile(np.diag(np.full(4, 1e-6)), (200, 1, 1))
+    usable, snr = np.ones(200, dtype=bool), rng.uniform(10, 100, 200)
+    assert isolation.is_deformed(shapes, covariance, snr=snr, usable=usable).mean() < 0.05
+    assert not isolation.is_deformed(
+        shapes[:5], covariance[:5], snr=snr[:5], usable=usable[:5]
+    ).any()  # too few to tell
+
+
+def test_limit():
+    table = QTable({"crowding": [0.0, 2.0, 5.0, np.inf], "flags": [0, 256, 0, 0]})
+    np.testing.assert_array_equal(isolation.is_isolated(table), [True, False, False, False])
+    np.testing.assert_array_equal(isolation.is_isolated(table, 6.0), [True, False, True, False])
+    for everything in (None, np.inf):
+        assert isolation.is_isolated(table, everything).all()
+    assert isolation.is_isolated(table["flags",]).all()  # tables of other programs
+    with pytest.raises(InputError, match="isolation must be a positive number of standard errors, or None, got 0"):
+        isolation.is_isolated(table, 0)
+
+
+def test_match_leaves_out_what_is_not_isolated():
+    rng = np.random.default_rng(6)
+    xy = np.stack(np.meshgrid(np.arange(8) * 60 + 45.0, np.arange(5) * 90 + 50.0), axis=-1).reshape(-1, 2)
+    xy += rng.uniform(-20, 20, xy.shape)
+    rows = []
+    for name, shift in (("a", 0.0), ("b", 12.0), ("c", -7.0), ("d", 3.0)):
+        for k, (x, y) in enumerate(xy + shift):
+            rows.append((name, x, y, 0.01, 0.01, 1e4 + k, 0, 5.0 if k < 10 else 0.5))
+    names = ("exposure", "x", "y", "x_err", "y_err", "flux", "flags", "crowding")
+    table = QTable(rows=rows, names=names)
+    assert len(ld.match(table, shape=(520, 520)).stars) == 30
+    assert len(ld.match(table, shape=(520, 520), isolation=10).stars) == 40
+    assert len(ld.match(table, shape=(520, 520), isolation=None).stars) == 40
+    with pytest.raises(InputError, match="isolation must be a positive number"):
+        ld.match(table, shape=(520, 520), isolation=-1)

@@ -1,0 +1,409 @@
+"""Work on many cores: the same results, bit for bit, in bounded memory, and nothing left when it fails."""
+
+import _thread
+import logging
+import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.nddata import CCDData
+from test_coaddition import SHAPE, expose, scene
+
+import legdistort as ld
+from legdistort import coaddition, levels, scratch, stacking
+from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError, LegdistortError
+from legdistort.exposure_files import ExposureFile
+from legdistort.parallel import each
+
+WORK = {"serial": {"workers": 1}, "threads": {"workers": 2, "threads": True}, "processes": {"workers": 2}}
+
+
+def work(i):
+    """What other processes import from this file."""
+    if i == 3:
+        warnings.warn("three is assumed", AssumptionWarning, stacklevel=1)
+    logging.getLogger("legdistort.test").warning("item %d", i)
+    if i == 99:
+        raise InputError("99 is not a number to work on")
+    return i * i
+
+
+def die(i):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two processes."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        yield cluster
+
+
+@pytest.fixture
+def client(cluster):
+    """The cluster as the current client, for one test."""
+    with cluster.get_client() as client:
+        yield client
+
+
+@pytest.fixture
+def interruptible():
+    """Ctrl-C as in a terminal: what a shell starts in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+class TestEach:
+    @pytest.mark.parametrize("how", WORK)
+    def test_results_warnings_log_and_errors_come_as_from_a_loop(self, how, caplog):
+        with pytest.warns(AssumptionWarning, match="three is assumed"):
+            assert list(each(work, range(10), **WORK[how])) == [i * i for i in range(10)]
+        assert sorted(r.getMessage() for r in caplog.records) == [f"item {i}" for i in range(10)]
+        with pytest.raises(InputError) as caught:
+            list(each(work, [1, 99, 2], **WORK[how]))
+        assert str(caught.value) == "99 is not a number to work on"  # no traceback of a worker in it
+
+    def test_the_client_of_the_caller_is_used(self, client):
+        assert set(each(_process, range(8))) == set(client.run(os.getpid).values())
+        assert set(each(_process, range(8), workers=1)) == {os.getpid()}
+        with pytest.raises(InputError, match=r"^99 is not a number to work on$"):
+            list(each(work, [99]))
+
+    def test_few_items_are_in_flight(self):
+        drawn, most = 0, 0
+
+        def items():
+            nonlocal drawn
+            for i in range(60):
+                drawn += 1
+                yield i
+
+        for done, _ in enumerate(each(abs, items(), workers=2, threads=True)):
+            most = max(most, drawn - done)
+        assert most <= 8
+
+    def test_a_process_that_dies_is_explained(self):
+        with pytest.raises(LegdistortError, match="a worker process died: it ran out of memory, or this is a script"):
+            list(each(die, [1], workers=2))
+
+    @pytest.mark.parametrize("how", ["threads", "processes"])
+    @pytest.mark.usefixtures("interruptible")
+    def test_an_interrupt_ends_it(self, how):
+        before = set(multiprocessing.active_children())
+        timer = threading.Timer(1, _thread.interrupt_main)
+        timer.start()
+        begin = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            list(each(time.sleep, [0.3] * 300, **WORK[how]))
+        assert time.monotonic() - begin < 30
+        assert set(multiprocessing.active_children()) <= before
+
+    @pytest.mark.parametrize("workers", [0, -1, 1.5, True])
+    def test_bad_numbers_of_workers(self, workers):
+        with pytest.raises(InputError, match="workers must be a positive integer, or None for one, got"):
+            list(each(abs, [1], workers=workers))
+
+
+def _process(i):
+    time.sleep(0.05)
+    return os.getpid()
+
+
+# --- exposures that stay in their files ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """Three frames of a few stars: plain, gzipped with companions, tile-compressed."""
+    folder, rng = tmp_path_factory.mktemp("frames"), np.random.default_rng(7)
+    y, x = np.mgrid[:120, :150]
+    xy = rng.uniform(15, 105, (12, 2))
+    stars = sum(4e3 * np.exp(-((x - px) ** 2 + (y - py) ** 2) / 5) for px, py in xy)
+    header = fits.Header({"GAIN": 2.0, "EXPTIME": 30.0, "RDNOISE": 5.0})
+    for i, name in enumerate(["a.fits", "b.fits.gz", "c.fits"]):
+        image = np.clip(rng.normal(100 + stars, 8), 0, 65535)
+        image = image.astype(np.uint16 if i == 0 else np.float32)
+        hdus = [fits.PrimaryHDU(image, header)]
+        if i == 1:
+            mask = fits.ImageHDU((rng.random(image.shape) < 0.01).astype(np.uint8), name="MASK")
+            hdus += [mask, fits.ImageHDU(np.full(image.shape, 8.0, dtype=np.float32), name="ERR")]
+        if i == 2:
+            hdus = [fits.PrimaryHDU(), fits.CompImageHDU(image, header, quantize_level=0, compression_type="GZIP_2")]
+        fits.HDUList(hdus).writeto(folder / name)
+    return [folder / name for name in ("a.fits", "b.fits.gz", "c.fits")]
+
+
+class TestExposureFiles:
+    def test_they_are_what_read_exposures_gives(self, frames):
+        for handle, exposure in zip(ld.open_exposures(frames), ld.read_exposures(frames), strict=True):
+            assert isinstance(handle, ExposureFile)
+            for thing in (handle, pickle.loads(pickle.dumps(handle))):
+                read = thing.read()
+                for name in ("name", "shape", "saturation", "gain", "read_noise", "exposure_time", "path"):
+                    assert getattr(thing, name) == getattr(exposure, name) == getattr(read, name)
+                assert thing.header.tostring() == exposure.header.tostring()
+                for name in ("data", "mask", "uncertainty"):
+                    np.testing.assert_array_equal(getattr(read, name), getattr(exposure, name))
+            assert exposure.read() is exposure
+            assert repr(handle) == f"<ExposureFile {handle.name!r}: 150 x 120 px in {handle.path}>"
+
+    def test_an_extension_is_remembered(self, frames):
+        (handle,) = ld.open_exposures(frames[1], ext="ERR")
+        assert handle.name == "b_ERR"
+        np.testing.assert_array_equal(handle.read().data, 8)
+
+    def test_what_is_in_memory_stays_there(self, frames):
+        with fits.open(frames[0]) as hdulist:
+            (from_list,) = ld.open_exposures([hdulist])
+        (from_ccd,) = ld.open_exposures(CCDData(np.ones((5, 5)), unit="adu"))
+        assert isinstance(from_list, ld.Exposure)
+        assert isinstance(from_ccd, ld.Exposure)
+
+    def test_files_that_change_or_go_are_named(self, frames, tmp_path):
+        path = tmp_path / "x.fits"
+        fits.writeto(path, np.ones((9, 8)))
+        (handle,) = ld.open_exposures(path)
+        fits.writeto(path, np.ones((9, 7)), overwrite=True)
+        with pytest.raises(InputError, match=r"x.fits has changed: its image had shape \(9, 8\), now \(9, 7\)"):
+            handle.read()
+        path.unlink()
+        with pytest.raises(InputError, match=r"x.fits: no such file"):
+            handle.read()
+        with pytest.raises(InputError, match="two exposures are named 'a'"):
+            ld.open_exposures([frames[0], frames[0]])
+
+    def test_measuring_is_the_same_for_files_and_processes(self, frames, client):
+        plain = ld.measure(ld.read_exposures(frames), workers=1)
+        assert len(set(plain["exposure"])) == 3
+        handles = ld.open_exposures(frames)
+        for table in (ld.measure(handles, workers=1), ld.measure(handles, workers=2), ld.measure(handles)):
+            assert table.colnames == plain.colnames
+            for name in plain.colnames:
+                np.testing.assert_array_equal(table[name], plain[name])
+
+
+# --- planes on disk -----------------------------------------------------------------------------------------------
+
+
+class TestScratch:
+    def test_planes_come_back_by_pieces(self, tmp_path):
+        plane = np.arange(30.0).reshape(5, 6)
+        with scratch.scratch_folder(tmp_path, 1) as folder:
+            stored = scratch.store(folder, "a / b", {"data": plane, "bad": None})
+            piece = stored.piece("data", (slice(1, 3), slice(2, 6)))
+            np.testing.assert_array_equal(piece, plane[1:3, 2:6])
+            assert type(piece) is np.ndarray  # and not what keeps the file mapped
+            assert stored.piece("bad", (slice(0, 1), slice(0, 1))) is None
+        assert not any(tmp_path.iterdir())
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, OSError(28, "No space left on device")])
+    def test_nothing_is_left(self, tmp_path, error):
+        def fail():
+            with scratch.scratch_folder(tmp_path, 1) as folder:
+                scratch.store(folder, "a", {"data": np.ones(3)})
+                raise error
+
+        with pytest.raises((KeyboardInterrupt, ValueError, DiskFullError)):
+            fail()
+        assert not any(tmp_path.iterdir())
+
+    def test_a_disk_too_small_is_told_before(self, tmp_path):
+        with (
+            pytest.raises(DiskFullError, match=r"take 1.1e\+09 GB while the mosaic is made, .* give another folder"),
+            scratch.scratch_folder(tmp_path, 2**60),
+        ):
+            pass
+        with pytest.raises(InputError, match="no scratch folder can be made in"), scratch.scratch_folder("/none", 1):
+            pass
+
+
+# --- mosaics ------------------------------------------------------------------------------------------------------
+
+PLANES = ("data", "variance", "weight", "footprint", "flags", "context")
+
+
+def night(n=4, seed=3, **planes):
+    """Noisy exposures of a few stars with bad pixels, and the truth about their distortions."""
+    solution, stars, flux = scene(n, rolls=range(n), spread=5, peak=5)
+    rng = np.random.default_rng(seed)
+    exposures = []
+    for e in expose(solution, stars, flux):
+        mask = rng.random(e.shape) < 0.002
+        data = (e.data + rng.normal(100, 8, e.shape)).astype(np.float32)
+        exposures.append(ld.Exposure(e.name, np.where(mask, 6e4, data), mask=mask, **planes))
+    return solution, exposures
+
+
+def assert_same(one, other):
+    for name in PLANES:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+class TestMosaicInBlocks:
+    @pytest.mark.parametrize(
+        "settings",
+        [
+            {"order": 3, "method": "clipped"},
+            {"order": 1},
+            {"order": 5, "method": "median"},
+            {"algorithm": "adaptive"},
+            {"algorithm": "drizzle"},
+            pytest.param({"algorithm": "exact"}, marks=pytest.mark.slow),
+        ],
+        ids=lambda s: " ".join(map(str, s.values())),
+    )
+    def test_they_fit_together(self, monkeypatch, settings):
+        solution, exposures = night(3 if settings.get("method") else 1)
+        monkeypatch.setattr(stacking, "_SAMPLES", 1 << 21)
+        whole = ld.coadd(exposures, solution, **settings)
+        assert max(whole.shape) < stacking.side(len(exposures))  # one block
+        monkeypatch.setattr(stacking, "_SAMPLES", 1)
+        pieces = ld.coadd(exposures, solution, **settings)
+        assert stacking.side(len(exposures)) == 64
+        for name in ("weight", "footprint", "flags", "context"):
+            np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name), err_msg=name)
+        # the exact algorithm puts every block on a small piece of a sphere, which is not quite flat
+        close = 2e-4 if settings.get("algorithm") == "exact" else 1e-6
+        np.testing.assert_allclose(pieces.data, whole.data, rtol=close, atol=1e-6 * np.nanmax(whole.data))
+        # found in a table of 256 fractions of a pixel, so rounding may take its neighbour
+        np.testing.assert_allclose(pieces.variance, whole.variance, rtol=0.02)
+
+    def test_any_number_of_workers_gives_the_same_bits(self, client, monkeypatch, tmp_path):
+        solution, exposures = night(uncertainty=np.full(SHAPE, 8.0))
+        monkeypatch.setattr(stacking, "_SAMPLES", 1 << 16)
+        settings = {"method": "clipped", "scratch": tmp_path}
+        one = ld.coadd(exposures, solution, workers=1, **settings)
+        for workers in (2, 3, None):  # None: the processes of the cluster
+            assert_same(ld.coadd(exposures, solution, workers=workers, **settings), one)
+        assert not any(tmp_path.iterdir())
+
+    @pytest.mark.slow
+    def test_two_hundred_times_the_same(self, monkeypatch):
+        solution, exposures = night(2)
+        monkeypatch.setattr(stacking, "_SAMPLES", 1 << 15)
+        one = ld.coadd(exposures, solution, workers=1)
+        for _ in range(200):
+            assert_same(ld.coadd(exposures, solution, workers=2), one)
+
+    def test_files_give_the_same_as_memory(self, tmp_path):
+        solution, exposures = night()
+        for e in exposures:
+            fits.HDUList([fits.PrimaryHDU(e.data), fits.ImageHDU(e.mask.astype(np.uint8), name="MASK")]).writeto(
+                tmp_path / f"{e.name}.fits"
+            )
+        assert_same(ld.coadd(ld.open_exposures(str(tmp_path / "*")), solution), ld.coadd(exposures, solution))
+
+    def test_the_context_says_who_contributes(self):
+        solution, exposures = night(34)
+        mosaic = ld.coadd(exposures, solution, order=1)
+        assert mosaic.context.shape == (2, *mosaic.shape)
+        bits = np.bitwise_count(mosaic.context).sum(axis=0)
+        np.testing.assert_array_equal(bits, mosaic.footprint)
+        for name in ("frame1", "frame33"):
+            alone = ld.coadd([e for e in exposures if e.name == name], solution, order=1)
+            ox, oy = np.array(alone.offset) - mosaic.offset
+            nx = alone.shape[1]
+            y, x = np.nonzero(np.pad(alone.footprint, ((oy, 0), (ox, 0))))
+            there = np.zeros(mosaic.shape, dtype=bool)
+            there[y, x] = True
+            for px, py in [(0, 0), (150, 200), (nx // 2, 3), (x.min(), y[x.argmin()]), (x.max(), y[x.argmax()])]:
+                assert (name in mosaic.contributors(px, py)) == there[py, px]
+        hdulist = mosaic.to_hdulist()
+        assert hdulist["CONTEXT"].data.dtype == np.int32
+        np.testing.assert_array_equal(hdulist["CONTEXT"].data.view(np.uint32), mosaic.context)
+        with pytest.raises(InputError, match=r"pixel \(-1, 0\) is not one of the \d+ x \d+ of the mosaic"):
+            mosaic.contributors(-1, 0)
+
+    @pytest.mark.usefixtures("interruptible")
+    def test_an_error_or_interrupt_leaves_nothing(self, monkeypatch, tmp_path):
+        solution, exposures = night(2)
+
+        def fail(*args, **kwargs):
+            raise OSError(28, "No space left on device")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(np, "save", fail)
+            with pytest.raises(DiskFullError, match=r"No space left on the disk of .* give another folder as scratch="):
+                ld.coadd(exposures, solution, scratch=tmp_path)
+        assert not any(tmp_path.iterdir())
+        survey = levels.survey
+        monkeypatch.setattr(coaddition, "survey", lambda *args, **kwargs: time.sleep(0.5) or survey(*args, **kwargs))
+        threading.Timer(1, _thread.interrupt_main).start()
+        with pytest.raises(KeyboardInterrupt):
+            [ld.coadd(exposures, solution, workers=2, scratch=tmp_path) for _ in range(20)]
+        assert not any(tmp_path.iterdir())
+
+    @pytest.mark.parametrize("first", [True, False])
+    def test_a_full_disk_loses_nothing(self, monkeypatch, tmp_path, first):
+        solution, exposures = night(1)
+        mosaic, path = ld.coadd(exposures, solution, order=0), tmp_path / "m.fits"
+        if not first:
+            mosaic.write(path)
+        before = [(p.name, p.read_bytes()) for p in tmp_path.iterdir()]
+
+        def write(self, name, **options):
+            name.write_bytes(b"SIMPLE")
+            raise OSError("Not enough space on disk: requested 9, available 6")
+
+        monkeypatch.setattr(fits.HDUList, "writeto", write)
+        with pytest.raises(DiskFullError, match=r"No space left on the disk for .*m.fits: nothing was replaced"):
+            mosaic.write(path, overwrite=True)
+        assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == before
+
+    def test_masked_exposures_are_left_out(self):
+        solution, exposures = night(2)
+        empty = SimpleNamespace(name="frame1", shape=SHAPE, header=fits.Header(), exposure_time=None)
+        empty.data, empty.mask, empty.uncertainty = np.ones(SHAPE), np.ones(SHAPE, dtype=bool), None
+        empty.read = lambda: empty
+        with pytest.warns(AssumptionWarning, match="left out of the mosaic: frame1: every pixel is masked"):
+            mosaic = ld.coadd([exposures[0], empty], solution)
+        assert (mosaic.exposures, mosaic.left_out) == (("frame0",), {"frame1": "every pixel is masked"})
+        with (
+            pytest.warns(AssumptionWarning, match="every pixel is masked"),
+            pytest.raises(InputError, match="no exposure meets the output grid: frame1: every pixel is masked"),
+        ):
+            ld.coadd([empty], solution)
+
+
+MEMORY = """
+import resource, sys
+sys.path.insert(0, {tests!r})
+import test_coaddition
+test_coaddition.SHAPE = (2048, 2048)
+import legdistort as ld
+
+if __name__ == "__main__":
+    solution, *_ = test_coaddition.scene(100, rolls=[0.01 * i for i in range(100)])
+    solution.sky = None
+    exposures = ld.open_exposures({folder!r} + "/*.fits")
+    mosaic = ld.coadd(exposures, solution, method="clipped", workers=2, scratch={folder!r})
+    mosaic.write({folder!r} + "/mosaic")
+    assert mosaic.footprint.max() == 100
+    print(sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 2**20)
+"""
+
+
+@pytest.mark.slow
+def test_a_hundred_frames_stay_under_two_gigabytes(tmp_path):
+    image = np.random.default_rng(1).normal(1000, 20, (2048, 2048)).astype(np.float32)
+    fits.writeto(tmp_path / "frame0.fits", image)
+    for i in range(1, 100):
+        (tmp_path / f"frame{i}.fits").symlink_to(tmp_path / "frame0.fits")
+    script = tmp_path / "script.py"
+    script.write_text(MEMORY.format(tests=str(Path(__file__).parent), folder=str(tmp_path)))
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) < 2
