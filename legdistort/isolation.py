@@ -9,7 +9,7 @@ subtracted, in standard errors of the position (`crowding`)? Subtraction leaves 
 from functools import lru_cache
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .exceptions import InputError
 from .fitting import Flag
@@ -81,7 +81,7 @@ def displacement(xy, flux, fwhm, *, sources=None):
     xy, flux = np.asarray(xy, dtype=float), np.asarray(flux, dtype=float)
     lit = flux > 0
     sources = lit if sources is None else lit & sources
-    i, j = cKDTree(xy).query_pairs(_REACH * fwhm, output_type="ndarray").T
+    i, j = KDTree(xy).query_pairs(_REACH * fwhm, output_type="ndarray").T
     i, j = np.concatenate([i, j]), np.concatenate([j, i])
     pairs = lit[i] & sources[j]
     i, j = i[pairs], j[pairs]

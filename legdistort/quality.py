@@ -6,7 +6,7 @@ All figures come from the same fits (`legdistort.sharpness`) on the same stars.
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from . import baselines, basis, catalogs, performance
 from .coaddition import coadd
@@ -223,7 +223,7 @@ class _Bench:
         flux = catalogs.values(method.stars, "flux") if "flux" in method.stars.colnames else np.ones(len(good))
         bright = good & (flux >= np.nanmedian(flux[good])) if good.any() else good
         chosen = np.flatnonzero(bright)
-        tree = cKDTree(method.positions[np.isfinite(method.positions).all(axis=1)])
+        tree = KDTree(method.positions[np.isfinite(method.positions).all(axis=1)])
         if len(chosen) and tree.n > 1:
             isolated = tree.query(method.positions[chosen], k=2)[0][:, 1] > 3 * fwhm + 1
             chosen = chosen[isolated] if np.count_nonzero(isolated) >= _FEW else chosen
