@@ -6,7 +6,8 @@ first one and are judged pair by pair, by the same measure, as ours is beside th
 and 30 px are tried and the best one counts, though nobody could tell which it is without the truth; after 5 s of the
 processor a pair counts as failed. With headers they
 get positions turned and shifted as the headers say.
-``--flips`` turns two of the exposures over, ``--sizes`` prints time and memory against the number of stars.
+``--flips`` turns two of the exposures over, ``--sizes`` prints time and memory against the number of stars,
+``--conditions`` takes what makes the grid hard apart, which the rivals do not stand all at once.
 """
 
 import argparse
@@ -158,6 +159,39 @@ def grid(n_fields, n_rivals, flips):
         print(f"{cell[0]:5d} {cell[1]:5g} {cell[2]:4d} ", "   ".join(text), flush=True)
 
 
+#: What makes a field of the grid hard, alone and together.
+CONDITIONS = {
+    "none of it": {},
+    "half of the detections false": {"spurious": 1.0},
+    "20 px of distortion": {"peak": 20.0},
+    "scales 5 % off": {"scales": True},
+    "all of it": {"spurious": 1.0, "peak": 20.0, "dynamic": 2.0, "depth": fields.DEPTHS, "scales": True},
+}
+
+
+def conditions(n_fields):
+    """Per cent of pairs of exposures that are right, by what makes them hard."""
+    print(f"{n_fields} fields a row, no headers: % of pairs right\nstars  deg   px{'':33s} ours  astroalign  XYXYMatch")
+    for n, angle, offset in ((100, 0.2, 20), (100, 30, 20), (1000, 0.2, 20), (1000, 30, 300)):
+        for name, options in CONDITIONS.items():
+            pairs = []
+            for seed in range(n_fields):
+                made = {"common": 0.9, "spurious": 0.0, "peak": 1e-3} | options
+                if "scales" in made:
+                    made["scales"] = np.random.default_rng([seed, 7]).uniform(0.95, 1.05, 6)
+                table = fields.make_field(n, *fields.six_poses(angle, offset, seed), seed=seed, **made)
+                pairs.append(
+                    [ours(table)[1], *(rival_pairs(rival, table) for rival in (astroalign_pairs, tweakwcs_pairs))]
+                )
+            right = [
+                100 * np.mean([is_right(*p) for p in np.reshape(each, (-1, 2))]) for each in np.swapaxes(pairs, 0, 1)
+            ]
+            print(
+                f"{n:5d} {angle:4g} {offset:4d}  {name:30s} {right[0]:5.0f} {right[1]:11.0f} {right[2]:10.0f}",
+                flush=True,
+            )
+
+
 def sizes():
     """Time of one processor and peak of memory for six exposures and more."""
     print(f"{'stars':>6s} {'exposures':>9s} {'CPU s':>6s} {'GB':>5s} {'recall':>7s} {'purity':>7s}")
@@ -179,6 +213,7 @@ if __name__ == "__main__":
     parser.add_argument("--fields", type=int, default=12)
     parser.add_argument("--flips", action="store_true")
     parser.add_argument("--sizes", action="store_true")
+    parser.add_argument("--conditions", action="store_true")
     parser.add_argument("--rivals", type=int, default=2, help="fields a cell that rivals try")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -186,5 +221,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGVTALRM, give_up)
     if arguments.sizes:
         sizes()
+    elif arguments.conditions:
+        conditions(min(arguments.fields, 4))
     else:
         grid(arguments.fields, arguments.rivals, fields.FLIPS if arguments.flips else None)
