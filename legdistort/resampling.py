@@ -300,7 +300,8 @@ def fill_bad(data, bad, radius=2):
 
 def _spline_gain(order, xy):
     """Variance of an interpolated pixel for unit white noise, from the fractions of its coordinates."""
-    fraction = (xy - np.floor(xy)).astype(np.float32)
+    fraction = xy.astype(np.float32)  # small numbers, since they count from the piece of the detector
+    fraction -= np.floor(fraction)
     fraction *= 1 - fraction
     *rest, last = _gain_series(order)
     gain = np.full_like(fraction, last)

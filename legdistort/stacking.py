@@ -236,9 +236,10 @@ def stack(block, *, recipe, n_exposures):
         widths=recipe.widths,
     )
     keep = combined.keep[:, *inner]
-    rejected = np.isfinite(data[:n]) & ~spare & ~combined.keep
-    flags = np.bitwise_or.reduce(np.where(combined.keep, doubt[:n], 0), axis=0)
-    flags |= np.where(rejected.any(axis=0), np.uint8(PixelFlag.REJECTED), np.uint8(0))
+    flags = np.bitwise_or.reduce(doubt[:n] * combined.keep, axis=0)
+    if recipe.method == "clipped":
+        rejected = np.isfinite(data[:n]) & ~spare & ~combined.keep
+        flags |= rejected.any(axis=0) * np.uint8(PixelFlag.REJECTED)
     for layer, used in zip(met, keep, strict=True):
         plane, bit = divmod(layer.index, _BITS)
         context[plane] |= used.astype(np.uint32) << np.uint32(bit)
@@ -285,12 +286,11 @@ def _resample(layer, window, recipe, planes):
         doubt[place] = outside * np.uint8(PixelFlag.EXTRAPOLATED)
     if found.full is not None:
         doubt[place] |= found.full * np.uint8(PixelFlag.SATURATED)
-    value *= layer.factor
+    factor = layer.factor * (pixel_map.area if recipe.conserve == "flux" else 1.0)
     if layer.sky is not None:
-        value -= layer.sky
-    area = pixel_map.area if recipe.conserve == "flux" else 1.0
-    value *= area
+        value -= layer.sky / layer.factor
+    value *= factor
     if layer.sky is not None:
         value += recipe.level
-    data[place], variance[place] = value, spread * (layer.factor * area) ** 2
+    data[place], variance[place] = value, spread * factor**2
     return True

@@ -1,4 +1,4 @@
-"""Reproduce the paper: ``python docs/paper/reproduce.py`` (7 minutes on 2 cores; ``--quick``: 2 minutes).
+"""Reproduce the paper: ``python docs/paper/reproduce.py`` (7 minutes on 2 cores; ``--quick``: half a minute).
 
 Runs the simulations of Bernard et al. (2017), the twin of its GeMS data, and the comparisons beyond it, prints every
 published number beside ours, and writes the table (``table.md``), the numbers (``results.json``) and the figures.
