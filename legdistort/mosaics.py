@@ -1,7 +1,9 @@
 """The co-added image and its file."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 
+import asdf
 import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
@@ -113,14 +115,16 @@ class Mosaic:
         return hdulist
 
     def write(self, path, *, overwrite=False):
-        """Write the mosaic as a FITS file (see `to_hdulist`).
+        """Write the mosaic as a FITS file (see `to_hdulist`), or as ASDF.
 
         The file appears under its name only when it is complete.
 
         Parameters
         ----------
         path : str or path
-            With ``.gz`` at its end it is compressed.
+            With ``.gz`` at its end it is compressed. With ``.asdf`` it is an ASDF file: the planes, ``wcs``,
+            ``exposures``, ``left_out``, ``offset`` and ``header`` under ``mosaic``, to be opened with asdf and
+            asdf-astropy alone.
         overwrite : bool
             Replace a file that exists.
 
@@ -130,4 +134,12 @@ class Mosaic:
             If the file exists and `overwrite` is false, or its folder does not exist.
         """
         with replacing(path, overwrite=overwrite) as temporary:
-            self.to_hdulist().writeto(temporary)
+            if Path(path).suffix == ".asdf":
+                asdf.AsdfFile({"mosaic": self._tree()}).write_to(temporary)
+            else:
+                self.to_hdulist().writeto(temporary)
+
+    def _tree(self):
+        tree = {each.name: getattr(self, each.name) for each in fields(self)}
+        tree["exposures"], tree["offset"] = list(self.exposures), self.offset and list(self.offset)
+        return tree | {"header": {k: v for k, v in self.header.items() if k not in ("HISTORY", "COMMENT", "")}}

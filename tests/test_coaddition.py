@@ -4,6 +4,7 @@ import itertools
 from dataclasses import dataclass, field
 from functools import cache
 
+import asdf
 import gwcs.coordinate_frames as cf
 import numpy as np
 import pytest
@@ -470,6 +471,18 @@ class TestFile:
         np.testing.assert_array_equal(back.data, mosaic.data)
         assert np.median(mosaic.variance[mosaic.footprint == 4]) == pytest.approx(0.7, abs=0.3)
         np.testing.assert_allclose(back.uncertainty**2, mosaic.variance, rtol=1e-5)
+
+    def test_asdf(self, tmp_path):
+        solution, stars, _, exposures, _ = plain()
+        mosaic = coadd(exposures, solution)
+        mosaic.write(tmp_path / "m.asdf")
+        with asdf.open(tmp_path / "m.asdf", memmap=False) as file:
+            tree = file["mosaic"]
+            for plane in ("data", "variance", "weight", "footprint", "flags", "context"):
+                np.testing.assert_array_equal(tree[plane], getattr(mosaic, plane))
+            sky = tree["wcs"].pixel_to_world(*(stars - tree["offset"]).T)
+            assert (tree["exposures"], tree["header"]["NCOMBINE"]) == (list(mosaic.exposures), 4)
+        assert solution.sky.to_sky(stars).separation(sky).max() < 1e-9 * u.deg
 
     def test_a_file_is_not_overwritten_unasked(self, tmp_path):
         mosaic = plain()[-1]
