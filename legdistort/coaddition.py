@@ -12,6 +12,7 @@ from astropy.wcs import WCS
 from .combination import METHODS
 from .drizzling import Drop
 from .exceptions import AssumptionWarning, InputError
+from .hulls import support
 from .levels import bad_pixels, flux_scales, match_backgrounds, saturated_pixels, survey
 from .mapping import Grid, map_exposure, outline
 from .mosaics import Mosaic
@@ -19,7 +20,7 @@ from .parallel import check_workers, each
 from .resampling import ALGORITHMS, fill_bad, rough_pixels, white_gain
 from .scratch import scratch_folder, store
 from .stacking import Layer, Recipe, assemble, check_memory
-from .weighting import EXTRAPOLATED, make_weights, stellar_widths, support
+from .weighting import EXTRAPOLATED, make_weights, stellar_widths
 
 logger = logging.getLogger(__name__)
 

@@ -13,6 +13,7 @@ from . import basis, catalogs, poses
 from .distortion import Distortion, like, outside, to_pixels
 from .exceptions import InputError
 from .findings import in_words
+from .hulls import support, supported
 
 
 def _wrapped(key, text):
@@ -299,14 +300,7 @@ class Solution:
 
     def supported(self, name, xy):
         """Whether detector positions (n, 2) lie inside the convex hull of the stars used in an exposure."""
-        from scipy.spatial import Delaunay, QhullError
-
-        rows = self.observations[(self.observations["exposure"] == name) & self.observations["used"]]
-        points = np.column_stack([rows["x"].to_value(u.pix), rows["y"].to_value(u.pix)])
-        try:
-            return Delaunay(points).find_simplex(xy) >= 0
-        except (QhullError, ValueError):  # fewer than three stars, or all on a line, support no area
-            return np.zeros(len(xy), dtype=bool)
+        return supported(support(name, self), np.asarray(xy, dtype=float).T)
 
     # -- words
 

@@ -10,12 +10,13 @@ import numpy as np
 from .combination import PixelFlag, combine, margin
 from .drizzling import Drop
 from .exceptions import InputError
+from .hulls import supported
 from .levels import Survey, sky_variance
 from .mapping import ExposureMap
 from .parallel import each
 from .resampling import resample_exposure
 from .scratch import Stored
-from .weighting import Weight, supported
+from .weighting import Weight
 
 _SAMPLES = 1 << 23  # pixels of all exposures that are stacked at a time
 _SIDES = 64, 512  # of blocks, px

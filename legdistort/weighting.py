@@ -1,4 +1,4 @@
-"""Weights of exposures and of their pixels in a co-added image, and which pixels the solution supports."""
+"""Weights of exposures and of their pixels in a co-added image."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -146,40 +146,3 @@ def _share(name, solution, fwhm):
     x, y, sigma = solution.sigma_map(name, support=False)
     own = (_OWN * fwhm) ** 2
     return x, y, own / (own + (sigma**2).mean(axis=2))
-
-
-def support(name, solution):
-    """Half-planes whose intersection is the hull of the stars used in an exposure.
-
-    Parameters
-    ----------
-    name : str
-    solution : Solution
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        ``a x + b y + c <= 0`` inside, as in `Solution.supported`. Where fewer than three stars support no area, no
-        pixel is inside.
-    """
-    from scipy.spatial import ConvexHull, QhullError
-
-    rows = solution.observations
-    rows = rows[(rows["exposure"] == name) & rows["used"]]
-    try:
-        return ConvexHull(np.column_stack([rows["x"].to_value(u.pix), rows["y"].to_value(u.pix)])).equations
-    except (QhullError, ValueError):
-        return np.array([[0.0, 0.0, 1.0]])
-
-
-def supported(planes, xy):
-    """Whether detector pixels ``(2, ...)`` lie within the half-planes of `support`."""
-    x, y = xy
-    inside = np.ones(x.shape, dtype=bool)
-    if not inside.size:
-        return inside
-    box = [(a, b) for a in (np.nanmin(x), np.nanmax(x)) for b in (np.nanmin(y), np.nanmax(y))]
-    for a, b, c in planes:
-        if max(a * p + b * q + c for p, q in box) > 1e-9:  # else all of the box is inside
-            inside &= a * x + b * y + c <= 1e-9
-    return inside

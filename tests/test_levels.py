@@ -9,6 +9,7 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 from reproject import reproject_interp
+from scipy.spatial import Delaunay
 from test_coaddition import SHAPE, SIGMA, StandIn, check_stars, covered, expose, fit_star, plain, scene, star_image
 
 from legdistort.coaddition import coadd
@@ -16,8 +17,9 @@ from legdistort.combination import PixelFlag
 from legdistort.distortion import Distortion
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.exposures import Exposure
+from legdistort.hulls import support, supported
 from legdistort.levels import flux_scales, sky_variance, survey
-from legdistort.weighting import make_weights, stellar_widths, support, supported
+from legdistort.weighting import make_weights, stellar_widths
 
 FLAT = {"conserve": "surface_brightness", "match_background": False}
 
@@ -216,7 +218,10 @@ class TestSupport:
         xy = rng.uniform(0, 300, (2000, 2))
         stand_in = type("S", (), {"observations": table})()
         np.testing.assert_array_equal(supported(planes, xy.T), Solution.supported(stand_in, "frame0", xy))
+        hull = Delaunay(np.column_stack([table["x"].to_value("pix"), table["y"].to_value("pix")]))
+        np.testing.assert_array_equal(supported(planes, xy.T), hull.find_simplex(xy) >= 0)
         inside = xy[supported(planes, xy.T)]
+        assert not Solution.supported(stand_in, "frame0", np.append(inside[:5], [[np.nan, 1.0]], axis=0))[-1]
         assert supported(planes, inside[:5].T).all()  # a box that lies inside altogether
 
     def test_options(self):

@@ -1,0 +1,41 @@
+"""Where on the detector an exposure has stars: the convex hull of those used."""
+
+import numpy as np
+from astropy import units as u
+
+
+def support(name, solution):
+    """Half-planes whose intersection is the hull of the stars used in an exposure.
+
+    Parameters
+    ----------
+    name : str
+    solution : Solution
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        ``a x + b y + c <= 0`` inside. Where fewer than three stars support no area, no
+        pixel is inside.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    rows = solution.observations
+    rows = rows[(rows["exposure"] == name) & rows["used"]]
+    try:
+        return ConvexHull(np.column_stack([rows["x"].to_value(u.pix), rows["y"].to_value(u.pix)])).equations
+    except (QhullError, ValueError):
+        return np.array([[0.0, 0.0, 1.0]])
+
+
+def supported(planes, xy):
+    """Whether detector pixels ``(2, ...)`` lie within the half-planes of `support`."""
+    x, y = xy
+    inside = np.isfinite(x) & np.isfinite(y)
+    if not inside.any():
+        return inside
+    box = [(a, b) for a in (np.nanmin(x), np.nanmax(x)) for b in (np.nanmin(y), np.nanmax(y))]
+    for a, b, c in planes:
+        if max(a * p + b * q + c for p, q in box) > 1e-9:  # else all of the box is inside
+            inside &= a * x + b * y + c <= 1e-9
+    return inside
