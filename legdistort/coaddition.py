@@ -17,7 +17,7 @@ from .levels import bad_pixels, flux_scales, match_backgrounds, saturated_pixels
 from .mapping import Grid, map_exposure, outline
 from .mosaics import Mosaic
 from .parallel import check_workers, each
-from .resampling import ALGORITHMS, fill_bad, rough_pixels, white_gain
+from .resampling import ALGORITHMS, fill_bad, is_compiled, rough_pixels, white_gain
 from .scratch import scratch_folder, store
 from .stacking import Layer, Recipe, assemble, check_memory
 from .weighting import EXTRAPOLATED, make_weights, stellar_widths
@@ -153,7 +153,16 @@ def coadd(
             for i, f in enumerate(frames)
         ]
         recipe = Recipe(
-            output.shape, method, algorithm, order, conserve, level, extrapolated == "mask", _span(fwhm), drop
+            shape=output.shape,
+            method=method,
+            algorithm=algorithm,
+            order=order,
+            conserve=conserve,
+            level=level,
+            mask=extrapolated == "mask",
+            widths=_span(fwhm),
+            drop=drop,
+            compiled=is_compiled(algorithm, order, sum(np.prod(f.shape) for f in frames)),
         )
         planes = assemble(layers, recipe, **share)
     settings = {"COMBINE": method, "RESAMPLE": _in_words(algorithm, order, drop), "CONSERVE": conserve}

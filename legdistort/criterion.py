@@ -13,12 +13,12 @@ Arrays are ordered by exposure, coordinates first, so that every sweep reads mem
 """
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from importlib.util import find_spec
+from functools import cached_property
 
 import numpy as np
 
 from . import basis
+from .extras import has_fast
 from .priors import dynamic_basis
 from .unknowns import Unknowns
 
@@ -28,15 +28,9 @@ _HOLD = 1e4
 COMPILED_FROM = 30_000
 
 
-@cache
-def _numba_found():
-    """Whether the extra ``fast`` is installed."""
-    return find_spec("numba") is not None and find_spec("threadpoolctl") is not None
-
-
 def is_compiled(n):
     """Whether the compiled loops of `legdistort.kernels` serve a problem of n observations."""
-    return n >= COMPILED_FROM and _numba_found()
+    return n >= COMPILED_FROM and has_fast()
 
 
 #: Smallest uncertainty of a static distortion that takes part in a fit, pixels.

@@ -31,11 +31,11 @@ def support(name, solution):
 def supported(planes, xy):
     """Whether detector pixels ``(2, ...)`` lie within the half-planes of `support`."""
     x, y = xy
-    inside = np.isfinite(x) & np.isfinite(y)
-    if not inside.any():
+    inside = np.ones(np.shape(x), dtype=bool)
+    if inside.size == 0:
         return inside
-    box = [(a, b) for a in (np.nanmin(x), np.nanmax(x)) for b in (np.nanmin(y), np.nanmax(y))]
+    box = [(a, b) for a in (np.min(x), np.max(x)) for b in (np.min(y), np.max(y))]
     for a, b, c in planes:
-        if max(a * p + b * q + c for p, q in box) > 1e-9:  # else all of the box is inside
-            inside &= a * x + b * y + c <= 1e-9
+        if not max(a * p + b * q + c for p, q in box) <= 1e-9:  # else all of the box is inside
+            inside &= a * x + b * y + c <= 1e-9  # NaN is not
     return inside

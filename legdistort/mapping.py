@@ -121,6 +121,15 @@ class Table:
             return replace(self, coefficients=self.coefficients[planes])(rows, columns)
         return self.at(*(np.arange(s.start, s.stop, dtype=float) for s in (rows, columns)))[planes]
 
+    def along_edge(self, rows, columns):
+        """Values (k, n) at the outermost pixels of two slices; None where there are no coefficients."""
+        if self.coefficients is None:
+            return None
+        y, x = (np.arange(s.start, s.stop, dtype=float) for s in (rows, columns))
+        return np.concatenate(
+            [self.at(*yx).reshape(len(self.coefficients), -1) for yx in ((y[[0, -1]], x), (y, x[[0, -1]]))], axis=1
+        )
+
     def at(self, y, x):
         """Values (k, ny, nx) where rows y (ny,) meet columns x (nx,)."""
         if self.coefficients is None:
@@ -226,20 +235,21 @@ class ExposureMap:
         ny, nx = self.shape
         # Interpolation needs data on both sides: beyond the outermost centres it would be extrapolation.
         centres = (-_TOLERANCE, nx - 1 + _TOLERANCE, -_TOLERANCE, ny - 1 + _TOLERANCE)
-        few = self.table.at(*(np.linspace(s.start, s.stop - 1, 9) for s in (rows, columns)))
-        sure = self.table.coefficients is not None and _far_inside(centres, *few[:2])
-        sure = sure and _far_inside(self.valid, *few[2:4])
-        wanted = [0, 1, 4] if sure else [0, 1, 4, 2, 3]
+        # The map has an inverse where it is valid: what holds along the edge of a piece then holds within.
+        edge = self.table.along_edge(rows, columns)
+        valid = edge is not None and not outside(self.valid, edge[2], edge[3]).any()
         widened = (slice(s.start - border, s.stop + border) for s in (rows, columns))
-        everything = self.table(*widened, wanted)
+        everything = self.table(*widened, [0, 1, 4] if valid else [0, 1, 4, 2, 3])
         wider, planes = (everything[:2], everything[:, 1:-1, 1:-1]) if border else (None, everything)
-        if sure:
-            inside, seen = np.ones(planes[0].shape, dtype=bool), planes[:2]
+        if valid and not outside(centres, edge[0], edge[1]).any():
+            inside = np.ones(planes[0].shape, dtype=bool)
         else:
-            inside = ~(outside(self.valid, planes[3], planes[4]) | outside(centres, planes[0], planes[1]))
-            seen = planes[:2, inside]
-        if not inside.any():
-            return None
+            inside = ~outside(centres, planes[0], planes[1])
+            if not valid:
+                inside &= ~outside(self.valid, planes[3], planes[4])
+            if not inside.any():
+                return None
+        seen = edge[:2] if valid else planes[:2, inside]
         part = tuple(
             slice(max(0, int(p.min()) - margin), min(n, int(p.max()) + 2 + margin))
             for p, n in zip(seen[::-1], self.shape, strict=True)
@@ -251,13 +261,6 @@ class ExposureMap:
             edges = self.corners(*(slice(p.start, p.stop + 1) for p in part)) - low
         everything[:2] -= origin
         return PixelMap((rows, columns), planes[:2], inside, planes[2], wider, edges), part
-
-
-def _far_inside(box, x, y):
-    """Whether smooth planes, of which a few points are given, lie in a box, with a tenth of what they span to spare."""
-    x_spare, y_spare = np.ptp(x) / 10 + 1, np.ptp(y) / 10 + 1
-    x_min, x_max, y_min, y_max = box
-    return not outside((x_min + x_spare, x_max - x_spare, y_min + y_spare, y_max - y_spare), x, y).any()
 
 
 def map_exposure(name, solution, grid, *, corners=False):

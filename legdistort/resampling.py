@@ -1,6 +1,7 @@
 """Pieces of detector images -> pieces of the output grid, with reproject as the engine.
 
-It is handed tiny WCS objects whose world *is* the output grid, and a pixel map (`legdistort.mapping`).
+It is handed tiny WCS objects whose world *is* the output grid, and a pixel map (`legdistort.mapping`). For many pixels,
+compiled twins of its splines take over (`legdistort.spline_kernels`).
 """
 
 from dataclasses import dataclass
@@ -14,9 +15,17 @@ from numpy.polynomial.polynomial import polyfit, polyval
 from scipy.ndimage import binary_dilation, map_coordinates
 
 from .drizzling import drizzle
+from .extras import has_fast
 
 ALGORITHMS = ("interp", "adaptive", "exact", "drizzle")
 _BAD_WEIGHT = 0.05  # an output pixel with a larger share of bad pixels is left empty
+#: Pixels of all exposures from which compiled splines are used, if numba is installed.
+COMPILED_FROM = 1 << 23
+
+
+def is_compiled(algorithm, order, n_pixels):
+    """Whether the compiled splines of `legdistort.spline_kernels` serve so many pixels."""
+    return algorithm == "interp" and order in (1, 3) and n_pixels >= COMPILED_FROM and has_fast()
 
 
 class _TableWCS(BaseLowLevelWCS):
@@ -81,12 +90,12 @@ def _look_up(table, x, y, margin=0):
     return tuple(plane[index] for plane in planes)
 
 
-def resample(planes, pixel_map, *, algorithm="interp", order=1):
+def resample(planes, pixel_map, *, algorithm="interp", order=1, compiled=False):
     """Images of one detector on the output grid, surface brightness conserved.
 
     Parameters
     ----------
-    planes : ndarray, shape (k, ny, nx)
+    planes : sequence of ndarray, shape (ny, nx)
         The images.
     pixel_map : `~legdistort.mapping.PixelMap`
         With what the algorithm asks for.
@@ -94,28 +103,41 @@ def resample(planes, pixel_map, *, algorithm="interp", order=1):
         One of reproject's.
     order : int
         Of the spline, for 'interp'.
+    compiled : bool
+        By compiled loops, see `is_compiled`.
 
     Returns
     -------
     ndarray, shape (k, my, mx)
         NaN outside the detector.
     """
+    if compiled:
+        from . import spline_kernels
+
+        out = np.empty((len(planes), *pixel_map.area.shape))
+        for plane, values in zip(planes, out, strict=True):
+            spline_kernels.interpolate(plane, pixel_map.xy, order, values)
+    else:
+        out = _reproject(planes, pixel_map, algorithm, order)
+    if not pixel_map.inside.all():
+        out[:, ~pixel_map.inside] = np.nan
+    return out
+
+
+def _reproject(planes, pixel_map, algorithm, order):
     import reproject  # brings dask along, which takes a third of a second
 
+    planes = np.asarray(planes)
     options = {"shape_out": (len(planes), *pixel_map.area.shape), "return_footprint": False}
     if algorithm == "exact":
         scale = 1 / max(pixel_map.area.shape)
         wcs_in, wcs_out = _TableWCS(to_world=pixel_map.corners, scale=scale), _TableWCS(scale=scale)
-        out = reproject.reproject_exact((planes, wcs_in), wcs_out, **options)
-    else:
-        options["roundtrip_coords"] = False
-        if algorithm == "interp":
-            out = reproject.reproject_interp((planes, _TableWCS(pixel_map.xy)), _TableWCS(), order=order, **options)
-        else:  # asks one pixel beyond the grid
-            out = reproject.reproject_adaptive((planes, _TableWCS(pixel_map.wider, margin=1)), _TableWCS(), **options)
-    if not pixel_map.inside.all():
-        out[:, ~pixel_map.inside] = np.nan
-    return out
+        return reproject.reproject_exact((planes, wcs_in), wcs_out, **options)
+    options["roundtrip_coords"] = False
+    if algorithm == "interp":
+        return reproject.reproject_interp((planes, _TableWCS(pixel_map.xy)), _TableWCS(), order=order, **options)
+    # asks one pixel beyond the grid
+    return reproject.reproject_adaptive((planes, _TableWCS(pixel_map.wider, margin=1)), _TableWCS(), **options)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -140,7 +162,9 @@ class Resampled:
     coverage: object = 1.0
 
 
-def resample_exposure(data, masks, variance, pixel_map, *, algorithm="interp", order=3, gain=None, drop=None):
+def resample_exposure(
+    data, masks, variance, pixel_map, *, algorithm="interp", order=3, compiled=False, gain=None, drop=None
+):
     """A piece of an exposure on the output grid.
 
     Parameters
@@ -154,7 +178,7 @@ def resample_exposure(data, masks, variance, pixel_map, *, algorithm="interp", o
         Of independent pixels.
     pixel_map : `~legdistort.mapping.PixelMap`
         Of its exposure.
-    algorithm, order
+    algorithm, order, compiled
         See `resample`; or 'drizzle'.
     gain : float, optional
         What the algorithm leaves of the variance of white noise (`white_gain`); not for 'interp', where it is known.
@@ -172,8 +196,8 @@ def resample_exposure(data, masks, variance, pixel_map, *, algorithm="interp", o
     extra = list(np.reshape(variance, (-1, *data.shape)) if np.ndim(variance) else [])
     if algorithm == "interp" and order > 0:
         hits = [_hits(masks[name], pixel_map) for name in spoilt]
-        out = [*resample(data[None], pixel_map, order=order)]
-        out += [*resample(np.array(extra), pixel_map, order=1)] if extra else []
+        out = [*resample(data[None], pixel_map, order=order, compiled=compiled)]
+        out += [*resample(extra, pixel_map, order=1, compiled=compiled)] if extra else []
         value = out.pop(0)
     else:
         shares = [masks[name].astype(np.float32) for name in spoilt]
@@ -181,12 +205,12 @@ def resample_exposure(data, masks, variance, pixel_map, *, algorithm="interp", o
         hits = [~(out.pop(0) <= _BAD_WEIGHT) for _ in spoilt]
     hits = dict(zip(spoilt, hits, strict=True))
     if algorithm == "interp":
-        gain = _spline_gain(order, pixel_map.xy)
+        gain = _spline_gain(order, pixel_map.xy, compiled)
     if "rough" in masks and algorithm == "interp" and order > 1:
         place = [np.clip(np.rint(p), 0, n - 1) for p, n in zip(pixel_map.xy[::-1], data.shape, strict=True)]
         near = masks["rough"][tuple(np.array(place, dtype=np.intp))] & pixel_map.inside
         value[near] = map_coordinates(data, pixel_map.xy[::-1, near], order=1, mode="nearest")
-        gain = np.where(near, _spline_gain(1, pixel_map.xy), gain)
+        gain = np.where(near, _spline_gain(1, pixel_map.xy, compiled), gain)
     if "bad" in masks:
         value[hits["bad"]] = np.nan
     spread = np.reshape(out, (*np.shape(variance)[:-2], *value.shape)) if out else variance
@@ -298,8 +322,12 @@ def fill_bad(data, bad, radius=2):
     return out
 
 
-def _spline_gain(order, xy):
+def _spline_gain(order, xy, compiled):
     """Variance of an interpolated pixel for unit white noise, from the fractions of its coordinates."""
+    if compiled:
+        from . import spline_kernels
+
+        return spline_kernels.product(_gain_series(order), xy)
     fraction = xy.astype(np.float32)  # small numbers, since they count from the piece of the detector
     fraction -= np.floor(fraction)
     fraction *= 1 - fraction

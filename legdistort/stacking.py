@@ -82,6 +82,8 @@ class Recipe:
         The smallest and the largest FWHM of all exposures, if known.
     drop : `~legdistort.drizzling.Drop` or None
         For drizzle.
+    compiled : bool
+        See `legdistort.resampling.is_compiled`.
     """
 
     shape: tuple
@@ -93,6 +95,7 @@ class Recipe:
     mask: bool = False
     widths: tuple | None = None
     drop: Drop | None = None
+    compiled: bool = False
 
     @property
     def margin(self):
@@ -270,6 +273,7 @@ def _resample(layer, window, recipe, planes):
         pixel_map,
         algorithm=recipe.algorithm,
         order=recipe.order,
+        compiled=recipe.compiled,
         gain=layer.gain,
         drop=recipe.drop,
     )

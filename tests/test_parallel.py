@@ -21,11 +21,12 @@ from astropy.nddata import CCDData
 from test_coaddition import SHAPE, expose, scene
 
 import legdistort as ld
-from legdistort import coaddition, levels, scratch, stacking
+from legdistort import coaddition, levels, resampling, scratch, stacking
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError, LegdistortError
 from legdistort.exposure_files import ExposureFile
 from legdistort.parallel import each
 
+COMPILED = pytest.mark.parametrize("compiled_from", [0, 1 << 62], ids=["compiled", "plain"])
 WORK = {"serial": {"workers": 1}, "threads": {"workers": 2, "threads": True}, "processes": {"workers": 2}}
 
 
@@ -281,8 +282,10 @@ class TestMosaicInBlocks:
         # found in a table of 256 fractions of a pixel, so rounding may take its neighbour
         np.testing.assert_allclose(pieces.variance, whole.variance, rtol=0.02)
 
-    def test_any_number_of_workers_gives_the_same_bits(self, client, monkeypatch, tmp_path):
+    @COMPILED
+    def test_any_number_of_workers_gives_the_same_bits(self, client, monkeypatch, tmp_path, compiled_from):
         solution, exposures = night(uncertainty=np.full(SHAPE, 8.0))
+        monkeypatch.setattr(resampling, "COMPILED_FROM", compiled_from)
         monkeypatch.setattr(stacking, "_SAMPLES", 1 << 16)
         settings = {"method": "clipped", "scratch": tmp_path}
         one = ld.coadd(exposures, solution, workers=1, **settings)
@@ -291,8 +294,10 @@ class TestMosaicInBlocks:
         assert not any(tmp_path.iterdir())
 
     @pytest.mark.slow
-    def test_two_hundred_times_the_same(self, monkeypatch):
+    @COMPILED
+    def test_two_hundred_times_the_same(self, monkeypatch, compiled_from):
         solution, exposures = night(2)
+        monkeypatch.setattr(resampling, "COMPILED_FROM", compiled_from)
         monkeypatch.setattr(stacking, "_SAMPLES", 1 << 15)
         one = ld.coadd(exposures, solution, workers=1)
         for _ in range(200):
