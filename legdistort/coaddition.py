@@ -16,10 +16,10 @@ from .hulls import support
 from .levels import bad_pixels, flux_scales, match_backgrounds, saturated_pixels, survey
 from .mapping import Grid, map_exposure, outline
 from .mosaics import Mosaic
-from .parallel import check_workers, each
+from .parallel import each
 from .resampling import ALGORITHMS, fill_bad, is_compiled, rough_pixels, white_gain
 from .scratch import scratch_folder, store
-from .stacking import Layer, Recipe, assemble, check_memory
+from .stacking import Layer, Recipe, assemble, size
 from .weighting import EXTRAPOLATED, make_weights, stellar_widths
 
 logger = logging.getLogger(__name__)
@@ -93,8 +93,9 @@ def coadd(
         Threads that share the work. None = the current ``dask.distributed.Client`` if there is one, else this one. The
         mosaic is the same, bit for bit.
     scratch : str or path, optional
-        Folder for the pixels of the exposures while work goes on, 4 to 13 bytes for each; the workers of a cluster must
-        see it. The default is that of the system (``TMPDIR``).
+        Folder for the pixels of the exposures while work goes on, 4 to 13 bytes for each, and for those of the mosaic,
+        21 or more, as long as it is in use; the workers of a cluster must see it. The default is that of the system
+        (``TMPDIR``).
     progress : bool
         Show progress bars.
 
@@ -106,20 +107,23 @@ def coadd(
     ------
     InputError
         Naming what is wrong: an option, an exposure whose shape is not that of the solution, a grid
-        without sky or shape, or larger than the memory, no exposure left, none on the grid.
+        without sky or shape, no exposure left, none on the grid.
     DiskFullError
-        If the disk is full. Nothing is left behind.
+        If the disk of `scratch` is full, or has less room than will be needed. Nothing is left behind.
     """
     order = _check_options(method, order, algorithm, conserve, extrapolated)
     drop = Drop(kernel, pixfrac) if algorithm == "drizzle" else None
     frames, left_out = _select(exposures, solution)
     output = reference_grid([f.name for f in frames], solution) if grid is None else _given_grid(grid, solution)
-    check_memory(output.shape, len(frames), check_workers(workers))
     maps = {f.name: map_exposure(f.name, solution, output, corners=algorithm in ("exact", "drizzle")) for f in frames}
     left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
     frames = [f for f in frames if maps[f.name] is not None]
     share = {"workers": workers, "threads": True, "progress": progress}
-    with scratch_folder(scratch, _STORED * sum(np.prod(f.shape) for f in frames)) as folder:
+    need = size(output.shape, len(frames)) + _STORED * sum(int(np.prod(f.shape)) for f in frames)
+    ny, nx = output.shape
+    with scratch_folder(
+        scratch, need, f"a mosaic of {nx} x {ny} px and the pixels of {len(frames)} exposures"
+    ) as folder:
         kept = each(partial(_keep, folder=folder), frames, description="reading", **share)
         kept = dict(zip([f.name for f in frames], kept, strict=True))
         masked = {name: "every pixel is masked" for name, found in kept.items() if found is None}
@@ -164,7 +168,7 @@ def coadd(
             drop=drop,
             compiled=is_compiled(algorithm, order, sum(np.prod(f.shape) for f in frames)),
         )
-        planes = assemble(layers, recipe, **share)
+        planes = assemble(layers, recipe, folder.parent, **share)
     settings = {"COMBINE": method, "RESAMPLE": _in_words(algorithm, order, drop), "CONSERVE": conserve}
     settings |= {"SKYLEVEL": level if match_background else None, "FLXSCALE": origin, "EXTRAPOL": extrapolated}
     settings |= {"WEIGHTS": weights if isinstance(weights, str) else "equal" if weights is None else "given"}

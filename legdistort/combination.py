@@ -88,12 +88,14 @@ def combine(data, variance, weight, *, method="mean", level=0.0, spare=None, fwh
     keep = use
     if method == "clipped":
         keep = confirmed(data, variance, use, level=level, fwhm=fwhm, widths=widths)
-    w = np.where(keep, weight, 0)
-    total = w.sum(axis=0)
+    total, mean, spread = np.zeros((3, *data.shape[1:]), dtype=np.float32)
+    for w, d, v, k in zip(weight, data, np.broadcast_to(variance, data.shape), keep, strict=True):
+        w = np.where(k, w, 0)
+        total += w
+        mean += np.where(k, w * d, 0)
+        spread += np.where(k, w * w * v, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(keep, w * data, 0).sum(axis=0) / total
-        spread = np.where(keep, w * w * variance, 0).sum(axis=0) / total**2
-    return Combined(mean.astype(np.float32), spread.astype(np.float32), total, keep)
+        return Combined(mean / total, spread / total**2, total, keep)
 
 
 def margin(method, widths=None):

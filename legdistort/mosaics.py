@@ -10,11 +10,18 @@ from astropy.wcs import WCS
 
 from .exceptions import InputError
 from .files import replacing
+from .scratch import forget
+
+_COMPRESSED = (".gz", ".bz2", ".xz", ".zip")
+_ROWS = 256  # that are written at a time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mosaic:
     """Co-added image.
+
+    The planes that `legdistort.coadd` makes are arrays on disk, in a folder for temporary files; only what is worked on
+    comes into memory.
 
     Attributes
     ----------
@@ -136,10 +143,22 @@ class Mosaic:
         with replacing(path, overwrite=overwrite) as temporary:
             if Path(path).suffix == ".asdf":
                 asdf.AsdfFile({"mosaic": self._tree()}).write_to(temporary)
-            else:
+            elif Path(path).suffix in _COMPRESSED:
                 self.to_hdulist().writeto(temporary)
+            else:
+                for hdu in self.to_hdulist():
+                    _append(temporary, hdu)
 
     def _tree(self):
         tree = {each.name: getattr(self, each.name) for each in fields(self)}
         tree["exposures"], tree["offset"] = list(self.exposures), self.offset and list(self.offset)
         return tree | {"header": {k: v for k, v in self.header.items() if k not in ("HISTORY", "COMMENT", "")}}
+
+
+def _append(path, hdu):
+    """Add an HDU to a FITS file, a few rows at a time: astropy would turn the bytes of all of it in memory."""
+    rows = hdu.data.reshape(-1, hdu.data.shape[-1])
+    with fits.StreamingHDU(str(path), hdu.header) as stream:  # of a path it takes the last part for the name
+        for start in range(0, len(rows), _ROWS):
+            stream.write(rows[start : start + _ROWS])
+            forget(rows)

@@ -1,5 +1,6 @@
-"""Pixels of exposures on disk while a mosaic is being made: a file for every plane, read by pieces."""
+"""Pixels on disk instead of in memory: those of exposures while a mosaic is being made, and the mosaic itself."""
 
+import mmap
 import shutil
 import tempfile
 from contextlib import contextmanager
@@ -36,7 +37,7 @@ class Stored:
 
 
 @contextmanager
-def scratch_folder(parent, need):
+def scratch_folder(parent, need, what="the pixels"):
     """A folder for planes that is gone when the block ends, however it ends.
 
     Parameters
@@ -45,6 +46,8 @@ def scratch_folder(parent, need):
         Where to make it; None = where the system keeps temporary files (``TMPDIR``).
     need : int
         Bytes that will be stored.
+    what : str
+        They are, for the message.
 
     Raises
     ------
@@ -63,8 +66,8 @@ def scratch_folder(parent, need):
         free = shutil.disk_usage(place).free
         if free < need:
             raise DiskFullError(
-                f"the pixels of the exposures take {need / 2**30:.2g} GB while the mosaic is made, {place} has "
-                f"{free / 2**30:.2g} GB left: {advice}"
+                f"{what} take {need / 2**30:.2g} GB on disk while work goes on, {place} has {free / 2**30:.2g} GB "
+                f"left: {advice}; if they should not be so many, look at the poses and at the grid"
             )
         yield Path(folder)
     except OSError as error:
@@ -96,3 +99,39 @@ def store(folder, name, planes):
     for plane, path in paths.items():
         np.save(path, planes[plane])
     return Stored(name, paths)
+
+
+class _Shared(mmap.mmap):
+    """Memory that is the same as a file, so that it may be dropped and read again."""
+
+
+def spill(shape, dtype, value, folder):
+    """An array on disk, all of one value; its file has no name and is gone when the array is.
+
+    Parameters
+    ----------
+    shape : tuple
+    dtype : dtype
+    value : number
+    folder : path
+
+    Returns
+    -------
+    ndarray
+        Of the size of the disk and not of the memory, if what was worked on is dropped by `forget`.
+    """
+    size = int(np.prod(shape))
+    values = np.full(min(size, 1 << 20), value, dtype)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        for start in range(0, size, len(values)):  # all of it: a disk that is full must be known now
+            file.write(values[: size - start])
+        file.flush()
+        return np.frombuffer(_Shared(file.fileno(), size * values.itemsize), dtype).reshape(shape)
+
+
+def forget(array):
+    """Drop the memory of an array that `spill` made; its values stay on disk. Others are left alone."""
+    while isinstance(array, np.ndarray | memoryview):
+        array = array.base if isinstance(array, np.ndarray) else array.obj
+    if isinstance(array, _Shared) and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
+        array.madvise(mmap.MADV_DONTNEED)

@@ -1,6 +1,5 @@
 """A mosaic block by block: the pieces of all exposures that meet a block, resampled and combined."""
 
-import os
 from dataclasses import dataclass
 from functools import partial
 from math import ceil
@@ -9,17 +8,16 @@ import numpy as np
 
 from .combination import PixelFlag, combine, margin
 from .drizzling import Drop
-from .exceptions import InputError
 from .hulls import supported
 from .levels import Survey, sky_variance
 from .mapping import ExposureMap
 from .parallel import each
 from .resampling import resample_exposure
-from .scratch import Stored
+from .scratch import Stored, forget, spill
 from .weighting import Weight
 
 _SAMPLES = 1 << 23  # pixels of all exposures that are stacked at a time
-_SIDES = 64, 512  # of blocks, px
+_SIDES = 64, 256  # of blocks, px
 _FORGETS = 2, 2, 12, 16, 20, 24  # pixels by which a spline of that order has forgotten, to 1e-8
 _BITS = 32  # exposures in a plane of the context
 
@@ -113,47 +111,40 @@ class Block:
     layers: list
 
 
-def assemble(layers, recipe, **share):
+def assemble(layers, recipe, folder, **share):
     """The planes of a mosaic.
 
     Parameters
     ----------
     layers : list of Layer
     recipe : Recipe
+    folder : path
+        The planes are arrays on the disk of this folder.
     **share
         How the work is shared, see `legdistort.parallel.each`.
 
     Returns
     -------
-    tuple of ndarray
+    list of ndarray
         Data, variance, weight, count, flags and context, as `stack` gives them for a block.
     """
-    data, variance = np.full((2, *recipe.shape), np.nan, dtype=np.float32)
-    weight, count = np.zeros(recipe.shape, dtype=np.float32), np.zeros(recipe.shape, dtype=np.int32)
-    flags = np.zeros(recipe.shape, dtype=np.uint8)
-    planes = data, variance, weight, count, flags, np.zeros((n_planes(len(layers)), *recipe.shape), dtype=np.uint32)
+    context = n_planes(len(layers)), *recipe.shape
+    planes = [spill(recipe.shape, np.float32, value, folder) for value in (np.nan, np.nan, 0)]
+    planes += [spill(recipe.shape, dtype, 0, folder) for dtype in (np.int32, np.uint8)]
+    planes += [spill(context, np.uint32, 0, folder)]
     pieces = list(blocks(layers, recipe))
     work = partial(stack, recipe=recipe, n_exposures=len(layers))
     stacked = each(work, pieces, description="co-adding", unit="block", **share)
     for block, values in zip(pieces, stacked, strict=True):
         for plane, value in zip(planes, values, strict=True):
             plane[..., *block.window] = value
+            forget(plane)
     return planes
 
 
-def check_memory(shape, n_exposures, workers):
-    """Refuse what the machine cannot hold."""
-    ny, nx = shape
-    need = ny * nx * (4 * 5 + 1 + 4 * n_planes(n_exposures)) + workers * _SAMPLES * 60
-    try:
-        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # not a POSIX system
-        memory = 16 << 30
-    if need > memory:
-        raise InputError(
-            f"a mosaic of {nx} x {ny} px from {n_exposures} exposures needs {need / 2**30:.0f} GB, this machine has "
-            f"{memory / 2**30:.0f}; are the poses right? Else use a coarser grid, or parts of it one after the other"
-        )
+def size(shape, n_exposures):
+    """Bytes of the planes of a mosaic."""
+    return int(np.prod(shape)) * (4 * 4 + 1 + 4 * n_planes(n_exposures))
 
 
 def side(n_exposures):

@@ -1,5 +1,6 @@
 """Co-addition: positions, fluxes, edges and header of mosaics of synthetic frames with a 20 px distortion."""
 
+import gzip
 import itertools
 from dataclasses import dataclass, field
 from functools import cache
@@ -21,7 +22,7 @@ from legdistort import poses
 from legdistort.basis import from_tensor
 from legdistort.coaddition import coadd, reference_grid
 from legdistort.distortion import Distortion, outside
-from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError
 from legdistort.exposures import Exposure, read_exposures
 from legdistort.mapping import tabulate, trace
 from legdistort.resampling import fill_bad
@@ -472,6 +473,15 @@ class TestFile:
         assert np.median(mosaic.variance[mosaic.footprint == 4]) == pytest.approx(0.7, abs=0.3)
         np.testing.assert_allclose(back.uncertainty**2, mosaic.variance, rtol=1e-5)
 
+    def test_the_file_is_that_of_the_hdulist(self, tmp_path):
+        *_, mosaic = plain()
+        mosaic.to_hdulist().writeto(tmp_path / "whole.fits")
+        for name in ("rows.fits", "packed.fits.gz"):
+            mosaic.write(tmp_path / name)
+        whole = (tmp_path / "whole.fits").read_bytes()
+        assert (tmp_path / "rows.fits").read_bytes() == whole
+        assert gzip.decompress((tmp_path / "packed.fits.gz").read_bytes()) == whole
+
     def test_asdf(self, tmp_path):
         solution, stars, _, exposures, _ = plain()
         mosaic = coadd(exposures, solution)
@@ -556,7 +566,8 @@ class TestBadInput:
         solution, *_, exposures, _ = plain()
         lost = StandIn(dict(solution.poses), solution.distortions)
         lost.poses["frame1"] = lost.poses["frame1"] + np.array([[0, 0, 1e6], [0, 0, -1e6]])
-        with pytest.raises(InputError, match=r"needs \d+ GB, this machine has \d+; are the poses right"):
+        message = r"a mosaic of \d+ x \d+ px and the pixels of \d exposures take 2e\+04 GB .* look at the poses"
+        with pytest.raises(DiskFullError, match=message):
             coadd(exposures, lost)
 
     def test_inputs_are_not_changed(self):

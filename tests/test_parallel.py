@@ -1,13 +1,16 @@
 """Work on many cores: the same results, bit for bit, in bounded memory, and nothing left when it fails."""
 
 import _thread
+import io
 import logging
+import mmap
 import multiprocessing
 import os
 import pickle
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import warnings
@@ -199,6 +202,14 @@ class TestExposureFiles:
 # --- planes on disk -----------------------------------------------------------------------------------------------
 
 
+def _resident():
+    """Bytes of this process in memory."""
+    statistics = Path("/proc/self/statm")
+    if not statistics.exists():
+        pytest.skip("the system does not say how much memory a process has")
+    return int(statistics.read_text().split()[1]) * mmap.PAGESIZE
+
+
 class TestScratch:
     def test_planes_come_back_by_pieces(self, tmp_path):
         plane = np.arange(30.0).reshape(5, 6)
@@ -221,9 +232,40 @@ class TestScratch:
             fail()
         assert not any(tmp_path.iterdir())
 
+    def test_spilled_arrays_may_be_forgotten(self, tmp_path):
+        array = scratch.spill((3, 700, 1000), np.float32, np.nan, tmp_path)
+        assert np.isnan(array).all()
+        array[1, 5:9] = 7
+        resident = _resident()
+        scratch.forget(array[0])  # any part of it stands for all
+        if hasattr(mmap, "MADV_DONTNEED"):
+            assert _resident() < resident - 6e6
+        assert (array[1, 5:9] == 7).all()
+        assert np.isnan(array).sum() == array.size - 4000
+        assert not any(tmp_path.iterdir())
+
+    def test_other_memory_is_not_forgotten(self, tmp_path):
+        np.save(tmp_path / "a.npy", np.zeros(5000))
+        for own in (np.zeros(5000), np.load(tmp_path / "a.npy", mmap_mode="c")):  # changes of the latter are in no file
+            own[:] = 3
+            scratch.forget(own)
+            assert (own == 3).all()
+
+    def test_a_disk_that_fills_up_is_told_when_an_array_is_made(self, monkeypatch, tmp_path):
+        class Full(io.BytesIO):
+            def write(self, data):
+                raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(tempfile, "TemporaryFile", lambda dir: Full())
+        with (
+            pytest.raises(DiskFullError, match=r"No space left on the disk of .* give another folder as scratch="),
+            scratch.scratch_folder(tmp_path, 1) as folder,
+        ):
+            scratch.spill((10, 10), np.float32, 0, folder)
+
     def test_a_disk_too_small_is_told_before(self, tmp_path):
         with (
-            pytest.raises(DiskFullError, match=r"take 1.1e\+09 GB while the mosaic is made, .* give another folder"),
+            pytest.raises(DiskFullError, match=r"the pixels take 1.1e\+09 GB on disk .* give another folder"),
             scratch.scratch_folder(tmp_path, 2**60),
         ):
             pass
@@ -269,6 +311,7 @@ class TestMosaicInBlocks:
     def test_they_fit_together(self, monkeypatch, settings):
         solution, exposures = night(3 if settings.get("method") else 1)
         monkeypatch.setattr(stacking, "_SAMPLES", 1 << 21)
+        monkeypatch.setattr(stacking, "_SIDES", (64, 512))
         whole = ld.coadd(exposures, solution, **settings)
         assert max(whole.shape) < stacking.side(len(exposures))  # one block
         monkeypatch.setattr(stacking, "_SAMPLES", 1)
@@ -359,11 +402,10 @@ class TestMosaicInBlocks:
             mosaic.write(path)
         before = [(p.name, p.read_bytes()) for p in tmp_path.iterdir()]
 
-        def write(self, name, **options):
-            name.write_bytes(b"SIMPLE")
+        def write(self, data):
             raise OSError("Not enough space on disk: requested 9, available 6")
 
-        monkeypatch.setattr(fits.HDUList, "writeto", write)
+        monkeypatch.setattr(fits.StreamingHDU, "write", write)
         with pytest.raises(DiskFullError, match=r"No space left on the disk for .*m.fits: nothing was replaced"):
             mosaic.write(path, overwrite=True)
         assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == before
