@@ -2,6 +2,7 @@
 
 import argparse
 import logging
+import signal
 import sys
 import warnings
 from contextlib import contextmanager, nullcontext
@@ -25,7 +26,7 @@ def main(argv=None):
     """Run the command line; returns the exit status: 0, 1 for a failed run, 2 for wrong usage."""
     arguments = _parser().parse_args(argv)
     try:
-        with _logging(arguments), warnings.catch_warnings():
+        with _stopping(), _logging(arguments), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of other packages
             warnings.simplefilter("default", LegdistortWarning)
             warnings.showwarning = lambda message, *_, **__: log.warning("%s", message)
@@ -50,6 +51,20 @@ def main(argv=None):
         print("legdistort: interrupted; nothing was left half-written", file=sys.stderr)
         return 1
     return 0
+
+
+@contextmanager
+def _stopping():
+    """SIGTERM, by which batch systems stop a job, is taken as Ctrl-C while a command runs: temporary files go."""
+    try:
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    except ValueError:  # in a thread, where signals do not arrive
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from .extras import has_fast
 ALGORITHMS = ("interp", "adaptive", "exact", "drizzle")
 _BAD_WEIGHT = 0.05  # an output pixel with a larger share of bad pixels is left empty
 #: Pixels of all exposures from which compiled splines are used, if numba is installed.
-COMPILED_FROM = 1 << 23
+COMPILED_FROM = 1 << 22
 
 
 def is_compiled(algorithm, order, n_pixels):

@@ -1,6 +1,9 @@
 """The command line on a small simulated night: what it leaves, and what it says of bad input."""
 
 import json
+import os
+import signal
+import tempfile
 
 import asdf
 import numpy as np
@@ -8,7 +11,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from legdistort import Solution
+from legdistort import Solution, coaddition
 from legdistort.cli import main
 from legdistort.simulation import simulate_exposures
 
@@ -121,6 +124,22 @@ def test_noise_frame_is_left_out_by_name(night, tmp_path, capsys):
     summary = json.loads(capsys.readouterr().out)
     assert summary["n_exposures"] == 6
     assert list(summary["left_out"]) == ["empty"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, number):
+    """By Ctrl-C, or by a batch system."""
+    (tmp_path / "scratch").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
+    monkeypatch.setattr(coaddition, "survey", lambda *args, **options: os.kill(os.getpid(), number))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler), signal.getsignal(signal.SIGTERM)
+    try:
+        assert run(night, tmp_path / "out") == 1
+    finally:
+        signal.signal(signal.SIGINT, before[0])
+    assert signal.getsignal(signal.SIGTERM) == before[1]
+    assert "interrupted; nothing was left half-written" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.rglob("*")] == ["scratch"]
 
 
 def test_existing_run_is_kept(night, tmp_path, capsys):

@@ -20,16 +20,19 @@ from pathlib import Path
 #: Row of the table -> (kernel by which rows are compared, function, its arguments).
 METHODS = {
     "legdistort, bilinear": ("bilinear", "ours", {"order": 1}),
+    "legdistort without numba, bilinear": ("bilinear", "ours", {"order": 1, "compiled": False}),
     "reproject_and_coadd, defaults": ("bilinear", "reproject", {}),
     "SWarp, BILINEAR": ("bilinear", "swarp", {"kernel": "BILINEAR"}),
     "drizzle package, square": ("bilinear", "drizzle", {"kernel": "square"}),
     "legdistort, drizzle": ("bilinear", "ours", {"algorithm": "drizzle"}),
     "legdistort, order 3": ("cubic", "ours", {"order": 3}),
+    "legdistort without numba, order 3": ("cubic", "ours", {"order": 3, "compiled": False}),
     "reproject_and_coadd, bicubic": ("cubic", "reproject", {"order": "bicubic"}),
     "SWarp, LANCZOS3": ("cubic", "swarp", {"kernel": "LANCZOS3"}),
     "drizzle package, lanczos3": ("cubic", "drizzle", {"kernel": "lanczos3"}),
     "legdistort, adaptive": ("adaptive", "ours", {"algorithm": "adaptive"}),
-    "reproject_interp, one frame": ("one frame", "single_reproject", {}),
+    "reproject_interp, one frame, gwcs as its file opens": ("one frame", "single_reproject", {"stock": True}),
+    "reproject_interp, one frame": ("one frame", "single_reproject", {"stock": False}),
     "legdistort, bilinear, one frame": ("one frame", "single_ours", {"order": 1}),
     "legdistort, order 3, one frame": ("one frame", "single_ours", {"order": 3}),
 }
@@ -72,10 +75,12 @@ def prepare(folder, small):
     )
 
 
-def ours(folder, out, **options):
+def ours(folder, out, *, compiled=True, **options):
     """`legdistort.coadd`."""
-    from legdistort import Solution, coadd, open_exposures
+    from legdistort import Solution, coadd, open_exposures, resampling
 
+    if not compiled:
+        resampling.COMPILED_FROM = float("inf")
     solution = Solution.read(folder / "solution.asdf")
     with timed():
         mosaic = coadd(open_exposures(frames(folder)), solution, **options)
@@ -135,25 +140,33 @@ def swarp(folder, out, *, kernel):
 
 
 def single_ours(folder, out, **options):
-    """One frame on the grid that holds it."""
+    """One frame on the grid that holds it, by a program that has done one before."""
     from legdistort import Solution, coadd, open_exposures
 
     solution, path = Solution.read(folder / "solution.asdf"), frames(folder)[0]
+    coadd(open_exposures(path), solution, **options)
     with timed():
         coadd(open_exposures(path), solution, **options)
 
 
-def single_reproject(folder, out):
+def single_reproject(folder, out, *, stock):
     """`reproject.reproject_interp` with its defaults, on the same grid."""
+    import asdf
     from reproject import reproject_interp
 
+    from legdistort.archive import write_wcs
     from legdistort.coaddition import reference_grid
 
     solution, _, _ = inputs(folder)
     path = frames(folder)[0]
-    grid = reference_grid([path.stem], solution)
+    grid, wcs = reference_grid([path.stem], solution), unbounded(solution, path)
+    if stock:
+        write_wcs(solution, path.stem, folder / "wcs.asdf", overwrite=True)
+        with asdf.open(folder / "wcs.asdf") as file:
+            wcs = file["meta"]["wcs"]
+        wcs.bounding_box = None
     with timed():
-        reproject_interp((read(path), unbounded(solution, path)), grid.wcs, shape_out=grid.shape)
+        reproject_interp((read(path), wcs), grid.wcs, shape_out=grid.shape)
 
 
 # --- pieces ------------------------------------------------------------------------------------------------------
