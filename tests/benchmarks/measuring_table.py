@@ -1,8 +1,9 @@
-"""Figures of docs/measuring.md: ``python tests/benchmarks/measuring_table.py [rivals] [profile] [crowded] [speed]``.
+"""Figures of docs/measuring.md: ``python tests/benchmarks/measuring_table.py [PART ...] [--frames N]``.
 
 ``rivals``: rms error of positions over the Cramer-Rao bound, beside SExtractor (windowed positions, if the command
-``source-extractor`` is there) and photutils; ``profile``: what a shape common to the frame gains; ``crowded``: blends
-fitted together and one by one; ``speed``: processor seconds of one process (set OPENBLAS_NUM_THREADS=1).
+``source-extractor`` is there) and photutils; ``widths``: the same for legdistort at seven widths; ``profile``: what a
+shape common to the frame gains; ``crowded``: blends fitted together and one by one; ``speed``: processor seconds of one
+process (set OPENBLAS_NUM_THREADS=1).
 """
 
 import argparse
@@ -132,19 +133,29 @@ def rivals(n):
     methods = [ours, shared, psf_moffat, psf_gaussian, daofinder]
     methods += [sextractor] * (shutil.which("source-extractor") is not None)
     for fwhm in (4.5, 2.0):
-        print(f"\nFWHM {fwhm} px: rms / bound, (stars), [std of (x - truth) / error]")
-        images = list(frames(n, fwhm))
-        for method in methods:
-            parts, start = [], time.process_time()
-            for image, truth, ratio, limit, _ in images:
-                xy, error = method(image, fwhm)
-                rows, star = matched(xy, truth, 0.4 * fwhm)
-                off = xy[rows] - truth[star]
-                off -= np.median(off[ratio[star] > 30], axis=0)  # conventions of pixels count against nobody
-                z = off / error[rows] if error is not None else np.full(off.shape, np.nan)
-                parts.append(np.column_stack([ratio[star], off / limit[star], z]))
-            _print_bins(method.__name__, np.concatenate(parts))
-            print(f"    {(time.process_time() - start) / n:.2f} s a frame" if method is not sextractor else "")
+        _compare(methods, n, fwhm)
+
+
+def widths(n):
+    """The same for legdistort alone, from undersampled to wide images."""
+    for fwhm in (1.2, 1.6, 2.0, 2.5, 3.5, 4.5, 6.0):
+        _compare([ours], n, fwhm)
+
+
+def _compare(methods, n, fwhm):
+    print(f"\nFWHM {fwhm} px: rms / bound, (stars), [std of (x - truth) / error]")
+    images = list(frames(n, fwhm))
+    for method in methods:
+        parts, start = [], time.process_time()
+        for image, truth, ratio, limit, _ in images:
+            xy, error = method(image, fwhm)
+            rows, star = matched(xy, truth, 0.4 * fwhm)
+            off = xy[rows] - truth[star]
+            off -= np.median(off[ratio[star] > 30], axis=0)  # conventions of pixels count against nobody
+            z = off / error[rows] if error is not None else np.full(off.shape, np.nan)
+            parts.append(np.column_stack([ratio[star], off / limit[star], z]))
+        _print_bins(method.__name__, np.concatenate(parts))
+        print(f"    {(time.process_time() - start) / n:.2f} s a frame" if method is not sextractor else "")
 
 
 def _print_bins(name, rows):
@@ -220,7 +231,7 @@ def speed(n):
 
 
 if __name__ == "__main__":
-    parts = {"rivals": rivals, "profile": profiles, "crowded": crowded, "speed": speed}
+    parts = {"rivals": rivals, "widths": widths, "profile": profiles, "crowded": crowded, "speed": speed}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART")
     parser.add_argument("--frames", type=int, default=6)
