@@ -2,8 +2,10 @@
 
 import logging
 import warnings
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
@@ -17,9 +19,9 @@ from .levels import bad_pixels, flux_scales, match_backgrounds, saturated_pixels
 from .mapping import Grid, map_exposure, outline
 from .mosaics import Mosaic
 from .parallel import each
-from .resampling import ALGORITHMS, fill_bad, is_compiled, rough_pixels, white_gain
+from .resampling import ALGORITHMS, fill_bad, is_compiled, noise_correlation, rough_pixels, white_gain
 from .scratch import scratch_folder, store
-from .stacking import Layer, Recipe, assemble, size
+from .stacking import Layer, Recipe, assemble, n_bytes
 from .weighting import EXTRAPOLATED, make_weights, stellar_widths
 
 logger = logging.getLogger(__name__)
@@ -27,6 +29,17 @@ logger = logging.getLogger(__name__)
 CONSERVE = ("flux", "surface_brightness")
 _ORDERS = {"nearest-neighbor": 0, "bilinear": 1, "biquadratic": 2, "bicubic": 3}
 _STORED = 5  # bytes a pixel in the scratch folder, about
+_COARSE = 1.5  # pixels of the grid in those of an exposure from which interpolation leaves out too much
+_MEANING = {
+    "COMBINE": "how exposures are combined",
+    "RESAMPLE": "how they are resampled, order or kernel",
+    "CONSERVE": "of stars, or of the sky",
+    "SKYLEVEL": "common level of the backgrounds",
+    "FLXSCALE": "where the flux scales come from",
+    "EXTRAPOL": "pixels outside the stars used",
+    "WEIGHTS": "of the exposures",
+    "NOISECOR": "noise of sums of many pixels over that by VAR",
+}
 _COPIED = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "BUNIT")
 
 
@@ -93,9 +106,9 @@ def coadd(
         Threads that share the work. None = the current ``dask.distributed.Client`` if there is one, else this one. The
         mosaic is the same, bit for bit.
     scratch : str or path, optional
-        Folder for the pixels of the exposures while work goes on, 4 to 13 bytes for each, and for those of the mosaic,
-        21 or more, as long as it is in use; the workers of a cluster must see it. The default is that of the system
-        (``TMPDIR``).
+        Folder for the pixels of the exposures while work goes on, 4 to 11 bytes for each (17 in double precision), and
+        for those of the mosaic, 21 or more, as long as it is in use; the workers of a cluster must see it. The default
+        is that of the system (``TMPDIR``), which some systems keep in memory.
     progress : bool
         Show progress bars.
 
@@ -119,63 +132,87 @@ def coadd(
     left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
     frames = [f for f in frames if maps[f.name] is not None]
     share = {"workers": workers, "threads": True, "progress": progress}
-    need = size(output.shape, len(frames)) + _STORED * sum(int(np.prod(f.shape)) for f in frames)
+    need = n_bytes(output.shape, len(frames)) + _STORED * sum(int(np.prod(f.shape)) for f in frames)
     ny, nx = output.shape
     with scratch_folder(
         scratch, need, f"a mosaic of {nx} x {ny} px and the pixels of {len(frames)} exposures"
     ) as folder:
         kept = each(partial(_keep, folder=folder), frames, description="reading", **share)
         kept = dict(zip([f.name for f in frames], kept, strict=True))
-        masked = {name: "every pixel is masked" for name, found in kept.items() if found is None}
-        _warn(masked)
-        left_out |= masked
-        frames = [f for f in frames if kept[f.name] is not None]
+        empty = {name: found for name, found in kept.items() if isinstance(found, str)}
+        _warn(empty)
+        left_out |= empty
+        frames = [f for f in frames if f.name not in empty]
         if not frames:
             raise InputError(f"no exposure meets the output grid: {_reasons(left_out)}")
-        factors, origin = flux_scales(frames, scale, solution)
-        surveys = [kept[f.name][1] for f in frames]
-        noise = {s.name: factors[s.name] * s.noise for s in surveys}
-        weight = make_weights(weights, noise, solution, times={f.name: f.exposure_time for f in frames})
-        fwhm = stellar_widths(solution, list(noise))
-        sky = match_backgrounds(surveys, solution, output, factors)
-        level = float(np.mean(list(sky.values())))
-        gains = [white_gain(maps[f.name], algorithm=algorithm, order=order, drop=drop) for f in frames]
-        layers = [
-            Layer(
-                index=i,
-                stored=kept[f.name][0],
-                map=maps[f.name],
-                survey=kept[f.name][1],
-                factor=factors[f.name],
-                variance=noise[f.name] ** 2,
-                sky=sky[f.name] if match_background else None,
-                weight=weight[f.name],
-                fwhm=fwhm and fwhm[f.name],
-                support=None if extrapolated == "keep" else support(f.name, solution),
-                gain=gains[i],
-            )
-            for i, f in enumerate(frames)
-        ]
         recipe = Recipe(
             shape=output.shape,
             method=method,
             algorithm=algorithm,
             order=order,
             conserve=conserve,
-            level=level,
             mask=extrapolated == "mask",
-            widths=_span(fwhm),
             drop=drop,
             compiled=is_compiled(algorithm, order, sum(np.prod(f.shape) for f in frames)),
         )
+        factors, origin = flux_scales(frames, scale, solution)
+        sky = match_backgrounds([kept[f.name][1] for f in frames], solution, output, factors)
+        layers, recipe = _layers(
+            frames, kept, maps, solution, recipe, factors=factors, weights=weights, sky=sky, matched=match_background
+        )
+        if extrapolated != "keep":
+            layers = [replace(each, support=support(each.survey.name, solution)) for each in layers]
         planes = assemble(layers, recipe, folder.parent, **share)
+    _warn_of_misuse(frames, maps, algorithm)
     settings = {"COMBINE": method, "RESAMPLE": _in_words(algorithm, order, drop), "CONSERVE": conserve}
-    settings |= {"SKYLEVEL": level if match_background else None, "FLXSCALE": origin, "EXTRAPOL": extrapolated}
+    settings |= {"SKYLEVEL": recipe.level if match_background else None, "FLXSCALE": origin, "EXTRAPOL": extrapolated}
     settings |= {"WEIGHTS": weights if isinstance(weights, str) else "equal" if weights is None else "given"}
-    settings |= {"NOISECOR": (gains[0] ** -0.5, "noise of sums of many pixels over that by VAR")}
+    correlation = noise_correlation(maps[frames[0].name], layers[0].gain, algorithm=algorithm, order=order)
+    settings["NOISECOR"] = correlation if np.isfinite(correlation) else None
     header = _header(frames, left_out, factors, settings)
     names = tuple(f.name for f in frames)
     return Mosaic(*planes, wcs=output.wcs, exposures=names, left_out=left_out, offset=output.offset, header=header)
+
+
+def _layers(frames, kept, maps, solution, recipe, *, factors, weights, sky, matched):
+    """The layers, and the recipe with the common background level and the widths of stars."""
+    noise = {f.name: factors[f.name] * kept[f.name][1].noise for f in frames}
+    weight = make_weights(weights, noise, solution, times={f.name: f.exposure_time for f in frames})
+    fwhm = stellar_widths(solution, list(noise))
+    level = float(np.mean(list(sky.values())))
+    if recipe.conserve == "flux" and not matched:  # the sky counts as flux as well
+        level *= float(np.mean([_area(maps[f.name]) for f in frames]))
+    layers = [
+        Layer(
+            index=i,
+            stored=kept[f.name][0],
+            map=maps[f.name],
+            survey=kept[f.name][1],
+            factor=factors[f.name],
+            variance=noise[f.name] ** 2,
+            sky=sky[f.name] if matched else None,
+            weight=weight[f.name],
+            fwhm=fwhm and fwhm[f.name],
+            gain=white_gain(maps[f.name], algorithm=recipe.algorithm, order=recipe.order, drop=recipe.drop),
+            photons=_photons(f, kept[f.name][0], maps[f.name], noise[f.name], factors[f.name], recipe.conserve),
+        )
+        for i, f in enumerate(frames)
+    ]
+    return layers, replace(recipe, level=level, widths=_span(fwhm))
+
+
+def _photons(frame, stored, exposure_map, noise, factor, conserve):
+    """Growth of the variance with the signal, by the gain where there is no uncertainty plane (see `Layer.photons`)."""
+    if not frame.gain or "variance" in stored.paths or noise == 0:
+        return 0.0
+    area = _area(exposure_map) if conserve == "flux" else 1.0
+    return float(factor / (noise**2 * area * frame.gain))
+
+
+def _area(exposure_map):
+    """Detector pixels per output pixel in the middle of an exposure."""
+    area = exposure_map.middle()[4].mean()
+    return area if np.isfinite(area) else 1.0
 
 
 def _check_options(method, order, algorithm, conserve, extrapolated):
@@ -206,7 +243,12 @@ def _in_words(algorithm, order, drop):
 
 def _select(exposures, solution):
     """Exposures that can be used, and the reasons why others cannot."""
-    exposures = list(exposures)
+    exposures = [exposures] if exposures is None or isinstance(exposures, str | Path) else list(exposures)
+    if not all(hasattr(e, "read") for e in exposures):
+        raise InputError(
+            "exposures must be images as open_exposures or read_exposures give them, got "
+            f"{type(exposures[0]).__name__}; give open_exposures('frames/*.fits')"
+        )
     names = [f.name for f in exposures]
     twice = {n for n in names if names.count(n) > 1}
     if twice:
@@ -234,13 +276,15 @@ def _warn(left_out):
 
 
 def _keep(frame, folder):
-    """The planes of an exposure, put aside, and its survey; None if it has no pixel to use."""
+    """The planes of an exposure, put aside, and its survey; or the reason why it cannot be used."""
     exposure = frame.read()
     bad = bad_pixels(exposure)
     if bad.all():
-        return None
+        return "every pixel is masked"
     data, variance = fill_bad(exposure.data, bad), None
     seen, full = survey(exposure, bad=bad, filled=data), saturated_pixels(exposure) & ~bad
+    if not data.any():
+        return "every pixel is 0"
     rough = rough_pixels(data, bad, full, seen.noise)
     if exposure.uncertainty is not None:
         variance = np.square(exposure.uncertainty, dtype=np.float32)
@@ -251,7 +295,13 @@ def _keep(frame, folder):
 
 
 def _reasons(left_out):
-    return "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+    names = {reason: [n for n, other in left_out.items() if other == reason] for reason in left_out.values()}
+    return "; ".join(f"{_few(same)}: {reason}" for reason, same in names.items())
+
+
+def _few(names, most=5):
+    more = f" and {len(names) - most} more" * (len(names) > most)
+    return ", ".join(names[:most]) + more
 
 
 def reference_grid(names, solution):
@@ -305,21 +355,40 @@ def _given_grid(grid, solution):
     return Grid(tuple(int(n) for n in wcs.array_shape), wcs, None, solution.sky)
 
 
+def _warn_of_misuse(frames, maps, algorithm):
+    """Of light that is lost between pixels, and of units that do not go together."""
+    scale = max(maps[f.name].scale for f in frames)
+    if algorithm == "interp" and scale > _COARSE:
+        warnings.warn(
+            f"pixels of the grid are {scale:.1f} times as large as those of the exposures: interpolation leaves light "
+            "out; take algorithm='adaptive' or 'drizzle'",
+            AssumptionWarning,
+            stacklevel=3,
+        )
+    units = {str(f.header.get("BUNIT", "")).strip() for f in frames} - {""}
+    if len(units) > 1:
+        warnings.warn(
+            f"the units (BUNIT) of the exposures differ: {', '.join(sorted(units))}; values are combined as they are",
+            AssumptionWarning,
+            stacklevel=3,
+        )
+
+
 def _header(frames, left_out, factors, settings):
     header = fits.Header()
     for key in _COPIED:
         values = {str(f.header.get(key, "")) for f in frames}
         if len(values) == 1 and values != {""}:
             header[key] = values.pop()
-    times = [f.exposure_time for f in frames]
+    times = [f.exposure_time or None for f in frames]
     if None not in times:
         mean = float(np.mean([time * factors[f.name] for f, time in zip(frames, times, strict=True)]))
-        header["EXPTIME"] = (mean, "[s] exposure time that the values stand for")
+        header["EXPTIME"] = (round(mean, 9), "[s] exposure time that the values stand for")
         header["TEXPTIME"] = (sum(times), "[s] sum of the exposure times")
     header["NCOMBINE"] = (len(frames), "number of exposures combined")
     for key, value in settings.items():
         if value is not None:
-            header[key] = value
+            header[key] = (value, _MEANING[key])
     header["CREATOR"] = f"legdistort {version('legdistort')}"
     for i, frame in enumerate(frames[:999], start=1):
         header[f"IMCMB{i:03d}"] = frame.name

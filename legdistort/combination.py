@@ -52,7 +52,7 @@ class Combined:
         return f"<Combined: {nx} x {ny} px, {k} exposures>"
 
 
-def combine(data, variance, weight, *, method="mean", level=0.0, spare=None, fwhm=None, widths=None):
+def combine(data, variance, weight, *, method="mean", level=0.0, photons=None, spare=None, fwhm=None, widths=None):
     """Combine exposures on a block of the output grid.
 
     Parameters
@@ -66,7 +66,10 @@ def combine(data, variance, weight, *, method="mean", level=0.0, spare=None, fwh
     method : {'mean', 'median', 'clipped'}
         Weighted mean; median; or weighted mean of what the median of at least three exposures confirms (`confirmed`).
     level : float
-        Background, from which the signal is counted when clipping.
+        Background, from which the signal is counted.
+    photons : array_like, shape (k,), optional
+        Relative growth of the variance of each exposure with the combined signal, by photons that are not in
+        `variance`. Clipping does not allow for them.
     spare : ndarray of bool, shape (k, ny, nx), optional
         Pixels that are used only where no exposure has others, such as saturated ones.
     fwhm, widths
@@ -84,18 +87,26 @@ def combine(data, variance, weight, *, method="mean", level=0.0, spare=None, fwh
         data = np.where(use, data, np.nan)
     weight = np.broadcast_to(np.asarray(weight, dtype=np.float32), data.shape)
     if method == "median":
-        return _median(data, variance, weight, use)
+        return _median(data, variance, weight, use, level, photons)
     keep = use
     if method == "clipped":
         keep = confirmed(data, variance, use, level=level, fwhm=fwhm, widths=widths)
-    total, mean, spread = np.zeros((3, *data.shape[1:]), dtype=np.float32)
-    for w, d, v, k in zip(weight, data, np.broadcast_to(variance, data.shape), keep, strict=True):
-        w = np.where(k, w, 0)
-        total += w
-        mean += np.where(k, w * d, 0)
-        spread += np.where(k, w * w * v, 0)
+    total, mean, spread = np.zeros((3, *data.shape[1:]))
     with np.errstate(invalid="ignore", divide="ignore"):
-        return Combined(mean / total, spread / total**2, total, keep)
+        for w, d, k in zip(weight, data, keep, strict=True):
+            total += np.where(k, w, 0)
+            mean += np.where(k, w * d, 0)
+        mean /= total
+        variance = np.broadcast_to(_with_photons(variance, photons, mean - level), data.shape)
+        for w, v, k in zip(weight, variance, keep, strict=True):
+            spread += np.where(k, w * w * v, 0)
+        return Combined(*(plane.astype(np.float32) for plane in (mean, spread / total**2, total)), keep)
+
+
+def _with_photons(variance, photons, signal):
+    if photons is None:
+        return variance
+    return variance * (1 + np.reshape(photons, (-1, 1, 1)) * np.fmax(signal, 0)).astype(np.float32)
 
 
 def margin(method, widths=None):
@@ -116,8 +127,10 @@ def _reach(widths):
     return 1 if widths is None else max(1, round(widths[1] / 3))
 
 
-def _median(data, variance, weight, use):
+def _median(data, variance, weight, use, level, photons):
     count = use.sum(axis=0)
+    centre = (_ranked(data, count, low=True) + _ranked(data, count, low=False)) / 2
+    variance = _with_photons(variance, photons, centre - level)
     with np.errstate(invalid="ignore", divide="ignore"):
         # That of the mean if errors are equal, else asymptotically less: with few exposures between the two. Then what
         # n is: 1, 1, 1.35, 1.19, 1.43, 1.29 ... pi/2 (within 4 %).
@@ -128,7 +141,6 @@ def _median(data, variance, weight, use):
         excess = np.where(count > 2, np.pi / 2 * count / (count + np.where(count % 2, 0.48, 1.3)), 1)
         spread = np.where(count > 0, excess * spread, np.nan)
     total = np.where(use, weight, 0).sum(axis=0)
-    centre = (_ranked(data, count, low=True) + _ranked(data, count, low=False)) / 2
     return Combined(centre.astype(np.float32), spread.astype(np.float32), total, use)
 
 

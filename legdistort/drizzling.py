@@ -70,20 +70,22 @@ def drizzle(data, good, variances, pixel_map, drop):
 
     c = pixel_map.corners
     centres = (c[:, :-1, :-1] + c[:, 1:, :-1] + c[:, :-1, 1:] + c[:, 1:, 1:]) / 4  # to 1e-5 px
-    # Drops whose centres lie beyond the output would not fall at all, not even the part that does not.
-    rim = 1 + int(np.ceil(max(np.abs(np.diff(c, axis=axis)).max() for axis in (1, 2))))
-    shape = tuple(n + 2 * rim for n in pixel_map.area.shape)
+    # Room for all drops: the package leaves out those beyond a straight-edged outline of the output; pieces are bent.
+    ny, nx = pixel_map.area.shape
+    low = np.minimum(np.floor(np.nanmin(c, axis=(1, 2))), 0).astype(int) - 2
+    high = np.maximum(np.ceil(np.nanmax(c, axis=(1, 2))), (nx, ny)).astype(int) + 2
+    shape = tuple(int(n) for n in (high - low)[::-1])
     onto = Drizzle(kernel=drop.kernel, out_shape=shape, fillval=np.nan, disable_ctx=True)
     onto.add_image(
         np.ascontiguousarray(data, dtype=np.float32),
         exptime=1.0,
-        pixmap=np.ascontiguousarray(np.moveaxis(centres, 0, -1)) + rim,
+        pixmap=np.ascontiguousarray(np.moveaxis(centres, 0, -1)) - low,
         data2=[np.ascontiguousarray(v, dtype=np.float32) for v in variances] or None,
         weight_map=good.astype(np.float32),
         pixfrac=drop.pixfrac,
         in_units="cps",
     )
-    within = slice(rim, -rim), slice(rim, -rim)
+    within = slice(-low[1], ny - low[1]), slice(-low[0], nx - low[0])
     coverage = onto.out_wht[within]
     empty = ~(np.abs(coverage) > _EMPTY * drop.pixfrac**2) | ~pixel_map.inside
     out = [np.where(empty, np.nan, plane[within]).astype(float) for plane in (onto.out_img, *(onto.out_img2 or ()))]

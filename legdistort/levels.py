@@ -221,7 +221,7 @@ def flux_scales(frames, scale, solution):
         )
     if scale is None:
         return dict.fromkeys(names, 1.0), "none"
-    times = [f.exposure_time for f in frames]
+    times = [f.exposure_time or None for f in frames]
     stars = None if scale == "exptime" else _star_scales(names, solution)
     if scale == "stars" and stars is None:
         raise InputError(
@@ -250,7 +250,7 @@ def _time_scales(frames, times):
     if len(set(times)) == 1 or unit.endswith(("/s", "/sec", "s-1", "s**-1", "s^-1")):
         return same
     if None in times:
-        missing = ", ".join(f.name for f in frames if f.exposure_time is None)
+        missing = ", ".join(f.name for f in frames if not f.exposure_time)
         warnings.warn(
             f"no exposure time known for {missing}: the exposures are taken to be equally long; "
             "give scale={name: factor} if they are not",

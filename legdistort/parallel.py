@@ -99,7 +99,9 @@ def _dask(function, items, *, workers, threads, client):
                 for message in warned:
                     warnings.warn(message, stacklevel=3)
                 for record in logged:
-                    logging.getLogger(record.name).handle(record)
+                    logger = logging.getLogger(record.name)
+                    if logger.isEnabledFor(record.levelno):
+                        logger.handle(record)
                 if error is not None:
                     raise error
                 yield result
@@ -115,9 +117,8 @@ def _scheduler(workers, threads, client):
 
     if threads:
         pool = ThreadPoolExecutor(workers)
-    else:  # an interrupt is for this process, which then stops the others
-        ignore = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
-        pool = ProcessPoolExecutor(workers, mp_context=get_context(), **ignore)
+    else:
+        pool = ProcessPoolExecutor(workers, mp_context=get_context(), initializer=_begin)
     try:
         yield (
             {"scheduler": "threads", "pool": pool}
@@ -131,6 +132,12 @@ def _scheduler(workers, threads, client):
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _begin():
+    """In a new worker: Ctrl-C is for the process that it works for, which then stops it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # forked workers would have the handler of the command line
 
 
 def _attempt(function, item):

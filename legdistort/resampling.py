@@ -6,6 +6,7 @@ compiled twins of its splines take over (`legdistort.spline_kernels`).
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import ceil
 
 import numpy as np
 from astropy import units as u
@@ -271,6 +272,43 @@ def white_gain(exposure_map, *, algorithm, order=None, drop=None):
                 return float(np.nanvar(drizzle(noise, np.ones(noise.shape, dtype=bool), [], found[0], drop)[0]))
             return float(np.nanvar(resample(noise[None], found[0], algorithm=algorithm)))
     return 1.0
+
+
+def noise_correlation(exposure_map, gain, *, algorithm, order=None):
+    """Noise of the sum of many pixels over that by the sum of their variances, in the middle of an exposure.
+
+    Parameters
+    ----------
+    exposure_map : `~legdistort.mapping.ExposureMap`
+    gain : float
+        From `white_gain`.
+    algorithm, order
+        As for `resample_exposure`.
+
+    Returns
+    -------
+    float
+    """
+    x, y, _, _, area = exposure_map.middle()
+    if algorithm != "interp":  # these lose no light: the sum has the noise of the pixels of the detector
+        return float((gain * area.mean()) ** -0.5)
+    along_x, along_y = (np.array([np.diff(p, axis=axis).mean() for p in (x, y)]) for axis in (1, 0))
+    reach = min(200, ceil(20 / min(np.hypot(*along_x), np.hypot(*along_y))))
+    i, k = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    step, correlation = _spline_correlation(order)
+    lag = along_x[:, None, None] * k + along_y[:, None, None] * i
+    both = [np.interp(np.abs(p), step * np.arange(len(correlation)), correlation, right=0) for p in lag]
+    return float(np.sqrt((both[0] * both[1]).sum()))
+
+
+@lru_cache
+def _spline_correlation(order, n=32, reach=20):
+    """Correlation of white noise after interpolation, at lags of so many n-th pixels: the step, and values."""
+    impulse = np.zeros(4 * reach + 1)
+    impulse[2 * reach] = 1
+    kernel = map_coordinates(impulse, [np.arange(reach, 3 * reach, 1 / n)], order=order)
+    values = np.correlate(kernel, kernel, "full")[len(kernel) - 1 :]
+    return 1 / n, values / values[0]
 
 
 def rough_pixels(data, bad, full, noise):

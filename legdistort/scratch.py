@@ -47,7 +47,7 @@ def scratch_folder(parent, need, what="the pixels"):
     need : int
         Bytes that will be stored.
     what : str
-        They are, for the message.
+        What these bytes are, for the message.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def scratch_folder(parent, need, what="the pixels"):
         free = shutil.disk_usage(place).free
         if free < need:
             raise DiskFullError(
-                f"{what} take {need / 2**30:.2g} GB on disk while work goes on, {place} has {free / 2**30:.2g} GB "
+                f"{what} take {need / 2**30:,.2f} GB on disk while work goes on, {place} has {free / 2**30:,.2f} GB "
                 f"left: {advice}; if they should not be so many, look at the poses and at the grid"
             )
         yield Path(folder)
@@ -118,7 +118,7 @@ def spill(shape, dtype, value, folder):
     Returns
     -------
     ndarray
-        Of the size of the disk and not of the memory, if what was worked on is dropped by `forget`.
+        It may be larger than the memory, if `forget` is called now and then. Processes forked from this one share it.
     """
     size = int(np.prod(shape))
     values = np.full(min(size, 1 << 20), value, dtype)

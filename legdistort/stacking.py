@@ -43,10 +43,12 @@ class Layer:
     weight : Weight
     fwhm : float or None
         Of its stars [px].
-    support : ndarray or None
-        Half-planes outside which the distortion is extrapolated; None = it does not matter.
     gain : float or None
         See `legdistort.resampling.resample_exposure`.
+    photons : float
+        See `legdistort.combination.combine`.
+    support : ndarray or None
+        Half-planes outside which the distortion is extrapolated; None = it does not matter.
     """
 
     index: int
@@ -58,8 +60,9 @@ class Layer:
     sky: float | None
     weight: Weight
     fwhm: float | None
-    support: np.ndarray | None
     gain: float | None
+    photons: float
+    support: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class Recipe:
     algorithm: str
     order: int
     conserve: str
-    level: float
+    level: float = 0.0
     mask: bool = False
     widths: tuple | None = None
     drop: Drop | None = None
@@ -142,8 +145,8 @@ def assemble(layers, recipe, folder, **share):
     return planes
 
 
-def size(shape, n_exposures):
-    """Bytes of the planes of a mosaic."""
+def n_bytes(shape, n_exposures):
+    """Of the planes of a mosaic."""
     return int(np.prod(shape)) * (4 * 4 + 1 + 4 * n_planes(n_exposures))
 
 
@@ -219,6 +222,7 @@ def stack(block, *, recipe, n_exposures):
         nothing = (np.zeros(shape, dtype=dtype) for dtype in (np.float32, np.int32, np.uint8))
         return empty, empty, *nothing, context
     n = len(met)
+    photons = [layer.photons for layer in met]
     spare = doubt[:n] & PixelFlag.SATURATED > 0
     combined = combine(
         data[:n],
@@ -226,6 +230,7 @@ def stack(block, *, recipe, n_exposures):
         weight[:n],
         method=recipe.method,
         level=recipe.level,
+        photons=photons if any(photons) else None,
         spare=spare if spare.any() else None,
         fwhm=None if recipe.widths is None else [layer.fwhm for layer in met],
         widths=recipe.widths,

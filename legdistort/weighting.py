@@ -34,6 +34,9 @@ def by_name(argument, given, names):
     InputError
         If a number is missing or not positive.
     """
+    unknown = [str(name) for name in given if name not in names]
+    if unknown:
+        raise InputError(f"{argument}: no exposure of that name is co-added: {', '.join(unknown)}")
     for name in names:
         value = given.get(name)
         if not (isinstance(value, (int, float, np.number)) and np.isfinite(value) and value > 0):

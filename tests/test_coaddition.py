@@ -2,7 +2,7 @@
 
 import gzip
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import asdf
@@ -543,7 +543,9 @@ class TestBadInput:
             coadd(exposures, StandIn(solution.poses, solution.distortions), grid=mosaic.wcs)
         away = mosaic.wcs.deepcopy()
         away.wcs.crpix = away.wcs.crpix + 5000
-        with pytest.raises(InputError, match="no exposure meets the output grid: frame0: it does not meet"):
+        with pytest.raises(
+            InputError, match="no exposure meets the output grid: frame0, frame1, frame2, frame3: it does not meet"
+        ):
             coadd(exposures, solution, grid=away)
 
     def test_exposures(self):
@@ -566,9 +568,37 @@ class TestBadInput:
         solution, *_, exposures, _ = plain()
         lost = StandIn(dict(solution.poses), solution.distortions)
         lost.poses["frame1"] = lost.poses["frame1"] + np.array([[0, 0, 1e6], [0, 0, -1e6]])
-        message = r"a mosaic of \d+ x \d+ px and the pixels of \d exposures take 2e\+04 GB .* look at the poses"
+        message = r"a mosaic of \d+ x \d+ px and the pixels of \d exposures take [\d,]+\.\d\d GB .* look at the poses"
         with pytest.raises(DiskFullError, match=message):
             coadd(exposures, lost)
+
+    def test_what_is_no_exposure(self):
+        solution, *_ = plain()
+        for given in ("demo/frames/*.fits", None, [np.zeros(SHAPE)]):
+            with pytest.raises(InputError, match=r"must be images as open_exposures .*; give open_exposures"):
+                coadd(given, solution)
+
+    def test_dubious_frames_are_told(self):
+        solution, stars, flux = scene(7, rolls=[0] * 7)
+        frames = expose(solution, stars, flux, header=fits.Header({"BUNIT": "adu"}))
+        frames[1] = replace(frames[1], header=fits.Header({"BUNIT": "adu/s"}))
+        with pytest.warns(AssumptionWarning, match=r"the units \(BUNIT\) of the exposures differ: adu, adu/s"):
+            coadd(frames, solution)
+        dead = [frames[0]] + [replace(f, data=np.zeros(SHAPE), header=fits.Header()) for f in frames[1:]]
+        names = "frame1, frame2, frame3, frame4, frame5 and 1 more"
+        with pytest.warns(AssumptionWarning, match=f"left out of the mosaic: {names}: every pixel is 0"):
+            assert coadd(dead, solution).exposures == ("frame0",)
+        with pytest.raises(InputError, match="scale: no exposure of that name is co-added: frame9"):
+            coadd(frames[:1], solution, scale={"frame0": 1, "frame9": 2})
+
+    def test_a_coarse_grid_is_for_other_algorithms(self):
+        solution, *_, exposures, mosaic = plain()
+        grid = mosaic.wcs.deepcopy()
+        grid.wcs.cd, grid.wcs.crpix = 3 * grid.wcs.cd, grid.wcs.crpix / 3
+        grid.array_shape = tuple(n // 3 for n in mosaic.shape)
+        with pytest.warns(AssumptionWarning, match=r"pixels of the grid are 3\.\d times .* take algorithm='adaptive'"):
+            coadd(exposures, solution, grid=grid)
+        coadd(exposures, solution, grid=grid, algorithm="adaptive")
 
     def test_inputs_are_not_changed(self):
         solution, *_, exposures, _ = plain()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_coaddition import SHAPE, StandIn, check_stars, covered, expose, fit_star, plain, scene
 
-from legdistort import poses
+from legdistort import poses, stacking
 from legdistort.coaddition import coadd
 from legdistort.distortion import Distortion
 from legdistort.drizzling import KERNELS, Drop
@@ -28,6 +28,24 @@ def test_it_is_the_exact_algorithm():
     assert np.quantile(difference, 0.999) < 1e-3 * peak
     check_stars(two, stars - two.offset, flux, position=0.04, relative=0.01)
     assert two.header["RESAMPLE"] == "drizzle square 1"
+
+
+@pytest.mark.parametrize("roll", [0, 2, 45, 137])
+@pytest.mark.parametrize("side", [256, 64])
+def test_bent_blocks_fit_together(monkeypatch, roll, side):
+    solution, *_ = scene(1, rolls=(roll,), seed=3)
+    y, x = np.indices(SHAPE)
+    image = 1000 + 200 * np.sin(x / 9) * np.cos(y / 11) + np.random.default_rng(0).normal(size=SHAPE)
+
+    def drizzled(side):
+        monkeypatch.setattr(stacking, "_SIDES", (side, side))
+        return coadd([Exposure("frame0", image)], solution, algorithm="drizzle", conserve="surface_brightness")
+
+    whole, pieces = drizzled(1024), drizzled(side)
+    np.testing.assert_array_equal(pieces.footprint, whole.footprint)
+    np.testing.assert_allclose(pieces.data, whole.data, rtol=1e-4)
+    np.testing.assert_allclose(pieces.weight, whole.weight, rtol=1e-3, atol=1e-4 * whole.weight.max())
+    assert np.nanmax(np.abs(whole.data - 1000)) < 206  # no drop is lost, in the whole neither
 
 
 def test_exposures_together():

@@ -265,7 +265,7 @@ class TestScratch:
 
     def test_a_disk_too_small_is_told_before(self, tmp_path):
         with (
-            pytest.raises(DiskFullError, match=r"the pixels take 1.1e\+09 GB on disk .* give another folder"),
+            pytest.raises(DiskFullError, match=r"the pixels take 1,073,741,824.00 GB on disk .* give another folder"),
             scratch.scratch_folder(tmp_path, 2**60),
         ):
             pass
@@ -437,7 +437,7 @@ if __name__ == "__main__":
     solution.sky = None
     exposures = ld.open_exposures({folder!r} + "/*.fits")
     mosaic = ld.coadd(exposures, solution, method="clipped", workers=2, scratch={folder!r})
-    mosaic.write({folder!r} + "/mosaic")
+    mosaic.write({folder!r} + "/mosaic.fits")
     assert mosaic.footprint.max() == 100
     print(sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 2**20)
 """

@@ -1,4 +1,4 @@
-"""Table of docs/stack_quality.md: ``python tests/benchmarks/coadd_table.py [--small] [--only WORD] [--keep FOLDER]``.
+"""Table of docs/stack_quality.md: ``python tests/benchmarks/coadd_table.py [--small] [--only WORDS] [--rounds N]``.
 
 A simulated GSAOI night (eleven frames of 2048 x 2048 px) is measured and solved; then legdistort, reproject, SWarp and
 drizzle co-add the same frames with the same distortions on the same grid, each in a process of its own, one after the
@@ -9,6 +9,7 @@ so that the largest memory of a process (``ru_maxrss``) is its own.
 import argparse
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -150,7 +151,7 @@ def single_ours(folder, out, **options):
 
 
 def single_reproject(folder, out, *, stock):
-    """`reproject.reproject_interp` with its defaults, on the same grid."""
+    """`reproject.reproject_interp` with its defaults, on the same grid, by a program that has done one before."""
     import asdf
     from reproject import reproject_interp
 
@@ -165,6 +166,7 @@ def single_reproject(folder, out, *, stock):
         with asdf.open(folder / "wcs.asdf") as file:
             wcs = file["meta"]["wcs"]
         wcs.bounding_box = None
+    reproject_interp((read(path), wcs), grid.wcs, shape_out=grid.shape)
     with timed():
         reproject_interp((read(path), wcs), grid.wcs, shape_out=grid.shape)
 
@@ -308,7 +310,10 @@ def step(name, folder, *more):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--small", action="store_true", help="six frames of 512 x 512 px")
-    parser.add_argument("--only", default="", help="rows whose name contains this")
+    parser.add_argument("--only", default="", help="rows whose name has this regular expression")
+    parser.add_argument(
+        "--rounds", type=int, default=1, help="run all rows so many times in turn, and take the best of each"
+    )
     parser.add_argument("--keep", type=Path, help="folder for the files; used again if it holds a night")
     parser.add_argument("--step", help=argparse.SUPPRESS)
     a = parser.parse_args()
@@ -332,11 +337,12 @@ def table(folder, a):
         step("prepare", folder, *["--small"] * a.small)
     n = len(frames(folder))
     costs = {}
-    for number, name in enumerate(METHODS):
-        if a.only in name:
+    for number, name in [*enumerate(METHODS)] * a.rounds:
+        if re.search(a.only, name):
             (folder / f"out_{number}.fits").unlink(missing_ok=True)
-            costs[name] = step(name, folder)
-            print(f"{name}: {costs[name]}", file=sys.stderr, flush=True)
+            cost = step(name, folder)
+            print(f"{name}: {cost}", file=sys.stderr, flush=True)
+            costs[name] = min(filter(None, [cost, costs.get(name)]), key=lambda c: c["cpu"], default=None)
     judged = step("judge", folder)
     print(f"{n} frames; {judged['n_stars']} stars; processor seconds; load {os.getloadavg()[0]:.1f}\n")
     print("| | kernel | s a frame, processor (wall) | peak memory, MB | FWHM, px | flux scatter, % "
