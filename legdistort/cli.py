@@ -4,6 +4,7 @@ import argparse
 import logging
 import signal
 import sys
+import threading
 import warnings
 from contextlib import contextmanager, nullcontext
 from importlib.metadata import version
@@ -12,6 +13,8 @@ from pathlib import Path
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from . import commands
+from .arguments import RESULTS, check_paths, columns, number_or_name, spectrum, word_or
+from .coaddition import CONSERVE, ORDERS
 from .drizzling import KERNELS
 from .exceptions import LegdistortError, LegdistortWarning
 from .levels import SCALES
@@ -33,6 +36,7 @@ def main(argv=None):
             with (
                 logging_redirect_tqdm([log]) if commands.wants_progress(arguments) else nullcontext()
             ):  # bars stay whole
+                check_paths(arguments)
                 arguments.function(arguments)
     except LegdistortError as error:
         if arguments.debug:
@@ -55,16 +59,18 @@ def main(argv=None):
 
 @contextmanager
 def _stopping():
-    """SIGTERM, by which batch systems stop a job, is taken as Ctrl-C while a command runs: temporary files go."""
-    try:
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    except ValueError:  # in a thread, where signals do not arrive
-        yield
-        return
+    """While a command runs, SIGTERM and SIGHUP (batch systems, lost terminals) are as Ctrl-C: temporary files go."""
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [n for n in numbers if signal.getsignal(n) is signal.SIG_DFL]  # as nohup ignores it, so do we
+    if threading.current_thread() is not threading.main_thread():  # where signals do not arrive
+        numbers = []
+    for n in numbers:
+        signal.signal(n, signal.default_int_handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for n in numbers:
+            signal.signal(n, signal.SIG_DFL)
 
 
 @contextmanager
@@ -87,13 +93,13 @@ def _logging(arguments):
 
 
 def _demo(p):
-    _out(p, "folder for frames and results")
+    _out(p, "folder for frames and results", leaves=())
     _night(p)
 
 
 def _run(p):
     _frames(p)
-    _out(p, "folder for the results")
+    _out(p, "folder for the results", leaves=RESULTS)
     _detection(p)
     _minimum(p)
     _fit(p, clip="5")
@@ -130,7 +136,7 @@ def _match(p):
 
 def _solve(p):
     p.add_argument("table", metavar="TABLE", help="exposure, star, x, y, x_err, y_err")
-    _out(p, "folder for the results")
+    _out(p, "folder for the results", leaves=RESULTS)
     _table(p)
     _fit(p, clip="no clipping")
 
@@ -144,7 +150,11 @@ def _prior(p):
     p.add_argument("--origin", type=int, choices=(0, 1), help="coordinate of the first pixel (default 0)")
     p.add_argument("--ext", help="extension of FITS files, header of a text, or place in an ASDF tree")
     p.add_argument("--frame", help="where to end: frame of a gwcs, or idl or tel of an aperture")
-    p.add_argument("--sigma", type=_width, help="scatter of single exposures around it, pixels, or the word evidence")
+    p.add_argument(
+        "--sigma",
+        type=word_or(float, "evidence"),
+        help="scatter of single exposures around it, pixels, or the word evidence",
+    )
     p.add_argument("--static-sigma", type=float, help="uncertainty of it, pixels")
 
 
@@ -152,7 +162,8 @@ def _coadd(p):
     _frames(p)
     p.add_argument("--solution", required=True, help="solution.asdf")
     _limit(p)
-    _out(p, "mosaic (FITS)")
+    _out(p, "mosaic (.fits, .fits.gz or .asdf)")
+    p.add_argument("--grid", type=Path, metavar="FILE", help="image or header text whose grid is taken")
     _combination(p)
     _workers(p)
 
@@ -161,6 +172,7 @@ def _attach(p):
     _show(p)
     _frames(p)
     where = p.add_mutually_exclusive_group(required=True)
+    p.set_defaults(leaves=())
     where.add_argument("--out", type=Path, help="folder for copies")
     where.add_argument("--in-place", action="store_true", help="change the frames themselves")
     form = p.add_mutually_exclusive_group()
@@ -183,9 +195,7 @@ def _predict(p):
     )
     p.add_argument("--prior", help="known static distortion: see the command prior")
     p.add_argument("--dynamic", type=float, help="rms of a coefficient from exposure to exposure, pixels")
-    p.add_argument(
-        "--spectrum", type=_spectrum, metavar="DEGREE=RMS,...", help="the same by degree, beyond the fit too"
-    )
+    p.add_argument("--spectrum", type=spectrum, metavar="DEGREE=RMS,...", help="the same by degree, beyond the fit too")
     p.add_argument("--gauge", choices=("minimal", "mean"), default="minimal", help="see the docs (default minimal)")
     p.add_argument("--seed", type=int, default=0, help="of stars and shifts that are drawn (default 0)")
     p.add_argument("--plot", type=Path, metavar="FILE.png", help="map of the error over the field")
@@ -194,7 +204,7 @@ def _predict(p):
 
 
 def _simulate(p):
-    _out(p, "folder for the frames")
+    _out(p, "folder for the frames", leaves=())
     _night(p)
 
 
@@ -271,37 +281,9 @@ def _parser():
     return parser
 
 
-def _columns(text):
-    pairs = [item.split("=") for item in text.split(",") if item]
-    if not all(len(pair) == 2 and all(pair) for pair in pairs):
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form star=name,x_err=xe")
-    return pairs
-
-
-def _word_or(number, word):
-    """Parser of a number, or of one word that stands for another way."""
-
-    def parse(text):
-        try:
-            return text if text == word else number(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor {word!r}") from None
-
-    return parse
-
-
-def _spectrum(text):
-    try:
-        return {int(degree): float(rms) for degree, rms in (item.split("=") for item in text.split(",") if item)}
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form 3=0.9,4=0.1") from None
-
-
-def _width(text):
-    return text if text == "evidence" else float(text)
-
-
-def _out(p, what):
+def _out(p, what, *, leaves=None):
+    """The argument of an output: a file; or a folder, with the names of what is replaced in it."""
+    p.set_defaults(leaves=leaves)
     p.add_argument("--out", required=True, type=Path, help=what)
     p.add_argument("--overwrite", action="store_true", help="replace what an earlier call left")
 
@@ -350,17 +332,17 @@ def _limit(p):
 
 
 def _table(p):
-    p.add_argument("--columns", type=_columns, default=[], metavar="OURS=THEIRS,...", help="names of columns")
+    p.add_argument("--columns", type=columns, default=[], metavar="OURS=THEIRS,...", help="names of columns")
     p.add_argument("--origin", type=int, choices=(0, 1), help="of pixels in the table (default 0; SExtractor 1)")
     p.add_argument("--shape", type=int, nargs=2, metavar=("NY", "NX"), help="of the detector, pixels")
 
 
 def _fit(p, *, clip):
-    p.add_argument("--degree", type=_word_or(int, "auto"), default=3, help="total degree, or auto (default 3)")
+    p.add_argument("--degree", type=word_or(int, "auto"), default=3, help="total degree, or auto (default 3)")
     p.add_argument("--prior", help="known static distortion: see the command prior")
     p.add_argument(
         "--prior-sigma",
-        type=_word_or(float, "evidence"),
+        type=word_or(float, "evidence"),
         metavar="PIXELS",
         help="scatter of exposures around it; evidence: found from them",
     )
@@ -380,17 +362,22 @@ def _fit(p, *, clip):
 
 def _combination(p):
     p.add_argument("--combine", choices=("mean", "median", "clipped"), default="clipped", help="(default clipped)")
-    p.add_argument("--order", type=int, default=3, help="of the interpolating spline (default 3)")
+    p.add_argument(
+        "--order", type=number_or_name, choices=(*range(6), *ORDERS), default=3, help="of the spline (default 3)"
+    )
     p.add_argument("--algorithm", choices=ALGORITHMS, default="interp", help="of resampling (default interp)")
     p.add_argument("--pixfrac", type=float, default=1.0, help="with drizzle: side of the drops (default 1)")
     p.add_argument(
         "--kernel", choices=KERNELS, default="square", help="with drizzle: shape of the drops (default square)"
     )
+    p.add_argument("--conserve", choices=CONSERVE, default="flux", help="when pixels change size (default flux)")
+    p.add_argument("--no-match-background", action="store_true", help="leave the levels of the sky as they are")
     p.add_argument("--weights", choices=(*WEIGHTS, "equal"), default="noise", help="of exposures (default noise)")
     p.add_argument("--scale", choices=(*SCALES, "none"), default="auto", help="of fluxes (default auto)")
     p.add_argument(
         "--extrapolated", choices=EXTRAPOLATED, default="flag", help="pixels outside the stars used (default flag)"
     )
+    p.add_argument("--scratch", type=Path, metavar="FOLDER", help="for pixels while work goes on (default: system's)")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """Resample exposures with the solution's distortions and combine them."""
 
-import logging
 import warnings
 from dataclasses import replace
 from functools import partial
@@ -9,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.wcs import WCS
 
 from .combination import METHODS
 from .drizzling import Drop
 from .exceptions import AssumptionWarning, InputError
+from .grids import given_grid, reference_grid
 from .hulls import support
 from .levels import bad_pixels, flux_scales, match_backgrounds, saturated_pixels, survey
-from .mapping import Grid, map_exposure, outline
+from .mapping import map_exposure
 from .mosaics import Mosaic
 from .parallel import each
 from .resampling import ALGORITHMS, fill_bad, is_compiled, noise_correlation, rough_pixels, white_gain
@@ -24,10 +23,8 @@ from .scratch import scratch_folder, store
 from .stacking import Layer, Recipe, assemble, n_bytes
 from .weighting import EXTRAPOLATED, make_weights, stellar_widths
 
-logger = logging.getLogger(__name__)
-
 CONSERVE = ("flux", "surface_brightness")
-_ORDERS = {"nearest-neighbor": 0, "bilinear": 1, "biquadratic": 2, "bicubic": 3}
+ORDERS = {"nearest-neighbor": 0, "bilinear": 1, "biquadratic": 2, "bicubic": 3}
 _STORED = 5  # bytes a pixel in the scratch folder, about
 _COARSE = 1.5  # pixels of the grid in those of an exposure from which interpolation leaves out too much
 _MEANING = {
@@ -127,7 +124,7 @@ def coadd(
     order = _check_options(method, order, algorithm, conserve, extrapolated)
     drop = Drop(kernel, pixfrac) if algorithm == "drizzle" else None
     frames, left_out = _select(exposures, solution)
-    output = reference_grid([f.name for f in frames], solution) if grid is None else _given_grid(grid, solution)
+    output = reference_grid([f.name for f in frames], solution) if grid is None else given_grid(grid, solution)
     maps = {f.name: map_exposure(f.name, solution, output, corners=algorithm in ("exact", "drizzle")) for f in frames}
     left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
     frames = [f for f in frames if maps[f.name] is not None]
@@ -225,9 +222,9 @@ def _check_options(method, order, algorithm, conserve, extrapolated):
     ):
         if value not in allowed:
             raise InputError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
-    order = _ORDERS.get(order, order) if isinstance(order, str) else order
+    order = ORDERS.get(order, order) if isinstance(order, str) else order
     if isinstance(order, bool) or order not in range(6):
-        raise InputError(f"order must be an integer from 0 to 5 or one of {', '.join(_ORDERS)}, got {order!r}")
+        raise InputError(f"order must be an integer from 0 to 5 or one of {', '.join(ORDERS)}, got {order!r}")
     return int(order)
 
 
@@ -302,57 +299,6 @@ def _reasons(left_out):
 def _few(names, most=5):
     more = f" and {len(names) - most} more" * (len(names) > most)
     return ", ".join(names[:most]) + more
-
-
-def reference_grid(names, solution):
-    """The smallest grid of reference-plane pixels that holds all exposures named.
-
-    Returns
-    -------
-    Grid
-        Its pixels are pixels of the reference plane, shifted by whole pixels.
-    """
-    edges = np.concatenate([solution.correct(name, outline(solution.shapes[name])) for name in names])
-    low = np.ceil(edges.min(axis=0) - 1e-6).astype(int)
-    nx, ny = np.floor(edges.max(axis=0) + 1e-6).astype(int) - low + 1
-    wcs = WCS(naxis=2)
-    wcs.array_shape = (ny, nx)
-    if solution.sky is None:
-        wcs.wcs.ctype = ["LINEAR", "LINEAR"]
-        wcs.wcs.crpix = 1 - low
-        wcs.wcs.crval = [0, 0]
-    else:
-        matrix = np.asarray(solution.sky.matrix, dtype=float)
-        wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-        wcs.wcs.cunit = ["deg", "deg"]
-        wcs.wcs.cd = matrix[:, :2]
-        wcs.wcs.crval = [solution.sky.lon, solution.sky.lat]
-        wcs.wcs.crpix = np.linalg.solve(matrix[:, :2], -matrix[:, 2]) - low + 1
-        wcs.wcs.radesys = "ICRS"
-    wcs.wcs.set()
-    logger.info("mosaic of %d x %d px on the reference plane", nx, ny)
-    return Grid((int(ny), int(nx)), wcs, (int(low[0]), int(low[1])), solution.sky)
-
-
-def _given_grid(grid, solution):
-    if isinstance(grid, fits.Header):
-        shape = (grid.get("NAXIS2"), grid.get("NAXIS1"))
-        wcs = WCS(grid)
-        wcs.array_shape = None if None in shape else shape
-    elif isinstance(grid, WCS):
-        wcs = grid.deepcopy()
-    else:
-        raise InputError(f"grid must be None, an astropy WCS or a FITS header, got {type(grid).__name__}")
-    if not wcs.has_celestial or wcs.naxis != 2:
-        raise InputError("grid must have two axes, both celestial; grid=None takes the reference plane")
-    if wcs.array_shape is None:
-        raise InputError("grid has no shape: give NAXIS1 and NAXIS2 in the header, or set wcs.array_shape = (ny, nx)")
-    if solution.sky is None:
-        raise InputError(
-            "the solution is not tied to the sky, so it cannot be put on a celestial grid; "
-            "measure frames with a header WCS, or give grid=None"
-        )
-    return Grid(tuple(int(n) for n in wcs.array_shape), wcs, None, solution.sky)
 
 
 def _warn_of_misuse(frames, maps, algorithm):

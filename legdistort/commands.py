@@ -179,8 +179,9 @@ def do_prior(a):
 
 
 def _coadding(a):
-    return _given(a, "order", "algorithm", "pixfrac", "kernel", "extrapolated") | {
+    return _given(a, "order", "algorithm", "pixfrac", "kernel", "extrapolated", "conserve", "scratch") | {
         "method": a.combine,
+        "match_background": not a.no_match_background,
         "weights": None if a.weights == "equal" else a.weights,
         "scale": None if a.scale == "none" else a.scale,
     }
@@ -190,11 +191,14 @@ def do_coadd(a):
     """``legdistort coadd``."""
     from .coaddition import coadd
     from .exposure_files import open_exposures
+    from .mosaics import check_ending
 
+    check_ending(a.out)
     solution = _solution(a)
+    grid = _grid(a.grid, solution)
     exposures = open_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
     share = {"workers": a.workers, "progress": wants_progress(a)}
-    mosaic = coadd(exposures, solution, **_coadding(a), **share)
+    mosaic = coadd(exposures, solution, grid=grid, **_coadding(a), **share)
     mosaic.write(a.out, overwrite=a.overwrite)
     figures = {"shape": list(mosaic.shape), "n_exposures": len(mosaic.exposures), "left_out": mosaic.left_out}
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
@@ -358,6 +362,20 @@ def _solution(a):
     from .solution import Solution
 
     return Solution.read(a.solution, max_bytes=a.max_bytes)
+
+
+def _grid(path, solution):
+    """The grid of a file, known to be one for the solution before any frame is read."""
+    from .grids import given_grid, read_grid
+
+    if path is None:
+        return None
+    grid = read_grid(path)
+    try:
+        given_grid(grid, solution)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return grid
 
 
 def _write_table(table, a):

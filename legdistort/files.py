@@ -15,6 +15,67 @@ def is_full(error):
     return error.errno in (ENOSPC, EDQUOT) or "space" in str(error) or "requested and" in str(error)
 
 
+def check_file(path, *, overwrite=False):
+    """Refuse a file that could not be written, before the work for it begins.
+
+    Raises
+    ------
+    InputError
+        If `path` is a folder, or exists and `overwrite` is false, or its folder does not exist or cannot be written.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give the name of a file")
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} exists already; give overwrite=True (--overwrite) to replace it, or another name")
+    if not path.parent.is_dir():
+        raise InputError(f"the folder {path.parent} does not exist; make it first")
+    _check_permission(path, path.parent)
+
+
+def check_folder(out):
+    """Refuse a folder that could not be made or filled, before the work for it begins.
+
+    Raises
+    ------
+    InputError
+        If `out` is a file, or cannot be written.
+    """
+    out = Path(out)
+    existing = next(place for place in (out, *out.absolute().parents) if place.exists())
+    if not existing.is_dir():
+        raise InputError(f"{existing} is a file; give a folder for the results")
+    _check_permission(out, existing)
+
+
+def _check_permission(path, folder):
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{path} cannot be written: no permission in {folder}; write elsewhere")
+
+
+def check_not_read(path, inputs):
+    """Refuse to replace what the output is made from.
+
+    Parameters
+    ----------
+    path : str or path
+        File or folder that will be replaced.
+    inputs : sequence of str or path
+        What is read. Words that name no file are left alone.
+
+    Raises
+    ------
+    InputError
+        If one of them is `path`, by whatever name or link, or lies in it.
+    """
+    path = Path(path)
+    if not path.exists():
+        return
+    for each in filter(os.path.exists, inputs):
+        if path.samefile(each) or path.resolve() in Path(each).resolve().parents:
+            raise InputError(f"{each} is read, and would be replaced: give the output another name")
+
+
 @contextmanager
 def _told_when_full(path):
     try:
@@ -41,19 +102,14 @@ def replacing(path, *, overwrite=False):
     Raises
     ------
     InputError
-        If `path` is a folder, or exists and `overwrite` is false, or its folder does not exist.
+        As `check_file` does.
     DiskFullError
         If the disk is full.
     """
     path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; give the name of a file")
-    if path.exists() and not overwrite:
-        raise InputError(f"{path} exists already; give overwrite=True (--overwrite) to replace it, or another name")
-    if not path.parent.is_dir():
-        raise InputError(f"the folder {path.parent} does not exist; make it first")
-    # the whole suffix is kept, since writers choose compression by it
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".partial-", suffix=f"-{path.name}")
+    check_file(path, overwrite=overwrite)
+    # the whole suffix is kept, since writers choose compression by it; they know it in small letters only
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".partial-", suffix=f"-{path.name.lower()}")
     os.close(handle)
     os.unlink(temporary)  # some writers refuse an existing file
     try:
@@ -78,13 +134,12 @@ def replacing_folder(out):
     Raises
     ------
     InputError
-        If `out` is a file.
+        As `check_folder` does.
     DiskFullError
         If the disk is full.
     """
     out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is a file; give a folder for the results")
+    check_folder(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".partial-{out.name}-"))
     try:

@@ -1,5 +1,6 @@
 """The co-added image and its file."""
 
+import re
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from .exceptions import InputError
 from .files import replacing
 from .scratch import forget
 
-_COMPRESSED = (".gz", ".bz2", ".xz", ".zip")
+_ENDING = re.compile(r"\.(?:(?P<asdf>asdf)|(?:fits|fit|fts)(?P<packed>\.gz|\.bz2)?)$", re.IGNORECASE)
 _ROWS = 256  # that are written at a time
 
 
@@ -21,15 +22,16 @@ class Mosaic:
     """Co-added image.
 
     The planes that `legdistort.coadd` makes are arrays on disk, in a folder for temporary files; only what is worked on
-    comes into memory.
+    comes into memory. Processes forked from this one share them: what one changes, all see.
 
     Attributes
     ----------
     data : ndarray of float32, shape (ny, nx)
         In the unit of the exposures, at their mean exposure time; NaN where nothing contributes.
     variance : ndarray of float32, shape (ny, nx)
-        Of each pixel by itself. Interpolation correlates neighbours: the variance of a sum over many pixels is
-        larger than the sum of theirs (about 1.3 times at order 3, 2.2 times at order 1).
+        Of each pixel by itself, with the photons of stars if there are uncertainty planes or gains. Interpolation
+        correlates neighbours: the variance of a sum over many pixels is larger than the sum of theirs (about 1.3 times
+        at order 3, 2.2 times at order 1).
     weight : ndarray of float32, shape (ny, nx)
         Sum of the weights of the exposures that contribute.
     footprint : ndarray of int32, shape (ny, nx)
@@ -80,10 +82,12 @@ class Mosaic:
         Raises
         ------
         InputError
-            If the mosaic has no such pixel.
+            If the mosaic has no such pixel, or x or y is not a whole number.
         """
         ny, nx = self.shape
-        if not (0 <= x < nx and 0 <= y < ny and x == int(x) and y == int(y)):
+        if not (x % 1 == 0 and y % 1 == 0):
+            raise InputError(f"pixels are told by whole numbers, got ({x}, {y}): round them, centres are at integers")
+        if not (0 <= x < nx and 0 <= y < ny):
             raise InputError(f"pixel ({x}, {y}) is not one of the {nx} x {ny} of the mosaic (x, y from 0)")
         planes = self.context[:, int(y), int(x)]
         return tuple(name for i, name in enumerate(self.exposures) if planes[i // 32] >> np.uint32(i % 32) & 1)
@@ -129,21 +133,22 @@ class Mosaic:
         Parameters
         ----------
         path : str or path
-            With ``.gz`` at its end it is compressed. With ``.asdf`` it is an ASDF file: the planes, ``wcs``,
-            ``exposures``, ``left_out``, ``offset`` and ``header`` under ``mosaic``, to be opened with asdf and
-            asdf-astropy alone.
+            Ending in ``.fits``, ``.fit`` or ``.fts``, with ``.gz`` or ``.bz2`` behind for a compressed file. With
+            ``.asdf`` it is an ASDF file: the planes, ``wcs``, ``exposures``, ``left_out``, ``offset`` and ``header``
+            under ``mosaic``, to be opened with asdf and asdf-astropy alone. Capitals do not matter.
         overwrite : bool
             Replace a file that exists.
 
         Raises
         ------
         InputError
-            If the file exists and `overwrite` is false, or its folder does not exist.
+            For another ending; if the file exists and `overwrite` is false, or its folder does not exist.
         """
+        ending = check_ending(path)
         with replacing(path, overwrite=overwrite) as temporary:
-            if Path(path).suffix == ".asdf":
+            if ending["asdf"]:
                 asdf.AsdfFile({"mosaic": self._tree()}).write_to(temporary)
-            elif Path(path).suffix in _COMPRESSED:
+            elif ending["packed"]:
                 self.to_hdulist().writeto(temporary)
             else:
                 for hdu in self.to_hdulist():
@@ -153,6 +158,28 @@ class Mosaic:
         tree = {each.name: getattr(self, each.name) for each in fields(self)}
         tree["exposures"], tree["offset"] = list(self.exposures), self.offset and list(self.offset)
         return tree | {"header": {k: v for k, v in self.header.items() if k not in ("HISTORY", "COMMENT", "")}}
+
+
+def check_ending(path):
+    """The parts of a name that a mosaic may have.
+
+    Returns
+    -------
+    re.Match
+        Its groups ``asdf`` and ``packed`` are None where the name does not ask for them.
+
+    Raises
+    ------
+    InputError
+        For a name that ends otherwise.
+    """
+    ending = _ENDING.search(Path(path).name)
+    if ending is None:
+        raise InputError(
+            f"{path}: the ending says the format of a mosaic; give .fits, .fit or .fts, also with .gz or .bz2 behind, "
+            "or .asdf"
+        )
+    return ending
 
 
 def _append(path, hdu):

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import time
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -10,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from . import archive, baselines, performance, provenance, quality
+from . import archive, baselines, files, performance, provenance, quality
 from .coaddition import coadd
 from .estimation import solve
 from .exceptions import InputError, MatchError
 from .exposure_files import open_exposures
 from .exposures import expand_paths
-from .files import replacing_folder
 from .findings import FOUND
 from .matching import match
 from .measurement import measure
@@ -151,7 +149,7 @@ def run(
     if comparison and judged:
         with _timed(timings, "compare"):
             stacks = _if_possible(quality.compare_stacks, kept, comparison, mosaic=mosaic, **coadding)
-    with replacing_folder(out) as target:
+    with files.replacing_folder(out) as target:
         with _timed(timings, "write"):
             write_results(solution, target)
             mosaic.write(target / "mosaic.fits")
@@ -217,14 +215,9 @@ def _if_possible(judge, *args, **kwargs):
 
 
 def check_folder(out, overwrite):
-    """Raise `InputError` if `out` is a file, or holds results and `overwrite` is false."""
-    out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is a file; give a folder for the results")
-    parent = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
-    if not os.access(parent, os.W_OK):
-        raise InputError(f"{out} cannot be written: no permission in {parent}; give another folder")
-    if (out / "solution.asdf").exists() and not overwrite:
+    """Raise `InputError` if `out` cannot be a folder, or holds results and `overwrite` is false."""
+    files.check_folder(out)
+    if (Path(out) / "solution.asdf").exists() and not overwrite:
         raise InputError(f"{out} already holds a run; give overwrite=True (--overwrite) or another folder")
 
 

@@ -1,18 +1,23 @@
 """The command line on a small simulated night: what it leaves, and what it says of bad input."""
 
+import inspect
 import json
 import os
+import re
 import signal
 import tempfile
+from pathlib import Path
 
 import asdf
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from astropy.wcs import WCS
 
-from legdistort import Solution, coaddition
+from legdistort import Solution, coadd, coaddition, commands, open_exposures
 from legdistort.cli import main
+from legdistort.exceptions import InputError
 from legdistort.simulation import simulate_exposures
 
 RESULTS = {"solution.asdf", "stars.ecsv", "wcs", "mosaic.fits", "report.html", "summary.json"}
@@ -67,6 +72,16 @@ def test_demo_is_as_good_as_it_says(demo):
     assert s["max_inverse_error_px"] <= 1e-6
     assert s["fwhm_ratio"] < 1.15
     assert s["chi2"] / s["dof"] == pytest.approx(1, abs=0.35)
+
+
+def test_the_page_shows_what_is_printed(demo):
+    page = (Path(__file__).parents[1] / "docs" / "first_mosaic.md").read_text(encoding="utf-8")
+    s = json.loads((demo / "summary.json").read_text())
+    shown = re.findall(r"^  .*? ([\d.]+) (?:px  \(\w+ ([\d.]+)\)|x that of)", page, re.MULTILINE)
+    keys = (("b_px", "b_bound_px"), ("b_abs_px", "b_abs_err_px"), ("sigma_new_px", "sigma_new_expected_px"))
+    for figures, names in zip(shown, (*keys, ("fwhm_ratio",)), strict=True):
+        for figure, name in zip(figures, names, strict=False):
+            assert float(figure) == pytest.approx(s[name], rel=0.1), name
 
 
 def test_files_agree_with_the_solution(demo):
@@ -126,18 +141,19 @@ def test_noise_frame_is_left_out_by_name(night, tmp_path, capsys):
     assert list(summary["left_out"]) == ["empty"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
 def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, number):
     """By Ctrl-C, or by a batch system."""
     (tmp_path / "scratch").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
     monkeypatch.setattr(coaddition, "survey", lambda *args, **options: os.kill(os.getpid(), number))
-    before = signal.signal(signal.SIGINT, signal.default_int_handler), signal.getsignal(signal.SIGTERM)
+    usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+    before = signal.signal(number, usual)
     try:
         assert run(night, tmp_path / "out") == 1
+        assert signal.getsignal(number) == usual
     finally:
-        signal.signal(signal.SIGINT, before[0])
-    assert signal.getsignal(signal.SIGTERM) == before[1]
+        signal.signal(number, before)
     assert "interrupted; nothing was left half-written" in capsys.readouterr().err
     assert [p.name for p in tmp_path.rglob("*")] == ["scratch"]
 
@@ -268,6 +284,189 @@ def test_help_has_an_example(command, capsys):
         main([command, "--help"])
     assert end.value.code == 0
     assert f"Example: legdistort {command}" in capsys.readouterr().out
+
+
+def _coadd(demo, out, *more):
+    frames = str(demo / "frames" / "*.fits")
+    return ["coadd", frames, "--solution", str(demo / "solution.asdf"), "--out", str(out), "--quiet", *map(str, more)]
+
+
+def _grid(demo):
+    """Header of a part of the sky of the demonstration, turned by 30 degrees, with pixels 1.25 times as large."""
+    old = WCS(fits.getheader(demo / "mosaic.fits"))
+    new = WCS(naxis=2)
+    new.wcs.ctype, new.wcs.crpix = ["RA---TAN", "DEC--TAN"], [121, 101]
+    new.wcs.crval = old.wcs_pix2world([[320, 300]], 0)[0]
+    c, s = 1.25 * np.cos(np.pi / 6), 1.25 * np.sin(np.pi / 6)
+    new.wcs.cd = old.pixel_scale_matrix @ [[c, -s], [s, c]]
+    return fits.Header({"NAXIS": 2, "NAXIS1": 240, "NAXIS2": 200}) + new.to_header()
+
+
+def test_coadd_on_the_grid_of_a_file(demo, tmp_path, capsys):
+    header = _grid(demo)
+    header.totextfile(tmp_path / "sky.head")
+    exposures = open_exposures(str(demo / "frames" / "*.fits"))
+    solution = Solution.read(demo / "solution.asdf")
+    settings = {"conserve": "surface_brightness", "match_background": False, "order": "bilinear", "method": "median"}
+    wanted = coadd(exposures, solution, grid=header, **settings)
+    (tmp_path / "scratch").mkdir()
+    options = ["--grid", tmp_path / "sky.head", "--scratch", tmp_path / "scratch", "--conserve", "surface_brightness",
+               "--no-match-background", "--order", "bilinear", "--combine", "median"]  # fmt: skip
+    assert main(_coadd(demo, tmp_path / "m.fits", *options)) == 0
+    assert "240 x 200 px, 6 exposures" in capsys.readouterr().out
+    assert list((tmp_path / "scratch").iterdir()) == []
+    with fits.open(tmp_path / "m.fits") as hdulist:
+        for hdu, plane in zip(hdulist, ("data", "variance", "weight", "footprint", "flags"), strict=False):
+            np.testing.assert_array_equal(hdu.data, getattr(wanted, plane))
+        corners = [[0, 0], [239, 0], [0, 199], [239, 199]]
+        sky = WCS(hdulist[0].header).wcs_pix2world(corners, 0)
+        np.testing.assert_allclose(sky, WCS(header).wcs_pix2world(corners, 0), rtol=0, atol=1e-11)
+        assert hdulist[0].header["CONSERVE"] == "surface_brightness"
+    assert np.isfinite(wanted.data).mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda header: header.remove("CTYPE1") or header.remove("CTYPE2"), "no CTYPE1"),
+        (lambda header: header.update(CTYPE1="LINEAR", CTYPE2="LINEAR"), "two axes, both celestial"),
+        (lambda header: header.update(WCSAXES=3, CTYPE3="FREQ"), "two axes, both celestial"),
+        (lambda header: header.remove("NAXIS1") or header.remove("NAXIS2"), "grid has no shape"),
+        (lambda header: header.update(CTYPE1="RA---XXX"), "XXX"),
+    ],
+)
+def test_grids_without_sense_are_named_before_any_work(demo, tmp_path, capsys, monkeypatch, spoil, words):
+    monkeypatch.setattr("legdistort.exposure_files.open_exposures", lambda *_, **__: pytest.fail("the work began"))
+    header = _grid(demo)
+    spoil(header)
+    header.totextfile(tmp_path / "bad.head")
+    failed(capsys, main(_coadd(demo, tmp_path / "m.fits", "--grid", tmp_path / "bad.head")), "bad.head: ", words)
+    assert [item.name for item in tmp_path.iterdir()] == ["bad.head"]
+
+
+def test_options_of_coadd_reach_it(demo, tmp_path, capsys, monkeypatch):
+    """And those that are not given are its own, but for the rejection of what the others do not confirm."""
+    given = {}
+
+    def stand_in(exposures, solution, **options):
+        given.update(options)
+        raise InputError("enough")
+
+    monkeypatch.setattr(coaddition, "coadd", stand_in)
+    failed(capsys, main(_coadd(demo, tmp_path / "m.fits")), "enough")
+    own = {name: p.default for name, p in inspect.signature(coadd).parameters.items() if p.kind is p.KEYWORD_ONLY}
+    assert own | given == own | {"method": "clipped"}
+    options = "--combine mean --order bicubic --algorithm drizzle --pixfrac 0.5 --kernel point --conserve "
+    options += "surface_brightness --no-match-background --weights equal --scale none --extrapolated mask --workers 2"
+    failed(capsys, main(_coadd(demo, tmp_path / "m.fits", *options.split(), "--scratch", tmp_path)), "enough")
+    assert given == {
+        "method": "mean", "order": "bicubic", "algorithm": "drizzle", "pixfrac": 0.5, "kernel": "point", "grid": None,
+        "conserve": "surface_brightness", "match_background": False, "weights": None, "scale": None,
+        "extrapolated": "mask", "workers": 2, "scratch": tmp_path, "progress": False,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("order", ["6", "cubic", "1.5"])
+def test_orders_that_there_are_not(order, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["coadd", "a.fits", "--solution", "s.asdf", "--out", "m.fits", "--order", order])
+    assert end.value.code == 2
+    assert "bicubic" in capsys.readouterr().err
+
+
+# --- outputs are looked at before the work begins
+
+FILES = {
+    "measure": "measure IN --out OUT",
+    "noise": "noise IN --out OUT",
+    "noise's plot": "noise IN --out elsewhere --plot OUT",
+    "match": "match other.ecsv IN --out OUT",
+    "prior": "prior IN --out OUT",
+    "coadd": "coadd other.fits IN --solution s.asdf --out OUT",
+    "coadd's solution": "coadd other.fits --solution IN --out OUT",
+    "coadd's grid": "coadd other.fits --solution s.asdf --grid IN --out OUT",
+    "predict": "predict --n-exposures 4 --stars IN --plot OUT",
+    "stars": "stars IN --out OUT",
+    "report": "report IN --out OUT",
+}
+FOLDERS = {
+    "demo": "demo --out OUT",
+    "simulate": "simulate --out OUT",
+    "run": "run IN --out OUT",
+    "run's prior": "run other.fits --prior IN --out OUT",
+    "run's reference": "run other.fits --reference IN --out OUT",
+    "solve": "solve IN --out OUT",
+    "attach": "attach s.asdf IN --out OUT",
+}
+
+
+def _ready(monkeypatch, line, *, read, out):
+    """The words of a command whose work would be a failure."""
+    words = [{"IN": str(read), "OUT": str(out)}.get(word, word) for word in line.split()]
+    monkeypatch.setattr(commands, f"do_{words[0]}", lambda a: pytest.fail("the work began"))
+    return [*words, "--quiet"]
+
+
+@pytest.mark.parametrize("line", FILES.values(), ids=FILES)
+def test_files_that_cannot_be_written(line, tmp_path, capsys, monkeypatch):
+    (tmp_path / "old").write_text("precious")
+    (tmp_path / "in.fits").write_text("")
+    for name, words in (("old", "old exists already"), ("", "is a folder"), ("none/m.fits", "none does not exist")):
+        failed(capsys, main(_ready(monkeypatch, line, read=tmp_path / "in.fits", out=tmp_path / name)), words)
+    assert (tmp_path / "old").read_text() == "precious"
+    with pytest.raises(pytest.fail.Exception, match="the work began"):
+        main([*_ready(monkeypatch, line, read="in.fits", out=tmp_path / "old"), "--overwrite"])
+
+
+@pytest.mark.parametrize("line", FOLDERS.values(), ids=FOLDERS)
+def test_folders_that_cannot_be_made(line, tmp_path, capsys, monkeypatch):
+    (tmp_path / "old").write_text("precious")
+    for name in ("old", "old/within"):
+        words = [*_ready(monkeypatch, line, read="in.fits", out=tmp_path / name), "--overwrite"]
+        failed(capsys, main(words), "old is a file; give a folder")
+    with pytest.raises(pytest.fail.Exception, match="the work began"):
+        main(_ready(monkeypatch, line, read="in.fits", out=tmp_path / "new" / "deep"))
+
+
+@pytest.mark.parametrize("line", FILES.values(), ids=FILES)
+def test_inputs_are_not_replaced(line, tmp_path, capsys, monkeypatch):
+    """Under their own name, or through a link."""
+    (tmp_path / "in.fits").write_text("precious")
+    (tmp_path / "link").symlink_to("in.fits")
+    own, link = tmp_path / "in.fits", tmp_path / "link"
+    for read, out in ((own, own), (own, link), (link, own)):
+        words = [*_ready(monkeypatch, line, read=read, out=out), "--overwrite"]
+        failed(capsys, main(words), "is read, and would be replaced: give the output another name")
+
+
+@pytest.mark.parametrize("name", ["run", "run's prior", "run's reference", "solve"])
+def test_inputs_in_the_folder_of_results(name, tmp_path, capsys, monkeypatch):
+    (tmp_path / "wcs").mkdir()
+    for result in ("solution.asdf", "stars.ecsv", "wcs/a.asdf", "mosaic.fits"):
+        (tmp_path / result).write_text("precious")
+        words = [*_ready(monkeypatch, FOLDERS[name], read=tmp_path / result, out=tmp_path), "--overwrite"]
+        failed(capsys, main(words), f"{result} is read, and would be replaced")
+    (tmp_path / "matched.ecsv").write_text("")
+    with pytest.raises(pytest.fail.Exception, match="the work began"):  # what stands under other names stays
+        main([*_ready(monkeypatch, FOLDERS[name], read=tmp_path / "matched.ecsv", out=tmp_path), "--overwrite"])
+
+
+def test_copies_of_frames_may_go_beside_the_solution(tmp_path, monkeypatch):
+    (tmp_path / "solution.asdf").write_text("")
+    with pytest.raises(pytest.fail.Exception, match="the work began"):
+        main(_ready(monkeypatch, "attach IN a.fits --out OUT", read=tmp_path / "solution.asdf", out=tmp_path))
+
+
+def test_the_frames_of_a_mosaic_survive_it(demo, tmp_path, capsys):
+    frame = demo / "frames" / "exp00.fits"
+    before = frame.read_bytes()
+    failed(capsys, main(_coadd(demo, frame, "--overwrite")), "exp00.fits is read")
+    assert frame.read_bytes() == before
+
+
+def test_the_ending_of_a_mosaic_is_looked_at_first(demo, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("legdistort.exposure_files.open_exposures", lambda *_, **__: pytest.fail("the work began"))
+    failed(capsys, main(_coadd(demo, tmp_path / "m.png")), "m.png: the ending says the format of a mosaic")
 
 
 def test_keck_lists_by_the_command_line(shared_data, tmp_path, capsys):

@@ -20,10 +20,11 @@ from scipy.optimize import least_squares
 
 from legdistort import poses
 from legdistort.basis import from_tensor
-from legdistort.coaddition import coadd, reference_grid
+from legdistort.coaddition import coadd
 from legdistort.distortion import Distortion, outside
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError
 from legdistort.exposures import Exposure, read_exposures
+from legdistort.grids import reference_grid
 from legdistort.mapping import tabulate, trace
 from legdistort.resampling import fill_bad
 

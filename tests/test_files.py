@@ -1,9 +1,18 @@
-"""Outputs appear whole or not at all."""
+"""Outputs appear whole or not at all, under names that say what they are, and never in the place of an input."""
 
+import bz2
+import gzip
+from io import BytesIO
+
+import asdf
+import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.wcs import WCS
 
 from legdistort.exceptions import InputError
-from legdistort.files import replacing, replacing_folder
+from legdistort.files import check_file, check_folder, check_not_read, replacing, replacing_folder
+from legdistort.mosaics import Mosaic
 
 
 def names(folder):
@@ -17,13 +26,13 @@ def half(path):
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
-    with replacing(tmp_path / "a.fits.gz") as temporary:
-        assert temporary.name.endswith("a.fits.gz")  # writers choose compression by the ending
+    with replacing(tmp_path / "A.FITS.gz") as temporary:
+        assert temporary.name.endswith("a.fits.gz")  # writers choose compression by the ending, in small letters
         assert not temporary.exists()
         temporary.write_text("new")
-        assert not (tmp_path / "a.fits.gz").exists()
-    assert (tmp_path / "a.fits.gz").read_text() == "new"
-    assert names(tmp_path) == ["a.fits.gz"]
+        assert not (tmp_path / "A.FITS.gz").exists()
+    assert (tmp_path / "A.FITS.gz").read_text() == "new"
+    assert names(tmp_path) == ["A.FITS.gz"]
 
 
 def test_a_failure_leaves_the_old_file(tmp_path):
@@ -105,3 +114,103 @@ def test_a_file_in_the_place_of_a_folder_and_the_reverse(tmp_path):
         (temporary / "was_file").mkdir()
     assert (tmp_path / "out" / "was_folder").is_file()
     assert (tmp_path / "out" / "was_file").is_dir()
+
+
+# --- checks before any work ---------------------------------------------------------------------------------------
+
+
+def test_files_and_folders_are_checked_beforehand(tmp_path):
+    (tmp_path / "a").write_text("old")
+    check_file(tmp_path / "new")
+    check_file(tmp_path / "a", overwrite=True)
+    check_folder(tmp_path / "x" / "y")
+    check_folder(tmp_path)
+    assert names(tmp_path) == ["a"]
+    for bad, words in ((tmp_path / "a", "exists already"), (tmp_path, "is a folder"), (tmp_path / "b/c", "not exist")):
+        with pytest.raises(InputError, match=words):
+            check_file(bad)
+    for bad in (tmp_path / "a", tmp_path / "a" / "b"):
+        with pytest.raises(InputError, match="a is a file; give a folder"):
+            check_folder(bad)
+
+
+def test_folders_without_permission(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda place, mode: place != tmp_path)  # root may write anywhere
+    with pytest.raises(InputError, match=r"a cannot be written: no permission in .*; write elsewhere"):
+        check_file(tmp_path / "a")
+    with pytest.raises(InputError, match=r"out cannot be written: no permission in"):
+        check_folder(tmp_path / "out")
+
+
+def test_inputs_are_not_replaced(tmp_path):
+    (tmp_path / "wcs").mkdir()
+    for name in ("a.fits", "b.fits", "wcs/a.asdf"):
+        (tmp_path / name).write_text(name)
+    (tmp_path / "link.fits").symlink_to("a.fits")
+    (tmp_path / "hard.fits").hardlink_to(tmp_path / "a.fits")
+    inputs = [str(tmp_path / "wcs" / ".." / "a.fits"), tmp_path / "wcs" / "a.asdf", "gsaoi-1", "no\0name"]
+    for other in ("a.fits", "link.fits", "hard.fits", "wcs"):
+        with pytest.raises(InputError, match=r"a\.(fits|asdf) is read, and would be replaced: give the output another"):
+            check_not_read(tmp_path / other, inputs)
+    for other in ("b.fits", "new.fits"):
+        check_not_read(tmp_path / other, inputs)
+
+
+# --- the file of a mosaic -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def mosaic():
+    plane = np.arange(12.0, dtype="f4").reshape(3, 4)
+    context = np.ones((1, 3, 4), "u4")
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["LINEAR", "LINEAR"]
+    return Mosaic(plane, plane, plane, plane.astype("i4"), plane.astype("u1"), context, wcs, exposures=("e1",))
+
+
+@pytest.mark.parametrize("name", ["m.fits", "M.FITS", "m.fit", "m.FTS", "m.v2.Fits"])
+def test_fits_files(mosaic, tmp_path, name):
+    mosaic.write(tmp_path / name)
+    assert names(tmp_path) == [name]
+    assert (tmp_path / name).read_bytes()[:9] == b"SIMPLE  ="
+    np.testing.assert_array_equal(fits.getdata(tmp_path / name), mosaic.data)
+
+
+@pytest.mark.parametrize(
+    ("name", "unpack"),
+    [("m.fits.gz", gzip), ("M.FITS.GZ", gzip), ("m.fts.Gz", gzip), ("m.fits.bz2", bz2), ("m.fit.BZ2", bz2)],
+)
+def test_packed_fits_files(mosaic, tmp_path, name, unpack):
+    mosaic.write(tmp_path / name)
+    assert names(tmp_path) == [name]
+    with fits.open(BytesIO(unpack.decompress((tmp_path / name).read_bytes()))) as hdulist:
+        np.testing.assert_array_equal(hdulist["SCI"].data, mosaic.data)
+        assert len(hdulist) == 6
+
+
+@pytest.mark.parametrize("name", ["m.asdf", "M.ASDF"])
+def test_asdf_files(mosaic, tmp_path, name):
+    mosaic.write(tmp_path / name)
+    with asdf.open(tmp_path / name) as file:
+        np.testing.assert_array_equal(file["mosaic"]["context"], mosaic.context)
+
+
+@pytest.mark.parametrize(
+    "name", ["m", "m.png", "a.hdf5", "a.fits.fz", "a.fits.zip", "a.fits.xz", "a.asdf.gz", "a.gz", "a.fitsx", "fits"]
+)
+def test_other_endings_are_refused(mosaic, tmp_path, name):
+    (tmp_path / name).write_text("precious")
+    with pytest.raises(InputError, match=rf"{name}: the ending says the format of a mosaic; give \.fits"):
+        mosaic.write(tmp_path / name, overwrite=True)
+    assert (tmp_path / name).read_text() == "precious"
+    assert names(tmp_path) == [name]
+
+
+def test_pixels_of_a_mosaic_are_whole_numbers(mosaic):
+    assert mosaic.contributors(3, 2.0) == mosaic.contributors(np.int64(3), 2) == ("e1",)
+    for x, y in ((0.4, 1), (1, 1.6), (np.nan, 1)):
+        with pytest.raises(InputError, match=rf"whole numbers, got \({x}, {y}\)"):
+            mosaic.contributors(x, y)
+    for x, y in ((-1, 0), (4, 0), (0, 3)):
+        with pytest.raises(InputError, match="is not one of the 4 x 3 of the mosaic"):
+            mosaic.contributors(x, y)

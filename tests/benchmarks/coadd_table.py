@@ -156,7 +156,7 @@ def single_reproject(folder, out, *, stock):
     from reproject import reproject_interp
 
     from legdistort.archive import write_wcs
-    from legdistort.coaddition import reference_grid
+    from legdistort.grids import reference_grid
 
     solution, _, _ = inputs(folder)
     path = frames(folder)[0]
