@@ -5,8 +5,7 @@ import argparse
 from .exposures import expand_paths
 from .files import check_file, check_folder, check_not_read
 
-#: What `run` and `solve` replace in their folder.
-RESULTS = ("solution.asdf", "stars.ecsv", "wcs", "mosaic.fits", "report.html", "summary.json")
+#: Arguments that name what is read.
 _READ = ("frames", "tables", "table", "sources", "solution", "stars", "prior", "reference", "grid")
 
 

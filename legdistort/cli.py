@@ -13,10 +13,11 @@ from pathlib import Path
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from . import commands
-from .arguments import RESULTS, check_paths, columns, number_or_name, spectrum, word_or
+from .arguments import check_paths, columns, number_or_name, spectrum, word_or
 from .coaddition import CONSERVE, ORDERS
 from .drizzling import KERNELS
 from .exceptions import LegdistortError, LegdistortWarning
+from .files import RESULTS
 from .levels import SCALES
 from .resampling import ALGORITHMS
 from .sources import DIRECTIONS

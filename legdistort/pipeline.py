@@ -217,8 +217,12 @@ def _if_possible(judge, *args, **kwargs):
 def check_folder(out, overwrite):
     """Raise `InputError` if `out` cannot be a folder, or holds results and `overwrite` is false."""
     files.check_folder(out)
-    if (Path(out) / "solution.asdf").exists() and not overwrite:
-        raise InputError(f"{out} already holds a run; give overwrite=True (--overwrite) or another folder")
+    there = [name for name in files.RESULTS if (Path(out) / name).exists()]
+    if there and not overwrite:
+        raise InputError(
+            f"{out} already holds {', '.join(there)}; give overwrite=True (--overwrite) to replace a run, or another "
+            "folder"
+        )
 
 
 def _check_shapes(exposures):

@@ -21,8 +21,10 @@ log = logging.getLogger(__name__)
 DIRECT_LIMIT = 3000
 #: ... and while building it costs no more than this many multiplications.
 _DIRECT_COST = 4e9
-#: The data overrule the convention along a direction where that gains this much chi2 (five standard errors).
+#: The data overrule the convention along a direction where that gains this much chi2 (five standard errors)...
 GAIN = 25.0
+#: ... and tell how far to an error below this many times the scatter of single exposures.
+_VAGUE = 3.0
 _SURE = 0.01  # curvature, relative to that of the coefficients, of a direction that is none of the gauge
 _WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not told
 _ROUNDING = 1e-9  # smallest curvature that means something, relative to that of the coefficients
@@ -93,6 +95,10 @@ class _Reduced:
         a static distortion of several pixels that the convention pushes into the star positions leaves residuals of
         second order. Standard errors are taken at the observed scale if that is larger.
 
+        A map shows only through the distortions in which exposures differ, so where these are small, a trace of
+        anything that is not in the model looks like a map of many pixels. A direction that the data tell worse than to
+        three times the scatter of single exposures is left to the convention, therefore.
+
         Parameters
         ----------
         told : ndarray, shape (n_constraints, n_told)
@@ -115,7 +121,9 @@ class _Reduced:
             sure[:] = False
         rest = (self.blocks.chi2 - gain.sum()) / max(self.dof, 1)
         if self.dof > 0 and rest <= self.explained:
-            sure |= gain > GAIN * max(1.0, rest)
+            maps = self.gauge.left_to_data(kept @ vectors)
+            variance = max(1.0, rest) / np.maximum(curvature, _ROUNDING * self.scale) * np.sum(maps**2, axis=1)
+            sure |= (gain > GAIN * max(1.0, rest)) & (variance < _VAGUE**2 * np.sum(self.gauge.scatter**2))
         return kept @ vectors[:, sure]
 
     @property

@@ -158,12 +158,13 @@ def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, numb
     assert [p.name for p in tmp_path.rglob("*")] == ["scratch"]
 
 
-def test_existing_run_is_kept(night, tmp_path, capsys):
+@pytest.mark.parametrize("kept", ["solution.asdf", "mosaic.fits"])
+def test_existing_run_is_kept(night, tmp_path, capsys, kept):
     out = tmp_path / "out"
     out.mkdir()
-    (out / "solution.asdf").write_text("precious")
-    failed(capsys, run(night, out), str(out), "--overwrite")
-    assert (out / "solution.asdf").read_text() == "precious"
+    (out / kept).write_text("precious")
+    failed(capsys, run(night, out), f"{out} already holds {kept}", "--overwrite")
+    assert (out / kept).read_text() == "precious"
     assert run(night, out, "--overwrite") == 0
     assert Solution.read(out / "solution.asdf").degree == 1
 

@@ -8,7 +8,11 @@ from numpy.testing import assert_allclose
 from legdistort import performance, poses, reduction, solvers
 from legdistort.distortion import Distortion
 from legdistort.estimation import solve
+from legdistort.exceptions import AssumptionWarning
+from legdistort.exposures import read_exposures
 from legdistort.matches import Matches
+from legdistort.matching import match
+from legdistort.measurement import measure
 from legdistort.priors import Prior
 from legdistort.problems import build
 from legdistort.simulation import simulate_matches
@@ -134,6 +138,55 @@ def test_understated_errors_do_not_contradict_the_convention():
     solution = solve(matches, prior=Prior(sim.truth.static))
     assert solution.chi2 > 300 * solution.dof
     assert solution.gauge.told is None
+
+
+@pytest.mark.parametrize("seeing", [{"dither": 50.0, "dynamic": 0.01}, {"dither": 0.0, "dynamic": 0.1}])
+def test_a_large_static_distortion_is_told_by_small_differences(seeing):
+    """10 px in all exposures, 0.1 to 1.5 px in which they differ, positions good to 0.01 px."""
+    solution = solve(simulate_matches(seed=1, sigma=0.01, static=10.0, n_stars=300, **seeing).matches)
+    assert len(solution.gauge.told) >= 7
+    assert abs(solution.chi2 - solution.dof) < 5 * np.sqrt(2 * solution.dof)
+
+
+def imperfect(seed):
+    """Small distortions, a trace of them above the degree that is fitted, and errors understated by a quarter."""
+    spread = np.where(np.arange(15) < 10, 0.1, 0.03)
+    sim = simulate_matches(seed=seed, n_stars=400, n_exposures=6, degree=4, static=0.0, dynamic=spread, sigma=0.1,
+                           zero_mean=False, dither=250.0, shape=(1000, 1000))  # fmt: skip
+    table = sim.matches.table.copy()
+    table["x_err"] *= 0.75
+    table["y_err"] *= 0.75
+    return Matches.from_table(table, shape=sim.matches.shapes, poses=sim.matches.poses)
+
+
+def rms_distortion(solution):
+    """Per axis, over detectors and exposures, shifts aside; modes have mean square 1/4."""
+    return np.sqrt(np.mean(np.sum(solution.coefficients[:, :, 1:] ** 2, axis=2)) / 4)
+
+
+@pytest.mark.parametrize("seed", [5, 14])
+@pytest.mark.parametrize("direct", [True, False])
+def test_what_the_data_hardly_tell_stays_with_the_convention(monkeypatch, seed, direct):
+    """What is not in the model looks like a map of 15 px, by more than five standard errors."""
+    monkeypatch.setattr(reduction, "uses_direct", lambda problem: direct)
+    solution = solve(imperfect(seed), degree=3)
+    assert 1.6 < solution.chi2 / solution.dof < 2
+    assert solution.gauge.told is None
+    assert rms_distortion(solution) < 0.2  # 0.15 of the truth, plus noise
+
+
+@pytest.mark.slow
+def test_real_frames_of_one_telescope_have_one_scale(shared_data):
+    """Similarities between these frames leave 0.1 to 0.2 px, and their scales agree to 0.0005."""
+    exposures = read_exposures(sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fits.gz")))
+    with pytest.warns(AssumptionWarning, match="no gain known"):
+        detections = measure(exposures)
+    matches = match(detections, exposures=exposures, min_exposures=4)
+    for degree in (2, 3, 4, 5):
+        solution = solve(matches, degree=degree, clip=5.0)
+        scales = [np.sqrt(np.linalg.det(pose[:, :2])) for pose in solution.poses.values()]
+        assert_allclose(scales, 1, rtol=0, atol=0.001)
+        assert rms_distortion(solution) < 0.5
 
 
 @pytest.mark.slow
