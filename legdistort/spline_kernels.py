@@ -24,10 +24,8 @@ def interpolate(image, xy, order, out):
     out : ndarray of float64, shape (my, mx)
         For the values: NaN outside the pixels; on their outer halves, that at the centre.
     """
-    if order == 3:
-        _cubic(_coefficients(image), xy, out)
-    else:
-        _linear(image, xy, out)
+    cubic = order == 3
+    _evaluate(_coefficients(image) if cubic else image, xy, out, cubic)
 
 
 @njit(cache=True, nogil=True)
@@ -93,16 +91,24 @@ def _place(x, n):
 
 
 @njit(cache=True, nogil=True)
-def _linear(image, xy, out):
+def _evaluate(image, xy, out, cubic):
+    """Values at coordinates, of the pixels or of the coefficients of cubic B-splines."""
     ny, nx = image.shape
     for r in range(out.shape[0]):
         for k in range(out.shape[1]):
             (j, u), (i, v) = _place(xy[0, r, k], nx), _place(xy[1, r, k], ny)
             if i < 0 or j < 0:
                 out[r, k] = np.nan
-                continue
-            low = (1 - u) * image[i, j] + u * image[i, j + 1]
-            out[r, k] = (1 - v) * low + v * ((1 - u) * image[i + 1, j] + u * image[i + 1, j + 1])
+            elif cubic:
+                out[r, k] = _cubic(image, i, j, u, v)
+            else:
+                out[r, k] = _linear(image, i, j, u, v)
+
+
+@njit(cache=True, nogil=True)
+def _linear(image, i, j, u, v):
+    low = (1 - u) * image[i, j] + u * image[i, j + 1]
+    return (1 - v) * low + v * ((1 - u) * image[i + 1, j] + u * image[i + 1, j + 1])
 
 
 @njit(cache=True, nogil=True)
@@ -113,20 +119,14 @@ def _weights(f):
 
 
 @njit(cache=True, nogil=True)
-def _cubic(c, xy, out):
+def _cubic(c, i, j, u, v):
     ny, nx = c.shape
-    for r in range(out.shape[0]):
-        for k in range(out.shape[1]):
-            (j, u), (i, v) = _place(xy[0, r, k], nx), _place(xy[1, r, k], ny)
-            if i < 0 or j < 0:
-                out[r, k] = np.nan
-                continue
-            a, b = _mirror(j - 1, nx), _mirror(j + 2, nx)
-            low, high = _mirror(i - 1, ny), _mirror(i + 2, ny)
-            w0, w1, w2, w3 = _weights(u)
-            v0, v1, v2, v3 = _weights(v)
-            s0 = w0 * c[low, a] + w1 * c[low, j] + w2 * c[low, j + 1] + w3 * c[low, b]
-            s1 = w0 * c[i, a] + w1 * c[i, j] + w2 * c[i, j + 1] + w3 * c[i, b]
-            s2 = w0 * c[i + 1, a] + w1 * c[i + 1, j] + w2 * c[i + 1, j + 1] + w3 * c[i + 1, b]
-            s3 = w0 * c[high, a] + w1 * c[high, j] + w2 * c[high, j + 1] + w3 * c[high, b]
-            out[r, k] = v0 * s0 + v1 * s1 + v2 * s2 + v3 * s3
+    a, b = _mirror(j - 1, nx), _mirror(j + 2, nx)
+    low, high = _mirror(i - 1, ny), _mirror(i + 2, ny)
+    w0, w1, w2, w3 = _weights(u)
+    v0, v1, v2, v3 = _weights(v)
+    s0 = w0 * c[low, a] + w1 * c[low, j] + w2 * c[low, j + 1] + w3 * c[low, b]
+    s1 = w0 * c[i, a] + w1 * c[i, j] + w2 * c[i, j + 1] + w3 * c[i, b]
+    s2 = w0 * c[i + 1, a] + w1 * c[i + 1, j] + w2 * c[i + 1, j + 1] + w3 * c[i + 1, b]
+    s3 = w0 * c[high, a] + w1 * c[high, j] + w2 * c[high, j + 1] + w3 * c[high, b]
+    return v0 * s0 + v1 * s1 + v2 * s2 + v3 * s3
