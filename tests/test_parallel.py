@@ -354,6 +354,18 @@ class TestMosaicInBlocks:
             )
         assert_same(ld.coadd(ld.open_exposures(str(tmp_path / "*")), solution), ld.coadd(exposures, solution))
 
+    def test_nothing_is_between_exposures_far_apart(self):
+        solution, exposures = night(2)
+        solution.poses["frame1"] = solution.poses["frame1"] - np.array([[0, 0, 900], [0, 0, 700]])
+        mosaic = ld.coadd(exposures, solution, order=1, match_background=False)
+        empty = mosaic.footprint == 0
+        assert min(mosaic.shape) > 900
+        assert 0.7 < empty.mean() < 0.9
+        for plane in (mosaic.data, mosaic.variance):
+            np.testing.assert_array_equal(np.isnan(plane), empty)
+        for plane in (mosaic.weight, mosaic.flags, *mosaic.context):
+            assert not plane[empty].any()
+
     def test_the_context_says_who_contributes(self):
         solution, exposures = night(34)
         mosaic = ld.coadd(exposures, solution, order=1)
