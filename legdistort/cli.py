@@ -14,12 +14,11 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from . import commands
 from .arguments import check_paths, columns, number_or_name, spectrum, word_or
-from .coaddition import CONSERVE, ORDERS
 from .drizzling import KERNELS
 from .exceptions import LegdistortError, LegdistortWarning
 from .files import RESULTS
 from .levels import SCALES
-from .resampling import ALGORITHMS
+from .resampling import ALGORITHMS, CONSERVE, ORDERS
 from .sources import DIRECTIONS
 from .weighting import EXTRAPOLATED, WEIGHTS
 

@@ -18,13 +18,20 @@ from .levels import bad_pixels, flux_scales, match_backgrounds, saturated_pixels
 from .mapping import map_exposure
 from .mosaics import Mosaic
 from .parallel import each
-from .resampling import ALGORITHMS, fill_bad, is_compiled, noise_correlation, rough_pixels, white_gain
+from .resampling import (
+    ALGORITHMS,
+    CONSERVE,
+    ORDERS,
+    fill_bad,
+    is_compiled,
+    noise_correlation,
+    rough_pixels,
+    white_gain,
+)
 from .scratch import scratch_folder, store
 from .stacking import Layer, Recipe, assemble, n_bytes
-from .weighting import EXTRAPOLATED, make_weights, stellar_widths
+from .weighting import EXTRAPOLATED, check_names, make_weights, stellar_widths
 
-CONSERVE = ("flux", "surface_brightness")
-ORDERS = {"nearest-neighbor": 0, "bilinear": 1, "biquadratic": 2, "bicubic": 3}
 _STORED = 5  # bytes a pixel in the scratch folder, about
 _COARSE = 1.5  # pixels of the grid in those of an exposure from which interpolation leaves out too much
 _MEANING = {
@@ -124,6 +131,8 @@ def coadd(
     order = _check_options(method, order, algorithm, conserve, extrapolated)
     drop = Drop(kernel, pixfrac) if algorithm == "drizzle" else None
     frames, left_out = _select(exposures, solution)
+    for argument, given in (("weights", weights), ("scale", scale)):
+        check_names(argument, given, [*(f.name for f in frames), *left_out])
     output = reference_grid([f.name for f in frames], solution) if grid is None else given_grid(grid, solution)
     maps = {f.name: map_exposure(f.name, solution, output, corners=algorithm in ("exact", "drizzle")) for f in frames}
     left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
@@ -191,19 +200,19 @@ def _layers(frames, kept, maps, solution, recipe, *, factors, weights, sky, matc
             weight=weight[f.name],
             fwhm=fwhm and fwhm[f.name],
             gain=white_gain(maps[f.name], algorithm=recipe.algorithm, order=recipe.order, drop=recipe.drop),
-            photons=_photons(f, kept[f.name][0], maps[f.name], noise[f.name], factors[f.name], recipe.conserve),
         )
         for i, f in enumerate(frames)
     ]
+    layers = [replace(each, photons=_photons(each, f.gain, recipe)) for each, f in zip(layers, frames, strict=True)]
     return layers, replace(recipe, level=level, widths=_span(fwhm))
 
 
-def _photons(frame, stored, exposure_map, noise, factor, conserve):
+def _photons(layer, gain, recipe):
     """Growth of the variance with the signal, by the gain where there is no uncertainty plane (see `Layer.photons`)."""
-    if not frame.gain or "variance" in stored.paths or noise == 0:
+    if not gain or "variance" in layer.stored.paths or layer.variance == 0:
         return 0.0
-    area = _area(exposure_map) if conserve == "flux" else 1.0
-    return float(factor / (noise**2 * area * frame.gain))
+    area = _area(layer.map) if recipe.conserve == "flux" else 1.0
+    return float(layer.factor / (layer.variance * area * gain))
 
 
 def _area(exposure_map):

@@ -87,7 +87,7 @@ def combine(data, variance, weight, *, method="mean", level=0.0, photons=None, s
         data = np.where(use, data, np.nan)
     weight = np.broadcast_to(np.asarray(weight, dtype=np.float32), data.shape)
     if method == "median":
-        return _median(data, variance, weight, use, level, photons)
+        return _median(data, variance, weight, use, level=level, photons=photons)
     keep = use
     if method == "clipped":
         keep = confirmed(data, variance, use, level=level, fwhm=fwhm, widths=widths)
@@ -127,7 +127,7 @@ def _reach(widths):
     return 1 if widths is None else max(1, round(widths[1] / 3))
 
 
-def _median(data, variance, weight, use, level, photons):
+def _median(data, variance, weight, use, *, level, photons):
     count = use.sum(axis=0)
     centre = (_ranked(data, count, low=True) + _ranked(data, count, low=False)) / 2
     variance = _with_photons(variance, photons, centre - level)

@@ -61,7 +61,7 @@ class Layer:
     weight: Weight
     fwhm: float | None
     gain: float | None
-    photons: float
+    photons: float = 0.0
     support: np.ndarray | None = None
 
 

@@ -34,9 +34,6 @@ def by_name(argument, given, names):
     InputError
         If a number is missing or not positive.
     """
-    unknown = [str(name) for name in given if name not in names]
-    if unknown:
-        raise InputError(f"{argument}: no exposure of that name is co-added: {', '.join(unknown)}")
     for name in names:
         value = given.get(name)
         if not (isinstance(value, (int, float, np.number)) and np.isfinite(value) and value > 0):
@@ -60,6 +57,13 @@ def stellar_widths(solution, names):
     good = np.asarray(rows["used"]) & np.isfinite(fwhm) & (fwhm > 0)
     widths = {name: fwhm[good & (exposure == name)] for name in names}
     return {name: float(np.median(w)) for name, w in widths.items()} if all(len(w) for w in widths.values()) else None
+
+
+def check_names(argument, given, names):
+    """Raise `InputError` if a mapping by exposure has other names than these; what is no mapping passes."""
+    unknown = [str(name) for name in given if name not in names] if isinstance(given, Mapping) else []
+    if unknown:
+        raise InputError(f"{argument}: no exposure of that name is co-added: {', '.join(unknown)}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

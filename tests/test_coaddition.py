@@ -588,7 +588,7 @@ class TestBadInput:
         dead = [frames[0]] + [replace(f, data=np.zeros(SHAPE), header=fits.Header()) for f in frames[1:]]
         names = "frame1, frame2, frame3, frame4, frame5 and 1 more"
         with pytest.warns(AssumptionWarning, match=f"left out of the mosaic: {names}: every pixel is 0"):
-            assert coadd(dead, solution).exposures == ("frame0",)
+            assert coadd(dead, solution, weights={f.name: 1 for f in dead}).exposures == ("frame0",)
         with pytest.raises(InputError, match="scale: no exposure of that name is co-added: frame9"):
             coadd(frames[:1], solution, scale={"frame0": 1, "frame9": 2})
 
