@@ -17,9 +17,14 @@ from astropy import units as u
 from PIL import Image
 
 import legdistort as ld
-from legdistort import baselines, performance, plotting, poses, problems, quality, quality_plots, solvers, starting
+from legdistort.assessment import baselines, stack_quality
 from legdistort.demo import run_demo
-from legdistort.distortion import Distortion
+from legdistort.geometry import similarity
+from legdistort.geometry.distortion import Distortion
+from legdistort.plots import solution_plots, stack_plots
+from legdistort.results import accuracy
+from legdistort.solving import minimisers, start_values
+from legdistort.solving.equations import problem_builder
 
 IMAGES = Path(__file__).parent / "images"
 BLUE, GREEN, ORANGE = "#0072B2", "#009E73", "#D55E00"
@@ -46,11 +51,11 @@ def sweeps(n_sweeps=300, n_seeds=10):
     for seed in range(n_seeds):
         sim = ld.simulate_matches(seed=seed)
         true = sim.truth.positions
-        problem = problems.build(sim.matches, 3, prior=ld.Prior(sim.truth.static))
-        start, _ = starting.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
+        problem = problem_builder.build(sim.matches, 3, prior=ld.Prior(sim.truth.static))
+        start, _ = start_values.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
         for name, solver, n in (
-            ("alternating", solvers.solve_alternating, n_sweeps),
-            ("joint", solvers.solve_joint, 4),
+            ("alternating", minimisers.solve_alternating, n_sweeps),
+            ("joint", minimisers.solve_joint, 4),
         ):
             state, curve = start, []
             for _ in range(n):
@@ -58,7 +63,7 @@ def sweeps(n_sweeps=300, n_seeds=10):
                     warnings.simplefilter("ignore")  # one step at a time never converges
                     state = solver(problem, state, max_iterations=1).state
                 positions = state.positions.T
-                curve.append([performance.bias(positions, true), performance.bias(positions, true, removed=3)])
+                curve.append([accuracy.bias(positions, true), accuracy.bias(positions, true, removed=3)])
             curves[name].append(curve)
     fig, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
     for name, colour in (("alternating", ORANGE), ("joint", BLUE)):
@@ -114,8 +119,8 @@ def aligned(solution, *, static=False):
             undistorted = Distortion(coefficients, solution.shapes[name]).invert(xy)
             table["x"][rows], table["y"][rows] = undistorted.T * u.pix
     matches = ld.Matches.from_table(table, shape=solution.shapes)  # estimates the similarities from the positions
-    back = {name: poses.invert(matches.poses[name]) for name in solution.names}
-    return by_star(solution, lambda name, xy: poses.apply(back[name], xy), table=table)
+    back = {name: similarity.invert(matches.poses[name]) for name in solution.names}
+    return by_star(solution, lambda name, xy: similarity.apply(back[name], xy), table=table)
 
 
 def by_star(solution, to_reference, *, table=None):
@@ -137,28 +142,28 @@ def stacked(run):
     )
     comparison = baselines.compare(matches, solution, prior=ld.Prior(solution.prior_mean[0]))
     frames = ld.open_exposures(str(run.out / "frames" / "*.fits"))
-    stacks = quality.compare_stacks(frames, comparison, mosaic=run.mosaic, method="clipped")
-    return quality_plots.plot_zooms(stacks.zooms)[0, 0].figure
+    stacks = stack_quality.compare_stacks(frames, comparison, mosaic=run.mosaic, method="clipped")
+    return stack_plots.plot_zooms(stacks.zooms)[0, 0].figure
 
 
 def draw_first_mosaic(run):
     """Pictures of the page "First mosaic"."""
     solution, first = run.solution, run.solution.names[0]
     fig, panels = plt.subplots(1, 2, figsize=(10, 5), layout="constrained")
-    plotting.plot_residuals(solution, ax=panels[0])
-    plotting.plot_scatter(solution, ax=panels[1])
+    solution_plots.plot_residuals(solution, ax=panels[0])
+    solution_plots.plot_scatter(solution, ax=panels[1])
     save(fig, "residuals.png")
 
     fig, panels = plt.subplots(1, 2, figsize=(10, 5), layout="constrained")
-    plotting.plot_distortion(solution, first, scale=None, ax=panels[0])
-    plotting.plot_distortion(solution, first, part="dynamic", scale=None, ax=panels[1])
+    solution_plots.plot_distortion(solution, first, scale=None, ax=panels[0])
+    solution_plots.plot_distortion(solution, first, part="dynamic", scale=None, ax=panels[1])
     save(fig, "distortion.png")
 
     fig, panels = plt.subplots(1, 2, figsize=(10, 4.6), layout="constrained")
-    plotting.plot_sigma_map(*solution.sigma_map(first), ax=panels[0])
+    solution_plots.plot_sigma_map(*solution.sigma_map(first), ax=panels[0])
     offset = run.mosaic.offset
     xy = np.column_stack([solution.stars["x"].value, solution.stars["y"].value]) - offset
-    plotting.plot_mosaic(run.mosaic, stars=xy, ax=panels[1])
+    solution_plots.plot_mosaic(run.mosaic, stars=xy, ax=panels[1])
     save(fig, "mosaic.png", colours=256)
 
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from . import performance
-from .files import replacing
-from .instruments import gsaoi_static
+from .geometry.gsaoi import gsaoi_static
 from .pipeline import check_folder, run, write_summary
-from .priors import Prior
-from .simulation import simulate_exposures
+from .priors.prior import Prior
+from .results import accuracy
+from .runtime.outputs import replacing
+from .simulation.observations import simulate_exposures
 
 #: Degree of the prior: the static map is then followed to 3e-6 px.
 PRIOR_DEGREE = 5
@@ -74,14 +74,14 @@ def compare(solution, truth, *, seed=0):
         seen = np.flatnonzero(solution.supported(name, truth.distort(name, new)))
         noisy = truth.distort(name, new[seen]) + error * rng.normal(size=(len(seen), 2))
         corrected[i, seen] = solution.correct(name, noisy)
-    measured = performance.scatter(corrected)
-    expected = performance.expected_scatter(solution, new, error, seen=np.isfinite(corrected[..., 0]))
+    measured = accuracy.scatter(corrected)
+    expected = accuracy.expected_scatter(solution, new, error, seen=np.isfinite(corrected[..., 0]))
     good = np.isfinite(measured) & np.isfinite(expected)
     return {
-        "b_px": performance.bias(solution.positions, true, removed=solution.degree),
-        "b_bound_px": performance.expected_bias(solution, removed=solution.degree),
-        "b_abs_px": performance.bias(solution.positions, true, removed="similarity"),
-        "b_abs_err_px": performance.expected_bias(solution, removed="similarity", absolute=True),
+        "b_px": accuracy.bias(solution.positions, true, removed=solution.degree),
+        "b_bound_px": accuracy.expected_bias(solution, removed=solution.degree),
+        "b_abs_px": accuracy.bias(solution.positions, true, removed="similarity"),
+        "b_abs_err_px": accuracy.expected_bias(solution, removed="similarity", absolute=True),
         "sigma_new_px": float(np.sqrt(np.mean(measured[good] ** 2))),
         "sigma_new_expected_px": float(np.sqrt(np.mean(expected[good] ** 2))),
     }

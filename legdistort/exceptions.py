@@ -4,6 +4,13 @@ All errors derive from `LegdistortError`, so that one ``except`` catches them
 and the command line can turn each into one clear line.
 """
 
+import contextlib
+import functools
+import inspect
+import os
+import warnings
+from pathlib import Path
+
 
 class LegdistortError(Exception):
     """Base of every error that the package raises on purpose."""
@@ -33,12 +40,6 @@ class ExportError(LegdistortError, ValueError):
     """A result does not fit the form asked for; allow a larger error, or choose a form that is exact."""
 
 
-def check_choice(value, allowed, name):
-    """Raise `InputError` naming the argument if `value` is not one of the words allowed."""
-    if value not in allowed:
-        raise InputError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
-
-
 class LegdistortWarning(UserWarning):
     """Base of every warning of the package."""
 
@@ -49,3 +50,23 @@ class ConvergenceWarning(LegdistortWarning):
 
 class AssumptionWarning(LegdistortWarning):
     """Something was missing from the input and a stated value was assumed."""
+
+
+#: Frames of these do not count as a caller's: the package, and what calls its functions for it.
+_INSIDE = str(Path(__file__).parent) + os.sep
+_BETWEEN = {functools.__file__, contextlib.__file__}
+
+
+def warn(message, category):
+    """Warn, with the line outside the package that led here as the place of the warning.
+
+    Parameters
+    ----------
+    message : str
+    category : type
+        A subclass of `LegdistortWarning`.
+    """
+    frame, level = inspect.currentframe(), 1
+    while frame and (frame.f_code.co_filename.startswith(_INSIDE) or frame.f_code.co_filename in _BETWEEN):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)

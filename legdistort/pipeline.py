@@ -9,18 +9,21 @@ from pathlib import Path
 
 import numpy as np
 
-from . import archive, baselines, files, performance, provenance, quality
-from .coaddition import coadd
-from .estimation import solve
+from .assessment import baselines, stack_quality
+from .coaddition.mosaicking import coadd
 from .exceptions import InputError, MatchError
-from .exposure_files import open_exposures
-from .exposures import expand_paths
-from .findings import FOUND
-from .matching import match
-from .measurement import measure
-from .options import check_options, check_reference
-from .report import write_report
-from .table_files import write_stars
+from .inputs.exposure_files import open_exposures
+from .inputs.exposures import expand_paths
+from .inputs.table_files import write_stars
+from .matching.matcher import match
+from .measurement.positions import measure
+from .reporting.page import write_report
+from .results import accuracy
+from .results.diagnostics import FOUND
+from .runtime import outputs, provenance
+from .solving.estimation import solve
+from .solving.options import check_options, check_reference
+from .wcs.files import write_wcs
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +97,8 @@ def run(
         hot pixels and cosmic rays do not get into it.
     compare : bool
         Also correct by shifts, by the prior's static distortion and shifts, and by a relative polynomial
-        (`legdistort.baselines`), and report the scatter and the sharpness of the stack that each of them leaves.
+        (`legdistort.assessment.baselines`), and report the scatter and the sharpness of the stack that each of them
+        leaves.
     overwrite : bool
         Replace the results of an earlier run.
     workers : int, optional
@@ -144,12 +148,12 @@ def run(
         kept = [exposure for exposure in exposures if exposure.name in solution.names]
         mosaic = coadd(kept, solution, **share, **coadding)
     with _timed(timings, "assess"):
-        judged = _if_possible(quality.assess, mosaic, solution, exposures=kept)
+        judged = _if_possible(stack_quality.assess, mosaic, solution, exposures=kept)
     stacks = None
     if comparison and judged:
         with _timed(timings, "compare"):
-            stacks = _if_possible(quality.compare_stacks, kept, comparison, mosaic=mosaic, **coadding)
-    with files.replacing_folder(out) as target:
+            stacks = _if_possible(stack_quality.compare_stacks, kept, comparison, mosaic=mosaic, **coadding)
+    with outputs.replacing_folder(out) as target:
         with _timed(timings, "write"):
             write_results(solution, target)
             mosaic.write(target / "mosaic.fits")
@@ -157,7 +161,7 @@ def run(
         if judged:
             summary["quality"] = asdict(judged)
         if comparison:
-            summary["comparison"] = {name: performance.scatter_summary(made) for name, made in comparison.items()}
+            summary["comparison"] = {name: accuracy.scatter_summary(made) for name, made in comparison.items()}
         if stacks:
             summary["stacks"] = stacks.figures()
         shown = {"mosaic": mosaic, "summary": summary, "comparison": comparison, "stacks": stacks}
@@ -172,7 +176,7 @@ def write_results(solution, target):
     write_stars(solution, target / "stars.ecsv")
     (target / "wcs").mkdir()
     for name in solution.names:
-        archive.write_wcs(solution, name, target / "wcs" / f"{name}.asdf")
+        write_wcs(solution, name, target / "wcs" / f"{name}.asdf")
 
 
 def write_summary(path, summary):
@@ -186,7 +190,7 @@ def summarise(solution, *, timings=None):
     ``rms_px``: unweighted rms residual per axis, used observations. ``sigma_px``: the paper's sigma (section 3.4) over
     the fitted stars, per axis.
     """
-    sigma = performance.scatter(performance.corrected_positions(solution))
+    sigma = accuracy.scatter(accuracy.corrected_positions(solution))
     return {
         "n_exposures": len(solution.names),
         "n_stars": int(np.count_nonzero(np.isfinite(solution.positions[:, 0]))),
@@ -216,8 +220,8 @@ def _if_possible(judge, *args, **kwargs):
 
 def check_folder(out, overwrite):
     """Raise `InputError` if `out` cannot be a folder, or holds results and `overwrite` is false."""
-    files.check_folder(out)
-    there = [name for name in files.RESULTS if (Path(out) / name).exists()]
+    outputs.check_folder(out)
+    there = [name for name in outputs.RESULTS if (Path(out) / name).exists()]
     if there and not overwrite:
         raise InputError(
             f"{out} already holds {', '.join(there)}; give overwrite=True (--overwrite) to replace a run, or another "

@@ -4,8 +4,8 @@ import numpy as np
 from astropy.table import Table, vstack
 from astropy.wcs import WCS
 
-from legdistort import basis
-from legdistort.exposures import Exposure
+from legdistort.geometry import basis
+from legdistort.inputs.exposures import Exposure
 
 SHAPE = (2048, 2048)
 

@@ -22,13 +22,14 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 import legdistort
-from legdistort import archive, provenance
-from legdistort.estimation import solve
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
-from legdistort.matches import Matches
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
-from legdistort.solution import Solution
+from legdistort.inputs.matches import Matches
+from legdistort.priors.prior import Prior
+from legdistort.results.solution import Solution
+from legdistort.runtime import provenance
+from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
+from legdistort.solving.estimation import solve
+from legdistort.wcs.files import write_wcs
 
 
 def small(**changes):
@@ -205,7 +206,7 @@ def test_nothing_is_overwritten_unasked(solution, tmp_path):
     with pytest.raises(InputError, match=r"s\.asdf exists already; give overwrite=True \(--overwrite\)"):
         solution.write(path)
     with pytest.raises(InputError, match="exists already"):
-        archive.write_wcs(solution, solution.names[0], path)
+        write_wcs(solution, solution.names[0], path)
     assert path.read_text() == "precious"
     solution.write(path, overwrite=True)
     assert len(Solution.read(path).names) == 4
@@ -226,7 +227,7 @@ def test_a_failed_write_leaves_nothing(solution, tmp_path, monkeypatch, existing
     with pytest.raises(OSError, match="No space left"):
         solution.write(path, overwrite=True)
     with pytest.raises(OSError, match="No space left"):
-        archive.write_wcs(solution, solution.names[0], tmp_path / "w.asdf")
+        write_wcs(solution, solution.names[0], tmp_path / "w.asdf")
     assert [p.name for p in tmp_path.iterdir()] == (["s.asdf"] if existing else [])
     assert not existing or path.read_text() == "precious"
 
@@ -247,7 +248,7 @@ def test_absent_and_foreign_files(solution, tmp_path):
         Solution.read(tmp_path / "empty.asdf")
     with pytest.raises(InputError, match="is not a readable ASDF file"):
         Solution.read(tmp_path)
-    archive.write_wcs(solution, solution.names[0], tmp_path / "w.asdf")
+    write_wcs(solution, solution.names[0], tmp_path / "w.asdf")
     with pytest.raises(
         InputError, match=r"w\.asdf is not .*: tag '.*gwcs/wcs.*' has no business in such a file; is it"
     ):
@@ -458,7 +459,7 @@ def test_the_inverse_that_was_certified_is_the_one_used(solution, tmp_path):
 
 def test_a_wcs_comes_back_as_it_was(with_sky, tmp_path):
     name = with_sky.names[2]
-    back = legdistort.read_wcs(archive.write_wcs(with_sky, name, tmp_path / "w.asdf"))
+    back = legdistort.read_wcs(write_wcs(with_sky, name, tmp_path / "w.asdf"))
     made = with_sky.wcs(name)
     p = np.random.default_rng(0).uniform(-100, 611, (500, 2))
     ra, dec = made(*p.T)
@@ -476,7 +477,7 @@ def test_a_wcs_comes_back_as_it_was(with_sky, tmp_path):
 
 def test_a_wcs_without_sky_and_with_another_shape(solution, tmp_path):
     name = solution.names[0]
-    back = legdistort.read_wcs(archive.write_wcs(solution, name, tmp_path / "w.asdf"))
+    back = legdistort.read_wcs(write_wcs(solution, name, tmp_path / "w.asdf"))
     assert_array_equal(back(100.0, 200.0), solution.wcs(name)(100.0, 200.0))
     assert back.available_frames == ["detector", "undistorted", "reference"]
 
@@ -515,7 +516,7 @@ def shifted(tree):
     ],
 )
 def test_changed_wcs_files_are_noticed(with_sky, tmp_path, change, message):
-    path = archive.write_wcs(with_sky, with_sky.names[0], tmp_path / "w.asdf")
+    path = write_wcs(with_sky, with_sky.names[0], tmp_path / "w.asdf")
     with asdf.open(path, lazy_load=False, memmap=False) as file:
         meta = dict(file.tree["meta"])
     change(meta)
@@ -710,7 +711,7 @@ def test_no_tree_breaks_the_reader(whole_tree, tmp_path, data):
 def test_no_damage_breaks_the_reader(solution, with_sky, tmp_path, which, data):
     path = tmp_path / f"{which}.asdf"
     if not path.exists():
-        solution.write(path) if which == "solution" else archive.write_wcs(with_sky, with_sky.names[0], path)
+        solution.write(path) if which == "solution" else write_wcs(with_sky, with_sky.names[0], path)
     content = bytearray(path.read_bytes())
     text = content.index(b"\n...\n")
     for _ in range(data.draw(st.integers(1, 8))):

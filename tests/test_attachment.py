@@ -16,13 +16,14 @@ from astropy.wcs import WCS
 from numpy.testing import assert_allclose, assert_array_equal
 from test_headers import detector, geometry  # noqa: F401  (a fixture)
 
-from legdistort import poses
-from legdistort.attachment import attach
-from legdistort.blocks import locate
-from legdistort.cli import main
-from legdistort.estimation import solve
+from legdistort.cli.parser import main
 from legdistort.exceptions import ExportError, InputError
-from legdistort.simulation import simulate_matches
+from legdistort.geometry import similarity
+from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.runtime.fits_bytes import locate
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving.estimation import solve
+from legdistort.wcs.attachment import attach
 
 SHAPE = (60, 90)
 OLD = {
@@ -157,7 +158,7 @@ def test_no_ghosts_over_a_wide_mosaic(geometry):  # noqa: F811
         t = np.linspace(-750, 1250, 161)
         q = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
         q = q[(np.abs(q - 249.5) > 270).any(axis=1)]  # not on the detector: 20 px is the largest displacement
-        sky = solution.sky.to_sky(poses.apply(poses.invert(solution.poses[seed_name]), q))
+        sky = solution.sky.to_sky(similarity.apply(similarity.invert(solution.poses[seed_name]), q))
         assert np.isnan(wcs.world_to_pixel(sky)).any(axis=0).all()
         assert np.isnan(wcs(*q.T)).any(axis=0).all()
 
@@ -258,7 +259,7 @@ def test_packed_files_stay_packed(one, frame, tmp_path, suffix, module):
 def test_attaching_again_replaces(one, frame):
     for kind in ("sip", "tpv"):
         attach(one, frame, in_place=True, kind=kind)
-    turned = dataclasses.replace(one, sky=poses.TangentPlane(50.0, 5.0, one.sky.matrix))
+    turned = dataclasses.replace(one, sky=TangentPlane(50.0, 5.0, one.sky.matrix))
     attach(turned, frame, in_place=True)
     assert names_in(frame) == ["PRIMARY", "PACKED", "", "ERR", "ASDF"]
     header = fits.getheader(frame)
@@ -356,7 +357,7 @@ def test_mode_and_links_survive(one, frame, tmp_path):
 
 
 def test_a_frame_that_changes_meanwhile(one, frame, monkeypatch):
-    from legdistort import attachment
+    from legdistort.wcs import attachment
 
     plan = attachment._plan
 

@@ -8,13 +8,18 @@ import pytest
 from astropy import units as u
 from numpy.testing import assert_allclose
 
-from legdistort import baselines, cli, comparison_plots, performance, poses, report
-from legdistort.estimation import solve
+from legdistort.assessment import baselines
+from legdistort.cli import parser
 from legdistort.exceptions import InputError, SolveError
-from legdistort.matches import Matches
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_exposures, simulate_gsaoi_matches, simulate_matches
-from legdistort.solution import Solution
+from legdistort.geometry import similarity
+from legdistort.inputs.matches import Matches
+from legdistort.priors.prior import Prior
+from legdistort.reporting import comparison_plots
+from legdistort.reporting import page as report
+from legdistort.results import accuracy
+from legdistort.results.solution import Solution
+from legdistort.simulation.observations import simulate_exposures, simulate_gsaoi_matches, simulate_matches
+from legdistort.solving.estimation import solve
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +64,7 @@ def test_static_map_and_shifts_leave_only_noise_where_nothing_is_dynamic():
     solution = baselines.solve_shifts(sim.matches, prior=prior)
     assert solution.chi2 / solution.dof == pytest.approx(1, abs=4 * np.sqrt(2 / solution.dof))
     assert_allclose(solution.coefficients[:, :, 1:], np.broadcast_to(sim.truth.static, (10, 2, 10))[:, :, 1:])
-    assert performance.bias(solution.positions, sim.truth.positions, removed="similarity") < 0.1
+    assert accuracy.bias(solution.positions, sim.truth.positions, removed="similarity") < 0.1
     assert baselines.solve_shifts(sim.matches).rms.max() > 3 * solution.rms.max()
 
 
@@ -80,7 +85,7 @@ def test_orientations_are_kept_and_noise_in_them_is_not():
     rolls = [0, 90, 180, 270, 0.01, 90]
     sim = simulate_matches(seed=5, static=0, dynamic=0, rotations=rolls, n_exposures=6, n_stars=25, sigma=0.05)
     solution = baselines.solve_shifts(sim.matches)
-    angles = np.array([poses.describe(solution.poses[name])["rotation"] for name in solution.names])
+    angles = np.array([similarity.describe(solution.poses[name])["rotation"] for name in solution.names])
     assert_allclose((angles - [0.005, 90, 180, 270, 0.005, 90] + 180) % 360 - 180, 0, atol=1e-9)
     turned = sim.matches.poses | {"exp01": sim.matches.poses["exp05"]}
     assert_allclose(solution.poses["exp01"][:, :2], turned["exp05"][:, :2], atol=1e-9)
@@ -101,7 +106,7 @@ def test_relative_polynomial_is_that_of_plain_least_squares(reference, weighted)
     else:
         i = np.argmax(np.bincount(obs.exposure)) if reference is None else 3
         pose = sim.matches.poses[sim.matches.names[i]]
-        target, error = poses.apply(poses.invert(pose), xy[i]), sigma[i]
+        target, error = similarity.apply(similarity.invert(pose), xy[i]), sigma[i]
     new = np.random.default_rng(0).uniform(300, 1700, (50, 2))
 
     def powers(p):
@@ -120,12 +125,13 @@ def test_relative_polynomial_is_that_of_plain_least_squares(reference, weighted)
 def test_stars_of_a_relative_solution_are_means_of_corrected_positions():
     sim = simulate_matches(seed=7, n_stars=60, n_exposures=6, dither=150, sigma=0.1)
     solution = baselines.solve_relative(sim.matches, reference="exp02")
-    corrected = performance.corrected_positions(solution)
+    corrected = accuracy.corrected_positions(solution)
     assert_allclose(solution.positions, np.nanmean(corrected, axis=0), atol=1e-6)
     assert solution.rms.max() < 0.13
     assert np.all(solution.coefficient_errors("exp00") > 0)
     assert_allclose(
-        solution.distort("exp02", solution.positions[:5]), poses.apply(solution.poses["exp02"], solution.positions[:5])
+        solution.distort("exp02", solution.positions[:5]),
+        similarity.apply(solution.poses["exp02"], solution.positions[:5]),
     )
 
 
@@ -149,9 +155,9 @@ def test_relative_errors_hold_in_simulation():
 
 def test_four_corrections_improve_in_turn(compared):
     assert list(compared) == ["shift", "static + shift", "relative polynomial", "all distortions solved"]
-    means = [performance.scatter_summary(s)["mean"] for s in compared.values()]
+    means = [accuracy.scatter_summary(s)["mean"] for s in compared.values()]
     assert means[0] > 1.2 * means[1] > 3 * means[2] > 3 * 0.95 * means[3]
-    counts = {performance.scatter_summary(s)["n_stars"] for s in compared.values()}
+    counts = {accuracy.scatter_summary(s)["n_stars"] for s in compared.values()}
     assert len(counts) == 1  # on the same stars
 
 
@@ -211,7 +217,7 @@ def test_comparison_is_drawn_with_its_figures(compared, with_flux, night):
     ax = comparison_plots.plot_comparison(compared, noise=None if with_flux else lambda e: 2 * e)
     texts = [text.get_text() for text in ax.get_legend().get_texts()]
     assert len(texts) == len(compared) + 1
-    figures = performance.scatter_summary(compared["shift"])
+    figures = accuracy.scatter_summary(compared["shift"])
     assert texts[0] == f"shift: {figures['mean']:.3f} ± {figures['std']:.3f} px"
     assert ("flux" in ax.get_xlabel()) == with_flux
     ax.figure.clear()
@@ -224,8 +230,8 @@ def test_scatter_of_new_stars_is_that_of_the_noise_and_of_the_correction():
     sim = simulate_matches(seed=9, sigma=0.1, n_stars=60)
     solution = solve(sim.matches, prior=Prior(sim.truth.static))
     xy = sim.truth.grid("exp00", 40)
-    measured = performance.new_scatter(solution, sim.truth.distort, xy, 0.1, rng=np.random.default_rng(1))
-    quiet = performance.new_scatter(solution, sim.truth.distort, xy, 0.0)
+    measured = accuracy.new_scatter(solution, sim.truth.distort, xy, 0.1, rng=np.random.default_rng(1))
+    quiet = accuracy.new_scatter(solution, sim.truth.distort, xy, 0.0)
     noise = np.sqrt(np.mean(measured**2) - np.mean(quiet**2))
     assert noise == pytest.approx(0.1 * np.sqrt(0.9), rel=0.02)  # 10 exposures, 1600 stars
     by_hand = np.stack([solution.correct(name, sim.truth.distort(name, xy)) for name in solution.names])
@@ -233,17 +239,17 @@ def test_scatter_of_new_stars_is_that_of_the_noise_and_of_the_correction():
     seen = np.zeros((10, len(xy)), dtype=bool)
     seen[:3] = True
     seen[0, 7] = seen[1, 7] = False
-    few = performance.new_scatter(solution, sim.truth.distort, xy, 0.0, seen=seen)
+    few = accuracy.new_scatter(solution, sim.truth.distort, xy, 0.0, seen=seen)
     assert np.isnan(few[7])
     assert_allclose(few[8], np.sqrt(by_hand[:3, 8].var(axis=0).mean()), rtol=1e-9)
 
 
 def test_contour_is_a_square_that_holds_most_stars():
     stars = np.random.default_rng(2).uniform(0, 2047, (200, 2))
-    square = performance.contour(stars, fraction=0.9)
+    square = accuracy.contour(stars, fraction=0.9)
     assert np.ptp(square, axis=0)[0] == pytest.approx(np.ptp(square, axis=0)[1])
-    assert np.count_nonzero(performance.in_contour(stars, square)) in (180, 181)
-    assert performance.in_contour(stars, performance.contour(stars, fraction=1)).all()
+    assert np.count_nonzero(accuracy.in_contour(stars, square)) in (180, 181)
+    assert accuracy.in_contour(stars, accuracy.contour(stars, fraction=1)).all()
 
 
 def test_errors_by_star_make_up_b():
@@ -251,12 +257,12 @@ def test_errors_by_star_make_up_b():
     true = rng.uniform(0, 1000, (20, 2))
     estimated = true + rng.normal(size=true.shape)
     estimated[4] = np.nan
-    b = performance.bias_by_star(estimated, true)
+    b = accuracy.bias_by_star(estimated, true)
     assert np.isnan(b[4]).all()
     assert_allclose(np.delete(b, 4, axis=0), np.delete(estimated - true, 4, axis=0))
     paper = np.sqrt(np.mean(np.sum(np.delete(b, 4, axis=0) ** 2, axis=1)))
-    assert performance.total(performance.bias(estimated, true)) == pytest.approx(paper)
-    left = np.delete(performance.bias_by_star(estimated, true, removed=1), 4, axis=0)
+    assert accuracy.total(accuracy.bias(estimated, true)) == pytest.approx(paper)
+    left = np.delete(accuracy.bias_by_star(estimated, true, removed=1), 4, axis=0)
     design = np.column_stack([np.ones(19), np.delete(true, 4, axis=0)])
     assert_allclose(design.T @ left, 0, atol=1e-8)
 
@@ -265,7 +271,7 @@ def test_report_has_the_comparison(compared):
     page = report.render(compared["all distortions solved"], comparison=compared)
     assert page.count("<h2>Corrections compared</h2>") == 1
     for name, solution in compared.items():
-        s = performance.scatter_summary(solution)
+        s = accuracy.scatter_summary(solution)
         assert f"<tr><td>{name}</td><td>{s['n_stars']}</td><td>{s['mean']:.4f}</td><td>{s['std']:.4f}</td>" in page
     assert "Corrections compared" not in report.render(compared["shift"])
 
@@ -274,7 +280,7 @@ def test_report_has_the_comparison(compared):
 def test_run_compares_when_asked(tmp_path, capsys):
     frames = simulate_exposures(small=True, seed=2).write(tmp_path / "frames")
     arguments = ["run", *map(str, frames), "--out", str(tmp_path / "out"), "--compare", "--quiet"]
-    assert cli.main(arguments) == 0
+    assert parser.main(arguments) == 0
     assert "relative polynomial" in capsys.readouterr().out
     figures = json.loads((tmp_path / "out" / "summary.json").read_text())["comparison"]
     assert list(figures) == ["shift", "relative polynomial", "all distortions solved"]  # no prior, no static map

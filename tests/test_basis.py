@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from numpy.polynomial import legendre
 from numpy.testing import assert_allclose, assert_array_equal
 
-from legdistort import basis
 from legdistort.exceptions import InputError
+from legdistort.geometry import basis
 
 DEGREES = [0, 1, 2, 3, 5, 9]
 

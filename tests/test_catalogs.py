@@ -7,9 +7,9 @@ from astropy.table import MaskedColumn, QTable, Table
 from astropy.utils.masked import Masked
 from numpy.testing import assert_array_equal
 
-from legdistort import catalogs
 from legdistort.exceptions import InputError
-from legdistort.table_files import read_table
+from legdistort.inputs import column_contract
+from legdistort.inputs.table_files import read_table
 
 
 def table(**changes):
@@ -26,7 +26,7 @@ def table(**changes):
 
 
 def check(rows):
-    return catalogs.check(rows, catalogs.MATCHED, "the table")
+    return column_contract.check(rows, column_contract.MATCHED, "the table")
 
 
 def test_a_good_table_becomes_a_qtable():
@@ -99,7 +99,7 @@ def test_names_may_be_bytes_or_objects():
 
 def test_renaming():
     given = Table({"XWIN": [1.0], "x": [7.0], "err": [0.1], "other": [2]}, meta={"key": 1})
-    out = catalogs.rename(given, {"x": "XWIN", "x_err": "err", "y_err": "err"})
+    out = column_contract.rename(given, {"x": "XWIN", "x_err": "err", "y_err": "err"})
     assert out.colnames == ["x", "x_err", "y_err", "other"]
     assert (out["x"][0], out["x_err"][0], out["y_err"][0], out["other"][0]) == (1, 0.1, 0.1, 2)
     assert out.meta == {"key": 1}
@@ -107,13 +107,13 @@ def test_renaming():
 
 
 def test_renaming_can_swap():
-    out = catalogs.rename(Table({"x": [1], "y": [2]}), {"x": "y", "y": "x"})
+    out = column_contract.rename(Table({"x": [1], "y": [2]}), {"x": "y", "y": "x"})
     assert (out["x"][0], out["y"][0]) == (2, 1)
 
 
 def test_renaming_names_the_missing_column():
     with pytest.raises(InputError, match="no column 'xe' to use as 'x_err'; the table has x, y"):
-        catalogs.rename(Table({"x": [1], "y": [2]}), {"x_err": "xe"})
+        column_contract.rename(Table({"x": [1], "y": [2]}), {"x_err": "xe"})
 
 
 @pytest.mark.parametrize("ending", ["ecsv", "csv", "fits", "txt", "ECSV"])

@@ -16,12 +16,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from photutils.aperture import CircularAperture, EllipticalAperture, SkyCircularAperture, aperture_photometry
 from reproject.mosaicking import find_optimal_celestial_wcs, reproject_and_coadd
 
-from legdistort import poses
-from legdistort.estimation import solve
 from legdistort.exceptions import ExportError, InputError
-from legdistort.matches import Matches
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_matches
+from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.inputs.matches import Matches
+from legdistort.priors.prior import Prior
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving.estimation import solve
 
 NY, NX = 100, 140
 SCALE = 2.0  # arcsec per pixel
@@ -36,7 +36,7 @@ def solution():
         static=0.15, dynamic=0.1, seed=2,
     )  # fmt: skip
     matrix = SCALE / 3600 * np.array([[-1.0, 0.1, 70.0], [0.1, 1.0, -50.0]])
-    sky = poses.TangentPlane(10.0, -70.0, matrix)
+    sky = TangentPlane(10.0, -70.0, matrix)
     matches = Matches(sim.matches.table, sim.matches.shapes, sim.matches.poses, sky)
     return solve(matches, prior=Prior(sim.truth.static))
 

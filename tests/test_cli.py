@@ -15,10 +15,12 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from legdistort import Solution, coadd, coaddition, commands, open_exposures
-from legdistort.cli import main
+from legdistort import Solution, coadd, open_exposures
+from legdistort.cli import commands
+from legdistort.cli.parser import main
+from legdistort.coaddition import mosaicking
 from legdistort.exceptions import InputError
-from legdistort.simulation import simulate_exposures
+from legdistort.simulation.observations import simulate_exposures
 
 RESULTS = {"solution.asdf", "stars.ecsv", "wcs", "mosaic.fits", "report.html", "summary.json"}
 
@@ -146,7 +148,7 @@ def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, numb
     """By Ctrl-C, or by a batch system."""
     (tmp_path / "scratch").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
-    monkeypatch.setattr(coaddition, "survey", lambda *args, **options: os.kill(os.getpid(), number))
+    monkeypatch.setattr(mosaicking, "survey", lambda *args, **options: os.kill(os.getpid(), number))
     usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
     before = signal.signal(number, usual)
     try:
@@ -337,7 +339,9 @@ def test_coadd_on_the_grid_of_a_file(demo, tmp_path, capsys):
     ],
 )
 def test_grids_without_sense_are_named_before_any_work(demo, tmp_path, capsys, monkeypatch, spoil, words):
-    monkeypatch.setattr("legdistort.exposure_files.open_exposures", lambda *_, **__: pytest.fail("the work began"))
+    monkeypatch.setattr(
+        "legdistort.inputs.exposure_files.open_exposures", lambda *_, **__: pytest.fail("the work began")
+    )
     header = _grid(demo)
     spoil(header)
     header.totextfile(tmp_path / "bad.head")
@@ -353,7 +357,7 @@ def test_options_of_coadd_reach_it(demo, tmp_path, capsys, monkeypatch):
         given.update(options)
         raise InputError("enough")
 
-    monkeypatch.setattr(coaddition, "coadd", stand_in)
+    monkeypatch.setattr(mosaicking, "coadd", stand_in)
     failed(capsys, main(_coadd(demo, tmp_path / "m.fits")), "enough")
     own = {name: p.default for name, p in inspect.signature(coadd).parameters.items() if p.kind is p.KEYWORD_ONLY}
     assert own | given == own | {"method": "clipped"}
@@ -466,7 +470,9 @@ def test_the_frames_of_a_mosaic_survive_it(demo, tmp_path, capsys):
 
 
 def test_the_ending_of_a_mosaic_is_looked_at_first(demo, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("legdistort.exposure_files.open_exposures", lambda *_, **__: pytest.fail("the work began"))
+    monkeypatch.setattr(
+        "legdistort.inputs.exposure_files.open_exposures", lambda *_, **__: pytest.fail("the work began")
+    )
     failed(capsys, main(_coadd(demo, tmp_path / "m.png")), "m.png: the ending says the format of a mosaic")
 
 

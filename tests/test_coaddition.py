@@ -18,19 +18,21 @@ from astropy.wcs import WCS
 from gwcs import WCS as GWCS
 from scipy.optimize import least_squares
 
-from legdistort import poses
-from legdistort.basis import from_tensor
-from legdistort.coaddition import coadd
-from legdistort.distortion import Distortion, outside
+from legdistort.coaddition.grids import reference_grid
+from legdistort.coaddition.mosaicking import coadd
+from legdistort.coaddition.resampling.engines import fill_bad
+from legdistort.coaddition.resampling.pixel_maps import tabulate, trace
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError
-from legdistort.exposures import Exposure, read_exposures
-from legdistort.grids import reference_grid
-from legdistort.mapping import tabulate, trace
-from legdistort.resampling import fill_bad
+from legdistort.geometry import similarity as poses
+from legdistort.geometry.basis import from_tensor
+from legdistort.geometry.distortion import Distortion
+from legdistort.geometry.models import outside
+from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.inputs.exposures import Exposure, read_exposures
 
 SHAPE = (300, 400)
 SIGMA = 1.4  # of the Gaussian stars, px
-SKY = poses.TangentPlane(83.2, -31.7, np.array([[-5e-5, 1e-5, 0.004], [1e-5, 5e-5, -0.003]]))
+SKY = TangentPlane(83.2, -31.7, np.array([[-5e-5, 1e-5, 0.004], [1e-5, 5e-5, -0.003]]))
 
 
 @dataclass

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from legdistort.combination import combine, confirmed, margin
-from legdistort.mapping import PixelMap
-from legdistort.resampling import resample_exposure
+from legdistort.coaddition.combination import combine, confirmed, margin
+from legdistort.coaddition.resampling.engines import resample_exposure
+from legdistort.coaddition.resampling.pixel_maps import PixelMap
 
 SHAPE = (300, 300)
 NOISE = 20.0

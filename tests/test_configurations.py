@@ -5,12 +5,13 @@ import pytest
 from astropy.table import Table, vstack
 from oracle import DenseOracle, predict
 
-from legdistort import performance, reduction
-from legdistort.estimation import solve
 from legdistort.exceptions import SolveError
-from legdistort.matches import Matches
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_matches
+from legdistort.inputs.matches import Matches
+from legdistort.priors.prior import Prior
+from legdistort.results import accuracy
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving.equations import reduced_system
+from legdistort.solving.estimation import solve
 
 RNG = np.random.default_rng
 
@@ -47,7 +48,7 @@ MOSAICS = {
 def test_little_overlap_converges_to_the_minimum(monkeypatch, mosaic, direct):
     """At the solution the criterion, written out independently, is flat along every direction the gauge allows."""
     matches, _ = grid_of_pointings(MOSAICS[mosaic])
-    monkeypatch.setattr(reduction, "uses_direct", lambda problem: direct)
+    monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: direct)
     solution = solve(matches, degree=2)
     assert int(solution.status.split()[2]) <= 10
     assert solution.chi2 / solution.dof == pytest.approx(1, abs=5 * np.sqrt(2 / solution.dof))
@@ -79,8 +80,8 @@ def test_every_degree_reaches_its_bound(degree):
                                dither=80.0, seed=seed)  # fmt: skip
         solution = solve(sim.matches, degree=degree, prior=Prior(sim.truth.static))
         true = sim.truth.positions[solution.star_names]
-        b.append(performance.bias(solution.positions, true, removed=degree))
-        bound.append(performance.expected_bias(solution, removed=degree))
+        b.append(accuracy.bias(solution.positions, true, removed=degree))
+        bound.append(accuracy.expected_bias(solution, removed=degree))
         pulls.append((solution.chi2 - solution.dof) / np.sqrt(2 * solution.dof))
     assert np.mean(b) / np.mean(bound) == pytest.approx(1, abs=0.06)
     assert abs(np.mean(pulls)) < 2.5
@@ -108,8 +109,8 @@ def test_rolled_and_flipped_exposures_of_two_detectors():
     prior = {name: Prior(mean) for name, mean in static.items()}
     solution = solve(matches, degree=2, prior=prior)
     assert solution.chi2 / solution.dof == pytest.approx(1, abs=4 * np.sqrt(2 / solution.dof))
-    b = performance.bias(solution.positions, true[solution.star_names], removed=2)
-    assert b == pytest.approx(performance.expected_bias(solution, removed=2), rel=0.25)
+    b = accuracy.bias(solution.positions, true[solution.star_names], removed=2)
+    assert b == pytest.approx(accuracy.expected_bias(solution, removed=2), rel=0.25)
     # each detector's own static distortion served its exposures
     departure = np.abs(solution.coefficients - solution.prior_mean)[:, :, 3:]
     assert departure.mean() < 0.3

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from oracle import predict
 
-from legdistort import basis
-from legdistort.distortion import TOLERANCE, Distortion, FastLegendre2D, outside
 from legdistort.exceptions import FoldError, InputError
+from legdistort.geometry import basis
+from legdistort.geometry.distortion import TOLERANCE, Distortion
+from legdistort.geometry.models import FastLegendre2D, outside
 
 SHAPES = [(2048, 2048), (512, 2048), (1500, 300)]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import legdistort
-from legdistort import cli
+from legdistort.cli import parser
 from legdistort.demo import run_demo
 
 ROOT = Path(__file__).parents[1]
@@ -59,12 +59,12 @@ def commands():
 
 @pytest.mark.parametrize("arguments", list(commands()))
 def test_commands_are_understood(arguments):
-    assert callable(cli._parser().parse_args(arguments).function)
+    assert callable(parser._parser().parse_args(arguments).function)
 
 
 def test_every_command_is_documented():
     headings = re.findall(r"^## (\S+)$", (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8"), re.MULTILINE)
-    (commands_,) = (a.choices for a in cli._parser()._actions if a.choices and "run" in a.choices)
+    (commands_,) = (a.choices for a in parser._parser()._actions if a.choices and "run" in a.choices)
     assert sorted(headings) == sorted(commands_)
 
 

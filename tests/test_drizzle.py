@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from test_coaddition import SHAPE, StandIn, check_stars, covered, expose, fit_star, plain, scene
 
-from legdistort import poses, stacking
-from legdistort.coaddition import coadd
-from legdistort.distortion import Distortion
-from legdistort.drizzling import KERNELS, Drop
+from legdistort.coaddition import block_stack
+from legdistort.coaddition.mosaicking import coadd
+from legdistort.coaddition.resampling.drizzling import KERNELS, Drop
 from legdistort.exceptions import InputError
-from legdistort.exposures import Exposure
+from legdistort.geometry import similarity
+from legdistort.geometry.distortion import Distortion
+from legdistort.inputs.exposures import Exposure
 
 drizzle = pytest.importorskip("drizzle")
 
@@ -38,7 +39,7 @@ def test_bent_blocks_fit_together(monkeypatch, roll, side):
     image = 1000 + 200 * np.sin(x / 9) * np.cos(y / 11) + np.random.default_rng(0).normal(size=SHAPE)
 
     def drizzled(side):
-        monkeypatch.setattr(stacking, "_SIDES", (side, side))
+        monkeypatch.setattr(block_stack, "_SIDES", (side, side))
         return coadd([Exposure("frame0", image)], solution, algorithm="drizzle", conserve="surface_brightness")
 
     whole, pieces = drizzled(1024), drizzled(side)
@@ -81,7 +82,7 @@ def test_variance_is_that_of_the_pixels(pixfrac):
 
 
 def test_bad_pixels_do_not_fall():
-    identity = StandIn({"a": poses.identity()}, {"a": Distortion(np.zeros((2, 3)), SHAPE)})
+    identity = StandIn({"a": similarity.identity()}, {"a": Distortion(np.zeros((2, 3)), SHAPE)})
     data, mask = np.full(SHAPE, 5.0), np.zeros(SHAPE, dtype=bool)
     mask[100, 100] = True
     data[mask] = 1e6

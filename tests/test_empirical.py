@@ -9,12 +9,17 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial import Delaunay
 
-from legdistort import Matches, Solution, baselines, cli, empirical, performance, solve
-from legdistort.criterion import State
+from legdistort import Matches, Solution, solve
+from legdistort.assessment import baselines
+from legdistort.cli import parser
 from legdistort.exceptions import InputError, LegdistortError, SolveError
-from legdistort.prediction import predict
-from legdistort.priors import Prior, dynamic_basis, dynamic_degrees
-from legdistort.simulation import simulate_matches
+from legdistort.geometry.detector_modes import dynamic_basis, dynamic_degrees
+from legdistort.priors.prior import Prior
+from legdistort.results import accuracy
+from legdistort.simulation.observations import simulate_matches
+from legdistort.simulation.prediction import predict
+from legdistort.solving.choices import prior_widths
+from legdistort.solving.equations.criterion import State
 
 SHAPE = (2048, 2048)
 SPECTRA = {
@@ -95,16 +100,16 @@ def likelihoods():
     solution = []
 
     def fit(problem_prior):
-        from legdistort import fits
+        from legdistort.solving import single_fit
 
         options = {"degree": 3, "own_degree": None, "gauge": "minimal", "method": "joint", "loss": "linear"}
         options |= {"clip": None, "limit": {}, "prior": problem_prior}
-        return fits.minimise(sim.matches, 0.0, options)
+        return single_fit.minimise(sim.matches, 0.0, options)
 
     done = fit(Prior(sim.truth.static, sigma=0.5))
     solution.append(done)
     labels = np.tile(np.arange(3), (5, 1))
-    evidence = empirical.evidence(done.weighted, done.result.state, labels, done.result.gauge.motion)
+    evidence = prior_widths.evidence(done.weighted, done.result.state, labels, done.result.gauge.motion)
     return evidence, dense
 
 
@@ -148,7 +153,7 @@ def test_where_the_fit_stood_does_not_matter(likelihoods):
         poses = np.stack([solution.poses[name] for name in solution.names])
         state = State(solution.positions.T, solution.coefficients, poses)
         labels = np.tile(np.arange(3), (5, 1))
-        other = empirical.evidence(problem, state, labels, gauge.motion)
+        other = prior_widths.evidence(problem, state, labels, gauge.motion)
         for widths in ([0.9, 0.3, 0.1], [0.1, 1.0, 0.5]):
             ours, theirs = (e.cost(np.log(widths))[0] - e.cost(np.log([0.5] * 3))[0] for e in (evidence, other))
             assert ours == pytest.approx(theirs, rel=0.01, abs=0.05)
@@ -171,7 +176,7 @@ def test_six_stars_at_degree_3():
     inside = grid[Delaunay(sim.truth.positions).find_simplex(grid) >= 0]
 
     def error(solution):
-        return np.sqrt(np.mean(performance.new_scatter(solution, sim.truth.distort, inside, 0) ** 2))
+        return np.sqrt(np.mean(accuracy.new_scatter(solution, sim.truth.distort, inside, 0) ** 2))
 
     free = [error(solve(sim.matches, degree=d, prior=Prior(sim.truth.static))) for d in (0, 1, 2)]
     assert error(found(sim)) < 0.9 * min(free)
@@ -261,7 +266,7 @@ def test_one_prior_one_set_of_widths():
 def test_some_of_many_exposures_are_enough(monkeypatch):
     sim = simulate(12, n_exposures=30)
     whole = found(sim).settings["widths"]
-    monkeypatch.setattr(empirical, "MOST", 15 * 20)
+    monkeypatch.setattr(prior_widths, "MOST", 15 * 20)
     part = found(sim).settings["widths"]
     assert part != whole
     assert_allclose(part, whole, rtol=0.5)
@@ -279,14 +284,14 @@ def test_with_a_static_distortion_that_is_fitted():
 def test_the_highest_likelihood_is_found(monkeypatch):
     """From one start as high as the best of many; two of the widths here once stuck at the lower end."""
     seen = []
-    plain = empirical.Evidence.best
+    plain = prior_widths.Evidence.best
 
     def spy(self, n, bounds, *, scale=False):
         seen.append((self, plain(self, n, bounds, scale=scale)))
         return seen[-1][1]
 
-    monkeypatch.setattr(empirical.Evidence, "best", spy)
-    monkeypatch.setattr(empirical, "PARSIMONY", 0.01)
+    monkeypatch.setattr(prior_widths.Evidence, "best", spy)
+    monkeypatch.setattr(prior_widths, "PARSIMONY", 0.01)
     for seed in (3, 7):
         found(simulate(8, seed=seed, dither=250))
     for evidence, widths in seen[1::2]:
@@ -403,7 +408,7 @@ def test_command_line(arguments, tmp_path, capsys):
     table.meta = sim.matches.to_meta()
     table.write(tmp_path / "matched.ecsv")
     command = ["solve", str(tmp_path / "matched.ecsv"), *arguments, "--out", str(tmp_path / "out"), "--json", "--quiet"]
-    assert cli.main(command) == 0
+    assert parser.main(command) == 0
     figures = capsys.readouterr().out
     assert '"effective_modes"' in figures
     assert ('"widths"' in figures) == ("evidence" in arguments)
@@ -411,7 +416,7 @@ def test_command_line(arguments, tmp_path, capsys):
 
 def test_command_line_refuses_other_words(capsys):
     with pytest.raises(SystemExit) as stop:
-        cli.main(["solve", "matched.ecsv", "--prior-sigma", "wide", "--out", "out"])
+        parser.main(["solve", "matched.ecsv", "--prior-sigma", "wide", "--out", "out"])
     assert stop.value.code == 2
     assert "'wide' is neither a number nor 'evidence'" in capsys.readouterr().err
 
@@ -421,8 +426,8 @@ def test_command_line_refuses_other_words(capsys):
 
 def errors(solution, truth, places):
     """Errors of one solution: stars (similarity removed), and new positions among the stars and all over the field."""
-    scatter = [np.sqrt(np.nanmean(performance.new_scatter(solution, truth.distort, xy, 0) ** 2)) for xy in places]
-    return [performance.bias(solution.positions, truth.positions, removed="similarity"), *scatter]
+    scatter = [np.sqrt(np.nanmean(accuracy.new_scatter(solution, truth.distort, xy, 0) ** 2)) for xy in places]
+    return [accuracy.bias(solution.positions, truth.positions, removed="similarity"), *scatter]
 
 
 @pytest.mark.slow
@@ -457,7 +462,7 @@ def test_wrong_priors_are_told():
         row = []
         for mean, factor in ((0, 1), (0, 2), (0, 0.5), (off, 1)):
             solution = solve(sim.matches, prior=Prior(sim.truth.static + mean, sigma=factor * widths))
-            b = performance.bias(solution.positions, sim.truth.positions, removed="similarity")
+            b = accuracy.bias(solution.positions, sim.truth.positions, removed="similarity")
             row.append([b, solution.chi2 / solution.dof, solution.settings["departure_ratio"]])
         rows.append(row)
     (b, chi2, ratio) = np.mean(rows, axis=0).T

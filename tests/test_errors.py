@@ -5,17 +5,20 @@ import pytest
 from astropy import units as u
 from numpy.testing import assert_allclose
 
-from legdistort import performance, poses, reduction, solvers
-from legdistort.distortion import Distortion
-from legdistort.estimation import solve
 from legdistort.exceptions import AssumptionWarning
-from legdistort.exposures import read_exposures
-from legdistort.matches import Matches
-from legdistort.matching import match
-from legdistort.measurement import measure
-from legdistort.priors import Prior
-from legdistort.problems import build
-from legdistort.simulation import simulate_matches
+from legdistort.geometry import similarity
+from legdistort.geometry.distortion import Distortion
+from legdistort.inputs.exposures import read_exposures
+from legdistort.inputs.matches import Matches
+from legdistort.matching.matcher import match
+from legdistort.measurement.positions import measure
+from legdistort.priors.prior import Prior
+from legdistort.results import accuracy
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving import minimisers
+from legdistort.solving.equations import reduced_system
+from legdistort.solving.equations.problem_builder import build
+from legdistort.solving.estimation import solve
 
 RNG = np.random.default_rng
 
@@ -35,15 +38,15 @@ def carried(sim, solution, prior, *, told=False):
         exact[:, part] = sim.truth.distort(name, sim.truth.positions[sim.matches.stars[problem.star[part]]]).T
     problem = type(problem)(**{**vars(problem), "xy": exact, "prior_sigma": None})
     fixed = np.stack([solution.poses[name] for name in solution.names])
-    state = solvers.State(solution.positions.T.copy(), solution.coefficients.copy(), fixed)
+    state = minimisers.State(solution.positions.T.copy(), solution.coefficients.copy(), fixed)
     for _ in range(6):
-        blocks = solvers.criterion.linearise(problem, state)
+        blocks = minimisers.criterion.linearise(problem, state)
         departure = (state.coefficients - problem.prior_mean)[:, :, : problem.n_modes].reshape(problem.n_exposures, -1)
-        system = reduction.reduced_system(problem, blocks, gauge)
+        system = reduced_system.reduced_system(problem, blocks, gauge)
         d_star, d_exposure = system.step(-gauge.violation(departure), free, 1e-10)
         coefficients = state.coefficients.copy()
         coefficients[:, :, : problem.n_modes] += d_exposure.reshape(problem.n_exposures, 2, -1)
-        state = solvers.State(state.positions + d_star, coefficients, state.poses)
+        state = minimisers.State(state.positions + d_star, coefficients, state.poses)
     departure = (state.coefficients - problem.prior_mean)[:, :, : problem.n_modes]
     assert told or np.abs(gauge.violation(departure)).max() < 1e-6
     return state.positions.T, departure.reshape(problem.n_exposures, -1)
@@ -89,8 +92,8 @@ def test_covariances_are_calibrated(setting):
         for name, mine in zip(solution.names, a, strict=True):
             x, y, sigma = solution.sigma_map(name, n=6)
             grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-            true = poses.apply(
-                poses.invert(solution.poses[name]),
+            true = similarity.apply(
+                similarity.invert(solution.poses[name]),
                 Distortion(mine.reshape(2, -1), solution.shapes[name]).invert(grid),
             )
             pull = (solution.correct(name, grid) - true) / sigma.reshape(-1, 2)
@@ -108,14 +111,14 @@ def precise(seed, **settings):
 def test_what_the_data_tell_is_left_to_them(monkeypatch, method):
     """The convention costs no chi2 where positions are precise enough to contradict it, and J ends at its minimum."""
     if method == "iterative":
-        monkeypatch.setattr(reduction, "uses_direct", lambda problem: False)
+        monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: False)
     sim = precise(1)
     solution = solve(sim.matches)
     assert len(solution.gauge.told) > 5
     assert abs(solution.chi2 - solution.dof) < 5 * np.sqrt(2 * solution.dof)
     true = sim.truth.positions[solution.star_names]
     # maps of the gauge are cubics of cubics here, so a common map of higher degree is taken out
-    b, bound = performance.bias(solution.positions, true, removed=6), performance.expected_bias(solution, removed=6)
+    b, bound = accuracy.bias(solution.positions, true, removed=6), accuracy.expected_bias(solution, removed=6)
     assert b == pytest.approx(bound, rel=0.25)
     assert "that the data do tell" in solution.gauge.sentence
     assert "there they decide" in str(solution.gauge)
@@ -168,7 +171,7 @@ def rms_distortion(solution):
 @pytest.mark.parametrize("direct", [True, False])
 def test_what_the_data_hardly_tell_stays_with_the_convention(monkeypatch, seed, direct):
     """What is not in the model looks like a map of 15 px, by more than five standard errors."""
-    monkeypatch.setattr(reduction, "uses_direct", lambda problem: direct)
+    monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: direct)
     solution = solve(imperfect(seed), degree=3)
     assert 1.6 < solution.chi2 / solution.dof < 2
     assert solution.gauge.told is None
@@ -212,8 +215,8 @@ def test_absolute_errors_are_right():
         sim = simulate_matches(seed=seed, zero_mean=False, dither=100.0, sigma=0.05, n_stars=60)
         solution = solve(sim.matches, prior=Prior(sim.truth.static))
         true = sim.truth.positions[solution.star_names]
-        measured.append(performance.bias(solution.positions, true, removed="similarity"))
-        reported.append(performance.expected_bias(solution, removed="similarity", absolute=True))
+        measured.append(accuracy.bias(solution.positions, true, removed="similarity"))
+        reported.append(accuracy.expected_bias(solution, removed="similarity", absolute=True))
     ratio = np.sqrt(np.mean(np.square(measured)) / np.mean(np.square(reported)))
     assert ratio == pytest.approx(1, abs=0.10)
 
@@ -225,13 +228,13 @@ def test_simulation_1_is_at_the_bound():
     for seed in range(20):
         sim = simulate_matches(seed=seed)
         solution = solve(sim.matches, prior=Prior(sim.truth.static))
-        b.append(performance.bias(solution.positions, sim.truth.positions[solution.star_names]))
+        b.append(accuracy.bias(solution.positions, sim.truth.positions[solution.star_names]))
         rng = RNG(1000 + seed)
         corrected = np.stack([
             solution.correct(name, sim.truth.distort(name, grid) + 0.14 * rng.normal(size=grid.shape))
             for name in solution.names
         ])  # fmt: skip
-        sigma.append(np.sqrt(np.mean(performance.scatter(corrected) ** 2)))
+        sigma.append(np.sqrt(np.mean(accuracy.scatter(corrected) ** 2)))
     assert np.sqrt(np.mean(np.square(b))) == pytest.approx(0.044, abs=0.004)
     assert np.sqrt(np.mean(np.square(sigma))) == pytest.approx(0.157, abs=0.010)
 
@@ -257,7 +260,7 @@ def test_gross_mismatches_cost_nothing():
         clean = solve(Matches.from_table(table[~wrong], shape=(2048, 2048), poses=nominal), prior=prior)
         assert not np.any(clipped.residuals["used"] & wrong)
         for solution, out in ((clipped, with_them), (clean, without)):
-            out.append(performance.bias(solution.positions, sim.truth.positions[solution.star_names]))
+            out.append(accuracy.bias(solution.positions, sim.truth.positions[solution.star_names]))
     ratio = np.sqrt(np.mean(np.square(with_them)) / np.mean(np.square(without)))
     assert ratio == pytest.approx(1, abs=0.05)
 
@@ -293,12 +296,12 @@ def test_one_noisy_exposure_does_not_blur_the_others():
         sim = _quiet_exposure(seed, sigma, dynamic, 4)
         table = sim[0].table
         solution = solve(sim[0], prior=Prior(np.zeros((2, 10))))
-        b.append(performance.bias(solution.positions, sim[1][solution.star_names]))
+        b.append(accuracy.bias(solution.positions, sim[1][solution.star_names]))
         others = table[table["exposure"] != "e4"]
         without = solve(
             Matches.from_table(others, shape=(2048, 2048), poses=sim[0].poses), prior=Prior(np.zeros((2, 10)))
         )
-        b_without.append(performance.bias(without.positions, sim[1][without.star_names]))
+        b_without.append(accuracy.bias(without.positions, sim[1][without.star_names]))
     assert np.sqrt(np.mean(np.square(b)) / np.mean(np.square(b_without))) < 1.1
 
 

@@ -10,7 +10,7 @@ from astropy.nddata import CCDData, InverseVariance, StdDevUncertainty
 from astropy.wcs import WCS
 
 from legdistort.exceptions import InputError
-from legdistort.exposures import Exposure, believable_wcs, read_exposures
+from legdistort.inputs.exposures import Exposure, believable_wcs, read_exposures
 
 SHAPE = (30, 40)
 

@@ -10,9 +10,9 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from legdistort.coaddition.mosaic import Mosaic
 from legdistort.exceptions import InputError
-from legdistort.files import check_file, check_folder, check_not_read, replacing, replacing_folder
-from legdistort.mosaics import Mosaic
+from legdistort.runtime.outputs import check_file, check_folder, check_not_read, replacing, replacing_folder
 
 
 def names(folder):

@@ -21,7 +21,7 @@ from numpy.polynomial.legendre import legval2d
 from numpy.testing import assert_allclose, assert_array_equal
 
 from legdistort.exceptions import InputError, SolveError
-from legdistort.fitters import LegendreDistortionFitter, leaves
+from legdistort.geometry.fitter import LegendreDistortionFitter, leaves
 
 NX, NY = 1200, 700
 DOMAIN = {"x_domain": (-0.5, NX - 0.5), "y_domain": (-0.5, NY - 0.5)}
@@ -67,10 +67,10 @@ def test_is_found_by_astropy():
     assert issubclass(LegendreDistortionFitter, fitting.Fitter)
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("legdistort", "legdistort.estimation", "gwcs")]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("legdistort", "legdistort.solving.estimation", "gwcs")]
 
 
-@pytest.mark.parametrize("first", ["astropy.modeling", "legdistort.fitters", *SLOW])
+@pytest.mark.parametrize("first", ["astropy.modeling", "legdistort.geometry.fitter", *SLOW])
 def test_is_found_whatever_is_imported_first(first):
     code = f"import {first}; from astropy.modeling.fitting import LegendreDistortionFitter"
     run = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
@@ -135,7 +135,7 @@ def test_agrees_with_trf(data):
 
 
 def displacement_of_ours():
-    from legdistort.distortion import displacement_model
+    from legdistort.geometry.models import displacement_model
 
     tensors = np.zeros((2, 4, 4))
     return displacement_model(tensors, (NY, NX))

@@ -8,15 +8,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 from oracle import predict
 from scipy.optimize import least_squares
 
-from legdistort import basis
-from legdistort.distortion import FastLegendre2D
-from legdistort.estimation import solve
 from legdistort.exceptions import InputError, SolveError
-from legdistort.fitters import leaves
-from legdistort.forms import Form
-from legdistort.matches import Matches
-from legdistort.simulation import simulate_matches
-from legdistort.solution import Solution
+from legdistort.geometry import basis
+from legdistort.geometry.fitter import leaves
+from legdistort.geometry.models import FastLegendre2D
+from legdistort.inputs.matches import Matches
+from legdistort.results.solution import Solution
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving.estimation import solve
+from legdistort.solving.model_forms import Form
 
 NX, NY = 1200, 700
 DETECTOR = {"x_domain": (-0.5, NX - 0.5), "y_domain": (-0.5, NY - 0.5)}

@@ -6,8 +6,8 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from test_coaddition import scene
 
+from legdistort.coaddition.grids import given_grid, read_grid
 from legdistort.exceptions import InputError
-from legdistort.grids import given_grid, read_grid
 
 SHAPE = (280, 300)
 

@@ -10,12 +10,13 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
-from legdistort import poses
-from legdistort.estimation import solve
 from legdistort.exceptions import ExportError, InputError
-from legdistort.headers import header_error, make_header
-from legdistort.simulation import simulate_matches
-from legdistort.truth import displacement, mode_orders
+from legdistort.geometry import similarity
+from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.simulation.observations import simulate_matches
+from legdistort.simulation.truth import displacement, mode_orders
+from legdistort.solving.estimation import solve
+from legdistort.wcs.fits_headers import header_error, make_header
 
 SHAPE = (700, 1100)  # oblong: an exchange of the axes cannot hide
 SCALE = 0.02 / 3600
@@ -58,7 +59,7 @@ def geometries():
             poses={name: np.column_stack([rotation, middle - rotation @ middle + shift]) for name in names},
             coefficients=coefficients,
             prior_mean=np.zeros_like(coefficients),
-            sky=poses.TangentPlane(lon, lat, np.column_stack([m, -m @ middle])),
+            sky=TangentPlane(lon, lat, np.column_stack([m, -m @ middle])),
         )
 
     return make
@@ -238,7 +239,7 @@ def test_better_than_taylor_series_and_least_squares(geometry):
         return np.prod(((p - middle) / 1000)[:, None] ** orders, axis=2)
 
     def undistorted(p):
-        return poses.apply(solution.poses["a"], solution.correct("a", p))
+        return similarity.apply(solution.poses["a"], solution.correct("a", p))
 
     near = middle + np.random.default_rng(0).uniform(-40, 40, (400, 2))
     taylor = np.linalg.lstsq(terms(near), undistorted(near), rcond=None)[0]
@@ -318,7 +319,7 @@ def test_swarp_puts_stars_where_tpv_says(geometry, tmp_path):
     with fits.open(tmp_path / "coadd.fits") as hdus:
         data, wcs = hdus[0].data.astype(float), WCS(hdus[0].header)
     pose = solution.poses["a"]
-    ra, dec = sky_of(solution, "a", poses.apply(pose, solution.correct("a", p)))
+    ra, dec = sky_of(solution, "a", similarity.apply(pose, solution.correct("a", p)))
     offsets = []
     for a, b in wcs.all_world2pix(np.column_stack([ra, dec]), 0):
         i, j = round(a), round(b)

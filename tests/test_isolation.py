@@ -7,12 +7,12 @@ from astropy.table import QTable
 from scipy.spatial import cKDTree
 
 import legdistort as ld
-from legdistort import isolation
 from legdistort.exceptions import InputError
-from legdistort.exposures import Exposure
-from legdistort.fitting import Flag
-from legdistort.measurement import UNUSABLE
-from legdistort.rendering import Moffat, add_noise, render
+from legdistort.inputs.exposures import Exposure
+from legdistort.measurement import crowding as isolation
+from legdistort.measurement.flags import Flag
+from legdistort.measurement.positions import UNUSABLE
+from legdistort.simulation.rendering import Moffat, add_noise, render
 
 SKY, GAIN, READ_NOISE = 100.0, 2.0, 10.0
 PSF = Moffat(4.5, 3.0)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from legdistort import criterion, elimination, problems, reduction, starting
-from legdistort.estimation import solve
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_matches
+from legdistort.priors.prior import Prior
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving import start_values
+from legdistort.solving.equations import criterion, elimination, problem_builder, reduced_system
+from legdistort.solving.estimation import solve
 
 pytest.importorskip("numba", reason="the compiled loops need the extra 'fast'")
 
@@ -25,8 +26,8 @@ def _set(**settings):
 @pytest.mark.parametrize("settings", [{"sigma": 0.05}, {"sigma": RNG.uniform(0.02, 0.2, (9, 120, 2)), "corr": 0.4}])
 def test_compiled_sums_are_the_plain_ones(monkeypatch, settings):
     sim, prior = _set(**settings)
-    problem = problems.build(sim.matches, 3, prior=prior)
-    state, _ = starting.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
+    problem = problem_builder.build(sim.matches, 3, prior=prior)
+    state, _ = start_values.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
     plain = criterion.linearise(problem, state)
     a, y = RNG.normal(size=plain.g_exposure.shape), RNG.normal(size=(2, problem.n_stars))
     sums = elimination.to_stars(problem, plain, a), elimination.to_exposures(problem, plain, y)
@@ -47,7 +48,7 @@ def test_compiled_solution_is_the_plain_one(monkeypatch, direct):
     sim, prior = _set(sigma=0.05)
     plain = solve(sim.matches, prior=prior)
     monkeypatch.setattr(criterion, "COMPILED_FROM", 0)
-    monkeypatch.setattr(reduction, "uses_direct", lambda problem: direct)
+    monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: direct)
     fast = solve(sim.matches, prior=prior)
     assert_allclose(fast.positions, plain.positions, atol=1e-5)  # both stop within 5e-5 standard errors
     assert_allclose(fast.coefficients, plain.coefficients, atol=1e-5)
@@ -57,12 +58,12 @@ def test_compiled_solution_is_the_plain_one(monkeypatch, direct):
 @pytest.mark.parametrize("robust", [True, False])
 def test_compiled_start_is_the_plain_one(monkeypatch, robust):
     sim, prior = _set(sigma=0.05, flips=[i in (1, 4) for i in range(9)])
-    problem = problems.build(sim.matches, 3, prior=prior)
+    problem = problem_builder.build(sim.matches, 3, prior=prior)
     nominal = np.stack([sim.matches.poses[name] for name in sim.matches.names])
     nominal[:, :, 2] += RNG.normal(scale=3, size=(9, 2))
-    plain, astray = starting.start(problem, nominal, robust=robust)
+    plain, astray = start_values.start(problem, nominal, robust=robust)
     monkeypatch.setattr(criterion, "COMPILED_FROM", 0)
-    fast, also_astray = starting.start(problem, nominal, robust=robust)
+    fast, also_astray = start_values.start(problem, nominal, robust=robust)
     assert_allclose(fast.positions, plain.positions, atol=1e-8)
     assert_allclose(fast.poses, plain.poses, atol=1e-8)
     assert not astray.any()

@@ -13,14 +13,14 @@ from reproject import reproject_interp
 from scipy.spatial import Delaunay
 from test_coaddition import SHAPE, SIGMA, StandIn, check_stars, covered, expose, fit_star, plain, scene, star_image
 
-from legdistort.coaddition import coadd
-from legdistort.combination import PixelFlag
-from legdistort.distortion import Distortion
+from legdistort.coaddition.combination import PixelFlag
+from legdistort.coaddition.levels import flux_scales, sky_variance, survey
+from legdistort.coaddition.mosaicking import coadd
+from legdistort.coaddition.weights import make_weights, stellar_widths
 from legdistort.exceptions import AssumptionWarning, InputError
-from legdistort.exposures import Exposure
-from legdistort.hulls import support, supported
-from legdistort.levels import flux_scales, sky_variance, survey
-from legdistort.weighting import make_weights, stellar_widths
+from legdistort.geometry.distortion import Distortion
+from legdistort.geometry.star_hull import support, supported
+from legdistort.inputs.exposures import Exposure
 
 FLAT = {"conserve": "surface_brightness", "match_background": False}
 
@@ -213,7 +213,7 @@ class TestSupport:
     def test_supported_is_that_of_the_solution(self):
         table = observed([1.0])
         planes = support("frame0", measured(plain()[0], table))
-        from legdistort.solution import Solution
+        from legdistort.results.solution import Solution
 
         rng = np.random.default_rng(0)
         xy = rng.uniform(0, 300, (2000, 2))

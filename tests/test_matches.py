@@ -6,12 +6,12 @@ from astropy import units as u
 from astropy.table import MaskedColumn, QTable, Table, vstack
 from numpy.testing import assert_allclose, assert_array_equal
 
-from legdistort import matches as module
-from legdistort import poses
 from legdistort.exceptions import InputError, MatchError
-from legdistort.matches import Matches
-from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
-from legdistort.table_files import read_table
+from legdistort.geometry import similarity
+from legdistort.inputs import matches as module
+from legdistort.inputs.matches import Matches
+from legdistort.inputs.table_files import read_table
+from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 
 SHAPE = (2048, 2048)
 
@@ -144,8 +144,8 @@ def test_missing_or_bad_pose(sim, pose, message):
 
 def relative(pose_by_name, names):
     """Poses seen from the first exposure, so that the choice of the reference plane drops out."""
-    first = poses.invert(pose_by_name[names[0]])
-    return np.stack([poses.compose(pose_by_name[name], first) for name in names])
+    first = similarity.invert(pose_by_name[names[0]])
+    return np.stack([similarity.compose(pose_by_name[name], first) for name in names])
 
 
 CORNERS = np.array([[0.0, 0.0], [2047.0, 0.0], [0.0, 2047.0], [2047.0, 2047.0]])
@@ -154,7 +154,7 @@ CORNERS = np.array([[0.0, 0.0], [2047.0, 0.0], [0.0, 2047.0], [2047.0, 2047.0]])
 def pose_error(found, true, names):
     """Largest displacement of a detector corner between two sets of poses, pixels."""
     return max(
-        np.abs(poses.apply(a, CORNERS) - poses.apply(b, CORNERS)).max()
+        np.abs(similarity.apply(a, CORNERS) - similarity.apply(b, CORNERS)).max()
         for a, b in zip(relative(found, names), relative(true, names), strict=True)
     )
 
@@ -190,7 +190,7 @@ def test_poses_survive_ten_percent_of_mismatches(settings):
 
 def test_plane_of_estimated_poses_has_the_scale_of_the_detector():
     sim = simulate_matches(n_stars=40, n_exposures=10, static=0, dynamic=0.5, sigma=0.1, seed=6)
-    found = [poses.describe(p) for p in Matches.from_table(table_of(sim), shape=SHAPE).poses.values()]
+    found = [similarity.describe(p) for p in Matches.from_table(table_of(sim), shape=SHAPE).poses.values()]
     assert np.mean([d["scale"] for d in found]) == pytest.approx(1, abs=1e-3)  # coefficients of 0.5 px scatter by 4e-4
     assert np.mean([d["rotation"] for d in found]) == pytest.approx(0, abs=0.06)
 
@@ -206,7 +206,7 @@ def test_poses_of_a_chain():
     table = Table(rows=rows, names=("exposure", "star", "x", "y", "x_err", "y_err"))
     found = Matches.from_table(table, shape=(1000, 1000)).poses
     for i in range(4):
-        pose = poses.compose(found[f"e{i}"], poses.invert(found["e0"]))
+        pose = similarity.compose(found[f"e{i}"], similarity.invert(found["e0"]))
         assert_allclose(pose, [[1, 0, -600 * i], [0, 1, 10 * i]], atol=1e-6)
 
 
@@ -225,7 +225,7 @@ def test_robust_similarity_keeps_given_weights(sim):
     xy = np.random.default_rng(0).uniform(0, 1000, (30, 2))
     target = xy + np.where(np.arange(30) < 20, 0.0, 8.0)[:, None]
     pose = module.robust_similarity(xy, target, weights=(np.arange(30) >= 20).astype(float))
-    assert_allclose(poses.apply(pose, xy), xy + 8, atol=1e-6)
+    assert_allclose(similarity.apply(pose, xy), xy + 8, atol=1e-6)
 
 
 # --- in and out of files -----------------------------------------------------------------------------------------

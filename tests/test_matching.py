@@ -18,15 +18,15 @@ from star_fields import (
     six_poses,
 )
 
-from legdistort import poses
-from legdistort.association import Group, interlink, label_stars, tie
-from legdistort.asterisms import offset_candidates, triangle_candidates
 from legdistort.exceptions import AssumptionWarning, InputError, MatchError
-from legdistort.groups import unite
-from legdistort.matching import match
-from legdistort.registration import Registration, register
-from legdistort.simulation import simulate_matches
-from legdistort.warps import StarList, Warp
+from legdistort.geometry import similarity
+from legdistort.matching.linking import Group, interlink, label_stars, tie
+from legdistort.matching.matcher import match
+from legdistort.matching.merging import unite
+from legdistort.matching.registration import Registration, register
+from legdistort.matching.seeds import offset_candidates, triangle_candidates
+from legdistort.matching.star_lists import StarList, Warp
+from legdistort.simulation.observations import simulate_matches
 
 
 def assert_good(table, matches, min_exposures=4, recall=0.95, purity=0.99):
@@ -86,8 +86,8 @@ def test_exposures_that_fit_no_single_one_fit_the_stars_of_all():
     assert len(groups) > 1
     (whole,) = unite(lists, groups, lambda i, j: None)
     assert sorted(whole.poses) == list(range(6))
-    turned = poses.compose(whole.poses[1], poses.invert(whole.poses[0]))
-    assert poses.describe(turned)["parity"] == -1
+    turned = similarity.compose(whole.poses[1], similarity.invert(whole.poses[0]))
+    assert similarity.describe(turned)["parity"] == -1
     assert match(table, shape=SHAPE).names == tuple(names)
 
 
@@ -119,7 +119,7 @@ def test_large_offsets_and_scale():
         table[c][third] = table[c][third] * 1.04
     matches = match(table, shape=(2200, 2200))
     assert_good(table, matches)
-    scales = {n: poses.describe(p)["scale"] for n, p in matches.poses.items()}
+    scales = {n: similarity.describe(p)["scale"] for n, p in matches.poses.items()}
     assert scales["e02"] / scales["e00"] == pytest.approx(1.04, abs=0.02)  # the distortion has a say in it
 
 
@@ -128,7 +128,7 @@ def test_flips(angles):
     table = make_field(150, angles, np.zeros((6, 2)), seed=4, flips=[0, 1, 0, 1, 0, 0])
     matches = match(table, shape=SHAPE)
     assert_good(table, matches)
-    parities = [poses.describe(matches.poses[f"e{k:02d}"])["parity"] for k in range(6)]
+    parities = [similarity.describe(matches.poses[f"e{k:02d}"])["parity"] for k in range(6)]
     assert np.array_equal(np.array(parities) * parities[0], [1, -1, 1, -1, 1, 1])
 
 
@@ -228,13 +228,13 @@ def test_headers_give_poses_and_sky():
     offsets = np.array([matches.poses[f"e{k:02d}"][:, 2] for k in range(6)])
     np.testing.assert_allclose(offsets - offsets[0], shifts - shifts[0], atol=1.5)
     centre = matches.sky.to_sky(
-        poses.apply(poses.invert(matches.poses["e00"]), np.array([[1023.5, 1023.5] + shifts[0]]))
+        similarity.apply(similarity.invert(matches.poses["e00"]), np.array([[1023.5, 1023.5] + shifts[0]]))
     )
     assert (
         centre.separation(header(0, shifts[0]).pixel_to_world(*(np.array([1023.5, 1023.5]) + shifts[0]))).arcsec < 0.04
     )
     assert matches.sky.pixel_scale == pytest.approx(0.02, rel=1e-3)
-    first = poses.describe(matches.poses["e00"])
+    first = similarity.describe(matches.poses["e00"])
     assert first["parity"] == 1
     assert abs(first["rotation"]) < 0.2
 
@@ -243,7 +243,9 @@ def test_rolled_frames_with_headers():
     table, exposures, _ = header_case(np.random.default_rng(5).normal(0, 15, (6, 2)))
     matches = match(table, exposures=exposures)
     assert_good(table, matches)
-    turned = poses.describe(matches.poses["e01"])["rotation"] - poses.describe(matches.poses["e00"])["rotation"]
+    turned = (
+        similarity.describe(matches.poses["e01"])["rotation"] - similarity.describe(matches.poses["e00"])["rotation"]
+    )
     assert turned == pytest.approx(90, abs=0.3)
 
 
@@ -251,7 +253,7 @@ def test_one_wrong_header_does_no_harm():
     table, exposures, _ = header_case(np.zeros((6, 2)), wrong=[2])
     matches = match(table, exposures=exposures)
     assert_good(table, matches)
-    back = poses.apply(poses.invert(matches.poses["e00"]), np.array([[1023.5, 1023.5]]))
+    back = similarity.apply(similarity.invert(matches.poses["e00"]), np.array([[1023.5, 1023.5]]))
     separation = matches.sky.to_sky(back)[0].separation(exposures[0].wcs.pixel_to_world(1023.5, 1023.5))
     assert separation.arcsec < 0.1
 
@@ -353,16 +355,16 @@ def test_candidates_hold_the_truth():
     rng = np.random.default_rng(0)
     source = rng.uniform(0, 1000, (80, 2))
     true = np.column_stack([1.03 * rotation(130, flip=True), [800.0, -200.0]])
-    target = poses.apply(true, source[20:]) + rng.normal(0, 1, (60, 2))
+    target = similarity.apply(true, source[20:]) + rng.normal(0, 1, (60, 2))
     best = triangle_candidates(source, target)[0]
-    assert np.abs(poses.apply(best, source) - poses.apply(true, source)).max() < 10
+    assert np.abs(similarity.apply(best, source) - similarity.apply(true, source)).max() < 10
     shifts = offset_candidates(source, source[30:] + [313.0, -70], size=1000)
     assert min(np.abs(s - [313, -70]).max() for s in shifts) < 1
 
 
 def test_contradictory_pairs_are_taken_apart():
     def paired(source, target, distance):
-        warp = Warp.from_pose(poses.identity(), SHAPE)
+        warp = Warp.from_pose(similarity.identity(), SHAPE)
         return Registration(np.array(source), np.array(target), np.array(distance), warp, 1.0, 99.0)
 
     # detections 0 of three exposures are one star, detections 1 another; one bad pair joins the two
@@ -384,8 +386,10 @@ def test_exposure_tied_by_mistake_is_found_out():
     positions = [np.column_stack([t["x"], t["y"]]) for t in table.group_by("exposure").groups]
     lists = [StarList(xy, np.full(len(xy), 0.1), SHAPE) for xy in [*positions, rng.uniform(0, 2047, (90, 2))]]
     (group,) = tie(lists[:6], lambda i, j: None)
-    false = Registration(np.arange(30), np.arange(30), np.zeros(30), Warp.from_pose(poses.identity(), SHAPE), 1.0, 99.0)
-    tied = Group({**group.poses, 6: poses.identity()}, {**group.registrations, (0, 6): false})
+    false = Registration(
+        np.arange(30), np.arange(30), np.zeros(30), Warp.from_pose(similarity.identity(), SHAPE), 1.0, 99.0
+    )
+    tied = Group({**group.poses, 6: similarity.identity()}, {**group.registrations, (0, 6): false})
     registrations, misfits = interlink(lists, tied)
     assert list(misfits) == [6]
     assert misfits[6] == "it agrees with only 1 of 6 exposures that it should overlap"
@@ -403,7 +407,7 @@ def test_real_star_lists(shared_data):
     matches = match(table, shape=(1024, 1024), min_exposures=3, columns={"x_err": "xe", "y_err": "ye"})
     assert matches.names == ("A", "B", "C", "D")
     assert len(matches.stars) >= 70
-    shift = [poses.describe(matches.poses[n])["dx"] for n in "ABCD"]
+    shift = [similarity.describe(matches.poses[n])["dx"] for n in "ABCD"]
     assert abs(abs(shift[1] - shift[2]) - 250) < 3
 
 

@@ -22,12 +22,12 @@ from star_images import (
     usable,
 )
 
-from legdistort import moffat, profile_fits
-from legdistort.blends import group_stars, members
-from legdistort.catalogs import DETECTED, check
 from legdistort.exceptions import AssumptionWarning, InputError
-from legdistort.exposures import Exposure, read_exposures
-from legdistort.measurement import Flag, measure
+from legdistort.inputs.column_contract import DETECTED, check
+from legdistort.inputs.exposures import Exposure, read_exposures
+from legdistort.measurement.positions import Flag, measure
+from legdistort.measurement.profiles import levenberg_marquardt, moffat
+from legdistort.measurement.profiles.blends import group_stars, members
 
 
 @pytest.fixture(scope="module", params=[4.5, 2.0], ids=["fwhm4.5", "fwhm2"])
@@ -103,7 +103,7 @@ def test_no_bias_with_the_phase_of_the_pixels(fwhm):
     weights = 1 / ((light + SKY) / GAIN + (READ_NOISE / GAIN) ** 2)
     shape = moffat.shape(fwhm)
     start = np.column_stack([np.zeros((len(xy), 2)), light.max(axis=1), np.tile(shape, (len(xy), 1)), 0 * xy[:, 0]])
-    fit = profile_fits.fit(light, weights, start, nodes=moffat.quadrature(fwhm), centre=shape)
+    fit = levenberg_marquardt.fit(light, weights, start, nodes=moffat.quadrature(fwhm), centre=shape)
     error = np.sqrt(np.einsum("nii->ni", fit.covariance)[:, :2])
     assert np.all(fit.converged)
     assert np.abs((fit.params[:, :2] - xy) / error).max() < 0.1

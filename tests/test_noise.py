@@ -10,12 +10,14 @@ from astropy.stats import biweight_scale
 from astropy.table import QTable
 
 import legdistort as ld
-from legdistort import cli, injection, performance
+from legdistort.cli import parser
 from legdistort.exceptions import AssumptionWarning, InputError
-from legdistort.exposures import Exposure
-from legdistort.measurement import UNUSABLE
-from legdistort.noise import NoiseCurves
-from legdistort.rendering import Moffat, add_noise, render
+from legdistort.inputs.exposures import Exposure
+from legdistort.measurement import injection
+from legdistort.measurement.noise_curves import NoiseCurves
+from legdistort.measurement.positions import UNUSABLE
+from legdistort.results import accuracy
+from legdistort.simulation.rendering import Moffat, add_noise, render
 
 SKY, GAIN, READ_NOISE = 100.0, 2.0, 10.0
 PSF = Moffat(4.5, 2.8)
@@ -200,7 +202,7 @@ def test_measure_takes_its_errors_from_the_curve(tmp_path):
     assert (table["x_err"] != plain["x_err"]).any()
     fits.writeto(tmp_path / "field7.fits", exposure.data, fits.Header({"GAIN": GAIN}))
     words = ["measure", str(tmp_path / "field7.fits"), "--quiet", "--out", str(tmp_path / "stars.ecsv")]
-    assert cli.main([*words, "--position-errors", "scaled"]) == 0
+    assert parser.main([*words, "--position-errors", "scaled"]) == 0
     assert (QTable.read(tmp_path / "stars.ecsv")["x_err"] == curves.apply(plain, "scaled")["x_err"]).all()
 
 
@@ -282,14 +284,14 @@ def test_command(tmp_path, capsys):
     fits.writeto(tmp_path / "a.fits", exposure.data, header)
     out, picture = tmp_path / "noise.ecsv", tmp_path / "noise.png"
     words = ["noise", str(tmp_path / "a.fits"), "--fwhm", "4", "5", "--n-positions", "20", "--fluxes", "1e4", "1e5"]
-    assert cli.main([*words, "--out", str(out), "--plot", str(picture), "--quiet", "--json"]) == 0
+    assert parser.main([*words, "--out", str(out), "--plot", str(picture), "--quiet", "--json"]) == 0
     laws = json.loads(capsys.readouterr().out)["laws"]
     assert [law["fwhm"] for law in laws] == [4, 5]
     curves = NoiseCurves.read(out)
     assert curves.exposures == ["a"]
     assert list(curves.table["flux"][:2]) == [1e4, 1e5]
     assert picture.read_bytes()[:4] == b"\x89PNG"
-    assert cli.main([*words, "--out", str(out), "--quiet"]) == 1
+    assert parser.main([*words, "--out", str(out), "--quiet"]) == 1
     assert "exists already" in capsys.readouterr().err
 
 
@@ -302,7 +304,7 @@ def test_scatter_of_real_stars_follows_the_curve(shared_data):
     matches = ld.match(ld.measure(exposures), exposures=exposures)
     assert len(matches.names) == 12
     solution = ld.solve(matches, degree=2, clip=5.0)
-    corrected = performance.corrected_positions(solution)
+    corrected = accuracy.corrected_positions(solution)
     n = np.isfinite(corrected[:, :, 0]).sum(axis=0)
     used = solution.observations[solution.observations["used"]]
     star = np.searchsorted(solution.star_names, used["star"])
@@ -313,7 +315,7 @@ def test_scatter_of_real_stars_follows_the_curve(shared_data):
     expected = np.sqrt(np.bincount(star, variance, len(n)) / np.maximum(n, 1))
     flux = np.bincount(star, used["flux"], len(n)) / np.maximum(n, 1)
     with np.errstate(divide="ignore"):
-        scatter = performance.scatter(corrected) * np.sqrt(n / (n - 1))
+        scatter = accuracy.scatter(corrected) * np.sqrt(n / (n - 1))
     good = np.flatnonzero((n >= 6) & np.isfinite(scatter))
     bins = np.array_split(good[np.argsort(flux[good])], 12)
     floor = np.median(scatter[bins[-1]])

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from legdistort import basis, performance
 from legdistort.exceptions import LegdistortWarning
+from legdistort.geometry import basis
+from legdistort.results import accuracy
 
 PAPER = Path(__file__).parents[1] / "docs" / "paper"
 WIDE = 4  # standard errors
@@ -82,7 +83,7 @@ def test_direction_of_the_nirc2_map(paper, shared_data, monkeypatch):
     """Map and Drizzle polynomial, by the same observatory, agree; they are added to detector pixels."""
     monkeypatch.setenv("LEGDISTORT_DATA", str(shared_data))
     families = paper("families")
-    source = importlib.import_module("legdistort.source_files").read_source
+    source = importlib.import_module("legdistort.priors.from_files").read_source
     central = source(families.nirc2_files(shared_data)).stated()
     folder = shared_data / "static_distortion" / "nirc2_kai"
     whole = source(folder / "nirc2_narrow_ACS.coeffs.txt").stated(shape=(1024, 1024))
@@ -201,7 +202,7 @@ def test_twin_of_the_gems_data(paper, tmp_path):
     published = {"shift": 0.83, "static + shift": 0.41, "relative polynomial": 0.24, "all distortions solved": 0.20}
     means = []
     for name, solution in gems.correct(twin).items():
-        s = performance.scatter_summary(solution)
+        s = accuracy.scatter_summary(solution)
         assert abs(s["mean"] - published[name]) < 3 * np.hypot(0.15 * s["mean"], s["std"] / np.sqrt(s["n_stars"])), name
         means.append(s["mean"])
     assert means == sorted(means, reverse=True)

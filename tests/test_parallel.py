@@ -24,10 +24,12 @@ from astropy.nddata import CCDData
 from test_coaddition import SHAPE, expose, scene
 
 import legdistort as ld
-from legdistort import coaddition, levels, resampling, scratch, stacking
+from legdistort.coaddition import block_stack, levels, mosaicking
+from legdistort.coaddition.resampling import engines
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError, LegdistortError
-from legdistort.exposure_files import ExposureFile
-from legdistort.parallel import each
+from legdistort.inputs.exposure_files import ExposureFile
+from legdistort.runtime import scratch
+from legdistort.runtime.parallel import each
 
 COMPILED = pytest.mark.parametrize("compiled_from", [0, 1 << 62], ids=["compiled", "plain"])
 WORK = {"serial": {"workers": 1}, "threads": {"workers": 2, "threads": True}, "processes": {"workers": 2}}
@@ -310,13 +312,13 @@ class TestMosaicInBlocks:
     )
     def test_they_fit_together(self, monkeypatch, settings):
         solution, exposures = night(3 if settings.get("method") else 1)
-        monkeypatch.setattr(stacking, "_SAMPLES", 1 << 21)
-        monkeypatch.setattr(stacking, "_SIDES", (64, 512))
+        monkeypatch.setattr(block_stack, "_SAMPLES", 1 << 21)
+        monkeypatch.setattr(block_stack, "_SIDES", (64, 512))
         whole = ld.coadd(exposures, solution, **settings)
-        assert max(whole.shape) < stacking.side(len(exposures))  # one block
-        monkeypatch.setattr(stacking, "_SAMPLES", 1)
+        assert max(whole.shape) < block_stack.side(len(exposures))  # one block
+        monkeypatch.setattr(block_stack, "_SAMPLES", 1)
         pieces = ld.coadd(exposures, solution, **settings)
-        assert stacking.side(len(exposures)) == 64
+        assert block_stack.side(len(exposures)) == 64
         for name in ("weight", "footprint", "flags", "context"):
             np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name), err_msg=name)
         # the exact algorithm puts every block on a small piece of a sphere, which is not quite flat
@@ -328,8 +330,8 @@ class TestMosaicInBlocks:
     @COMPILED
     def test_any_number_of_workers_gives_the_same_bits(self, client, monkeypatch, tmp_path, compiled_from):
         solution, exposures = night(uncertainty=np.full(SHAPE, 8.0))
-        monkeypatch.setattr(resampling, "COMPILED_FROM", compiled_from)
-        monkeypatch.setattr(stacking, "_SAMPLES", 1 << 16)
+        monkeypatch.setattr(engines, "COMPILED_FROM", compiled_from)
+        monkeypatch.setattr(block_stack, "_SAMPLES", 1 << 16)
         settings = {"method": "clipped", "scratch": tmp_path}
         one = ld.coadd(exposures, solution, workers=1, **settings)
         for workers in (2, 3, None):  # None: the processes of the cluster
@@ -340,8 +342,8 @@ class TestMosaicInBlocks:
     @COMPILED
     def test_two_hundred_times_the_same(self, monkeypatch, compiled_from):
         solution, exposures = night(2)
-        monkeypatch.setattr(resampling, "COMPILED_FROM", compiled_from)
-        monkeypatch.setattr(stacking, "_SAMPLES", 1 << 15)
+        monkeypatch.setattr(engines, "COMPILED_FROM", compiled_from)
+        monkeypatch.setattr(block_stack, "_SAMPLES", 1 << 15)
         one = ld.coadd(exposures, solution, workers=1)
         for _ in range(200):
             assert_same(ld.coadd(exposures, solution, workers=2), one)
@@ -400,7 +402,7 @@ class TestMosaicInBlocks:
                 ld.coadd(exposures, solution, scratch=tmp_path)
         assert not any(tmp_path.iterdir())
         survey = levels.survey
-        monkeypatch.setattr(coaddition, "survey", lambda *args, **kwargs: time.sleep(0.5) or survey(*args, **kwargs))
+        monkeypatch.setattr(mosaicking, "survey", lambda *args, **kwargs: time.sleep(0.5) or survey(*args, **kwargs))
         threading.Timer(1, _thread.interrupt_main).start()
         with pytest.raises(KeyboardInterrupt):
             [ld.coadd(exposures, solution, workers=2, scratch=tmp_path) for _ in range(20)]

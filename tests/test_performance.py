@@ -5,12 +5,12 @@ import pytest
 from numpy.testing import assert_allclose
 from oracle import DenseOracle
 
-from legdistort import performance
-from legdistort.estimation import solve
 from legdistort.exceptions import InputError
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
-from legdistort.solution import Solution
+from legdistort.priors.prior import Prior
+from legdistort.results import accuracy
+from legdistort.results.solution import Solution
+from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
+from legdistort.solving.estimation import solve
 
 SEEDS = range(40)
 
@@ -69,8 +69,8 @@ def test_relative_bias_is_the_one_expected(runs, make, removed):
     pairs = []
     for sim, solution in runs(make):
         true = sim.truth.positions[solution.star_names]
-        b = performance.bias(solution.positions, true, removed=removed)
-        pairs.append((b**2, performance.expected_bias(solution, removed=removed) ** 2))
+        b = accuracy.bias(solution.positions, true, removed=removed)
+        pairs.append((b**2, accuracy.expected_bias(solution, removed=removed) ** 2))
     assert_agrees(pairs, slack=0.03)
 
 
@@ -88,8 +88,8 @@ def test_scatter_of_new_positions_is_the_one_expected(runs, make):
             corrected[i, seen[i]] = solution.correct(name, p[i, seen[i]])
         inside = solution.supported(solution.names[1], p[1])  # beyond the stars it is extrapolation
         use = inside & (seen.sum(axis=0) > 1)
-        measured = performance.scatter(corrected)
-        expected = performance.expected_scatter(solution, xy, sigma, seen=seen)
+        measured = accuracy.scatter(corrected)
+        expected = accuracy.expected_scatter(solution, xy, sigma, seen=seen)
         pairs.append((np.mean(measured[use] ** 2), np.mean(expected[use] ** 2)))
     assert_agrees(pairs, slack=0.05)
 
@@ -112,9 +112,9 @@ def test_absolute_bias_is_the_one_expected(make, slack):
         sim = make(seed)
         solution = solved(sim)
         true = sim.truth.positions[solution.star_names]
-        b = performance.bias(solution.positions, true, removed="similarity")
-        pairs.append((b**2, performance.expected_bias(solution, removed="similarity", absolute=True) ** 2))
-        relative.append(performance.expected_bias(solution, removed="similarity"))
+        b = accuracy.bias(solution.positions, true, removed="similarity")
+        pairs.append((b**2, accuracy.expected_bias(solution, removed="similarity", absolute=True) ** 2))
+        relative.append(accuracy.expected_bias(solution, removed="similarity"))
     assert_agrees(pairs, slack=slack)
     assert np.mean(relative) < 0.5 * np.sqrt(np.mean(pairs))  # without it the error would be far too small
 
@@ -124,7 +124,7 @@ def test_absolute_bias_adds_the_static_uncertainty():
     sim = paper(0, n_stars=200)
     sharp = solve(sim.matches, prior=Prior(sim.truth.static, sigma=1e-3))
     vague = solve(sim.matches, prior=Prior(sim.truth.static, sigma=1e-3, static_sigma=0.5))
-    left, right = (performance.expected_bias(s, removed=1, absolute=True) for s in (sharp, vague))
+    left, right = (accuracy.expected_bias(s, removed=1, absolute=True) for s in (sharp, vague))
     # 7 modes of degree 2 and 3 per axis, each 0.5 px: rms over the detector 0.5 sqrt(7) / 2 px
     assert np.sqrt(right**2 - left**2) == pytest.approx(0.5 * np.sqrt(7) / 2, rel=0.15)
 
@@ -134,9 +134,9 @@ def test_slopes_of_the_paper():
     for n in (5, 20):
         sim = paper(1, n_exposures=n, n_stars=200)
         solution = solved(sim)
-        assert performance.expected_bias(solution) == pytest.approx(0.14 / np.sqrt(n), rel=0.04)
+        assert accuracy.expected_bias(solution) == pytest.approx(0.14 / np.sqrt(n), rel=0.04)
         xy = sim.truth.positions
-        new = performance.expected_scatter(solution, xy, 0.14)
+        new = accuracy.expected_scatter(solution, xy, 0.14)
         rms = np.sqrt(np.nanmean(new**2))
         assert rms == pytest.approx(0.14 * np.sqrt((1 - 1 / n) * (1 + 10 / 200)), rel=0.03)
 
@@ -154,7 +154,7 @@ def test_covariance_between_stars_is_the_oracles(corr):
     assert_allclose(matrix, expected[np.ix_(by_axis, by_axis)], rtol=1e-3, atol=1e-7)
     errors = np.concatenate([solution.stars[c].value for c in ("x_err", "y_err")])
     assert_allclose(np.sqrt(np.diag(matrix)), errors, rtol=1e-6)
-    assert performance.expected_bias(solution) == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-6)
+    assert accuracy.expected_bias(solution) == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-6)
 
 
 # --- the plain figures -------------------------------------------------------------------------------------------
@@ -162,11 +162,11 @@ def test_covariance_between_stars_is_the_oracles(corr):
 
 def test_bias_is_rms_per_axis():
     true = np.random.default_rng(0).uniform(0, 100, (50, 2))
-    assert performance.bias(true + [3, 4], true) == pytest.approx(np.sqrt(12.5))
-    assert performance.bias(true + [3, 4], true, removed="similarity") == pytest.approx(0, abs=1e-12)
+    assert accuracy.bias(true + [3, 4], true) == pytest.approx(np.sqrt(12.5))
+    assert accuracy.bias(true + [3, 4], true, removed="similarity") == pytest.approx(0, abs=1e-12)
     lost = true + [3, 4]
     lost[7] = np.nan
-    assert performance.bias(lost, true) == pytest.approx(np.sqrt(12.5))
+    assert accuracy.bias(lost, true) == pytest.approx(np.sqrt(12.5))
 
 
 @pytest.mark.parametrize("removed", [0, 1, 3, "similarity"])
@@ -183,29 +183,29 @@ def test_what_is_removed(removed):
         powers = (true[:, :1] / 2000) ** i * (true[:, 1:] / 2000) ** j
         moved = true + powers @ rng.normal(size=(len(i), 2))
         k = 2 * len(i)
-    assert performance.bias(moved, true, removed=removed) < 1e-9
-    left = [performance.bias(true + rng.normal(size=true.shape), true, removed=removed) ** 2 for _ in range(60)]
+    assert accuracy.bias(moved, true, removed=removed) < 1e-9
+    left = [accuracy.bias(true + rng.normal(size=true.shape), true, removed=removed) ** 2 for _ in range(60)]
     assert np.mean(left) == pytest.approx(1 - k / 800, abs=0.025)
     with pytest.raises(InputError, match="removed must be an integer from 0 to 30, got 'affine'"):
-        performance.bias(moved, true, removed="affine")
+        accuracy.bias(moved, true, removed="affine")
 
 
 def test_scatter_is_the_papers():
     rng = np.random.default_rng(2)
     c = rng.normal(size=(5, 30, 2))
     expected = np.sqrt(c.var(axis=0).sum(axis=1) / 2)
-    assert_allclose(performance.scatter(c), expected)
+    assert_allclose(accuracy.scatter(c), expected)
     c[1:, 0] = np.nan
     c[:, 1] = np.nan
     c[3, 2, 0] = np.nan
-    out = performance.scatter(c)
+    out = accuracy.scatter(c)
     assert np.isnan(out[:2]).all()
     assert_allclose(out[2], np.sqrt(np.delete(c[:, 2], 3, axis=0).var(axis=0).sum() / 2))
 
 
 def test_corrected_positions_stand_where_they_belong(runs):
     _, solution = runs(gsaoi)[0]
-    corrected = performance.corrected_positions(solution)
+    corrected = accuracy.corrected_positions(solution)
     assert corrected.shape == (len(solution.names), len(solution.star_names), 2)
     rows = solution.residuals
     seen = np.zeros(corrected.shape[:2], dtype=bool)
@@ -220,21 +220,21 @@ def test_corrected_positions_stand_where_they_belong(runs):
 def test_scatter_of_positions_seen_once_or_without_noise(runs):
     _, solution = runs(gsaoi)[0]
     far = np.array([[1e5, 1e5]])
-    assert np.isnan(performance.expected_scatter(solution, far, 0.1)).all()
+    assert np.isnan(accuracy.expected_scatter(solution, far, 0.1)).all()
     middle = solution.positions[:5]
     once = np.zeros((len(solution.names), 5), dtype=bool)
     once[2] = True
-    assert np.isnan(performance.expected_scatter(solution, middle, 0.1, seen=once)).all()
+    assert np.isnan(accuracy.expected_scatter(solution, middle, 0.1, seen=once)).all()
     # a perfect position still scatters by the errors of the corrections
-    without = performance.expected_scatter(solution, middle, 0.0)
+    without = accuracy.expected_scatter(solution, middle, 0.0)
     assert np.all(without > 0)
-    assert np.all(without < performance.expected_scatter(solution, middle, 0.1))
+    assert np.all(without < accuracy.expected_scatter(solution, middle, 0.1))
 
 
 def test_a_solution_from_a_file_says_what_it_lacks(runs, tmp_path):
     _, solution = runs(gsaoi)[0]
     back = Solution.read(solution.write(tmp_path / "s.asdf"))
     with pytest.raises(InputError, match="read from a file keeps no covariances between stars; call solve again"):
-        performance.expected_bias(back)
+        accuracy.expected_bias(back)
     xy = solution.positions[:4]
-    assert_allclose(performance.expected_scatter(back, xy, 0.1), performance.expected_scatter(solution, xy, 0.1))
+    assert_allclose(accuracy.expected_scatter(back, xy, 0.1), accuracy.expected_scatter(solution, xy, 0.1))

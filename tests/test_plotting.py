@@ -10,9 +10,10 @@ from matplotlib import pyplot
 from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.quiver import Quiver, QuiverKey
 
-from legdistort import basis, drawing, plotting
 from legdistort.exceptions import InputError
-from legdistort.solution import Solution
+from legdistort.geometry import basis
+from legdistort.plots import elements, solution_plots
+from legdistort.results.solution import Solution
 
 
 def make_solution(
@@ -99,7 +100,7 @@ def color(name):
 
 def test_residual_arrows_are_the_used_residuals_in_stated_proportion(solution):
     name = solution.names[2]
-    ax = plotting.plot_residuals(solution, name, scale=500)
+    ax = solution_plots.plot_residuals(solution, name, scale=500)
     title, xlabel, ylabel = texts(ax)
     assert name in title
     assert "× 500" in title
@@ -114,7 +115,7 @@ def test_residual_arrows_are_the_used_residuals_in_stated_proportion(solution):
 
 
 def test_residuals_of_all_exposures_have_a_key_and_mark_what_was_not_used(solution):
-    ax = plotting.plot_residuals(solution)
+    ax = solution_plots.plot_residuals(solution)
     quiver = next(c for c in ax.collections if isinstance(c, Quiver))
     key = next(c for c in ax.get_children() if isinstance(c, QuiverKey))
     assert key.label == f"{key.U:g} px"
@@ -125,17 +126,17 @@ def test_residuals_of_all_exposures_have_a_key_and_mark_what_was_not_used(soluti
 
 
 def test_many_residuals_are_thinned():
-    ax = plotting.plot_residuals(make_solution(11, 400))
+    ax = solution_plots.plot_residuals(make_solution(11, 400))
     assert next(c for c in ax.collections if isinstance(c, Quiver)).N == 3000
 
 
 def test_residuals_refuse_what_they_cannot_draw(solution):
     with pytest.raises(InputError, match="no exposure 'nonsense'"):
-        plotting.plot_residuals(solution, "nonsense")
+        solution_plots.plot_residuals(solution, "nonsense")
     empty = make_solution(2)
     empty.residuals["used"][empty.residuals["exposure"] == empty.names[1]] = False
     with pytest.raises(InputError, match=f"no position of {empty.names[1]} was used"):
-        plotting.plot_residuals(empty, empty.names[1])
+        solution_plots.plot_residuals(empty, empty.names[1])
 
 
 # -- distortions
@@ -143,30 +144,30 @@ def test_residuals_refuse_what_they_cannot_draw(solution):
 
 def test_grid_is_the_distortion_magnified(solution):
     name = solution.names[3]
-    ax = plotting.plot_distortion(solution, name)
+    ax = solution_plots.plot_distortion(solution, name)
     assert "× 50" in texts(ax)[0]
     lines = grids(ax)
-    straight, bent = lines[color(drawing.GREY)], lines[color(drawing.BLUE)]
+    straight, bent = lines[color(elements.GREY)], lines[color(elements.BLUE)]
     q = straight.reshape(-1, 2)
     expected = q + 50 * (solution.distortion(name)(q) - q)
     np.testing.assert_allclose(bent.reshape(-1, 2), expected, atol=1e-8)
     assert np.ptp(q[:, 0]) == 2048  # edge to edge
-    prior = lines[color(drawing.ORANGE)].reshape(-1, 2)
+    prior = lines[color(elements.ORANGE)].reshape(-1, 2)
     shift = solution.prior_mean[3] @ basis.values(3, *basis.normalize(q, (2048, 2048)))
     np.testing.assert_allclose(prior, q + 50 * shift.T, atol=1e-8)
 
 
 def test_dynamic_grid_leaves_the_prior_out(solution):
-    ax = plotting.plot_distortion(solution, solution.names[0], part="dynamic", scale=10)
+    ax = solution_plots.plot_distortion(solution, solution.names[0], part="dynamic", scale=10)
     lines = grids(ax)
-    assert color(drawing.ORANGE) not in lines
-    q = lines[color(drawing.GREY)].reshape(-1, 2)
+    assert color(elements.ORANGE) not in lines
+    q = lines[color(elements.GREY)].reshape(-1, 2)
     shift = (solution.coefficients[0] - solution.prior_mean[0]) @ basis.values(3, *basis.normalize(q, (2048, 2048)))
-    np.testing.assert_allclose(lines[color(drawing.BLUE)].reshape(-1, 2), q + 10 * shift.T, atol=1e-8)
+    np.testing.assert_allclose(lines[color(elements.BLUE)].reshape(-1, 2), q + 10 * shift.T, atol=1e-8)
 
 
 def test_automatic_magnification_makes_a_tenth_of_the_detector(solution):
-    scale = plotting.distortion_scale(solution, solution.names)
+    scale = solution_plots.distortion_scale(solution, solution.names)
     t = np.linspace(-0.5, 2047.5, 40)
     q = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
     peak = max(np.abs(solution.distortion(name)(q) - q).max() for name in solution.names)
@@ -175,7 +176,7 @@ def test_automatic_magnification_makes_a_tenth_of_the_detector(solution):
 
 def test_small_multiples_come_in_pages_of_twelve():
     solution = make_solution(15, 10)
-    first, second = plotting.plot_distortions(solution), plotting.plot_distortions(solution, page=1)
+    first, second = solution_plots.plot_distortions(solution), solution_plots.plot_distortions(solution, page=1)
     shown = [ax.get_title(loc="left") for ax in (*first, *second)]
     assert shown == list(solution.names)
     assert len(first) == 12
@@ -183,12 +184,12 @@ def test_small_multiples_come_in_pages_of_twelve():
     assert "× 50" in first[0].figure.get_suptitle()
     assert first[0].figure.get_supxlabel() == "x [px]"
     with pytest.raises(InputError, match="page 2 is empty: 15 exposures fill 2 pages"):
-        plotting.plot_distortions(solution, page=2)
+        solution_plots.plot_distortions(solution, page=2)
 
 
 def test_unknown_part_is_refused(solution):
     with pytest.raises(InputError, match="'total', 'nonlinear' or 'dynamic', got 'static'"):
-        plotting.plot_distortion(solution, solution.names[0], part="static")
+        solution_plots.plot_distortion(solution, solution.names[0], part="static")
 
 
 # -- coefficients
@@ -197,7 +198,7 @@ def test_unknown_part_is_refused(solution):
 @pytest.mark.parametrize("degree", [1, 2, 3, 6])
 def test_bars_are_the_coefficients_beside_the_prior(degree):
     solution = make_solution(3, 20, degree)
-    panels = plotting.plot_coefficients(solution, solution.names[1])
+    panels = solution_plots.plot_coefficients(solution, solution.names[1])
     n = basis.n_modes(degree)
     for axis, ax in enumerate(panels):
         heights = {c.get_label(): [bar.get_height() for bar in c] for c in ax.containers}
@@ -212,7 +213,7 @@ def test_bars_are_the_coefficients_beside_the_prior(degree):
 
 
 def test_bars_of_all_exposures_show_mean_and_scatter(solution):
-    panels = plotting.plot_coefficients(solution)
+    panels = solution_plots.plot_coefficients(solution)
     bars = next(c for c in panels[0].containers if "mean" in c.get_label())
     np.testing.assert_allclose([b.get_height() for b in bars], solution.coefficients[:, 0].mean(axis=0))
     error = bars.errorbar.lines[2][0].get_segments()
@@ -221,7 +222,7 @@ def test_bars_of_all_exposures_show_mean_and_scatter(solution):
 
 def test_no_orange_bars_without_prior():
     solution = make_solution(2, 20, prior=False)
-    for ax in plotting.plot_coefficients(solution):
+    for ax in solution_plots.plot_coefficients(solution):
         assert [c.get_label() for c in ax.containers if c.get_label() == "prior"] == []
 
 
@@ -229,7 +230,7 @@ def test_no_orange_bars_without_prior():
 
 
 def test_scatter_is_the_rms_of_the_used_residuals_of_each_star(solution):
-    ax = plotting.plot_scatter(solution)
+    ax = solution_plots.plot_scatter(solution)
     points, curve = ax.lines
     rows = solution.residuals[solution.residuals["used"]]
     star = rows[rows["star"] == 7]
@@ -243,7 +244,7 @@ def test_scatter_is_the_rms_of_the_used_residuals_of_each_star(solution):
 
 
 def test_without_flux_the_reported_error_takes_its_place():
-    ax = plotting.plot_scatter(make_solution(2, 30, flux=False))
+    ax = solution_plots.plot_scatter(make_solution(2, 30, flux=False))
     assert texts(ax)[1] == "reported error per axis [px]"
     curve = ax.lines[1]
     np.testing.assert_array_equal(curve.get_xdata(), curve.get_ydata())
@@ -253,7 +254,7 @@ def test_flux_unit_is_shown_and_unknown_fluxes_are_left_out():
     solution = make_solution(3, 30)
     solution.residuals["flux"] = solution.residuals["flux"] * u.adu
     solution.residuals["flux"][solution.residuals["star"] == 4] = np.nan
-    ax = plotting.plot_scatter(solution)
+    ax = solution_plots.plot_scatter(solution)
     assert ax.get_xlabel() == "flux [adu]"
     assert len(ax.lines[0].get_xdata()) == 29
 
@@ -263,7 +264,7 @@ def test_flux_unit_is_shown_and_unknown_fluxes_are_left_out():
 
 def test_mosaic_is_averaged_in_blocks_and_keeps_its_pixels():
     mosaic = make_mosaic(300)
-    ax = plotting.plot_mosaic(mosaic, max_size=100, stars=[[10, 20], [200, 250]])
+    ax = solution_plots.plot_mosaic(mosaic, max_size=100, stars=[[10, 20], [200, 250]])
     (image,) = ax.images
     assert image.get_array().shape == (100, 100)
     assert np.ma.getmaskarray(image.get_array())[:, :3].all()  # the strip of 10 pixels without data
@@ -275,24 +276,24 @@ def test_mosaic_is_averaged_in_blocks_and_keeps_its_pixels():
 def test_block_mean_ignores_what_is_not_finite():
     image = np.arange(35.0).reshape(5, 7)
     image[0, 0] = np.nan
-    out = drawing.block_mean(image, 2)
+    out = elements.block_mean(image, 2)
     assert out.shape == (3, 4)
     assert out[0, 0] == pytest.approx(np.mean([1, 7, 8]))
     assert out[2, 3] == 34
     image[:2, :2] = np.nan
-    assert np.isnan(drawing.block_mean(image, 2)[0, 0])
+    assert np.isnan(elements.block_mean(image, 2)[0, 0])
 
 
 def test_mosaic_without_data_is_refused():
     with pytest.raises(InputError, match="no finite pixel"):
-        plotting.plot_mosaic(SimpleNamespace(data=np.full((5, 5), np.nan)))
+        solution_plots.plot_mosaic(SimpleNamespace(data=np.full((5, 5), np.nan)))
 
 
 def test_sigma_map_shows_the_rms_of_both_axes():
     x, y = np.linspace(-0.5, 99.5, 6), np.linspace(-0.5, 49.5, 4)
     sigma = np.random.default_rng(0).uniform(0.1, 0.3, (4, 6, 2))
     sigma[0, 0] = np.nan
-    ax = plotting.plot_sigma_map(x, y, sigma, stars=[[3, 4]])
+    ax = solution_plots.plot_sigma_map(x, y, sigma, stars=[[3, 4]])
     mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
     shown = np.ma.filled(mesh.get_array().reshape(4, 6), np.nan)
     np.testing.assert_allclose(shown, np.sqrt((sigma**2).mean(axis=2)))
@@ -300,7 +301,7 @@ def test_sigma_map_shows_the_rms_of_both_axes():
     assert texts(ax)[1:] == ("x [px]", "y [px]")
     assert "[px]" in ax.figure.axes[1].get_ylabel()
     with pytest.raises(InputError, match=r"sigma must have shape \(6, 4\)"):
-        plotting.plot_sigma_map(y, x, sigma)
+        solution_plots.plot_sigma_map(y, x, sigma)
 
 
 # -- all of them
@@ -311,10 +312,10 @@ def test_axes_given_are_used_and_nothing_else_is_opened(solution):
     from matplotlib.figure import Figure
 
     ax = Figure().subplots()
-    assert plotting.plot_residuals(solution, ax=ax) is ax
-    assert plotting.plot_mosaic(make_mosaic(50), ax=Figure().subplots()).images
+    assert solution_plots.plot_residuals(solution, ax=ax) is ax
+    assert solution_plots.plot_mosaic(make_mosaic(50), ax=Figure().subplots()).images
     fig = Figure()
-    assert plotting.plot_coefficients(solution, fig=fig)[0].figure is fig
+    assert solution_plots.plot_coefficients(solution, fig=fig)[0].figure is fig
     assert pyplot.get_fignums() == before
 
 
@@ -322,12 +323,12 @@ def test_names_are_taken_literally_and_cut():
     name = r"$\frac{a$_b<c>" + "x" * 80
     solution = make_solution(names=[name, "other"], n_stars=20)
     for ax in (
-        plotting.plot_residuals(solution, name),
-        plotting.plot_distortion(solution, name),
-        plotting.plot_coefficients(solution, name)[0],
+        solution_plots.plot_residuals(solution, name),
+        solution_plots.plot_distortion(solution, name),
+        solution_plots.plot_coefficients(solution, name)[0],
     ):
         ax.figure.canvas.draw()  # mathtext would fail here
-    assert len(drawing.shorten(name)) == 44
+    assert len(elements.shorten(name)) == 44
 
 
 @pytest.mark.parametrize(
@@ -335,9 +336,9 @@ def test_names_are_taken_literally_and_cut():
     [(1, 1), (0.99, 0.5), (0.05, 0.05), (4.9, 2), (1000, 1000), (7e-5, 5e-5), (0, 1), (np.inf, 1)],
 )
 def test_round_down(value, expected):
-    assert drawing.round_down(value) == pytest.approx(expected)
+    assert elements.round_down(value) == pytest.approx(expected)
 
 
 def test_grid_collections_carry_lines_only(solution):
-    ax = plotting.plot_distortion(solution, solution.names[0])
+    ax = solution_plots.plot_distortion(solution, solution.names[0])
     assert all(isinstance(c, LineCollection) for c in ax.collections)

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from legdistort import poses
 from legdistort.exceptions import InputError
+from legdistort.geometry import similarity
+from legdistort.geometry.tangent_plane import TangentPlane
 
 
 @st.composite
@@ -28,28 +29,33 @@ XY = np.random.default_rng(0).uniform(-1000, 1000, (20, 2))
 
 @given(similarities())
 def test_apply_is_mx_plus_t(a):
-    assert_allclose(poses.apply(a, XY)[3], a[:, :2] @ XY[3] + a[:, 2])
+    assert_allclose(similarity.apply(a, XY)[3], a[:, :2] @ XY[3] + a[:, 2])
 
 
 @given(similarities())
 def test_inverse_undoes(a):
-    assert_allclose(poses.apply(poses.invert(a), poses.apply(a, XY)), XY, atol=1e-8)
-    assert_allclose(poses.compose(a, poses.invert(a))[:, :2], np.eye(2), atol=1e-12)
+    assert_allclose(similarity.apply(similarity.invert(a), similarity.apply(a, XY)), XY, atol=1e-8)
+    assert_allclose(similarity.compose(a, similarity.invert(a))[:, :2], np.eye(2), atol=1e-12)
 
 
 @given(similarities(), similarities(), similarities())
 def test_composition(a, b, c):
-    assert_allclose(poses.apply(poses.compose(a, b), XY), poses.apply(a, poses.apply(b, XY)), rtol=1e-10, atol=1e-6)
-    left, right = poses.compose(poses.compose(a, b), c), poses.compose(a, poses.compose(b, c))
+    assert_allclose(
+        similarity.apply(similarity.compose(a, b), XY),
+        similarity.apply(a, similarity.apply(b, XY)),
+        rtol=1e-10,
+        atol=1e-6,
+    )
+    left, right = similarity.compose(similarity.compose(a, b), c), similarity.compose(a, similarity.compose(b, c))
     assert_allclose(left, right, rtol=1e-9, atol=1e-6 * np.abs(left).max())
-    assert_allclose(poses.compose(a, poses.identity()), a)
-    assert_allclose(poses.compose(poses.identity(), a), a)
+    assert_allclose(similarity.compose(a, similarity.identity()), a)
+    assert_allclose(similarity.compose(similarity.identity(), a), a)
 
 
 @given(similarities())
 def test_similarities_pass_the_check_and_are_described(a):
-    assert_allclose(poses.check(a), a)
-    d = poses.describe(a)
+    assert_allclose(similarity.check(a), a)
+    d = similarity.describe(a)
     turn = np.radians(d["rotation"])
     m = d["scale"] * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ np.diag([1, d["parity"]])
     assert_allclose(np.column_stack([m, [d["dx"], d["dy"]]]), a, rtol=1e-9, atol=1e-9 * d["scale"])
@@ -57,20 +63,20 @@ def test_similarities_pass_the_check_and_are_described(a):
 
 @given(similarities())
 def test_fit_recovers_a_similarity(a):
-    assert_allclose(poses.fit_similarity(XY, poses.apply(a, XY)), a, rtol=1e-7, atol=1e-7)
+    assert_allclose(similarity.fit_similarity(XY, similarity.apply(a, XY)), a, rtol=1e-7, atol=1e-7)
 
 
 @given(similarities(), st.integers(0, 99))
 def test_fit_is_the_least_squares_solution(a, seed):
     """Against a plain design matrix, weighted, with noise."""
     rng = np.random.default_rng(seed)
-    scale = poses.describe(a)["scale"]
-    target = poses.apply(a, XY) + scale * rng.normal(size=XY.shape)
+    scale = similarity.describe(a)["scale"]
+    target = similarity.apply(a, XY) + scale * rng.normal(size=XY.shape)
     w = rng.uniform(0, 1, len(XY))
-    pose = poses.fit_similarity(XY, target, weights=w)
+    pose = similarity.fit_similarity(XY, target, weights=w)
     x, y = XY.T
     one, zero = np.ones(len(XY)), np.zeros(len(XY))
-    parity = poses.describe(a)["parity"]
+    parity = similarity.describe(a)["parity"]
     # M = [[p, -q], [q, p]], or [[p, q], [q, -p]] in a mirror
     design = np.concatenate([np.column_stack([x, -parity * y, one, zero]), np.column_stack([parity * y, x, zero, one])])
     root = np.sqrt(np.tile(w, 2))
@@ -80,9 +86,9 @@ def test_fit_is_the_least_squares_solution(a, seed):
 
 def test_parity_can_be_held():
     mirrored = XY * [-1, 1]
-    assert poses.describe(poses.fit_similarity(XY, mirrored))["parity"] == -1
-    assert poses.describe(poses.fit_similarity(XY, mirrored, parity=1))["parity"] == 1
-    assert poses.describe(poses.fit_similarity(XY, XY, parity=-1))["parity"] == -1
+    assert similarity.describe(similarity.fit_similarity(XY, mirrored))["parity"] == -1
+    assert similarity.describe(similarity.fit_similarity(XY, mirrored, parity=1))["parity"] == 1
+    assert similarity.describe(similarity.fit_similarity(XY, XY, parity=-1))["parity"] == -1
 
 
 @pytest.mark.parametrize(
@@ -95,7 +101,7 @@ def test_parity_can_be_held():
 )
 def test_too_few_points(source, weights, message):
     with pytest.raises(InputError, match=message):
-        poses.fit_similarity(source, source, weights=weights)
+        similarity.fit_similarity(source, source, weights=weights)
 
 
 @pytest.mark.parametrize(
@@ -110,13 +116,13 @@ def test_too_few_points(source, weights, message):
 )
 def test_bad_poses(pose, message):
     with pytest.raises(InputError, match=message):
-        poses.check(pose, "pose of exp1")
+        similarity.check(pose, "pose of exp1")
 
 
 def plane(lon=201.3, lat=-47.5, scale=0.02 / 3600, angle=12.0):
     t = np.radians(angle)
     m = scale * np.array([[-np.cos(t), np.sin(t)], [np.sin(t), np.cos(t)]])
-    return poses.TangentPlane(lon, lat, np.column_stack([m, -m @ [511.5, 383.5]]))
+    return TangentPlane(lon, lat, np.column_stack([m, -m @ [511.5, 383.5]]))
 
 
 @pytest.mark.parametrize(("lon", "lat"), [(201.3, -47.5), (0.0, 0.0), (359.9999, 60.0), (30.0, 89.999), (30.0, -90.0)])
@@ -152,7 +158,7 @@ def test_sky_jacobian_is_the_finite_difference(lon, lat, flip):
     """Offsets on the sky that a small step in x or y makes, east and north at the place itself."""
     angle = np.radians(25)
     m = 2e-3 * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ np.diag([flip, 1.1])
-    plane = poses.TangentPlane(lon, lat, np.column_stack([m, [0.3, -0.2]]))
+    plane = TangentPlane(lon, lat, np.column_stack([m, [0.3, -0.2]]))
     xy = np.random.default_rng(0).uniform(-1500, 1500, (30, 2))  # up to 3 degrees off: far from flat
     found = plane.jacobian(xy)
     for k, step in enumerate(np.eye(2) * 0.5):
@@ -163,7 +169,7 @@ def test_sky_jacobian_is_the_finite_difference(lon, lat, flip):
 
 
 def test_sky_errors_are_those_of_a_cloud_of_points():
-    plane = poses.TangentPlane(30.0, 70.0, np.array([[-1e-3, 5e-4, 0.1], [5e-4, 1e-3, 0.5]]))
+    plane = TangentPlane(30.0, 70.0, np.array([[-1e-3, 5e-4, 0.1], [5e-4, 1e-3, 0.5]]))
     covariance = np.array([[0.04, 0.01], [0.01, 0.09]])
     cloud = np.random.default_rng(1).multivariate_normal([800, -300], covariance, 200_000)
     sky, centre = plane.to_sky(cloud), plane.to_sky(np.array([[800.0, -300.0]]))

@@ -10,15 +10,17 @@ from numpy.testing import assert_allclose
 from oracle import modes
 from oracle import predict as model
 
-from legdistort import performance, poses, uncertainty
-from legdistort.cli import main
-from legdistort.estimation import solve
+from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError, MatchError, SolveError
-from legdistort.matches import Matches
-from legdistort.prediction import predict
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_matches
-from legdistort.truth import displacement
+from legdistort.geometry import similarity
+from legdistort.inputs.matches import Matches
+from legdistort.priors.prior import Prior
+from legdistort.results import accuracy as performance
+from legdistort.simulation.observations import simulate_matches
+from legdistort.simulation.prediction import predict
+from legdistort.simulation.truth import displacement
+from legdistort.solving.equations import covariances
+from legdistort.solving.estimation import solve
 
 SHAPE = (2048, 2048)
 
@@ -195,7 +197,7 @@ def test_aliasing_is_that_of_a_dense_fit():
     def both(i, j):  # Jacobian of one observation by stars and all modes
         pose = p.solution.poses[p.solution.names[i]]
         unit = [model(stars[j : j + 1], np.eye(12)[k].reshape(2, 6), pose, (900, 1300))[0] for k in range(12)]
-        return pose[:, :2], np.array(unit).T - poses.apply(pose, stars[j])[:, None]
+        return pose[:, :2], np.array(unit).T - similarity.apply(pose, stars[j])[:, None]
 
     fitted = np.tile(np.arange(6) < 3, 2)
     design, target = [], []
@@ -340,7 +342,7 @@ def test_a_distorting_prior_and_the_mean_gauge():
 
 
 def test_many_coefficients_are_approximated_and_it_is_said(monkeypatch):
-    monkeypatch.setattr(uncertainty, "DENSE_LIMIT", 50)
+    monkeypatch.setattr(covariances, "DENSE_LIMIT", 50)
     with pytest.warns(AssumptionWarning, match="80 coefficients: their covariance is approximated"):
         p = predict(n_exposures=4, n_stars=200, sigma=0.1)
     assert p.sigma == pytest.approx(0.1 * p.thumb[1], rel=0.05)

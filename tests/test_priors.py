@@ -7,11 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from legdistort import basis, poses
-from legdistort.distortion import Distortion
 from legdistort.exceptions import InputError
-from legdistort.instruments import gsaoi_polynomials, gsaoi_static
-from legdistort.priors import Prior, similarity_basis, similarity_part
+from legdistort.geometry import basis, similarity
+from legdistort.geometry.detector_modes import similarity_basis, similarity_part
+from legdistort.geometry.distortion import Distortion
+from legdistort.geometry.gsaoi import gsaoi_polynomials, gsaoi_static
+from legdistort.priors.prior import Prior
 
 SHAPE = (2048, 2048)
 
@@ -32,7 +33,7 @@ def published(detector):
 def on_detector(prior, shape, q_of_p):
     """Largest distance of D(q) and p, where the map, brought to pixels by ``prior.plane``, says that q belongs to p."""
     p = pixels(shape)
-    q = poses.apply(prior.plane, q_of_p(p))
+    q = similarity.apply(prior.plane, q_of_p(p))
     return np.hypot(*(Distortion(prior.mean, shape)(q) - p).T).max()
 
 
@@ -46,9 +47,9 @@ def test_gsaoi_forward_and_its_truncation(detector, degree):
     worst = on_detector(prior, SHAPE, lambda p: np.column_stack(published(detector)(*(p + 1).T)))
     assert worst == pytest.approx(prior.truncation, rel=0.02, abs=1e-8)  # the corners are among the points
     assert prior.truncation <= {3: 0.02, 5: 3e-5, 9: 1e-8}[degree]
-    assert_allclose(similarity_part(prior.mean, SHAPE), poses.identity(), atol=1e-10)
-    assert poses.describe(prior.plane)["scale"] == pytest.approx(1 / 0.0197, rel=0.01)
-    poses.check(prior.plane)
+    assert_allclose(similarity_part(prior.mean, SHAPE), similarity.identity(), atol=1e-10)
+    assert similarity.describe(prior.plane)["scale"] == pytest.approx(1 / 0.0197, rel=0.01)
+    similarity.check(prior.plane)
 
 
 @pytest.mark.parametrize("detector", [1, 2, 3, 4])
@@ -104,15 +105,15 @@ def test_the_plane_does_not_matter(angle, scale, parity, shift, seed):
         lambda x, y: d.invert(np.column_stack([x, y])).T, shape=shape, direction="detector_to_reference", degree=2
     )
     second = Prior.from_model(
-        lambda x, y: poses.apply(turned, d.invert(np.column_stack([x, y]))).T,
+        lambda x, y: similarity.apply(turned, d.invert(np.column_stack([x, y]))).T,
         shape=shape,
         direction="detector_to_reference",
         degree=2,
     )
     assert_allclose(second.mean, first.mean, atol=1e-6)
-    assert_allclose(similarity_part(second.mean, shape), poses.identity(), atol=1e-8)
-    assert_allclose(poses.compose(second.plane, turned)[:, :2], first.plane[:, :2], atol=1e-8)
-    assert poses.describe(second.plane)["parity"] == parity
+    assert_allclose(similarity_part(second.mean, shape), similarity.identity(), atol=1e-8)
+    assert_allclose(similarity.compose(second.plane, turned)[:, :2], first.plane[:, :2], atol=1e-8)
+    assert similarity.describe(second.plane)["parity"] == parity
 
 
 def test_a_similarity_alone_is_no_distortion():
@@ -202,6 +203,6 @@ def test_similarity_part_is_the_best_similarity(shape, degree):
     rows = similarity_basis(shape, basis.n_modes(degree))
     assert_allclose(rows @ rows.T, np.eye(len(rows)), atol=1e-12)
     if degree:
-        assert_allclose(similarity_part(a, shape), poses.fit_similarity(q, target, weights=w, parity=1), atol=1e-9)
+        assert_allclose(similarity_part(a, shape), similarity.fit_similarity(q, target, weights=w, parity=1), atol=1e-9)
     else:
         assert_allclose(similarity_part(a, shape), [[1, 0, a[0, 0] / 2], [0, 1, a[1, 0] / 2]])

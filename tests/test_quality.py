@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from legdistort import baselines, quality_plots, report
-from legdistort import quality as module  # its coadd is replaced where truth is wanted instead
-from legdistort.estimation import solve
+from legdistort.assessment import baselines, stack_quality
+from legdistort.assessment.stack_quality import SINGLE, assess, compare_stacks
+from legdistort.assessment.star_shapes import measure_shapes
 from legdistort.exceptions import InputError
-from legdistort.exposures import Exposure
-from legdistort.priors import Prior
-from legdistort.quality import SINGLE, assess, compare_stacks
-from legdistort.sharpness import measure_shapes
-from legdistort.simulation import simulate_gsaoi_matches
+from legdistort.inputs.exposures import Exposure
+from legdistort.plots import stack_plots
+from legdistort.priors.prior import Prior
+from legdistort.reporting import page as report
+from legdistort.simulation.observations import simulate_gsaoi_matches
+from legdistort.solving.estimation import solve
 
 WIDTH = 2 * np.sqrt(2 * np.log(2))  # of a Gaussian, in its standard deviations
 SIGMA, SKY, OFFSET = 1.9, 50.0, (-80, -90)
@@ -183,7 +184,7 @@ def test_offsets_of_single_exposures(night, solution, exposures, monkeypatch):
         moved.append(Exposure(name=exposure.name, data=gaussians(truth.shape, xy, truth.flux, SIGMA)))
     comparison = {"copy": replace(solution), baselines.METHOD: solution}
     perfect = stack(solution, SIGMA)
-    monkeypatch.setattr(module, "coadd", lambda *args, **kwargs: perfect)
+    monkeypatch.setattr(stack_quality, "coadd", lambda *args, **kwargs: perfect)
     found = compare_stacks(moved, comparison, mosaic=perfect, fwhm=FWHM).qualities
     assert found[SINGLE].position == pytest.approx(0.1, rel=0.2)
     assert found["copy"].position < 2e-3
@@ -196,7 +197,7 @@ def test_stars_lost_anywhere_are_lost_everywhere(night, solution, exposures, mon
     star = np.argmax(solution.stars["flux"])
     x, y = np.round(solution.positions[star] - OFFSET).astype(int)
     holed.data[y - 3 : y + 4, x - 3 : x + 4] = np.nan
-    monkeypatch.setattr(module, "coadd", lambda frames, made, **options: holed)
+    monkeypatch.setattr(stack_quality, "coadd", lambda frames, made, **options: holed)
     comparison = {"other": replace(solution), baselines.METHOD: solution}
     made = compare_stacks(exposures, comparison, mosaic=whole, fwhm=FWHM)
     assert {q.n_stars for q in made.qualities.values()} == {n - 1}
@@ -247,7 +248,7 @@ def test_comparison_needs_the_method(night, solution, exposures):
 
 @pytest.fixture(scope="module")
 def stacks(night, solution, exposures):
-    from legdistort.coaddition import coadd
+    from legdistort.coaddition.mosaicking import coadd
 
     comparison = baselines.compare(night.matches, solution, prior=Prior(night.truth.static))
     mosaic = coadd(exposures, solution)
@@ -283,7 +284,7 @@ def test_zooms_have_their_star_in_the_middle(stacks, solution):
 
 def test_zooms_are_drawn_in_one_stretch(stacks):
     made, comparison = stacks
-    axes = quality_plots.plot_zooms(made.zooms, fig=Figure(layout="constrained"))
+    axes = stack_plots.plot_zooms(made.zooms, fig=Figure(layout="constrained"))
     assert axes.shape == (3, 4)
     assert [ax.get_title(loc="left") for ax in axes[0]] == list(comparison)
     for row, zoom in zip(axes, made.zooms, strict=True):

@@ -8,7 +8,7 @@ from scipy.ndimage import maximum_filter
 from star_fields import detections
 
 from legdistort import Exposure, coadd, match, read_exposures, solve
-from legdistort.measurement import measure
+from legdistort.measurement.positions import measure
 
 pytestmark = pytest.mark.slow
 

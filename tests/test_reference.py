@@ -13,16 +13,16 @@ from astropy.table import MaskedColumn, QTable, Table
 from astropy.time import Time
 from numpy.testing import assert_allclose
 
-from legdistort import performance
-from legdistort.cli import main
-from legdistort.estimation import solve
+from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
-from legdistort.matches import Matches
-from legdistort.poses import TangentPlane
-from legdistort.priors import Prior
-from legdistort.reference import mean_epoch, read_reference, year
-from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
-from legdistort.solution import Solution
+from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.inputs.matches import Matches
+from legdistort.inputs.reference_catalogue import mean_epoch, read_reference, year
+from legdistort.priors.prior import Prior
+from legdistort.results import accuracy
+from legdistort.results.solution import Solution
+from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
+from legdistort.solving.estimation import solve
 
 RNG = np.random.default_rng
 
@@ -99,8 +99,8 @@ def test_absolute_positions_become_as_good_as_relative_ones(sim):
     prior = Prior(sim.truth.static)
     before = solve(sim.matches, prior=prior)
     after = solve(sim.matches, prior=prior, reference=planar(sim, 60, 0.02))
-    assert performance.bias(before.positions, truth(sim, before)) > 0.2
-    assert performance.bias(after.positions, truth(sim, after)) < 0.025
+    assert accuracy.bias(before.positions, truth(sim, before)) > 0.2
+    assert accuracy.bias(after.positions, truth(sim, after)) < 0.025
     assert np.mean(pulls(sim, after) ** 2) == pytest.approx(1, abs=0.35)
     assert_allclose(after.stars["x_err"], before.stars["x_err"], rtol=0.02)
     assert after.chi2 == pytest.approx(before.chi2, abs=5)
@@ -149,9 +149,9 @@ def test_relative_positions_are_not_blurred(error):
     prior = Prior(sim.truth.static)
     before = solve(sim.matches, prior=prior)
     after = solve(sim.matches, prior=prior, reference=planar(sim, 40, error))
-    changed = performance.bias(after.positions, before.positions, removed=3)
-    assert changed < 0.01 * performance.expected_bias(before, removed=3)
-    assert performance.bias(after.positions, before.positions) > 10 * changed
+    changed = accuracy.bias(after.positions, before.positions, removed=3)
+    assert changed < 0.01 * accuracy.expected_bias(before, removed=3)
+    assert accuracy.bias(after.positions, before.positions) > 10 * changed
 
 
 def test_large_maps_change_relative_positions_to_second_order_and_for_the_better():
@@ -160,7 +160,7 @@ def test_large_maps_change_relative_positions_to_second_order_and_for_the_better
     prior = Prior(sim.truth.static)
     before = solve(sim.matches, prior=prior)
     after = solve(sim.matches, prior=prior, reference=planar(sim, 60, 1e-6))
-    assert performance.bias(after.positions, truth(sim, after)) < 5e-4
+    assert accuracy.bias(after.positions, truth(sim, after)) < 5e-4
     assert before.chi2 > 100 * after.chi2
 
 
@@ -170,8 +170,8 @@ def test_wrong_reference_is_told():
     before = solve(sim.matches, prior=prior)
     with pytest.warns(AssumptionWarning, match=r"are \d+\.\d times larger than the errors of both say"):
         after = solve(sim.matches, prior=prior, reference=planar(sim, 60, 0.3, stated=0.01))
-    changed = performance.bias(after.positions, before.positions, removed=3)
-    assert changed < 0.05 * performance.expected_bias(before, removed=3)
+    changed = accuracy.bias(after.positions, before.positions, removed=3)
+    assert changed < 0.05 * accuracy.expected_bias(before, removed=3)
 
 
 def test_mismatched_stars_are_rejected_by_name(sim):
@@ -200,9 +200,9 @@ def test_many_stars_are_treated_one_by_one(sim, monkeypatch):
     """Beyond `DENSE` stars the covariances between their relative errors are left out: nearly the same."""
     reference, prior = planar(sim, 40, 0.02), Prior(sim.truth.static)
     dense = solve(sim.matches, prior=prior, reference=reference)
-    monkeypatch.setattr("legdistort.tie.DENSE", 10)
+    monkeypatch.setattr("legdistort.solving.gauge.catalogue_map.DENSE", 10)
     by_star = solve(sim.matches, prior=prior, reference=reference)
-    assert performance.bias(by_star.positions, dense.positions) < 0.3 * performance.expected_bias(dense, absolute=True)
+    assert accuracy.bias(by_star.positions, dense.positions) < 0.3 * accuracy.expected_bias(dense, absolute=True)
     assert_allclose(by_star.stars["x_err_abs"], dense.stars["x_err_abs"], rtol=0.15)
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from legdistort import rendering
 from legdistort.exceptions import InputError
+from legdistort.simulation import rendering
 
 
 def test_profile_holds_unit_flux_and_its_width():

@@ -12,9 +12,11 @@ from matplotlib import pyplot
 from PIL import Image
 from test_plotting import make_mosaic, make_solution
 
-from legdistort import basis, report, simulation
-from legdistort.estimation import solve
 from legdistort.exceptions import InputError
+from legdistort.geometry import basis
+from legdistort.reporting import page as report
+from legdistort.simulation import observations
+from legdistort.solving.estimation import solve
 
 ODD = ["a<b>&\"c'", "$x$_\\frac{", "<script>alert(1)</script>", "星 plain"]
 VOID = {"meta", "img", "br"}
@@ -210,7 +212,7 @@ def test_nothing_is_left_behind_when_it_fails(tmp_path, solution, monkeypatch):
 
 
 def test_solved_set_gives_a_page(tmp_path):
-    matches = simulation.simulate_matches(n_stars=25, n_exposures=3, degree=2, seed=3).matches
+    matches = observations.simulate_matches(n_stars=25, n_exposures=3, degree=2, seed=3).matches
     solution = solve(matches, degree=2)
     before = pyplot.get_fignums()
     with pyplot.style.context("dark_background"):  # a user's style does not reach the page

@@ -7,10 +7,13 @@ import pytest
 from astropy import units as u
 from numpy.testing import assert_allclose
 
-from legdistort import Matches, Solution, cli, performance, run, selection, solve
+from legdistort import Matches, Solution, run, solve
+from legdistort.cli import parser
 from legdistort.exceptions import AssumptionWarning, FoldError, InputError, SolveError
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_matches
+from legdistort.priors.prior import Prior
+from legdistort.results import accuracy
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving.choices import held_out_stars
 
 SHAPE = (2048, 2048)
 
@@ -35,7 +38,7 @@ def solved(sim, **options):
 def test_what_is_kept_out_has_no_say():
     """The same as solving the table without these stars, whatever their positions are."""
     sim = simulate(40, 0.5, 0.5, 0.5, dither=200, seen=0.8)
-    kept, table = selection.hold_out(sim.matches, 0.2)
+    kept, table = held_out_stars.hold_out(sim.matches, 0.2)
     assert len(np.unique(table["star"])) == 8
     assert len(kept.table) + len(table) == len(sim.matches.table)
     assert not set(kept.stars) & set(table["star"])
@@ -55,7 +58,7 @@ def test_what_is_kept_out_has_no_say():
 
 def test_the_choice_is_seeded():
     sim = simulate(30, 0.5, 0.5)
-    first, second, other = (selection.hold_out(sim.matches, 0.3, seed=seed)[1]["star"] for seed in (0, 0, 1))
+    first, second, other = (held_out_stars.hold_out(sim.matches, 0.3, seed=seed)[1]["star"] for seed in (0, 0, 1))
     assert np.array_equal(first, second)
     assert not np.array_equal(first, other)
 
@@ -80,7 +83,7 @@ def test_scatter_tells_a_degree_that_is_too_low():
 
 def test_reported_scatter_is_that_of_the_corrected_positions():
     sim = simulate(30, 0.5, 0.5, seen=0.9)
-    _, table = selection.hold_out(sim.matches, 0.2)
+    _, table = held_out_stars.hold_out(sim.matches, 0.2)
     solution = solved(sim, degree=1, validate=0.2)
     by_star = []
     for star in np.unique(table["star"]):
@@ -112,7 +115,7 @@ def test_scaled_and_floored_errors_count():
 
 def test_a_mismatch_among_them_is_clipped():
     sim = simulate(40, 0.5, 0.5)
-    _, kept = selection.hold_out(sim.matches, 0.2)
+    _, kept = held_out_stars.hold_out(sim.matches, 0.2)
     table = sim.matches.table.copy()
     bad = np.flatnonzero((table["star"] == kept["star"][0]) & (table["exposure"] == kept["exposure"][0]))
     table["x"][bad] += 20 * u.pix
@@ -144,7 +147,7 @@ def test_too_few_stars_to_keep_any_out():
     table = table[[0, 2, 3]]
     matches = Matches.from_table(table, shape=SHAPE, poses={name: np.eye(2, 3) for name in set(table["exposure"])})
     with pytest.raises(InputError, match="stars that two exposures or more see; there are 1 of them"):
-        selection.hold_out(matches, 0.4)
+        held_out_stars.hold_out(matches, 0.4)
     with pytest.raises(InputError, match="degree='auto' needs stars that two exposures or more see; there are 1"):
         solve(matches, degree="auto")
 
@@ -152,7 +155,7 @@ def test_too_few_stars_to_keep_any_out():
 def test_an_exposure_that_would_have_no_stars():
     sim = simulate(10, 0.5)
     table = sim.matches.table
-    _, kept = selection.hold_out(sim.matches, 0.4)
+    _, kept = held_out_stars.hold_out(sim.matches, 0.4)
     table = table[(table["exposure"] != "exp00") | np.isin(table["star"], kept["star"])]
     matches = Matches.from_table(table, shape=SHAPE, poses=sim.matches.poses)
     with pytest.raises(InputError, match="no star is left in exposure exp00, others are kept out"):
@@ -168,7 +171,7 @@ def test_the_degree_put_in_is_chosen(degree):
     solution = solved(sim, degree="auto")
     chosen = solution.settings["selection"]
     assert solution.degree == chosen["degree"] == solution.settings["degree"] == degree
-    assert chosen["degrees"] == list(range(min(degree + selection.N_WORSE, selection.HIGHEST) + 1))
+    assert chosen["degrees"] == list(range(min(degree + held_out_stars.N_WORSE, held_out_stars.HIGHEST) + 1))
     assert chosen["scores"][degree] == min(chosen["scores"])
     assert chosen["scores"][degree] == pytest.approx(1 + (degree + 1) * (degree + 2) / 2 / 54, rel=0.2)
     assert not chosen["alarm"]
@@ -211,7 +214,7 @@ def test_a_mismatched_star_has_no_say():
 def test_kept_out_stars_do_not_choose():
     """What validate keeps out is not in the folds either."""
     sim = simulate(40, 0.5, 0.5, n_exposures=5)
-    kept, _ = selection.hold_out(sim.matches, 0.2)
+    kept, _ = held_out_stars.hold_out(sim.matches, 0.2)
     both = solved(sim, degree="auto", validate=0.2).settings["selection"]
     assert both == solve(kept, degree="auto", prior=Prior(sim.truth.static)).settings["selection"]
 
@@ -236,7 +239,7 @@ def test_x4_folds_as_foretold(margin):
     shift, modes of the same parity.
     """
     sim = fourth(margin=margin)
-    told = selection.folding(solved(sim, degree=4), 3, 4)
+    told = held_out_stars.folding(solved(sim, degree=4), 3, 4)
     assert told["mode"] == [4, 0]
     put_in = np.sqrt(np.mean(sim.truth.dynamic[:, 0, 10] ** 2) / 2) / 2  # rms over both axes and the field
     assert told["energy"] == pytest.approx(put_in, rel=0.05)
@@ -261,7 +264,7 @@ def test_few_stars_fold_more():
         width = np.zeros(10)
         width[6:] = 0.4
         sim = simulate_matches(n_stars=25, dynamic=width, sigma=0.01, noise=0, seed=seed)
-        told.append(selection.folding(solved(sim), 2, 3)["folds_into"][2])
+        told.append(held_out_stars.folding(solved(sim), 2, 3)["folds_into"][2])
         low = solved(sim, degree=2)
         wrong = (low.coefficients - low.prior_mean)[:, :, 3:6]
         done.append(np.sqrt((wrong**2).mean(axis=(0, 1)).sum()) / 2)
@@ -269,9 +272,11 @@ def test_few_stars_fold_more():
 
 
 def test_noise_is_no_energy():
-    excess = [selection.folding(solved(simulate(40, 0.5, 0.5, seed=s), degree=3), 1, 3)["excess"] for s in range(12)]
+    excess = [
+        held_out_stars.folding(solved(simulate(40, 0.5, 0.5, seed=s), degree=3), 1, 3)["excess"] for s in range(12)
+    ]
     assert abs(np.mean(excess)) < 0.7
-    assert max(np.abs(excess)) < selection.ALARM
+    assert max(np.abs(excess)) < held_out_stars.ALARM
 
 
 def test_alarm_is_raised():
@@ -284,7 +289,7 @@ def test_alarm_is_raised():
     assert [a["degree"] for a in chosen["aliasing"]] == [solution.degree + 1, solution.degree + 2][
         : len(chosen["aliasing"])
     ]
-    assert any(a["excess"] > selection.ALARM for a in chosen["aliasing"])
+    assert any(a["excess"] > held_out_stars.ALARM for a in chosen["aliasing"])
     assert "is there as well" in " ".join(str(solution).split())
 
 
@@ -316,7 +321,7 @@ def test_command_line(tmp_path, capsys):
     table.meta = sim.matches.to_meta()
     table.write(tmp_path / "matched.ecsv")
     command = ["solve", str(tmp_path / "matched.ecsv"), "--degree", "auto", "--validate", "0.1", "--json", "--quiet"]
-    assert cli.main([*command, "--out", str(tmp_path / "out")]) == 0
+    assert parser.main([*command, "--out", str(tmp_path / "out")]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["selection"]["degree"] == 1
     assert figures["validation"]["n_stars"] == 3
@@ -324,19 +329,19 @@ def test_command_line(tmp_path, capsys):
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "stars kept out scatter least with it" in page
     assert "expected from the errors" in page
-    assert cli.main([*command[:2], "--validate", "0.9", "--out", str(tmp_path / "no")]) == 1
+    assert parser.main([*command[:2], "--validate", "0.9", "--out", str(tmp_path / "no")]) == 1
     assert "validate must be a fraction of the stars between 0 and 0.5, got 0.9" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        cli.main([*command[:2], "--degree", "many", "--out", "no"])
+        parser.main([*command[:2], "--degree", "many", "--out", "no"])
     assert "'many' is neither a number nor 'auto'" in capsys.readouterr().err
 
 
 def test_expected_scatter_takes_an_error_for_each_position():
     solution = solved(simulate(30, 0.5, 0.5), degree=1)
     xy = np.array([[500.0, 500.0], [1500.0, 900.0]])
-    same = performance.expected_scatter(solution, xy, 0.2)
-    assert_allclose(performance.expected_scatter(solution, xy, np.full((10, 2), 0.2)), same)
-    mixed = performance.expected_scatter(solution, xy, np.full((10, 2), [0.2, 0.4]))
+    same = accuracy.expected_scatter(solution, xy, 0.2)
+    assert_allclose(accuracy.expected_scatter(solution, xy, np.full((10, 2), 0.2)), same)
+    mixed = accuracy.expected_scatter(solution, xy, np.full((10, 2), [0.2, 0.4]))
     assert mixed[0] == same[0]
     assert mixed[1] > 1.7 * same[1]
 
@@ -355,7 +360,7 @@ def test_the_choice_costs_little():
                 def error(degree, sim=sim, grid=grid):
                     try:
                         made = solved(sim, degree=degree)
-                        scatter = performance.new_scatter(made, sim.truth.distort, grid, 0.14)
+                        scatter = accuracy.new_scatter(made, sim.truth.distort, grid, 0.14)
                     except (FoldError, SolveError):  # no answer for so few stars
                         return np.inf
                     return np.sqrt(np.nanmean(scatter**2))

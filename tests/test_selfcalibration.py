@@ -8,14 +8,15 @@ from astropy.table import vstack
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
-from legdistort import Matches, Prior, Solution, basis, solve
-from legdistort.distortion import Distortion
+from legdistort import Matches, Prior, Solution, solve
 from legdistort.exceptions import AssumptionWarning, InputError, SolveError
-from legdistort.instruments import gsaoi_static
-from legdistort.poses import apply
-from legdistort.priors import similarity_basis
-from legdistort.simulation import matches_from, simulate_matches
-from legdistort.truth import displacement
+from legdistort.geometry import basis
+from legdistort.geometry.detector_modes import similarity_basis
+from legdistort.geometry.distortion import Distortion
+from legdistort.geometry.gsaoi import gsaoi_static
+from legdistort.geometry.similarity import apply
+from legdistort.simulation.observations import matches_from, simulate_matches
+from legdistort.simulation.truth import displacement
 
 SHAPE = (2048, 2048)
 GRID = basis.denormalize(*(a.ravel() for a in np.meshgrid(*[np.linspace(-0.98, 0.98, 15)] * 2)), SHAPE)

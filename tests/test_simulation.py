@@ -9,14 +9,14 @@ from astropy.table import QTable
 from astropy.wcs import WCS
 from numpy.polynomial import legendre
 
-from legdistort import basis, poses
 from legdistort.exceptions import FoldError, InputError
-from legdistort.exposures import read_exposures
-from legdistort.instruments import GsaoiMap, gsaoi_polynomials, gsaoi_static
-from legdistort.night import Night
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_exposures, simulate_gsaoi_matches, simulate_matches
-from legdistort.truth import displacement
+from legdistort.geometry import basis, similarity
+from legdistort.geometry.gsaoi import GsaoiMap, gsaoi_polynomials, gsaoi_static
+from legdistort.inputs.exposures import read_exposures
+from legdistort.priors.prior import Prior
+from legdistort.simulation.gsaoi_night import Night
+from legdistort.simulation.observations import simulate_exposures, simulate_gsaoi_matches, simulate_matches
+from legdistort.simulation.truth import displacement
 
 
 def arrays(matches):
@@ -105,7 +105,7 @@ def test_default_is_simulation_one():
     assert np.all(sim.matches.table["x_err"].value == 0.14)
     np.testing.assert_allclose(truth.dynamic.mean(axis=0), 0, atol=1e-14)
     for name in truth.names:
-        np.testing.assert_array_equal(sim.matches.poses[name], poses.identity())
+        np.testing.assert_array_equal(sim.matches.poses[name], similarity.identity())
     assert repr(sim) == "<Simulation: <Matches: 300 observations of 30 stars in 10 exposures>>"
     assert repr(truth) == "<Truth: 30 stars, 10 exposures, 10 modes>"
 
@@ -148,7 +148,7 @@ def test_positions_follow_the_equation_of_the_paper(settings):
     exposure, star, xy = arrays(sim.matches)
     star = sim.matches.stars[star]
     for i, j, observed in zip(exposure[::7], star[::7], xy[::7], strict=True):
-        q = poses.apply(truth.poses[truth.names[i]], truth.positions[j])
+        q = similarity.apply(truth.poses[truth.names[i]], truth.positions[j])
         u, v = (q[0] + 0.5) * 2 / nx - 1, (q[1] + 0.5) * 2 / ny - 1
         assert max(abs(u), abs(v)) <= 1
         np.testing.assert_allclose(observed, q + paper_displacement(truth.coefficients[i], u, v), rtol=0, atol=1e-9)
@@ -181,7 +181,7 @@ def test_dithered_stars_are_seen_only_on_the_detector():
     seen = np.zeros((10, 200), dtype=bool)
     seen[exposure, sim.matches.stars[star]] = True
     for row, name in zip(seen, truth.names, strict=True):
-        q = poses.apply(truth.poses[name], truth.positions)
+        q = similarity.apply(truth.poses[name], truth.positions)
         np.testing.assert_array_equal(row, np.all((q >= 19.5) & (q <= 2027.5), axis=1))
     assert seen.sum(axis=0).min() >= 3
     assert seen.mean() < 0.95
@@ -199,7 +199,7 @@ def test_fraction_seen_and_nominal_poses():
 
 def test_rotation_turns_about_the_middle_of_the_detector():
     truth = simulate_matches(n_exposures=2, rotations=[0, 90], shape=(100, 100)).truth
-    np.testing.assert_allclose(poses.apply(truth.poses["exp01"], [59.5, 49.5]), [49.5, 59.5], atol=1e-12)
+    np.testing.assert_allclose(similarity.apply(truth.poses["exp01"], [59.5, 49.5]), [49.5, 59.5], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -230,7 +230,7 @@ def test_unknown_exposure_is_named():
 
 def test_grid_covers_the_detector():
     truth = simulate_matches(n_exposures=3, rotations=[0, 90, 45], flips=[0, 1, 0], shape=(300, 200)).truth
-    q = poses.apply(truth.poses["exp01"], truth.grid("exp01", 10))
+    q = similarity.apply(truth.poses["exp01"], truth.grid("exp01", 10))
     assert q.shape == (100, 2)
     np.testing.assert_allclose(q.min(axis=0), [9.5, 14.5])
     np.testing.assert_allclose(q.max(axis=0), [189.5, 284.5])
@@ -247,7 +247,7 @@ def test_night_is_like_the_paper():
         errors.append(sim.matches.table["x_err"].value)
         truth = sim.truth
         q = truth.grid("exp00", 30)
-        q = poses.apply(truth.poses["exp00"], q)
+        q = similarity.apply(truth.poses["exp00"], q)
         rms += [np.sum(displacement(a, q, truth.shape) ** 2, axis=1).mean() for a in truth.dynamic]
     assert len(truth.names) == 11
     assert 60 <= np.mean(counts) <= 80
@@ -263,10 +263,10 @@ def test_night_positions_are_static_then_dynamic():
     model = gsaoi_static(2)
     name, i = truth.names[3], 3
     xy = truth.distort(name, truth.positions)
-    q = poses.apply(truth.poses[name], truth.positions)
+    q = similarity.apply(truth.poses[name], truth.positions)
     static = xy - (truth.dynamic[i] @ basis.values(3, *basis.normalize(q, truth.shape))).T
     arcsec = np.stack(model(*static.T), axis=-1)
-    np.testing.assert_allclose(arcsec, poses.apply(truth.instrument.similarity, q), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(arcsec, similarity.apply(truth.instrument.similarity, q), rtol=0, atol=1e-9)
     assert 15 < np.abs(xy - q).max() < 60
 
 
@@ -321,7 +321,7 @@ def test_header_points_off_by_the_stated_amount(small):
     middle = np.array([[255.5, 255.5]])
     directions = []
     for name, hdulist in small.hdus.items():
-        header = WCS(hdulist[0].header).pixel_to_world(*poses.apply(truth.poses[name], middle).T)
+        header = WCS(hdulist[0].header).pixel_to_world(*similarity.apply(truth.poses[name], middle).T)
         true = truth.sky.to_sky(middle)
         assert header.separation(true)[0].arcsec == pytest.approx(0.3, rel=1e-3)
         directions.append(true.position_angle(header)[0].deg)

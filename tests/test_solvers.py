@@ -6,12 +6,16 @@ from astropy import units as u
 from numpy.testing import assert_allclose
 from oracle import DenseOracle, predict
 
-from legdistort import criterion, performance, poses, problems, reduction, starting
-from legdistort.estimation import solve
 from legdistort.exceptions import ConvergenceWarning, InputError, SolveError
-from legdistort.matches import Matches
-from legdistort.priors import Prior, similarity_part
-from legdistort.simulation import simulate_matches
+from legdistort.geometry import similarity
+from legdistort.geometry.detector_modes import similarity_part
+from legdistort.inputs.matches import Matches
+from legdistort.priors.prior import Prior
+from legdistort.results import accuracy
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving import start_values
+from legdistort.solving.equations import criterion, problem_builder, reduced_system
+from legdistort.solving.estimation import solve
 
 RNG = np.random.default_rng
 
@@ -76,8 +80,8 @@ def test_model_is_the_published_formula():
 
 def test_jacobian_is_the_finite_difference():
     sim = small(corr=0.3)
-    problem = problems.build(sim.matches, 2, prior=Prior(sim.truth.static))
-    state, _ = starting.start(problem, np.stack([sim.matches.poses[n] for n in sim.matches.names]))
+    problem = problem_builder.build(sim.matches, 2, prior=Prior(sim.truth.static))
+    state, _ = start_values.start(problem, np.stack([sim.matches.poses[n] for n in sim.matches.names]))
     blocks = criterion.linearise(problem, state)
 
     def cost(positions, coefficients):
@@ -106,13 +110,13 @@ def test_alternating_reaches_the_same_minimum():
     with pytest.warns(ConvergenceWarning, match="drift along directions that the data do not tell"):
         published = solve(sim.matches, prior=prior, method="alternating", max_iterations=60)
     assert_allclose(published.chi2, joint.chi2, rtol=2e-4)
-    assert performance.bias(published.positions, joint.positions, removed=3) < 5e-4
+    assert accuracy.bias(published.positions, joint.positions, removed=3) < 5e-4
 
 
 def test_conjugate_gradients_give_the_direct_answer(monkeypatch):
     sim = small(n_exposures=7, n_stars=40, sigma=0.05, rotations=None, seen=0.8, min_exposures=3)
     direct = solve(sim.matches, degree=2, prior=Prior(sim.truth.static))
-    monkeypatch.setattr(reduction, "uses_direct", lambda problem: False)
+    monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: False)
     iterative = solve(sim.matches, degree=2, prior=Prior(sim.truth.static))
     assert_allclose(iterative.positions, direct.positions, atol=1e-6)
     assert_allclose(iterative.coefficients, direct.coefficients, atol=1e-6)
@@ -124,7 +128,7 @@ def test_poses_carry_the_similarities():
     for i, name in enumerate(solution.names):
         part = similarity_part(solution.coefficients[i] - sim.truth.static, solution.shapes[name])
         corner = np.array([[0.0, 0.0], [1199.0, 699.0]])
-        assert np.abs(poses.apply(part, corner) - corner).max() < 1e-3
+        assert np.abs(similarity.apply(part, corner) - corner).max() < 1e-3
 
 
 def test_poses_are_a_convention():
@@ -139,7 +143,7 @@ def test_poses_are_a_convention():
     blind = solve(Matches.from_table(table_of(sim), shape=(2048, 2048)), prior=prior)
     for other in (off, blind):
         assert_allclose(other.chi2, right.chi2, rtol=1e-6)
-        assert performance.bias(other.positions, right.positions, removed="similarity") < 2e-3
+        assert accuracy.bias(other.positions, right.positions, removed="similarity") < 2e-3
 
 
 def test_minimal_gauge_of_equal_exposures_is_the_mean():
@@ -161,7 +165,7 @@ def test_mean_of_corrected_positions_is_the_reference_position():
     """The paper's section 3.3: equal to a few 1e-3 px."""
     sim = simulate_matches(seed=4)
     solution = solve(sim.matches, prior=Prior(sim.truth.static))
-    mean = np.nanmean(performance.corrected_positions(solution), axis=0)
+    mean = np.nanmean(accuracy.corrected_positions(solution), axis=0)
     assert np.abs(mean - solution.positions).max() < 3e-3
 
 
@@ -186,8 +190,8 @@ def test_halved_errors_quarter_the_covariance():
     whole = solve(sim.matches, degree=2)
     half = solve(Matches.from_table(table, shape=(700, 1200), poses=sim.matches.poses), degree=2)
     # the gauge weighs the scatter against the errors, so only what is free of it scales to the letter
-    full = performance.expected_bias(whole, removed=2)
-    assert_allclose(performance.expected_bias(half, removed=2), full / 2, rtol=1e-3)
+    full = accuracy.expected_bias(whole, removed=2)
+    assert_allclose(accuracy.expected_bias(half, removed=2), full / 2, rtol=1e-3)
     assert_allclose(half.chi2, 4 * whole.chi2, rtol=1e-4)
 
 
@@ -216,7 +220,7 @@ def test_prior_width_makes_sparse_fields_solvable():
     with pytest.raises(SolveError, match=r"exp00 has 8 stars, fewer than the 10 modes of degree 3: .*at most 2 here"):
         solve(sim.matches, prior=Prior(sim.truth.static))
     solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma=0.9))
-    assert performance.bias(solution.positions, sim.truth.positions[solution.star_names]) < 0.3
+    assert accuracy.bias(solution.positions, sim.truth.positions[solution.star_names]) < 0.3
 
 
 def test_clipping_finds_gross_outliers():
@@ -231,7 +235,7 @@ def test_clipping_finds_gross_outliers():
                            poses=sim.matches.poses), prior=Prior(sim.truth.static))  # fmt: skip
     assert set(wrong) <= set(np.flatnonzero(~clipped.residuals["used"]))
     assert np.count_nonzero(~clipped.residuals["used"]) <= len(wrong) + 3
-    assert performance.bias(clipped.positions, clean.positions) < 0.02
+    assert accuracy.bias(clipped.positions, clean.positions) < 0.02
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
@@ -243,8 +247,8 @@ def test_robust_losses_resist_outliers(loss):
     matches = Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses)
     true = sim.truth.positions
     prior = Prior(sim.truth.static)
-    assert performance.bias(solve(matches, prior=prior, loss=loss).positions, true) < 0.12
-    assert performance.bias(solve(matches, prior=prior).positions, true) > 0.3
+    assert accuracy.bias(solve(matches, prior=prior, loss=loss).positions, true) < 0.12
+    assert accuracy.bias(solve(matches, prior=prior).positions, true) > 0.3
 
 
 @pytest.mark.parametrize(

@@ -20,17 +20,18 @@ from hypothesis import strategies as st
 from numpy.polynomial import polynomial
 from numpy.testing import assert_allclose
 
-from legdistort import basis, poses
-from legdistort.cli import main
-from legdistort.distortion import Distortion
-from legdistort.estimation import solve
+from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
-from legdistort.instruments import GsaoiMap, gsaoi_polynomials, gsaoi_static
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_matches
-from legdistort.solution import Solution
-from legdistort.source_files import read_source
-from legdistort.wcs import exposure_wcs
+from legdistort.geometry import basis, similarity
+from legdistort.geometry.distortion import Distortion
+from legdistort.geometry.gsaoi import GsaoiMap, gsaoi_polynomials, gsaoi_static
+from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.priors.from_files import read_source
+from legdistort.priors.prior import Prior
+from legdistort.results.solution import Solution
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving.estimation import solve
+from legdistort.wcs.exposure_wcs import exposure_wcs
 
 FORWARD, BACKWARD = "detector_to_reference", "reference_to_detector"
 
@@ -53,7 +54,7 @@ def touching(sky, centre):
 def distance(prior, plane):
     """Largest distance [pix] of a prior and the map it stands for, by one dense evaluation of that map."""
     x, y = grid(prior.shape, 500)
-    q = poses.apply(prior.plane, np.column_stack(plane(x, y)))
+    q = similarity.apply(prior.plane, np.column_stack(plane(x, y)))
     return np.hypot(
         *(q + (prior.mean @ basis.values(prior.degree, *basis.normalize(q, prior.shape))).T).T - [x, y]
     ).max()
@@ -114,10 +115,12 @@ def test_gsaoi_table(shared_data, detector):
     # Newton's method on the table itself, and the inverse that goes into files
     own = GsaoiMap(detector)
     p = np.column_stack([x, y])
-    assert np.abs(own.distort(poses.apply(poses.invert(own.similarity), np.transpose(arcsec))) - p).max() < 1e-8
+    assert (
+        np.abs(own.distort(similarity.apply(similarity.invert(own.similarity), np.transpose(arcsec))) - p).max() < 1e-8
+    )
     prior = Prior.from_file(f"gsaoi-{detector}", degree=9)
     d = Distortion(prior.mean, prior.shape)
-    undistorted = poses.apply(prior.plane, np.transpose(arcsec))
+    undistorted = similarity.apply(prior.plane, np.transpose(arcsec))
     correction = d.model().inverse
     assert np.hypot(*(d(undistorted) - p).T).max() < 1e-6
     assert np.hypot(*(np.column_stack(correction(x, y)) - undistorted).T).max() < 1e-6
@@ -141,7 +144,7 @@ def test_gwcs_files(shared_data, name):
     assert_allclose(onto_sky.function(x, y), wcs(x, y), rtol=0, atol=1e-9)
     centre = wcs((shape[1] - 1) / 2, (shape[0] - 1) / 2)
     expected = touching(wcs(x, y), centre)
-    scale = np.sqrt(abs(np.linalg.det(np.array(poses.fit_similarity(np.column_stack([x, y]), expected.T))[:, :2])))
+    scale = np.sqrt(abs(np.linalg.det(np.array(similarity.fit_similarity(np.column_stack([x, y]), expected.T))[:, :2])))
     assert np.abs(np.array(onto_sky.on_plane()(x, y)) - expected).max() / scale < 1e-9  # pixels
 
 
@@ -337,8 +340,8 @@ def test_our_own_wcs_comes_back(tmp_path):
     """From the gwcs of an exposure: the distortion that it was made of."""
     mean = np.zeros((2, 10))
     mean[:, 3:] = np.random.default_rng(1).normal(0, 0.3, (2, 7))
-    sky = poses.TangentPlane(0.0, 60.0, np.array([[-1e-5, 0, 0], [0, 1e-5, 0]]))
-    wcs = exposure_wcs("a", poses.identity(), Distortion(mean, (512, 512)), sky)
+    sky = TangentPlane(0.0, 60.0, np.array([[-1e-5, 0, 0], [0, 1e-5, 0]]))
+    wcs = exposure_wcs("a", similarity.identity(), Distortion(mean, (512, 512)), sky)
     tree = {"meta": {"wcs": wcs}}
     asdf.AsdfFile(tree, version="1.5.0").write_to(tmp_path / "a.asdf")
     prior = Prior.from_file(tmp_path / "a.asdf", degree=3)
@@ -409,7 +412,7 @@ def test_written_and_read(tmp_path):
     ],
 )
 def test_damaged_priors(tmp_path, changes, message):
-    Prior(np.zeros((2, 3)), shape=(10, 20), plane=poses.identity()).write(tmp_path / "p.asdf")
+    Prior(np.zeros((2, 3)), shape=(10, 20), plane=similarity.identity()).write(tmp_path / "p.asdf")
     with asdf.open(tmp_path / "p.asdf", memmap=False, lazy_load=False) as file:
         tree = dict(file["legdistort_prior"])
     asdf.AsdfFile({"legdistort_prior": tree | changes}).write_to(tmp_path / "p.asdf")

@@ -6,13 +6,13 @@ from numpy.polynomial.polynomial import polyval
 from numpy.testing import assert_allclose, assert_array_equal
 from test_coaddition import SHAPE, expose, scene
 
-from legdistort import resampling
-from legdistort.coaddition import coadd
-from legdistort.exposures import Exposure
-from legdistort.mapping import PixelMap
+from legdistort.coaddition.mosaicking import coadd
+from legdistort.coaddition.resampling import engines
+from legdistort.coaddition.resampling.pixel_maps import PixelMap
+from legdistort.inputs.exposures import Exposure
 
 pytest.importorskip("numba", reason="compiled splines need the extra 'fast'")
-from legdistort import spline_kernels
+from legdistort.coaddition.resampling import compiled_splines
 
 RNG = np.random.default_rng(5)
 
@@ -27,8 +27,8 @@ def test_values_are_those_of_reproject(order, dtype, shape):
     xy[:, 0, :4] = [[0, nx - 1, nx - 0.5, -0.5], [0, ny - 1, ny - 0.5, -0.5]]
     xy[0, 5, 5] = np.nan
     pixel_map = PixelMap((slice(90), slice(70)), xy, np.ones((90, 70), dtype=bool), np.ones((90, 70)))
-    expected = resampling.resample([image], pixel_map, order=order)
-    found = resampling.resample([image], pixel_map, order=order, compiled=True)
+    expected = engines.resample([image], pixel_map, order=order)
+    found = engines.resample([image], pixel_map, order=order, compiled=True)
     assert np.isnan(expected).any()
     assert_allclose(found, expected, rtol=1e-12 if dtype is np.float64 else 1e-7)  # NaN where reproject has it
 
@@ -37,7 +37,7 @@ def test_gain_is_a_product_of_polynomials():
     series, xy = np.array([1.0, -2.5, 0.7, 0.3]), RNG.uniform(-3, 40, (2, 20, 30))
     fraction = xy - np.floor(xy)
     gain = polyval(fraction * (1 - fraction), series)
-    assert_allclose(spline_kernels.product(series, xy), gain[0] * gain[1], rtol=1e-6)
+    assert_allclose(compiled_splines.product(series, xy), gain[0] * gain[1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("settings", [{"order": 1}, {"order": 3}, {"order": 3, "weights": "variance"}, {"order": 2}])
@@ -55,9 +55,9 @@ def test_the_mosaic_is_the_same(monkeypatch, settings):
     ]
     plain = coadd(exposures, solution, **settings)
     calls = []
-    monkeypatch.setattr(resampling, "COMPILED_FROM", 0)
-    interpolate = spline_kernels.interpolate
-    monkeypatch.setattr(spline_kernels, "interpolate", lambda *args: calls.append(interpolate(*args)))
+    monkeypatch.setattr(engines, "COMPILED_FROM", 0)
+    interpolate = compiled_splines.interpolate
+    monkeypatch.setattr(compiled_splines, "interpolate", lambda *args: calls.append(interpolate(*args)))
     fast = coadd(exposures, solution, **settings)
     assert bool(calls) == (settings["order"] != 2)  # which reproject does at any size
     for name in ("footprint", "flags", "context"):

@@ -14,14 +14,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
 
-from legdistort import catalogs, cli, provenance, sextractor
-from legdistort.estimation import solve
+from legdistort.cli import parser
 from legdistort.exceptions import InputError, LegdistortError
-from legdistort.measurement import Flag
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
-from legdistort.solution import Solution
-from legdistort.table_files import read_table, stack, write_stars
+from legdistort.inputs import column_contract, sextractor
+from legdistort.inputs.table_files import read_table, stack, write_stars
+from legdistort.measurement.positions import Flag
+from legdistort.priors.prior import Prior
+from legdistort.results.solution import Solution
+from legdistort.runtime import provenance
+from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
+from legdistort.solving.estimation import solve
 
 # Lines that SExtractor 2.25.0 wrote: CATALOG_TYPE ASCII_HEAD, errors both as variances and as an ellipse.
 SEXTRACTOR = """\
@@ -66,7 +68,7 @@ def write_ldac(path, *tables, size=(700, 600)):
 
 
 def assert_detections(table, exposure):
-    out = catalogs.check(table, catalogs.DETECTED, "the table")
+    out = column_contract.check(table, column_contract.DETECTED, "the table")
     assert_allclose(out["x"].value, [246.3459, 429.1783, 296.8534], rtol=0, atol=1e-9)  # counted from 0
     assert_allclose(out["y"].value, [36.4745, 27.9282, 14.6776], rtol=0, atol=1e-9)
     assert_allclose(out["x_err"].value, np.sqrt([1.6337801021e-05, 3.1468126874e-04, 1.0401713094e-03]))
@@ -230,7 +232,7 @@ def test_bad_files_are_named(tmp_path, name, content, message):
     else:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=message):
-        catalogs.check(read_table(tmp_path / name), catalogs.DETECTED, name)
+        column_contract.check(read_table(tmp_path / name), column_contract.DETECTED, name)
 
 
 def test_tables_that_do_not_go_together():
@@ -241,10 +243,10 @@ def test_tables_that_do_not_go_together():
 def test_columns_of_several_values_are_refused():
     table = Table({"exposure": ["a"], "x": [[1.0, 2.0]], "y": [1.0], "x_err": [0.1], "y_err": [0.1]})
     with pytest.raises(InputError, match=r"column 'x' must hold one number a row, it has shape \(1, 2\)"):
-        catalogs.check(table, catalogs.DETECTED, "t")
+        column_contract.check(table, column_contract.DETECTED, "t")
     table["exposure"], table["x"] = [["a", "b"]], [1.0]
     with pytest.raises(InputError, match=r"column 'exposure' must hold one name a row, it has shape \(1, 2\)"):
-        catalogs.check(table, catalogs.DETECTED, "t")
+        column_contract.check(table, column_contract.DETECTED, "t")
 
 
 # --- stars out -----------------------------------------------------------------------------------------------------
@@ -261,7 +263,7 @@ SKY = ["ra", "dec", "ra_error", "dec_error", "ra_dec_corr", "ra_error_abs", "dec
 
 def test_stars_follow_the_virtual_observatory(solution):
     stars = solution.stars
-    assert set(stars.colnames) == set(catalogs.STARS)
+    assert set(stars.colnames) == set(column_contract.STARS)
     for name in stars.colnames:
         assert check_ucd(stars[name].info.meta["ucd"], check_controlled_vocabulary=True), name
         assert len(stars[name].info.description) > 10
@@ -284,7 +286,9 @@ def test_stars_come_back_from_every_format(solution, tmp_path, ending):
     stars = solution.stars
     if ending in (".vot", ".xml"):
         resource = parse_single_table(path)
-        assert {f.name: f.ucd for f in resource.fields} == {name: catalogs.STARS[name][0] for name in stars.colnames}
+        assert {f.name: f.ucd for f in resource.fields} == {
+            name: column_contract.STARS[name][0] for name in stars.colnames
+        }
         back = QTable(resource.to_table(use_names_over_ids=True))
     else:
         back = QTable.read(path, format="ascii.csv" if ending == ".csv" else None)
@@ -373,9 +377,9 @@ def reads_or_refuses(path):
     except LegdistortError as error:
         assert path.name in str(error)  # noqa: PT017
         return
-    for contract in (catalogs.MATCHED, catalogs.DETECTED):
+    for contract in (column_contract.MATCHED, column_contract.DETECTED):
         try:
-            catalogs.check(table, contract, "the table")
+            column_contract.check(table, contract, "the table")
         except LegdistortError as error:
             assert "the table" in str(error) or "column" in str(error)  # noqa: PT017
 
@@ -392,9 +396,9 @@ def test_from_lists_to_stars_in_the_shell(tmp_path, capsys):
         table = Table({"XWIN_IMAGE": rows["x"].value + 1, "YWIN_IMAGE": rows["y"].value + 1})
         table["ERRX2WIN_IMAGE"], table["ERRY2WIN_IMAGE"], table["ERRXYWIN_IMAGE"] = 4e-4, 4e-4, 0.0
         paths.append(str(write_ldac(tmp_path / f"{name}.ldac", table)))
-    assert cli.main(["match", *paths, "--out", str(tmp_path / "m.ecsv"), "--quiet"]) == 0
+    assert parser.main(["match", *paths, "--out", str(tmp_path / "m.ecsv"), "--quiet"]) == 0
     solving = ["solve", str(tmp_path / "m.ecsv"), "--degree", "1", "--out", str(tmp_path / "r"), "--quiet"]
-    assert cli.main(solving) == 0
+    assert parser.main(solving) == 0
     solution = Solution.read(tmp_path / "r" / "solution.asdf")
     assert solution.provenance["inputs"] == provenance.checksums([*paths, tmp_path / "m.ecsv"])
     first = solution.residuals[solution.residuals["exposure"] == sim.matches.names[0]]
@@ -402,10 +406,10 @@ def test_from_lists_to_stars_in_the_shell(tmp_path, capsys):
         np.round(sim.matches.table["x"][sim.matches.table["exposure"] == sim.matches.names[0]].value, 6)
     )
     stars = ["stars", str(tmp_path / "r" / "solution.asdf"), "--out", str(tmp_path / "s.fits")]
-    assert cli.main(stars) == 0
+    assert parser.main(stars) == 0
     assert len(QTable.read(tmp_path / "s.fits")) == len(solution.star_names)
     capsys.readouterr()
-    assert cli.main(stars) == 1
+    assert parser.main(stars) == 1
     assert "s.fits exists already" in capsys.readouterr().err
-    assert cli.main([*stars, "--overwrite", "--max-bytes", "1000"]) == 1
+    assert parser.main([*stars, "--overwrite", "--max-bytes", "1000"]) == 1
     assert "is refused" in capsys.readouterr().err

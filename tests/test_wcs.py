@@ -17,14 +17,15 @@ from astropy.modeling import CompoundModel, fitting, models
 from astropy.modeling.separable import separability_matrix
 from numpy.testing import assert_allclose, assert_array_equal
 
-from legdistort import poses
-from legdistort.archive import write_wcs
-from legdistort.distortion import FastLegendre2D
-from legdistort.estimation import solve
 from legdistort.exceptions import InputError
-from legdistort.matches import Matches
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
+from legdistort.geometry import similarity
+from legdistort.geometry.models import FastLegendre2D
+from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.inputs.matches import Matches
+from legdistort.priors.prior import Prior
+from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
+from legdistort.solving.estimation import solve
+from legdistort.wcs.files import write_wcs
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def solution():
         n_stars=60, n_exposures=4, shape=(700, 1200), dither=40, rotations=[0, 20, -60, 5], flips=[0, 0, 1, 0], seed=2
     )
     m = 2e-5 / 3.6 * np.array([[-1.0, 0.1, 500.0], [0.1, 1.0, -200.0]])
-    matches = Matches(sim.matches.table, sim.matches.shapes, sim.matches.poses, poses.TangentPlane(10.0, -70.0, m))
+    matches = Matches(sim.matches.table, sim.matches.shapes, sim.matches.poses, TangentPlane(10.0, -70.0, m))
     return solve(matches, prior=Prior(sim.truth.static))
 
 
@@ -67,7 +68,7 @@ def test_forward_is_the_exact_correction(solution):
         to_reference = wcs.get_transform("detector", "reference")
         assert_allclose(np.column_stack(to_reference(*p.T)), solution.correct(name, p), rtol=0, atol=1e-6)
         q = np.column_stack(wcs.get_transform("detector", "undistorted")(*p.T))
-        assert_allclose(q, poses.apply(solution.poses[name], solution.correct(name, p)), rtol=0, atol=1e-6)
+        assert_allclose(q, similarity.apply(solution.poses[name], solution.correct(name, p)), rtol=0, atol=1e-6)
 
 
 def test_backward_is_the_exact_distortion(solution):
@@ -107,8 +108,8 @@ def test_outside_is_nan(solution):
             assert np.isnan(wcs(*p)).all()
         assert np.isfinite(wcs(-0.5, -0.5)).all()
         assert np.isfinite(wcs(nx - 0.5, ny - 0.5)).all()
-        far = poses.apply(
-            poses.invert(solution.poses[name]), [[-0.2 * nx, 0], [1.2 * nx, 0], [0, 1.3 * ny], [9e3, 9e3]]
+        far = similarity.apply(
+            similarity.invert(solution.poses[name]), [[-0.2 * nx, 0], [1.2 * nx, 0], [0, 1.3 * ny], [9e3, 9e3]]
         )
         assert np.isnan(solution.distort(name, far)).all()
         assert np.isnan(wcs.get_transform("reference", "detector")(*far.T)).all()
@@ -204,7 +205,11 @@ def test_quantities_in_quantities_out(solution):
     model, distortion = solution.model(name), solution.distortion(name)
     p = detector_points(solution, name)[:-4]
     x = solution.correct(name, p)
-    for function, at in ((model, x), (model.inverse, p), (distortion.model(), poses.apply(solution.poses[name], x))):
+    for function, at in (
+        (model, x),
+        (model.inverse, p),
+        (distortion.model(), similarity.apply(solution.poses[name], x)),
+    ):
         plain, unit = function(*at.T), function(*(at * u.pix).T)
         assert_array_equal(u.Quantity(unit).to_value(u.pix), plain)
         with pytest.raises(InputError, match="positions must be in pixels, got deg"):
@@ -349,7 +354,7 @@ print(once, resident() - before)
 def test_nothing_stays_in_memory(tmp_path):
     """After an evaluation of 2048 x 2048 pixels both ways, by the figure of the operating system."""
     sim = simulate_matches(n_stars=40, n_exposures=3, seed=3)
-    sky = poses.TangentPlane(10.0, 20.0, np.array([[-1.0, 0, 1024.0], [0, 1.0, -1024.0]]) / 36000)
+    sky = TangentPlane(10.0, 20.0, np.array([[-1.0, 0, 1024.0], [0, 1.0, -1024.0]]) / 36000)
     solution = solve(
         Matches(sim.matches.table, sim.matches.shapes, sim.matches.poses, sky), prior=Prior(sim.truth.static)
     )

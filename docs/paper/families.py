@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import BSpline
 
-from legdistort import basis
-from legdistort.instruments import gsaoi_polynomials
-from legdistort.source_files import read_source
+from legdistort.geometry import basis
+from legdistort.geometry.gsaoi import gsaoi_polynomials
+from legdistort.priors.from_files import read_source
 
 DEGREES = range(1, 13)
 SPLINE_CELLS = range(1, 11)

@@ -10,8 +10,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from legdistort import basis, comparison_plots, drawing, performance
-from legdistort.instruments import GsaoiMap
+from legdistort.geometry import basis
+from legdistort.geometry.gsaoi import GsaoiMap
+from legdistort.plots import elements
+from legdistort.reporting import comparison_plots
+from legdistort.results import accuracy
 
 IMAGES = Path(__file__).parents[1] / "images" / "paper"
 BLACK, BLUE, ORANGE, RED, GREEN, GREY = "#000000", "#0072B2", "#E69F00", "#D55E00", "#009E73", "#9a9a9a"
@@ -47,10 +50,10 @@ def first_modes(shape=(100, 100), amplitude=24.0):
     titles = ["no distortion", "m = 0: L₀(x) L₀(y), shift", "m = 1: L₁(x) L₀(y), scale", "m = 2: L₀(x) L₁(y), shear"]
     for k, (ax, title) in enumerate(zip(panels, titles, strict=True)):
         coefficients = np.zeros((2, 3))
-        drawing.draw_grid(ax, shape, coefficients, color=GREY, linewidth=0.6)
+        elements.draw_grid(ax, shape, coefficients, color=GREY, linewidth=0.6)
         if k:
             coefficients[0, k - 1] = amplitude
-        drawing.draw_grid(ax, shape, coefficients, color=BLUE, linewidth=1.0)
+        elements.draw_grid(ax, shape, coefficients, color=BLUE, linewidth=1.0)
         ax.autoscale_view()
         ax.set(aspect="equal", xlabel="x [px]")
         ax.set_title(title, loc="left", fontsize="medium")
@@ -68,8 +71,8 @@ def application(sim, magnified=30):
     panels[0, 0].set_title("reference positions X_ref", loc="left", fontsize="medium")
     for i, name in enumerate(truth.names[:3]):
         ax = panels[0, i + 1]
-        drawing.draw_grid(ax, truth.shape, np.zeros_like(truth.coefficients[i]), color=GREY, linewidth=0.4)
-        drawing.draw_grid(ax, truth.shape, magnified * truth.coefficients[i], color=BLUE, linewidth=0.9)
+        elements.draw_grid(ax, truth.shape, np.zeros_like(truth.coefficients[i]), color=GREY, linewidth=0.4)
+        elements.draw_grid(ax, truth.shape, magnified * truth.coefficients[i], color=BLUE, linewidth=0.9)
         ax.set_title(f"distortion D_{i}, × {magnified}", loc="left", fontsize="medium")
         ax = panels[1, i + 1]
         moved = xy + magnified * (truth.distort(name, xy) - xy)
@@ -134,7 +137,7 @@ def error_map(sim, grid, sigma, square):
     ax.plot(*sim.truth.positions.T, "x", color="black", markersize=8, mew=1.2)
     ax.add_patch(plt.Rectangle(square[0], *np.ptp(square, axis=0), fill=False, color=RED, linewidth=2))
     ax.set(aspect="equal", xlabel="x [px]", ylabel="y [px]")
-    inside = performance.in_contour(grid, square)
+    inside = accuracy.in_contour(grid, square)
     rms = [np.sqrt(np.mean(part**2)) for part in (sigma, sigma[inside])]
     ax.set_title(f"σ_grid = {rms[0]:.3f} px, σ_contour = {rms[1]:.3f} px (red square)", loc="left", fontsize="medium")
     return fig
@@ -337,7 +340,7 @@ def _picture(ax, image, corner, limits, *, block=1):
 
 def _show(ax, image, most=450):
     block = max(1, -(-max(image.shape) // most))
-    small = drawing.block_mean(image, block)
+    small = elements.block_mean(image, block)
     sky, high = np.nanpercentile(small, [50, 84])
     _picture(ax, np.arcsinh((small - sky) / (high - sky)), (0, 0), (-1, 5), block=block)
     ax.set(xlabel="x [px]", ylabel="y [px]")

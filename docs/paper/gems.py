@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import legdistort as ld
-from legdistort import baselines, performance, rendering
+from legdistort.assessment import baselines
 from legdistort.demo import nearest
-from legdistort.instruments import gsaoi_static
-from legdistort.night import Night
-from legdistort.truth import Truth
+from legdistort.geometry.gsaoi import gsaoi_static
+from legdistort.results import accuracy
+from legdistort.simulation import rendering
+from legdistort.simulation.gsaoi_night import Night
+from legdistort.simulation.truth import Truth
 
 #: Rms over the detector, both axes together, pixels.
 DYNAMIC, RESIDUE = 0.62, 0.31
@@ -63,7 +65,7 @@ def correct(twin, *, errors="stated"):
 def absolute_error(twin, solution, *, removed):
     """Error b of the reference positions after a common similarity or polynomial, pixels per axis."""
     true = nearest(solution.positions, twin.truth.positions)
-    return performance.bias(solution.positions, true, removed=removed)
+    return accuracy.bias(solution.positions, true, removed=removed)
 
 
 def noise_curve(exposure, night, fwhm, fluxes, *, n=100, size=1024, seed=0):

@@ -8,8 +8,10 @@ from astropy.table import Table, vstack
 from families import data_folder, nirc2_files
 
 import legdistort as ld
-from legdistort import baselines, basis, performance
-from legdistort.priors import similarity_basis
+from legdistort.assessment import baselines
+from legdistort.geometry import basis
+from legdistort.geometry.detector_modes import similarity_basis
+from legdistort.results import accuracy
 
 SHAPE = (1100, 1100)
 FLOOR = 0.02
@@ -154,7 +156,7 @@ def report(figures):
         for (degree, name), (scale, error, gain) in found["scale"].items():
             yield f"  degree {degree}: {scale:.2f} +- {error:.2f} times the {name} wanted (chi2 falls by {gain:.0f})"
         for name, made in found["corrections"].items():
-            s = performance.scatter_summary(made)
+            s = accuracy.scatter_summary(made)
             yield f"  {name:22s} sigma_j {s['mean']:.3f} +- {s['std']:.3f} px per axis, {s['n_stars']} stars"
 
 

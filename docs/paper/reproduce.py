@@ -26,10 +26,11 @@ import numpy as np
 import simulations
 
 import legdistort as ld
-from legdistort import baselines, performance
+from legdistort.assessment import baselines
+from legdistort.assessment.stack_quality import assess
 from legdistort.exceptions import LegdistortWarning
-from legdistort.instruments import GsaoiMap
-from legdistort.quality import assess
+from legdistort.geometry.gsaoi import GsaoiMap
+from legdistort.results import accuracy
 
 HERE = Path(__file__).parent
 
@@ -72,7 +73,7 @@ def model(plan):
     sim = ld.simulate_matches(n_exposures=30, seed=1)
     solution = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static), gauge=simulations.GAUGE)
     plan.save(figures.one_star(sim, solution), "schema")
-    corrected = performance.corrected_positions(solution)
+    corrected = accuracy.corrected_positions(solution)
     apart = np.abs(np.nanmean(corrected, axis=0) - solution.positions).max()
     yield Row("3.3", "mean of corrected positions − X_ref, px", "a few 0.001", f"{apart:.4f}", "largest of 30 stars")
 
@@ -81,8 +82,8 @@ def simulation_1(plan):
     """Section 4.1."""
     sim, solution, grid, sigma, square = simulations.simulation_1(n_grid=50 if plan.quick else simulations.N_GRID)
     plan.save(figures.error_map(sim, grid, sigma, square), "ergrid")
-    inside = performance.in_contour(grid, square)
-    b = performance.bias(solution.positions, sim.truth.positions)
+    inside = accuracy.in_contour(grid, square)
+    b = accuracy.bias(solution.positions, sim.truth.positions)
     yield Row("Sim. 1", "b, px", "0.05", f"{b:.3f}", "one outcome")
     yield Row("Sim. 1", "σ_contour, px", "0.16", f"{simulations.rms(sigma[inside]):.3f}", "one outcome")
     yield Row("Sim. 1", "σ_grid, px", "0.2", f"{simulations.rms(sigma):.3f}", "one outcome")
@@ -209,7 +210,7 @@ def _noise(plan, twin_):
 def _four(solutions, twin_, label, *, published=False):
     paper = dict(zip(solutions, ("0.83 ± 0.40", "0.41 ± 0.21", "0.24 ± 0.21", "0.20 ± 0.20"), strict=False))
     for name, solution in solutions.items():
-        s = performance.scatter_summary(solution)
+        s = accuracy.scatter_summary(solution)
         both = f"both axes {s['mean_total']:.3f} ± {s['std_total']:.3f}; {label}"
         yield Row(
             "5.3",
@@ -244,8 +245,8 @@ def _stack(plan, twin_, solutions):
 
 def _zooms(method, static, n=2, apart=400, least=8):
     """Where the static correction is worst, among the brighter half of the stars, on most exposures."""
-    corrected = performance.corrected_positions(static)
-    sigma = np.nan_to_num(performance.scatter(corrected))
+    corrected = accuracy.corrected_positions(static)
+    sigma = np.nan_to_num(accuracy.scatter(corrected))
     seen = np.isfinite(corrected[..., 0]).sum(axis=0)
     bright = np.asarray(method.stars["flux"]) > np.nanmedian(method.stars["flux"])
     chosen = []
@@ -290,7 +291,7 @@ def beyond(plan):
                 label, f"degree {degree}: multiple of the {name} wanted", "", f"{scale:.2f} ± {error:.2f}", remark
             )
         for name, solution in made["corrections"].items():
-            s = performance.scatter_summary(solution)
+            s = accuracy.scatter_summary(solution)
             yield Row(label, f"σ_j, px: {name}", "", f"{s['mean']:.3f} ± {s['std']:.3f}", f"{s['n_stars']} stars")
 
 

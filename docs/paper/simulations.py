@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import legdistort as ld
-from legdistort import basis, performance, poses
-from legdistort.simulation import matches_from
+from legdistort.geometry import basis, similarity
+from legdistort.results import accuracy
+from legdistort.simulation.observations import matches_from
 
 #: Standard deviations of the measured positions, pixels; at 0 the errors are 0 but for rounding.
 LEVELS = (0.03, 0.07, 0.14, 0.28)
@@ -26,8 +27,8 @@ def simulation_1(seed=0, *, n_grid=N_GRID):
     sim = ld.simulate_matches(seed=seed)
     solution = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static), gauge=GAUGE)
     grid = sim.truth.grid(sim.truth.names[0], n_grid)
-    sigma = performance.new_scatter(solution, sim.truth.distort, grid, 0.14, rng=np.random.default_rng(seed))
-    return sim, solution, grid, sigma, performance.contour(sim.truth.positions, fraction=FRACTION_INSIDE)
+    sigma = accuracy.new_scatter(solution, sim.truth.distort, grid, 0.14, rng=np.random.default_rng(seed))
+    return sim, solution, grid, sigma, accuracy.contour(sim.truth.positions, fraction=FRACTION_INSIDE)
 
 
 @dataclass(frozen=True)
@@ -54,13 +55,13 @@ class Outcome:
         )
         truth = sim.truth
         solution = ld.solve(sim.matches, prior=ld.Prior(truth.static) if self.static_known else None, gauge=GAUGE)
-        b = [performance.bias(solution.positions, truth.positions, removed=removed) for removed in (None, 3)]
+        b = [accuracy.bias(solution.positions, truth.positions, removed=removed) for removed in (None, 3)]
         if not self.n_grid:
             return (*b, np.nan, np.nan)
         grid = truth.grid(truth.names[0], self.n_grid)
         rng = np.random.default_rng((self.seed, 1))
-        scatter = performance.new_scatter(solution, truth.distort, grid, self.sigma, rng=rng)
-        inside = performance.in_contour(grid, performance.contour(truth.positions, fraction=FRACTION_INSIDE))
+        scatter = accuracy.new_scatter(solution, truth.distort, grid, self.sigma, rng=rng)
+        inside = accuracy.in_contour(grid, accuracy.contour(truth.positions, fraction=FRACTION_INSIDE))
         return (*b, rms(scatter[inside]), rms(scatter))
 
 
@@ -137,7 +138,7 @@ def simulation_5(kind, *, amplitude=1.0, n_stars=1000, n_exposures=10, seed=0):
     matches = matches_from(truth, observed, errors, np.random.default_rng(0), noise=0)
     solution = ld.solve(matches, prior=ld.Prior(sim.truth.static), gauge=GAUGE)
     found = np.stack([whole_coefficients(solution, name) for name in solution.names])
-    return found - sim.truth.coefficients, performance.bias(solution.positions, truth.positions)
+    return found - sim.truth.coefficients, accuracy.bias(solution.positions, truth.positions)
 
 
 def x4_coefficients():
@@ -152,7 +153,7 @@ def whole_coefficients(solution, name):
 
     def displacement(u, v):
         xy = basis.denormalize(u, v, shape)
-        return (distortion(poses.apply(solution.poses[name], xy)) - xy).T
+        return (distortion(similarity.apply(solution.poses[name], xy)) - xy).T
 
     return basis.project(displacement, solution.degree, solution.degree + 6)
 

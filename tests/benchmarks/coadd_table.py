@@ -48,10 +48,10 @@ def prepare(folder, small):
     from astropy.io import fits
 
     from legdistort import coadd, match, measure, read_exposures, simulate_exposures, solve
-    from legdistort.attachment import attach
     from legdistort.demo import nearest
-    from legdistort.instruments import gsaoi_static
-    from legdistort.priors import Prior
+    from legdistort.geometry.gsaoi import gsaoi_static
+    from legdistort.priors.prior import Prior
+    from legdistort.wcs.attachment import attach
 
     night = simulate_exposures(small=small, seed=0)
     paths = night.write(folder / "frames")
@@ -78,10 +78,11 @@ def prepare(folder, small):
 
 def ours(folder, out, *, compiled=True, **options):
     """`legdistort.coadd`."""
-    from legdistort import Solution, coadd, open_exposures, resampling
+    from legdistort import Solution, coadd, open_exposures
+    from legdistort.coaddition.resampling import engines
 
     if not compiled:
-        resampling.COMPILED_FROM = float("inf")
+        engines.COMPILED_FROM = float("inf")
     solution = Solution.read(folder / "solution.asdf")
     with timed():
         mosaic = coadd(open_exposures(frames(folder)), solution, **options)
@@ -155,8 +156,8 @@ def single_reproject(folder, out, *, stock):
     import asdf
     from reproject import reproject_interp
 
-    from legdistort.archive import write_wcs
-    from legdistort.grids import reference_grid
+    from legdistort.coaddition.grids import reference_grid
+    from legdistort.wcs.files import write_wcs
 
     solution, _, _ = inputs(folder)
     path = frames(folder)[0]
@@ -246,8 +247,9 @@ def judge(folder):
     import numpy as np
     from astropy.io import fits
 
-    from legdistort import Solution, performance
-    from legdistort.sharpness import measure_shapes
+    from legdistort import Solution
+    from legdistort.assessment.star_shapes import measure_shapes
+    from legdistort.results import accuracy
 
     truth, solution = np.load(folder / "truth.npz"), Solution.read(folder / "solution.asdf")
     bright = truth["flux"] >= np.median(truth["flux"])
@@ -266,7 +268,7 @@ def judge(folder):
             "fwhm": float(np.median(shapes[keep, 2])),
             "flux": float(np.std(ratio) / np.mean(ratio)),
             "x_ref": float(np.sqrt(np.mean(off**2))),
-            "truth": performance.bias(off + grid[keep], xy[keep], removed=degree),
+            "truth": accuracy.bias(off + grid[keep], xy[keep], removed=degree),
         }
     print(json.dumps(out))
 

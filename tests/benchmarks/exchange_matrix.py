@@ -21,14 +21,15 @@ from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 from numpy.polynomial import polynomial
 
-from legdistort import poses
-from legdistort.attachment import attach
-from legdistort.distortion import Distortion
 from legdistort.exceptions import ExportError, LegdistortWarning
-from legdistort.headers import make_header
-from legdistort.priors import Prior
-from legdistort.source_files import read_source
-from legdistort.wcs import exposure_wcs
+from legdistort.geometry import similarity
+from legdistort.geometry.distortion import Distortion
+from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.priors.from_files import read_source
+from legdistort.priors.prior import Prior
+from legdistort.wcs.attachment import attach
+from legdistort.wcs.exposure_wcs import exposure_wcs
+from legdistort.wcs.fits_headers import make_header
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import test_headers
@@ -92,7 +93,7 @@ def imported(what, reader, where, plane, *, degree=5, **options):
     source = read_source(where, ext=options.get("ext"), frame=options.get("frame")).stated(**told)
     x, y = grid(source.shape)
     off = np.array(source.on_plane()(x + source.origin, y + source.origin)) - plane(x, y)
-    scale = poses.describe(prior.plane)["scale"]  # pixels for a unit of the plane
+    scale = similarity.describe(prior.plane)["scale"]  # pixels for a unit of the plane
     return Row(what, reader, float(scale * np.hypot(*off).max()), degree, prior.truncation)
 
 
@@ -254,8 +255,8 @@ def own_wcs():
     mean = np.zeros((2, 10))
     mean[:, 3:] = np.random.default_rng(1).normal(0, 3, (2, 7))
     d = Distortion(mean, (512, 512))
-    sky = poses.TangentPlane(0.0, 89.9, np.array([[-1e-5, 0, 0], [0, 1e-5, 0]]))
-    tree = {"meta": {"wcs": exposure_wcs("a", poses.identity(), d, sky)}}
+    sky = TangentPlane(0.0, 89.9, np.array([[-1e-5, 0, 0], [0, 1e-5, 0]]))
+    tree = {"meta": {"wcs": exposure_wcs("a", similarity.identity(), d, sky)}}
     with tempfile.TemporaryDirectory() as folder:
         paths = Path(folder, "a.asdf"), Path(folder, "a.fits")
         asdf.AsdfFile(tree, version="1.5.0").write_to(paths[0])

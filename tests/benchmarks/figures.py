@@ -3,8 +3,9 @@
 import numpy as np
 import sets
 
-from legdistort import performance, solve
-from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
+from legdistort import solve
+from legdistort.results import accuracy
+from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 
 
 def rms(values):
@@ -20,11 +21,11 @@ def simulation_1(n_seeds=20):
     for seed in range(n_seeds):
         sim = simulate_matches(seed=seed)
         solution = solve(sim.matches, prior=sets.Prior(sim.truth.static))
-        b.append(performance.bias(solution.positions, sim.truth.positions[solution.star_names]))
+        b.append(accuracy.bias(solution.positions, sim.truth.positions[solution.star_names]))
         rng = np.random.default_rng(1000 + seed)
         noisy = [sim.truth.distort(name, grid) + 0.14 * rng.normal(size=grid.shape) for name in solution.names]
         corrected = np.stack([solution.correct(name, xy) for name, xy in zip(solution.names, noisy, strict=True)])
-        sigma.append(rms(performance.scatter(corrected)))
+        sigma.append(rms(accuracy.scatter(corrected)))
     print(f"Simulation 1, {n_seeds} seeds, per axis: b {rms(b):.4f} px, sigma {rms(sigma):.4f} px")
 
 
@@ -38,10 +39,10 @@ def gsaoi(n_seeds=50):
         true = sim.truth.positions[solution.star_names]
         rows.append(
             [
-                performance.bias(solution.positions, true, removed=3),
-                performance.expected_bias(solution, removed=3),
-                performance.bias(solution.positions, true, removed="similarity"),
-                performance.expected_bias(solution, removed="similarity", absolute=True),
+                accuracy.bias(solution.positions, true, removed=3),
+                accuracy.expected_bias(solution, removed=3),
+                accuracy.bias(solution.positions, true, removed="similarity"),
+                accuracy.expected_bias(solution, removed="similarity", absolute=True),
             ]
         )
     b, bound, absolute, reported = (rms(column) for column in zip(*rows, strict=True))

@@ -24,7 +24,7 @@ from astropy.table import Table
 from scipy.spatial import cKDTree
 
 from legdistort.exceptions import LegdistortError
-from legdistort.matching import match
+from legdistort.matching.matcher import match
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import star_fields as fields

@@ -26,8 +26,8 @@ from scipy.spatial import cKDTree
 sys.path.insert(0, str(Path(__file__).parent.parent))
 import star_images as sky
 
-from legdistort.exposures import Exposure
-from legdistort.measurement import Flag, measure
+from legdistort.inputs.exposures import Exposure
+from legdistort.measurement.positions import Flag, measure
 
 BINS = [(10, 30), (30, 100), (100, 300), (300, 1000)]
 

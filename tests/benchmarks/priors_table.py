@@ -10,10 +10,11 @@ import warnings
 import numpy as np
 from scipy.spatial import Delaunay
 
-from legdistort import performance, solve
+from legdistort import solve
 from legdistort.exceptions import LegdistortError
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_matches
+from legdistort.priors.prior import Prior
+from legdistort.results import accuracy
+from legdistort.simulation.observations import simulate_matches
 
 #: Standard deviation of the coefficients from exposure to exposure, pixels, ten modes of degree 0 to 3.
 SPECTRA = {
@@ -48,8 +49,8 @@ def places(sim):
 def errors(solution, sim, *, noise=0.0):
     """b, similarity removed; scatter of new positions among the stars and over the field."""
     rng = np.random.default_rng(0)
-    scatter = [performance.new_scatter(solution, sim.truth.distort, xy, noise, rng=rng) for xy in places(sim)]
-    b = performance.bias(solution.positions, sim.truth.positions, removed="similarity")
+    scatter = [accuracy.new_scatter(solution, sim.truth.distort, xy, noise, rng=rng) for xy in places(sim)]
+    b = accuracy.bias(solution.positions, sim.truth.positions, removed="similarity")
     return np.array([b, *(np.sqrt(np.nanmean(s**2)) for s in scatter)])
 
 

@@ -4,8 +4,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.sparse import csr_array
 
-from legdistort import criterion
-from legdistort.criterion import State
+from legdistort.solving.equations import criterion
+from legdistort.solving.equations.criterion import State
 
 
 def solve_scipy(problem, state):

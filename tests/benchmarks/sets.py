@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from legdistort import problems, starting
-from legdistort.instruments import gsaoi_static
-from legdistort.priors import Prior
-from legdistort.simulation import simulate_gsaoi_matches, simulate_matches
+from legdistort.geometry.gsaoi import gsaoi_static
+from legdistort.priors.prior import Prior
+from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
+from legdistort.solving import start_values
+from legdistort.solving.equations import problem_builder
 
 
 def make(name, *, n_exposures=100, n_stars=10_000):
@@ -22,6 +23,6 @@ def make(name, *, n_exposures=100, n_stars=10_000):
 
 def problem(sim, prior, degree=3):
     """The criterion and its start values."""
-    posed = problems.build(sim.matches, degree, prior=prior)
+    posed = problem_builder.build(sim.matches, degree, prior=prior)
     nominal = np.stack([sim.matches.poses[name] for name in sim.matches.names])
-    return posed, starting.start(posed, nominal)[0]
+    return posed, start_values.start(posed, nominal)[0]

@@ -22,9 +22,12 @@ def measure(name, solver, n_exposures, n_stars):
     import rivals
     import sets
 
-    from legdistort import Matches, kernels, performance, solve, solvers  # kernels: imports do not count
+    from legdistort import Matches, solve
+    from legdistort.results import accuracy
+    from legdistort.solving import minimisers
+    from legdistort.solving.equations import compiled
 
-    assert kernels
+    assert compiled
     warnings.simplefilter("ignore")
     sim, prior = sets.make(name, n_exposures=n_exposures, n_stars=n_stars)
     true = sim.truth.positions[sim.matches.stars]
@@ -41,7 +44,7 @@ def measure(name, solver, n_exposures, n_stars):
             if solver == "scipy":
                 state, chi2 = rivals.solve_scipy(problem, start)
             else:
-                result = solvers.solve_alternating(problem, start, max_iterations=300)
+                result = minimisers.solve_alternating(problem, start, max_iterations=300)
                 state, chi2, sweeps = result.state, result.blocks.chi2, len(result.history)
             positions = state.positions.T
         times.append(time.perf_counter() - begin)
@@ -52,13 +55,13 @@ def measure(name, solver, n_exposures, n_stars):
         "n_obs": len(table),
         "seconds": min(times[1:] or times),
         "MB": memory,
-        "b": performance.bias(positions, true, removed=3),
+        "b": accuracy.bias(positions, true, removed=3),
         "chi2": chi2,
     }
     if solver == "alternating":
         row["sweeps"] = sweeps
     if solver == "joint":
-        row["sigma"] = float(performance.scatter(performance.corrected_positions(solution)).mean())
+        row["sigma"] = float(accuracy.scatter(accuracy.corrected_positions(solution)).mean())
         begin = time.perf_counter()
         _ = solution.stars
         row["covariance"] = time.perf_counter() - begin

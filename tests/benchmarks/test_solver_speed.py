@@ -4,7 +4,8 @@ import pytest
 import rivals
 import sets
 
-from legdistort import Matches, solve, solvers
+from legdistort import Matches, solve
+from legdistort.solving import minimisers
 
 
 @pytest.fixture(scope="module", params=["simulation 1", "gsaoi-like", "large"])
@@ -45,6 +46,6 @@ def test_rivals(benchmark, posed, rival):
         assert benchmark.pedantic(rivals.solve_scipy, args=(problem, start), rounds=1)[1] > 0
     else:
         result = benchmark.pedantic(
-            solvers.solve_alternating, args=(problem, start), kwargs={"max_iterations": 300}, rounds=1
+            minimisers.solve_alternating, args=(problem, start), kwargs={"max_iterations": 300}, rounds=1
         )
         assert result.blocks.chi2 > 0

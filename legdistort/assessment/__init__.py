@@ -1,0 +1,1 @@
+"""How good a solution and a mosaic are, compared with other corrections."""

@@ -1,0 +1,334 @@
+"""What the method is compared with (Bernard et al. 2017, section 5.3): shifts, static map, relative polynomial.
+
+Every function takes `Matches` and returns a `Solution`, whose residuals, stars and corrections are used like those of
+`legdistort.solve`. Their models leave distortion in the data on purpose, so the stated errors cannot be right: all
+reported errors are scaled to the residuals, and the absolute ones, ``x_err_abs`` and ``y_err_abs``, are not
+available (NaN): nothing in these fits tells how far their plane is from the sky.
+"""
+
+import logging
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+
+from ..exceptions import InputError, LegdistortError, SolveError
+from ..geometry import basis, similarity
+from ..inputs.matches import Matches
+from ..priors.prior import means
+from ..results.gauge import Gauge
+from ..results.solution import Solution
+from ..solving import minimisers
+from ..solving.equations import criterion
+from ..solving.equations import problem_builder as problems
+from ..solving.equations.covariances import Uncertainty
+from ..solving.equations.criterion import State
+from ..solving.gauge import constraints
+
+log = logging.getLogger(__name__)
+
+#: Linear parts of poses that differ by less than this are the same orientation.
+_SAME_ORIENTATION = 0.02
+#: Name of the solution itself in a comparison.
+METHOD = "all distortions solved"
+
+
+def solve_shifts(matches, *, prior=None, weighted=False):
+    """Shifts between exposures and nothing else; with a prior, after its static distortion was taken out.
+
+    Rotation and scale are those of the nominal poses, averaged over the exposures of like orientation, so that none
+    is fitted to single exposures.
+
+    Parameters
+    ----------
+    matches : Matches
+    prior : Prior or dict, optional
+        Static distortion, as for `legdistort.solve`; its widths play no part.
+    weighted : bool
+        Weight by the stated errors; otherwise, and by default, all positions alike, because the distortion that is
+        left exceeds the errors.
+
+    Returns
+    -------
+    Solution
+        Of degree 0, in pixels of the undistorted detector: ``settings["method"]`` is "shift" or "static + shift".
+    """
+    matches = replace(_checked(matches), poses=_without_own_turns(matches))
+    stated = replace(problems.build(matches, 0, prior=means(prior)), prior_sigma=None, static_sigma=None)
+    problem = stated if weighted else _equal(stated)
+    state = State(matches.positions.T.copy(), problem.prior_mean.copy(), _stacked(matches))
+    result = minimisers.solve_joint(problem, state)
+    name = "shift" if prior is None else "static + shift"
+    convention = _convention(result.gauge, name, "the mean of all exposures")
+    return _solution(matches, (stated, problem), result.state, convention, Uncertainty)
+
+
+def solve_relative(matches, *, degree=3, reference=None, weighted=True, error_floor=0.0):
+    """A polynomial from one exposure, or from the mean of all, to every other: relative correction.
+
+    The positions measured in the reference exposure, errors and distortion and all, are taken for the plane. The stars
+    that it does not see are averaged from the others.
+
+    Parameters
+    ----------
+    matches : Matches
+    degree : int
+        Total degree of the polynomials.
+    reference : str, optional
+        Exposure that serves as reference (Bernard et al. 2016: "one reference frame chosen arbitrarily"); by default
+        the one with most stars. "mean" stands for a master frame: the mean of all exposures after similarities.
+    weighted : bool
+        Weight by the errors of both positions; otherwise all stars alike.
+    error_floor : float
+        Pixels, added in quadrature to every error.
+
+    Returns
+    -------
+    Solution
+        Errors of the coefficients include those of the reference positions, as if they were independent for every
+        exposure.
+
+    Raises
+    ------
+    InputError
+        If there is no such exposure.
+    SolveError
+        Naming an exposure that shares fewer stars with the reference than the polynomial has modes.
+    """
+    problem = problems.build(_checked(matches), degree, error_floor=error_floor)
+    target, variance, name = _reference(matches, problem, reference)
+    state = State(target, np.zeros((problem.n_exposures, 2, problem.n_modes)), _stacked(matches))
+    state = State(target, state.coefficients, _fit_poses(problem, state, variance))
+    state, covariance = _fit_polynomials(problem, state, variance, weighted=weighted)
+    state, _ = constraints.absorb_similarities(problem, state)
+    fixed = np.zeros((problem.n_exposures, 1, 1))
+    fixed[slice(None) if name is None else problem.names.index(name)] = 1
+    convention = constraints.make("minimal", problem, state, criterion.linearise(problem, state))
+    rows = (fixed * np.eye(2 * problem.n_modes)).transpose(1, 0, 2)
+    plane = "the mean of all exposures" if name is None else f"the detector of exposure {name}, undistorted by decree"
+    convention = _convention(convention, "relative polynomial", plane, constraint=rows)
+    state = State(_corrected_mean(matches, problem, state), state.coefficients, state.poses)
+
+    def uncertainty(problem, blocks, gauge, *, scale):
+        return _Conditional(problem, blocks, gauge, covariance, scale)
+
+    weights = problem if weighted else _equal(problem)
+    return _solution(matches, (problem, weights), state, convention, uncertainty)
+
+
+def compare(matches, solution, *, prior=None):
+    """The four corrections of the paper (section 5.3.1, Figure "ercomp") on the observations that a solution used.
+
+    Parameters
+    ----------
+    matches : Matches
+        What was solved.
+    solution : Solution
+        What `legdistort.solve` made of it: the method. Its clipped observations and exposures take no part, and its
+        error floor is that of the polynomial too.
+    prior : Prior or dict, optional
+        Static distortion; without one the second correction is left out.
+
+    Returns
+    -------
+    dict
+        ``{name: Solution}``: "shift", "static + shift", "relative polynomial", "all distortions solved". A
+        correction that fails on these data is left out, with a warning in the log that says why.
+    """
+    table = solution.observations[solution.observations["used"]]
+    table = table[matches.table.colnames]
+    kept = {name: matches.poses[name] for name in solution.names}
+    same = Matches.from_table(table, shape=solution.shapes, poses=kept, sky=matches.sky)
+    floor = solution.settings.get("error_floor", 0.0)
+    calls = {
+        "shift": lambda: solve_shifts(same),
+        "static + shift": lambda: solve_shifts(same, prior=prior),
+        "relative polynomial": lambda: solve_relative(same, degree=max(solution.degree, 1), error_floor=floor),
+    }
+    if prior is None:
+        del calls["static + shift"]
+    out = {}
+    for name, call in calls.items():
+        try:
+            made = call()
+            made.max_inverse_error  # noqa: B018  (a map that folds is of no use)
+            out[name] = made
+        except LegdistortError as error:
+            log.warning("%s is left out of the comparison: %s", name, error)
+    return out | {METHOD: solution}
+
+
+# -- pieces
+
+
+def _checked(matches):
+    if not isinstance(matches, Matches):
+        raise InputError(f"matches must be Matches, got {type(matches).__name__}")
+    return matches
+
+
+def _equal(problem):
+    """The problem with one weight for all observations."""
+    weight = np.zeros_like(problem.weight)
+    weight[:2] = np.median(problem.weight[:2])
+    return replace(problem, weight=weight)
+
+
+def _stacked(matches):
+    return np.stack([matches.poses[name] for name in matches.names])
+
+
+def _without_own_turns(matches):
+    """Poses whose linear part is the mean of those of like orientation; the middle of every detector stays put."""
+    linear = _stacked(matches)[:, :, :2]
+    out = {}
+    for name, own in zip(matches.names, linear, strict=True):
+        pose, size = matches.poses[name], np.array(matches.shapes[name][::-1])
+        like = np.linalg.norm(linear - own, axis=(1, 2)) < _SAME_ORIENTATION * np.linalg.norm(own)
+        mean, middle = linear[like].mean(axis=0), (size - 1) / 2
+        out[name] = np.column_stack([mean, middle - mean @ similarity.apply(similarity.invert(pose), middle)])
+    return out
+
+
+def _reference(matches, problem, reference):
+    """Reference positions (2, n_stars), their variance (2, n_stars) [pix^2], infinite if unknown, and the exposure."""
+    variance = np.full((2, problem.n_stars), np.inf)
+    target = matches.positions.T.copy()
+    if reference == "mean":
+        total = np.stack([np.bincount(problem.star, w, problem.n_stars) for w in problem.weight[:2]])
+        return target, 1 / total, None
+    name = reference
+    if name is None:
+        name = problem.names[int(np.argmax(np.diff(problem.start)))]
+    if name not in problem.names:
+        raise InputError(f"reference must be 'mean' or one of {', '.join(problem.names)}, got {reference!r}")
+    part = problem.part(problem.names.index(name))
+    target[:, problem.star[part]] = similarity.apply(similarity.invert(matches.poses[name]), problem.xy[:, part].T).T
+    variance[:, problem.star[part]] = 1 / problem.weight[:2, part]
+    return target, variance, name
+
+
+def _fit_poses(problem, state, variance):
+    """Similarities (n_exposures, 2, 3) from the reference positions to those of every exposure."""
+    out = state.poses.copy()
+    for i, name in enumerate(problem.names):
+        own = problem.star[problem.part(i)]
+        known = np.isfinite(variance[0, own])
+        if np.count_nonzero(known) < max(problem.n_modes, 2):
+            raise SolveError(
+                f"exposure {name} shares {np.count_nonzero(known)} stars with the reference, fewer than the "
+                f"{problem.n_modes} modes of degree {problem.degree}: lower the degree or take another reference"
+            )
+        xy = problem.xy[:, problem.part(i)][:, known].T
+        parity = 1 if np.linalg.det(out[i, :, :2]) > 0 else -1
+        out[i] = similarity.fit_similarity(state.positions[:, own[known]].T, xy, parity=parity)
+    return out
+
+
+def _fit_polynomials(problem, state, variance, *, weighted):
+    """Coefficients of every exposure given the reference positions, and their covariances, one block an exposure."""
+    coefficients, blocks = state.coefficients.copy(), []
+    for i, name in enumerate(problem.names):
+        part = problem.part(i)
+        own, (_, b, _) = problem.star[part], criterion.predict(problem, state, i)
+        offset = problem.xy[:, part] - similarity.apply(state.poses[i], state.positions[:, own].T).T
+        covariance = np.zeros((2 * problem.n_modes, 2 * problem.n_modes))
+        for axis in (0, 1):
+            known = np.isfinite(variance[axis, own])
+            noise = 1 / problem.weight[axis, part][known] + variance[axis, own[known]]
+            weight = 1 / noise if weighted else np.ones_like(noise)
+            design = b[:, known] * np.sqrt(weight)
+            if np.linalg.cond(design) > 1e7:
+                raise SolveError(f"the stars of exposure {name} do not determine degree {problem.degree}: lower it")
+            to_coefficients = np.linalg.pinv(design.T) * np.sqrt(weight)
+            coefficients[i, axis] = to_coefficients @ offset[axis, known]
+            span = slice(axis * problem.n_modes, (axis + 1) * problem.n_modes)
+            covariance[span, span] = to_coefficients * noise @ to_coefficients.T
+        blocks.append(covariance)
+    return State(state.positions, coefficients, state.poses), np.stack(blocks)
+
+
+def _corrected_mean(matches, problem, state):
+    """Weighted mean (2, n_stars) of the corrected positions of every star."""
+    from ..geometry.distortion import Distortion
+
+    weight = problem.weight[:2].sum(axis=0)
+    sums = np.zeros((2, problem.n_stars))
+    for i, name in enumerate(problem.names):
+        part = problem.part(i)
+        distortion = Distortion(state.coefficients[i], problem.shapes[i], name)
+        back = similarity.apply(similarity.invert(state.poses[i]), distortion.invert(problem.xy[:, part].T))
+        np.add.at(sums.T, problem.star[part], weight[part, None] * back)
+    return sums / np.bincount(problem.star, weight, problem.n_stars)
+
+
+class _Conditional(Uncertainty):
+    """Errors where the coefficients of every exposure were fitted by themselves: no covariance between exposures."""
+
+    def __init__(self, problem, blocks, gauge, covariance, scale):
+        super().__init__(problem, blocks, gauge, scale=scale)
+        self._blockwise = covariance
+
+    @cached_property
+    def coefficients(self):
+        n, size, _ = self._blockwise.shape
+        out = np.zeros((n, size, n, size))
+        out[np.arange(n), :, np.arange(n)] = self._scale**2 * self._blockwise
+        return out.reshape(n * size, n * size)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class _Convention(Gauge):
+    """The plane of a baseline, in words; what it hides is not known."""
+
+    words: str = ""
+
+    @property
+    def sentence(self):
+        """The convention in a sentence."""
+        return self.words
+
+    def __str__(self):
+        return self.words
+
+
+def _convention(gauge, name, plane, **changes):
+    given = {field.name: getattr(gauge, field.name) for field in fields(gauge)} | changes
+    given["dynamic"] = np.full_like(gauge.dynamic, np.nan)  # absolute errors come out as NaN, from a file too
+    return _Convention(**given, words=f"{name}: the plane is {plane}; absolute errors are not available")
+
+
+def _solution(matches, problems, state, gauge, uncertainty):
+    """The frozen result: chi2 by the stated errors, reported errors scaled by what the weights in force leave."""
+    stated, problem = problems
+    blocks = criterion.linearise(problem, state)
+    table = QTable(matches.table, copy=False)
+    back = np.empty_like(blocks.residual)
+    back[:, problem.order] = blocks.residual
+    table["dx"], table["dy"] = back * u.pix
+    table["used"] = np.ones(len(table), dtype=bool)
+    dof = 2 * len(table) - 2 * problem.n_stars - (problem.n_exposures - 1) * 2 * problem.n_modes
+    scale = float(np.sqrt(blocks.chi2 / dof)) if dof > 0 else 1.0
+    method = gauge.words.split(":")[0]
+    degree = basis.degree_of(problem.n_modes)
+    return Solution(
+        names=problem.names,
+        degree=degree,
+        shapes=dict(matches.shapes),
+        poses=dict(zip(problem.names, state.poses, strict=True)),
+        coefficients=state.coefficients,
+        prior_mean=problem.prior_mean,
+        star_names=np.asarray(matches.stars),
+        positions=state.positions.T.copy(),
+        observations=table,
+        chi2=float(criterion.squares(stated, blocks.residual).sum()),
+        dof=dof,
+        status=f"{method}: solved directly",
+        gauge=gauge,
+        uncertainty=uncertainty(problem, blocks, gauge, scale=scale),
+        sky=matches.sky,
+        left_out=dict(matches.left_out),
+        settings={"method": method, "degree": degree, "errors": "scale"},
+    )

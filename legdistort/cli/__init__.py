@@ -1,0 +1,5 @@
+"""The command ``legdistort``."""
+
+from .parser import main
+
+__all__ = ["main"]

@@ -1,0 +1,1 @@
+"""From exposures and a `Solution` to a mosaic."""

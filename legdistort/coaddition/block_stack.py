@@ -1,0 +1,297 @@
+"""A mosaic block by block: the pieces of all exposures that meet a block, resampled and combined."""
+
+from dataclasses import dataclass
+from functools import partial
+from math import ceil
+
+import numpy as np
+
+from ..geometry.star_hull import supported
+from ..runtime.parallel import each
+from ..runtime.scratch import Stored, forget, spill
+from .combination import PixelFlag, combine, margin
+from .levels import Survey, sky_variance
+from .resampling.drizzling import Drop
+from .resampling.engines import resample_exposure
+from .resampling.pixel_maps import ExposureMap
+from .weights import Weight
+
+_SAMPLES = 1 << 23  # pixels of all exposures that are stacked at a time
+_SIDES = 64, 256  # of blocks, px
+_FORGETS = 2, 2, 12, 16, 20, 24  # pixels by which a spline of that order has forgotten, to 1e-8
+_BITS = 32  # exposures in a plane of the context
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Layer:
+    """One exposure of the stack, ready to be resampled.
+
+    Attributes
+    ----------
+    index : int
+        Its place among all.
+    stored : Stored
+        Its planes: ``data``, with bad pixels filled; perhaps ``bad``, ``variance``.
+    map : ExposureMap
+    survey : Survey
+    factor : float
+        Flux scale.
+    variance : float
+        Of the background, at that scale, where there is no such plane.
+    sky : float or None
+        Background, at that scale, that is brought to the common level; None = left alone.
+    weight : Weight
+    fwhm : float or None
+        Of its stars [px].
+    gain : float or None
+        See `legdistort.coaddition.resampling.engines.resample_exposure`.
+    photons : float
+        See `legdistort.coaddition.combination.combine`.
+    support : ndarray or None
+        Half-planes outside which the distortion is extrapolated; None = it does not matter.
+    """
+
+    index: int
+    stored: Stored
+    map: ExposureMap
+    survey: Survey
+    factor: float
+    variance: float
+    sky: float | None
+    weight: Weight
+    fwhm: float | None
+    gain: float | None
+    photons: float = 0.0
+    support: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How exposures become a mosaic.
+
+    Attributes
+    ----------
+    shape : tuple
+        Of the mosaic.
+    method, algorithm, order, conserve
+        See `legdistort.coadd`.
+    level : float
+        The common background level.
+    mask : bool
+        Whether extrapolated pixels are left out.
+    widths : tuple or None
+        The smallest and the largest FWHM of all exposures, if known.
+    drop : `~legdistort.coaddition.resampling.drizzling.Drop` or None
+        For drizzle.
+    compiled : bool
+        See `legdistort.coaddition.resampling.engines.is_compiled`.
+    """
+
+    shape: tuple
+    method: str
+    algorithm: str
+    order: int
+    conserve: str
+    level: float = 0.0
+    mask: bool = False
+    widths: tuple | None = None
+    drop: Drop | None = None
+    compiled: bool = False
+
+    @property
+    def margin(self):
+        """Pixels of an exposure, around those that are wanted, on which their values depend."""
+        if self.algorithm == "interp":
+            return _FORGETS[self.order]
+        return 10
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Block:
+    """A piece of the output grid, ``window``, and the layers that may meet it."""
+
+    window: tuple
+    layers: list
+
+
+def assemble(layers, recipe, folder, **share):
+    """The planes of a mosaic.
+
+    Parameters
+    ----------
+    layers : list of Layer
+    recipe : Recipe
+    folder : path
+        The planes are arrays on the disk of this folder.
+    **share
+        How the work is shared, see `legdistort.runtime.parallel.each`.
+
+    Returns
+    -------
+    list of ndarray
+        Data, variance, weight, count, flags and context, as `stack` gives them for a block.
+    """
+    context = n_planes(len(layers)), *recipe.shape
+    planes = [spill(recipe.shape, np.float32, value, folder) for value in (np.nan, np.nan, 0)]
+    planes += [spill(recipe.shape, dtype, 0, folder) for dtype in (np.int32, np.uint8)]
+    planes += [spill(context, np.uint32, 0, folder)]
+    pieces = list(blocks(layers, recipe))
+    work = partial(stack, recipe=recipe, n_exposures=len(layers))
+    stacked = each(work, pieces, description="co-adding", unit="block", **share)
+    for block, values in zip(pieces, stacked, strict=True):
+        for plane, value in zip(planes, values, strict=True):
+            plane[..., *block.window] = value
+            forget(plane)
+    return planes
+
+
+def n_bytes(shape, n_exposures):
+    """Of the planes of a mosaic."""
+    return int(np.prod(shape)) * (4 * 4 + 1 + 4 * n_planes(n_exposures))
+
+
+def side(n_exposures):
+    """Side of a block [px], so that so many exposures of it are held at once, whoever works on it."""
+    low, high = _SIDES
+    return int(np.clip(np.sqrt(_SAMPLES / n_exposures) // low * low, low, high))
+
+
+def blocks(layers, recipe):
+    """The blocks of the output grid that exposures may meet."""
+    ny, nx = recipe.shape
+    step, edge = side(len(layers)), margin(recipe.method, recipe.widths)
+    for y in range(0, ny, step):
+        for x in range(0, nx, step):
+            window = slice(y, min(y + step, ny)), slice(x, min(x + step, nx))
+            near = [layer for layer in layers if _meet(_widen(window, edge, recipe.shape), layer.map.window)]
+            if near:
+                yield Block(window, near)
+
+
+def n_planes(n_exposures):
+    """Number of planes that the context of so many exposures has."""
+    return ceil(n_exposures / _BITS)
+
+
+def _meet(a, b):
+    return all(s.start < t.stop and t.start < s.stop for s, t in zip(a, b, strict=True))
+
+
+def _widen(window, edge, shape):
+    return tuple(slice(max(0, s.start - edge), min(n, s.stop + edge)) for s, n in zip(window, shape, strict=True))
+
+
+def _inner(window, outer):
+    """A window counted from the start of another one."""
+    return tuple(slice(s.start - o.start, s.stop - o.start) for s, o in zip(window, outer, strict=True))
+
+
+def stack(block, *, recipe, n_exposures):
+    """Combine the exposures that meet a block.
+
+    Parameters
+    ----------
+    block : Block
+    recipe : Recipe
+    n_exposures : int
+        Of the whole mosaic.
+
+    Returns
+    -------
+    data, variance, weight : ndarray of float32, shape (ny, nx)
+    count : ndarray of int32, shape (ny, nx)
+    flags : ndarray of uint8, shape (ny, nx)
+        Bits of `legdistort.coaddition.combination.PixelFlag`.
+    context : ndarray of uint32, shape (n_planes, ny, nx)
+        Bit i % 32 of plane i // 32 is set where exposure i contributes.
+    """
+    outer = _widen(block.window, margin(recipe.method, recipe.widths), recipe.shape)
+    shape = tuple(s.stop - s.start for s in outer)
+    data, variance = np.full((2, len(block.layers), *shape), np.nan, dtype=np.float32)
+    weight = np.zeros(data.shape, dtype=np.float32)
+    doubt = np.zeros(data.shape, dtype=np.uint8)
+    met = []
+    for layer in block.layers:
+        if _resample(layer, outer, recipe, [plane[len(met)] for plane in (data, variance, weight, doubt)]):
+            met.append(layer)
+    inner = _inner(block.window, outer)
+    shape = tuple(s.stop - s.start for s in inner)
+    context = np.zeros((n_planes(n_exposures), *shape), dtype=np.uint32)
+    if not met:
+        empty = np.full(shape, np.nan, dtype=np.float32)
+        nothing = (np.zeros(shape, dtype=dtype) for dtype in (np.float32, np.int32, np.uint8))
+        return empty, empty, *nothing, context
+    n = len(met)
+    photons = [layer.photons for layer in met]
+    spare = doubt[:n] & PixelFlag.SATURATED > 0
+    combined = combine(
+        data[:n],
+        variance[:n],
+        weight[:n],
+        method=recipe.method,
+        level=recipe.level,
+        photons=photons if any(photons) else None,
+        spare=spare if spare.any() else None,
+        fwhm=None if recipe.widths is None else [layer.fwhm for layer in met],
+        widths=recipe.widths,
+    )
+    keep = combined.keep[:, *inner]
+    flags = np.bitwise_or.reduce(doubt[:n] * combined.keep, axis=0)
+    if recipe.method == "clipped":
+        rejected = np.isfinite(data[:n]) & ~spare & ~combined.keep
+        flags |= rejected.any(axis=0) * np.uint8(PixelFlag.REJECTED)
+    for layer, used in zip(met, keep, strict=True):
+        plane, bit = divmod(layer.index, _BITS)
+        context[plane] |= used.astype(np.uint32) << np.uint32(bit)
+    planes = combined.data, combined.variance, combined.weight, combined.count, flags
+    return *(p[inner] for p in planes), context
+
+
+def _resample(layer, window, recipe, planes):
+    """Fill the place of one exposure in the stacks of a window; False if it does not meet it."""
+    data, variance, weight, doubt = planes
+    edge = recipe.margin * ceil(layer.map.scale)
+    found = layer.map.piece(window, margin=edge, border=recipe.algorithm == "adaptive")
+    if found is None:
+        return False
+    pixel_map, part = found
+    image, spread = layer.stored.piece("data", part), layer.stored.piece("variance", part)
+    by_pixel = layer.weight.by_pixel and spread is not None
+    if spread is None:
+        spread = layer.variance / layer.factor**2
+    elif by_pixel:
+        spread = np.stack([spread, sky_variance(layer.survey, image, spread)])
+    masks = {plane: layer.stored.piece(plane, part) for plane in ("bad", "full", "rough")}
+    found = resample_exposure(
+        image,
+        masks,
+        spread,
+        pixel_map,
+        algorithm=recipe.algorithm,
+        order=recipe.order,
+        compiled=recipe.compiled,
+        gain=layer.gain,
+        drop=recipe.drop,
+    )
+    value, spread = found.data, found.variance
+    place = _inner(pixel_map.window, window)
+    xy = pixel_map.xy + np.array([part[1].start, part[0].start]).reshape(2, 1, 1)
+    weight[place] = layer.weight.at(xy) * found.coverage
+    if by_pixel:
+        spread, sky = spread
+        weight[place] *= np.nan_to_num(layer.survey.noise**2 / sky)
+    if layer.support is not None:
+        outside = ~supported(layer.support, xy)
+        if recipe.mask:
+            value[outside] = np.nan
+        doubt[place] = outside * np.uint8(PixelFlag.EXTRAPOLATED)
+    if found.full is not None:
+        doubt[place] |= found.full * np.uint8(PixelFlag.SATURATED)
+    factor = layer.factor * (pixel_map.area if recipe.conserve == "flux" else 1.0)
+    if layer.sky is not None:
+        value -= layer.sky / layer.factor
+    value *= factor
+    if layer.sky is not None:
+        value += recipe.level
+    data[place], variance[place] = value, spread * factor**2
+    return True

@@ -1,0 +1,191 @@
+"""The co-added image and its file."""
+
+import re
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import asdf
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS
+
+from ..exceptions import InputError
+from ..runtime.outputs import replacing
+from ..runtime.scratch import forget
+
+_ENDING = re.compile(r"\.(?:(?P<asdf>asdf)|(?:fits|fit|fts)(?P<packed>\.gz|\.bz2)?)$", re.IGNORECASE)
+_ROWS = 256  # that are written at a time
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Mosaic:
+    """Co-added image.
+
+    The planes that `legdistort.coadd` makes are arrays on disk, in a folder for temporary files; only what is worked on
+    comes into memory. Processes forked from this one share them: what one changes, all see.
+
+    Attributes
+    ----------
+    data : ndarray of float32, shape (ny, nx)
+        In the unit of the exposures, at their mean exposure time; NaN where nothing contributes.
+    variance : ndarray of float32, shape (ny, nx)
+        Of each pixel by itself, with the photons of stars if there are uncertainty planes or gains. Interpolation
+        correlates neighbours: the variance of a sum over many pixels is larger than the sum of theirs (about 1.3 times
+        at order 3, 2.2 times at order 1).
+    weight : ndarray of float32, shape (ny, nx)
+        Sum of the weights of the exposures that contribute.
+    footprint : ndarray of int32, shape (ny, nx)
+        Number of exposures that contribute to each pixel.
+    flags : ndarray of uint8, shape (ny, nx)
+        Bits: 1 = the distortion of an exposure that contributes is extrapolated, 2 = saturated in all exposures and
+        used for want of better, 4 = an exposure was rejected (`legdistort.coaddition.combination.PixelFlag`).
+    context : ndarray of uint32, shape (n, ny, nx)
+        Which these are: bit i % 32 of plane i // 32 is set where ``exposures[i]`` contributes.
+    wcs : `~astropy.wcs.WCS`
+        TAN if the sky is known, else linear with the reference plane (0-based) as world; or the WCS asked for.
+    exposures : tuple of str
+        Names of the exposures used.
+    left_out : dict
+        Names of the others, with the reason.
+    offset : tuple of int or None
+        ``(ox, oy)``: the centre of pixel (x, y) is the point (x + ox, y + oy) of the reference plane. None = the
+        mosaic has another grid.
+    header : `~astropy.io.fits.Header`
+        Unit, exposure time, method and what else goes into the file besides the WCS.
+    """
+
+    data: np.ndarray
+    variance: np.ndarray
+    weight: np.ndarray
+    footprint: np.ndarray
+    flags: np.ndarray
+    context: np.ndarray
+    wcs: WCS
+    exposures: tuple
+    left_out: dict = field(default_factory=dict)
+    offset: tuple | None = None
+    header: fits.Header = field(default_factory=fits.Header)
+
+    @property
+    def shape(self):
+        """Image shape ``(ny, nx)``."""
+        return self.data.shape
+
+    def __repr__(self):
+        ny, nx = self.shape
+        left_out = f", {len(self.left_out)} left out" if self.left_out else ""
+        return f"<Mosaic: {nx} x {ny} px, {len(self.exposures)} exposures{left_out}>"
+
+    def contributors(self, x, y):
+        """Names of the exposures that contribute to pixel (x, y) of the mosaic, 0-based.
+
+        Raises
+        ------
+        InputError
+            If the mosaic has no such pixel, or x or y is not a whole number.
+        """
+        ny, nx = self.shape
+        if not (x % 1 == 0 and y % 1 == 0):
+            raise InputError(f"pixels are told by whole numbers, got ({x}, {y}): round them, centres are at integers")
+        if not (0 <= x < nx and 0 <= y < ny):
+            raise InputError(f"pixel ({x}, {y}) is not one of the {nx} x {ny} of the mosaic (x, y from 0)")
+        planes = self.context[:, int(y), int(x)]
+        return tuple(name for i, name in enumerate(self.exposures) if planes[i // 32] >> np.uint32(i % 32) & 1)
+
+    def to_hdulist(self):
+        """The FITS file: image (primary HDU, ``SCI``), ``VAR``, ``WEIGHT``, ``FOOTPRINT``, ``FLAGS``, ``CONTEXT``.
+
+        Each has the WCS. ``CONTEXT`` has a third axis where there are more than 32 exposures; a bit counts them in the
+        order of the keywords ``IMCMB001``, ``IMCMB002``, ...
+        """
+        header = self.header.copy()
+        header.update(self.wcs.to_header(relax=True))
+        if self.offset is not None:  # IRAF's logical = LTM physical + LTV, 1-based: physical is the reference plane
+            for axis, shift in enumerate(self.offset, start=1):
+                header[f"LTM{axis}_{axis}"] = (1.0, "reference-plane pixels are mosaic pixels")
+                header[f"LTV{axis}"] = (-float(shift), "reference plane + LTV = mosaic pixel")
+        context = self.context.view(np.int32)  # the sign is the last bit, as drizzled images have it
+        planes = {"SCI": self.data, "VAR": self.variance, "WEIGHT": self.weight, "FOOTPRINT": self.footprint}
+        planes["FLAGS"] = self.flags
+        planes["CONTEXT"] = context[0] if len(context) == 1 else context
+        hdulist = fits.HDUList()
+        for name, plane in planes.items():
+            hdu = (fits.ImageHDU if hdulist else fits.PrimaryHDU)(plane, header)
+            hdu.name = name
+            hdulist.append(hdu)
+        unit = header.get("BUNIT")
+        if unit:
+            hdulist["VAR"].header["BUNIT"] = f"({unit})**2"
+        for name, meaning in (
+            ("WEIGHT", "sum of weights"),
+            ("FOOTPRINT", "number of exposures"),
+            ("FLAGS", "bits: 1 extrapolated, 2 saturated, 4 rejected"),
+            ("CONTEXT", "bits: exposures IMCMBnnn"),
+        ):
+            hdulist[name].header["BUNIT"] = ("", meaning)
+        return hdulist
+
+    def write(self, path, *, overwrite=False):
+        """Write the mosaic as a FITS file (see `to_hdulist`), or as ASDF.
+
+        The file appears under its name only when it is complete.
+
+        Parameters
+        ----------
+        path : str or path
+            Ending in ``.fits``, ``.fit`` or ``.fts``, with ``.gz`` or ``.bz2`` behind for a compressed file. With
+            ``.asdf`` it is an ASDF file: the planes, ``wcs``, ``exposures``, ``left_out``, ``offset`` and ``header``
+            under ``mosaic``, to be opened with asdf and asdf-astropy alone. Capitals do not matter.
+        overwrite : bool
+            Replace a file that exists.
+
+        Raises
+        ------
+        InputError
+            For another ending; if the file exists and `overwrite` is false, or its folder does not exist.
+        """
+        ending = check_ending(path)
+        with replacing(path, overwrite=overwrite) as temporary:
+            if ending["asdf"]:
+                asdf.AsdfFile({"mosaic": self._tree()}).write_to(temporary)
+            elif ending["packed"]:
+                self.to_hdulist().writeto(temporary)
+            else:
+                for hdu in self.to_hdulist():
+                    _append(temporary, hdu)
+
+    def _tree(self):
+        tree = {each.name: getattr(self, each.name) for each in fields(self)}
+        tree["exposures"], tree["offset"] = list(self.exposures), self.offset and list(self.offset)
+        return tree | {"header": {k: v for k, v in self.header.items() if k not in ("HISTORY", "COMMENT", "")}}
+
+
+def check_ending(path):
+    """The parts of a name that a mosaic may have.
+
+    Returns
+    -------
+    re.Match
+        Its groups ``asdf`` and ``packed`` are None where the name does not ask for them.
+
+    Raises
+    ------
+    InputError
+        For a name that ends otherwise.
+    """
+    ending = _ENDING.search(Path(path).name)
+    if ending is None:
+        raise InputError(
+            f"{path}: the ending says the format of a mosaic; give .fits, .fit or .fts, also with .gz or .bz2 behind, "
+            "or .asdf"
+        )
+    return ending
+
+
+def _append(path, hdu):
+    """Add an HDU to a FITS file, a few rows at a time: astropy would turn the bytes of all of it in memory."""
+    rows = hdu.data.reshape(-1, hdu.data.shape[-1])
+    with fits.StreamingHDU(str(path), hdu.header) as stream:  # of a path it takes the last part for the name
+        for start in range(0, len(rows), _ROWS):
+            stream.write(rows[start : start + _ROWS])
+            forget(rows)

@@ -1,0 +1,349 @@
+"""Resample exposures with the solution's distortions and combine them."""
+
+from dataclasses import replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+from ..exceptions import AssumptionWarning, InputError, warn
+from ..geometry.star_hull import support
+from ..runtime.parallel import each
+from ..runtime.scratch import scratch_folder, store
+from .block_stack import Layer, Recipe, assemble, n_bytes
+from .combination import METHODS
+from .grids import given_grid, reference_grid
+from .levels import bad_pixels, flux_scales, match_backgrounds, saturated_pixels, survey
+from .mosaic import Mosaic
+from .resampling.drizzling import Drop
+from .resampling.engines import (
+    ALGORITHMS,
+    CONSERVE,
+    ORDERS,
+    fill_bad,
+    is_compiled,
+    noise_correlation,
+    rough_pixels,
+    white_gain,
+)
+from .resampling.pixel_maps import map_exposure
+from .weights import EXTRAPOLATED, check_names, make_weights, stellar_widths
+
+_STORED = 5  # bytes a pixel in the scratch folder, about
+_COARSE = 1.5  # pixels of the grid in those of an exposure from which interpolation leaves out too much
+_MEANING = {
+    "COMBINE": "how exposures are combined",
+    "RESAMPLE": "how they are resampled, order or kernel",
+    "CONSERVE": "of stars, or of the sky",
+    "SKYLEVEL": "common level of the backgrounds",
+    "FLXSCALE": "where the flux scales come from",
+    "EXTRAPOL": "pixels outside the stars used",
+    "WEIGHTS": "of the exposures",
+    "NOISECOR": "noise of sums of many pixels over that by VAR",
+}
+_COPIED = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "BUNIT")
+
+
+def coadd(
+    exposures,
+    solution,
+    *,
+    method="mean",
+    order=3,
+    algorithm="interp",
+    grid=None,
+    conserve="flux",
+    match_background=True,
+    weights="noise",
+    scale="auto",
+    extrapolated="flag",
+    pixfrac=1.0,
+    kernel="square",
+    workers=None,
+    scratch=None,
+    progress=False,
+):
+    """Co-add exposures on the distortion-free reference plane, or on any celestial WCS.
+
+    Parameters
+    ----------
+    exposures : sequence of Exposure
+        The images; or what `legdistort.open_exposures` gives: then they are never all in memory.
+    solution : Solution
+        With the distortion of every exposure; an exposure without one is left out with a warning.
+    method : {'mean', 'median', 'clipped'}
+        Weighted mean; median; or weighted mean of what the others confirm, without cosmic rays, hot pixels and trails,
+        where at least three exposures meet (`legdistort.coaddition.combination.confirmed`).
+    order : int or str
+        Order of the spline, 0 to 5, or the name that reproject gives it, such as 'bilinear'.
+    algorithm : {'interp', 'adaptive', 'exact', 'drizzle'}
+        Which of reproject's algorithms, or that of STScI; `order` counts for 'interp' only. 'exact' is fifty times
+        slower. 'drizzle' with `pixfrac` 1 is the same, fast; it needs the extra ``legdistort[drizzle]``.
+    grid : `~astropy.wcs.WCS` or `~astropy.io.fits.Header`, optional
+        Output grid, with its shape. The default is the reference plane, pixel for pixel, as large as all
+        exposures need.
+    conserve : {'flux', 'surface_brightness'}
+        'flux' multiplies by the determinant of the distortion, so that a star has the flux of the exposures.
+        'surface_brightness' leaves pixel values as they are interpolated.
+    match_background : bool
+        Bring the backgrounds to one level, by robust differences where exposures overlap. The level is then
+        left out of the multiplication for 'flux', so that a flat sky stays flat.
+    weights : {'noise', 'variance', 'exptime', 'seeing', 'sigma_map', None} or dict
+        Of the exposures in a mean: 1/sigma^2 of their background noise; the same by pixel, from the uncertainty planes
+        without the photons of stars; exposure time; 'noise' / FWHM^2; 'noise' times s^2 / (s^2 + e^2), e being
+        the error of the distortion correction (`Solution.sigma_map`) and s = 0.02 FWHM that of a star of
+        signal-to-noise ratio 20; equal; or by name.
+    scale : {'auto', 'exptime', 'stars', None} or dict
+        Factors by which data are multiplied: 'exptime' brings all to the mean exposure time if times differ (data
+        in units per second are left alone); 'stars' makes the measured fluxes of common stars agree; 'auto' goes by
+        time unless stars differ from that by more than 2 % and 3 sigma, as through clouds, or times are not known;
+        none; or by name.
+    extrapolated : {'flag', 'mask', 'keep'}
+        Pixels outside the stars used of an exposure, where its distortion is extrapolated (`Solution.supported`): used
+        and flagged in the mosaic; left out; or used.
+    pixfrac, kernel
+        For 'drizzle': side of the drops as a fraction of a pixel, and their shape, 'square', 'turbo' or 'point'.
+    workers : int, optional
+        Threads that share the work. None = the current ``dask.distributed.Client`` if there is one, else this one. The
+        mosaic is the same, bit for bit.
+    scratch : str or path, optional
+        Folder for the pixels of the exposures while work goes on, 4 to 11 bytes for each (17 in double precision), and
+        for those of the mosaic, 21 or more, as long as it is in use; the workers of a cluster must see it. The default
+        is that of the system (``TMPDIR``), which some systems keep in memory.
+    progress : bool
+        Show progress bars.
+
+    Returns
+    -------
+    Mosaic
+
+    Raises
+    ------
+    InputError
+        Naming what is wrong: an option, an exposure whose shape is not that of the solution, a grid
+        without sky or shape, no exposure left, none on the grid.
+    DiskFullError
+        If the disk of `scratch` is full, or has less room than will be needed. Nothing is left behind.
+    """
+    order = _check_options(method, order, algorithm, conserve, extrapolated)
+    drop = Drop(kernel, pixfrac) if algorithm == "drizzle" else None
+    frames, left_out = _select(exposures, solution)
+    for argument, given in (("weights", weights), ("scale", scale)):
+        check_names(argument, given, [*(f.name for f in frames), *left_out])
+    output = reference_grid([f.name for f in frames], solution) if grid is None else given_grid(grid, solution)
+    maps = {f.name: map_exposure(f.name, solution, output, corners=algorithm in ("exact", "drizzle")) for f in frames}
+    left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
+    frames = [f for f in frames if maps[f.name] is not None]
+    share = {"workers": workers, "threads": True, "progress": progress}
+    need = n_bytes(output.shape, len(frames)) + _STORED * sum(int(np.prod(f.shape)) for f in frames)
+    ny, nx = output.shape
+    with scratch_folder(
+        scratch, need, f"a mosaic of {nx} x {ny} px and the pixels of {len(frames)} exposures"
+    ) as folder:
+        kept = each(partial(_keep, folder=folder), frames, description="reading", **share)
+        kept = dict(zip([f.name for f in frames], kept, strict=True))
+        empty = {name: found for name, found in kept.items() if isinstance(found, str)}
+        _warn(empty)
+        left_out |= empty
+        frames = [f for f in frames if f.name not in empty]
+        if not frames:
+            raise InputError(f"no exposure meets the output grid: {_reasons(left_out)}")
+        recipe = Recipe(
+            shape=output.shape,
+            method=method,
+            algorithm=algorithm,
+            order=order,
+            conserve=conserve,
+            mask=extrapolated == "mask",
+            drop=drop,
+            compiled=is_compiled(algorithm, order, sum(np.prod(f.shape) for f in frames)),
+        )
+        factors, origin = flux_scales(frames, scale, solution)
+        sky = match_backgrounds([kept[f.name][1] for f in frames], solution, output, factors)
+        layers, recipe = _layers(
+            frames, kept, maps, solution, recipe, factors=factors, weights=weights, sky=sky, matched=match_background
+        )
+        if extrapolated != "keep":
+            layers = [replace(each, support=support(each.survey.name, solution)) for each in layers]
+        planes = assemble(layers, recipe, folder.parent, **share)
+    _warn_of_misuse(frames, maps, algorithm)
+    settings = {"COMBINE": method, "RESAMPLE": _in_words(algorithm, order, drop), "CONSERVE": conserve}
+    settings |= {"SKYLEVEL": recipe.level if match_background else None, "FLXSCALE": origin, "EXTRAPOL": extrapolated}
+    settings |= {"WEIGHTS": weights if isinstance(weights, str) else "equal" if weights is None else "given"}
+    correlation = noise_correlation(maps[frames[0].name], layers[0].gain, algorithm=algorithm, order=order)
+    settings["NOISECOR"] = correlation if np.isfinite(correlation) else None
+    header = _header(frames, left_out, factors, settings)
+    names = tuple(f.name for f in frames)
+    return Mosaic(*planes, wcs=output.wcs, exposures=names, left_out=left_out, offset=output.offset, header=header)
+
+
+def _layers(frames, kept, maps, solution, recipe, *, factors, weights, sky, matched):
+    """The layers, and the recipe with the common background level and the widths of stars."""
+    noise = {f.name: factors[f.name] * kept[f.name][1].noise for f in frames}
+    weight = make_weights(weights, noise, solution, times={f.name: f.exposure_time for f in frames})
+    fwhm = stellar_widths(solution, list(noise))
+    level = float(np.mean(list(sky.values())))
+    if recipe.conserve == "flux" and not matched:  # the sky counts as flux as well
+        level *= float(np.mean([_area(maps[f.name]) for f in frames]))
+    layers = [
+        Layer(
+            index=i,
+            stored=kept[f.name][0],
+            map=maps[f.name],
+            survey=kept[f.name][1],
+            factor=factors[f.name],
+            variance=noise[f.name] ** 2,
+            sky=sky[f.name] if matched else None,
+            weight=weight[f.name],
+            fwhm=fwhm and fwhm[f.name],
+            gain=white_gain(maps[f.name], algorithm=recipe.algorithm, order=recipe.order, drop=recipe.drop),
+        )
+        for i, f in enumerate(frames)
+    ]
+    layers = [replace(each, photons=_photons(each, f.gain, recipe)) for each, f in zip(layers, frames, strict=True)]
+    return layers, replace(recipe, level=level, widths=_span(fwhm))
+
+
+def _photons(layer, gain, recipe):
+    """Growth of the variance with the signal, by the gain where there is no uncertainty plane (see `Layer.photons`)."""
+    if not gain or "variance" in layer.stored.paths or layer.variance == 0:
+        return 0.0
+    area = _area(layer.map) if recipe.conserve == "flux" else 1.0
+    return float(layer.factor / (layer.variance * area * gain))
+
+
+def _area(exposure_map):
+    """Detector pixels per output pixel in the middle of an exposure."""
+    area = exposure_map.middle()[4].mean()
+    return area if np.isfinite(area) else 1.0
+
+
+def _check_options(method, order, algorithm, conserve, extrapolated):
+    """The order as an integer, all options being sound."""
+    for name, value, allowed in (
+        ("method", method, METHODS),
+        ("algorithm", algorithm, ALGORITHMS),
+        ("conserve", conserve, CONSERVE),
+        ("extrapolated", extrapolated, EXTRAPOLATED),
+    ):
+        if value not in allowed:
+            raise InputError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+    order = ORDERS.get(order, order) if isinstance(order, str) else order
+    if isinstance(order, bool) or order not in range(6):
+        raise InputError(f"order must be an integer from 0 to 5 or one of {', '.join(ORDERS)}, got {order!r}")
+    return int(order)
+
+
+def _span(widths):
+    return (min(widths.values()), max(widths.values())) if widths else None
+
+
+def _in_words(algorithm, order, drop):
+    return {"interp": f"interp {order}", "drizzle": drop and f"drizzle {drop.kernel} {drop.pixfrac:g}"}.get(
+        algorithm, algorithm
+    )
+
+
+def _select(exposures, solution):
+    """Exposures that can be used, and the reasons why others cannot."""
+    exposures = [exposures] if exposures is None or isinstance(exposures, str | Path) else list(exposures)
+    if not all(hasattr(e, "read") for e in exposures):
+        raise InputError(
+            "exposures must be images as open_exposures or read_exposures give them, got "
+            f"{type(exposures[0]).__name__}; give open_exposures('frames/*.fits')"
+        )
+    names = [f.name for f in exposures]
+    twice = {n for n in names if names.count(n) > 1}
+    if twice:
+        raise InputError(f"exposures come twice: {', '.join(sorted(twice))}; names must differ")
+    frames, left_out = [], {}
+    for frame in exposures:
+        if frame.name not in solution.poses:
+            left_out[frame.name] = solution.left_out.get(frame.name, "it is not in the solution")
+        elif frame.shape != tuple(solution.shapes[frame.name]):
+            raise InputError(
+                f"exposure {frame.name}: its shape {frame.shape} is not that of the solution, "
+                f"{tuple(solution.shapes[frame.name])}; a trimmed or binned image needs a solution of its own"
+            )
+        else:
+            frames.append(frame)
+    if not frames:
+        raise InputError(f"no exposure to co-add: {_reasons(left_out) or 'the list is empty'}")
+    _warn(left_out)
+    return frames, left_out
+
+
+def _warn(left_out):
+    if left_out:
+        warn(f"left out of the mosaic: {_reasons(left_out)}", AssumptionWarning)
+
+
+def _keep(frame, folder):
+    """The planes of an exposure, put aside, and its survey; or the reason why it cannot be used."""
+    exposure = frame.read()
+    bad = bad_pixels(exposure)
+    if bad.all():
+        return "every pixel is masked"
+    data, variance = fill_bad(exposure.data, bad), None
+    seen, full = survey(exposure, bad=bad, filled=data), saturated_pixels(exposure) & ~bad
+    if not data.any():
+        return "every pixel is 0"
+    rough = rough_pixels(data, bad, full, seen.noise)
+    if exposure.uncertainty is not None:
+        variance = np.square(exposure.uncertainty, dtype=np.float32)
+        variance[bad] = np.mean(variance, where=~bad)
+    masks = {"bad": bad, "full": full, "rough": rough}
+    planes = {"data": data, "variance": variance} | {name: mask for name, mask in masks.items() if mask.any()}
+    return store(folder, frame.name, planes), seen
+
+
+def _reasons(left_out):
+    names = {reason: [n for n, other in left_out.items() if other == reason] for reason in left_out.values()}
+    return "; ".join(f"{_few(same)}: {reason}" for reason, same in names.items())
+
+
+def _few(names, most=5):
+    more = f" and {len(names) - most} more" * (len(names) > most)
+    return ", ".join(names[:most]) + more
+
+
+def _warn_of_misuse(frames, maps, algorithm):
+    """Of light that is lost between pixels, and of units that do not go together."""
+    scale = max(maps[f.name].scale for f in frames)
+    if algorithm == "interp" and scale > _COARSE:
+        warn(
+            f"pixels of the grid are {scale:.1f} times as large as those of the exposures: interpolation leaves light "
+            "out; take algorithm='adaptive' or 'drizzle'",
+            AssumptionWarning,
+        )
+    units = {str(f.header.get("BUNIT", "")).strip() for f in frames} - {""}
+    if len(units) > 1:
+        warn(
+            f"the units (BUNIT) of the exposures differ: {', '.join(sorted(units))}; values are combined as they are",
+            AssumptionWarning,
+        )
+
+
+def _header(frames, left_out, factors, settings):
+    header = fits.Header()
+    for key in _COPIED:
+        values = {str(f.header.get(key, "")) for f in frames}
+        if len(values) == 1 and values != {""}:
+            header[key] = values.pop()
+    times = [f.exposure_time or None for f in frames]
+    if None not in times:
+        mean = float(np.mean([time * factors[f.name] for f, time in zip(frames, times, strict=True)]))
+        header["EXPTIME"] = (round(mean, 9), "[s] exposure time that the values stand for")
+        header["TEXPTIME"] = (sum(times), "[s] sum of the exposure times")
+    header["NCOMBINE"] = (len(frames), "number of exposures combined")
+    for key, value in settings.items():
+        if value is not None:
+            header[key] = (value, _MEANING[key])
+    header["CREATOR"] = f"legdistort {version('legdistort')}"
+    for i, frame in enumerate(frames[:999], start=1):
+        header[f"IMCMB{i:03d}"] = frame.name
+    for name, reason in left_out.items():
+        header.add_history(f"left out {name}: {reason}")
+    return header

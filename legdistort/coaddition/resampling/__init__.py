@@ -1,0 +1,1 @@
+"""Pieces of one exposure on the output grid."""

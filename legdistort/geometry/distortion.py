@@ -1,0 +1,249 @@
+"""One exposure's distortion: undistorted pixels q -> detector pixels, and its certified inverse.
+
+``D(q) = q + sum_m a_m b_m(u(q))`` (Bernard et al. 2017, eq. for X_ij in section 2.1, with the basis in
+detector coordinates). D is exact; the opposite direction has no closed form and is fitted once by a
+Legendre tensor whose degree is raised until the round trip holds.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..exceptions import FoldError, InputError
+from . import basis
+from .models import _CHUNK, displacement_model
+
+#: Largest round-trip error of a certified inverse, pixels.
+TOLERANCE = 1e-6
+#: A Jacobian determinant below this counts as a fold.
+FOLD = 0.1
+_MAX_INVERSE_DEGREE = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """Fitted inverse of a `Distortion`.
+
+    Attributes
+    ----------
+    tensors : ndarray, shape (2, n, n)
+        Displacement q - p as un-normalised Legendre tensors of the detector pixel p.
+    error : float
+        Largest round-trip error found, detector pixels.
+    valid : tuple
+        ``(x_min, x_max, y_min, y_max)``: box of undistorted pixels around the image of the detector.
+    """
+
+    tensors: np.ndarray
+    error: float
+    valid: tuple
+
+    def __repr__(self):
+        return f"<Inverse: degree {self.tensors.shape[1] - 1}, error {self.error:.1e} px>"
+
+
+@dataclass(frozen=True, eq=False)
+class Distortion:
+    """Distortion of one exposure in its own pixels.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (2, n_modes)
+        Of the normalised basis, x then y, pixels.
+    shape : tuple
+        ``(ny, nx)`` of the detector.
+    name : str
+        For messages.
+    """
+
+    coefficients: np.ndarray
+    shape: tuple
+    name: str = ""
+
+    def __post_init__(self):
+        c = np.asarray(self.coefficients, dtype=float)
+        if c.ndim != 2 or len(c) != 2 or not np.all(np.isfinite(c)):
+            raise InputError(f"coefficients must be finite, of shape (2, n_modes), got shape {c.shape}")
+        basis.degree_of(c.shape[1])
+        object.__setattr__(self, "coefficients", c)
+
+    @property
+    def degree(self):
+        """Total degree."""
+        return basis.degree_of(self.coefficients.shape[1])
+
+    def __repr__(self):
+        ny, nx = self.shape
+        return f"<Distortion{f' of {self.name}' if self.name else ''}: degree {self.degree}, {nx} x {ny} px>"
+
+    def __call__(self, q):
+        """Undistorted pixels (n, 2) -> detector pixels (n, 2)."""
+        q = np.asarray(q, dtype=float)
+        return q + (self.coefficients @ basis.values(self.degree, *basis.normalize(q, self.shape))).T
+
+    def jacobian(self, q):
+        """Derivative dD/dq, shape (n, 2, 2), first index the detector axis."""
+        return self._value_and_jacobian(np.asarray(q, dtype=float))[1]
+
+    def _value_and_jacobian(self, q):
+        b, bu, bv = basis.gradients(self.degree, *basis.normalize(q, self.shape))
+        ny, nx = self.shape
+        jacobian = np.empty((len(q), 2, 2))
+        jacobian[:, :, 0] = (self.coefficients @ bu).T * (2 / nx)
+        jacobian[:, :, 1] = (self.coefficients @ bv).T * (2 / ny)
+        jacobian[:, 0, 0] += 1
+        jacobian[:, 1, 1] += 1
+        return q + (self.coefficients @ b).T, jacobian
+
+    def invert(self, p, *, tolerance=1e-10, max_iterations=50):
+        """Detector pixels (n, 2) -> undistorted pixels by Newton's method.
+
+        The scheme is that of the corrected positions, criterion J_3 of section 3.3.
+
+        Raises
+        ------
+        FoldError
+            Naming the worst place, if some points do not converge.
+        """
+        p = np.asarray(p, dtype=float)
+        size = _CHUNK // 2
+        blocks = [self._newton(p[k : k + size], tolerance, max_iterations) for k in range(0, len(p), size)]
+        q = np.concatenate(blocks) if blocks else p.copy()
+        wrong = ~(np.abs(self(q) - p).max(axis=1) < max(1e-8, tolerance))
+        wrong &= np.isfinite(p).all(axis=1)
+        if wrong.any():
+            self._raise_fold(p[wrong][0], "cannot be inverted")
+        return q
+
+    def _newton(self, p, tolerance, max_iterations):
+        """Newton's method; the Jacobian is kept while every step is ten times shorter than the one before."""
+        q, jacobian, size = 2 * p - self(p), None, np.inf
+        for _ in range(max_iterations):
+            with np.errstate(invalid="ignore", over="ignore"):
+                if jacobian is None:
+                    value, jacobian = self._value_and_jacobian(q)
+                else:
+                    value = self(q)
+                step = _solve2(jacobian, p - value)
+                q = q + step
+            last, size = size, np.nanmax(np.abs(step), initial=0)
+            if not size > tolerance:
+                break
+            if size > 0.1 * last:
+                jacobian = None
+        return q
+
+    def _raise_fold(self, place, what):
+        raise FoldError(
+            f"the distortion{f' of exposure {self.name}' if self.name else ''} {what} near pixel "
+            f"({round(place[0])}, {round(place[1])}): two places fall on one; too few stars there for "
+            f"degree {self.degree}?"
+        )
+
+    def check_fold(self):
+        """Raise `FoldError` if the Jacobian determinant is below `FOLD` anywhere on the detector."""
+        t = np.linspace(-1, 1, 8 * self.degree + 9)
+        q = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), self.shape)
+        determinant = np.linalg.det(self.jacobian(q))
+        worst = int(np.argmin(determinant))
+        if determinant[worst] <= FOLD:
+            self._raise_fold(q[worst], f"folds (Jacobian determinant {determinant[worst]:.2f})")
+
+    @cached_property
+    def inverse(self):
+        """The fitted `Inverse`, certified to `TOLERANCE` on a grid, random points, the edges and the corners.
+
+        Raises
+        ------
+        FoldError
+            If the map folds, or no inverse of degree up to 30 reaches the tolerance.
+        """
+        self.check_fold()
+        nodes, weights = np.polynomial.legendre.leggauss(_MAX_INVERSE_DEGREE + 12)
+        u, v = np.meshgrid(nodes, nodes, indexing="ij")
+        p = basis.denormalize(u.ravel(), v.ravel(), self.shape)
+        shift = (self.invert(p) - p).T.reshape(2, *u.shape)
+        vander = weights[:, None] * basis.legendre(_MAX_INVERSE_DEGREE, nodes).T
+        normalised = np.einsum("ui,vj,auv->aij", vander, vander, shift, optimize=True)
+        norms = basis.norm(np.arange(_MAX_INVERSE_DEGREE + 1))
+        tensors = normalised * np.outer(norms, norms)
+        check = _check_points(self.shape)
+        q = self.invert(check)
+        errors = []
+        for degree in range(max(self.degree, 1), _MAX_INVERSE_DEGREE + 1):
+            part = tensors[:, : degree + 1, : degree + 1]
+            errors.append(self.round_trip_error(part, check))
+            if errors[-1] <= TOLERANCE / 2:  # half, so that unchecked points stay below the promise
+                return Inverse(part.copy(), errors[-1], _valid_box(q, self.shape))
+        raise FoldError(
+            f"no inverse of the distortion{f' of exposure {self.name}' if self.name else ''} up to degree "
+            f"{_MAX_INVERSE_DEGREE} is better than {min(errors):.1e} px ({TOLERANCE:.0e} is wanted); "
+            "the distortion is too strong or too ragged, lower the degree"
+        )
+
+    def round_trip_error(self, tensors, p=None):
+        """Largest ``|D(E(p)) - p|`` [pix] of an inverse E given by its displacement tensors, over check points."""
+        p = _check_points(self.shape) if p is None else p
+        return float(np.abs(self(self._corrected(tensors, p)) - p).max())
+
+    def _corrected(self, tensors, p):
+        """Detector pixels (n, 2) -> undistorted pixels by the displacement tensors of an inverse."""
+        u, v = basis.normalize(p, self.shape)
+        return p + np.stack([np.polynomial.legendre.legval2d(u, v, t) for t in tensors], axis=-1)
+
+    def adopt(self, inverse):
+        """Take over an inverse that was certified earlier, after checking its certificate again.
+
+        Raises
+        ------
+        InputError
+            If the round-trip error is not the one certified, or the region of validity not the image of the detector.
+        """
+        p = _check_points(self.shape)
+        q = self._corrected(inverse.tensors, p)
+        error, box = np.abs(self(q) - p).max(), _valid_box(q, self.shape)
+        whose = f"the inverse of the distortion{f' of exposure {self.name}' if self.name else ''}"
+        if not (abs(error - inverse.error) <= 1e-9 and error <= TOLERANCE):
+            raise InputError(
+                f"{whose} misses by {error:.3g} px where {inverse.error:.3g} px was certified: coefficients or inverse "
+                "were changed since; solve again, or take the file as it was written"
+            )
+        if not np.allclose(box, inverse.valid, rtol=0, atol=1e-3):
+            raise InputError(f"{whose} is said to be valid in {inverse.valid}, but the detector's image lies in {box}")
+        self.__dict__["inverse"] = inverse
+
+    def model(self):
+        """D as an astropy compound model (undistorted -> detector pixels) with the certified inverse attached."""
+        inverse = self.inverse
+        forward = displacement_model(
+            basis.to_tensor(self.coefficients), self.shape, valid=inverse.valid, name="distortion"
+        )
+        forward.inverse = displacement_model(inverse.tensors, self.shape, name="correction")
+        return forward
+
+
+def _solve2(a, b):
+    """Solve n systems of two equations, a (n, 2, 2), b (n, 2), without LAPACK's cost per call."""
+    determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+    x = (a[:, 1, 1] * b[:, 0] - a[:, 0, 1] * b[:, 1]) / determinant
+    y = (a[:, 0, 0] * b[:, 1] - a[:, 1, 0] * b[:, 0]) / determinant
+    return np.stack([x, y], axis=1)
+
+
+def _check_points(shape):
+    """Random points, a regular grid with the edges and the corners of a detector, (n, 2) pixels."""
+    t = np.linspace(-1, 1, 33)
+    grid = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
+    scattered = np.random.default_rng(20170101).uniform(-1, 1, (1000, 2))
+    edge = np.linspace(-1, 1, 129)
+    ends = np.ones_like(edge)
+    sides = np.concatenate([np.stack(s, axis=1) for s in ((edge, ends), (edge, -ends), (ends, edge), (-ends, edge))])
+    return basis.denormalize(*np.concatenate([grid, scattered, sides]).T, shape)
+
+
+def _valid_box(q, shape, margin=0.01):
+    """Box around the image of the detector, with a margin of 1 % of its size."""
+    extra = margin * max(shape)
+    (x_min, y_min), (x_max, y_max) = q.min(axis=0) - extra, q.max(axis=0) + extra
+    return (float(x_min), float(x_max), float(y_min), float(y_max))

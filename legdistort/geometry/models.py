@@ -1,0 +1,176 @@
+"""Distortions and poses as astropy models."""
+
+import sys
+
+import numpy as np
+from astropy import units as u
+from astropy.modeling import models
+from astropy.modeling.core import FittableModel  # astropy.modeling is half imported when it looks for our fitter
+from astropy.modeling.parameters import Parameter
+
+from ..exceptions import InputError
+from . import basis, similarity
+
+_CHUNK = 8192  # points per block: the work arrays stay in the cache
+
+
+class FastLegendre2D(models.Legendre2D):
+    """`~astropy.modeling.models.Legendre2D` that is thread-safe, keeps no work arrays and knows where it is valid.
+
+    The stock model stores its recurrence in attributes: two threads that evaluate one instance corrupt each
+    other, and full-size arrays stay behind. Its derivatives forget the domain, so that astropy's non-linear fitters
+    end at wrong coefficients; here they are right. Positions may be quantities in pixels, and so is then the value.
+    Parameters and serialisation are those of `Legendre2D`, and ASDF files hold the stock model.
+
+    Attributes
+    ----------
+    valid : tuple or None
+        ``(x_min, x_max, y_min, y_max)``: NaN is returned outside, where the polynomial would be extrapolated
+        and could fold back onto the detector.
+    """
+
+    valid = None
+
+    def evaluate(self, x, y, *coeffs):
+        """Value at (x, y); coefficients in the order of ``param_names``."""
+        shape = (self.y_degree + 1, self.x_degree + 1)
+        c = np.array([np.asarray(c, dtype=float).reshape(-1)[0] for c in coeffs]).reshape(shape)
+        c /= np.outer(basis.norm(np.arange(shape[0])), basis.norm(np.arange(shape[1])))
+        given = x if isinstance(x, u.Quantity) else y
+        x, y = np.broadcast_arrays(to_pixels(x), to_pixels(y))
+        out = np.empty(x.shape)
+        flat_x, flat_y, flat = x.reshape(-1), y.reshape(-1), out.reshape(-1)
+        for start in range(0, flat.size, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            px = basis.legendre(self.x_degree, _to_window(flat_x[part], self.x_domain, self.x_window))
+            py = basis.legendre(self.y_degree, _to_window(flat_y[part], self.y_domain, self.y_window))
+            np.einsum("jn,jn->n", c @ px, py, out=flat[part])
+            if self.valid is not None:
+                flat[part][outside(self.valid, flat_x[part], flat_y[part])] = np.nan
+        return like(given, out)
+
+    def fit_deriv(self, x, y, *params):
+        """Derivatives with respect to the coefficients, shape (n, n_coefficients).
+
+        As for the stock model x and y are positions in the window. But only astropy's linear fitter hands over those;
+        its non-linear fitters and sums of models hand over plain positions, which are mapped here.
+        """
+        if sys._getframe(1).f_code.co_name in ("_wrap_deriv", "_calc_compound_deriv"):
+            x = _to_window(x, self.x_domain, self.x_window)
+            y = _to_window(y, self.y_domain, self.y_window)
+        return super().fit_deriv(x, y, *params)
+
+    def stock(self):
+        """The same function as a plain `~astropy.modeling.models.Legendre2D`."""
+        return models.Legendre2D(
+            self.x_degree,
+            self.y_degree,
+            x_domain=self.x_domain,
+            y_domain=self.y_domain,
+            x_window=self.x_window,
+            y_window=self.y_window,
+            name=self.name,
+            fixed=self.fixed,
+            **dict(zip(self.param_names, self.parameters, strict=True)),
+        )
+
+
+def to_pixels(x):
+    """Plain float array of positions given as numbers, or as a quantity in pixels; `InputError` for another unit."""
+    if not isinstance(x, u.Quantity):
+        return np.asarray(x, dtype=float)
+    try:
+        return np.asarray(x.to_value(u.pix), dtype=float)
+    except u.UnitConversionError:
+        raise InputError(f"positions must be in pixels, got {x.unit}") from None
+
+
+def like(given, pixels):
+    """Pixels as a quantity if what was given is one."""
+    return pixels * u.pix if isinstance(given, u.Quantity) else pixels
+
+
+def _to_window(x, domain, window):
+    if domain is None:
+        return x
+    (d0, d1), (w0, w1) = domain, window
+    return w0 + (x - d0) * ((w1 - w0) / (d1 - d0))
+
+
+def outside(box, x, y):
+    """Whether points lie outside a box ``(x_min, x_max, y_min, y_max)``; NaN counts as outside."""
+    x_min, x_max, y_min, y_max = box
+    return ~((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max))
+
+
+def displacement_model(tensors, shape, *, valid=None, name=None):
+    """Model (x, y) -> (x, y) + two Legendre series on the detector.
+
+    Parameters
+    ----------
+    tensors : array_like, shape (2, n, n)
+        Coefficients ``[axis, i, j]`` of the un-normalised ``P_i(u) P_j(v)``, pixels. Where none of total degree n and
+        more is there, these are marked as fixed for fitters.
+    shape : tuple
+        ``(ny, nx)`` of the detector.
+    valid : tuple, optional
+        See `FastLegendre2D`.
+    """
+    ny, nx = shape
+    parts, tensors = [], np.asarray(tensors, dtype=float)
+    degree = tensors.shape[1] - 1
+    above = np.argwhere(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) > degree)
+    fixed = {} if np.any(tensors[:, above[:, 0], above[:, 1]]) else {f"c{i}_{j}": True for i, j in above}
+    for axis, tensor in zip("xy", tensors, strict=True):
+        part = FastLegendre2D(
+            degree,
+            degree,
+            x_domain=(-0.5, nx - 0.5),
+            y_domain=(-0.5, ny - 0.5),
+            x_window=(-1, 1),
+            y_window=(-1, 1),
+            name=f"d{axis}",
+            fixed=fixed,
+            **{f"c{i}_{j}": float(tensor[i][j]) for i in range(degree + 1) for j in range(degree + 1)},
+        )
+        part.valid = valid
+        parts.append(part)
+    model = models.Identity(2) + (models.Mapping((0, 1, 0, 1)) | (parts[0] & parts[1]))
+    model.name = name
+    return model
+
+
+class Similarity2D(FittableModel):
+    """A pose as a model: `~astropy.modeling.models.AffineTransformation2D` with one number a parameter.
+
+    astropy's fitters refuse the stock model, whose parameters are matrices. The parameters are fixed, since a pose is
+    not fitted together with the linear modes of a distortion. Positions may be quantities in pixels.
+    """
+
+    n_inputs = n_outputs = 2
+    _separable = False
+    xx, xy, dx = (Parameter(default=d, fixed=True) for d in (1.0, 0.0, 0.0))
+    yx, yy, dy = (Parameter(default=d, fixed=True) for d in (0.0, 1.0, 0.0))
+
+    @staticmethod
+    def evaluate(x, y, *pose):
+        """Positions (x, y) through the pose ``[[xx, xy, dx], [yx, yy, dy]]``."""
+        given = x if isinstance(x, u.Quantity) else y
+        x, y = to_pixels(x), to_pixels(y)
+        xx, xy, dx, yx, yy, dy = pose
+        return like(given, xx * x + xy * y + dx), like(given, yx * x + yy * y + dy)
+
+    @property
+    def inverse(self):
+        """The opposite direction."""
+        return pose_model(similarity.invert(np.reshape(self.parameters, (2, 3))))
+
+    def stock(self):
+        """The same function as a plain `~astropy.modeling.models.AffineTransformation2D`."""
+        pose = np.reshape(self.parameters, (2, 3))
+        return models.AffineTransformation2D(matrix=pose[:, :2], translation=pose[:, 2], name=self.name)
+
+
+def pose_model(pose, name=None):
+    """A pose (2, 3) as a `Similarity2D`."""
+    return Similarity2D(*np.ravel(pose), name=name)

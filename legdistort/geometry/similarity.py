@@ -1,0 +1,122 @@
+"""Similarities between the reference plane and detectors, and the tie to the sky.
+
+A *pose* is a (2, 3) array ``[M | t]`` that maps a position X (pixels of the
+reference plane) to undistorted pixels of one exposure, ``q = M X + t``; M is a
+rotation, possibly with a flip, times a scale.
+"""
+
+import numpy as np
+
+from ..exceptions import InputError
+
+
+def identity():
+    """The pose that changes nothing, shape (2, 3)."""
+    return np.eye(2, 3)
+
+
+def apply(pose, xy):
+    """Map positions (..., 2) through a pose."""
+    return np.asarray(xy, dtype=float) @ pose[:, :2].T + pose[:, 2]
+
+
+def invert(pose):
+    """The pose of the opposite direction."""
+    inverse = np.linalg.inv(pose[:, :2])
+    return np.column_stack([inverse, -inverse @ pose[:, 2]])
+
+
+def compose(second, first):
+    """The pose ``x -> second(first(x))``."""
+    return np.column_stack([second[:, :2] @ first[:, :2], apply(second, first[:, 2])])
+
+
+def check(pose, name="pose"):
+    """Return `pose` as a (2, 3) float array; raise `InputError` if it is not a similarity."""
+    pose = np.asarray(pose, dtype=float)
+    if pose.shape != (2, 3) or not np.all(np.isfinite(pose)):
+        raise InputError(f"{name} must be a finite (2, 3) array [M | t], got shape {pose.shape}")
+    scale2 = abs(np.linalg.det(pose[:, :2]))
+    if scale2 == 0 or not np.allclose(pose[:, :2] @ pose[:, :2].T, scale2 * np.eye(2), rtol=0, atol=1e-6 * scale2):
+        raise InputError(
+            f"{name} is not a similarity (rotation, flip, scale, shift): its linear part is {pose[:, :2].tolist()}; "
+            "leave shear to the distortion"
+        )
+    return pose
+
+
+def describe(pose):
+    """Shift [pix], rotation [deg], scale and parity (+1 or -1) of a pose, as a dict."""
+    m = pose[:, :2]
+    parity = 1 if np.linalg.det(m) > 0 else -1
+    return {
+        "dx": float(pose[0, 2]),
+        "dy": float(pose[1, 2]),
+        "rotation": float(np.degrees(np.arctan2(m[1, 0], m[0, 0]))),
+        "scale": float(np.sqrt(abs(np.linalg.det(m)))),
+        "parity": parity,
+    }
+
+
+def fit_similarity(source, target, *, weights=None, parity=None):
+    """Least-squares similarity that carries `source` to `target`.
+
+    Parameters
+    ----------
+    source, target : array_like, shape (n, 2)
+    weights : array_like, shape (n,), optional
+        Non-negative; at least two distinct points need a positive one.
+    parity : {1, -1, None}
+        Keep the orientation, flip it, or take whichever fits better.
+
+    Returns
+    -------
+    ndarray, shape (2, 3)
+
+    Raises
+    ------
+    InputError
+        With fewer than two distinct points.
+    """
+    source, target = np.asarray(source, float), np.asarray(target, float)
+    w = np.ones(len(source)) if weights is None else np.asarray(weights, float)
+    if len(source) < 2 or np.count_nonzero(w) < 2:
+        raise InputError(f"a similarity needs at least two points, got {np.count_nonzero(w)}")
+    w = w / w.sum()
+    mean_s, mean_t = w @ source, w @ target
+    ds, dt = source - mean_s, target - mean_t
+    power = w @ (ds**2).sum(axis=1)
+    if power == 0:
+        raise InputError("a similarity needs at least two distinct points, all are at the same place")
+    cross = (w[:, None] * dt).T @ ds / power  # M = argmin |dt - M ds|^2 within the similarities
+    keep, flip = (np.hypot(*part) for part in _turns(cross))
+    if parity is None:
+        parity = 1 if keep >= flip else -1
+    return similarity_of(mean_s, mean_t, cross, parity)
+
+
+def similarity_of(mean_s, mean_t, cross, parity):
+    """Least-squares similarities from the moments of their points.
+
+    Parameters
+    ----------
+    mean_s, mean_t : ndarray, shape (..., 2)
+        Weighted mean of source and target.
+    cross : ndarray, shape (..., 2, 2)
+        Weighted sum of target times source about their means, over the sum of squares of the source.
+    parity : ndarray of 1 or -1, shape (...)
+
+    Returns
+    -------
+    ndarray, shape (..., 2, 3)
+    """
+    a, b = np.where(np.asarray(parity) > 0, *_turns(cross))
+    m = np.stack([np.stack([a, -b * parity], axis=-1), np.stack([b, a * parity], axis=-1)], axis=-2)
+    shift = mean_t - np.einsum("...ab,...b->...a", m, mean_s)
+    return np.concatenate([m, shift[..., None]], axis=-1)
+
+
+def _turns(cross):
+    """Scale times cosine and sine of the best rotation, and of the best rotation after a flip of y."""
+    (xx, xy), (yx, yy) = np.moveaxis(cross, (-2, -1), (0, 1))
+    return np.stack([xx + yy, yx - xy]), np.stack([xx - yy, yx + xy])

@@ -1,0 +1,196 @@
+"""The column contract of every table that enters or leaves, checked in one place."""
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable, Table
+
+from ..exceptions import InputError
+
+#: Columns of a table of matched positions: name -> (unit, required)
+MATCHED = {
+    "exposure": (None, True),
+    "star": (None, True),
+    "x": (u.pix, True),
+    "y": (u.pix, True),
+    "x_err": (u.pix, True),
+    "y_err": (u.pix, True),
+    "xy_corr": (None, False),
+    "detector": (None, False),
+    "flux": (None, False),
+}
+
+#: Columns of a table of detections.
+DETECTED = {
+    "exposure": (None, True),
+    "x": (u.pix, True),
+    "y": (u.pix, True),
+    "x_err": (u.pix, True),
+    "y_err": (u.pix, True),
+    "xy_corr": (None, False),
+    "flux": (None, False),
+    "flux_err": (None, False),
+    "fwhm": (u.pix, False),
+    "flags": (None, False),
+    "crowding": (None, False),
+}
+
+#: Columns of a table of stars: name -> (UCD of the Virtual Observatory, meaning). Names of sky columns are Gaia's.
+STARS = {
+    "star": ("meta.id;meta.main", "name or number of the star"),
+    "x": ("pos.cartesian.x", "distortion-free position in the reference plane, pixels from 0"),
+    "y": ("pos.cartesian.y", "distortion-free position in the reference plane, pixels from 0"),
+    "x_err": ("stat.error;pos.cartesian.x", "standard deviation in the gauge of the solution"),
+    "y_err": ("stat.error;pos.cartesian.y", "standard deviation in the gauge of the solution"),
+    "x_err_abs": ("stat.error;pos.cartesian.x", "standard deviation with what the gauge hides, pointing aside"),
+    "y_err_abs": ("stat.error;pos.cartesian.y", "standard deviation with what the gauge hides, pointing aside"),
+    "xy_corr": ("stat.correlation;pos.cartesian", "correlation of x_err and y_err"),
+    "n": ("meta.number;obs", "observations used"),
+    "flux": ("phot.flux;stat.mean", "mean over the exposures"),
+    "ra": ("pos.eq.ra;meta.main", "right ascension, ICRS"),
+    "dec": ("pos.eq.dec;meta.main", "declination, ICRS"),
+    "ra_error": ("stat.error;pos.eq.ra", "standard deviation of ra times cos(dec), in the gauge of the solution"),
+    "dec_error": ("stat.error;pos.eq.dec", "standard deviation of dec, in the gauge of the solution"),
+    "ra_dec_corr": ("stat.correlation;pos.eq", "correlation of ra_error and dec_error"),
+    "ra_error_abs": ("stat.error;pos.eq.ra", "the same with what the gauge hides, pointing aside"),
+    "dec_error_abs": ("stat.error;pos.eq.dec", "the same with what the gauge hides, pointing aside"),
+}
+
+
+def describe_stars(table):
+    """Give the columns of a table of stars their UCDs and meanings (`STARS`); returns the table."""
+    for name in table.colnames:
+        if name in STARS:
+            ucd, table[name].info.description = STARS[name]
+            table[name].info.meta = {"ucd": ucd}
+    return table
+
+
+def values(table, column, unit=None):
+    """A column as a plain float array in `unit`; columns without a unit are taken as they are.
+
+    Raises
+    ------
+    InputError
+        If the column's unit cannot be converted.
+    """
+    data = table[column]
+    if data.ndim != 1:
+        raise InputError(f"column {column!r} must hold one number a row, it has shape {data.shape}")
+    try:
+        if np.ma.isMaskedArray(data) and np.ma.is_masked(data):
+            data = data.astype(float).filled(np.nan)
+        if getattr(data, "unit", None) is not None and unit is not None:
+            data = u.Quantity(data).to_value(unit)
+        return np.array(data, dtype=float)
+    except (u.UnitConversionError, TypeError, ValueError) as error:
+        raise InputError(f"column {column!r} cannot be read as numbers in {unit or 'no unit'}: {error}") from None
+
+
+def labels(table, column):
+    """A column of names (str) or serials (int) as a plain array."""
+    missing = np.ma.getmaskarray(table[column]) if np.ma.isMaskedArray(table[column]) else np.zeros(len(table), bool)
+    if missing.any():
+        raise InputError(
+            f"column {column!r} has no value in {np.count_nonzero(missing)} of {len(missing)} rows, the first is row "
+            f"{int(np.argmax(missing))}; fill them or leave these rows out"
+        )
+    data = np.asarray(table[column])
+    if data.ndim != 1:
+        raise InputError(f"column {column!r} must hold one name a row, it has shape {data.shape}")
+    if data.dtype.kind == "S":
+        data = np.char.decode(data, "utf-8", "replace")
+    if data.dtype.kind == "O":
+        data = data.astype(str)
+    if data.dtype.kind not in "iuU":
+        raise InputError(f"column {column!r} must hold names or integers, got {data.dtype}")
+    return data
+
+
+def rename(table, columns):
+    """Copy of a table with columns renamed to the contract's names.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table` or anything that it takes
+    columns : dict
+        ``{contract name: name in the table}``, for example ``{"star": "name", "x_err": "xe"}``.
+
+    Raises
+    ------
+    InputError
+        Naming the column that is not there.
+    """
+    table = Table(table, copy=False)
+    for wanted, present in columns.items():
+        if present not in table.colnames:
+            raise InputError(f"no column {present!r} to use as {wanted!r}; the table has {', '.join(table.colnames)}")
+    out = Table(meta=table.meta)
+    for name in table.colnames:
+        targets = [wanted for wanted, present in columns.items() if present == name]  # one column may serve twice
+        for target in targets or ([] if name in columns else [name]):
+            out[target] = table[name]
+    return out
+
+
+def _rows(bad, table, what):
+    first = int(np.flatnonzero(bad)[0])
+    where = ", ".join(f"{k} {table[k][first]}" for k in ("exposure", "star") if k in table.colnames)
+    return f"{what} in {np.count_nonzero(bad)} of {len(bad)} rows; the first is row {first} ({where})"
+
+
+def check(table, contract, what):
+    """Check a table against a column contract and return it as a `~astropy.table.QTable`.
+
+    Columns beyond the contract are kept. Positions must be finite, errors positive
+    and finite, correlations inside (-1, 1).
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+    contract : dict
+        `MATCHED` or `DETECTED`.
+    what : str
+        How messages call the table.
+
+    Raises
+    ------
+    InputError
+        Naming the column and the first row at fault.
+    """
+    table = Table(table, copy=False)
+    missing = [name for name, (_, required) in contract.items() if required and name not in table.colnames]
+    if missing:
+        raise InputError(
+            f"{what} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}; it has "
+            f"{', '.join(table.colnames)} (map names: columns={{'{missing[0]}': ...}} or --columns {missing[0]}=...)"
+        )
+    if len(table) == 0:
+        raise InputError(f"{what} is empty")
+    out = QTable()
+    for name in table.colnames:
+        unit = contract[name][0] if name in contract else None
+        if name in ("exposure", "star", "detector"):
+            out[name] = labels(table, name)
+        elif name in contract:
+            column = values(table, name, unit)
+            column = column if unit is None else u.Quantity(column, unit, copy=False)
+            out.add_column(column, name=name, copy=False)  # `values` made a copy already
+        else:
+            out[name] = table[name]
+    for name in ("x", "y"):
+        bad = ~np.isfinite(out[name].value)
+        if bad.any():
+            raise InputError(f"{what}: " + _rows(bad, out, f"{name} is not finite"))
+    for name in ("x_err", "y_err"):
+        bad = ~(np.isfinite(out[name].value) & (out[name].value > 0))
+        if bad.any():
+            raise InputError(
+                f"{what}: "
+                + _rows(bad, out, f"{name} is not a positive finite number")
+                + "; errors are standard deviations in pixels, leave out rows without one"
+            )
+    if "xy_corr" in out.colnames:
+        bad = ~(np.abs(out["xy_corr"]) < 1)
+        if bad.any():
+            raise InputError(f"{what}: " + _rows(bad, out, "xy_corr is not inside (-1, 1)"))
+    return out

@@ -1,0 +1,396 @@
+"""Matched positions: which detection of which exposure is which star, and roughly where everything lies."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+from scipy.sparse.csgraph import connected_components
+
+from ..exceptions import InputError, MatchError
+from ..geometry import similarity as poses
+from ..geometry.tangent_plane import TangentPlane
+from . import column_contract
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """The plain arrays behind `Matches`, one row an observation.
+
+    Attributes
+    ----------
+    exposure, star : ndarray of int, shape (n,)
+        Indices into `Matches.names` and `Matches.stars`.
+    xy : ndarray, shape (n, 2)
+        Pixels.
+    covariance : ndarray, shape (n, 3)
+        ``var_x, var_y, cov_xy`` [pix^2].
+    """
+
+    exposure: np.ndarray
+    star: np.ndarray
+    xy: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Positions of the same stars in several exposures.
+
+    Attributes
+    ----------
+    table : `~astropy.table.QTable`
+        One row an observation: ``exposure``, ``star``, ``x``, ``y``, ``x_err``, ``y_err`` [pix]
+        and what else came with it. Rows are never reordered.
+    shapes : dict
+        ``{exposure: (ny, nx)}``.
+    poses : dict
+        ``{exposure: (2, 3) array}``, reference plane -> undistorted pixels (see `legdistort.geometry.similarity`).
+    sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
+        Where the reference plane lies on the sky, if that is known.
+    left_out : dict
+        ``{exposure: reason}`` of exposures that could not be used.
+    epoch : float or None
+        Mean of the exposures, a Julian year, if their headers tell it.
+    """
+
+    table: QTable
+    shapes: dict
+    poses: dict
+    sky: TangentPlane | None = None
+    left_out: dict = field(default_factory=dict)
+    epoch: float | None = None
+
+    @cached_property
+    def names(self):
+        """Exposure names, in the order in which they first appear."""
+        return _first_seen(self.table["exposure"])[0]
+
+    @cached_property
+    def stars(self):
+        """Star identifiers, sorted."""
+        return _ranked(self.table["star"])[0]
+
+    @cached_property
+    def observations(self):
+        """The table as plain arrays (`Observations`)."""
+        return _observations(self.table, _first_seen(self.table["exposure"])[1], _ranked(self.table["star"])[1])
+
+    @cached_property
+    def positions(self):
+        """Rough reference positions (n_stars, 2): mean of the measured ones carried back by the poses."""
+        obs = self.observations
+        back = np.empty_like(obs.xy)
+        for i, name in enumerate(self.names):
+            rows = obs.exposure == i
+            back[rows] = poses.apply(poses.invert(self.poses[name]), obs.xy[rows])
+        return _star_means(back, obs.star, len(self.stars))
+
+    def without(self, reasons):
+        """The same matches without some exposures, ``{name: reason}``, which join `left_out`.
+
+        Raises
+        ------
+        MatchError
+            If what is left is one exposure, or falls apart.
+        """
+        table = self.table[~np.isin(self.table["exposure"], list(reasons))]
+        kept = {name: pose for name, pose in self.poses.items() if name not in reasons}
+        left_out = self.left_out | dict(reasons)
+        if len(table) == 0:
+            raise MatchError(
+                "no exposure agrees with the others: " + "; ".join(f"{k}: {v}" for k, v in reasons.items())
+            )
+        known = {"sky": self.sky, "left_out": left_out, "epoch": self.epoch}
+        return type(self).from_table(table, shape=self.shapes, poses=kept, **known)
+
+    def to_meta(self):
+        """Shapes, poses and sky as plain lists, for the header of a table file; see `read_meta`."""
+        sky = self.sky
+        return {
+            "shapes": {name: list(self.shapes[name]) for name in self.names},
+            "poses": {name: self.poses[name].tolist() for name in self.names},
+            "sky": None if sky is None else {"lon": sky.lon, "lat": sky.lat, "matrix": sky.matrix.tolist()},
+            "left_out": dict(self.left_out),
+            "epoch": self.epoch,
+        }
+
+    @staticmethod
+    def read_meta(meta):
+        """What `to_meta` wrote, as arguments ``poses``, ``sky``, ``left_out``, ``epoch`` of `from_table`."""
+        given, sky = meta.get("poses"), meta.get("sky")
+        return {
+            "poses": None if given is None else {name: np.array(pose) for name, pose in given.items()},
+            "sky": None if sky is None else TangentPlane(sky["lon"], sky["lat"], np.array(sky["matrix"])),
+            "left_out": meta.get("left_out"),
+            "epoch": meta.get("epoch"),
+        }
+
+    def __repr__(self):
+        return f"<Matches: {len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures>"
+
+    @classmethod
+    def from_table(cls, table, *, shape, poses=None, columns=None, sky=None, left_out=None, epoch=None):
+        """Matches from anybody's table.
+
+        Parameters
+        ----------
+        table : `~astropy.table.Table`
+            Columns ``exposure``, ``star`` (int or str), ``x``, ``y``, ``x_err``, ``y_err`` (pixels,
+            0-based, standard deviations), optional ``xy_corr``, ``detector``, ``flux``.
+        shape : tuple or dict
+            ``(ny, nx)``, or that by exposure.
+        poses : dict, optional
+            ``{exposure: (2, 3)}``, reference -> undistorted pixels; estimated from the positions if not given.
+        columns : dict, optional
+            ``{our name: name in the table}``, for example ``{"star": "name", "x_err": "xe"}``.
+        sky : `~legdistort.geometry.tangent_plane.TangentPlane`, optional
+        left_out : dict, optional
+            Passed on.
+        epoch : float, optional
+            Mean of the exposures, a Julian year.
+
+        Raises
+        ------
+        InputError
+            For missing columns, bad values, duplicate (exposure, star) rows, a missing shape or pose.
+        MatchError
+            For one exposure only, or exposures in groups without a common star.
+        """
+        if columns:
+            table = column_contract.rename(table, columns)
+        table = column_contract.check(table, column_contract.MATCHED, "the table of matched positions")
+        table["exposure"] = table["exposure"].astype(str)
+        names, exposure_index = _first_seen(table["exposure"])
+        for name in names:
+            if not name.strip(". ") or "/" in name or "\\" in name:
+                raise InputError(f"exposure {name!r} cannot be the name of a file; rename it (no slashes, not empty)")
+        shapes = _by_exposure(shape, names)
+        _check_inside(table, exposure_index, names, shapes)
+        stars, star_index = _ranked(table["star"])
+        _check_duplicates(table, exposure_index, star_index, len(stars))
+        _check_connected(exposure_index, star_index, names, len(stars))
+        if poses is None:
+            xy = np.column_stack([table["x"].value, table["y"].value])
+            pose_list = estimate_poses(exposure_index, star_index, xy, names=names)
+            poses = dict(zip(names, pose_list, strict=True))
+        else:
+            poses = _check_poses(poses, names)
+        matches = cls(table, shapes, poses, sky, dict(left_out or {}), epoch)
+        matches.__dict__.update(names=names, stars=stars)  # known already
+        matches.__dict__["observations"] = _observations(table, exposure_index, star_index)
+        return matches
+
+
+def _by_exposure(shape, names):
+    if not isinstance(shape, dict):
+        shape = dict.fromkeys(names, shape)
+    missing = [name for name in names if name not in shape]
+    if missing:
+        raise InputError(f"shape has no entry for exposure {missing[0]!r}; give (ny, nx) for every exposure")
+    out = {}
+    for name in names:
+        try:
+            ny, nx = (int(n) for n in shape[name])
+        except (TypeError, ValueError):
+            ny = nx = 0
+        if ny < 1 or nx < 1:
+            raise InputError(f"shape of exposure {name!r} must be (ny, nx) in pixels, got {shape[name]!r}")
+        out[name] = (ny, nx)
+    return out
+
+
+def _check_poses(given, names):
+    missing = [name for name in names if name not in given]
+    if missing:
+        raise InputError(f"poses has no entry for exposure {missing[0]!r}; give a (2, 3) array for every exposure")
+    return {name: poses.check(given[name], f"pose of exposure {name!r}") for name in names}
+
+
+def _first_seen(column):
+    """Distinct names in the order in which they first appear, and the number of each row's name."""
+    column = np.asarray(column)
+    heads = np.flatnonzero(np.concatenate([[True], column[1:] != column[:-1]]))  # tables come in runs of one exposure
+    numbers = {}
+    run = [numbers.setdefault(str(name), len(numbers)) for name in column[heads]]
+    return tuple(numbers), np.repeat(run, np.diff(np.append(heads, len(column))))
+
+
+def _ranked(column):
+    """Distinct stars, sorted, and the rank of each row's star; a table look-up where stars are small integers."""
+    column = np.asarray(column)
+    if column.dtype.kind in "iu" and len(column) and column.min() >= 0 and column.max() < 4 * len(column) + 1000:
+        present = np.bincount(column.astype(np.int64)) > 0
+        return np.flatnonzero(present).astype(column.dtype), (np.cumsum(present) - 1)[column]
+    return np.unique(column, return_inverse=True)
+
+
+def _observations(table, exposure, star):
+    x_err, y_err = table["x_err"].to_value(u.pix), table["y_err"].to_value(u.pix)
+    corr = np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else np.zeros(len(table))
+    return Observations(
+        exposure=exposure,
+        star=star,
+        xy=np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)]),
+        covariance=np.column_stack([x_err**2, y_err**2, corr * x_err * y_err]),
+    )
+
+
+def _check_duplicates(table, exposure, star, n_stars):
+    key = exposure.astype(np.int64) * n_stars + star
+    if np.all(key[1:] > key[:-1]):
+        return
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(np.diff(key[order]) == 0)
+    if len(same):
+        rows = order[same[0] : same[0] + 2]
+        raise InputError(
+            f"star {table['star'][rows[0]]} stands {'twice' if len(same) == 1 else 'more than once'} in exposure "
+            f"{table['exposure'][rows[0]]} (rows {rows[0]} and {rows[1]}; {len(same)} such rows in all); "
+            "keep one position of a star in an exposure"
+        )
+
+
+def _check_inside(table, exposure, names, shapes):
+    """Positions belong on their detector, give or take a tenth of its size."""
+    sizes = np.array([shapes[name][::-1] for name in names])
+    ends = np.array([[table[k].value.min(), table[k].value.max()] for k in ("x", "y")])
+    smallest = sizes.min(axis=0)
+    if np.all(ends[:, 0] >= -0.1 * smallest) and np.all(ends[:, 1] <= 1.1 * smallest):
+        return
+    size = sizes[exposure]
+    xy = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
+    out = ((xy < -0.1 * size) | (xy > 1.1 * size)).any(axis=1)
+    if out.any():
+        row = int(np.flatnonzero(out)[0])
+        name = names[exposure[row]]
+        raise InputError(
+            f"{np.count_nonzero(out)} positions lie outside their detector; the first is row {row}, star "
+            f"{table['star'][row]} of exposure {name} at ({xy[row, 0]:.0f}, {xy[row, 1]:.0f}) px, where the shape is "
+            f"{shapes[name]} (ny, nx): correct the shape or the position"
+        )
+
+
+def _check_connected(exposure, star, names, n_stars):
+    if len(names) < 2:
+        raise MatchError(
+            f"only one exposure ({names[0]}): the distortion is found from the differences between exposures, "
+            "give at least two of the same field"
+        )
+    # tie every exposure to the first one of each of its stars: the same groups as all pairs, in a small graph
+    n = len(names)
+    first = np.full(n_stars, n)
+    np.minimum.at(first, star, exposure)
+    tied = np.zeros((n, n), dtype=bool)
+    tied[exposure, first[star]] = True
+    count, group = connected_components(tied, directed=False)
+    if count > 1:
+        groups = [[name for name, g in zip(names, group, strict=True) if g == label] for label in range(count)]
+        listed = "; ".join(_shorten(g) for g in groups)
+        raise MatchError(
+            f"the exposures form {len(groups)} groups with no star in common: {listed}; solve each group by itself"
+        )
+
+
+def _shorten(names, most=6):
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _star_means(xy, star, n_stars, weights=None):
+    w = np.ones(len(star)) if weights is None else weights
+    total = np.bincount(star, w, n_stars)
+    sums = np.column_stack([np.bincount(star, w * xy[:, k], n_stars) for k in (0, 1)])
+    with np.errstate(invalid="ignore"):
+        return sums / total[:, None]
+
+
+def robust_similarity(source, target, *, weights=None, n_iterations=10):
+    """Similarity by iteratively reweighted least squares with Cauchy weights at the observed scale.
+
+    Parameters as for `legdistort.geometry.similarity.fit_similarity`. The scale is the median residual.
+    """
+    base = np.ones(len(source)) if weights is None else weights
+    w = base
+    for _ in range(n_iterations):
+        pose = poses.fit_similarity(source, target, weights=w)
+        r2 = ((poses.apply(pose, source) - target) ** 2).sum(axis=1)
+        scale2 = np.median(r2)
+        if scale2 <= 1e-20 * np.ptp(target, axis=0).max() ** 2:
+            break
+        w = base / (1 + r2 / (2 * scale2))
+    return pose
+
+
+def estimate_poses(exposure, star, xy, *, names=None):
+    """Poses of all exposures from matched positions alone.
+
+    The exposure with the most stars becomes the reference plane; the others are tied one after the
+    other, each to all that already stand, the best connected first, then all are refined together.
+
+    Parameters
+    ----------
+    exposure, star : ndarray of int, shape (n,)
+    xy : ndarray, shape (n, 2)
+    names : sequence of str, optional
+        For messages.
+
+    Returns
+    -------
+    list of ndarray, each (2, 3)
+
+    Raises
+    ------
+    MatchError
+        Naming an exposure that shares fewer than two stars with all the others.
+    """
+    n_exposures, n_stars = exposure.max() + 1, star.max() + 1
+    names = range(n_exposures) if names is None else names
+    rows = [np.flatnonzero(exposure == i) for i in range(n_exposures)]
+    first = int(np.argmax([len(r) for r in rows]))
+    found = {first: poses.identity()}
+    back = np.full_like(xy, np.nan)
+    back[rows[first]] = xy[rows[first]]
+    sums, counts = np.zeros((n_stars, 2)), np.zeros(n_stars)
+    np.add.at(sums, star[rows[first]], xy[rows[first]])
+    np.add.at(counts, star[rows[first]], 1)
+    while len(found) < n_exposures:
+        shared = {i: rows[i][counts[star[rows[i]]] > 0] for i in range(n_exposures) if i not in found}
+        best = max(shared, key=lambda i: len(shared[i]))
+        r = shared[best]
+        if len(r) < 2 or np.all(np.ptp(xy[r], axis=0) == 0):
+            raise MatchError(
+                f"exposure {names[best]} shares {len(r)} star{'s' * (len(r) != 1)} with the other exposures; its shift "
+                "and rotation need at least 2: give poses, or leave it out"
+            )
+        mean = sums[star[r]] / counts[star[r], None]
+        found[best] = robust_similarity(mean, xy[r])
+        off = np.hypot(*(poses.apply(found[best], mean) - xy[r]).T)
+        if np.median(off) > 0.05 * np.ptp(xy[r], axis=0).max():
+            continue  # mismatched: it gets a pose, but has no say in those of the others
+        back = poses.apply(poses.invert(found[best]), xy[rows[best]])
+        np.add.at(sums, star[rows[best]], back)
+        np.add.at(counts, star[rows[best]], 1)
+    return _refine_poses([found[i] for i in range(n_exposures)], rows, star, xy)
+
+
+def _scales(pose_list):
+    return np.sqrt(np.abs(np.linalg.det(np.stack(pose_list)[:, :, :2])))
+
+
+def _refine_poses(pose_list, rows, star, xy, n_sweeps=3):
+    """Refit every pose to the mean of all, the first one's plane held by the mean of the poses."""
+    ends = np.array([xy.min(axis=0), xy.max(axis=0)])
+    for _ in range(n_sweeps):
+        back = np.empty_like(xy)
+        for pose, r in zip(pose_list, rows, strict=True):
+            back[r] = poses.apply(poses.invert(pose), xy[r])
+        mean = _star_means(back, star, star.max() + 1)
+        refined = [robust_similarity(mean[star[r]], xy[r]) for r in rows]
+        old, new = ([poses.apply(poses.invert(p), ends) for p in pair] for pair in (pose_list, refined))
+        usual = np.abs(np.log(_scales(refined) / np.median(_scales(refined)))) < np.log(1.5)
+        old, new = (np.concatenate([pair for pair, keep in zip(ends_of, usual, strict=True) if keep])
+                    for ends_of in (old, new))  # fmt: skip
+        common = robust_similarity(old, new)
+        pose_list = [poses.compose(pose, common) for pose in refined]
+    return pose_list

@@ -1,0 +1,320 @@
+"""A reference catalogue: positions with errors that the star positions are to be tied to.
+
+Columns are those of Gaia (also as VizieR writes them), or ``x``, ``y`` in the reference plane. Where a table has both,
+the sky is taken.
+"""
+
+from dataclasses import dataclass, replace
+from numbers import Real
+from pathlib import Path
+
+import numpy as np
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.table import Table
+from astropy.time import Time
+
+from ..exceptions import InputError
+from . import column_contract
+from .table_files import read_table
+
+#: How VizieR calls the columns of Gaia, in small letters.
+VIZIER = {
+    "ra_icrs": "ra", "de_icrs": "dec", "e_ra_icrs": "ra_error", "e_de_icrs": "dec_error", "pmde": "pmdec",
+    "e_pmra": "pmra_error", "e_pmde": "pmdec_error", "radecor": "ra_dec_corr", "rapmracor": "ra_pmra_corr",
+    "rapmdecor": "ra_pmdec_corr", "depmracor": "dec_pmra_corr", "depmdecor": "dec_pmdec_corr",
+    "pmrapmdecor": "pmra_pmdec_corr", "gmag": "phot_g_mean_mag",
+}  # fmt: skip
+_PARAMETERS = ("ra", "dec", "pmra", "pmdec")
+_UNITS = dict.fromkeys(("ra", "dec"), u.deg) | dict.fromkeys(("pmra", "pmdec"), u.mas / u.yr)
+_MAS = np.radians(1 / 3.6e6)
+#: Years between catalogue and exposures within which a star without proper motion still serves.
+_SAME_TIME = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Positions to be tied to; one row a star.
+
+    Attributes
+    ----------
+    label : str
+        How messages call it.
+    star : ndarray, shape (n,), or None
+        Which star of the matches each is, if that is known.
+    flux : ndarray, shape (n,), or None
+        On any scale.
+    sky : ndarray, shape (n, 2), or None
+        ICRS right ascension and declination, degrees.
+    xy : ndarray, shape (n, 2), or None
+        Instead: positions in the reference plane, pixels.
+    covariance : ndarray, shape (n, 2, 2) or (n, 4, 4)
+        Of the position, pixels squared; or of ra, dec (and pmra, pmdec) along east and north, mas and years.
+    motion : ndarray, shape (n, 2), or None
+        Proper motions to the east and north, mas a year.
+    epoch : ndarray, shape (n,), or None
+        Years of the positions.
+    """
+
+    label: str
+    star: np.ndarray | None
+    flux: np.ndarray | None
+    sky: np.ndarray | None
+    xy: np.ndarray | None
+    covariance: np.ndarray
+    motion: np.ndarray | None = None
+    epoch: np.ndarray | None = None
+
+    def __len__(self):
+        return len(self.covariance)
+
+    def __repr__(self):
+        kind = "sky" if self.xy is None else "reference-plane"
+        motion = ", with proper motions" if self.motion is not None else ""
+        return f"<Reference: {len(self)} stars, {kind} positions{motion}>"
+
+    def subset(self, rows):
+        """The same with some of its stars."""
+        arrays = {key: value[rows] for key, value in vars(self).items() if isinstance(value, np.ndarray)}
+        return replace(self, **arrays)
+
+    def at(self, epoch):
+        """The reference with its stars where they were at an epoch, in years (straight motion, no parallax).
+
+        Raises
+        ------
+        InputError
+            If there are proper motions and `epoch` is None, or no star has one.
+        """
+        if self.motion is None:
+            return self
+        if epoch is None:
+            raise InputError(
+                f"{self.label} has proper motions, but the epoch of the exposures is not known (no MJD-OBS or DATE-OBS "
+                "in their headers): give epoch=, a decimal year or an astropy Time (--epoch)"
+            )
+        years = epoch - self.epoch
+        known = np.isfinite(self.motion).all(axis=1) & np.isfinite(self.covariance).all(axis=(1, 2))
+        still = ~known & (np.abs(years) < _SAME_TIME)
+        if not (known | still).any():
+            raise InputError(
+                f"no star of {self.label} has a proper motion with errors, and its epoch is not that of the exposures "
+                f"({epoch:.2f}): leave the columns out to take the positions as they are"
+            )
+        motion = np.where(known[:, None], self.motion, 0) * years[:, None] * _MAS
+        place, east, north = _axes(self.sky)
+        place = place + motion[:, :1] * east + motion[:, 1:] * north
+        step = np.hstack([np.eye(2), np.zeros((2, 2))]) + years[:, None, None] * np.hstack(
+            [np.zeros((2, 2)), np.eye(2)]
+        )
+        full = np.where(np.isfinite(self.covariance), self.covariance, 0)
+        covariance = step @ full @ step.transpose(0, 2, 1)
+        moved = replace(self, sky=_degrees(place), covariance=covariance, motion=None, epoch=np.full(len(self), epoch))
+        return moved.subset(known | still)
+
+    def on_plane(self, plane):
+        """Positions (n, 2) and covariances (n, 2, 2) in pixels of a tangent plane; NaN far off its tangent point."""
+        place, east, north = _axes(self.sky)
+        middle = directions(np.array([[plane.lon, plane.lat]]))[0]
+        far = place @ middle < 0.5  # beyond 60 degrees; the projection ends at 90
+        step = 1e-6
+        xy, x_east, x_north = (_project(plane, place + step * shift) for shift in (0 * east, east, north))
+        slope = np.stack([x_east - xy, x_north - xy], axis=-1) * _MAS / step
+        xy[far] = np.nan
+        return xy, slope @ self.covariance[:, :2, :2] @ slope.transpose(0, 2, 1)
+
+
+def directions(sky):
+    """Unit vectors (n, 3) to positions (n, 2) on the sky, degrees."""
+    lon, lat = np.radians(sky).T
+    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+
+
+def _axes(sky):
+    """Unit vectors (n, 3) to positions (n, 2) in degrees, and those to the east and to the north there."""
+    place, lon = directions(sky), np.radians(sky[:, 0])
+    east = np.stack([-np.sin(lon), np.cos(lon), np.zeros(len(lon))], axis=1)
+    return place, east, np.cross(place, east)
+
+
+def _degrees(place):
+    lon = np.degrees(np.arctan2(place[:, 1], place[:, 0])) % 360
+    return np.stack([lon, np.degrees(np.arctan2(place[:, 2], np.hypot(place[:, 0], place[:, 1])))], axis=1)
+
+
+def _project(plane, place):
+    return plane.from_sky(SkyCoord(*_degrees(place).T * u.deg, frame="icrs"))
+
+
+def year(epoch):
+    """An epoch as a decimal Julian year, None as None.
+
+    Raises
+    ------
+    InputError
+        If it is neither an `~astropy.time.Time` nor a year from 1800 to 2200.
+    """
+    if epoch is None:
+        return None
+    value = epoch.jyear if isinstance(epoch, Time) else epoch
+    if isinstance(value, bool) or not isinstance(value, Real) or not 1800 <= value <= 2200:
+        raise InputError(f"epoch must be a decimal year, such as 2013.25, or one astropy Time, got {epoch!r}")
+    return float(value)
+
+
+def mean_epoch(headers):
+    """Mean epoch of exposures by their headers (MJD-AVG, MJD-OBS, DATE-AVG or DATE-OBS), a Julian year, or None."""
+    found = [value for value in map(_header_epoch, headers) if value is not None]
+    return float(np.mean(found)) if found else None
+
+
+def _header_epoch(header):
+    for key in ("MJD-AVG", "MJD-OBS", "DATE-AVG", "DATE-OBS"):
+        value = header.get(key)
+        try:
+            if isinstance(value, Real) and value > 1:
+                return year(Time(value, format="mjd"))
+            if isinstance(value, str):
+                return year(Time(value.strip(), scale="utc"))
+        except ValueError:  # a header that says nothing readable says nothing
+            continue
+    return None
+
+
+def read_reference(reference):
+    """The `Reference` in a table or file.
+
+    Parameters
+    ----------
+    reference : `~astropy.table.Table`, str, path or Reference
+
+    Raises
+    ------
+    InputError
+        For columns that are missing or hold no numbers, and for a table without a usable row.
+    """
+    if isinstance(reference, Reference):
+        return reference
+    if isinstance(reference, (str, Path)):
+        label, table = f"the reference {reference}", read_table(reference)
+    elif isinstance(reference, Table):
+        label, table = "the reference", Table(reference)  # Quantities become columns with a unit
+    else:
+        raise InputError(f"reference must be a table or the path of one, got {type(reference).__name__}")
+    table = _named(table)
+    celestial = {"ra", "dec"} <= set(table.colnames)
+    if not celestial and not {"x", "y"} <= set(table.colnames):
+        raise InputError(
+            f"{label} has neither ra, dec nor x, y; it has {', '.join(table.colnames)}: rename its columns"
+        )
+    try:
+        made = (_celestial if celestial else _planar)(table, label)
+    except InputError as error:
+        raise InputError(f"{label}: {error}" if label not in str(error) else str(error)) from None
+    positions = made.sky if celestial else made.xy
+    good = np.isfinite(positions).all(axis=1) & np.isfinite(made.covariance[:, :2, :2]).all(axis=(1, 2))
+    if not good.any():
+        raise InputError(f"{label} has no row with finite positions and errors ({len(good)} rows)")
+    if made.star is not None and len(np.unique(made.star[good])) < np.count_nonzero(good):
+        names, count = np.unique(made.star[good], return_counts=True)
+        raise InputError(f"{label} names star {names[count > 1][0]} more than once")
+    return made.subset(good)
+
+
+def _named(table):
+    """The table with the names of Gaia where it has those of VizieR or capitals."""
+    table = table.copy(copy_data=False)
+    for name in table.colnames:
+        small = name.lower()
+        wanted = VIZIER.get(small, small)
+        if wanted != name and wanted not in table.colnames:
+            table.rename_column(name, wanted)
+    for name in ("x_err", "y_err", "ra_error", "dec_error"):  # a table of stars of a solution
+        if f"{name}_abs" in table.colnames:
+            table[name] = table[f"{name}_abs"]
+    return table
+
+
+def _planar(table, label):
+    xy = np.column_stack([column_contract.values(table, name, u.pix) for name in ("x", "y")])
+    errors = _errors(table, ("x_err", "y_err"), u.pix, label)
+    return Reference(label, _star(table), _flux(table), None, xy, _covariance(table, errors, [("x", "y", "xy_corr")]))
+
+
+def _celestial(table, label):
+    sky = np.column_stack([column_contract.values(table, name, u.deg) for name in ("ra", "dec")])
+    if np.any(np.abs(sky[:, 1]) > 90):
+        raise InputError(f"dec must lie in -90 ... 90 degrees, got {sky[np.argmax(np.abs(sky[:, 1])), 1]:g}")
+    moving = [name in table.colnames for name in ("pmra", "pmdec")]
+    motion = epoch = None
+    columns = ["ra_error", "dec_error"]
+    if any(moving):
+        if not all(moving):
+            raise InputError("one of pmra, pmdec is missing")
+        motion = np.column_stack([column_contract.values(table, name, _UNITS[name]) for name in ("pmra", "pmdec")])
+        epoch = _epochs(table, label)
+        columns += ["pmra_error", "pmdec_error"]
+    errors = _errors(table, columns[:2], u.mas, label)
+    if motion is not None:
+        errors = np.hstack([errors, _errors(table, columns[2:], u.mas / u.yr, label)])
+    names = _PARAMETERS[: len(columns)]
+    pairs = [(a, b, f"{a}_{b}_corr") for i, a in enumerate(names) for b in names[i + 1 :]]
+    covariance = _covariance(table, errors, pairs, names)
+    return Reference(label, _star(table), _flux(table), sky, None, covariance, motion, epoch)
+
+
+def _errors(table, names, unit, label):
+    missing = [name for name in names if name not in table.colnames]
+    if missing:
+        raise InputError(
+            f"{label} lacks {' and '.join(missing)}, errors of its {'motions' if 'pm' in missing[0] else 'positions'} "
+            f"({unit}, standard deviations); it has {', '.join(table.colnames)}"
+        )
+    out = np.column_stack([column_contract.values(table, name, unit) for name in names])
+    bad = ~(out > 0) & np.isfinite(out)
+    if bad.any():
+        row, k = np.argwhere(bad)[0]
+        raise InputError(f"{names[k]} must be positive, got {out[row, k]:g} in row {row}")
+    return out
+
+
+def _covariance(table, errors, pairs, names=("x", "y")):
+    """Covariances (n, k, k) from errors (n, k) and the columns of correlations that there are."""
+    out = np.zeros((*errors.shape, errors.shape[1]))
+    diagonal = np.arange(errors.shape[1])
+    out[:, diagonal, diagonal] = errors**2
+    for first, second, name in pairs:
+        if name in table.colnames:
+            corr = np.nan_to_num(column_contract.values(table, name))
+            if np.any(np.abs(corr) > 1):
+                raise InputError(f"{name} must lie in -1 ... 1, got {corr[np.argmax(np.abs(corr))]:g}")
+            i, k = names.index(first), names.index(second)
+            out[:, i, k] = out[:, k, i] = corr * errors[:, i] * errors[:, k]
+    return out
+
+
+def _epochs(table, label):
+    if "ref_epoch" not in table.colnames and "ref_epoch" not in table.meta:
+        raise InputError(
+            f"{label} has proper motions but no column ref_epoch, the year of its positions (2016.0 for Gaia DR3): "
+            "add it"
+        )
+    if "ref_epoch" not in table.colnames:
+        return np.full(len(table), year(table.meta["ref_epoch"]))
+    column = table["ref_epoch"]
+    out = column.jyear if isinstance(column, Time) else column_contract.values(table, "ref_epoch", u.yr)
+    for value in (np.nanmin(out), np.nanmax(out)):
+        year(float(value))
+    return out
+
+
+def _star(table):
+    return column_contract.labels(table, "star") if "star" in table.colnames else None
+
+
+def _flux(table):
+    if "flux" in table.colnames:
+        return np.nan_to_num(column_contract.values(table, "flux"), nan=0.0)
+    if "phot_g_mean_mag" in table.colnames:
+        return np.nan_to_num(10 ** (-0.4 * column_contract.values(table, "phot_g_mean_mag")), nan=0.0)
+    return None

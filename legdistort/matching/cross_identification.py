@@ -1,0 +1,221 @@
+"""Which star of a solution is which star of a reference catalogue, and where that lies in the reference plane."""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..exceptions import InputError
+from ..geometry import similarity
+from ..geometry.tangent_plane import TangentPlane
+from ..inputs.matches import robust_similarity
+from ..inputs.reference_catalogue import directions
+from .registration import register
+from .seeds import scale_candidates
+from .star_lists import StarList
+
+log = logging.getLogger(__name__)
+
+#: Part of the field within which stars must agree that are said to be the same, once a similarity is taken out.
+_AGREEMENT = 0.05
+#: Part of the field that the plane of the catalogue may be off.
+_MARGIN = 0.5
+#: Chance that a star which is near by accident is taken for a reference star.
+_CHANCE = 0.03
+#: How far, as a part of it, the pixel scale may be from the one that is given.
+_SCALE = 0.2
+_ARCSEC = 1 / 3600
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identified:
+    """Reference stars that the solution has.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (n,)
+        Stars of the solution.
+    xy : ndarray, shape (n, 2)
+        Where the reference puts them, reference-plane pixels.
+    covariance : ndarray, shape (n, 2, 2)
+        Of these positions, px^2.
+    sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
+        As it was known, or as the reference gives it.
+    """
+
+    rows: np.ndarray
+    xy: np.ndarray
+    covariance: np.ndarray
+    sky: TangentPlane | None
+
+    def __repr__(self):
+        return f"<Identified: {len(self.rows)} reference stars>"
+
+
+def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=None):
+    """Find the stars that a solution and a reference have in common.
+
+    By name if the reference names them; else on the plane, where chance must not explain what agrees; else, with
+    celestial positions and no sky known, by their pattern, in any orientation.
+
+    Parameters
+    ----------
+    reference : Reference
+        At the epoch of the exposures.
+    names : ndarray, shape (n,)
+    positions : ndarray, shape (n, 2)
+        Pixels; NaN for stars that are not to be used.
+    flux : ndarray, shape (n,), optional
+    sky : TangentPlane, optional
+        Where the reference plane lies, roughly.
+    pixel_scale : float, optional
+        Arcsec, to the nearest 20 per cent.
+
+    Returns
+    -------
+    Identified
+
+    Raises
+    ------
+    InputError
+        If there are none, or they do not agree.
+    """
+    solved = np.isfinite(positions).all(axis=1)
+    rows = np.flatnonzero(solved)
+    flux = None if flux is None else flux[rows]
+    if reference.star is not None:
+        found = _by_name(reference, names, rows)
+    elif reference.xy is None and sky is None:
+        found = _by_pattern(reference, positions[rows], flux, pixel_scale)
+        found = rows[found[0]], found[1]
+    else:
+        plane = reference.xy if reference.xy is not None else reference.on_plane(sky)[0]
+        found = _on_plane(reference, plane, positions[rows], flux)
+        found = rows[found[0]], found[1]
+    rows, reference = found[0], reference.subset(found[1])
+    if reference.xy is not None:
+        xy, covariance = reference.xy, reference.covariance
+    else:
+        if sky is None:
+            sky = _tangent_plane(reference, positions[rows])
+        xy, covariance = reference.on_plane(sky)
+    _check_agreement(reference.label, positions[rows], xy, np.ptp(positions[solved], axis=0).max())
+    return Identified(rows, xy, covariance, sky)
+
+
+def _by_name(reference, names, rows):
+    """Stars of the same name; a number is the same as its digits."""
+    known = {str(names[row]): row for row in rows}
+    pairs = [(known[str(name)], k) for k, name in enumerate(reference.star) if str(name) in known]
+    if not pairs:
+        raise InputError(
+            f"{reference.label} names none of the stars of the exposures: it has "
+            f"{', '.join(map(str, reference.star[:3]))} ..., they are {', '.join(list(known)[:3])} ...; without the "
+            "column star it is matched by position"
+        )
+    return np.array(pairs).T
+
+
+def _on_plane(reference, plane, positions, flux):
+    """Rows of the stars and of the reference that stand at one place, wherever the plane may be off a little."""
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    size = (high - low).max()
+    near = np.flatnonzero(np.all((plane > low - _MARGIN * size) & (plane < high + _MARGIN * size), axis=1))
+    if len(near):
+        found = _registered(positions, plane[near], flux, reference.flux, near, guess=True)
+        if found is None:
+            found = _neighbours(positions, plane[near], high - low)
+        inside = np.all((plane[near] > low) & (plane[near] < high), axis=1)
+        if len(found[0]) > np.count_nonzero(inside) / 2:  # of what is another field a few are near by chance
+            return found[0], near[found[1]]
+    distance = np.nanmin(cKDTree(positions).query(np.nan_to_num(plane, nan=1e9))[0], initial=np.inf)
+    raise InputError(
+        f"none of the {len(plane)} stars of {reference.label} lies where a star of the exposures is"
+        + (f"; the nearest two are {distance:.0f} px apart" if distance < 1e8 else "")
+        + ": another field, the wrong columns, or a wrong sky in the headers?"
+    )
+
+
+def _registered(source, target, source_flux, target_flux, near, *, guess):
+    """Rows of source and target by `registration.register`; None if nothing stands out from chance."""
+    if min(len(source), len(target)) < 5:
+        return None
+    fluxes = (source_flux, None if target_flux is None else target_flux[near])
+    if any(f is None for f in fluxes):
+        fluxes = None, None
+    lists = []
+    for xy, flux, shift in ((source, fluxes[0], 0.0), (target, fluxes[1], 10.0)):  # so that nothing stands still
+        low, span = xy.min(axis=0) - shift, np.ptp(xy, axis=0) + shift
+        lists.append((low, StarList(xy - low, np.zeros(len(xy)), tuple(np.ceil(span[::-1]).astype(int) + 1), flux)))
+    (low, stars), (other, catalogue) = lists
+    pose = np.column_stack([np.eye(2), low - other]) if guess else None
+    found = register(stars, catalogue, guess=pose)
+    return None if found is None else (found.source, found.target)
+
+
+def _neighbours(positions, plane, span):
+    """Mutual neighbours nearer than chance allows; for lists that are too short for a pattern."""
+    limit = np.sqrt(_CHANCE * np.prod(np.maximum(span, 1)) / (np.pi * len(positions)))
+    stars = cKDTree(positions)
+    distance, row = stars.query(plane, distance_upper_bound=limit)
+    back = cKDTree(plane).query(positions)[1]
+    good = [k for k in np.flatnonzero(np.isfinite(distance)) if back[row[k]] == k]
+    return row[good], np.array(good, dtype=int)
+
+
+def _by_pattern(reference, positions, flux, pixel_scale):
+    """Rows of the stars and of the reference, by pattern alone, on a plane around the middle of the reference."""
+    if len(reference) < 5 or len(positions) < 5:
+        raise InputError(
+            f"the exposures have no WCS, and {len(reference)} stars of {reference.label} and {len(positions)} of the "
+            "exposures are too few to find one by their pattern: name them in a column star, or take more"
+        )
+    xy = reference.on_plane(_middle(reference.sky, _ARCSEC))[0]
+    scales = scale_candidates(positions, xy)
+    if pixel_scale is not None:
+        scales = [s for s in scales if abs(np.log(s / pixel_scale)) < _SCALE] + [pixel_scale]
+    for scale in scales:
+        found = _registered(positions, xy / scale, flux, reference.flux, slice(None), guess=False)
+        if found is not None:
+            log.info("the stars were found in %s by their pattern: %d pairs", reference.label, len(found[0]))
+            return found
+    raise InputError(
+        f"the exposures have no WCS, and the pattern of their {len(positions)} stars is not that of the "
+        f"{len(reference)} of {reference.label}"
+        + (f" at {pixel_scale:g} arcsec a pixel" if pixel_scale else "")
+        + ": another field, too small a part of it, or another pixel scale (pixel_scale=, --pixel-scale)? A column "
+        "star that names them also helps"
+    )
+
+
+def _middle(sky, scale):
+    """The plane that touches the sky in the middle of positions (n, 2), in pixels of `scale` degrees."""
+    place = np.mean(directions(sky), axis=0)
+    lon, lat = np.degrees([np.arctan2(place[1], place[0]), np.arctan2(place[2], np.hypot(place[0], place[1]))])
+    return TangentPlane(float(lon) % 360, float(lat), scale * similarity.identity())
+
+
+def _tangent_plane(reference, positions):
+    """Tangent point, rotation, scale and parity from identified stars."""
+    if len(positions) < 3:
+        raise InputError(
+            f"the exposures have no WCS, and {len(positions)} stars of {reference.label} are too few to tell rotation, "
+            "scale and parity: 3 are needed"
+        )
+    plane = _middle(reference.sky, 1.0)
+    matrix = robust_similarity(positions, reference.on_plane(plane)[0])
+    return TangentPlane(plane.lon, plane.lat, matrix)
+
+
+def _check_agreement(label, positions, xy, size):
+    """Raise `InputError` if a similarity does not carry one to the other, roughly."""
+    if len(positions) < 3:
+        return
+    off = np.hypot(*(similarity.apply(robust_similarity(positions, xy), positions) - xy).T)
+    if not np.median(off) < _AGREEMENT * size:
+        raise InputError(
+            f"the {len(positions)} stars that {label} shares with the exposures by name do not lie as they do there "
+            f"({np.median(off):.0f} px off, whatever shift, rotation and scale): other stars under the same names? "
+            "Without the column star they are matched by position"
+        )

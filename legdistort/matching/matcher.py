@@ -1,0 +1,335 @@
+"""Detections of all exposures -> matches: the same star gets the same number, every exposure its nominal pose."""
+
+import logging
+
+import numpy as np
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.wcs.utils import wcs_to_celestial_frame
+
+from ..exceptions import AssumptionWarning, InputError, MatchError, warn
+from ..geometry import similarity
+from ..geometry.tangent_plane import TangentPlane
+from ..inputs import column_contract
+from ..inputs.matches import Matches, estimate_poses
+from ..inputs.reference_catalogue import mean_epoch
+from ..measurement.crowding import LIMIT, is_isolated
+from ..measurement.positions import UNUSABLE
+from .linking import interlink, label_stars, standing, tie
+from .merging import unite
+from .star_lists import StarList
+
+logger = logging.getLogger(__name__)
+
+#: Fewest detections with which an exposure can take part.
+FEWEST = 5
+#: Headers that disagree with the others by more than this part of the field do not say where the field lies.
+HEADER_TOLERANCE = 0.1
+
+
+def match(
+    detections,
+    *,
+    exposures=None,
+    shape=None,
+    min_exposures=4,
+    columns=None,
+    tolerance=None,
+    reject_flags=UNUSABLE,
+    isolation=LIMIT,
+    progress=False,
+):
+    """Find out which detections are the same star.
+
+    Exposures may differ by any shift that leaves an overlap, any rotation, a flip, several per cent of scale
+    and a distortion of about one per cent of the field. Header WCSs, where there are any, are tried first and
+    never trusted: what does not stand out from chance is not a match.
+
+    Parameters
+    ----------
+    detections : `~astropy.table.Table`
+        Columns ``exposure``, ``x``, ``y``, ``x_err``, ``y_err`` (pixels, 0-based, standard deviations), optional
+        ``flux``, ``flags``, ``xy_corr``; further columns are kept.
+    exposures : list of `~legdistort.inputs.exposures.Exposure`, optional
+        Give the shapes and the nominal WCSs, by name.
+    shape : tuple or dict, optional
+        ``(ny, nx)``, or that by exposure, when there are no `exposures`.
+    min_exposures : int
+        A star is kept when it was found in that many exposures.
+    columns : dict, optional
+        ``{name expected: name in the table}``.
+    tolerance : float, optional
+        Largest distance of two detections of a star after distortions have been fitted for the pair, pixels;
+        by default 5 times the scatter found, with the errors of both detections and of the fit on top.
+    reject_flags : int
+        Detections with any of these bits in ``flags`` are not used.
+    isolation : float or None
+        Largest ``crowding`` of a detection, see `legdistort.measurement.crowding`; deformed ones are left out too.
+        They help to find out which star is which all the same. None = all are kept. Tables without the column are
+        taken as they are.
+    progress : bool
+        Show progress bars.
+
+    Returns
+    -------
+    Matches
+        Stars are numbered from 0, the brightest first (without fluxes, in order of position). Poses refer to the
+        plane of the richest exposure, or, with WCSs, to the tangent plane at their median pointing, in pixels of the
+        first exposure and with its orientation. Exposures that fit nowhere stand in ``left_out`` with the reason.
+
+    Raises
+    ------
+    InputError
+        For missing columns, bad values, a missing shape, fewer exposures than `min_exposures`.
+    MatchError
+        For a single exposure, exposures in groups without a star in common, or no star in `min_exposures` exposures.
+    """
+    if columns:
+        detections = column_contract.rename(detections, columns)
+    table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
+    table["exposure"] = table["exposure"].astype(str)
+    named = None if exposures is None else {e.name: e for e in exposures}
+    names = list(named or dict.fromkeys(table["exposure"].tolist()))
+    _check_arguments(table, names, min_exposures, tolerance)
+    shapes = _shapes(table, names, named, shape)
+    if "flags" in table.colnames:
+        table = table[(np.asarray(table["flags"]).astype(int) & int(reject_flags)) == 0]
+    table = _without_repetitions(table)
+    headers = _Headers({n: e.wcs for n, e in (named or {}).items() if e.wcs is not None}, shapes)
+
+    rows = {name: np.flatnonzero(table["exposure"] == name) for name in names}
+    left_out = {n: f"only {len(r)} usable detections of at least {FEWEST}" for n, r in rows.items() if len(r) < FEWEST}
+    kept = [name for name in names if name not in left_out]
+    lists = [_star_list(table[rows[name]], shapes[name]) for name in kept]
+    stars = _associate(lists, kept, headers, left_out, tolerance=tolerance, progress=progress)
+    star = np.full(len(table), -1)
+    for name, labels in stars.items():
+        star[rows[name]] = labels
+    isolated = is_isolated(table, isolation)
+    if not isolated.all():
+        logger.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
+        star[~isolated] = -1
+    table, star = _keep_common(table, star, min_exposures, left_out)
+    epoch = mean_epoch(e.header for e in named.values()) if named else None
+    return _finish(table, star, shapes, headers, left_out, epoch)
+
+
+def _without_repetitions(table):
+    """The table without rows that repeat a position of the same exposure: they would pass for two blended stars."""
+    place = np.rec.fromarrays([table["exposure"], table["x"].value, table["y"].value])
+    first = np.sort(np.unique(place, return_index=True)[1])
+    if len(first) < len(table):
+        logger.warning("%d detections stand twice at the very same place; one of each is kept", len(table) - len(first))
+    return table[first]
+
+
+def _check_arguments(table, names, min_exposures, tolerance):
+    unknown = sorted(set(table["exposure"].tolist()) - set(names))
+    if unknown:
+        raise InputError(
+            f"the table of detections names exposure {unknown[0]!r}, which is not among exposures= ({', '.join(names)})"
+        )
+    if int(min_exposures) != min_exposures or min_exposures < 2:
+        raise InputError(f"min_exposures must be an integer of at least 2, got {min_exposures!r}")
+    if tolerance is not None and not 0 < tolerance < np.inf:
+        raise InputError(f"tolerance must be a positive number of pixels, got {tolerance!r}")
+    if len(names) == 1:
+        raise MatchError(f"only one exposure ({names[0]}): give at least two of the same field")
+    if len(names) < min_exposures:
+        raise InputError(
+            f"{len(names)} exposures were given and stars must be in min_exposures={min_exposures} of them; "
+            f"use min_exposures={len(names)} or fewer (--min-exposures)"
+        )
+
+
+def _shapes(table, names, named, shape):
+    if named is not None:
+        return {name: named[name].shape for name in names}
+    if isinstance(shape, dict):
+        missing = [name for name in names if name not in shape]
+        if missing:
+            raise InputError(f"shape has no entry for exposure {missing[0]!r}; give (ny, nx) for every exposure")
+        return {name: tuple(shape[name]) for name in names}
+    if shape is None:
+        shape = tuple(int(np.ceil(table[c].to_value(u.pix).max() + 0.5)) for c in ("y", "x"))
+        warn(
+            f"no shape given: every exposure is taken as {shape[1]} x {shape[0]} pixels, the extent of the positions; "
+            "pass shape=(ny, nx) or exposures=",
+            AssumptionWarning,
+        )
+    return dict.fromkeys(names, tuple(shape))
+
+
+def _star_list(table, shape):
+    x, y, x_err, y_err = (table[c].to_value(u.pix) for c in ("x", "y", "x_err", "y_err"))
+    flux = None
+    if "flux" in table.colnames:
+        flux = np.nan_to_num(column_contract.values(table, "flux"), nan=-np.inf)
+    return StarList(np.column_stack([x, y]), np.hypot(x_err, y_err), shape, flux)
+
+
+def _associate(lists, names, headers, left_out, *, tolerance, progress):
+    """Star labels by exposure name; exposures without a place are added to `left_out`."""
+    if len(lists) < 2:
+        raise MatchError(f"fewer than two exposures have stars: {_reasons(left_out)}")
+
+    def guess(i, j):
+        return headers.step(names[i], names[j])
+
+    groups = unite(lists, tie(lists, guess, tolerance=tolerance, progress=progress), guess, tolerance=tolerance)
+    hot = standing(lists, groups[0])
+    if any(h.any() for h in hot):
+        logger.info("%d detections stand still while the sky moves: hot pixels, not used", sum(h.sum() for h in hot))
+        lists = [stars.subset(~h) for stars, h in zip(lists, hot, strict=True)]
+        groups = unite(lists, tie(lists, guess, tolerance=tolerance, progress=progress), guess, tolerance=tolerance)
+    _check_groups(groups, lists, names, left_out)
+    registrations, misfits = interlink(lists, groups[0], tolerance=tolerance, progress=progress)
+    left_out.update({names[i]: reason for i, reason in misfits.items()})
+    good = {pair: r for pair, r in registrations.items() if not misfits.keys() & set(pair)}
+    logger.info("%d pairs of exposures registered", len(good))
+    labels = [np.full(len(h), -1) for h in hot]
+    for label, h, found in zip(labels, hot, label_stars([len(stars) for stars in lists], good), strict=True):
+        label[~h] = found
+    return dict(zip(names, labels, strict=True))
+
+
+def _check_groups(groups, lists, names, left_out):
+    for group in groups:
+        if len(group.poses) == 1:
+            (only,) = group.poses
+            left_out[names[only]] = f"none of its {len(lists[only])} detections fit other exposures better than chance"
+    large = [sorted(names[i] for i in group.poses) for group in groups if len(group.poses) > 1]
+    if len(large) > 1:
+        listed = "; ".join(", ".join(group) for group in large)
+        raise MatchError(
+            f"the exposures form {len(large)} groups with no star in common: {listed}; match each group by itself"
+        )
+    if not large:
+        raise MatchError(
+            f"no two exposures show the same stars (tried {', '.join(names)}); check that they overlap and that the "
+            "detections are stars"
+        )
+
+
+def _keep_common(table, star, min_exposures, left_out):
+    """Rows of stars in enough exposures; exposures with fewer than 3 of these go, and with them their rows."""
+    exposure = np.asarray(table["exposure"])
+    while True:
+        _, inverse, count = np.unique(star, return_inverse=True, return_counts=True)
+        keep = (star >= 0) & (count[inverse] >= min_exposures)
+        seen = np.unique(exposure[keep], return_counts=True)
+        poor = {str(n): c for n, c in zip(*seen, strict=True) if c < 3}
+        absent = [n for n in np.unique(exposure) if n not in seen[0] and n not in left_out]
+        if not keep.any():
+            most = np.max(count[inverse][star >= 0], initial=0)
+            raise MatchError(
+                f"no star was found in min_exposures={min_exposures} exposures, the best in {most}; lower min_exposures"
+                + (f"; left out: {_reasons(left_out)}" if left_out else "")
+            )
+        left_out.update(
+            {str(n): f"only {poor.get(n, 0)} of its stars are in {min_exposures} exposures" for n in [*poor, *absent]}
+        )
+        if not poor:
+            return table[keep], star[keep]
+        star = np.where(np.isin(exposure, list(poor)), -1, star)
+
+
+def _reasons(left_out):
+    return "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+
+
+def _finish(table, star, shapes, headers, left_out, epoch):
+    names = tuple(dict.fromkeys(table["exposure"].tolist()))
+    _, index = np.unique(star, return_inverse=True)
+    exposure = np.array([names.index(name) for name in table["exposure"]])
+    xy = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
+    table["star"] = _number(table, index, xy)
+    shapes = {name: shapes[name] for name in names}
+    try:
+        found = dict(zip(names, estimate_poses(exposure, index, xy, names=names), strict=True))
+    except MatchError:
+        found = None  # from_table says which groups are apart
+    sky = None
+    if found is not None:
+        found, sky = headers.place(found)
+    for name, reason in left_out.items():
+        logger.warning("%s is left out: %s", name, reason)
+    return Matches.from_table(table, shape=shapes, poses=found, sky=sky, left_out=left_out, epoch=epoch)
+
+
+def _number(table, index, xy):
+    """Serial numbers: by falling median flux, or else by position from left to right."""
+    n = index.max() + 1
+    if "flux" in table.colnames:
+        order = np.lexsort([column_contract.values(table, "flux"), index])
+        middle = np.searchsorted(index[order], np.arange(n)) + np.bincount(index, minlength=n) // 2
+        value = -np.nan_to_num(column_contract.values(table, "flux")[order][middle], nan=-np.inf)
+    else:
+        value = np.bincount(index, xy[:, 0], n) / np.bincount(index, minlength=n)
+    serial = np.empty(n, int)
+    serial[np.argsort(value, kind="stable")] = np.arange(n)
+    return serial[index]
+
+
+class _Headers:
+    """Nominal poses from the header WCSs (linear part), and the tangent plane they share."""
+
+    def __init__(self, wcss, shapes):
+        self.shapes, self.poses, self.sky = shapes, {}, None
+        if not wcss:
+            return
+        centres = np.array([_to_sky(w, _grid(shapes[n], 1)).cartesian.xyz.value[:, 0] for n, w in wcss.items()])
+        # the median, not the mean: one header may point anywhere
+        middle = SkyCoord(*np.median(centres, axis=0), representation_type="cartesian").spherical
+        on_sky = TangentPlane(middle.lon.deg, middle.lat.deg, similarity.identity())
+        planes = {}
+        for name, w in wcss.items():
+            grid = _grid(shapes[name], 5)
+            plane = on_sky.from_sky(_to_sky(w, grid))
+            if np.all(np.isfinite(plane)):
+                planes[name] = similarity.fit_similarity(grid, plane)
+        if not planes:
+            return
+        first, matrix = next(iter(planes.items()))
+        matrix = np.column_stack([matrix[:, :2], -matrix[:, :2] @ _grid(shapes[first], 1)[0]])
+        self.sky = TangentPlane(on_sky.lon, on_sky.lat, matrix)
+        self.poses = {name: similarity.compose(similarity.invert(plane), matrix) for name, plane in planes.items()}
+
+    def step(self, source, target):
+        """Nominal pose from one exposure's pixels to another's, or None."""
+        if source in self.poses and target in self.poses:
+            return similarity.compose(self.poses[target], similarity.invert(self.poses[source]))
+        return None
+
+    def place(self, found):
+        """Poses in any plane -> poses in the headers' plane, by the mean of the headers that agree; and its tie."""
+        names = [name for name in found if name in self.poses]
+        if not names:
+            return found, None
+        # every header says where the plane of the poses lies in the plane of the sky
+        steps = np.array([similarity.compose(similarity.invert(found[n]), self.poses[n]) for n in names])
+        size = max(max(self.shapes[n]) for n in names)
+        corners = np.array([similarity.apply(step, _grid(self.shapes[names[0]], 2)) for step in steps])
+        apart = np.linalg.norm(corners - np.median(corners, axis=0), axis=2).max(axis=1)
+        good = apart < HEADER_TOLERANCE * size
+        if 2 * np.count_nonzero(good) <= len(names):
+            warn(
+                "the header WCSs contradict the stars and one another; they are ignored, and the sky stays unknown",
+                AssumptionWarning,
+            )
+            return found, None
+        mean = steps[good].mean(axis=0)
+        return {name: similarity.compose(pose, mean) for name, pose in found.items()}, self.sky
+
+
+def _grid(shape, n):
+    """Pixels of an n x n grid from edge to edge (the centre for n = 1), shape (n*n, 2)."""
+    x, y = (np.linspace(0, size - 1, n) if n > 1 else np.array([(size - 1) / 2]) for size in shape[::-1])
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def _to_sky(wcs, xy):
+    """Sky positions by the linear part of a WCS (no SIP or table), as the poses lead to undistorted pixels."""
+    wcs = wcs.celestial
+    lon, lat = wcs.wcs_pix2world(xy, 0).T
+    return SkyCoord(lon * u.deg, lat * u.deg, frame=wcs_to_celestial_frame(wcs)).icrs

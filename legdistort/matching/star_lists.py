@@ -1,0 +1,114 @@
+"""Star lists and the polynomial maps that carry one to another."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..geometry import basis, similarity
+
+#: Degree of a map and the number of pairs that it asks for; with fewer it is a similarity (degree 0).
+NEEDED = ((5, 84), (3, 15), (2, 10), (1, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class StarList:
+    """Detections of one exposure.
+
+    Attributes
+    ----------
+    xy : ndarray, shape (n, 2)
+    error : ndarray, shape (n,)
+        Total position error, pixels.
+    shape : tuple
+        ``(ny, nx)``.
+    flux : ndarray, shape (n,), or None
+    """
+
+    xy: np.ndarray
+    error: np.ndarray
+    shape: tuple
+    flux: np.ndarray | None = None
+
+    def __len__(self):
+        return len(self.xy)
+
+    @cached_property
+    def tree(self):
+        """KD-tree of the positions."""
+        return cKDTree(self.xy)
+
+    @cached_property
+    def ranking(self):
+        """Indices, brightest first; None without fluxes."""
+        return None if self.flux is None else np.argsort(-self.flux, kind="stable")
+
+    @property
+    def field(self):
+        """Longer side of the detector, pixels."""
+        return float(max(self.shape))
+
+    @property
+    def area(self):
+        """Area of the detector, pixels squared."""
+        return float(self.shape[0] * self.shape[1])
+
+    def subset(self, keep):
+        """The list with some of its rows (boolean mask)."""
+        flux = None if self.flux is None else self.flux[keep]
+        return StarList(self.xy[keep], self.error[keep], self.shape, flux)
+
+
+@dataclass(frozen=True, eq=False)
+class Warp:
+    """Polynomial map from one list to another: coefficients (n_modes, 2) in the basis of the source's detector.
+
+    `covariance` is that of the coefficients for positions of unit variance, (n_modes, n_modes); None if not known.
+    """
+
+    coefficients: np.ndarray
+    shape: tuple
+    covariance: np.ndarray | None = None
+
+    def __call__(self, xy):
+        """Map positions (n, 2)."""
+        return self._design(xy) @ self.coefficients
+
+    def leverage(self, xy):
+        """Variance of mapped positions (n,) over that of the positions fitted; large where the map extrapolates."""
+        if self.covariance is None:
+            return np.zeros(len(xy))
+        design = self._design(xy)
+        return np.einsum("ij,ij->i", design @ self.covariance, design)
+
+    def _design(self, xy):
+        degree = basis.degree_of(len(self.coefficients))
+        return basis.values(degree, *basis.normalize(xy, self.shape)).T
+
+    @classmethod
+    def from_pose(cls, pose, shape):
+        """The same map as a pose."""
+        corners = np.array([[0.0, 0], [shape[1], 0], [0, shape[0]]])
+        design = basis.values(1, *basis.normalize(corners, shape)).T
+        return cls(np.linalg.solve(design, similarity.apply(pose, corners)), shape)
+
+
+def allowed_degree(n):
+    """Degree of the map that a number of pairs supports; 0 for a similarity."""
+    return next((degree for degree, needed in NEEDED if n >= needed), 0)
+
+
+def fit_warp(p, q, shape, degree, *, weights, width, parity):
+    """Weighted polynomial from `p` to `q` (n, 2), for degree 0 a similarity of that parity.
+
+    Modes beyond the affine ones are held to one per cent of the field.
+    """
+    if degree == 0:
+        return Warp.from_pose(similarity.fit_similarity(p, q, weights=weights, parity=parity), shape)
+    design = basis.values(degree, *basis.normalize(p, shape))
+    i, j = basis.orders(degree)
+    ridge = np.where(i + j > 1, (width / (0.01 * max(shape))) ** 2, 1e-9)
+    normal = (design * weights) @ design.T + np.diag(ridge)
+    covariance = np.linalg.inv(normal)
+    return Warp(covariance @ ((design * weights) @ q), shape, covariance)

@@ -1,0 +1,1 @@
+"""From images to star positions and their errors."""

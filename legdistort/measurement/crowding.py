@@ -1,0 +1,162 @@
+"""How much other stars disturb the position of a star.
+
+"We only consider relatively well-isolated stars in order to avoid any confusion" (Bernard et al. 2017, section 5.2.1).
+Two things are asked of every star. *Detected neighbours*: how far would their light pull the position if it were not
+subtracted, in standard errors of the position (`crowding`)? Subtraction leaves a small part of that, some per cent.
+*Neighbours too close to be detected* show in the shape of the star (`is_deformed`).
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ..exceptions import InputError
+from .flags import Flag
+
+#: Largest `crowding` of a star called isolated: what subtraction leaves of it is then a small part of its error.
+LIMIT = 3.0
+#: Chi2 of a shape, per parameter, beyond which it is not that of a single star; chance alone gives 1 in 300.
+DEFORMED = 4.0
+
+_BETA = 3.0
+_REACH = 6.0  # FWHM: neighbours farther away than this pull at nothing but the background
+_QUARTILE = 0.3186  # of the absolute value of a unit normal
+_QUARTILE_OF_CHI2 = 1.923  # with 4 degrees of freedom
+_FEWEST = 20  # stars that tell what shape is usual
+
+
+def is_isolated(table, limit=LIMIT):
+    """Whether detections have neither `crowding` above a limit nor the flag ``DEFORMED``.
+
+    Tables without a column ``crowding``, of other programs, tell nothing: all their rows pass.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        As from `legdistort.measure`.
+    limit : float or None
+        None or infinity: everything passes.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+
+    Raises
+    ------
+    InputError
+        If the limit is not positive.
+    """
+    if limit is not None and not limit > 0:
+        raise InputError(f"isolation must be a positive number of standard errors, or None, got {limit!r}")
+    if limit is None or limit == np.inf or "crowding" not in table.colnames:
+        return np.ones(len(table), dtype=bool)
+    isolated = np.asarray(table["crowding"], dtype=float) <= limit
+    if "flags" in table.colnames:
+        isolated &= (np.asarray(table["flags"]).astype(int) & Flag.DEFORMED) == 0
+    return isolated
+
+
+def displacement(xy, flux, fwhm, *, sources=None):
+    """Shift of every star's position by the light of its neighbours, were that left in.
+
+    To first order, for round Moffat profiles (beta = 3) of one width, fitted in a box of 4 FWHM with free background:
+    shifts of several neighbours add as vectors.
+
+    Parameters
+    ----------
+    xy : ndarray, shape (n, 2)
+        Positions [pix].
+    flux : ndarray, shape (n,)
+    fwhm : float
+        [pix]
+    sources : ndarray of bool, shape (n,), optional
+        Which of them give light; by default all with a positive flux.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        Pixels, towards the neighbours; NaN for stars without a positive flux.
+    """
+    xy, flux = np.asarray(xy, dtype=float), np.asarray(flux, dtype=float)
+    lit = flux > 0
+    sources = lit if sources is None else lit & sources
+    i, j = KDTree(xy).query_pairs(_REACH * fwhm, output_type="ndarray").T
+    i, j = np.concatenate([i, j]), np.concatenate([j, i])
+    pairs = lit[i] & sources[j]
+    i, j = i[pairs], j[pairs]
+    away = xy[j] - xy[i]
+    distance = np.maximum(np.hypot(*away.T), 1e-9)
+    pull = flux[j] / flux[i] * fwhm * np.interp(distance / fwhm, *_pull()) / distance
+    out = np.where(lit[:, None], np.zeros_like(xy), np.nan)
+    np.add.at(out, i, pull[:, None] * away)
+    return out
+
+
+@lru_cache(maxsize=1)
+def _pull():
+    """Distances, and the shift of a star by an equal one there; both in FWHM."""
+    half = np.linspace(-2, 2, 81)
+    x, y = np.meshgrid(half, half)
+
+    def profile(x):
+        return (1 + 4 * (2 ** (1 / _BETA) - 1) * (x**2 + y**2)) ** -_BETA
+
+    slope = (profile(x - 1e-4) - profile(x + 1e-4)) / 2e-4  # derivative by the position of the star
+    distances = np.linspace(0, _REACH, 121)
+    return distances, np.array([(slope * profile(x - d)).sum() for d in distances]) / (slope**2).sum()
+
+
+def crowding(table, fwhm):
+    """Shift by the light of detected neighbours, were that left in, in standard errors of the position.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        Detections of one exposure: ``x``, ``y``, ``x_err``, ``y_err``, ``flux``, ``flags``.
+    fwhm : float
+        Of its stars [pix].
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        0 for a star without neighbours; infinite for one without a positive flux.
+    """
+    x, y, x_err, y_err = (table[name].value for name in ("x", "y", "x_err", "y_err"))
+    sources = (table["flags"] & (Flag.NOT_CONVERGED | Flag.INSIGNIFICANT)) == 0
+    shift = displacement(np.column_stack([x, y]), table["flux"], fwhm, sources=sources)
+    ratio = np.hypot(shift[:, 0] / x_err, shift[:, 1] / y_err)
+    return np.where(np.isnan(ratio), np.inf, ratio)
+
+
+def is_deformed(shapes, covariance, *, snr, usable):
+    """Whether shapes differ from that of the other stars of the frame by more than their noise.
+
+    The usual shape is the median of the best quarter of the stars, by signal-to-noise ratio; the scatter among them
+    beyond their noise (the profile varies over the field, and no profile is quite a Moffat function) is allowed for.
+
+    Parameters
+    ----------
+    shapes : ndarray, shape (n, 4)
+        Of fitted profiles, see `legdistort.measurement.profiles.moffat.NAMES`.
+    covariance : ndarray, shape (n, 4, 4)
+    snr : ndarray, shape (n,)
+    usable : ndarray of bool, shape (n,)
+        Stars whose shape counts for what is usual.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    best = np.flatnonzero(usable)[np.argsort(-snr[usable], kind="stable")]
+    best = best[: max(_FEWEST, len(best) // 4)]
+    if len(best) < 8:
+        return np.zeros(len(shapes), dtype=bool)
+    off = shapes - np.median(shapes[best], axis=0)
+    # the quartile stays what it is among single stars even where half of the others are blends
+    spread = (np.quantile(np.abs(off[best]), 0.25, axis=0) / _QUARTILE) ** 2
+    noise = np.median(np.einsum("nii->ni", covariance[best]), axis=0)
+    total = covariance + np.diag(np.maximum(spread - noise, 0))
+    chi2 = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off)
+    usual = max(1.0, np.quantile(chi2[best], 0.25) / _QUARTILE_OF_CHI2)  # the spread is itself known from few stars
+    return chi2 > DEFORMED * shapes.shape[1] * usual

@@ -1,0 +1,288 @@
+"""Stars of known position put into real images, in places free of stars, and measured again."""
+
+import logging
+import zlib
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from astropy import units as u
+from astropy.stats import biweight_scale
+from astropy.table import QTable
+from scipy.ndimage import maximum_filter
+from scipy.spatial import cKDTree
+
+from ..exceptions import InputError
+from .flags import UNUSABLE
+from .noise_curves import NoiseCurves
+from .profiles import moffat
+from .profiles.cutouts import Stamps
+from .profiles.frame_fit import box_half, fit_stars, locate_stars
+
+logger = logging.getLogger(__name__)
+
+#: Distance of injected stars from one another and from the detections of the frame, in FWHM.
+APART, AWAY = 8.0, 3.0
+#: Fewest that must find room in a frame at a time.
+ROOM = 4
+#: Fluxes that are tried by default.
+N_FLUXES = 12
+
+_TRIES = 20  # places drawn for each one wanted
+_FAINTEST = 1.5  # lowest flux, in units of that at the detection limit
+_RANGE = 1000  # highest flux, at least so many times the lowest: both regimes show
+_BELOW_SATURATION = 0.8
+
+
+def calibrate_frame(exposure, remeasure, *, threshold=5.0, widths=None, fluxes=None, n_positions=100, seed=0):
+    """Errors of positions in one frame, from stars put into it and measured.
+
+    Parameters
+    ----------
+    exposure : `~legdistort.inputs.exposures.Exposure`
+    remeasure : callable
+        ``remeasure(exposure)`` and ``remeasure(exposure, fwhm=...)``: table of detections.
+    threshold : float
+        Detection limit of `remeasure`.
+    widths : sequence of float, optional
+        FWHM of the stars put in [pix]; by default that of the frame's own.
+    fluxes : sequence of float, optional
+        By default from the detection limit to the brightest star of the frame or a thousand times the limit, but
+        below saturation.
+    n_positions : int
+        For every width and flux.
+    seed : int
+        Of the random numbers, which depend on the name of the exposure too.
+
+    Returns
+    -------
+    `~legdistort.measurement.noise_curves.NoiseCurves`
+
+    Raises
+    ------
+    InputError
+        For a frame without stars if `widths` or the gain are missing, without room, or saturated at the faintest stars.
+    """
+    name, rng = exposure.name, np.random.default_rng([seed, zlib.crc32(exposure.name.encode())])
+    frame, centres, shape = locate_stars(exposure, {}, threshold=threshold)
+    if not len(centres) and widths is None:
+        raise InputError(f"{name}: no star above {threshold:g} times the noise tells how wide stars are; give fwhm")
+    photon = _photon_noise(frame, exposure, centres, shape)
+    own = float(moffat.fwhm(shape)) if len(centres) else None
+    rows = []
+    for width in widths or [own]:
+        profile = scaled(shape, width)
+        levels = np.sort(fluxes if fluxes is not None else default_fluxes(exposure, frame, centres, profile, threshold))
+
+        again = remeasure if width == own else partial(remeasure, fwhm=width)
+        each = np.repeat(levels[::-1], n_positions)  # stars of about the same flux come into one frame
+        off = _offsets(exposure, centres, each, profile, photon=photon, again=again, rng=rng)
+        logger.info("%s: FWHM %.2f px, %d stars put in at %d fluxes", name, width, len(each), len(levels))
+        for flux in levels:
+            rows.append({"exposure": name, "fwhm": width * u.pix, "flux": flux} | _statistics(off[each == flux]))
+    return NoiseCurves(QTable(rows, meta={"fwhm": {name: own}, "photon": {name: float(photon)}}))
+
+
+def _photon_noise(frame, exposure, centres, shape):
+    """Variance per unit of star light: by the gain, or by the uncertainty plane or the fits of the brighter stars."""
+    if exposure.gain:
+        return 1 / exposure.gain
+    if not len(centres):
+        raise InputError(f"{exposure.name}: neither a gain nor stars that would tell the photon noise; give gain")
+    if not frame.noise_given:
+        return fit_stars(Stamps(frame, centres, box_half(moffat.fwhm(shape))), shape)[-1]
+    x, y = centres[:50].T
+    above = frame.variance[y, x] - np.median(frame.variance[frame.good])
+    return max(float(np.median(above / np.maximum(frame.signal[y, x], 1e-30))), 0.0)
+
+
+def default_fluxes(exposure, frame, centres, shape, threshold):
+    """Fluxes from the detection limit to bright stars, evenly spaced in their logarithm; see `calibrate_frame`."""
+    params = np.array([[0, 0, 1.0, *shape, 0]])
+    unit = moffat.evaluate(params, box_half(moffat.fwhm(shape)), moffat.CENTRES)[0] / moffat.flux(params)
+    variance = np.median(frame.variance[frame.good])
+    lowest = _FAINTEST * threshold * np.sqrt(variance / (unit**2).sum())
+    highest = _RANGE * lowest
+    if len(centres):
+        highest = max(highest, frame.signal[centres[:, 1], centres[:, 0]].max() / unit.max())
+    if exposure.saturation:
+        sky = np.median(exposure.data[frame.good] - frame.signal[frame.good])
+        highest = min(highest, _BELOW_SATURATION * (exposure.saturation - sky) / unit.max())
+    if highest < 2 * lowest:
+        raise InputError(f"{exposure.name}: stars saturate before they are detected; give fluxes, or check saturation")
+    return np.geomspace(lowest, highest, N_FLUXES)
+
+
+def measure_calibrated(exposure, *, measuring, source, threshold, known):
+    """What `measuring` gives for an exposure, errors taken from its noise curve
+    (`legdistort.measurement.noise_curves.SOURCES`).
+
+    Parameters
+    ----------
+    exposure : `~legdistort.inputs.exposures.Exposure`
+        Or what its ``read()`` gives one for.
+    measuring : callable
+        ``measuring(exposure)``: a tuple, the table of detections first.
+    source : {"injected", "scaled"}
+    threshold : float
+        Detection limit of `measuring`.
+    known : dict
+        ``gain``, ``read_noise``, ``saturation`` in place of the exposure's; None: as it says.
+    """
+    exposure = exposure.read()
+    table, *rest = measuring(exposure)
+    if np.any((table["flags"] & UNUSABLE) == 0):
+
+        def remeasure(image, **changes):
+            return measuring(image, max_stars=None, **changes)[0]
+
+        exposure = replace(exposure, **{key: value for key, value in known.items() if value is not None})
+        curves = calibrate_frame(exposure, remeasure, threshold=threshold)
+        table = curves.apply(table, source)
+    return table, *rest
+
+
+def _offsets(exposure, centres, flux, shape, *, photon, again, rng):
+    """Measured less true positions and errors stated (n, 4): x, y, x_err, y_err; NaN for stars not found."""
+    fwhm, n, done = float(moffat.fwhm(shape)), len(flux), 0
+    out = np.full((n, 4), np.nan)
+    while done < n:
+        xy = free_positions(exposure, centres, fwhm, n=n - done, rng=rng)
+        if len(xy) < min(ROOM, n - done):
+            raise InputError(
+                f"{exposure.name}: no room for injected stars of FWHM {fwhm:.3g} px: only {len(xy)} places lie "
+                f"{AWAY:g} FWHM from its {len(centres)} detections, clear of edges and bad pixels; give a smaller "
+                "fwhm, another frame, or a higher threshold"
+            )
+        part = slice(done, done + len(xy))
+        table = again(inject(exposure, xy, flux[part], shape, photon=photon, rng=rng))
+        table = table[(table["flags"] & UNUSABLE) == 0]
+        if len(table):
+            found = np.column_stack([table[name].value for name in ("x", "y", "x_err", "y_err")])
+            distance, nearest = cKDTree(found[:, :2]).query(xy)
+            found = found[nearest]
+            found[:, :2] -= xy
+            out[part] = np.where((distance < max(1.5, fwhm))[:, None], found, np.nan)
+        done += len(xy)
+    return out
+
+
+def _statistics(off):
+    """Columns of `NoiseCurves` for stars of one flux."""
+    found = off[np.isfinite(off[:, 0])]
+    out = {"n": len(off), "found": len(found) / len(off)}
+    for k, axis in enumerate("xy"):
+        d, err = found[:, k], found[:, 2 + k]
+        enough = len(found) > 2
+        sigma = biweight_scale(d, M=np.zeros(1)) if enough else np.nan
+        pull = biweight_scale(d / err, M=np.zeros(1)) if enough else np.nan
+        figures = {
+            "rms": np.sqrt(np.mean(d**2)) if len(d) else np.nan,
+            "sigma": sigma,
+            "bias": np.median(d) if len(d) else np.nan,
+            "err": np.median(err) if len(d) else np.nan,
+        }
+        out |= {f"{axis}_{key}": value * u.pix for key, value in figures.items()} | {f"{axis}_ratio": 1 / pull}
+    return out
+
+
+def scaled(shape, fwhm):
+    """Shape parameters (4,) of a profile brought to another FWHM [pix]; ellipticity and beta stay."""
+    shape = np.array(shape, dtype=float)
+    shape[:2] += 2 * np.log(moffat.fwhm(shape) / fwhm)
+    return shape
+
+
+def free_positions(exposure, taken, fwhm, *, n, rng):
+    """Random positions at which nothing but sky was detected.
+
+    Parameters
+    ----------
+    exposure : `~legdistort.inputs.exposures.Exposure`
+    taken : ndarray, shape (m, 2)
+        Positions of everything detected.
+    fwhm : float
+        Of the stars that shall stand there [pix].
+    n : int
+        So many, or as many as find room `APART`, `AWAY` from the detections, their boxes free of bad pixels.
+    rng : `~numpy.random.Generator`
+
+    Returns
+    -------
+    ndarray, shape (at most n, 2)
+    """
+    ny, nx = exposure.shape
+    half = box_half(fwhm)
+    if min(ny, nx) < 2 * half + 2:
+        return np.zeros((0, 2))
+    bad = exposure.mask if not exposure.saturation else exposure.mask | (exposure.data >= exposure.saturation)
+    if bad.any():
+        bad = maximum_filter(bad, 2 * half + 1)
+    cells = int(np.ceil(nx * ny / (APART * fwhm) ** 2))
+    xy = rng.uniform(half, np.array([nx, ny]) - 1 - half, (_TRIES * min(n, cells), 2))
+    columns, rows = np.round(xy).astype(int).T
+    xy = xy[~bad[rows, columns]]
+    if len(taken):
+        xy = xy[cKDTree(taken).query(xy)[0] > AWAY * fwhm]
+    if not len(xy):
+        return xy
+    tree, keep = cKDTree(xy), np.ones(len(xy), dtype=bool)
+    for i in range(len(xy)):
+        if keep[i]:
+            near = np.array(tree.query_ball_point(xy[i], APART * fwhm))
+            keep[near[near > i]] = False
+    return xy[keep][:n]
+
+
+def inject(exposure, xy, flux, shape, *, photon, rng):
+    """An exposure with stars added, and their photon noise.
+
+    The profile is averaged over every pixel of the core, and reaches to 8 FWHM.
+
+    Parameters
+    ----------
+    exposure : `~legdistort.inputs.exposures.Exposure`
+    xy : ndarray, shape (n, 2)
+        Centres [pix].
+    flux : ndarray, shape (n,)
+        Of the whole profiles, in units of the data.
+    shape : ndarray, shape (4,)
+        Shape parameters of `legdistort.measurement.profiles.moffat`.
+    photon : float
+        Variance per unit of star light (1 / gain); 0 adds no noise.
+    rng : `~numpy.random.Generator`
+
+    Returns
+    -------
+    `~legdistort.inputs.exposures.Exposure`
+        A copy; its uncertainty plane, if there is one, has the photon noise too.
+    """
+    light = _light(exposure.shape, xy, flux, shape)
+    added = light if not photon else photon * rng.poisson(light / photon)
+    uncertainty = exposure.uncertainty
+    if uncertainty is not None:
+        uncertainty = np.sqrt(uncertainty**2 + photon * light)
+    return replace(exposure, data=exposure.data + added, uncertainty=uncertainty)
+
+
+def _light(image_shape, xy, flux, shape):
+    ny, nx = image_shape
+    width = float(moffat.fwhm(shape))
+    nodes = moffat.quadrature(min(width, 2.0))  # 3 or 5 points a pixel, however wide
+    half, wide = box_half(width), int(np.ceil(8 * width))
+    offset = np.arange(-wide, wide + 1)
+    core = np.flatnonzero((np.abs(offset)[:, None] <= half) & (np.abs(offset) <= half))
+    out = np.zeros(ny * nx)
+    for k in range(0, len(xy), 100):
+        part = slice(k, k + 100)
+        pixel = np.round(xy[part]).astype(int)
+        params = np.zeros((len(pixel), 8))
+        params[:, :2], params[:, 2], params[:, 3:7] = xy[part] - pixel, 1.0, shape
+        params[:, 2] = flux[part] / moffat.flux(params)
+        stamp = moffat.evaluate(params, wide, moffat.CENTRES)
+        stamp[:, core] = moffat.evaluate(params, half, nodes)
+        x = (pixel[:, :1, None] + offset) + np.zeros((len(offset), 1), dtype=int)
+        y = (pixel[:, 1:, None] + offset[:, None]) + np.zeros(len(offset), dtype=int)
+        inside = ((x >= 0) & (x < nx) & (y >= 0) & (y < ny)).reshape(stamp.shape)
+        np.add.at(out, (y * nx + x).reshape(stamp.shape)[inside], stamp[inside])
+    return out.reshape(image_shape)

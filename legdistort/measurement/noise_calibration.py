@@ -1,0 +1,114 @@
+"""Noise curves of exposures, by measuring stars put into them as `legdistort.measure` measures all others."""
+
+import warnings
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from astropy.table import vstack
+
+from ..exceptions import AssumptionWarning, InputError, warn
+from ..inputs.exposure_files import listed
+from ..runtime.parallel import each
+from .injection import calibrate_frame
+from .noise_curves import NoiseCurves
+from .positions import measure
+
+_KNOWN = ("gain", "read_noise", "saturation")
+
+
+def calibrate_noise(
+    exposures, *, fluxes=None, fwhm=None, n_positions=100, seed=0, measuring=None, workers=None, progress=False
+):
+    """Find the error of a position as a function of flux, by putting stars into the real background.
+
+    As in section 5.2.2 of Bernard et al. 2017: profiles of given FWHM and flux are added at known random positions,
+    with photon noise, and measured by `legdistort.measure`. They stand three FWHM or more from every detection and
+    eight from one another, as many in one copy of the frame as find room. Their shape is the median one of the frame.
+
+    Parameters
+    ----------
+    exposures : Exposure or sequence of Exposure
+        From `legdistort.read_exposures` or `legdistort.open_exposures`.
+    fluxes : sequence of float, optional
+        In units of the data; by default twelve from the detection limit to the brightest star, or a thousand times
+        the limit, but below saturation.
+    fwhm : float or sequence of float, optional
+        Widths [pix]; by default that of the frame's own stars.
+    n_positions : int
+        Stars for every flux and width, at least 10.
+    seed : int
+        Of the random numbers; the same seed gives the same table.
+    measuring : dict, optional
+        Arguments of `legdistort.measure`, such as ``{"gain": 2.0, "threshold": 4}``.
+    workers : int, optional
+        Processes that share the frames, as for `legdistort.measure`.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    `~legdistort.measurement.noise_curves.NoiseCurves`
+
+    Raises
+    ------
+    InputError
+        For arguments out of range, a frame without stars if `fwhm` or the gain are missing, and one without room.
+
+    Warns
+    -----
+    AssumptionWarning
+        If exposures lack a gain: the photon noise put in is estimated from their stars.
+    """
+    exposures, measuring = listed(exposures, "calibrate_noise"), dict(measuring or {})
+    fluxes, widths = _check_arguments(fluxes, fwhm, n_positions, seed)
+    measure([], **measuring)  # checks its arguments
+    options = {"fluxes": fluxes, "widths": widths, "n_positions": n_positions, "seed": seed}
+    work = partial(_calibrate, measuring=measuring, options=options)
+    results = list(each(work, exposures, workers=workers, progress=progress, description="noise"))
+    assumed = {name: photon for _, photons in results for name, photon in photons.items()}
+    if assumed:
+        gains = [f"{name} {1 / photon:.3g}" if photon else f"{name} none seen" for name, photon in assumed.items()]
+        more = f" and {len(gains) - 3} more" if len(gains) > 3 else ""
+        warn(
+            "no gain known: the photon noise of injected stars is estimated from the stars of the frames (equivalent "
+            f"gain, e-/ADU: {', '.join(gains[:3])}{more}); give gain or the keyword GAIN to have it exact",
+            AssumptionWarning,
+        )
+    tables = [curves.table for curves, _ in results]
+    table = vstack(tables, metadata_conflicts="silent")
+    table.meta = {key: {k: v for each_ in tables for k, v in each_.meta[key].items()} for key in ("fwhm", "photon")}
+    table.meta["seed"] = seed
+    return NoiseCurves(table)
+
+
+def _calibrate(exposure, *, measuring, options):
+    """Curves of one exposure, and its photon noise by name if that is an estimate."""
+    known = {key: measuring[key] for key in _KNOWN if measuring.get(key) is not None}
+    exposure = replace(exposure.read(), **known)
+
+    def remeasure(image, **changes):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AssumptionWarning)  # of the gain, said once for the frame
+            return measure([image], **measuring | {"workers": 1} | changes)
+
+    curves = calibrate_frame(exposure, remeasure, threshold=measuring.get("threshold", 5.0), **options)
+    return curves, {} if exposure.gain else curves.table.meta["photon"]
+
+
+def _check_arguments(fluxes, fwhm, n_positions, seed):
+    """Fluxes and widths as lists, or None."""
+    if fluxes is not None:
+        fluxes = np.unique(np.asarray(fluxes, dtype=float))
+        if not fluxes.size or not (np.isfinite(fluxes) & (fluxes > 0)).all():
+            raise InputError(f"fluxes must be positive numbers, in units of the data, got {fluxes.tolist()}")
+    widths = None
+    if fwhm is not None:
+        widths = np.unique(np.asarray(fwhm, dtype=float)).tolist()
+        if not widths or not all(0.5 <= width <= 200 for width in widths):
+            raise InputError(f"fwhm must lie between 0.5 and 200 pixels, got {fwhm!r}")
+    if int(n_positions) != n_positions or n_positions < 10:
+        raise InputError(f"n_positions must be an integer of at least 10, got {n_positions!r}")
+    if isinstance(seed, bool) or int(seed) != seed or seed < 0:
+        raise InputError(f"seed must be an integer, 0 or above, got {seed!r}")
+    return fluxes, widths

@@ -1,0 +1,1 @@
+"""Moffat profiles fitted to all stars of a frame."""

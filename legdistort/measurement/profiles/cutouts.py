@@ -1,0 +1,64 @@
+"""Cut-outs around all stars of a frame, and the models of the stars laid over each other."""
+
+import numpy as np
+
+from . import moffat
+
+_CHUNK = 200  # stars: their models stay in the processor's cache
+
+
+class Stamps:
+    """Square cut-outs around integer positions, and models of all stars laid over each other.
+
+    Parameters
+    ----------
+    frame : `~legdistort.measurement.detection.Frame`
+    centres : ndarray of int, shape (n, 2)
+        Central pixels (x, y).
+    half : int
+        Stamps reach from -half to half; models of neighbours twice as far.
+    """
+
+    def __init__(self, frame, centres, half):
+        self.frame, self.centres, self.half = frame, centres, half
+        self.index, self.inside = self._pixels(half)
+        self.index_wide, self.inside_wide = self._pixels(2 * half)
+        offsets = np.abs(np.arange(-2 * half, 2 * half + 1)) <= half
+        self.core = np.flatnonzero(offsets[:, None] & offsets)
+        self.data = self.cut(frame.signal)
+        self.variance = self.cut(frame.variance)
+        self.saturated = self.cut(frame.saturated) & self.inside
+        self.good = self.cut(frame.good) & self.inside & ~self.saturated
+
+    def _pixels(self, half):
+        ny, nx = self.frame.signal.shape
+        dy, dx = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
+        x, y = self.centres[:, :1] + dx, self.centres[:, 1:] + dy
+        inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
+        return np.clip(y, 0, ny - 1) * nx + np.clip(x, 0, nx - 1), inside
+
+    def cut(self, image):
+        """Values of an image in the stamps, (n, npix)."""
+        return image.ravel()[self.index]
+
+    def models(self, params, nodes):
+        """Every star on its own stamp, and the sum of all others there; (n, npix) each."""
+        params = params.astype(self.data.dtype)
+        own, total = np.empty_like(self.data), np.zeros_like(self.frame.signal).ravel()
+        core = np.empty_like(own)  # what the star adds to the sum on its own stamp
+        for i in range(0, len(params), _CHUNK):
+            rows = slice(i, i + _CHUNK)
+            own[rows] = moffat.evaluate(params[rows], self.half, nodes)
+            # far from the centre pixels need no integration
+            wide = moffat.evaluate(params[rows], 2 * self.half, moffat.CENTRES)
+            wide[:, self.core] = own[rows]
+            wide[params[rows, 2] <= 0] = 0
+            core[rows] = wide[:, self.core]
+            np.add.at(total, self.index_wide[rows][self.inside_wide[rows]], wide[self.inside_wide[rows]])
+        others = total[self.index] - core
+        return own, np.where(self.inside, others, 0)
+
+    def near(self, params, radius):
+        """Pixels within a radius of the fitted centres, (n, npix)."""
+        dy, dx = np.mgrid[-self.half : self.half + 1, -self.half : self.half + 1].reshape(2, -1)
+        return np.hypot(dx - params[:, :1], dy - params[:, 1:2]) <= np.maximum(radius, 0.8)

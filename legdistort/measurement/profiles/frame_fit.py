@@ -1,0 +1,261 @@
+"""All stars of a frame fitted: neighbours subtracted, noise from the model, hot pixels told from stars."""
+
+import numpy as np
+
+from ..detection import MESH, detect, prepare
+from ..flags import Flag
+from . import moffat
+from .blends import fit_groups, group_stars, partner_models
+from .cutouts import Stamps
+from .levenberg_marquardt import HELD, SHAPE_SIGMA, fit
+from .pixel_noise import NEIGHBOUR, pixel_noise
+from .shape_field import shape_field
+
+#: Shapes of stars, and ways to fit those that touch: see `fit_stars`.
+PROFILES, BLENDS = ("own", "shared", "linear"), ("together", "alone")
+
+_FIRST_FWHM = 3.0
+_OUTLIER = 6.0  # standard deviations ...
+_OUTLIER_MODEL = 0.2  # ... plus this fraction of the star itself, which no real profile follows exactly
+#: Limits of the passes: what the first leaves tells the noise, the second prepares the last.
+_FIRST, _MIDDLE, _LAST = {"max_iterations": 20}, {"max_iterations": 20, "tolerance": 1e-2}, {"max_iterations": 40}
+_SHAPELY = 20  # signal-to-noise ratio of stars that tell the shape of all
+_GAP = 1 / 3  # part of the pixels within one FWHM that may be missing
+_POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no star, however sharp, has so little
+
+
+def _start(stamps, shape):
+    middle = stamps.data.shape[1] // 2
+    start = np.zeros((len(stamps.centres), 8))
+    start[:, 3:7] = shape
+    start[:, 2] = np.maximum(stamps.data[:, middle], np.sqrt(stamps.variance[:, middle]))
+    return start
+
+
+def _weights(good, variance):
+    return np.where(good, 1 / variance, 0.0)
+
+
+def find_stars(frame, threshold, fwhm=None):
+    """Detect with a kernel as wide as the stars, which is found by trying.
+
+    Parameters
+    ----------
+    frame : `~legdistort.measurement.detection.Frame`
+        From `legdistort.measurement.detection.prepare`.
+    threshold : float
+        Signal-to-noise ratio.
+    fwhm : float, optional
+        Width of the kernel [pix], if it is known.
+
+    Returns
+    -------
+    centres : ndarray of int, shape (n, 2)
+        Pixels (x, y), the highest signal-to-noise ratio first.
+    shape : ndarray, shape (4,)
+        Median of the bright stars, hot pixels left out (see `legdistort.measurement.profiles.moffat.shape`).
+    """
+    kernel = fwhm or _FIRST_FWHM
+    shape = moffat.shape(kernel)
+    for _ in range(6):
+        centres = detect(frame, kernel, threshold)
+        if len(centres) == 0:
+            break
+        shape = _common_shape(Stamps(frame, centres[:150], box_half(kernel)), kernel)
+        before, kernel = kernel, float(moffat.fwhm(shape))
+        if fwhm is not None or abs(before - kernel) < 0.1 * kernel:
+            break
+    return centres, shape
+
+
+def locate_stars(exposure, known, *, threshold, fwhm=None):
+    """An exposure prepared for fitting, and its stars: `legdistort.measurement.detection.prepare` and `find_stars`.
+
+    Parameters
+    ----------
+    exposure : `~legdistort.inputs.exposures.Exposure`
+    known : dict
+        ``gain``, ``read_noise``, ``saturation`` instead of what the exposure says; None: as it says.
+    threshold : float
+        Signal-to-noise ratio.
+    fwhm : float, optional
+        Of the stars [pix], if it is known.
+
+    Returns
+    -------
+    frame : `~legdistort.measurement.detection.Frame`
+    centres : ndarray of int, shape (n, 2)
+    shape : ndarray, shape (4,)
+    """
+    frame = prepare(exposure, **known)
+    centres, shape = find_stars(frame, threshold, fwhm)
+    if moffat.fwhm(shape) > MESH / 8:  # stars as wide as that would pass for sky
+        frame = prepare(exposure, **known, mesh=int(8 * moffat.fwhm(shape)))
+        centres, shape = find_stars(frame, threshold, fwhm)
+    return frame, centres, shape
+
+
+def box_half(fwhm):
+    """Half the side of the box fitted, without the central pixel."""
+    return max(4, int(np.ceil(2 * fwhm)))
+
+
+def _common_shape(stamps, fwhm):
+    """Median shape of the bright stars."""
+    start = moffat.shape(fwhm)
+    fit, pointlike = _fit_once(stamps, start, moffat.quadrature(fwhm))
+    clean = fit.converged & ~(stamps.saturated & stamps.near(fit.params, fwhm)).any(axis=1)
+    clean &= (pointlike[:, 0] > _POINTLIKE * pointlike[:, 1]) & (pointlike[:, 0] > fit.chi2) & (fit.params[:, 2] > 0)
+    if not clean.any():
+        return start
+    # the better half by signal-to-noise ratio, or 10 of them: faint stars have no shape to speak of
+    ratio = np.where(clean, fit.params[:, 2] / np.sqrt(fit.covariance[:, 2, 2]), -1)
+    best = np.argsort(-ratio)[: min(max(10, clean.sum() // 2), clean.sum())]
+    return np.median(fit.params[best, 3:7], axis=0)
+
+
+def _fit_once(stamps, shape, nodes):
+    """First pass, with the noise of the sky alone; the fit, and `_point_chi2` of the same pixels."""
+    start = _start(stamps, shape)
+    _, others = stamps.models(start, nodes)
+    data, weights = stamps.data - others, _weights(stamps.good, stamps.variance + (NEIGHBOUR * others) ** 2)
+    return fit(data, weights, start, nodes=nodes, centre=shape, **_FIRST), _point_chi2(data, weights)
+
+
+def _point_chi2(data, weights):
+    """Chi2 of a single bright pixel on a flat background, and of the background alone; (n, 2)."""
+    n, npix = data.shape
+    size = round(np.sqrt(npix))
+    middle = np.zeros((size, size), dtype=bool)
+    middle[size // 2 - 1 : size // 2 + 2, size // 2 - 1 : size // 2 + 2] = True
+    peak = np.argmax(np.where(middle.ravel() & (weights > 0), data, -np.inf), axis=1)
+    out = []
+    for drop in (True, False):
+        w = weights.copy()
+        if drop:
+            w[np.arange(n), peak] = 0
+        mean = (w * data).sum(axis=1) / np.maximum(w.sum(axis=1), np.finfo(w.dtype).tiny)
+        out.append((w * (data - mean[:, None]) ** 2).sum(axis=1))
+    return np.column_stack(out)
+
+
+def fit_stars(stamps, shape, *, profile="own", blends="together"):
+    """Fit all stars of a frame in three passes.
+
+    The first knows the noise of the sky alone; the others add the photon noise of the models of the pass
+    before, fit stars that touch together, subtract the models of the other neighbours and leave out pixels that
+    follow none.
+
+    Parameters
+    ----------
+    stamps : `~legdistort.measurement.profiles.cutouts.Stamps`
+        Around the detections.
+    shape : ndarray, shape (4,)
+        Of the stars of the frame.
+    profile : {"own", "shared", "linear"}
+        In the last pass every star has a shape of its own, or that of the frame, or one that varies linearly over it.
+    blends : {"together", "alone"}
+        Whether stars within two FWHM of each other are fitted together, with one shape and one background.
+
+    Returns
+    -------
+    found : `~legdistort.measurement.profiles.levenberg_marquardt.Fit`
+        One row a star.
+    flags : ndarray of int, shape (n,)
+    snr : ndarray, shape (n,)
+        Signal-to-noise ratio of the flux at known shape.
+    photon : float
+        Variance per unit of star light that was used.
+    """
+    width = float(moffat.fwhm(shape))
+    nodes = moffat.quadrature(width)
+    found, _ = _fit_once(stamps, shape, nodes)
+    models = stamps.models(found.params, nodes)
+    noise = pixel_noise(stamps, found, models, nodes)
+    radius = min(2 * width, stamps.half) if blends == "together" else 0.0
+    hot, weights = _is_hot(stamps, found, models, stamps.good), None
+    done = hot & (moffat.fwhm(found.params) < 0.6 * width)
+    centre, sigma = shape, SHAPE_SIGMA
+    for last in (False, True):
+        if last and profile != "own":
+            use = ~hot & ~_is_wild(found, width) & (_ratio(models, weights) > _SHAPELY)
+            xy = stamps.centres + found.params[:, :2]
+            centre, sigma = shape_field(found, xy, use, linear=profile == "linear", fallback=shape), HELD
+        labels = _touching(stamps, found, hot, done, radius)
+        pixels = _, weights = _separate(stamps, found, models, labels, noise, nodes)
+        start = np.where(_is_wild(found, width)[:, None], _start(stamps, shape), found.params)
+        options = {"nodes": nodes, "sigma": sigma, **(_LAST if last else _MIDDLE)}
+        found = fit_groups(found, labels, pixels, start, stamps=stamps, centre=centre, **options)
+        models = stamps.models(found.params, nodes)
+        done = _is_hot(stamps, found, models, weights > 0)
+        hot = done | (hot if sigma is HELD else moffat.fwhm(found.params) < 0.6 * width)
+    wild = np.flatnonzero(_is_wild(found, width) & ~done)
+    if len(wild):
+        known = np.broadcast_to(centre, (len(hot), 4))[wild]
+        found = _share_shape(stamps.data - models[1], weights, found, wild, shape=known, nodes=nodes)
+        models[0][wild] = moffat.evaluate(found.params[wild], stamps.half, nodes)
+        hot[wild] |= _is_hot(stamps, found, models, weights > 0)[wild]
+    snr = _ratio(models, weights)
+    return found, _flags(stamps, found, weights > 0, (wild, hot, snr), width), snr, noise[1]
+
+
+def _ratio(models, weights):
+    """Signal-to-noise ratio of the flux at known shape."""
+    return np.sqrt((weights * models[0] ** 2).sum(axis=1))
+
+
+def _flags(stamps, found, good, troubles, width):
+    wild, hot, snr = troubles
+    flags = np.zeros(len(good), dtype=int)
+    flags[wild] |= Flag.SHARED_SHAPE
+    flags[hot] |= Flag.HOT
+    flags[_is_wild(found, width)] |= Flag.NOT_CONVERGED
+    flags[snr < 3] |= Flag.INSIGNIFICANT
+    near = stamps.near(found.params, width)
+    flags[(near & stamps.inside & ~good & ~stamps.saturated).any(axis=1)] |= Flag.MASKED
+    flags[(near & stamps.saturated).any(axis=1)] |= Flag.SATURATED
+    seen = stamps.inside & stamps.cut(stamps.frame.good)
+    flags[(near & ~seen).sum(axis=1) > _GAP * near.sum(axis=1)] |= Flag.EDGE
+    return flags
+
+
+def _touching(stamps, found, hot, done, radius):
+    """Numbers of the groups to be fitted together, -1 for no fit; what is no star or has lost its peak stays alone."""
+    labels = np.arange(len(hot))
+    stars = ~hot & ~(stamps.saturated & stamps.near(found.params, radius / 2)).any(axis=1)
+    if radius > 0 and stars.any():
+        labels[stars] = len(hot) + group_stars(stamps.centres[stars], radius)
+    return np.where(done, -1, labels)
+
+
+def _separate(stamps, found, models, labels, noise, nodes):
+    """Stamps without the light of other groups, and weights; 0 for pixels that follow no model."""
+    own, others = models
+    sky, photon = noise
+    partners = partner_models(stamps, labels, found.params, nodes)
+    variance = sky + photon * np.maximum(own + others, 0) + (NEIGHBOUR * (others - partners)) ** 2
+    residual = np.abs(stamps.data - own - others - found.params[:, 7:])
+    good = stamps.good & (residual < _OUTLIER * np.sqrt(variance) + _OUTLIER_MODEL * np.abs(own + partners))
+    return stamps.data - (others - partners), _weights(good, variance)
+
+
+def _is_hot(stamps, found, models, good):
+    """Stars explained better by one bright pixel than by a profile."""
+    data, weights = stamps.data - models[1], _weights(good, stamps.variance)
+    residual = data - models[0] - found.params[:, 7:]
+    return _point_chi2(data, weights)[:, 0] <= (weights * residual**2).sum(axis=1)
+
+
+def _is_wild(fit, width):
+    ratio = moffat.fwhm(fit.params) / width
+    shift = np.hypot(fit.params[:, 0], fit.params[:, 1])
+    return ~fit.converged | (fit.params[:, 2] <= 0) | (ratio > 3) | (ratio < 1 / 3) | (shift > 1 + 0.5 * width)
+
+
+def _share_shape(data, weights, found, rows, *, shape, nodes):
+    """The fit with some stars fitted anew and alone, their shape held at that of the frame."""
+    data = data[rows]
+    start = np.zeros((len(rows), 8))
+    start[:, 2] = np.maximum(found.params[rows, 2], 1e-3 * np.abs(data).max(axis=1))
+    start[:, 3:7] = shape
+    return found.updated(rows, fit(data, weights[rows], start, nodes=nodes, centre=shape, sigma=HELD))

@@ -1,0 +1,97 @@
+"""Pieces that pictures are made of: axes, titles, ticks, grids, round numbers, block means."""
+
+import numpy as np
+
+from ..geometry import basis
+
+#: Colours that stay apart for colour-blind readers and in grey print (Okabe & Ito).
+BLUE, ORANGE, RED, GREY = "#0072B2", "#E69F00", "#D55E00", "#9a9a9a"
+
+_GRID_LINES = 11
+
+
+def round_down(value):
+    """Largest of ..., 0.1, 0.2, 0.5, 1, 2, 5, 10, ... that is not above a positive `value`."""
+    if not (np.isfinite(value) and value > 0):
+        return 1.0
+    power = float(np.floor(np.log10(value)))
+    steps = [float(f"{digit}e{int(power)}") for digit in (1, 2, 5, 10)]
+    return max(s for s in steps if s <= value * (1 + 1e-9))
+
+
+def new_axes(ax, size):
+    """The axes given, or the only ones of a new figure of this size in inches."""
+    if ax is None:
+        ax = new_figure(None, size).subplots()
+    return ax
+
+
+def new_figure(fig, size):
+    """The figure given, or a new one, set to this size in inches."""
+    if fig is None:
+        from matplotlib import pyplot
+
+        fig = pyplot.figure(layout="constrained")
+    fig.set_size_inches(size)
+    return fig
+
+
+def set_title(ax, text, size="medium"):
+    """Title at the left, taken literally."""
+    ax.set_title(text, fontsize=size, loc="left", parse_math=False)  # a name may hold a dollar sign
+
+
+def shorten(name, length=44):
+    """A name cut in its middle to a length."""
+    return name if len(name) <= length else f"{name[: length // 2]}…{name[1 - length // 2 :]}"
+
+
+def set_log_ticks(axis):
+    """Labels at 1, 2, 5 where a logarithmic axis is short, at powers of ten where it is long."""
+    from matplotlib import ticker
+
+    low, high = axis.get_view_interval()
+    axis.set_minor_formatter(ticker.NullFormatter())
+    if high < 300 * low:
+        axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if high > 8 * low else (1, 1.5, 2, 3, 4, 5, 6, 8)))
+        axis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+
+
+def peak(coefficients):
+    """Largest displacement on the detector, per axis."""
+    t = np.linspace(-1, 1, 17)
+    u, v = np.meshgrid(t, t)
+    degree = basis.degree_of(coefficients.shape[1])
+    return float(np.abs(np.tensordot(coefficients, basis.values(degree, u, v), 1)).max())
+
+
+def draw_grid(ax, shape, coefficients, **style):
+    """Grid lines over the detector, displaced by a Legendre series."""
+    from matplotlib.collections import LineCollection
+
+    lines, along = np.linspace(-1, 1, _GRID_LINES), np.linspace(-1, 1, 65)
+    u, v = np.meshgrid(along, lines)
+    degree = basis.degree_of(coefficients.shape[1])
+    paths = []
+    for first, second in ((u, v), (v, u)):
+        shift = np.tensordot(coefficients, basis.values(degree, first, second), 1)
+        paths.extend(basis.denormalize(first, second, shape) + np.moveaxis(shift, 0, -1))
+    ax.add_collection(LineCollection(paths, **style))
+
+
+def running_median(x, y, per_bin=8):
+    """Medians of x and y in bins of about equal number along x, by increasing x."""
+    order = np.argsort(x)
+    bins = np.array_split(order, int(np.clip(len(x) // per_bin, 1, 20)))
+    if len(bins) == 1:
+        return np.sort(x), np.full(len(x), np.median(y))
+    return np.array([np.median(x[b]) for b in bins]), np.array([np.median(y[b]) for b in bins])
+
+
+def block_mean(image, block):
+    """Mean over square blocks of the finite pixels; incomplete blocks at the far edges are filled up with NaN."""
+    image = np.pad(image, [(0, -n % block) for n in image.shape], constant_values=np.nan)
+    cells = image.reshape(image.shape[0] // block, block, -1, block)
+    finite = np.isfinite(cells)
+    with np.errstate(invalid="ignore"):  # 0 / 0 = NaN where a block is empty
+        return np.where(finite, cells, 0.0).sum(axis=(1, 3)) / finite.sum(axis=(1, 3))

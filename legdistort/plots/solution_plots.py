@@ -1,0 +1,370 @@
+"""Pictures of finished objects: residuals, distortions, coefficients, error maps, mosaics.
+
+Every function draws on the axes ``ax`` that it is given, or on new ones, and returns them; those that need
+several take a figure ``fig``, set its size and return a list of axes. Nothing is shown or saved.
+"""
+
+import numpy as np
+
+from ..exceptions import InputError
+from ..geometry import basis
+from ..inputs import column_contract
+from . import elements
+from .elements import BLUE, GREY, ORANGE, RED, round_down
+
+#: Panels of one figure of small multiples.
+PANELS = 12
+_MAX_ARROWS = 3000
+
+
+def plot_residuals(solution, name=None, *, scale=None, ax=None):
+    """Arrows of the residuals (measured minus model) over the detector; crosses mark positions not used.
+
+    Of more than 3000 arrows a random sample is drawn.
+
+    Parameters
+    ----------
+    solution : `~legdistort.results.solution.Solution`
+        What is drawn.
+    name : str, optional
+        One exposure; by default all are drawn over each other.
+    scale : float, optional
+        Magnification; by default a round number that makes the longest tenth of the arrows 8 % of the detector.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw.
+
+    Raises
+    ------
+    InputError
+        If the exposure is unknown or none of its positions was used.
+    """
+    ax = elements.new_axes(ax, (6.4, 6.4))
+    table = solution.residuals
+    if name is not None:
+        solution.index(name)  # refuses an unknown name
+        table = table[column_contract.labels(table, "exposure") == name]
+    x, y, dx, dy = (column_contract.values(table, column, "pix") for column in ("x", "y", "dx", "dy"))
+    used = np.asarray(table["used"], dtype=bool)
+    rows = np.flatnonzero(used)
+    if not len(rows):
+        raise InputError(f"nothing to draw: no position of {name or 'any exposure'} was used")
+    ny, nx = _largest_shape(solution, name)
+    scale = scale or round_down(0.08 * max(nx, ny) / (np.percentile(np.hypot(dx, dy)[rows], 90) or 1))
+    if len(rows) > _MAX_ARROWS:
+        rows = np.random.default_rng(0).choice(rows, _MAX_ARROWS, replace=False)
+    ax.plot(x[~used], y[~used], "x", color=RED, markersize=4, label="not used", linestyle="none")
+    arrows = ax.quiver(
+        *(a[rows] for a in (x, y, dx, dy)),
+        angles="xy",
+        scale_units="xy",
+        scale=1 / scale,
+        width=0.002,
+        color=BLUE,
+    )
+    key = round_down(0.1 * max(nx, ny) / scale)
+    ax.quiverkey(arrows, 0.87, 1.025, key, f"{key:g} px", labelpos="E", coordinates="axes")
+    ax.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), xlabel="x [px]", ylabel="y [px]", aspect="equal")
+    if not used.all():
+        ax.legend(loc="upper right", fontsize="small")
+    elements.set_title(ax, f"{elements.shorten(name or 'All exposures')}: residuals × {scale:g}")
+    return ax
+
+
+def plot_distortion(solution, name, *, part="total", scale=50, ax=None):
+    """Regular grid of undistorted pixels as the distortion of one exposure carries it to the detector, magnified.
+
+    Parameters
+    ----------
+    solution : `~legdistort.results.solution.Solution`
+        What is drawn.
+    name : str
+        Exposure.
+    part : {"total", "nonlinear", "dynamic"}
+        The whole distortion (blue) over its prior mean (orange); the same without the constant and linear modes, as
+        in the paper's Figure "disto"; or only the departure from the prior mean. The undistorted grid is grey.
+    scale : float, optional
+        Magnification of the displacements; None is a round number that makes the largest displacement
+        about a tenth of the detector.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw.
+
+    Raises
+    ------
+    InputError
+        If the exposure or the part is unknown.
+    """
+    ax = elements.new_axes(ax, (5.4, 5.4))
+    coefficients, prior = _parts(solution, name, part)
+    shape = solution.shapes[name]
+    scale = scale or distortion_scale(solution, [name], part=part)
+    elements.draw_grid(ax, shape, np.zeros_like(coefficients), color=GREY, linewidth=0.5)
+    if prior is not None:
+        elements.draw_grid(ax, shape, scale * prior, color=ORANGE, linewidth=2.4, alpha=0.7)
+    elements.draw_grid(ax, shape, scale * coefficients, color=BLUE, linewidth=0.9)
+    ax.margins(0.03)
+    ax.autoscale_view()
+    ax.set(xlabel="x [px]", ylabel="y [px]", aspect="equal")
+    elements.set_title(ax, f"{elements.shorten(name)}: {_heading(part, scale, prior is not None)}")
+    return ax
+
+
+def plot_distortions(solution, *, names=None, page=0, part="total", scale=50, fig=None):
+    """Small multiples of `plot_distortion`, twelve exposures a page, all with one magnification.
+
+    Parameters
+    ----------
+    solution : `~legdistort.results.solution.Solution`
+        What is drawn.
+    names : sequence of str, optional
+        Exposures to draw, default all.
+    page : int
+        Which dozen of `names`, from 0.
+    part, scale
+        As in `plot_distortion`; None chooses one magnification for all of the page.
+    fig : `~matplotlib.figure.Figure`, optional
+        Where to draw.
+    """
+    names = list(solution.names if names is None else names)
+    shown = names[page * PANELS : (page + 1) * PANELS]
+    if not shown:
+        raise InputError(f"page {page} is empty: {len(names)} exposures fill {-(-len(names) // PANELS)} pages from 0")
+    columns = min(4, len(shown))
+    rows = -(-len(shown) // columns)
+    fig = elements.new_figure(fig, (2.3 * columns + 0.5, 2.3 * rows + 0.6))
+    panels = list(fig.subplots(rows, columns, squeeze=False).flat)
+    scale = scale or distortion_scale(solution, shown, part=part)
+    for i, (ax, name) in enumerate(zip(panels, shown, strict=False)):
+        plot_distortion(solution, name, part=part, scale=scale, ax=ax)
+        elements.set_title(ax, elements.shorten(name, 26), size="small")
+        ax.set(xlabel="", ylabel="")
+        ax.tick_params(labelsize="x-small", labelleft=i % columns == 0, labelbottom=i + columns >= len(shown))
+        ax.locator_params(nbins=3)
+    for ax in panels[len(shown) :]:
+        ax.remove()
+    panels = panels[: len(shown)]
+    (x_min, y_min), (x_max, y_max) = type(panels[0].dataLim).union([ax.dataLim for ax in panels]).get_points()
+    pad = 0.03 * max(x_max - x_min, y_max - y_min)
+    for ax in panels:
+        ax.set(xlim=(x_min - pad, x_max + pad), ylim=(y_min - pad, y_max + pad))
+    fig.supxlabel("x [px]", fontsize="medium")
+    fig.supylabel("y [px]", fontsize="medium")
+    heading = _heading(part, scale, part != "dynamic" and np.any(solution.prior_mean))
+    fig.suptitle(heading.capitalize(), fontsize="medium")
+    return panels
+
+
+def distortion_scale(solution, names, *, part="total"):
+    """Round magnification that makes the largest displacement of some exposures about a tenth of the detector."""
+    peak = max(elements.peak(_parts(solution, name, part)[0]) for name in names)
+    size = max(max(solution.shapes[name]) for name in names)
+    return round_down(0.1 * size / peak) if peak > 0 else 1.0
+
+
+def plot_coefficients(solution, name=None, *, fig=None):
+    """Bars of the distortion coefficients beside the prior mean (the paper's Figure "coeff").
+
+    Displacement along x above, along y below; modes are named by their orders in x and y.
+
+    Parameters
+    ----------
+    solution : `~legdistort.results.solution.Solution`
+        What is drawn.
+    name : str, optional
+        One exposure; by default the mean of all, with their scatter (standard deviation) as bars.
+    fig : `~matplotlib.figure.Figure`, optional
+        Where to draw.
+    """
+    if name is None:
+        values, prior = np.mean(solution.coefficients, axis=0), np.mean(solution.prior_mean, axis=0)
+        label, scatter = "mean of the exposures, and scatter", np.std(solution.coefficients, axis=0)
+    else:
+        values, prior = _parts(solution, name, "total")
+        label, scatter = elements.shorten(name), [None, None]
+    has_prior = prior is not None and np.any(prior)
+    n = values.shape[1]
+    fig = elements.new_figure(fig, (max(6.4, 0.34 * n + 1.2), 4.8))
+    panels = list(fig.subplots(2, 1, sharex=True, sharey=True))
+    width = 0.4 if has_prior else 0.7
+    for axis, ax in enumerate(panels):
+        ax.axhline(0, color="black", linewidth=0.6)
+        at = np.arange(n)
+        if has_prior:
+            ax.bar(at - width / 2, prior[axis], width, color=ORANGE, label="prior")
+            at = at + width / 2
+        bars = ax.bar(at, values[axis], width, yerr=scatter[axis], color=BLUE, error_kw={"elinewidth": 0.8})
+        bars.set_label(label)
+        ax.set_ylabel(f"along {'xy'[axis]} [px]")
+        ax.grid(axis="y", linewidth=0.3)
+        ax.set_axisbelow(True)
+    tall = n > 15
+    panels[1].set_xticks(
+        range(n),
+        [f"({i}, {j})" for i, j in zip(*basis.orders(basis.degree_of(n)), strict=True)],
+        rotation=90 if tall else 0,
+        fontsize="small",
+    )
+    panels[1].set_xlabel("orders of the mode in x, y")
+    legend = panels[0].legend(fontsize="small", loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+    elements.set_title(panels[0], "Distortion coefficients")
+    return panels
+
+
+def plot_scatter(solution, *, label="scatter of one star", color=BLUE, ax=None):
+    """Residual scatter of every star against its flux, with the reported error (the paper's Figure "ercomp").
+
+    The scatter is the rms residual per axis over the used positions of a star (two at least), the curve the
+    median reported error per axis. Without fluxes the reported error takes their place.
+
+    Parameters
+    ----------
+    solution : `~legdistort.results.solution.Solution`
+        What is drawn.
+    label, color
+        Of the points, so that several solutions can share the axes.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw.
+    """
+    ax = elements.new_axes(ax, (6.4, 4.6))
+    table = solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]
+    _, star = np.unique(column_contract.labels(table, "star"), return_inverse=True)
+    n = np.bincount(star)
+
+    def mean(values):
+        return np.bincount(star, values) / n
+
+    dx, dy, x_err, y_err = (column_contract.values(table, column, "pix") for column in ("dx", "dy", "x_err", "y_err"))
+    scatter, error = np.sqrt(mean(dx**2 + dy**2) / 2), np.sqrt(mean(x_err**2 + y_err**2) / 2)
+    flux = mean(column_contract.values(table, "flux")) if "flux" in table.colnames else np.full(len(n), np.nan)
+    keep = n >= 2
+    if np.any(flux[keep] > 0):
+        keep &= flux > 0
+        at, curve = elements.running_median(flux[keep], error[keep])
+        abscissa, xlabel = flux, f"flux [{table['flux'].unit or 'unit of the input'}]"
+    else:
+        at = curve = np.sort(error[keep])
+        abscissa, xlabel = error, "reported error per axis [px]"
+    ax.loglog(abscissa[keep], scatter[keep], "o", color=color, markersize=4, alpha=0.7, mew=0, label=label)
+    ax.loglog(at, curve, color=RED, linewidth=2, label="reported error (median)")
+    ax.set(xlabel=xlabel, ylabel="rms residual per axis [px]")
+    ax.grid(linewidth=0.3)
+    elements.set_log_ticks(ax.xaxis)
+    elements.set_log_ticks(ax.yaxis)
+    ax.legend(fontsize="small")
+    elements.set_title(ax, "Residual scatter of the stars")
+    return ax
+
+
+def plot_mosaic(mosaic, *, stars=None, max_size=900, ax=None):
+    """Co-added image, asinh stretch, dark stars on light sky; pixels without data are pale blue.
+
+    Parameters
+    ----------
+    mosaic : `~legdistort.coaddition.mosaicking.Mosaic`
+        Only its ``data``, shape (ny, nx), are looked at.
+    stars : array_like, shape (n, 2), optional
+        Positions to be circled, mosaic pixels.
+    max_size : int
+        Larger images are averaged in blocks for display; the axes stay in mosaic pixels.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw.
+    """
+    from matplotlib import colormaps
+
+    ax = elements.new_axes(ax, (7.0, 7.0))
+    data = np.asarray(mosaic.data, dtype=float)
+    image = elements.block_mean(data, block := max(1, -(-max(data.shape) // max_size)))
+    good = image[np.isfinite(image)]
+    if not good.size:
+        raise InputError(f"the mosaic of shape {data.shape} has no finite pixel to show")
+    sky, high = np.percentile(good, [50, 99.9])
+    soft = 2 * (sky - np.percentile(good, 16)) or 1.0  # twice the noise of the sky
+    height, width = (block * n for n in image.shape)
+    ax.imshow(
+        np.ma.masked_invalid(np.arcsinh((image - sky) / soft)),
+        vmin=np.arcsinh(-1.2),
+        vmax=max(np.arcsinh((high - sky) / soft), 4.0),
+        cmap=colormaps["gray_r"].with_extremes(bad="#cfe0f1"),
+        origin="lower",
+        extent=(-0.5, width - 0.5, -0.5, height - 0.5),
+    )
+    if stars is not None:
+        ax.plot(*np.asarray(stars, dtype=float).T, "o", mfc="none", color=RED, markersize=9, mew=0.9)
+    ny, nx = data.shape
+    ax.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), xlabel="x [px]", ylabel="y [px]")
+    elements.set_title(ax, "Mosaic (asinh stretch)")
+    return ax
+
+
+def plot_sigma_map(x, y, sigma, *, stars=None, ax=None):
+    """Map of the error of a corrected position (the paper's Figure "ergrid").
+
+    Drawn by ``plot_sigma_map(*solution.sigma_map(name))``.
+
+    Parameters
+    ----------
+    x, y : array_like, shape (n_x,), (n_y,)
+        Pixels of the detector, increasing.
+    sigma : array_like, shape (n_y, n_x) or (n_y, n_x, 2)
+        Error per axis, pixels (of two axes their rms is shown); NaN where no star supports the correction.
+    stars : array_like, shape (n, 2), optional
+        Positions of the stars that were fitted, drawn as crosses.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw.
+
+    Raises
+    ------
+    InputError
+        If the shapes do not agree.
+    """
+    from matplotlib import colormaps
+
+    ax = elements.new_axes(ax, (6.4, 5.4))
+    x, y, sigma = (np.asarray(a, dtype=float) for a in (x, y, sigma))
+    if sigma.shape not in ((len(y), len(x)), (len(y), len(x), 2)):
+        raise InputError(f"sigma must have shape ({len(y)}, {len(x)}) or that and 2, got {sigma.shape}")
+    if sigma.ndim == 3:
+        sigma = np.sqrt(np.mean(sigma**2, axis=2))
+    good = sigma[np.isfinite(sigma)]
+    picture = ax.pcolormesh(
+        x,
+        y,
+        np.ma.masked_invalid(sigma),
+        cmap=colormaps["viridis"].with_extremes(bad="#e6e6e6"),
+        vmax=np.percentile(good, 99) if good.size else None,  # a steep corner must not flatten the rest
+        shading="nearest",
+        rasterized=True,
+    )
+    ax.figure.colorbar(picture, ax=ax, label="error per axis [px]", extend="max", shrink=0.85)
+    if stars is not None:
+        ax.plot(*np.asarray(stars, dtype=float).T, "x", color="white", markersize=7, mew=3)
+        ax.plot(*np.asarray(stars, dtype=float).T, "x", color="black", markersize=6, mew=1)
+    ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), xlabel="x [px]", ylabel="y [px]", aspect="equal")
+    elements.set_title(ax, "Error of a corrected position")
+    return ax
+
+
+def _heading(part, scale, has_prior):
+    what = {"total": "distortion", "nonlinear": "distortion of degree 2 and more", "dynamic": "dynamic distortion"}[
+        part
+    ]
+    return f"{what} × {scale:g}{' (blue) over the prior (orange)' if has_prior else ''}"
+
+
+def _parts(solution, name, part):
+    """Coefficients to draw and those of the prior behind them (None without one)."""
+    i = solution.index(name)
+    if part == "dynamic":
+        return solution.coefficients[i] - solution.prior_mean[i], None
+    if part not in ("total", "nonlinear"):
+        raise InputError(f"part must be 'total', 'nonlinear' or 'dynamic', got {part!r}")
+    coefficients, prior = solution.coefficients[i].copy(), solution.prior_mean[i].copy()
+    if part == "nonlinear":
+        coefficients[:, :3] = prior[:, :3] = 0
+    return coefficients, prior if np.any(prior) else None
+
+
+def _largest_shape(solution, name):
+    shapes = [solution.shapes[name]] if name is not None else list(solution.shapes.values())
+    return tuple(max(sizes) for sizes in zip(*shapes, strict=True))

@@ -1,0 +1,1 @@
+"""A static distortion that is known beforehand, from anything."""

@@ -1,0 +1,165 @@
+"""Any map of a detector as a similarity and a Legendre series, with the measured error of leaving off the rest."""
+
+import numpy as np
+
+from ..exceptions import InputError
+from ..geometry import basis, similarity
+from ..geometry.detector_modes import similarity_part
+from ..geometry.distortion import Distortion
+from .source import check_folds
+
+#: Points along a side of the grid that folds and truncation are looked for on, and of the coarser one for the pose.
+CHECK_GRID, POSE_GRID = 129, 33
+#: Least number of quadrature nodes along a side: for maps that are no polynomials.
+NODES = 24
+
+
+def expand(source, degree, parity=None):
+    """Legendre coefficients of a source.
+
+    The pose is the similarity that leaves none in the series (least squares over the detector).
+
+    Parameters
+    ----------
+    source : Source
+        Complete (see `Source.stated`).
+    degree : int
+        Total degree.
+    parity : {1, -1, None}
+        Orientation of the plane relative to the detector; None takes what fits.
+
+    Returns
+    -------
+    coefficients : ndarray, shape (2, n_modes)
+        Pixels, undistorted to detector.
+    pose : ndarray, shape (2, 3)
+        From the plane of the source to undistorted pixels.
+    truncation : float
+        Largest distance [pix] of source and series over a dense grid of the detector, edges and corners included.
+
+    Raises
+    ------
+    InputError
+        If the source cannot be followed over the detector.
+    """
+    to_plane, shape = _Plane(source), source.shape
+    check_folds(to_plane.dense, to_plane.pixels, source.name)
+    every = (CHECK_GRID - 1) // (POSE_GRID - 1)
+    pixels, plane = (grid[::every, ::every].reshape(-1, 2) for grid in (to_plane.pixels, to_plane.dense))
+    pose = similarity.fit_similarity(plane, pixels, parity=parity)
+    for _ in range(10):
+        mean = basis.project(
+            lambda u, v, pose=pose: to_plane.displacement(basis.denormalize(u, v, shape), pose),
+            degree,
+            max(NODES, degree + 6),
+        )
+        shift = similarity_part(mean, shape)
+        pose = similarity.compose(shift, pose)
+        if np.abs(similarity.apply(shift, pixels) - pixels).max() < 1e-10:
+            break
+    return mean, pose, _truncation(to_plane, pose, Distortion(mean, shape))
+
+
+def _truncation(to_plane, pose, series):
+    """Largest distance of source and series: on the grid, then on a finer one around its worst points."""
+    pixels = to_plane.pixels.reshape(-1, 2)
+    left = _distance(series, pose, to_plane.dense.reshape(-1, 2), pixels)
+    worst = pixels[np.argsort(left)[-8:]]
+    cell = to_plane.pixels[1, 1] - to_plane.pixels[0, 0]
+    t = np.linspace(-1, 1, 17)
+    finer = (worst[:, None] + cell * np.stack(np.meshgrid(t, t), axis=-1).reshape(1, -1, 2)).reshape(-1, 2)
+    finer = np.clip(finer, pixels[0], pixels[-1])
+    return float(max(left.max(), _distance(series, pose, to_plane.of_pixels(finer), finer).max()))
+
+
+def _distance(series, pose, plane, pixels):
+    return np.hypot(*(series(similarity.apply(pose, plane)) - pixels).T)
+
+
+class _Plane:
+    """A source as the function plane -> detector pixels (0-based)."""
+
+    def __init__(self, source):
+        self._function, self._origin, self._name = source.on_plane(), source.origin, source.name
+        self._inverse, self._affine = source.direction == "reference_to_detector", None
+        self._reached = None
+        t = np.linspace(-1, 1, CHECK_GRID)
+        self.pixels = basis.denormalize(*np.meshgrid(t, t), source.shape)
+        self.dense = self.of_pixels(self.pixels.reshape(-1, 2)).reshape(self.pixels.shape)
+        if not np.all(np.isfinite(self.dense)):
+            row, column = np.argwhere(~np.isfinite(self.dense))[0, :2]
+            raise InputError(
+                f"{self._name} gives values that are not finite on the detector, the first at pixel "
+                f"{self.pixels[row, column].round(1).tolist()}; check shape and origin"
+            )
+
+    def of_pixels(self, pixels):
+        """Plane coordinates of detector pixels (n, 2)."""
+        if not self._inverse:
+            return self._call(pixels + self._origin)
+        if self._affine is None:
+            self._affine = self._approach(pixels.mean(axis=0), np.ptp(pixels, axis=0))
+        matrix, shift, size = self._affine
+        return self._newton(lambda w: self._call(w) - self._origin, pixels, (pixels - shift) @ matrix, size)[0]
+
+    def _approach(self, centre, extent):
+        """Affine approximation pixels -> plane: from the origin of the plane outward; and the size of a pixel there."""
+        corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        size = 1.0
+        for _ in range(30):  # a step in the plane that moves the image by about a pixel
+            moved = np.ptp(self._call(size * corners), axis=0).max()
+            if not 0 < moved < np.inf:
+                raise InputError(f"{self._name} is not finite, or constant, around the origin of its plane")
+            if 0.1 < moved < 10:
+                break
+            size /= moved
+        plane = size * corners
+        for spread in np.linspace(0.05, 1, 20):  # widen slowly: far from the detector the model means nothing
+            design = np.column_stack([plane, np.ones(len(plane))])
+            affine = np.linalg.lstsq(design, self._call(plane) - self._origin, rcond=None)[0]
+            if not abs(np.linalg.det(affine[:2])) > 0:
+                raise InputError(f"{self._name} cannot be inverted near the origin of its plane; check direction")
+            matrix, shift = np.linalg.inv(affine[:2]), affine[2]
+            plane = (centre + spread * extent * (corners - 1 / 3) - shift) @ matrix
+        return matrix, shift, np.sqrt(abs(np.linalg.det(matrix)))
+
+    def _call(self, xy):
+        with np.errstate(all="ignore"):
+            return np.stack([np.asarray(a, dtype=float) for a in self._function(xy[:, 0], xy[:, 1])], axis=1)
+
+    def displacement(self, q, pose):
+        """p - q (2, n) of the detector pixels p that see the undistorted pixels q."""
+        w = similarity.apply(similarity.invert(pose), q)
+        if self._inverse:
+            return (self._call(w) - self._origin - q).T
+        # called for nearly the same again while the pose settles: it goes on from where it was
+        start, slope = self._reached or (q, None)
+        self._reached = self._newton(lambda p: self._call(p + self._origin), w, start, 1.0, slope)
+        return (self._reached[0] - q).T
+
+    def _newton(self, function, target, start, size, slope=None):
+        """Solve function(p) = target from start; the result, and the inverse Jacobian near it.
+
+        The Jacobian, central differences over a pixel (of that size in p), is kept while it serves.
+        """
+        p, moved, step = start, np.inf, size / 2
+        for _ in range(60):
+            if slope is None:
+                dx = (function(p + [step, 0]) - function(p - [step, 0])) / size
+                dy = (function(p + [0, step]) - function(p - [0, step])) / size
+                try:
+                    slope = np.linalg.inv(np.stack([dx, dy], axis=2))
+                except np.linalg.LinAlgError:
+                    break
+            change = np.einsum("nij,nj->ni", slope, target - function(p))
+            p = p + change
+            before, moved = moved, np.abs(change).max() / size
+            # angles in degrees are known to some 1e-8 px: good enough when it comes no nearer
+            if moved < 1e-11 or 0.25 * before < moved < 1e-6:
+                return p, slope
+            if moved > 0.1 * before:
+                slope = None
+        raise InputError(
+            f"{self._name} cannot be inverted over the detector (last step {moved:.1e} px); "
+            "check direction, shape and origin"
+        )

@@ -1,0 +1,244 @@
+"""What is known of the distortion beforehand."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..exceptions import InputError
+from ..geometry import basis
+
+#: As `sigma` of a `Prior`: to be found from the exposures.
+EVIDENCE = "evidence"
+
+
+def _per_mode(value, n, name):
+    """A width given as a number, per mode or per axis and mode -> (2, n_modes), non-negative."""
+    if isinstance(value, str):
+        if name == "sigma" and value == EVIDENCE:
+            return EVIDENCE
+        words = "widths in pixels" + (f", or {EVIDENCE!r}: found from the exposures" if name == "sigma" else "")
+        raise InputError(f"{name} must be {words}, got {value!r}")
+    out = np.asarray(value, dtype=float)
+    try:
+        out = np.broadcast_to(out, (2, n)).copy()
+    except ValueError:
+        raise InputError(
+            f"{name} must be a number, one per mode ({n},) or per axis and mode (2, {n}), got shape {out.shape}"
+        ) from None
+    if not np.all(out >= 0) or (name != "sigma" and not np.all(np.isfinite(out))):
+        raise InputError(f"{name} must be finite and not negative (a standard deviation in pixels), got {value!r}")
+    return out
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Prior:
+    """Static distortion known beforehand, and how far to trust it.
+
+    Parameters
+    ----------
+    mean : array_like, shape (2, n_modes)
+        Static distortion A_0 in the normalised Legendre basis, pixels, x then y (reference -> detector).
+    sigma : array_like, optional
+        Scatter of single exposures around the mean, pixels: a number, (n_modes,) or (2, n_modes). It shrinks
+        what the data cannot tell. None leaves the exposures free. Zero keeps a mode at the mean, infinity leaves it
+        free. "evidence" lets `legdistort.solve` find it from the exposures, one width a degree
+        (`legdistort.solving.choices.prior_widths`).
+    static_sigma : array_like, optional
+        Uncertainty of the mean itself, same forms. It is common to all exposures and does not average down.
+    shape : tuple, optional
+        ``(ny, nx)`` of the detector it belongs to; solving exposures of another shape with it is then an error.
+    source : str or dict, optional
+        Where it comes from, in words, or item by item (kind, name, direction, files with their checksums); kept with
+        the solution.
+
+    Attributes
+    ----------
+    truncation : float
+        Largest distance [pix] on the detector between the mean and the model it was made from (0 if given directly).
+    plane : ndarray or None
+        Pose (2, 3) from the plane of that model to undistorted pixels: the similarity taken out of the mean.
+
+    Raises
+    ------
+    InputError
+        For arrays of the wrong length or values that are not finite.
+    """
+
+    mean: np.ndarray
+    sigma: np.ndarray | str | None
+    static_sigma: np.ndarray | None
+    shape: tuple | None
+    truncation: float
+    plane: np.ndarray | None
+    source: str | dict | None
+
+    def __init__(self, mean, *, sigma=None, static_sigma=None, shape=None, truncation=0.0, plane=None, source=None):
+        mean = np.array(mean, dtype=float)
+        if mean.ndim != 2 or mean.shape[0] != 2:
+            raise InputError(f"mean must have shape (2, n_modes), x then y, got {mean.shape}")
+        if not np.all(np.isfinite(mean)):
+            raise InputError("mean has values that are not finite")
+        basis.degree_of(mean.shape[1])
+        widths = [
+            None if value is None else _per_mode(value, mean.shape[1], name)
+            for value, name in ((sigma, "sigma"), (static_sigma, "static_sigma"))
+        ]
+        for name, value in zip(
+            ("mean", "sigma", "static_sigma", "shape", "truncation", "plane", "source"),
+            (mean, *widths, shape, truncation, plane, source),
+            strict=True,
+        ):
+            object.__setattr__(self, name, value)
+
+    @property
+    def degree(self):
+        """Total degree of the mean."""
+        return basis.degree_of(self.mean.shape[1])
+
+    def describe(self):
+        """Everything but the mean as plain numbers and strings, as files of solutions keep it."""
+        widths = {"sigma": self.sigma, "static_sigma": self.static_sigma}
+        return {
+            "source": self.source,
+            "degree": self.degree,
+            "shape": None if self.shape is None else [int(n) for n in self.shape],
+            "truncation_px": float(self.truncation),
+            **{
+                name: value if value is None or isinstance(value, str) else value.tolist()
+                for name, value in widths.items()
+            },
+        }
+
+    @property
+    def in_numbers(self):
+        """`sigma` as an array, or None.
+
+        Raises
+        ------
+        InputError
+            While it is to be found from the exposures.
+        """
+        if isinstance(self.sigma, str):
+            raise InputError(
+                f"the prior has sigma={self.sigma!r}: solve finds it from exposures; give widths in pixels here"
+            )
+        return self.sigma
+
+    def with_sigma(self, sigma, *, degree=0):
+        """The same prior with another scatter `sigma`, its mean taken as zero from its own degree up to `degree`."""
+        degree = max(self.degree, degree)
+        if np.ndim(sigma):  # of modes beyond those given nothing is known
+            given = np.asarray(sigma, dtype=float)
+            sigma = np.full((*given.shape[:-1], basis.n_modes(degree)), np.inf)
+            sigma[..., : given.shape[-1]] = given[..., : sigma.shape[-1]]
+        known = {name: getattr(self, name) for name in ("shape", "truncation", "plane", "source")}
+        static = None if self.static_sigma is None else basis.change_degree(self.static_sigma, degree)
+        return Prior(basis.change_degree(self.mean, degree), sigma=sigma, static_sigma=static, **known)
+
+    def __repr__(self):
+        words = [f"degree {self.degree}", f"{self.mean.shape[1]} modes an axis"]
+        words += [f"{name} given" for name in ("sigma", "static_sigma") if getattr(self, name) is not None]
+        return f"<Prior: {', '.join(words)}>"
+
+    @property
+    def rms(self):
+        """Root mean square of the mean over the detector [pix], x and y."""
+        return np.sqrt((self.mean**2).sum(axis=1)) / 2  # the basis has unit norm on [-1, 1]^2, of area 4
+
+    @classmethod
+    def from_model(
+        cls,
+        model,
+        *,
+        shape=None,
+        direction=None,
+        origin=None,
+        frame=None,
+        degree=5,
+        parity=None,
+        sigma=None,
+        static_sigma=None,
+    ):
+        """Prior from a model, WCS, aperture or function of a detector's static distortion.
+
+        The map may end in any plane (arcsec, degrees, pixels): the similarity between that plane and the detector
+        is taken out, since it belongs to the pose of an exposure; shear stays. What ends on the sky, or in V2 and V3,
+        is first projected on the plane that touches the sphere at the centre of the detector.
+
+        Parameters
+        ----------
+        model : callable, astropy model, gwcs, `~astropy.wcs.WCS` or SIAF aperture
+            ``model(x, y) -> (x, y)`` on arrays, between detector pixels and an undistorted plane; units are welcome.
+        shape : tuple, optional
+            ``(ny, nx)`` of the detector; needed if the model does not tell.
+        direction : {"detector_to_reference", "reference_to_detector"}, optional
+            What the model does; needed if it does not tell.
+        origin : {0, 1}, optional
+            Coordinate of the centre of the model's first pixel (default 0; WCSs and apertures tell).
+        frame : str, optional
+            Where to end: of a gwcs, the name of a frame (default "undistorted", or else "v2v3", or else the last); of a
+            SIAF aperture "idl" (default) or "tel".
+        degree : int
+            Total degree of the Legendre series; `truncation` tells what it leaves out.
+        parity : {1, -1, None}
+            Orientation of the plane relative to the detector; None takes what fits.
+        sigma, static_sigma
+            As for `Prior`.
+
+        Raises
+        ------
+        InputError
+            For a wrong direction or origin, or a model that cannot be followed over the detector.
+        """
+        from .expansion import expand
+        from .from_objects import describe
+
+        source = describe(model, frame=frame).stated(shape=shape, direction=direction, origin=origin)
+        mean, plane, truncation = expand(source, basis.check_degree(degree), parity)
+        known = {"shape": source.shape, "truncation": truncation, "plane": plane, "source": source.record()}
+        return cls(mean, sigma=sigma, static_sigma=static_sigma, **known)
+
+    @classmethod
+    def from_file(cls, where, *, ext=None, frame=None, **options):
+        """Prior from a file, or a name, of any kind that is recognised.
+
+        Parameters
+        ----------
+        where : str, path, or sequence of two of them
+            ``prior.asdf``, ``solution.asdf`` (the mean of its exposures), or any source of
+            `legdistort.priors.from_files.read_source`: ASDF with a gwcs or a model, FITS headers, two FITS maps,
+            Drizzle coefficients, ``gsaoi-1`` ... ``gsaoi-4``, ``siaf:INSTRUMENT/APERTURE``.
+        ext : int, str or (str, int), optional
+            Extension of FITS files, header of a text, or place in the tree of an ASDF file.
+        frame : str, optional
+        **options
+            As for `from_model`: shape, direction, origin, degree, parity, sigma, static_sigma.
+
+        Raises
+        ------
+        InputError
+            Naming the file, and what to do.
+        """
+        from .storage import open_prior
+
+        return open_prior(where, cls, ext=ext, frame=frame, **options)
+
+    def write(self, path, *, overwrite=False):
+        """Write everything to an ASDF file (`legdistort.priors.storage`)."""
+        from .storage import write_prior
+
+        return write_prior(self, path, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path):
+        """Read what `write` wrote."""
+        from .storage import read_prior
+
+        return read_prior(path, cls)
+
+
+def means(prior):
+    """A prior, or dict of priors, without the widths."""
+    if isinstance(prior, dict):
+        return {key: means(each) for key, each in prior.items()}
+    return prior.with_sigma(None) if isinstance(prior, Prior) else prior

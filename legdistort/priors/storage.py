@@ -1,0 +1,118 @@
+"""Priors as ASDF files, and the door through which a prior of any kind comes in."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import asdf
+import numpy as np
+
+from ..exceptions import InputError
+from ..geometry import similarity
+from ..geometry.basis import check_degree
+from ..results.solution import Solution
+from ..runtime import provenance
+from ..runtime.asdf_files import ASDF_STANDARD, check_tree, read_tree
+from ..runtime.outputs import replacing
+from . import source as sources
+from .from_files import read_source
+
+#: Version of the layout under ``legdistort_prior``.
+LAYOUT = 1
+
+
+def write_prior(prior, path, *, overwrite=False):
+    """Write a `Prior` to an ASDF file of plain arrays, numbers and strings."""
+    tree = {
+        "layout": LAYOUT,
+        "provenance": provenance.stamp(),
+        "coefficients": prior.mean,
+        "sigma": prior.sigma,
+        "static_sigma": prior.static_sigma,
+        "shape": None if prior.shape is None else [int(n) for n in prior.shape],
+        "truncation_px": float(prior.truncation),
+        "plane": prior.plane,
+        "source": prior.source,
+    }
+    with replacing(path, overwrite=overwrite) as temporary:
+        asdf.AsdfFile({"legdistort_prior": tree}, version=ASDF_STANDARD).write_to(temporary)
+    return Path(path)
+
+
+def read_prior(path, kind):
+    """Read a `Prior` from an ASDF file.
+
+    Raises
+    ------
+    InputError
+        If the file is not one that `write_prior` wrote, was damaged since, or has a newer layout.
+    """
+    tree = read_tree(path).get("legdistort_prior")
+    if not isinstance(tree, dict) or "layout" not in tree:
+        raise InputError(f"{path} holds no legdistort prior (no entry 'legdistort_prior'); make one: legdistort prior")
+    if tree["layout"] != LAYOUT:
+        raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
+    check_tree({"legdistort_prior": tree}, "prior-1.schema.yaml", path)
+    try:
+        arrays = {key: tree[key] for key in ("sigma", "static_sigma", "plane")}
+        arrays = {key: np.array(value) if hasattr(value, "shape") else value for key, value in arrays.items()}
+        if arrays["plane"] is not None:
+            similarity.check(arrays["plane"], "plane")
+        prior = kind(
+            np.array(tree["coefficients"]),
+            shape=None if tree["shape"] is None else tuple(tree["shape"]),
+            truncation=float(tree["truncation_px"]),
+            source=tree["source"],
+            **arrays,
+        )
+        check_degree(prior.degree)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} is damaged: {error}") from None
+    return prior
+
+
+def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=None, **options):
+    """Prior from whatever stands in a file (see `Prior.from_file`)."""
+    if isinstance(where, (list, tuple)) and len(where) == 1:
+        where = where[0]
+    options = {key: value for key, value in options.items() if value is not None}
+    widths = {key: value for key, value in (("sigma", sigma), ("static_sigma", static_sigma)) if value is not None}
+    ready = _ready(where, kind)
+    if ready is not None:
+        given = options | {key: value for key, value in (("ext", ext), ("frame", frame)) if value is not None}
+        if "shape" in given and ready.shape in (None, tuple(given["shape"])):
+            widths["shape"] = sources.check_shape(given.pop("shape"))
+        if given:
+            raise InputError(f"{where} is a prior already: {', '.join(given)} cannot be chosen any more; leave it out")
+        known = {field.name: getattr(ready, field.name) for field in dataclasses.fields(ready)}
+        return kind(**known | widths)
+    source = read_source(where, ext=ext, frame=frame)
+    try:
+        return kind.from_model(source, **options, **widths)
+    except InputError:
+        raise
+    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # its model had the say
+        raise InputError(f"{source.name}: the distortion cannot be evaluated ({error})") from None
+
+
+def _ready(where, kind):
+    """The prior in a prior.asdf or solution.asdf; None for anything else."""
+    if not isinstance(where, (str, Path)) or not Path(where).is_file():
+        return None
+    with open(where, "rb") as file:
+        start = file.read(1 << 20)  # the arrays come later
+    if start.startswith(b"#ASDF") and re.search(rb"^legdistort_prior:", start, re.MULTILINE):
+        return read_prior(where, kind)
+    if start.startswith(b"#ASDF") and re.search(rb"^legdistort:", start, re.MULTILINE):
+        return _of_solution(where, kind)
+    return None
+
+
+def _of_solution(path, kind):
+    """The mean distortion of the exposures of another field."""
+    earlier = Solution.read(path)
+    shapes = {tuple(earlier.shapes[name]) for name in earlier.names}
+    if len(shapes) > 1:
+        raise InputError(f"{path} has detectors of several shapes, {sorted(shapes)}; it gives no single prior")
+    record = {"kind": "solution", "name": str(path), "files": provenance.checksums(path)}
+    return kind(earlier.coefficients.mean(axis=0), shape=shapes.pop(), source=record)

@@ -1,0 +1,1 @@
+"""What comes out of `legdistort.solve`, and the files made from it."""

@@ -1,0 +1,285 @@
+"""The two error criteria of the paper (section 3.4), as measured and as expected from the covariances.
+
+*b* is the error of the reference positions, *sigma* the scatter of corrected positions over the exposures.
+All figures are rms *per axis*, ``sqrt((x^2 + y^2) / 2)``, so that they compare with the errors of positions. The
+paper's equations, which sum both axes, give the *total*, sqrt(2) times as much: see `total`. (The figures that
+it quotes for its simulations are per axis all the same: its slopes tend to 1, not to sqrt(2).)
+"""
+
+import numpy as np
+
+from ..exceptions import InputError
+from ..geometry import basis, similarity
+
+#: Numbers held at once while expected scatters are computed.
+_BLOCK = 2**24
+
+
+def total(per_axis):
+    """A criterion of both axes together, as the paper's equations write it, from one per axis: sqrt(2) times."""
+    return np.sqrt(2) * np.asarray(per_axis)
+
+
+def bias(estimated, true, *, removed=None):
+    """Error b of reference positions, rms per axis (first criterion of the paper, section 3.4).
+
+    ``b = sqrt(1/N_star sum_j |b_j|^2)`` with ``b_j`` of `bias_by_star`, over sqrt(2).
+
+    Parameters
+    ----------
+    estimated, true : array_like, shape (n_stars, 2)
+    removed : None, "similarity" or int
+        What is fitted to the differences and taken out first: nothing; shift, rotation and scale; or a
+        polynomial map of this total degree (what is left is free of the gauge).
+
+    Returns
+    -------
+    float
+        Pixels.
+    """
+    return float(np.sqrt(np.nanmean(bias_by_star(estimated, true, removed=removed) ** 2)))
+
+
+def bias_by_star(estimated, true, *, removed=None):
+    """Error ``b_j = X_est_j - X_ref_j`` of every reference position, x and y (paper, section 3.4).
+
+    Parameters are those of `bias`.
+
+    Returns
+    -------
+    ndarray, shape (n_stars, 2)
+        Pixels; NaN for a star that was not estimated.
+    """
+    estimated, true = np.asarray(estimated, float), np.asarray(true, float)
+    good = np.isfinite(estimated).all(axis=1)
+    difference = (estimated - true)[good].T.ravel()
+    columns = _columns(true[good], removed)
+    out = np.full(estimated.shape, np.nan)
+    out[good] = (difference - columns @ (columns.T @ difference)).reshape(2, -1).T
+    return out
+
+
+def expected_bias(solution, *, removed=None, absolute=False):
+    """What `bias` should be, from the covariance of the solution.
+
+    Parameters
+    ----------
+    solution : Solution
+        As returned by `legdistort.solve`.
+    removed : None, "similarity" or int
+        As for `bias`. With the fitted degree this is the Cramer-Rao bound of the gauge-free error.
+    absolute : bool
+        Add what the gauge hides (mean dynamic distortion, static uncertainty).
+    """
+    good = np.isfinite(solution.positions).all(axis=1)
+    xy = solution.positions[good]
+    if not hasattr(type(solution.uncertainty), "star_matrix"):  # of the class: to ask the object would compute it
+        raise InputError("a solution read from a file keeps no covariances between stars; call solve again")
+    if removed is None:  # each star by itself: the covariances between stars, a large matrix, are not needed
+        variance = (solution.absolute_variance if absolute else solution.uncertainty.stars)[:2, good]
+        return float(np.sqrt(np.mean(variance)))
+    covariance = solution.uncertainty.star_matrix[np.ix_(np.tile(good, 2), np.tile(good, 2))]
+    if absolute:
+        hidden = solution.gauge.absolute_covariance
+        modes = np.kron(np.eye(2), solution.gauge.modes_at(xy, len(hidden) // 2)).T
+        covariance = covariance + modes @ hidden @ modes.T
+    columns = _columns(xy, removed)
+    left = np.trace(covariance) - np.trace(columns.T @ covariance @ columns)
+    return float(np.sqrt(left / len(covariance)))
+
+
+def _columns(xy, removed):
+    """Orthonormal displacement fields (2 n, k) at positions (n, 2), x first, of what is to be removed."""
+    n = len(xy)
+    if removed is None:
+        return np.zeros((2 * n, 0))
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    x, y = (2 * (xy - low) / (high - low) - 1).T
+    if removed == "similarity":
+        x, y = (xy - xy.mean(axis=0)).T
+        one, zero = np.ones(n), np.zeros(n)
+        fields = [[one, zero], [zero, one], [x, y], [-y, x]]
+        columns = np.array([np.concatenate(f) for f in fields]).T
+    else:
+        degree = basis.check_degree(removed, "removed")
+        columns = np.kron(np.eye(2), basis.values(degree, x, y)).T
+    return np.linalg.qr(columns)[0]
+
+
+def scatter(corrected):
+    """Scatter sigma_j of corrected positions, rms per axis (second criterion of the paper, section 3.4).
+
+    ``sigma_j = sqrt(1/N_im sum_i |X_corr_ij - avg_i(X_corr_ij)|^2)``, over sqrt(2). The criterion of a whole field is
+    their rms, ``sigma = sqrt(1/N_grid sum_j' sigma_j'^2)``, over new stars on a grid: `new_scatter`.
+
+    Parameters
+    ----------
+    corrected : array_like, shape (n_exposures, n_stars, 2)
+        NaN where a star is not seen.
+
+    Returns
+    -------
+    ndarray, shape (n_stars,)
+        With 1/n_im as in the paper; NaN for a star seen less than twice.
+    """
+    corrected = np.asarray(corrected, float)
+    seen = np.isfinite(corrected).all(axis=2)
+    n = seen.sum(axis=0)
+    filled = np.where(seen[..., None], corrected, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = filled.sum(axis=0) / n[:, None]
+        variance = (np.where(seen[..., None], corrected - mean, 0) ** 2).sum(axis=(0, 2)) / (2 * n)
+    return np.sqrt(np.where(n > 1, variance, np.nan))
+
+
+def corrected_positions(solution):
+    """Corrected positions (n_exposures, n_stars, 2) of the fitted stars (section 3.3), NaN where not used."""
+    table = solution.observations
+    out = np.full((len(solution.names), len(solution.star_names), 2), np.nan)
+    for i, name in enumerate(solution.names):
+        rows = table[(table["exposure"] == name) & table["used"]]
+        xy = np.column_stack([rows["x"].value, rows["y"].value])
+        out[i, np.searchsorted(solution.star_names, rows["star"])] = solution.correct(name, xy)
+    return out
+
+
+def new_scatter(solution, distort, xy, sigma, *, seen=None, rng=None):
+    """Scatter sigma_j' of new stars that the solution has not seen, measured in a simulation, rms per axis.
+
+    Each is put at its true pixels, given an error, and corrected with the solution (paper, section 3.4: the
+    criterion "generalised to stars that are not used in the resolution"). Over a grid it is the paper's Figure
+    "ergrid"; its rms is sigma_grid, that over the stars `in_contour` sigma_contour.
+
+    Parameters
+    ----------
+    solution : Solution
+    distort : callable
+        ``distort(name, xy)``: true pixels of reference positions, such as `legdistort.simulation.truth.Truth.distort`.
+    xy : array_like, shape (n, 2)
+        True reference positions, for example ``truth.grid(name, 150)``.
+    sigma : float
+        Error of one measured position, pixels per axis; 0 leaves the errors of the correction alone.
+    seen : array_like of bool, shape (n_exposures, n), optional
+        In which exposures a star is measured; by default in all.
+    rng : `~numpy.random.Generator`, optional
+        Of the errors.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Pixels; NaN for a star seen less than twice.
+    """
+    rng = np.random.default_rng(0) if rng is None else rng
+    xy = np.asarray(xy, dtype=float)
+    corrected = np.full((len(solution.names), len(xy), 2), np.nan)
+    for i, name in enumerate(solution.names):
+        on = slice(None) if seen is None else np.flatnonzero(np.asarray(seen)[i])
+        measured = np.array(distort(name, xy[on]))
+        if sigma:
+            measured += sigma * rng.standard_normal(measured.shape)
+        corrected[i, on] = solution.correct(name, measured)
+    return scatter(corrected)
+
+
+def contour(stars, *, fraction=0.9):
+    """The square that holds most stars, inside which the paper (section 4.1) averages sigma.
+
+    The paper does not say how it was chosen. Here it is centred between the outermost stars.
+
+    Parameters
+    ----------
+    stars : array_like, shape (n, 2)
+        Positions of the stars that were fitted.
+    fraction : float
+        How many of them lie inside.
+
+    Returns
+    -------
+    ndarray, shape (2, 2)
+        Lower and upper corner.
+    """
+    stars = np.asarray(stars, dtype=float)
+    middle = (stars.min(axis=0) + stars.max(axis=0)) / 2
+    half = np.quantile(np.abs(stars - middle).max(axis=1), fraction)
+    return np.stack([middle - half, middle + half])
+
+
+def in_contour(xy, square):
+    """Whether positions (n, 2) lie inside a square (2, 2) of `contour`."""
+    return ((xy >= square[0]) & (xy <= square[1])).all(axis=-1)
+
+
+def scatter_summary(solution):
+    """Mean and standard deviation of sigma_j over the stars of a solution (paper, section 5.3.1).
+
+    Returns
+    -------
+    dict
+        ``n_stars``; ``mean``, ``std``: per axis, pixels; ``mean_total``, ``std_total``: both axes together.
+    """
+    sigma = scatter(corrected_positions(solution))
+    sigma = sigma[np.isfinite(sigma)]
+    mean, std = float(np.mean(sigma)), float(np.std(sigma))
+    both = {"mean_total": float(total(mean)), "std_total": float(total(std))}
+    return {"n_stars": len(sigma), "mean": mean, "std": std, **both}
+
+
+def expected_scatter(solution, xy, sigma, *, seen=None, covariance=None):
+    """What `scatter` should be for new positions that the solution has not seen, from its Fisher matrix.
+
+    Parameters
+    ----------
+    solution : Solution
+    xy : array_like, shape (n, 2)
+        Reference positions.
+    sigma : float or array_like, shape (n_exposures, n)
+        Error of one detector position, pixels per axis.
+    seen : array_like of bool, shape (n_exposures, n), optional
+        In which exposures a position is measured; by default those on whose detector it falls.
+    covariance : ndarray, shape (n_exposures * 2 n_modes,) squared, optional
+        Of the errors of the coefficients, of this or a higher degree; by default that of the solution.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Rms per axis; NaN where fewer than two exposures see the position.
+    """
+    xy = np.asarray(xy, dtype=float)
+    covariance = solution.uncertainty.coefficients if covariance is None else covariance
+    sigma = np.broadcast_to(sigma, (len(solution.names), len(xy)))
+    step = max(1, _BLOCK // (2 * len(covariance)))
+    parts = [
+        _expected_variance(
+            solution, xy[part], sigma[:, part], None if seen is None else np.asarray(seen)[:, part], covariance
+        )
+        for part in (slice(k, k + step) for k in range(0, len(xy), step))
+    ]
+    return np.sqrt(np.concatenate([*parts, np.zeros(0)]))
+
+
+def _expected_variance(solution, xy, sigma, seen, covariance):
+    """Square of `expected_scatter` for as many positions as fit in memory."""
+    n_exposures = len(solution.names)
+    size = len(covariance) // n_exposures
+    degree = basis.degree_of(size // 2)
+    rows = np.zeros((n_exposures, len(xy), 2, size))
+    own, noise, n = np.zeros(len(xy)), np.zeros(len(xy)), np.zeros(len(xy), dtype=int)
+    for i, name in enumerate(solution.names):
+        distortion, pose = solution.distortion(name), solution.poses[name]
+        ny, nx = solution.shapes[name]
+        q = similarity.apply(pose, xy)
+        if seen is None:
+            on = (np.abs(distortion(q) - [(nx - 1) / 2, (ny - 1) / 2]) <= [nx / 2, ny / 2]).all(axis=1)
+        else:
+            on = seen[i]
+        back = np.linalg.inv(distortion.jacobian(q[on]) @ pose[:, :2])
+        b = basis.values(degree, *basis.normalize(q[on], solution.shapes[name]))
+        rows[i, on] = mine = np.einsum("kac,mk->kacm", back, b).reshape(len(b.T), 2, size)
+        own[on] += (mine @ covariance[i * size : (i + 1) * size, i * size : (i + 1) * size] * mine).sum(axis=(1, 2))
+        noise[on] += sigma[i, on] ** 2 * (back**2).sum(axis=(1, 2))
+        n[on] += 1
+    flat = rows.transpose(1, 2, 0, 3).reshape(2 * len(xy), -1)
+    together = ((flat @ covariance) * flat).sum(axis=1).reshape(-1, 2).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        variance = (own + noise - (together + noise) / n) / (2 * n)
+    return np.where(n > 1, np.maximum(variance, 0), np.nan)

@@ -1,0 +1,138 @@
+"""How a reference catalogue tied a solution."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry import basis
+from ..geometry.detector_modes import dynamic_basis, similarity_basis
+
+
+@dataclass(frozen=True, eq=False)
+class Tie:
+    """How a reference tied the star positions.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (2 k, 2 k)
+        Of the map that the exposures do not tell, px^2, in the k modes of the gauge (3 if it has one).
+    shared : ndarray, shape (3, n_stars)
+        xx, yy, xy [px^2]: what to add to relative variance and that of the map at each star, for their errors have
+        the noise of the star in common.
+    measured : ndarray, shape (n,)
+        By how much the reference has brought down the variance of shift, rotation and scale, of shear, of degree 2 and
+        so on: 0, not at all, to 1. The first is 0.5 for a single star, which tells the shift alone.
+    stars : ndarray, shape (n_reference,)
+        Names of the stars that the reference has.
+    offsets : ndarray, shape (n_reference, 2)
+        Reference less tied position, pixels.
+    used : ndarray of bool, shape (n_reference,)
+        False for what was rejected as a mismatch.
+    ratio : float
+        chi2 of the offsets over its degrees of freedom; NaN if there are hardly any.
+    """
+
+    covariance: np.ndarray
+    shared: np.ndarray
+    measured: np.ndarray
+    stars: np.ndarray
+    offsets: np.ndarray
+    used: np.ndarray
+    ratio: float
+
+    @property
+    def rms(self):
+        """Rms of the used offsets per axis, pixels; rounding is none."""
+        return round(float(np.sqrt(np.mean(self.offsets[self.used] ** 2))), 9)
+
+    @property
+    def sentence(self):
+        """What was used, in a sentence."""
+        out = self.stars[~self.used]
+        words = f"tied to {np.count_nonzero(self.used)} stars of a reference, {self.rms:.2g} px rms per axis from it"
+        if len(out):
+            named = ", ".join(str(name) for name in out[:6]) + (" ..." if len(out) > 6 else "")
+            words += f"; {len(out)} rejected as mismatched: {named}"
+        return words
+
+    @property
+    def alone(self):
+        """Whether a single star tells the shift, and nothing else."""
+        return self.measured[0] < 1
+
+    def errors(self, size):
+        """Name, number of modes and error [px, rms over the field and axis] by degree, as a list.
+
+        NaN for rotation and scale if the reference does not tell them. `size` (ny, nx) is that of the box of the modes.
+        """
+        known = Knowledge(self.covariance, np.zeros(len(self.covariance)), False, size)
+        similar, parts = known.similarities, known.by_degree()
+        if self.alone:
+            groups = {"shift": similar[:, :2], "rotation, scale": np.full((len(similar), 2), np.nan)}
+        else:
+            groups = {"shift, rotation, scale": similar}
+        groups |= {f"degree {d}" if d > 1 else "shear": part for d, part in enumerate(parts, start=1)}
+        return [
+            (name, part.shape[1], float(np.sqrt(np.trace(part.T @ self.covariance @ part) / 8)))
+            for name, part in groups.items()
+        ]
+
+    def words(self, convention):
+        """What pins the modes of every degree, ``{name as in errors: words}``."""
+        out = {"shift" if self.alone else "shift, rotation, scale": "the reference"}
+        for degree, share in enumerate(self.measured[1:], start=1):
+            words = ["the reference"] * bool(share > 0.1) + [convention] * bool(share <= 0.9)
+            out[f"degree {degree}" if degree > 1 else "shear"] = " and ".join(words)
+        return out
+
+    @property
+    def statement(self):
+        """What was used and how well it agrees, in sentences."""
+        told = "" if np.isnan(self.ratio) else f" (chi2 {self.ratio:.2g} per degree of freedom)"
+        return f"The plane is {self.sentence}{told}."
+
+    def __repr__(self):
+        return f"<Tie: {np.count_nonzero(self.used)} of {len(self.used)} reference stars, {self.rms:.2g} px rms>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Knowledge:
+    """What is known of the common map before the reference is asked.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (2 k, 2 k)
+        Of all but its similarity, px^2.
+    centre : ndarray, shape (2 k,)
+        Its most probable value, in modes.
+    free : bool
+        Whether a static distortion that nobody knows adds to it: its size, degree by degree, is then found.
+    size : tuple
+        ``(ny, nx)`` of the box of the modes, pixels.
+    """
+
+    covariance: np.ndarray
+    centre: np.ndarray
+    free: bool
+    size: tuple
+
+    def __repr__(self):
+        return f"<Knowledge: {self.n_modes} modes an axis>"
+
+    @property
+    def n_modes(self):
+        """k."""
+        return len(self.centre) // 2
+
+    @property
+    def similarities(self):
+        """Orthonormal columns (2 k, 4): shift in x and y, scale, rotation."""
+        return similarity_basis(self.size, self.n_modes).T
+
+    def by_degree(self):
+        """Orthonormal columns of all but the similarities: the two shears, then those of each further degree."""
+        columns = dynamic_basis(self.size, self.n_modes).T
+        degree = basis.degree_of(self.n_modes)
+        orders = np.sum(basis.orders(degree), axis=0)[3:]
+        which = np.concatenate([[1, 1], orders, orders])
+        return [columns[:, which == d] for d in range(1, degree + 1)]

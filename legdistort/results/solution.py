@@ -1,0 +1,391 @@
+"""The result of `solve`: positions, distortions, their errors, and everything made from them."""
+
+import textwrap
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+from astropy.wcs import WCS
+
+from ..exceptions import InputError
+from ..geometry import basis
+from ..geometry import similarity as poses
+from ..geometry.distortion import Distortion
+from ..geometry.models import like, outside, to_pixels
+from ..geometry.star_hull import support, supported
+from ..geometry.tangent_plane import TangentPlane
+from ..inputs import column_contract
+from .diagnostics import in_words
+
+
+def _wrapped(key, text):
+    """Lines of at most 110 characters that begin with a key."""
+    return textwrap.wrap(text, 110, initial_indent=f"{key:8s}", subsequent_indent=" " * 8)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Distortion-free star positions and the distortion of every exposure.
+
+    Made by `legdistort.solve`, read back by `Solution.read`.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Exposures.
+    degree : int
+        Total degree that was fitted.
+    shapes : dict
+        ``{exposure: (ny, nx)}``.
+    poses : dict
+        ``{exposure: (2, 3)}``, reference plane -> undistorted pixels, refined.
+    coefficients : ndarray, shape (n_exposures, 2, n_modes)
+        Distortion A_i, pixels, normalised Legendre modes, x then y. With a prior of higher degree than the
+        fit, its remaining modes follow unchanged.
+    prior_mean : ndarray, same shape
+        Static distortion A_0 around which the solution lies (zero without a prior).
+    star_names : ndarray, shape (n_stars,)
+    positions : ndarray, shape (n_stars, 2)
+        X_ref, reference-plane pixels; NaN for a star none of whose observations was used.
+    observations : `~astropy.table.QTable`
+        The matched table that was solved, with ``dx``, ``dy`` [pix] and ``used`` added.
+    chi2 : float
+        Weighted sum of squares of the used residuals.
+    dof : int
+        Its degrees of freedom, the directions fixed by the gauge counted.
+    status : str
+        How the minimisation ended.
+    gauge : Gauge
+    uncertainty : Uncertainty
+        Covariances in the gauge.
+    sky : TangentPlane or None
+    left_out : dict
+        ``{exposure: reason}``.
+    settings : dict
+        How `solve` was called.
+    provenance : dict
+        ``created``, ``versions`` of packages and, if files went in, ``inputs`` ``{base name: SHA-256}``.
+    form : `legdistort.solving.model_forms.Form` or None
+        The model that was given to `solve`. Files do not keep it: `model` then has the usual form, the same function.
+    """
+
+    names: tuple
+    degree: int
+    shapes: dict
+    poses: dict
+    coefficients: np.ndarray
+    prior_mean: np.ndarray
+    star_names: np.ndarray
+    positions: np.ndarray
+    observations: QTable
+    chi2: float
+    dof: int
+    status: str
+    gauge: object
+    uncertainty: object
+    sky: TangentPlane | None = None
+    left_out: dict = field(default_factory=dict)
+    settings: dict = field(default_factory=dict)
+    provenance: dict = field(default_factory=dict)
+    form: object = None
+
+    # -- tables
+
+    @cached_property
+    def stars(self):
+        """One row a star: ``star``, ``x``, ``y``, errors [pix], ``n``, mean ``flux`` and the sky if known.
+
+        ``x_err``, ``y_err`` are relative (in the gauge); ``x_err_abs``, ``y_err_abs`` add what the gauge hides: the
+        mean dynamic distortion of the set and the uncertainty of the static one. Pointing, rotation and
+        scale common to all exposures are those of the nominal poses and are not part of these errors, unless a
+        reference ties them: then they are. On the sky:
+        ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
+        ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue.
+        """
+        table = QTable({"star": self.star_names, "x": self.positions[:, 0] * u.pix, "y": self.positions[:, 1] * u.pix})
+        variance, absolute = self.uncertainty.stars, self.absolute_variance
+        for suffix, each in (("err", variance), ("err_abs", absolute)):
+            for k, axis in enumerate("xy"):
+                table[f"{axis}_{suffix}"] = np.sqrt(each[k]) * u.pix
+        table["xy_corr"] = variance[2] / np.sqrt(variance[0] * variance[1])
+        used = self.observations[self.observations["used"]]
+        index = np.searchsorted(self.star_names, used["star"])
+        table["n"] = np.bincount(index, minlength=len(table))
+        if "flux" in used.colnames:
+            with np.errstate(invalid="ignore"):
+                table["flux"] = np.bincount(index, used["flux"], len(table)) / table["n"]
+        if self.sky is not None:
+            sky = self.sky.to_sky(self.positions)
+            table["ra"], table["dec"] = u.Quantity(sky.ra, subok=False), u.Quantity(sky.dec, subok=False)
+            errors = self.sky.to_sky_errors(self.positions, variance)
+            table["ra_error"], table["dec_error"], table["ra_dec_corr"] = errors
+            table["ra_error_abs"], table["dec_error_abs"], _ = self.sky.to_sky_errors(self.positions, absolute)
+        return column_contract.describe_stars(table)
+
+    @property
+    def residuals(self):
+        """One row an observation, as given: ``exposure``, ``star``, ``dx``, ``dy`` [pix], ``used`` and more.
+
+        A residual is the measured minus the predicted detector position.
+        """
+        return self.observations
+
+    def hidden_variance(self, xy):
+        """Variance (n, 2) [pix^2] that the gauge hides at reference positions (n, 2)."""
+        return self._hidden(xy)[:2].T
+
+    def _hidden(self, xy):
+        """xx, yy, xy (3, n)."""
+        covariance = self.gauge.absolute_covariance
+        n = len(covariance) // 2
+        modes = self.gauge.modes_at(xy, n)
+        blocks = covariance[:n, :n], covariance[n:, n:], covariance[:n, n:]
+        return np.stack([np.einsum("mj,mk,kj->j", modes, block, modes) for block in blocks])
+
+    @property
+    def absolute_variance(self):
+        """Covariance xx, yy, xy (3, n_stars) [pix^2] of the positions, with what the gauge hides."""
+        tie = self.gauge.tie
+        return self.uncertainty.stars + self._hidden(self.positions) + (0 if tie is None else tie.shared)
+
+    @property
+    def effective_modes(self):
+        """``{exposure: number}`` of its modes, both axes together, that the data determine rather than a prior.
+
+        The trace of the influence of the data on the coefficients. Without prior widths it is their number, less what
+        the gauge fixes. None if the solution does not know it.
+        """
+        return self.settings.get("effective_modes")
+
+    # -- geometry
+
+    def index(self, name):
+        """Position of an exposure in `names`.
+
+        Raises
+        ------
+        InputError
+            If the solution has no such exposure; says why if it was left out.
+        """
+        if name not in self.names:
+            why = f": it was left out ({self.left_out[name]})" if name in self.left_out else ""
+            raise InputError(f"no exposure {name!r} in the solution{why}; it has {', '.join(self.names)}")
+        return self.names.index(name)
+
+    @cached_property
+    def _distortions(self):
+        return [Distortion(a, self.shapes[name], name) for name, a in zip(self.names, self.coefficients, strict=True)]
+
+    def distortion(self, name):
+        """The `Distortion` of an exposure: undistorted -> detector pixels, without the pose."""
+        return self._distortions[self.index(name)]
+
+    def distort(self, name, xy):
+        """Reference positions (n, 2) -> detector pixels (n, 2); NaN where the exposure does not reach.
+
+        A quantity in pixels gives a quantity.
+        """
+        distortion = self.distortion(name)
+        q = poses.apply(self.poses[name], np.atleast_2d(to_pixels(xy)))
+        p = distortion(q)
+        p[outside(distortion.inverse.valid, q[:, 0], q[:, 1])] = np.nan
+        return like(xy, p)
+
+    def correct(self, name, xy):
+        """Detector pixels (n, 2) -> reference positions (n, 2), exact (section 3.3, criterion J_3).
+
+        A quantity in pixels gives a quantity.
+        """
+        distortion = self.distortion(name)
+        distortion.check_fold()
+        q = distortion.invert(np.atleast_2d(to_pixels(xy)))
+        return like(xy, poses.apply(poses.invert(self.poses[name]), q))
+
+    def model(self, name):
+        """Reference plane -> detector pixels as an astropy compound model with inverse."""
+        from ..wcs.exposure_wcs import exposure_model
+
+        distortion = self.distortion(name)
+        return exposure_model(self.poses[name], distortion, self.form)
+
+    def wcs(self, name):
+        """The gwcs of an exposure: detector -> undistorted -> reference -> icrs (the last if the sky is known)."""
+        from ..wcs.exposure_wcs import exposure_wcs
+
+        distortion = self.distortion(name)
+        return exposure_wcs(name, self.poses[name], distortion, self.sky)
+
+    def header(self, name, *, kind="sip", max_error=1e-3):
+        """FITS header of an exposure, TAN-SIP or TPV, with its error in it (`legdistort.wcs.fits_headers`)."""
+        from ..wcs.fits_headers import make_header
+
+        return make_header(self, name, kind=kind, max_error=max_error)
+
+    def fits_wcs(self, name, *, max_error=1e-3):
+        """The nearest `astropy.wcs.WCS` of an exposure, TAN-SIP, for what takes no other (`CCDData`, `Cutout2D`).
+
+        Parameters
+        ----------
+        name : str
+        max_error : float
+            Largest error allowed over the whole detector, pixels.
+
+        Raises
+        ------
+        ExportError
+            If no SIP polynomial is that close, naming the best.
+        InputError
+            If the sky is not known.
+        """
+        from ..wcs.fits_headers import make_header
+
+        wcs = WCS(make_header(self, name, max_error=max_error))
+        wcs.array_shape = self.shapes[name]
+        return wcs
+
+    @property
+    def max_inverse_error(self):
+        """Largest certified round-trip error over all exposures, pixels."""
+        return max(distortion.inverse.error for distortion in self._distortions)
+
+    # -- errors
+
+    @property
+    def static_sigma(self):
+        """Uncertainty of the prior mean, shape (2, n_modes) [pix], or None."""
+        return self.gauge.static_sigma
+
+    def coefficient_errors(self, name):
+        """Standard deviations (2, n_modes) of the fitted coefficients of an exposure in the gauge, pixels."""
+        return np.sqrt(np.diag(self._block(name))).reshape(2, -1)
+
+    def _block(self, name, other=None):
+        size = 2 * basis.n_modes(self.degree)
+        i, k = self.index(name), self.index(name if other is None else other)
+        return self.uncertainty.coefficients[i * size : (i + 1) * size, k * size : (k + 1) * size]
+
+    def sigma_map(self, name, *, n=64, support=True):
+        """Error of the distortion correction over a detector (paper's Figure "ergrid", noise of the position excluded).
+
+        Parameters
+        ----------
+        name : str
+        n : int
+            Points along the longer side.
+        support : bool
+            NaN outside the convex hull of the stars used in this exposure, where the correction is extrapolated.
+
+        Returns
+        -------
+        x, y : ndarray, shape (n_x,), (n_y,)
+            Pixels.
+        sigma : ndarray, shape (n_y, n_x, 2)
+            Standard deviation of the corrected position per axis, reference-plane pixels.
+        """
+        distortion = self.distortion(name)
+        ny, nx = self.shapes[name]
+        step = max(nx, ny) / n
+        x = np.linspace(-0.5, nx - 0.5, max(2, round(nx / step)))
+        y = np.linspace(-0.5, ny - 0.5, max(2, round(ny / step)))
+        grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        q = distortion.invert(grid)
+        b = basis.values(self.degree, *basis.normalize(q, self.shapes[name]))
+        m = len(b)
+        block = self._block(name).reshape(2, m, 2, m)
+        detector = np.einsum("mn,ambk,kn->nab", b, block, b, optimize=True)
+        back = np.linalg.inv(distortion.jacobian(q) @ self.poses[name][:, :2])
+        variance = np.einsum("nab,nbc,nac->na", back, detector, back)
+        sigma = np.sqrt(np.maximum(variance, 0)).reshape(len(y), len(x), 2)
+        if support:
+            sigma[~self.supported(name, grid).reshape(len(y), len(x))] = np.nan
+        return x, y, sigma
+
+    def supported(self, name, xy):
+        """Whether detector positions (n, 2) lie inside the convex hull of the stars used in an exposure."""
+        return supported(support(name, self), np.asarray(xy, dtype=float).T)
+
+    # -- words
+
+    @property
+    def rms(self):
+        """Unweighted rms residual (2,) per axis of the used observations, pixels."""
+        used = self.observations["used"]
+        return np.array([np.sqrt(np.mean(self.observations[d][used].to_value(u.pix) ** 2)) for d in ("dx", "dy")])
+
+    @property
+    def sky_sentence(self):
+        """Where the reference plane lies on the sky, and how that is known."""
+        if self.sky is None:
+            return "not known: no WCS in the headers that proved right, no reference catalogue with ra, dec"
+        source = {"exposures": "from the headers", "reference": "from the reference"}.get(self.settings.get("sky"), "")
+        tied = ", tied to the reference" if source and self.gauge.tie is not None and "head" in source else ""
+        words = f"tangent point {self.sky.lon:.6f} {self.sky.lat:+.6f} deg, {self.sky.pixel_scale:.5g} arcsec/px"
+        return f"{words}{', ' * bool(source)}{source}{tied}"
+
+    def __repr__(self):
+        return (
+            f"<Solution: {len(self.names)} exposures, {len(self.star_names)} stars, degree {self.degree}, "
+            f"chi2 {self.chi2:.1f} for {self.dof} degrees of freedom>"
+        )
+
+    def _static_in_words(self):
+        if self.settings.get("static") != "fit":
+            return []
+        own = self.settings["exposure_degree"]
+        mine = f"modes up to degree {own}" if own else "its pose alone"
+        return [f"static  fitted: one distortion for all exposures of a detector, {mine} for every exposure"]
+
+    def __str__(self):
+        used = self.observations["used"]
+        lines = [
+            repr(self)[1:-1],
+            f"status  {self.status}",
+            *self._static_in_words(),
+            *_wrapped("gauge", self.gauge.sentence),
+            f"sky     {self.sky_sentence}",
+            f"rms     {self.rms[0]:.4f}, {self.rms[1]:.4f} px in x, y; "
+            f"{np.count_nonzero(used)} of {len(used)} observations used",
+            *(line for key, text in in_words(self.settings).items() for line in _wrapped(key, text)),
+            "",
+            f"{'exposure':24s} {'stars':>5s} {'shift x':>9s} {'shift y':>9s} {'rotation':>9s} {'scale':>9s} "
+            f"{'rms x':>7s} {'rms y':>7s} {'distortion':>10s}",
+        ]
+        for name, a in zip(self.names, self.coefficients, strict=True):
+            rows = self.observations[used & (self.observations["exposure"] == name)]
+            d = poses.describe(self.poses[name])
+            rms = [np.sqrt(np.mean(rows[k].to_value(u.pix) ** 2)) if len(rows) else np.nan for k in ("dx", "dy")]
+            lines.append(
+                f"{name[:24]:24s} {len(rows):5d} {d['dx']:9.2f} {d['dy']:9.2f} {d['rotation']:9.4f} {d['scale']:9.6f} "
+                f"{rms[0]:7.4f} {rms[1]:7.4f} {np.sqrt((a**2).sum()) / 2:10.3f}"
+            )
+        lines += [f"left out {name}: {reason}" for name, reason in self.left_out.items()]
+        return "\n".join(lines)
+
+    # -- files
+
+    def write(self, path, *, overwrite=False):
+        """Write everything to an ASDF file (`legdistort.results.storage`)."""
+        from .storage import write_solution
+
+        return write_solution(self, path, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path, *, max_bytes=None):
+        """Read what `write` wrote; the certificate of every inverse is checked again.
+
+        Parameters
+        ----------
+        path : str or path
+        max_bytes : int, optional
+            Largest size of the arrays in the file, unpacked; 2 GiB if not given.
+
+        Raises
+        ------
+        InputError
+            For a file that is damaged, too large, no solution, or was changed after it was written.
+        """
+        from .storage import read_solution
+
+        return read_solution(path, cls, max_bytes=max_bytes)

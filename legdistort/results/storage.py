@@ -1,0 +1,198 @@
+"""Solutions and WCSs as ASDF files that any gwcs user can open.
+
+Files follow ASDF standard 1.5.0, which stacks of early 2025 read as well. The tree of a solution is plain: arrays,
+numbers and strings under ``legdistort``; the WCS of an exposure stands at ``meta.wcs``. Both have a schema in
+``legdistort/data``. Inverses are written with their certificate, which is checked again when they are read.
+"""
+
+import dataclasses
+from functools import partial
+from pathlib import Path
+
+import asdf
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+
+from ..exceptions import FoldError, InputError
+from ..geometry import basis
+from ..geometry.distortion import Inverse
+from ..geometry.tangent_plane import TangentPlane
+from ..inputs import column_contract
+from ..inputs.plain_columns import plain, plain_columns, restored
+from ..runtime import provenance
+from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_tree, read_tree, understood
+from ..runtime.outputs import replacing
+from .catalogue_tie import Tie
+from .gauge import Gauge
+from .stored_covariances import StoredUncertainty
+
+#: Version of the layout under ``legdistort``.
+LAYOUT = 2
+
+
+# -- one WCS
+
+
+# -- solutions
+
+
+def write_solution(solution, path, *, overwrite=False):
+    """Write a `Solution`, its covariances included, to an ASDF file."""
+    table = plain_columns(solution.observations)
+    tree = {
+        "layout": LAYOUT,
+        "provenance": solution.provenance or provenance.stamp(),
+        "settings": solution.settings,
+        "status": solution.status,
+        "degree": solution.degree,
+        "chi2": float(solution.chi2),
+        "dof": int(solution.dof),
+        "exposures": [_exposure_tree(solution, name) for name in solution.names],
+        "stars": {"star": np.asarray(solution.star_names), "position": solution.positions},
+        "columns": table.colnames,  # their order: that of a mapping is lost in files
+        "observations": {name: plain(table[name]) for name in table.colnames},
+        "covariance": solution.uncertainty.stored(),
+        "gauge": _fields(solution.gauge) | {"tie": _fields(solution.gauge.tie)},
+        "sky": None
+        if solution.sky is None
+        else {"lon": solution.sky.lon, "lat": solution.sky.lat, "matrix": solution.sky.matrix},
+        "left_out": solution.left_out,
+    }
+    file = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
+    for column in tree["observations"].values():  # names repeat; covariances and coefficients would not get smaller
+        file.set_array_compression(column["values"], "zlib")
+    with replacing(path, overwrite=overwrite) as temporary:
+        file.write_to(temporary)
+    return Path(path)
+
+
+def _exposure_tree(solution, name):
+    i = solution.index(name)
+    try:
+        inverse = solution.distortion(name).inverse
+        certified = {
+            "tensors": inverse.tensors,
+            "error_px": inverse.error,
+            "valid_undistorted_px": list(inverse.valid),
+        }
+    except FoldError:  # such a solution is worth a look, but has no WCS
+        certified = None
+    return {
+        "name": name,
+        "shape": [int(n) for n in solution.shapes[name]],
+        "pose": solution.poses[name],
+        "coefficients": solution.coefficients[i],
+        "prior_mean": solution.prior_mean[i],
+        "inverse": certified,
+    }
+
+
+def read_solution(path, kind, *, max_bytes=None):
+    """Read a solution of class `kind` from an ASDF file; see `Solution.read`."""
+    tree = read_tree(path, max_bytes=MAX_BYTES if max_bytes is None else max_bytes).get("legdistort")
+    if not isinstance(tree, dict) or "layout" not in tree:
+        raise InputError(f"{path} holds no legdistort solution (no entry 'legdistort'); give a solution.asdf")
+    if tree["layout"] not in (1, LAYOUT):
+        raise InputError(f"{path} has layout {tree['layout']}, this version reads 1 to {LAYOUT}; update legdistort")
+    if tree["layout"] == 1:
+        tree = understood(path, layout_2, tree)
+    check_tree({"legdistort": tree}, "solution-2.schema.yaml", path)
+    return understood(path, partial(_from_tree, kind), tree)
+
+
+def layout_2(tree):
+    """A tree of layout 1 as one of layout 2: text as arrays, and room for the certified inverses, which it lacks."""
+    return tree | {
+        "layout": 2,
+        "exposures": [{**exposure, "inverse": None} for exposure in tree["exposures"]],
+        "stars": tree["stars"] | {"star": np.array(tree["stars"]["star"])},
+        "observations": {
+            name: {"values": np.array(column["values"]), "unit": column["unit"]}
+            for name, column in tree["observations"].items()
+        },
+    }
+
+
+def _fields(thing):
+    """The fields of a dataclass by name; None for None."""
+    return None if thing is None else {field.name: getattr(thing, field.name) for field in dataclasses.fields(thing)}
+
+
+def _made(kind, tree):
+    """A dataclass from its fields by name, those that are absent at their defaults; None for None."""
+    if tree is None:
+        return None
+    known = {field.name: tree[field.name] for field in dataclasses.fields(kind) if field.name in tree}
+    return kind(**{key: np.array(value) if hasattr(value, "shape") else value for key, value in known.items()})
+
+
+def _from_tree(kind, tree):
+    exposures = tree["exposures"]
+    table = QTable({name: restored(tree["observations"][name]) for name in tree["columns"]})
+    sky = tree["sky"]
+    solution = kind(
+        names=tuple(e["name"] for e in exposures),
+        degree=tree["degree"],
+        shapes={e["name"]: tuple(e["shape"]) for e in exposures},
+        poses={e["name"]: np.array(e["pose"]) for e in exposures},
+        coefficients=np.stack([np.array(e["coefficients"]) for e in exposures]),
+        prior_mean=np.stack([np.array(e["prior_mean"]) for e in exposures]),
+        star_names=np.array(tree["stars"]["star"]),
+        positions=np.array(tree["stars"]["position"]),
+        observations=table,
+        chi2=tree["chi2"],
+        dof=tree["dof"],
+        status=tree["status"],
+        gauge=_made(Gauge, tree["gauge"] | {"tie": _made(Tie, tree["gauge"].get("tie"))}),
+        uncertainty=StoredUncertainty(*(np.array(tree["covariance"][key]) for key in ("coefficients", "stars"))),
+        sky=None if sky is None else TangentPlane(sky["lon"], sky["lat"], np.array(sky["matrix"])),
+        left_out=dict(tree["left_out"]),
+        settings=dict(tree["settings"]),
+        provenance=dict(tree["provenance"]),
+    )
+    _check_consistent(solution)
+    for exposure in exposures:
+        if exposure["inverse"] is not None:
+            kept = exposure["inverse"]
+            inverse = Inverse(np.array(kept["tensors"]), kept["error_px"], tuple(kept["valid_undistorted_px"]))
+            solution.distortion(exposure["name"]).adopt(inverse)
+    return solution
+
+
+def _check_consistent(solution):
+    """Raise if parts of a solution do not fit together."""
+    n, n_modes, n_stars = len(solution.names), basis.n_modes(solution.degree), len(solution.star_names)
+    if len(set(solution.names)) < n:
+        raise ValueError("two exposures have the same name")
+    for name, pose in solution.poses.items():
+        if pose.shape != (2, 3) or not np.isfinite(pose).all() or np.linalg.det(pose[:, :2]) == 0:
+            raise ValueError(f"the pose of {name} should be a finite, invertible array (2, 3)")
+    own, gauge = 2 * n_modes, solution.gauge
+    held = gauge.n_constraints  # with a shared static distortion those of the modes of single exposures only
+    if held != 2 * basis.n_modes(basis.degree_of(held // 2)):
+        raise ValueError(f"the gauge cannot have {held} constraints")
+    for what, array, shape in (
+        ("positions", solution.positions, (n_stars, 2)),
+        ("prior means", solution.prior_mean, solution.coefficients.shape),
+        ("covariance of the coefficients", solution.uncertainty.coefficients, (n * own, n * own)),
+        ("covariance of the stars", solution.uncertainty.stars, (3, n_stars)),
+        ("gauge.constraint", gauge.constraint, (held, n, held)),
+        ("gauge.motion", gauge.motion, (n, held, held)),
+        ("gauge.dynamic", gauge.dynamic, (n, held, held)),
+        ("gauge.box", gauge.box, (2, 2)),
+        ("gauge.static_sigma", gauge.static_sigma, (2, held // 2)),
+        ("gauge.told", gauge.told, (0 if gauge.told is None else len(gauge.told), held)),
+        ("gauge.values", gauge.values, (held,)),
+        ("gauge.tie.shared", None if gauge.tie is None else gauge.tie.shared, (3, n_stars)),
+    ):
+        if array is not None and array.shape != shape:
+            raise ValueError(f"the {what} should have shape {shape}, not {array.shape}")
+    table = column_contract.check(solution.observations, column_contract.MATCHED, "the table of residuals")
+    for name in ("dx", "dy"):
+        column_contract.values(table, name, u.pix)
+    if np.asarray(table["used"]).dtype != bool:
+        raise ValueError("the column 'used' should be of booleans")
+    for column, known in (("exposure", solution.names), ("star", solution.star_names)):
+        if not np.isin(np.asarray(table[column]), known).all():
+            raise ValueError(f"the table of residuals names {column}s that are not in the list of them")

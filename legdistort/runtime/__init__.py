@@ -1,0 +1,1 @@
+"""Work on this machine: outputs, disk, workers, file formats. Knows nothing of astronomy."""

@@ -1,0 +1,230 @@
+"""ASDF files from anywhere: sizes bounded before anything is unpacked, nothing executed, nonsense refused in words.
+
+A file is looked at three times: its blocks (what they declare to hold), its YAML as a stream of events (length,
+nesting, repetition by aliases, tags), and its tree before any object is made of it (references, sizes of arrays).
+Only then does asdf open it.
+"""
+
+import hashlib
+import math
+import mmap
+import re
+import struct
+import warnings
+import zlib
+from importlib import resources
+from pathlib import Path
+
+import asdf
+import numpy as np
+import yaml
+from asdf.tags.core.ndarray import asdf_datatype_to_numpy_dtype
+
+from ..exceptions import InputError
+
+#: Version of the ASDF standard that is written.
+ASDF_STANDARD = "1.5.0"
+#: Bytes that the arrays of a file may take in memory, unless more are allowed.
+MAX_BYTES = 2 << 30
+#: Tags of plain trees: arrays, and what asdf says of itself.
+CORE = ("tag:stsci.edu:asdf/core/",)
+#: Tags of a tree with a gwcs inside.
+WITH_WCS = (
+    "tag:stsci.edu:asdf/",
+    "tag:stsci.edu:gwcs/",
+    "tag:astropy.org:astropy/coordinates/",
+    "tag:astropy.org:astropy/time/",
+    "tag:astropy.org:astropy/transform/",
+    "tag:astropy.org:astropy/units/",
+)
+_PLAIN = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "seq", "map", "timestamp")}
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_MAX_DEPTH = 100
+_BYTES_PER_NODE = 2048  # what a node of YAML takes in memory while it is read, about
+_BLOCK = b"\xd3BLK"
+_HEADER = struct.Struct(">I4sQQQ16s")  # flags, compression, allocated, used, unpacked, checksum
+
+
+def read_tree(path, *, tags=CORE, max_bytes=MAX_BYTES):
+    """The tree of an ASDF file, all arrays in memory.
+
+    Parameters
+    ----------
+    path : str or path
+    tags : tuple of str
+        Beginnings of the YAML tags that may stand in the file; a tag makes asdf call a converter.
+    max_bytes : int
+        Largest size of all arrays together, unpacked. The tree itself may have one node for every 2048 of them.
+
+    Raises
+    ------
+    InputError
+        Naming the file and what is wrong with it.
+    """
+    path = Path(path)
+    if not isinstance(max_bytes, int) or max_bytes < 1:
+        raise InputError(f"max_bytes must be a positive number of bytes, got {max_bytes!r}")
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    if not path.is_file():
+        raise InputError(f"{path} is not a readable ASDF file: not a file")
+    try:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore", asdf.exceptions.AsdfWarning)  # of other versions; the schema has the say
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                end = _check_yaml(content, tags, max_bytes)
+                _check_blocks(content, end, max_bytes)
+            _check_node(asdf.util.load_yaml(file, tagged=True), "", [max_bytes])
+            file.seek(0)
+            with asdf.open(file, memmap=False, lazy_load=False) as opened:
+                return dict(opened.tree)
+    except _TooLargeError as error:
+        raise InputError(
+            f"{path} is refused: {error} {max_bytes} bytes are allowed; if you trust the file, allow more "
+            "with max_bytes= (--max-bytes)"
+        ) from None
+    except Exception as error:  # whatever a broken file provokes
+        raise InputError(f"{path} is not a readable ASDF file: {_first_line(error)}") from None
+
+
+def check_tree(tree, schema, path):
+    """Check a tree against a schema of the package.
+
+    Parameters
+    ----------
+    tree : dict
+    schema : str
+        Name of a file in ``legdistort/data``.
+    path : str or path
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        Naming the entry, what stands there and what should.
+    """
+    place = resources.files("legdistort") / "data" / schema
+    try:
+        asdf.AsdfFile(tree, custom_schema=str(place)).validate()
+    except asdf.exceptions.ValidationError as error:
+        entry = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in error.absolute_path).lstrip(".")
+        meaning = "" if error.validator == "required" else error.schema.get("description", "")
+        raise InputError(
+            f"{path} is damaged: entry {entry or 'tree'}: {_first_line(error)[:200]}"
+            + (f"; it should be {meaning}" if meaning else "")
+        ) from None
+    except Exception as error:  # a tree that asdf cannot take
+        raise InputError(f"{path} is damaged: {_first_line(error)}") from None
+
+
+class _TooLargeError(Exception):
+    """A size beyond the limit; the sentence without the limit."""
+
+
+def _first_line(error):
+    text = getattr(error, "message", None) or str(error) or type(error).__name__
+    return f"{text}".strip().splitlines()[0]
+
+
+def _check_yaml(content, tags, max_bytes):
+    """Check the text of the tree event by event, and return where it ends."""
+    if content[:5] != b"#ASDF":
+        raise ValueError("it does not begin with #ASDF")
+    most = max_bytes // _BYTES_PER_NODE
+    found = re.compile(rb"\r?\n\.\.\.(\r?\n|$)").search(content)
+    if not found:
+        raise ValueError("its tree has no end; the file is cut off")
+    if found.end() > 32 * most + 10_000:
+        raise _TooLargeError(f"its tree is {found.end()} bytes of text, more than 1 for every 64 of arrays.")
+    counts, anchors = [[None, 0]], {}  # open collections: anchor, number of nodes with aliases written out
+    for event in yaml.parse(content[: found.end()], Loader=_LOADER):
+        if isinstance(event, yaml.events.AliasEvent):
+            if event.anchor not in anchors:
+                raise ValueError(f"alias *{event.anchor} of nothing, or within itself")
+            counts[-1][1] += anchors[event.anchor]
+        elif isinstance(event, yaml.events.CollectionEndEvent):
+            anchor, number = counts.pop()
+            anchors[anchor] = number
+            counts[-1][1] += number
+        elif isinstance(event, yaml.events.NodeEvent):
+            if event.tag and event.tag not in _PLAIN and not event.tag.startswith(tags):
+                raise ValueError(f"tag {event.tag[:100]!r} has no business in such a file; is it the one you mean?")
+            if isinstance(event, yaml.events.CollectionStartEvent):
+                counts.append([event.anchor, 1])
+            else:
+                anchors[event.anchor] = 1
+                counts[-1][1] += 1
+        if len(counts) > _MAX_DEPTH:
+            raise ValueError(f"its tree is nested more than {_MAX_DEPTH} levels deep")
+        if counts[-1][1] > most:
+            raise _TooLargeError(f"its tree has more than {most} nodes, 1 for every {_BYTES_PER_NODE} bytes.")
+    return found.end()
+
+
+def _check_blocks(content, start, max_bytes):
+    """Check what the blocks of arrays declare to hold, before any is unpacked."""
+    place, total = content.find(_BLOCK, start), 0
+    number = 0
+    while place >= 0 and content[place : place + 4] == _BLOCK:
+        (size,) = struct.unpack(">H", content[place + 4 : place + 6])
+        header = content[place + 6 : place + 6 + _HEADER.size]
+        flags, packing, allocated, used, unpacked, checksum = _HEADER.unpack(header)
+        if flags & 1:
+            raise ValueError(f"block {number} is a stream of unknown length")
+        # bzip2 and lz4 unpack more than they declare before anyone notices
+        if packing not in (b"\0\0\0\0", b"zlib"):
+            raise ValueError(f"block {number} is packed with {packing!r}; write it anew with zlib, or unpacked")
+        place += 6 + size
+        if place + allocated > len(content) or used > allocated:
+            raise ValueError(f"block {number} reaches beyond the end of the file; it is cut off")
+        total += unpacked
+        if total > max_bytes:
+            raise _TooLargeError(f"its arrays take {total} bytes and more when unpacked.")
+        if any(checksum) and not _is_whole(content[place : place + used], checksum, packing, unpacked):
+            raise ValueError(f"block {number} is damaged: its checksum is another")
+        place += allocated
+        number += 1
+
+
+def _is_whole(data, checksum, packing, unpacked):
+    """Whether the checksum is that of the data: as they stand there or, by earlier versions of asdf, as they unpack."""
+    if hashlib.md5(data, usedforsecurity=False).digest() == checksum:
+        return True
+    if packing != b"zlib":
+        return False
+    data = zlib.decompressobj().decompress(data, max(unpacked, 1))  # not a byte more than declared
+    return hashlib.md5(data, usedforsecurity=False).digest() == checksum
+
+
+def _check_node(node, where, room):
+    """Check references and sizes of arrays below a node of the tree; `room` holds the bytes left for arrays."""
+    if isinstance(node, dict):
+        if "$ref" in node:
+            raise ValueError(f"entry {where or 'tree'} refers to another file, which is not followed")
+        if "/core/ndarray-" in getattr(node, "_tag", "") and "data" not in node:
+            _check_array(node, where, room)
+        for key, value in node.items():
+            _check_node(value, f"{where}.{key}" if where else str(key), room)
+    elif isinstance(node, list):
+        for k, value in enumerate(node):
+            _check_node(value, f"{where}[{k}]", room)
+
+
+def _check_array(node, where, room):
+    if not isinstance(node.get("source"), int):
+        raise ValueError(f"array {where} lies in another file ({str(node.get('source'))[:80]!r}), which is not opened")
+    itemsize = asdf_datatype_to_numpy_dtype(node["datatype"], node.get("byteorder", "big")).itemsize
+    room[0] -= math.prod(int(n) for n in node["shape"]) * itemsize  # strides may make much of little
+    if room[0] < 0:
+        raise _TooLargeError(f"array {where} has shape {list(node['shape'])}: too large with those before it.")
+
+
+def understood(path, function, tree):
+    """``function(tree)``, whatever it stumbles over told with the name of the file."""
+    try:
+        with np.errstate(all="ignore"):
+            return function(tree)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Exception as error:  # there is no end to what can be wrong in a file
+        raise InputError(f"{path} is damaged: {type(error).__name__} {error}") from None

@@ -1,0 +1,48 @@
+"""Checks of arguments that more than one function has."""
+
+from dataclasses import fields
+
+import numpy as np
+
+from ..exceptions import InputError
+
+
+def check_choice(value, allowed, name):
+    """Raise `InputError` naming the argument if `value` is not one of the words allowed."""
+    if value not in allowed:
+        raise InputError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+
+
+def check_counts(**counts):
+    """Raise `InputError` naming the first count that is not a positive integer."""
+    for name, value in counts.items():
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+            raise InputError(f"{name} must be a positive integer, got {value!r}")
+
+
+def options_from(kind, given, argument):
+    """Frozen options of class `kind` from a dict of keywords, as they come through another function.
+
+    Parameters
+    ----------
+    kind : type
+        A frozen dataclass that checks its fields when it is made.
+    given : dict or None
+    argument : str
+        Name of the argument that the dict was given as.
+
+    Raises
+    ------
+    InputError
+        For what is no dict, for an unknown keyword, and what `kind` raises; the message names `argument`.
+    """
+    if given is not None and not isinstance(given, dict):
+        raise InputError(f"{argument} must be a dict of options, got {type(given).__name__}")
+    known = [field.name for field in fields(kind)]
+    for name in given or {}:
+        if name not in known:
+            raise InputError(f"{argument} has no option {name!r}; it takes {', '.join(known)}")
+    try:
+        return kind(**(given or {}))
+    except InputError as error:
+        raise InputError(f"{argument}: {error}") from None

@@ -1,0 +1,161 @@
+"""FITS files as bytes: some cards of a header change, HDUs are added, and every other byte stays as it is.
+
+Writing a file anew through astropy may reformat cards, scale integers or compress again; here none of that can happen.
+"""
+
+import bz2
+import gzip
+import io
+import re
+import warnings
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from astropy.io import fits
+from astropy.utils.exceptions import AstropyWarning
+
+from ..exceptions import InputError
+
+BLOCK = 2880
+_CARD = 80
+_PACKED = {
+    b"\x1f\x8b": (gzip.decompress, lambda raw: gzip.compress(raw, mtime=0)),
+    b"BZ": (bz2.decompress, bz2.compress),
+}
+
+
+class Span(NamedTuple):
+    """Where an HDU lies in a file: offsets of its header, of its data, and of what follows; and its header."""
+
+    start: int
+    data: int
+    stop: int
+    header: fits.Header
+
+
+def read_bytes(path):
+    """The unpacked content of a FITS file, and the function that packs it as it was (gzip, bzip2 or not at all).
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or not FITS.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    raw = path.read_bytes()
+    unpack, pack = _PACKED.get(raw[:2], (bytes, bytes))
+    try:
+        raw = unpack(raw)
+    except (OSError, EOFError, ValueError, zlib.error) as error:
+        raise InputError(f"{path}: cannot be unpacked, damaged ({error})") from None
+    if not raw.startswith(b"SIMPLE  ="):
+        raise InputError(f"{path}: not a FITS file, plain or packed with gzip or bzip2")
+    return raw, pack
+
+
+def open_bytes(raw, **options):
+    """An HDUList of the content of a file, its oddities left alone."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyWarning)
+        hdulist = fits.open(io.BytesIO(raw), memmap=False, **options)
+        len(hdulist)  # astropy reads headers when they are asked for
+    return hdulist
+
+
+def locate(raw, path):
+    """The `Span` of every HDU.
+
+    Raises
+    ------
+    InputError
+        If one is incomplete; `path` names the file.
+    """
+    spans = []
+    with open_bytes(raw, disable_image_compression=True) as hdulist:
+        for i, hdu in enumerate(hdulist):
+            info = hdu.fileinfo()
+            if info["datLoc"] + info["datSpan"] > len(raw):
+                raise InputError(f"{path}: truncated, the data of HDU {i} {hdu.name} are incomplete".replace("  ", " "))
+            spans.append(Span(info["hdrLoc"], info["datLoc"], info["datLoc"] + info["datSpan"], hdu.header))
+    rest = raw[spans[-1].stop :]
+    if rest.strip(b"\0 "):
+        raise InputError(f"{path}: damaged or truncated, the {len(rest)} bytes after HDU {len(spans) - 1} are no HDU")
+    return spans
+
+
+def splice(raw, edits):
+    """The bytes with parts exchanged: `edits` are ``(start, stop, replacement)`` that do not overlap."""
+    pieces, position = [], 0
+    for start, stop, replacement in sorted(edits, key=lambda edit: edit[:2]):
+        pieces += [raw[position:start], replacement]
+        position = stop
+    return b"".join([*pieces, raw[position:]])
+
+
+def exchange_cards(header, data, new, obsolete):
+    """The bytes of a header with some cards exchanged and, if it has one, its ``CHECKSUM`` renewed.
+
+    Parameters
+    ----------
+    header, data : bytes
+        Of one HDU, padding included. ``DATASUM`` stays true, since the data do not change.
+    new : `~astropy.io.fits.Header`
+        Cards that take the place of the first card removed, or go to the end.
+    obsolete : compiled regular expression
+        A card whose keyword matches it wholly is removed, together with its continuation.
+    """
+    cards, place, removing = [], None, False
+    for start in range(0, len(header), _CARD):
+        card = header[start : start + _CARD]
+        keyword = card[:8].decode("ascii", "replace").rstrip()
+        if keyword == "END":
+            break
+        removing = obsolete.fullmatch(keyword) is not None or (removing and keyword == "CONTINUE")
+        if not removing:
+            cards.append(card)
+        elif place is None:
+            place = len(cards)
+    place = len(cards) if place is None else place
+    text = new.tostring(sep="", endcard=False, padding=False).encode("ascii")
+    content = b"".join([*cards[:place], text, *cards[place:], b"END".ljust(_CARD)])
+    return _with_checksum(content.ljust(-(-len(content) // BLOCK) * BLOCK), data)
+
+
+def _with_checksum(header, data):
+    """The header with the value of its ``CHECKSUM`` card, if any, made true."""
+    found = re.match(rb"(?:.{80})*?(?=CHECKSUM=)", header, re.DOTALL)
+    if found is None:
+        return header
+    place = found.end()
+
+    def with_value(value):
+        return header[:place] + f"CHECKSUM= '{value}'".ljust(_CARD).encode("ascii") + header[place + _CARD :]
+
+    return with_value(_encode(0xFFFFFFFF ^ _sum32(with_value("0" * 16) + data)))
+
+
+def _sum32(content):
+    """Sum of 32-bit words in ones' complement (FITS standard 4.0, appendix J.1)."""
+    total = int(np.frombuffer(content, ">u4").sum(dtype=np.uint64))
+    while total >> 32:
+        total = (total & 0xFFFFFFFF) + (total >> 32)
+    return total
+
+
+def _encode(value):
+    """32 bits as the sixteen letters and digits of a ``CHECKSUM`` card (FITS standard 4.0, appendix J.2)."""
+    columns = []
+    for byte in value.to_bytes(4, "big"):
+        quotient, rest = divmod(byte, 4)
+        four = [quotient + rest + 48, quotient + 48, quotient + 48, quotient + 48]
+        while any(58 <= c <= 64 or 91 <= c <= 96 for c in four):  # neither letter nor digit: shift within pairs
+            for k in (0, 2):
+                if any(58 <= c <= 64 or 91 <= c <= 96 for c in four[k : k + 2]):
+                    four[k], four[k + 1] = four[k] + 1, four[k + 1] - 1
+        columns.append(four)
+    letters = "".join(chr(columns[j][i]) for i in range(4) for j in range(4))
+    return letters[-1] + letters[:-1]

@@ -1,0 +1,138 @@
+"""Pixels on disk instead of in memory: those of exposures while a mosaic is being made, and the mosaic itself."""
+
+import mmap
+import shutil
+import tempfile
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..exceptions import DiskFullError, InputError
+from .outputs import is_full
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Stored:
+    """Planes of one exposure in a scratch folder.
+
+    Attributes
+    ----------
+    name : str
+        Of the exposure.
+    paths : dict
+        File of each plane, by its name.
+    """
+
+    name: str
+    paths: dict
+
+    def piece(self, plane, part):
+        """A piece of a plane, by slices of its rows and columns; None if there is no such plane."""
+        if plane not in self.paths:
+            return None
+        # Mapped for this piece alone: what stays mapped counts as memory of the process.
+        return np.array(np.load(self.paths[plane], mmap_mode="r")[part])
+
+
+@contextmanager
+def scratch_folder(parent, need, what="the pixels"):
+    """A folder for planes that is gone when the block ends, however it ends.
+
+    Parameters
+    ----------
+    parent : str, path or None
+        Where to make it; None = where the system keeps temporary files (``TMPDIR``).
+    need : int
+        Bytes that will be stored.
+    what : str
+        What these bytes are, for the message.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made there.
+    DiskFullError
+        If the disk is full.
+    """
+    place = Path(tempfile.gettempdir() if parent is None else parent)
+    advice = "give another folder as scratch= (or in the environment, TMPDIR)"
+    try:
+        folder = tempfile.mkdtemp(prefix="legdistort-", dir=place)
+    except OSError as error:
+        raise InputError(f"no scratch folder can be made in {place} ({error.strerror}): {advice}") from None
+    try:
+        free = shutil.disk_usage(place).free
+        if free < need:
+            raise DiskFullError(
+                f"{what} take {need / 2**30:,.2f} GB on disk while work goes on, {place} has {free / 2**30:,.2f} GB "
+                f"left: {advice}; if they should not be so many, look at the poses and at the grid"
+            )
+        yield Path(folder)
+    except OSError as error:
+        if not is_full(error):
+            raise
+        raise DiskFullError(f"No space left on the disk of {place}: {advice}; no mosaic was made") from None
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def store(folder, name, planes):
+    """Store planes of an exposure.
+
+    Parameters
+    ----------
+    folder : path
+        From `scratch_folder`.
+    name : str
+        Of the exposure.
+    planes : dict of ndarray or None
+        By name; None is left out.
+
+    Returns
+    -------
+    Stored
+    """
+    own = Path(tempfile.mkdtemp(dir=folder))  # not by its name, which is free text
+    paths = {plane: own / f"{plane}.npy" for plane, values in planes.items() if values is not None}
+    for plane, path in paths.items():
+        np.save(path, planes[plane])
+    return Stored(name, paths)
+
+
+class _Shared(mmap.mmap):
+    """Memory that is the same as a file, so that it may be dropped and read again."""
+
+
+def spill(shape, dtype, value, folder):
+    """An array on disk, all of one value; its file has no name and is gone when the array is.
+
+    Parameters
+    ----------
+    shape : tuple
+    dtype : dtype
+    value : number
+    folder : path
+
+    Returns
+    -------
+    ndarray
+        It may be larger than the memory, if `forget` is called now and then. Processes forked from this one share it.
+    """
+    size = int(np.prod(shape))
+    values = np.full(min(size, 1 << 20), value, dtype)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        # All of it: a disk that is full must be known now. Merely reserved pages would take a fifth longer in all.
+        for start in range(0, size, len(values)):
+            file.write(values[: size - start])
+        file.flush()
+        return np.frombuffer(_Shared(file.fileno(), size * values.itemsize), dtype).reshape(shape)
+
+
+def forget(array):
+    """Drop the memory of an array that `spill` made; its values stay on disk. Others are left alone."""
+    while isinstance(array, np.ndarray | memoryview):
+        array = array.base if isinstance(array, np.ndarray) else array.obj
+    if isinstance(array, _Shared) and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
+        array.madvise(mmap.MADV_DONTNEED)

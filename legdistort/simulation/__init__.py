@@ -1,0 +1,1 @@
+"""Synthetic truth, and predictions before any data exist."""

@@ -1,0 +1,238 @@
+"""A simulated GSAOI night: its settings, and the truth drawn from them."""
+
+from dataclasses import dataclass, fields, replace
+from datetime import datetime, timedelta
+
+import numpy as np
+from astropy.io import fits
+
+from ..exceptions import InputError
+from ..geometry import basis, similarity
+from ..geometry.gsaoi import GsaoiMap
+from ..geometry.tangent_plane import TangentPlane
+from ..runtime.checks import check_counts
+from . import rendering
+from .truth import (
+    Truth,
+    draw_coefficients,
+    draw_poses,
+    draw_stars,
+    exposure_names,
+    fit_static,
+    footprint,
+    mode_orders,
+    shifted,
+    within,
+)
+
+
+@dataclass(frozen=True)
+class Night:
+    """Settings of a simulated GSAOI night in the likeness of Bernard et al. (2017, section 5).
+
+    Attributes
+    ----------
+    n_exposures, n_stars : int
+        Every star lies on at least one exposure.
+    size : int
+        Pixels along a side; other than 2048 it is the same field on coarser pixels.
+    dither : float
+        Rms length of the dithers, pixels (5 arcsec at 20 mas are 250); uniform in a square.
+    dynamic_rms : float
+        Rms over the detector of the displacement, both axes together, that an exposure adds to the static
+        distortion, pixels. Degrees 1 to 3; coefficients of degree l have standard deviations that go as 1/l.
+    residue_rms : float
+        Rms of the same kind, pixels, of a dynamic part of degrees 4 to 6, all modes alike, which a fit of degree 3
+        cannot follow.
+    zero_mean : bool
+        Subtract the mean over the exposures from these.
+    detector : int
+        Of GSAOI, for its static distortion: 2 is the lower left one.
+    pointing_error : float
+        How far every header is off on the sky, arcsec, in random directions.
+    sigma_range : tuple of float
+        Position errors of the brightest and of the faintest star, pixels; they set the fluxes.
+    fwhm, beta, ellipticity : float
+        Moffat profile: pixels, exponent, 1 - axis ratio. Exposures scatter about them (5 %, 0, 30 %).
+    halo, halo_fwhm : float
+        Part of the flux that adaptive optics leave in a wide round halo of the same exponent, and its width, pixels.
+    sky : float
+        ADU a pixel.
+    gain, read_noise, saturation : float
+        Electrons per ADU, electrons, ADU.
+    exptime : float
+        Seconds; for the header only.
+    """
+
+    n_exposures: int = 11
+    n_stars: int = 120
+    size: int = 2048
+    dither: float = 250.0
+    dynamic_rms: float = 0.4
+    residue_rms: float = 0.0
+    zero_mean: bool = False
+    detector: int = 2
+    pointing_error: float = 0.3
+    sigma_range: tuple = (0.002, 0.14)
+    fwhm: float = 4.5
+    beta: float = 2.8
+    ellipticity: float = 0.1
+    halo: float = 0.0
+    halo_fwhm: float = 30.0
+    sky: float = 200.0
+    gain: float = 2.0
+    read_noise: float = 15.0
+    saturation: float = 50000.0
+    exptime: float = 60.0
+
+    def __post_init__(self):
+        check_counts(n_stars=self.n_stars, n_exposures=self.n_exposures, size=self.size)
+        lo, hi = self.sigma_range
+        if not 0 < lo <= hi:
+            raise InputError(f"sigma_range must be (smallest, largest) error in pixels, got {self.sigma_range!r}")
+        if not (0 <= self.halo < 1 and self.residue_rms >= 0):
+            raise InputError(
+                f"halo must be in [0, 1) and residue_rms not negative, got {self.halo!r} and {self.residue_rms!r}"
+            )
+
+    @property
+    def psf(self):
+        """The mean profile, round."""
+        return rendering.Moffat(self.fwhm, self.beta)
+
+    def position_error(self, flux):
+        """Smallest possible position error [pix] at these fluxes [ADU]; a halo only takes flux away."""
+        camera = {"sky": self.sky, "gain": self.gain, "read_noise": self.read_noise}
+        return rendering.position_error((1 - self.halo) * np.asarray(flux), psf=self.psf, **camera)
+
+
+#: A night that is rendered and reduced in seconds.
+SMALL_NIGHT = Night(n_exposures=6, n_stars=70, size=512, dither=60.0)
+
+
+def draw_night(small, seed, settings):
+    """Settings, truth, and the generator for what is left to draw (profiles and noise).
+
+    Parameters
+    ----------
+    small : bool
+        Start from `SMALL_NIGHT` instead of the defaults of `Night`.
+    seed : int
+        Seed of everything.
+    settings : dict
+        Attributes of `Night` to change.
+
+    Returns
+    -------
+    night : Night
+    truth : `~legdistort.simulation.truth.Truth`
+    rng : `~numpy.random.Generator`
+    """
+    unknown = set(settings) - {field.name for field in fields(Night)}
+    if unknown:
+        known = ", ".join(field.name for field in fields(Night))
+        raise InputError(f"unknown setting {min(unknown)!r}; a night has {known}")
+    night = replace(SMALL_NIGHT if small else Night(), **settings)
+    star_rng, map_rng, pose_rng, noise_rng = np.random.default_rng(seed).spawn(4)
+    instrument = GsaoiMap(night.detector, night.size)
+    shape, names = (night.size, night.size), exposure_names(night.n_exposures)
+    true_poses = draw_poses(pose_rng, names, shape, night.dither)
+    dynamic = _draw_dynamic(map_rng, night)
+    truth = Truth(
+        names=names,
+        shape=shape,
+        positions=np.empty((0, 2)),
+        flux=_draw_flux(star_rng, night),
+        static=fit_static(instrument, shape, basis.degree_of(dynamic.shape[2])),
+        dynamic=dynamic,
+        poses=true_poses,
+        nominal_poses=_point_wrongly(pose_rng, true_poses, night.pointing_error / instrument.pixel_scale),
+        instrument=instrument,
+        sky=_sky(instrument, night.size),
+    )
+    positions = draw_stars(
+        star_rng,
+        night.n_stars,
+        footprint(true_poses.values(), shape),
+        lambda xy: stars_inside(truth, night, xy),
+        1,
+        separation=10 * night.fwhm,
+    )
+    return night, replace(truth, positions=positions), noise_rng
+
+
+def _draw_dynamic(rng, night):
+    low = _draw_degrees(rng, night, night.dynamic_rms, range(1, 4), power=-1)
+    if night.residue_rms == 0:
+        return low
+    high = _draw_degrees(rng, night, night.residue_rms, range(4, 7), power=0)
+    high[:, :, : low.shape[2]] = low
+    return high
+
+
+def _draw_degrees(rng, night, rms, degrees, *, power):
+    """Coefficients of some degrees l, standard deviations as l**power, for this rms displacement of both axes."""
+    total = np.sum(mode_orders(max(degrees)), axis=1)
+    spectrum = np.where(np.isin(total, degrees), np.maximum(total, 1.0) ** power, 0)
+    # a coefficient a displaces by a/2 rms over the detector, on each of two axes
+    spectrum *= rms / np.sqrt(2 * np.sum(spectrum**2) / 4)
+    return draw_coefficients(rng, spectrum, max(degrees), night.n_exposures, "dynamic_rms", zero_mean=night.zero_mean)
+
+
+def _point_wrongly(rng, true_poses, error):
+    """Poses as headers know them: `error` pixels off in random directions."""
+    angle = rng.uniform(0, 2 * np.pi, len(true_poses))
+    shifts = error * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return {name: shifted(pose, shift) for (name, pose), shift in zip(true_poses.items(), shifts, strict=True)}
+
+
+def stars_inside(truth, night, xy):
+    """Which positions lie at least 3 FWHM inside each exposure, bool (n_exposures, n)."""
+    return np.array([within(truth.distort(name, xy), truth.shape, 3 * night.fwhm) for name in truth.names])
+
+
+def _draw_flux(rng, night):
+    """Fluxes within `night.sigma_range`, three times as many for every factor of 40 fainter."""
+    grid = np.geomspace(1, 1e12, 500)
+    error = night.position_error(grid)
+    bright, faint = np.exp(np.interp(np.log(night.sigma_range), np.log(error[::-1]), np.log(grid[::-1])))
+    slope = 0.3
+    a, b = faint**-slope, bright**-slope
+    return (a + (b - a) * rng.random(night.n_stars)) ** (-1 / slope)
+
+
+def _sky(instrument, size):
+    """N159W, as in the paper: north up, east left, tangent point in the middle of the reference plane."""
+    s, middle = instrument.pixel_scale / 3600, (size - 1) / 2
+    return TangentPlane(84.916667, -69.765278, np.array([[-s, 0, s * middle], [0, s, -s * middle]]))
+
+
+def header(truth, name, night, index):
+    """FITS header of one exposure, the `index`-th of the night, with the nominal TAN WCS."""
+    sky, pose = truth.sky, truth.nominal_poses[name]
+    tangent = similarity.apply(pose, similarity.invert(sky.matrix)[:, 2])
+    cd = sky.matrix[:, :2] @ np.linalg.inv(pose[:, :2])
+    start = datetime(2014, 12, 8, 3) + index * timedelta(seconds=night.exptime + 20)
+    return fits.Header(
+        [
+            ("FILENAME", f"{name}.fits"),
+            ("OBJECT", "SIMULATED", "simulated star field"),
+            ("DATE-OBS", start.isoformat()),
+            ("MJD-OBS", round((start - datetime(1858, 11, 17)) / timedelta(days=1), 8)),
+            ("EXPTIME", night.exptime, "[s]"),
+            ("GAIN", night.gain, "[electron/adu]"),
+            ("RDNOISE", night.read_noise, "[electron]"),
+            ("SATURATE", night.saturation, "[adu]"),
+            ("BUNIT", "adu"),
+            ("CTYPE1", "RA---TAN"),
+            ("CTYPE2", "DEC--TAN"),
+            ("CUNIT1", "deg"),
+            ("CUNIT2", "deg"),
+            ("RADESYS", "ICRS"),
+            ("CRVAL1", sky.lon),
+            ("CRVAL2", sky.lat),
+            ("CRPIX1", tangent[0] + 1),
+            ("CRPIX2", tangent[1] + 1),
+            *((f"CD{i + 1}_{j + 1}", cd[i, j]) for i in (0, 1) for j in (0, 1)),
+        ]
+    )

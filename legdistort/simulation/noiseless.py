@@ -1,0 +1,78 @@
+"""The solution that positions without noise would have: all its errors are there before any data are."""
+
+from dataclasses import replace
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+
+from ..geometry.detector_modes import dynamic_basis
+from ..results.solution import Solution
+from ..solving.equations import criterion
+from ..solving.equations.covariances import Uncertainty
+from ..solving.gauge import constraints
+
+#: Without an assumption the scatter of single exposures is taken to be this many times the errors.
+_LARGE = 100.0
+
+
+def noiseless_solution(matches, problem, layout, kind, scatter):
+    """What `legdistort.solve` would give for exact positions, their errors being as stated.
+
+    Parameters
+    ----------
+    matches : Matches
+        Without noise.
+    problem : Problem
+        Made of them.
+    layout : Layout
+        They come from.
+    kind : {"minimal", "mean"}
+        Of the gauge.
+    scatter : ndarray, shape (2, n_modes), or None
+        Of the coefficients from exposure to exposure, pixels, if anything is assumed of it.
+
+    Returns
+    -------
+    Solution
+    State
+    """
+    stars = np.asarray(matches.stars)
+    positions = layout.positions[stars]
+    state = criterion.State(positions.T.copy(), problem.prior_mean.copy(), np.stack(list(layout.poses.values())))
+    blocks = criterion.linearise(problem, state)
+    gauge = _gauge(kind, problem, state, blocks, scatter, layout.sigma)
+    table = QTable(matches.table, copy=False)
+    table["dx"] = table["dy"] = np.zeros(len(table)) * u.pix
+    table["used"] = np.ones(len(table), dtype=bool)
+    solution = Solution(
+        names=problem.names,
+        degree=problem.degree,
+        shapes=dict(matches.shapes),
+        poses=dict(layout.poses),
+        coefficients=state.coefficients,
+        prior_mean=problem.prior_mean,
+        star_names=stars,
+        positions=positions,
+        observations=table,
+        chi2=0.0,
+        dof=0,
+        status="predicted: nothing was measured",
+        gauge=gauge,
+        uncertainty=Uncertainty(problem, blocks, gauge),
+    )
+    return solution, state
+
+
+def _gauge(kind, problem, state, blocks, scatter, sigma):
+    """The gauge, its weights from the scatter assumed, since there are no data to show it.
+
+    Where nothing was assumed it counts as large beside the errors, and the gauge knows no absolute error.
+    """
+    if any(problem.has_widths(i) for i in range(problem.n_exposures)):
+        return constraints.make(kind, problem, state, blocks)
+    others = dynamic_basis(problem.shapes[0], problem.n_modes)
+    assumed = np.full(2 * problem.n_modes, _LARGE * sigma) if scatter is None else scatter.ravel()
+    dynamic = np.stack([others.T @ (others * assumed**2 @ others.T) @ others] * problem.n_exposures)
+    gauge = constraints.make(kind, problem, state, blocks, dynamic=dynamic)
+    return replace(gauge, dynamic=np.zeros_like(dynamic)) if scatter is None else gauge

@@ -1,0 +1,270 @@
+"""Simulated catalogues and images, seeded, with their truth: the direct model of Bernard et al. (2017, section 2).
+
+One source of synthetic truth for tests, demonstrations and benchmarks.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import QTable
+from tqdm import tqdm
+
+from ..exceptions import InputError
+from ..geometry import similarity
+from ..inputs.matches import Matches
+from ..runtime.checks import check_counts
+from . import gsaoi_night, rendering
+from .truth import (
+    Truth,
+    draw_coefficients,
+    draw_poses,
+    draw_stars,
+    exposure_names,
+    footprint,
+    shifted,
+    within,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A simulated catalogue: `matches`, as they would be measured, and the `truth`."""
+
+    matches: Matches
+    truth: Truth
+
+    def __repr__(self):
+        return f"<Simulation: {self.matches!r}>"
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedExposures:
+    """Simulated images.
+
+    Attributes
+    ----------
+    hdus : dict
+        ``{name: HDUList}``, image in the primary HDU.
+    truth : Truth
+    """
+
+    hdus: dict
+    truth: Truth
+
+    def write(self, folder):
+        """Write ``NAME.fits`` for every exposure and ``truth.ecsv``; return the paths of the images."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = [folder / f"{name}.fits" for name in self.hdus]
+        for path, hdulist in zip(paths, self.hdus.values(), strict=True):
+            hdulist.writeto(path, overwrite=True)
+        self.truth.table().write(folder / "truth.ecsv", overwrite=True)
+        return paths
+
+    def __repr__(self):
+        ny, nx = self.truth.shape
+        return f"<SimulatedExposures: {len(self.hdus)} images of {ny} x {nx} pixels, {len(self.truth.positions)} stars>"
+
+
+def simulate_matches(
+    *,
+    n_stars=30,
+    n_exposures=10,
+    degree=3,
+    sigma=0.14,
+    shape=(2048, 2048),
+    static=1.5,
+    dynamic=0.9,
+    zero_mean=True,
+    dither=0.0,
+    rotations=None,
+    flips=None,
+    seen=1.0,
+    margin=0.0,
+    min_exposures=None,
+    pose_error=0.0,
+    noise=1.0,
+    corr=0.0,
+    seed=0,
+):
+    """Catalogues of the same stars in several distorted exposures.
+
+    The default is Simulation 1 of Bernard et al. (2017, section 4.1). What is drawn for stars, distortions, poses and
+    noise comes from separate streams of the seed: another `sigma` keeps the same stars and distortions.
+
+    Parameters
+    ----------
+    n_stars, n_exposures : int
+        Counts.
+    degree : int
+        Total degree of the distortions.
+    sigma : float or array_like
+        Error of a position per axis, pixels; broadcast to (n_exposures, n_stars), or with a last axis of 2 for
+        different errors in x and y.
+    shape : tuple of int
+        ``(ny, nx)`` of the detector.
+    static, dynamic : float or array_like
+        Standard deviation of the coefficients, pixels: one for all, per mode (n_modes,), or (2, n_modes).
+    zero_mean : bool
+        Subtract the mean over the exposures from the dynamic part.
+    dither : float
+        Rms length of the shifts of the exposures, pixels; uniform in a square.
+    rotations : array_like, shape (n_exposures,), optional
+        Degrees, about the middle of the detector.
+    flips : array_like of bool, shape (n_exposures,), optional
+        Exposures seen in a mirror (x reversed).
+    seen : float
+        Probability that a star on the detector is measured.
+    margin : float
+        Stars nearer to the detector's edge than this many undistorted pixels are not measured.
+    min_exposures : int, optional
+        Every star is on the detector in so many exposures at least; default 4 as in the paper, or all if fewer.
+    pose_error : float
+        Rms error of each component of the nominal shifts that the matches carry, pixels.
+    noise : float
+        Factor on the noise drawn: 0 leaves the positions exact while their stated errors stay.
+    corr : float
+        Correlation of the errors in x and y, in (-1, 1).
+    seed : int
+        The same seed gives the same simulation.
+
+    Returns
+    -------
+    Simulation
+        Stars are numbered from 0, the rows of ``truth.positions``.
+
+    Raises
+    ------
+    InputError
+        For arguments out of range.
+    """
+    check_counts(n_stars=n_stars, n_exposures=n_exposures)
+    if not (0 < seen <= 1 and -1 < corr < 1 and dither >= 0 and noise >= 0):
+        raise InputError(
+            "seen must be in (0, 1], corr in (-1, 1), dither and noise not negative, got "
+            f"{seen=}, {corr=}, {dither=}, {noise=}"
+        )
+    sigma = position_errors(sigma, n_exposures, n_stars)
+    star_rng, map_rng, pose_rng, noise_rng = np.random.default_rng(seed).spawn(4)
+    static = draw_coefficients(map_rng, static, degree, 1, "static")[0]
+    dynamic = draw_coefficients(map_rng, dynamic, degree, n_exposures, "dynamic", zero_mean=zero_mean)
+    names = exposure_names(n_exposures)
+    true_poses = draw_poses(pose_rng, names, shape, dither, rotations=rotations, flips=flips)
+    nominal = {name: shifted(pose, pose_error * pose_rng.normal(size=2)) for name, pose in true_poses.items()}
+
+    def inside(xy):
+        # judged by the undistorted position, so that the polynomials are never extrapolated
+        return np.array([within(similarity.apply(pose, xy), shape, margin) for pose in true_poses.values()])
+
+    least = min(4, n_exposures) if min_exposures is None else min_exposures
+    positions = draw_stars(star_rng, n_stars, footprint(true_poses.values(), shape), inside, least)
+    truth = Truth(names, tuple(shape), positions, None, static, dynamic, true_poses, nominal)
+    observed = inside(positions) & (noise_rng.random((n_exposures, n_stars)) < seen)
+    return Simulation(matches_from(truth, observed, sigma, noise_rng, noise=noise, corr=corr), truth)
+
+
+def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **settings):
+    """Images of a simulated GSAOI night.
+
+    Stars are drawn with at least 10 FWHM between them. Their true pixels are ``D(q) + d_i(q)``: the published static
+    distortion D of the real detector, inverted by Newton's method, and a dynamic Legendre part.
+
+    Parameters
+    ----------
+    small : bool
+        Six exposures of 512 x 512 pixels instead of eleven of 2048 x 2048.
+    noise : bool
+        Photon and read noise; without it the images are float32 and not clipped at saturation.
+    seed : int
+        The same seed gives the same night.
+    progress : bool
+        Show a progress bar.
+    **settings
+        Any attribute of `~legdistort.simulation.gsaoi_night.Night`.
+
+    Returns
+    -------
+    SimulatedExposures
+        Images in ADU (uint16), headers with GAIN, RDNOISE, SATURATE and a TAN WCS that is off by
+        `~legdistort.simulation.gsaoi_night.Night.pointing_error`.
+
+    Raises
+    ------
+    InputError
+        For an unknown setting or one out of range.
+    """
+    night, truth, rng = gsaoi_night.draw_night(small, seed, settings)
+    hdus = {}
+    for i, name in enumerate(tqdm(truth.names, desc="simulate", disable=not progress)):
+        psf = replace(
+            night.psf,
+            fwhm=night.fwhm * (1 + 0.05 * np.clip(rng.normal(), -2, 2)),
+            ellipticity=night.ellipticity * (1 + 0.3 * np.clip(rng.normal(), -2, 2)),
+            angle=rng.uniform(0, np.pi),
+        )
+        xy = truth.distort(name, truth.positions)
+        image = rendering.render(truth.shape, xy, (1 - night.halo) * truth.flux, psf=psf, sky=night.sky)
+        if night.halo:
+            wide = replace(night.psf, fwhm=night.halo_fwhm)
+            image += rendering.render(truth.shape, xy, night.halo * truth.flux, psf=wide)
+        if noise:
+            image = rendering.add_noise(image, rng, gain=night.gain, read_noise=night.read_noise)
+            image = np.rint(np.clip(image, 0, min(night.saturation, 65535))).astype(np.uint16)
+        else:
+            image = image.astype(np.float32)
+        hdus[name] = fits.HDUList([fits.PrimaryHDU(image, gsaoi_night.header(truth, name, night, i))])
+    return SimulatedExposures(hdus, truth)
+
+
+def simulate_gsaoi_matches(*, small=False, seed=0, **settings):
+    """The catalogue of the same night: positions with the errors of an ideal fit, drawn without images.
+
+    Parameters are those of `simulate_exposures`, and so are the truth, stars and nominal poses of a seed. A star is
+    measured where it lies at least 3 FWHM inside the edge; a star measured on fewer than four exposures (or all, if
+    there are fewer) is left out, as in the paper.
+
+    Returns
+    -------
+    Simulation
+    """
+    night, truth, rng = gsaoi_night.draw_night(small, seed, settings)
+    observed = gsaoi_night.stars_inside(truth, night, truth.positions)
+    observed &= np.count_nonzero(observed, axis=0) >= min(4, night.n_exposures)
+    sigma = np.broadcast_to(night.position_error(truth.flux)[None, :, None], (*observed.shape, 2))
+    return Simulation(matches_from(truth, observed, sigma, rng, sky=truth.sky), truth)
+
+
+def position_errors(sigma, n_exposures, n_stars):
+    """Errors as (n_exposures, n_stars, 2)."""
+    sigma = np.asarray(sigma, dtype=float)
+    full = (n_exposures, n_stars, 2)
+    try:
+        out = np.broadcast_to(sigma if sigma.ndim == 3 else sigma[..., None], full)
+    except ValueError:
+        raise InputError(
+            f"sigma must broadcast to {full[:2]} (exposures, stars) or to {full}, got shape {sigma.shape}"
+        ) from None
+    if not np.all(out > 0):
+        raise InputError("sigma must be positive everywhere; for positions without noise use noise=0")
+    return out
+
+
+def matches_from(truth, observed, sigma, rng, *, noise=1.0, corr=0.0, sky=None):
+    """Matches from truth: `observed` (n_exposures, n_stars) bool, `sigma` (n_exposures, n_stars, 2) pixels."""
+    drawn = rng.normal(size=sigma.shape)
+    drawn[..., 1] = corr * drawn[..., 0] + np.sqrt(1 - corr**2) * drawn[..., 1]
+    xy = np.stack([truth.distort(name, truth.positions) for name in truth.names]) + noise * sigma * drawn
+    exposure, star = np.nonzero(observed)
+    table = QTable({"exposure": np.array(truth.names)[exposure], "star": star})
+    for k, axis in enumerate("xy"):
+        table[axis] = xy[exposure, star, k] * u.pix
+    for k, axis in enumerate("xy"):
+        table[f"{axis}_err"] = sigma[exposure, star, k] * u.pix
+    if corr:
+        table["xy_corr"] = np.full(len(star), float(corr))
+    if truth.flux is not None:
+        table["flux"] = truth.flux[star]
+    return Matches.from_table(table, shape=truth.shape, poses=truth.nominal_poses, sky=sky)

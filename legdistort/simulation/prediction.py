@@ -1,0 +1,371 @@
+"""What a set of observations will give, before it is made: the two criteria of the paper from the Fisher matrix alone.
+
+Positions without noise, the normal equations there, the gauge and the covariances as `legdistort.solve` reports them;
+no simulation (Bernard et al. 2017, section 4, measures the same by Monte Carlo).
+"""
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from astropy.table import Table
+
+from ..exceptions import LegdistortError
+from ..geometry import basis
+from ..results import accuracy
+from ..results.solution import Solution
+from ..runtime.checks import check_choice, check_counts
+from ..solving.equations import problem_builder
+from ..solving.gauge.constraints import KINDS
+from .aliasing import alias, assumed_spectra
+from .noiseless import noiseless_solution
+from .planned_layout import lay_out
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Expected errors of a planned set of exposures, made by `predict`.
+
+    All are rms per axis in pixels; the paper's equations, which sum both axes, give sqrt(2) times as much.
+
+    Attributes
+    ----------
+    solution : Solution
+        As the solution would be without noise: star positions with their expected errors (``solution.stars``),
+        covariances, gauge, ``solution.sigma_map(name)``.
+    sigma_meas : float
+        Error of one measured position: rms over all, and that of new positions.
+    b : float
+        Expected error of the reference positions, relative (in the gauge).
+    b_abs : float
+        With what the gauge hides: mean dynamic distortion of the set, uncertainty of the static one; pointing,
+        rotation and scale of the field aside. NaN where nothing was assumed of the dynamic distortion.
+    sigma : float
+        Expected scatter of new corrected positions inside the contour of the stars, a square that holds most of them.
+    sigma_field : float
+        The same over the whole field (wherever two exposures see it).
+    b_alias, sigma_alias : float
+        Errors beside these from distortions of higher degree than is fitted, if a spectrum was given (else 0).
+    x, y : ndarray, shape (n_x,), (n_y,)
+        Reference-plane pixels of the maps.
+    error_map, alias_map : ndarray, shape (n_y, n_x)
+        Scatter sigma_j' over the field (the paper's Figure "ergrid"), NaN where fewer than two exposures see it; and
+        that from aliasing.
+    contour : ndarray, shape (2, 2)
+        Lower and upper corner of the square.
+    folded : ndarray, shape (2, n_modes)
+        Rms error of the fitted coefficients from aliasing: where the energy of the modes left out goes.
+    spectrum : ndarray, shape (2, n_modes)
+        Scatter of the distortion from exposure to exposure that was assumed, NaN where it is unknown.
+    settings : dict
+        How `predict` was called.
+    """
+
+    solution: Solution
+    sigma_meas: float
+    b: float
+    b_abs: float
+    sigma: float
+    sigma_field: float
+    b_alias: float
+    sigma_alias: float
+    x: np.ndarray
+    y: np.ndarray
+    error_map: np.ndarray
+    alias_map: np.ndarray
+    contour: np.ndarray
+    folded: np.ndarray
+    spectrum: np.ndarray
+    settings: dict = field(default_factory=dict)
+
+    @property
+    def degree(self):
+        """Total degree that is fitted."""
+        return self.solution.degree
+
+    @property
+    def n_exposures(self):
+        """Number of exposures."""
+        return len(self.solution.names)
+
+    @property
+    def n_stars(self):
+        """Number of stars that serve."""
+        return len(self.solution.star_names)
+
+    @property
+    def stars_per_exposure(self):
+        """Stars on every exposure, shape (n_exposures,)."""
+        table = self.solution.observations
+        return np.array([np.count_nonzero(table["exposure"] == name) for name in self.solution.names])
+
+    @property
+    def s_b(self):
+        """Slope of the noise propagation on reference positions, b / sigma_meas (paper, section 4.2)."""
+        return self.b / self.sigma_meas
+
+    @property
+    def s_sigma(self):
+        """Slope of the noise propagation on corrected positions, sigma / sigma_meas (paper, section 4.2)."""
+        return self.sigma / self.sigma_meas
+
+    @property
+    def b_total(self):
+        """Noise and aliasing together, relative."""
+        return float(np.hypot(self.b, self.b_alias))
+
+    @property
+    def sigma_total(self):
+        """Noise and aliasing together, inside the contour."""
+        return float(np.hypot(self.sigma, self.sigma_alias))
+
+    @property
+    def thumb(self):
+        """Rules of thumb for s_b and s_sigma: 1/sqrt(n_im) and sqrt((1 - 1/n_im)(1 + n_modes/n_star)).
+
+        With the mean number of exposures of a star for n_im, and that of stars on an exposure for n_star.
+        """
+        n = len(self.solution.observations)
+        n_im, n_star = n / self.n_stars, n / self.n_exposures
+        return n_im**-0.5, float(np.sqrt((1 - 1 / n_im) * (1 + basis.n_modes(self.degree) / n_star)))
+
+    def summary(self):
+        """All figures as a dict of numbers."""
+        out = {"n_exposures": self.n_exposures, "n_stars": self.n_stars, "degree": self.degree}
+        out |= {f.name: getattr(self, f.name) for f in fields(self) if f.type is float}
+        thumb_b, thumb_sigma = self.thumb
+        out |= {name: getattr(self, name) for name in ("b_total", "sigma_total", "s_b", "s_sigma")}
+        return out | {"thumb_b": thumb_b, "thumb_sigma": thumb_sigma}
+
+    def plot(self, *, ax=None):
+        """Map of the expected scatter of new positions, aliasing included, with stars and contour; returns the axes.
+
+        The paper's Figure "ergrid". Of more than 300 stars none are drawn.
+        """
+        from ..plots import elements, solution_plots
+
+        stars = self.solution.positions
+        total = np.hypot(self.error_map, self.alias_map)
+        ax = solution_plots.plot_sigma_map(self.x, self.y, total, stars=stars if len(stars) <= 300 else None, ax=ax)
+        (x0, y0), (x1, y1) = self.contour
+        ax.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], color=elements.RED, linewidth=1.8)
+        elements.set_title(
+            ax, f"Expected scatter: {self.n_exposures} exposures, {self.n_stars} stars, degree {self.degree}"
+        )
+        return ax
+
+    def alternatives(self):
+        """The same stars with half and twice the exposures, and fitted one degree lower and higher, as a table.
+
+        The distortion assumed stays the same: what a lower degree leaves out is counted as aliasing. Exposures
+        are only varied where their offsets and errors do not name single ones.
+
+        Returns
+        -------
+        `~astropy.table.Table`
+            One row a plan, this one first; ``meta["failed"]`` says which cannot be solved, and why.
+        """
+        n, settings = self.n_exposures, self.settings
+        changes = [{"degree": d} for d in (self.degree - 1, self.degree + 1) if 0 <= d <= basis.MAX_DEGREE]
+        single = settings["poses"] is None and np.ndim(settings["dithers"]) == 0 and np.ndim(settings["sigma"]) < 2
+        if single:
+            least = (settings["min_exposures"] or min(4, n)) / n  # the same part of them, for the same stars
+            some = [m for m in (n // 2, 2 * n) if m > 1]
+            changes += [{"n_exposures": m, "min_exposures": max(min(2, m), round(least * m))} for m in some]
+        rows, failed = [self.summary()], {}
+        for change in changes:
+            try:
+                rows.append(predict(**settings | change).summary())
+            except LegdistortError as error:
+                failed["{} {}".format(*next(iter(change.items())))] = str(error)
+        table = Table(rows)
+        table.meta["failed"] = failed
+        for name in table.colnames:
+            if table[name].dtype.kind == "f":
+                slope = name.startswith(("s_", "thumb_"))
+                table[name].info.format = ".3f" if slope else f".{self._decimals}f"
+        return table
+
+    @property
+    def _decimals(self):
+        """Decimal places that show three digits of errors like these."""
+        return max(4, 3 - int(np.floor(np.log10(self.sigma_meas))))
+
+    def __repr__(self):
+        return (
+            f"<Prediction: {self.n_exposures} exposures, {self.n_stars} stars, degree {self.degree}, "
+            f"b {self.b:.4f} px, sigma {self.sigma:.4f} px>"
+        )
+
+    def __str__(self):
+        ny, nx = self.solution.shapes[self.solution.names[0]]
+        low, high = self.stars_per_exposure.min(), self.stars_per_exposure.max()
+        thumb_b, thumb_sigma = self.thumb
+        aliased = np.any(self.folded != 0)  # NaN included
+
+        def row(label, noise, aliasing=None, *slopes):
+            values = [
+                noise,
+                *([] if not aliased else [None, None] if aliasing is None else [aliasing, np.hypot(noise, aliasing)]),
+            ]
+            cells = ["" if v is None else "not known" if np.isnan(v) else f"{v:.{self._decimals}f}" for v in values]
+            cells += [f"{slope:.3f}" for slope in slopes]
+            return (f"{label:44s}" + "".join(f"{cell:>11s}" for cell in cells)).rstrip()
+
+        head = ["noise", *(["aliasing", "together"] if aliased else []), "/ sigma", "thumb"]
+        return "\n".join(
+            [
+                f"Prediction: {self.n_exposures} exposures of {ny} x {nx} px, {self.n_stars} stars "
+                f"({low if low == high else f'{low} to {high}'} on each), degree {self.degree}, "
+                f"errors of {self.sigma_meas:.4g} px",
+                f"{'expected, rms per axis [px]':44s}" + "".join(f"{cell:>11s}" for cell in head),
+                row("b, star positions, relative", self.b, self.b_alias, self.s_b, thumb_b),
+                row("b, absolute (mean dynamic distortion too)", self.b_abs),
+                row("sigma, new positions inside the contour", self.sigma, self.sigma_alias, self.s_sigma, thumb_sigma),
+                row("sigma, new positions over the whole field", self.sigma_field, _rms(self.alias_map)),
+                f"gauge {self.solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), "
+                "s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
+            ]
+        )
+
+
+def predict(
+    *,
+    n_exposures,
+    stars=None,
+    n_stars=None,
+    density=None,
+    sigma=None,
+    degree=3,
+    shape=(2048, 2048),
+    dithers=0.0,
+    poses=None,
+    prior=None,
+    gauge="minimal",
+    dynamic=None,
+    spectrum=None,
+    static_spectrum=None,
+    min_exposures=None,
+    n_grid=50,
+    seed=0,
+):
+    """Expected errors of a planned set of exposures, from its Fisher matrix.
+
+    Parameters
+    ----------
+    n_exposures : int
+        Two or more.
+    stars : array_like, shape (n, 2), or Table, optional
+        Positions in the reference plane, pixels; of a table the columns ``x``, ``y``. One of `stars`, `n_stars` and
+        `density` is needed.
+    n_stars : int, optional
+        So many are drawn, evenly over the field. With the same seed they are those of `simulate_matches`.
+    density : float, optional
+        The same as stars per detector.
+    sigma : float, array_like or callable
+        Error of one measured position per axis, pixels: a number, or broadcast to (n_exposures, n_stars), so that
+        (n_stars,) is per star and (n_exposures, 1) per exposure; or a function of the column ``flux`` of `stars`.
+        By default the columns ``x_err``, ``y_err`` of `stars`.
+    degree : int
+        Total degree that will be fitted.
+    shape : tuple of int
+        ``(ny, nx)`` of the detector.
+    dithers : float or array_like, shape (n_exposures, 2)
+        Shifts of the exposures in pixels, or their rms length, to be drawn evenly in a square.
+    poses : dict, optional
+        Instead of dithers, ``{exposure: (2, 3)}``, reference plane -> undistorted pixels, as for rolls.
+    prior : Prior, optional
+        Static distortion; with widths the exposures may have fewer stars than modes.
+    gauge : {"minimal", "mean"}
+        As for `solve`.
+    dynamic : float or array_like, optional
+        Scatter of the fitted coefficients from exposure to exposure, pixels: one, per mode (n_modes,) or
+        (2, n_modes). It gives the absolute error. Not with a prior that has widths, which say the same.
+    spectrum : dict or array_like, optional
+        The same with degrees beyond the fitted one, whose aliasing it predicts: ``{degree: pixels}``, the standard
+        deviation of each coefficient of a degree, or per mode. Without a fitted degree in it, `dynamic` may be added.
+    static_spectrum : dict or array_like, optional
+        The same for a distortion common to all exposures that the prior does not know; only modes beyond the fitted
+        degree count (for the others see ``static_sigma`` of `Prior`).
+    min_exposures : int, optional
+        Stars on fewer exposures are left out; default 4, or all if there are fewer.
+    n_grid : int
+        Points of the maps along the longer side.
+    seed : int
+        Of what is drawn.
+
+    Returns
+    -------
+    Prediction
+
+    Raises
+    ------
+    InputError
+        For arguments out of range or in contradiction.
+    SolveError
+        Naming the exposure with fewer stars than modes, as `solve` would.
+
+    Notes
+    -----
+    Up to 8000 coefficients (400 exposures at degree 3) their full covariance is used; beyond, an `AssumptionWarning`
+    says that it is approximated by one block an exposure.
+    """
+    settings = dict(locals())  # the arguments as given
+    check_counts(n_grid=n_grid)
+    degree = basis.check_degree(degree)
+    check_choice(gauge, KINDS, "gauge")
+    independent, common = assumed_spectra(degree, prior, dynamic, spectrum, static_spectrum)
+    layout = lay_out(
+        n_exposures=n_exposures, stars=stars, n_stars=n_stars, density=density, sigma=sigma, shape=shape,
+        dithers=dithers, poses=poses, min_exposures=min_exposures, seed=seed,
+    )  # fmt: skip
+    sigma_meas = layout.sigma
+    matches = layout.matches(np.zeros((2, 1)) if prior is None else prior.mean)
+    problem = problem_builder.build(matches, degree, prior=prior)
+    fitted = independent[:, : problem.n_modes]
+    known = bool(np.isfinite(fitted).all())
+    solution, state = noiseless_solution(matches, problem, layout, gauge, fitted if known else None)
+    x, y = layout.axes(n_grid)
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    noise = accuracy.expected_scatter(solution, grid, sigma_meas)
+    aliased, folded, b_alias = np.where(np.isfinite(noise), 0.0, np.nan), np.zeros_like(fitted), 0.0
+    if max(independent.shape[1], common.shape[1]) > problem.n_modes:
+        aliasing = alias(
+            problem, state, solution.gauge, solution.uncertainty.coefficients, independent=independent, common=common
+        )
+        aliased = accuracy.expected_scatter(solution, grid, 0.0, covariance=aliasing.covariance)
+        folded, b_alias = aliasing.folded, float(np.sqrt(np.mean(aliasing.stars)))
+    square = accuracy.contour(solution.positions)
+    inside = accuracy.in_contour(grid, square)
+    drawn = {} if stars is not None else {"stars": layout.positions, "n_stars": None, "density": None}
+    return Prediction(
+        solution=solution,
+        sigma_meas=sigma_meas,
+        b=accuracy.expected_bias(solution),
+        b_abs=accuracy.expected_bias(solution, absolute=True) if known or solution.gauge.prior else np.nan,
+        sigma=_rms(noise[inside]),
+        sigma_field=_rms(noise),
+        b_alias=b_alias,
+        sigma_alias=_rms(aliased[inside]),
+        x=x,
+        y=y,
+        error_map=noise.reshape(len(y), len(x)),
+        alias_map=aliased.reshape(len(y), len(x)),
+        contour=square,
+        folded=folded,
+        spectrum=independent,
+        settings=settings | drawn | {"spectrum": independent, "dynamic": None},
+    )
+
+
+def show(plans):
+    """The table of `Prediction.alternatives` as text: criteria (aliasing if any is known), slopes, rules of thumb."""
+    criteria = [c for c in ("b", "b_alias", "b_abs", "sigma", "sigma_alias") if np.nansum(plans[c]) > 0]
+    columns = ["n_exposures", "degree", "n_stars", *criteria, "s_b", "thumb_b", "s_sigma", "thumb_sigma"]
+    lines = plans[columns].pformat(max_lines=-1, max_width=-1)
+    return "\n".join(lines + [f"{change}: {reason}" for change, reason in plans.meta["failed"].items()])
+
+
+def _rms(values):
+    """Rms of those that are finite; NaN if none is."""
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan

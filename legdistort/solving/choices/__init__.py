@@ -1,0 +1,1 @@
+"""What the exposures themselves say of degree and prior widths."""

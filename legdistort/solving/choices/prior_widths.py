@@ -1,0 +1,292 @@
+"""Widths of a prior found from the exposures themselves: empirical Bayes, or type-II maximum likelihood.
+
+How far single exposures depart from the static distortion is mostly not known. It shows in the data: with stars and
+poses integrated out, the data are Gaussian with a covariance that depends on the variance of the modes of each degree,
+and the widths that make the data most likely are taken (MacKay 1992; in mixed models, restricted maximum likelihood).
+Modes that the data do not tell, and maps common to all exposures, have no say in it, so it works where an exposure has
+fewer stars than modes.
+"""
+
+import logging
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+from ...exceptions import ConvergenceWarning, warn
+from ...geometry import basis
+from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
+from ...priors.prior import Prior
+from ..equations import criterion, elimination, problem_builder
+
+log = logging.getLogger(__name__)
+
+#: The widths have settled when none changes by more than this part of itself.
+TOLERANCE = 0.01
+#: Fits at most.
+MAX_ROUNDS = 12
+#: Widths are sought within these factors of the median position error; at the lower end a degree is as good as fixed.
+RANGE = 1e-3, 1e6
+#: So many coefficients, those of exposures drawn at random, are enough to tell the widths.
+MOST = 800
+#: A width is taken for nothing if that costs less than this in the logarithm of the likelihood: two standard errors.
+PARSIMONY = 2.0
+_RIDGE = 1e-10  # on what is eliminated, relative: a similarity common to all exposures is not determined
+
+
+def is_wanted(prior):
+    """Whether a prior, or one of a dict of them, leaves its widths to be found."""
+    priors = prior.values() if isinstance(prior, dict) else [prior]
+    return any(isinstance(p, Prior) and isinstance(p.sigma, str) for p in priors)
+
+
+def resolve(prior, widths):
+    """The prior, or dict of priors, with widths found, ``{id(Prior): (degree,)}``, in the place of "evidence"."""
+    if isinstance(prior, dict):
+        return {key: resolve(p, widths) for key, p in prior.items()}
+    if id(prior) not in widths:
+        return prior
+    found = widths[id(prior)]
+    if not len(found):  # at degree 0 there is nothing that scatters
+        return prior.with_sigma(None)
+    return prior.with_sigma(found[np.maximum(np.add(*basis.orders(len(found))), 1) - 1], degree=len(found))
+
+
+def describe(prior, widths, scale=1.0):
+    """Widths found, by degree from 1, as plain numbers: a list, by detector or exposure if the prior came so, or None.
+
+    They are in units of errors that were stated `scale` times too small.
+    """
+    if isinstance(prior, dict):
+        return {str(key): describe(p, widths, scale) for key, p in prior.items()} if widths else None
+    return (scale * widths[id(prior)]).tolist() if id(prior) in widths else None
+
+
+def find_widths(fit, prior, degree, unit, *, scale=False):
+    """The fit in which the widths are those that the data say.
+
+    Fits and widths follow one another until the widths settle: outliers, weights and the point where the model is
+    linearised depend on the fit. The first has small widths, so that outliers stand out.
+
+    Parameters
+    ----------
+    fit : callable
+        ``fit(prior)``, returning an object with ``matches``, ``weighted`` and ``result.state``.
+    prior : Prior or dict
+    degree : int
+        Up to which exposures have modes of their own.
+    unit : float
+        Typical error of a position, pixels.
+    scale : bool
+        The stated errors are known up to a common factor only.
+
+    Returns
+    -------
+    fit
+    dict
+        ``{id(Prior): widths (degree,) [pix]}`` of degrees 1, 2 and more; 0 where it was held at the smallest one.
+    """
+    wanted = list(prior.values()) if isinstance(prior, dict) else [prior]
+    wanted = list({id(p): p for p in wanted if is_wanted(p)}.values())
+    widths, bounds = np.full((len(wanted), degree), unit), unit * np.array(RANGE)
+
+    def fitted():
+        with warnings.catch_warnings(record=True) as caught:  # of the last fit they are told
+            warnings.simplefilter("always")
+            return fit(resolve(prior, dict(zip(map(id, wanted), widths, strict=True)))), caught
+
+    for _ in range(MAX_ROUNDS if degree else 0):
+        done, caught = fitted()
+        labels = _labels(problem_builder.by_exposure(done.matches, prior), wanted, degree)
+        seen = evidence(*_sample(done.weighted, done.result.state, labels, done.result.gauge.motion))
+        found = seen.best(widths.size, bounds, scale=scale).reshape(widths.shape)
+        log.debug("widths by degree: %s px", found)
+        if np.all(np.abs(found - widths) <= TOLERANCE * np.maximum(found, unit)):
+            break
+        widths = found
+    else:
+        done, caught = fitted()
+        if degree:
+            words = f"the widths of the prior have not settled after {MAX_ROUNDS} fits, the last are {widths} px"
+            warn(words, ConvergenceWarning)
+    for warning in caught:
+        warn(warning.message, warning.category)
+    return done, dict(zip(map(id, wanted), np.where(widths > 1.01 * bounds[0], widths, 0), strict=True))
+
+
+def _labels(priors, wanted, degree):
+    """Number of the width of every exposure and degree (n_exposures, degree), -1 where none is sought."""
+    numbers = {id(p): k for k, p in enumerate(wanted)}
+    prior = np.array([numbers.get(id(p), -1) for p in priors])
+    return np.where(prior[:, None] >= 0, prior[:, None] * degree + np.arange(degree), -1)
+
+
+def _sample(problem, state, labels, motion):
+    """The same with a random choice of the exposures, should they be more than are needed."""
+    n = max(5, MOST // problem.unknowns.n_own)
+    if problem.n_exposures <= n:
+        return problem, state, labels, motion
+    rng = np.random.default_rng(0)
+    groups = [np.flatnonzero(labels[:, 0] == first) for first in np.unique(labels[:, 0])]
+    keep = np.sort(np.concatenate([rng.permutation(g)[: max(5, n // len(groups))] for g in groups]))
+    rows = np.concatenate([np.arange(*problem.start[i : i + 2]) for i in keep])
+    stars, star = np.unique(problem.star[rows], return_inverse=True)
+    group = problem.group if problem.group is None else np.unique(problem.group[keep], return_inverse=True)[1]
+    part = replace(
+        problem,
+        names=tuple(problem.names[i] for i in keep),
+        shapes=[problem.shapes[i] for i in keep],
+        n_stars=len(stars),
+        start=np.concatenate([[0], np.cumsum(np.diff(problem.start)[keep])]),
+        star=star,
+        xy=problem.xy[:, rows],
+        weight=problem.weight[:, rows],
+        prior_mean=problem.prior_mean[keep],
+        prior_sigma=problem.prior_sigma[keep],
+        group=group,
+    )
+    state = criterion.State(state.positions[:, stars], state.coefficients[keep], state.poses[keep])
+    return part, state, labels[keep], motion[keep]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The data as the widths see them: stars, poses and all that has widths of its own eliminated.
+
+    Up to a constant, twice the logarithm of the likelihood of widths ``w`` is
+    ``p' W (1 + W S W)^-1 W p - log det(1 + W S W)``, with ``W = diag(w)``.
+
+    Attributes
+    ----------
+    curvature : ndarray, shape (n, n)
+        S of the dynamic coefficients.
+    pull : ndarray, shape (n,)
+        p, the gradient at the prior mean.
+    label : ndarray of int, shape (n,)
+        Number of the width of every coefficient.
+    chi2 : float
+        J at the prior mean.
+    n_data : int
+        Measured coordinates beyond those needed for what was eliminated.
+    """
+
+    curvature: np.ndarray
+    pull: np.ndarray
+    label: np.ndarray
+    chi2: float
+    n_data: int
+
+    def cost(self, log_widths, *, scale=False):
+        """Minus the logarithm of the likelihood, and its gradient; with `scale`, at the best scale of all errors.
+
+        The gradient vanishes where a width is what its coefficients, and the number of them that the data determine,
+        say: the fixed point of MacKay (1992).
+        """
+        w = np.exp(log_widths)[self.label]
+        root, lower = cho_factor(np.eye(len(w)) + w[:, None] * self.curvature * w, lower=True)
+        inverse = cho_solve((root, lower), np.eye(len(w)))
+        mean = inverse @ (w * self.pull)  # of the coefficients given the data, in their widths
+        explained = w * self.pull @ mean
+        gain, per_square = -explained / 2, 1.0
+        if scale:
+            left = max(self.chi2 - explained, 1e-12 * self.chi2)
+            gain, per_square = self.n_data / 2 * np.log(left), self.n_data / left
+        slope = (1 - np.diag(inverse)) - per_square * mean**2
+        return gain + np.log(np.diag(root)).sum(), np.bincount(self.label, slope, len(log_widths))
+
+    def best(self, n, bounds, *, scale=False):
+        """The n widths of the highest likelihood between two bounds; at the lower one where another gains little.
+
+        Parameters
+        ----------
+        n : int
+        bounds : (float, float)
+        scale : bool
+            As for `cost`.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+        """
+        low, high = np.log(bounds)
+        square = np.bincount(self.label, (self.pull / np.diag(self.curvature)) ** 2, n)
+        unit = square / np.bincount(self.label, minlength=n)  # variances of that order: where 0 is left if it has to be
+        dropped = np.zeros(n, dtype=bool)
+
+        def cost(variance):
+            value, slope = self.cost(np.log(variance * unit) / 2, scale=scale)
+            return value, slope / (2 * variance)
+
+        def highest(start):
+            limits = np.exp(2 * np.array([low * np.ones(n), np.where(dropped, low, high)])) / unit
+            start = np.clip(start, *limits)
+            return minimize(cost, start, jac=True, bounds=list(zip(*limits, strict=True)), method="L-BFGS-B")
+
+        found = highest(np.ones(n))
+        while not dropped.all():
+            without = [np.where(np.arange(n) == k, 0, found.x) for k in np.flatnonzero(~dropped)]
+            loss = np.array([cost(np.maximum(v, np.exp(2 * low) / unit))[0] for v in without]) - found.fun
+            if loss.min() > PARSIMONY:
+                break
+            dropped[np.flatnonzero(~dropped)[loss.argmin()]] = True
+            found = highest(without[loss.argmin()])
+        return np.sqrt(found.x * unit)
+
+
+def evidence(problem, state, labels, motion):
+    """The data of a fit as the widths see them.
+
+    Parameters
+    ----------
+    problem : Problem
+        With the weights that were in force.
+    state : State
+        Where J and its derivatives are taken.
+    labels : ndarray of int, shape (n_exposures, degree)
+        Number of the width of every exposure and degree from 1; -1 where none is sought.
+    motion : ndarray, shape (n_exposures, 2 n, 2 n)
+        How maps of the reference plane change the coefficients (`legdistort.results.gauge.Gauge`); along them the data
+        say nothing, and what the linear model has to say is noise.
+    """
+    wanted = labels[:, 0] >= 0
+    sigma = np.where(wanted[:, None, None], np.inf, problem.prior_sigma)
+    problem = replace(problem, prior_sigma=None if np.isinf(sigma).all() else sigma)
+    blocks, unknowns = criterion.linearise(problem, state), problem.unknowns
+    n = problem.n_modes
+    degree, departure = dynamic_degrees(n), state.coefficients - problem.prior_mean
+    sought = degree <= labels.shape[1]
+    rows, label, origin = [], [], []
+    for i in np.flatnonzero(wanted):
+        mine = dynamic_basis(problem.shapes[i], n)[sought]
+        place = np.zeros((problem.n_exposures, 2 * n, len(mine)))
+        place[i] = mine.T
+        rows.append(unknowns.gather(place).T)
+        label.append(labels[i, degree[sought] - 1])
+        origin.append(mine @ departure[i, :, :n].ravel())
+    rows, origin = np.concatenate(rows), np.concatenate(origin)
+    moved = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
+    pull = unknowns.gather(blocks.g_exposure - elimination.to_exposures(problem, blocks, moved))
+    matrix = elimination.reduced_matrix(problem, blocks)
+    common = motion.reshape(problem.n_exposures, 2, -1, motion.shape[2])
+    common = np.pad(common, ((0, 0), (0, 0), (0, n - common.shape[2]), (0, 0)))
+    common = np.linalg.qr(unknowns.gather(common.reshape(problem.n_exposures, 2 * n, -1)))[0]
+    pull -= common @ (common.T @ pull)
+    matrix -= common @ (common.T @ matrix)
+    matrix -= (matrix @ common) @ common.T
+    others = criterion.complement(rows)
+    across, inner = rows @ matrix @ others.T, others @ matrix @ others.T
+    inner += _RIDGE * np.trace(inner) / max(len(inner), 1) * np.eye(len(inner))
+    solved = np.linalg.solve(inner, np.column_stack([across.T, others @ pull]))
+    curvature = rows @ matrix @ rows.T - across @ solved[:, :-1]
+    slope = rows @ pull - across @ solved[:, -1]
+    chi2 = blocks.cost - (moved * blocks.g_star).sum() - others @ pull @ solved[:, -1]
+    n_free = 2 * np.count_nonzero(blocks.v[0] > 0) + len(others) - 4
+    return Evidence(
+        curvature=(curvature + curvature.T) / 2,
+        pull=slope + curvature @ origin,
+        label=np.concatenate(label),
+        chi2=float(chi2 + 2 * slope @ origin + origin @ curvature @ origin),
+        n_data=2 * np.count_nonzero(problem.weight[0]) - n_free,
+    )

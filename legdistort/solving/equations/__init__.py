@@ -1,0 +1,1 @@
+"""The criterion J, its normal equations and their covariances."""

@@ -1,0 +1,363 @@
+"""Compiled twins of the loops over observations in `legdistort.solving.equations.criterion`, for large problems.
+
+They need numba (the extra ``fast``); without it, and for small problems where compiling would not pay, the plain
+NumPy code runs. Both give the same numbers. Observations are taken in batches, so that the inner loops run over
+neighbours in memory and become vector instructions; exposures are shared out among threads, each with star sums of
+its own, so results do not depend on timing. The coupling is kept in single precision: it steers the step, while the
+gradient, which decides where the minimum is, stays in double.
+"""
+
+from functools import cache
+
+import numpy as np
+from numba import get_num_threads, njit, prange
+from threadpoolctl import ThreadpoolController
+
+from ...geometry import basis
+
+_BATCH = 64
+_FAST = {"contract", "reassoc", "nsz"}  # sums may be reordered; NaN and infinity keep their meaning
+
+
+@cache
+def _libraries():
+    return ThreadpoolController()
+
+
+def one_blas_thread():
+    """Context in which the linear algebra library keeps to one thread.
+
+    The loops here use all cores; idle threads of the library, which wait in a busy loop, would take turns with them.
+    """
+    return _libraries().limit(limits=1, user_api="blas")
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _legendre(u, p, d):
+    """Normalised Legendre polynomials and derivatives at u (n,), into p and d (top, n)."""
+    n = len(u)
+    top = len(p)
+    for o in range(n):
+        p[0, o], d[0, o] = 1.0, 0.0
+    if top > 1:
+        for o in range(n):
+            p[1, o], d[1, o] = u[o], 1.0
+    for k in range(1, top - 1):
+        for o in range(n):
+            p[k + 1, o] = ((2 * k + 1) * u[o] * p[k, o] - k * p[k - 1, o]) / (k + 1)
+            d[k + 1, o] = d[k - 1, o] + (2 * k + 1) * p[k, o]
+    for k in range(top):
+        scale = np.sqrt(k + 0.5)
+        for o in range(n):
+            p[k, o] *= scale
+            d[k, o] *= scale
+
+
+@njit(cache=True, nogil=True)
+def _bounds(start, n_chunks):
+    """Exposure numbers that cut the observations in chunks of about equal size."""
+    out = np.zeros(n_chunks + 1, np.int64)
+    for c in range(1, n_chunks):
+        out[c] = np.searchsorted(start, start[-1] * c // n_chunks)
+    out[n_chunks] = len(start) - 1
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _model(a, orders, size, q, work):
+    """Distorted positions and I + A grad b of a batch; q (2, n) is overwritten with the positions."""
+    pu, du, pv, dv, b, g = work
+    ix, iy = orders
+    n = q.shape[1]
+    su, sv = 2.0 / size[1], 2.0 / size[0]
+    _legendre((q[0] + 0.5) * su - 1.0, pu, du)
+    _legendre((q[1] + 0.5) * sv - 1.0, pv, dv)
+    for o in range(n):
+        g[0, o], g[1, o], g[2, o], g[3, o] = 1.0, 0.0, 0.0, 1.0
+    for m in range(len(ix)):
+        p, dp, r, dr, ax, ay, row = pu[ix[m]], du[ix[m]], pv[iy[m]], dv[iy[m]], a[0, m], a[1, m], b[m]
+        for o in range(n):
+            row[o] = p[o] * r[o]
+            slope_u, slope_v = dp[o] * r[o] * su, p[o] * dr[o] * sv
+            q[0, o] += ax * row[o]
+            q[1, o] += ay * row[o]
+            g[0, o] += ax * slope_u
+            g[1, o] += ax * slope_v
+            g[2, o] += ay * slope_u
+            g[3, o] += ay * slope_v
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _normal_block(weight, b, out):
+    """Add ``sum w b b'`` of a batch to the lower triangle of out (n_modes, n_modes)."""
+    n_modes = len(out)
+    n = len(weight)
+    for m in range(n_modes):
+        for other in range(m + 1):
+            total = 0.0
+            for o in range(n):
+                total += weight[o] * b[m, o] * b[other, o]
+            out[m, other] += total
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _dots(b, x, out):
+    for m in range(len(out)):
+        total = 0.0
+        for o in range(len(x)):
+            total += b[m, o] * x[o]
+        out[m] += total
+
+
+@njit(cache=True, parallel=True, fastmath=_FAST)
+def _linearise(n_chunks, start, star, xy, weight, unequal, positions, coefficients, poses, sizes, orders, n_modes):
+    n_exposures, n, n_all = len(start) - 1, len(star), orders.shape[1]
+    values, coupling = np.empty((n_modes, n), np.float32), np.empty((2, 2, n), np.float32)
+    residual = np.empty((2, n))
+    sums = np.zeros((n_chunks, positions.shape[1], 5))
+    u_blocks, gradient = np.zeros((n_exposures, 3, n_modes, n_modes)), np.zeros((n_exposures, 2, n_modes))
+    chi2 = np.zeros(n_chunks)
+    bounds, top = _bounds(start, n_chunks), orders.max() + 1
+    for c in prange(n_chunks):
+        q_, wr_ = np.empty((2, _BATCH)), np.empty((2, _BATCH))
+        legendre_, b_, g_ = np.empty((4, top, _BATCH)), np.empty((n_all, _BATCH)), np.empty((4, _BATCH))
+        mine = sums[c]
+        for i in range(bounds[c], bounds[c + 1]):
+            pose = poses[i]
+            r00, r01, r10, r11 = pose[0, 0], pose[0, 1], pose[1, 0], pose[1, 1]
+            for first in range(start[i], start[i + 1], _BATCH):
+                last = min(first + _BATCH, start[i + 1])
+                size = last - first
+                q, wr, b, g = q_[:, :size], wr_[:, :size], b_[:, :size], g_[:, :size]
+                for o in range(size):
+                    x, y = positions[0, star[first + o]], positions[1, star[first + o]]
+                    q[0, o] = r00 * x + r01 * y + pose[0, 2]
+                    q[1, o] = r10 * x + r11 * y + pose[1, 2]
+                work = (legendre_[0], legendre_[1], legendre_[2], legendre_[3], b, g)
+                _model(coefficients[i], orders, sizes[i], q, work)
+                w = weight[:, first:last]
+                total = 0.0
+                for o in range(size):
+                    k = first + o
+                    jxx, jxy = g[0, o] * r00 + g[1, o] * r10, g[0, o] * r01 + g[1, o] * r11
+                    jyx, jyy = g[2, o] * r00 + g[3, o] * r10, g[2, o] * r01 + g[3, o] * r11
+                    fxx, fxy = jxx * w[0, o] + jyx * w[2, o], jxx * w[2, o] + jyx * w[1, o]
+                    fyx, fyy = jxy * w[0, o] + jyy * w[2, o], jxy * w[2, o] + jyy * w[1, o]
+                    rx, ry = xy[0, k] - q[0, o], xy[1, k] - q[1, o]
+                    residual[0, k], residual[1, k] = rx, ry
+                    coupling[0, 0, k], coupling[0, 1, k] = fxx, fxy
+                    coupling[1, 0, k], coupling[1, 1, k] = fyx, fyy
+                    wr[0, o], wr[1, o] = w[0, o] * rx + w[2, o] * ry, w[2, o] * rx + w[1, o] * ry
+                    total += rx * wr[0, o] + ry * wr[1, o]
+                    row = mine[star[k]]
+                    row[0] += fxx * jxx + fxy * jyx
+                    row[1] += fyx * jxy + fyy * jyy
+                    row[2] += fxx * jxy + fxy * jyy
+                    row[3] += fxx * rx + fxy * ry
+                    row[4] += fyx * rx + fyy * ry
+                chi2[c] += total
+                for m in range(n_modes):
+                    for o in range(size):
+                        values[m, first + o] = b[m, o]
+                _normal_block(w[0], b, u_blocks[i, 0])
+                if unequal:
+                    _normal_block(w[1], b, u_blocks[i, 1])
+                    _normal_block(w[2], b, u_blocks[i, 2])
+                _dots(b, wr[0], gradient[i, 0])
+                _dots(b, wr[1], gradient[i, 1])
+    return values, coupling, residual, sums, u_blocks, gradient, chi2.sum()
+
+
+@njit(cache=True, parallel=True, fastmath=_FAST)
+def _to_stars(n_chunks, start, star, values, coupling, a, n_stars):
+    sums = np.zeros((n_chunks, n_stars, 2))
+    bounds, n_modes = _bounds(start, n_chunks), len(values)
+    for c in prange(n_chunks):
+        x, y = np.empty(_BATCH), np.empty(_BATCH)
+        for i in range(bounds[c], bounds[c + 1]):
+            for first in range(start[i], start[i + 1], _BATCH):
+                size = min(_BATCH, start[i + 1] - first)
+                x[:], y[:] = 0.0, 0.0
+                for m in range(n_modes):
+                    row, ax, ay = values[m, first : first + size], a[i, m], a[i, n_modes + m]
+                    for o in range(size):
+                        x[o] += ax * row[o]
+                        y[o] += ay * row[o]
+                for o in range(size):
+                    k = first + o
+                    sums[c, star[k], 0] += coupling[0, 0, k] * x[o] + coupling[0, 1, k] * y[o]
+                    sums[c, star[k], 1] += coupling[1, 0, k] * x[o] + coupling[1, 1, k] * y[o]
+    return sums
+
+
+@njit(cache=True, parallel=True, fastmath=_FAST)
+def _to_exposures(n_chunks, start, star, values, coupling, stars):
+    n_modes = len(values)
+    out = np.zeros((len(start) - 1, 2, n_modes))
+    bounds = _bounds(start, n_chunks)
+    for c in prange(n_chunks):
+        x, y = np.empty(_BATCH), np.empty(_BATCH)
+        for i in range(bounds[c], bounds[c + 1]):
+            for first in range(start[i], start[i + 1], _BATCH):
+                size = min(_BATCH, start[i + 1] - first)
+                for o in range(size):
+                    k = first + o
+                    sx, sy = stars[0, star[k]], stars[1, star[k]]
+                    x[o] = coupling[0, 0, k] * sx + coupling[1, 0, k] * sy
+                    y[o] = coupling[0, 1, k] * sx + coupling[1, 1, k] * sy
+                for m in range(n_modes):
+                    row, sum_x, sum_y = values[m, first : first + size], 0.0, 0.0
+                    for o in range(size):
+                        sum_x += row[o] * x[o]
+                        sum_y += row[o] * y[o]
+                    out[i, 0, m] += sum_x
+                    out[i, 1, m] += sum_y
+    return out
+
+
+@njit(cache=True, parallel=True, fastmath=_FAST)
+def _undistorted(n_chunks, start, xy, coefficients, sizes, orders):
+    out = np.empty_like(xy)
+    bounds, top, n_all = _bounds(start, n_chunks), orders.max() + 1, orders.shape[1]
+    for c in prange(n_chunks):
+        x_, legendre_ = np.empty((2, _BATCH)), np.empty((4, top, _BATCH))
+        b_, g_ = np.empty((n_all, _BATCH)), np.empty((4, _BATCH))
+        for i in range(bounds[c], bounds[c + 1]):
+            for first in range(start[i], start[i + 1], _BATCH):
+                last = min(first + _BATCH, start[i + 1])
+                size = last - first
+                x, guess, given = x_[:, :size], out[:, first:last], xy[:, first:last]
+                work = (legendre_[0], legendre_[1], legendre_[2], legendre_[3], b_[:, :size], g_[:, :size])
+                guess[:] = given
+                for _sweep in range(2):
+                    x[:] = guess
+                    _model(coefficients[i], orders, sizes[i], x, work)
+                    guess += given - x
+    return out
+
+
+@njit(cache=True, parallel=True, fastmath=_FAST)
+def _mean_sums(n_chunks, start, star, q, weight, back, n_stars):
+    sums = np.zeros((n_chunks, n_stars, 3))
+    bounds = _bounds(start, n_chunks)
+    for c in prange(n_chunks):
+        for i in range(bounds[c], bounds[c + 1]):
+            pose = back[i]
+            for k in range(start[i], start[i + 1]):
+                w, row = weight[k], sums[c, star[k]]
+                row[0] += w * (pose[0, 0] * q[0, k] + pose[0, 1] * q[1, k] + pose[0, 2])
+                row[1] += w * (pose[1, 0] * q[0, k] + pose[1, 1] * q[1, k] + pose[1, 2])
+                row[2] += w
+    return sums
+
+
+@njit(cache=True, parallel=True, fastmath=_FAST)
+def _distances(start, star, q, poses, positions):
+    out = np.empty(q.shape[1])
+    for i in prange(len(start) - 1):
+        pose = poses[i]
+        for k in range(start[i], start[i + 1]):
+            x, y = positions[0, star[k]], positions[1, star[k]]
+            dx = q[0, k] - (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2])
+            dy = q[1, k] - (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2])
+            out[k] = dx * dx + dy * dy
+    return out
+
+
+@njit(cache=True, parallel=True, fastmath=_FAST)
+def _moments(start, star, q, weight, positions):
+    """Per exposure: means of source and target, cross moments xx, xy, yx, yy (target, source), power of the source."""
+    out = np.zeros((len(start) - 1, 9))
+    for i in prange(len(start) - 1):
+        total, row = 0.0, out[i]
+        for k in range(start[i], start[i + 1]):
+            w = weight[k]
+            total += w
+            row[0] += w * positions[0, star[k]]
+            row[1] += w * positions[1, star[k]]
+            row[2] += w * q[0, k]
+            row[3] += w * q[1, k]
+        if total > 0:
+            row[:4] /= total
+        for k in range(start[i], start[i + 1]):
+            w, sx, sy = weight[k], positions[0, star[k]] - row[0], positions[1, star[k]] - row[1]
+            tx, ty = q[0, k] - row[2], q[1, k] - row[3]
+            row[4] += w * tx * sx
+            row[5] += w * tx * sy
+            row[6] += w * ty * sx
+            row[7] += w * ty * sy
+            row[8] += w * (sx * sx + sy * sy)
+    return out
+
+
+def linearise(problem, state):
+    """Twin of the sums in `legdistort.solving.equations.criterion.linearise`; the same arrays, and chi2."""
+    orders = np.stack(basis.orders(basis.degree_of(state.coefficients.shape[2])))
+    values, coupling, residual, sums, parts, gradient, chi2 = _linearise(
+        get_num_threads(),
+        problem.start,
+        problem.star,
+        problem.xy,
+        problem.weight,
+        problem.unequal,
+        np.ascontiguousarray(state.positions),
+        state.coefficients,
+        state.poses,
+        _sizes(problem),
+        orders,
+        problem.n_modes,
+    )
+    sums = sums.sum(axis=0).T
+    xx, yy, xy = (parts + np.tril(parts, -1).swapaxes(2, 3)).swapaxes(0, 1)
+    u = np.block([[xx, xy], [xy, yy if problem.unequal else xx]])
+    return values, coupling, residual, sums[:3].copy(), sums[3:].copy(), u, gradient.reshape(len(u), -1), chi2
+
+
+def to_stars(problem, blocks, a):
+    """Twin of `legdistort.solving.equations.elimination.to_stars`."""
+    sums = _to_stars(get_num_threads(), problem.start, problem.star, blocks.values, blocks.coupling, a, problem.n_stars)
+    return sums.sum(axis=0).T.copy()
+
+
+def to_exposures(problem, blocks, y):
+    """Twin of `legdistort.solving.equations.elimination.to_exposures`."""
+    out = _to_exposures(
+        get_num_threads(), problem.start, problem.star, blocks.values, blocks.coupling, np.ascontiguousarray(y)
+    )
+    return out.reshape(len(out), -1)
+
+
+def undistorted(problem):
+    """Twin of `legdistort.solving.start_values.undistorted`, without its checks."""
+    orders = np.stack(basis.orders(basis.degree_of(problem.prior_mean.shape[2])))
+    return _undistorted(get_num_threads(), problem.start, problem.xy, problem.prior_mean, _sizes(problem), orders)
+
+
+def mean_sums(problem, back, q, weight):
+    """Weighted sums (2, n_stars) of positions q carried back by the poses `back`, and of the weights (n_stars,)."""
+    sums = _mean_sums(get_num_threads(), problem.start, problem.star, q, weight, back, problem.n_stars)
+    x, y, total = sums.sum(axis=0).T
+    return np.stack([x, y]), total
+
+
+def distances(problem, pose_list, q, positions):
+    """Twin of `legdistort.solving.start_values.distances`."""
+    return _distances(problem.start, problem.star, q, pose_list, np.ascontiguousarray(positions))
+
+
+def moments(problem, q, weight, positions):
+    """Moments of the similarities positions -> q of all exposures.
+
+    Returns
+    -------
+    mean_s, mean_t : ndarray, shape (n_exposures, 2)
+    cross : ndarray, shape (n_exposures, 2, 2)
+        See `legdistort.geometry.similarity.similarity_of`; NaN where the stars lie at one place.
+    """
+    out = _moments(problem.start, problem.star, q, weight, np.ascontiguousarray(positions))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return out[:, :2], out[:, 2:4], (out[:, 4:8] / out[:, 8:]).reshape(-1, 2, 2)
+
+
+def _sizes(problem):
+    return np.array(problem.shapes, dtype=float)

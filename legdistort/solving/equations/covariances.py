@@ -1,0 +1,100 @@
+"""Covariances of a solution in its gauge, computed when first asked for."""
+
+from functools import cached_property
+
+import numpy as np
+
+from ...exceptions import AssumptionWarning, warn
+from . import elimination, reduced_system
+
+#: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
+DENSE_LIMIT = 8000
+
+
+class Uncertainty:
+    """Errors of coefficients and star positions (relative: in the gauge).
+
+    ``cov(A) = S^-1`` on the constraints of the gauge and
+    ``cov(X_j) = V_j^-1 + V_j^-1 E cov(A) E' V_j^-1``.
+
+    Parameters
+    ----------
+    problem : Problem
+    blocks : Blocks
+        At the solution.
+    gauge : Gauge
+    scale : float
+        Factor on all standard deviations (1: the stated errors are taken as they are).
+    """
+
+    def __init__(self, problem, blocks, gauge, *, scale=1.0):
+        self._problem, self._blocks, self._gauge, self._scale = problem, blocks, gauge, scale
+
+    @cached_property
+    def coefficients(self):
+        """Covariance of the fitted coefficients, shape (n_exposures * 2 n_modes,) squared, px^2; x modes first."""
+        problem, blocks = self._problem, self._blocks
+        n = problem.n_exposures * 2 * problem.n_modes
+        if n <= DENSE_LIMIT:
+            return self._scale**2 * reduced_system.Direct(problem, blocks, self._gauge).covariance()
+        warn(
+            f"{n} coefficients: their covariance is approximated by one block an exposure (stars taken as known)",
+            AssumptionWarning,
+        )
+        size = 2 * problem.n_modes
+        out = np.zeros((problem.n_exposures, size, problem.n_exposures, size), dtype=np.float32)
+        index = np.arange(problem.n_exposures)
+        out[index, :, index, :] = self._scale**2 * np.linalg.inv(blocks.u)
+        return out.reshape(n, n)
+
+    @cached_property
+    def stars(self):
+        """Covariance xx, yy, xy of every star's position in the gauge, shape (3, n_stars), px^2."""
+        problem, blocks = self._problem, self._blocks
+        inverse = elimination.inverse_star_blocks(blocks.v)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            l00 = np.sqrt(inverse[0])
+            l10 = np.where(l00 > 0, inverse[2] / l00, 0)
+            l11 = np.sqrt(np.maximum(inverse[1] - l10**2, 0))
+        inner = np.concatenate(
+            [_block_diagonal(factor, self.coefficients) for factor in elimination.star_factors(problem, blocks)], axis=1
+        )
+        c00, c11, c01 = inner / self._scale**2
+        extra_xx = l00**2 * c00
+        extra_xy = l00 * (l10 * c00 + l11 * c01)
+        extra_yy = l10**2 * c00 + 2 * l10 * l11 * c01 + l11**2 * c11
+        out = self._scale**2 * (inverse + np.stack([extra_xx, extra_yy, extra_xy]))
+        out[:, blocks.v[0] <= 0] = np.nan
+        return out
+
+    @cached_property
+    def star_matrix(self):
+        """Covariance between all star positions in the gauge, shape (2 n_stars,) squared, px^2; all x first."""
+        problem, blocks = self._problem, self._blocks
+        inverse = elimination.inverse_star_blocks(blocks.v)
+        n = problem.n_stars
+        alone = np.zeros((2, n, 2, n))
+        index = np.arange(n)
+        alone[0, index, 0, index], alone[1, index, 1, index] = inverse[0], inverse[1]
+        alone[0, index, 1, index] = alone[1, index, 0, index] = inverse[2]
+        alone = alone.reshape(2 * n, 2 * n)
+        coupling = np.zeros((2, n, problem.n_exposures, 2 * problem.n_modes))
+        for i in range(problem.n_exposures):
+            part = problem.part(i)
+            f, b = blocks.coupling[:, :, part], blocks.values[:, part]
+            coupling[:, problem.star[part], i] = np.einsum("can,mn->cnam", f, b).reshape(2, b.shape[1], -1)
+        spread = alone @ coupling.reshape(2 * n, -1)
+        return self._scale**2 * alone + spread @ self.coefficients @ spread.T
+
+    def stored(self):
+        """The arrays that a file keeps."""
+        return {"coefficients": self.coefficients, "stars": self.stars}
+
+
+def _block_diagonal(factor, covariance):
+    """2 x 2 diagonal blocks xx, yy, xy of ``factor' C factor`` for factors (n, 2 n_stars), shape (3, n_stars)."""
+    half = factor.shape[1] // 2
+    product = covariance @ factor
+    x, y = factor[:, :half], factor[:, half:]
+    cx, cy = product[:, :half], product[:, half:]
+    return np.stack([np.einsum("nj,nj->j", a, b) for a, b in ((x, cx), (y, cy), (x, cy))])

@@ -1,0 +1,311 @@
+"""The weighted least-squares criterion J: residuals, derivatives and normal blocks. It knows no solver.
+
+``J = sum_ij r_ij' W_ij r_ij`` over residuals ``r = x_data - D_i(X_j)`` in detector pixels
+(Bernard et al. 2017, eq. of section 3.1, per axis and with correlated errors), plus Gaussian priors on the
+coefficients. With ``q = T_i(X)``, ``G = I + A grad b`` and ``J_ij = G R_i`` (2, 2), an observation
+contributes to the normal equations::
+
+    V_j  += J' W J           star block (2, 2)
+    U_i  += W (x) b b'       exposure block (2 n_modes, 2 n_modes)
+    E_ij  = (J' W) (x) b     coupling, kept as its factors F = J' W and b
+
+Arrays are ordered by exposure, coordinates first, so that every sweep reads memory once and in order.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ...geometry import basis
+from ...geometry.detector_modes import dynamic_basis
+from ...runtime.optional import has_fast
+from .unknowns import Unknowns
+
+#: Weight on steps along directions that are fixed, relative to that of the data.
+_HOLD = 1e4
+#: Number of observations from which compiled loops are used, if numba is installed.
+COMPILED_FROM = 30_000
+
+
+def is_compiled(n):
+    """Whether the compiled loops of `legdistort.solving.equations.compiled` serve a problem of n observations."""
+    return n >= COMPILED_FROM and has_fast()
+
+
+#: Smallest uncertainty of a static distortion that takes part in a fit, pixels.
+_SMALLEST = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Everything in J that does not change while it is minimised.
+
+    Attributes
+    ----------
+    degree : int
+        Total degree that is fitted; modes of the prior beyond it stay at the prior.
+    names : tuple of str
+    shapes : list of (ny, nx), one an exposure
+    n_stars : int
+    order : ndarray of int, shape (n,), or slice
+        Row of the table behind every observation.
+    start : ndarray of int, shape (n_exposures + 1,)
+        Observations ``start[i]:start[i + 1]`` belong to exposure i.
+    star : ndarray of int, shape (n,)
+        Ascending within an exposure.
+    xy : ndarray, shape (2, n)
+    weight : ndarray, shape (3, n)
+        Inverse covariance: xx, yy, xy [1/pix^2]; zero for an observation that is left out.
+    prior_mean : ndarray, shape (n_exposures, 2, n_all)
+    prior_sigma : ndarray, shape (n_exposures, 2, n_modes), or None
+    static_sigma : ndarray, shape (2, n_modes), or None
+        Uncertainty of the prior mean; of several priors the largest.
+    own_degree : int or None
+        Up to this degree exposures have modes of their own; None: nothing is shared. See `Unknowns`.
+    group : ndarray of int, shape (n_exposures,)
+        Detector of every exposure; exposures of one share what is not their own.
+    """
+
+    degree: int
+    names: tuple
+    shapes: list
+    n_stars: int
+    order: np.ndarray | slice
+    start: np.ndarray
+    star: np.ndarray
+    xy: np.ndarray
+    weight: np.ndarray
+    prior_mean: np.ndarray
+    prior_sigma: np.ndarray | None = None
+    static_sigma: np.ndarray | None = None
+    own_degree: int | None = None
+    group: np.ndarray | int = 0
+
+    @cached_property
+    def unequal(self):
+        """Whether some observation has different or correlated axis weights."""
+        return bool(np.any(self.weight[0] != self.weight[1]) or np.any(self.weight[2]))
+
+    @property
+    def compiled(self):
+        """Whether the compiled loops of `legdistort.solving.equations.compiled` serve this problem."""
+        return is_compiled(self.xy.shape[1])
+
+    @property
+    def n_exposures(self):
+        """Number of exposures."""
+        return len(self.shapes)
+
+    @cached_property
+    def unknowns(self):
+        """The unknown coefficients as one vector."""
+        return Unknowns(self.degree, self.own_degree, self.group, self.shapes)
+
+    @property
+    def has_prior(self):
+        """Whether widths of a prior take part in J."""
+        return self.prior_sigma is not None or (self.unknowns.shared and self.static_sigma is not None)
+
+    @property
+    def n_modes(self):
+        """Number of fitted modes per axis."""
+        return basis.n_modes(self.degree)
+
+    def has_widths(self, i):
+        """Whether the prior has widths for exposure i: neither infinite, which is free, nor zero, which is `fixed`."""
+        if self.prior_sigma is None:
+            return False
+        return bool(np.any((self.prior_sigma[i] > 0) & np.isfinite(self.prior_sigma[i])))
+
+    def n_free(self, i):
+        """Number of modes (of the axis that has more) without a prior width: stars that exposure i needs at least."""
+        return self.n_modes if self.prior_sigma is None else int(np.isinf(self.prior_sigma[i]).sum(axis=1).max())
+
+    @cached_property
+    def fixed(self):
+        """Directions of every exposure's coefficients that stay at the prior mean, for its width is zero there.
+
+        List of orthonormal rows (n_fixed, 2 n_modes); None if nothing is fixed.
+        """
+        if self.prior_sigma is None or np.all(self.prior_sigma > 0):
+            return None
+        rows = [dynamic_basis(shape, self.n_modes) for shape in self.shapes]
+        return [r[~np.any((r != 0) & (s.ravel() > 0), axis=1)] for r, s in zip(rows, self.prior_sigma, strict=True)]
+
+    def part(self, i):
+        """Observations of exposure i, as a slice."""
+        return slice(self.start[i], self.start[i + 1])
+
+    def scaled(self, factor):
+        """The same problem with all weights multiplied by `factor` (n,); zero leaves an observation out."""
+        return replace(self, weight=self.weight * factor)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The unknowns: positions (2, n_stars), coefficients (n_exposures, 2, n_all), poses (n_exposures, 2, 3)."""
+
+    positions: np.ndarray
+    coefficients: np.ndarray
+    poses: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """J and its normal equations at one state.
+
+    Attributes
+    ----------
+    chi2 : float
+        Data part of J.
+    penalty : float
+        Prior part of J.
+    residual : ndarray, shape (2, n)
+    v : ndarray, shape (3, n_stars)
+        Star blocks xx, yy, xy.
+    g_star : ndarray, shape (2, n_stars)
+    u : ndarray, shape (n_exposures, 2 n_modes, 2 n_modes)
+        Exposure blocks with the prior, x modes first.
+    u_data : ndarray
+        The same without the prior.
+    g_exposure : ndarray, shape (n_exposures, 2 n_modes)
+    coupling : ndarray, shape (2, 2, n)
+        F = J' W, star coordinate first.
+    values : ndarray, shape (n_modes, n)
+        Basis at every observation.
+    """
+
+    chi2: float
+    penalty: float
+    residual: np.ndarray
+    v: np.ndarray
+    g_star: np.ndarray
+    u: np.ndarray
+    u_data: np.ndarray
+    g_exposure: np.ndarray
+    coupling: np.ndarray
+    values: np.ndarray
+
+    @property
+    def cost(self):
+        """J: data and prior."""
+        return self.chi2 + self.penalty
+
+
+def prior_precision(problem, i):
+    """Inverse prior covariance (2 n_modes, 2 n_modes) of exposure i; none along its similarities and what is fixed.
+
+    A similarity of the coefficients is a change of the pose, which has no prior.
+    """
+    n = 2 * problem.n_modes
+    out = np.zeros((n, n))
+    if problem.unknowns.shared and problem.static_sigma is not None:
+        out = problem.unknowns.common_precision(np.maximum(problem.static_sigma.ravel(), _SMALLEST))[i]
+    if not problem.has_widths(i):
+        return out
+    sigma = np.minimum(problem.prior_sigma[i].ravel(), 1e6)  # infinity stands for free
+    others = dynamic_basis(problem.shapes[i], problem.n_modes)
+    others = others[np.any((others != 0) & (sigma > 0), axis=1)]
+    return out + others.T @ np.linalg.solve(others * sigma**2 @ others.T, others)
+
+
+def complement(rows):
+    """Orthonormal rows that span what the orthonormal `rows` (k, n) leave, shape (n - k, n)."""
+    return np.linalg.qr(rows.T, mode="complete")[0][:, len(rows) :].T
+
+
+def predict(problem, state, i, *, derivative=True):
+    """Model positions of the observations of exposure i, with what the normal equations need.
+
+    Returns
+    -------
+    position : ndarray, shape (2, n_i)
+    values : ndarray, shape (n_all, n_i)
+        Basis values.
+    jacobian : ndarray, shape (2, 2, n_i)
+        dD/dX, detector axis first. Only if `derivative`.
+    """
+    ny, nx = problem.shapes[i]
+    pose, a = state.poses[i], state.coefficients[i]
+    q = pose[:, :2] @ state.positions[:, problem.star[problem.part(i)]] + pose[:, 2:]
+    u, v = (2 * q[0] + 1) / nx - 1, (2 * q[1] + 1) / ny - 1
+    degree = basis.degree_of(a.shape[1])
+    if not derivative:
+        values = basis.values(degree, u, v)
+        return q + a @ values, values
+    values, du, dv = basis.gradients(degree, u, v)
+    gx, gy = a @ du * (2 / nx), a @ dv * (2 / ny)  # columns of G - I
+    gx[0] += 1
+    gy[1] += 1
+    r = pose[:, :2]
+    jacobian = np.stack([gx * r[0, 0] + gy * r[1, 0], gx * r[0, 1] + gy * r[1, 1]], axis=1)
+    return q + a @ values, values, jacobian
+
+
+def residuals(problem, state):
+    """``x_data - D(X)`` of every observation, shape (2, n) pixels, in the order of the problem."""
+    out = np.empty_like(problem.xy)
+    for i in range(problem.n_exposures):
+        part = problem.part(i)
+        out[:, part] = problem.xy[:, part] - predict(problem, state, i, derivative=False)[0]
+    return out
+
+
+def squares(problem, residual):
+    """``r' W r`` of every observation, shape (n,)."""
+    w, (x, y) = problem.weight, residual
+    return w[0] * x * x + w[1] * y * y + 2 * w[2] * x * y
+
+
+def linearise(problem, state):
+    """J and its normal equations at a state: one pass over the observations."""
+    if problem.compiled:
+        from . import compiled as kernels
+
+        values, coupling, residual, v, g_star, u, g_exposure, chi2 = kernels.linearise(problem, state)
+    else:
+        values, coupling, residual, v, g_star, u, g_exposure = _sums(problem, state)
+        chi2 = float(squares(problem, residual).sum())
+    u_data, penalty = u, 0.0
+    if problem.has_prior:
+        u = u.copy()
+        for i in range(problem.n_exposures):
+            precision = prior_precision(problem, i)
+            departure = (state.coefficients[i] - problem.prior_mean[i])[:, : problem.n_modes].ravel()
+            u[i] += precision
+            g_exposure[i] -= precision @ departure
+            penalty += float(departure @ precision @ departure)
+            if problem.fixed is not None:
+                rows = problem.fixed[i]
+                u[i] += _HOLD * np.trace(u_data[i]) / len(departure) * rows.T @ rows
+                g_exposure[i] -= rows.T @ (rows @ g_exposure[i])
+    return Blocks(chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values)
+
+
+def _sums(problem, state):
+    """The plain twin of `legdistort.solving.equations.compiled.linearise`."""
+    n_modes, n_exposures, n = problem.n_modes, problem.n_exposures, problem.xy.shape[1]
+    residual, values, coupling = np.empty((2, n)), np.empty((n_modes, n)), np.empty((2, 2, n))
+    v, g_star = np.zeros((3, problem.n_stars)), np.zeros((2, problem.n_stars))
+    u = np.empty((n_exposures, 2 * n_modes, 2 * n_modes))
+    g_exposure = np.empty((n_exposures, 2 * n_modes))
+    for i in range(n_exposures):
+        part = problem.part(i)
+        star, w = problem.star[part], problem.weight[:, part]
+        position, b, jac = predict(problem, state, i)
+        b = values[:, part] = b[:n_modes]
+        r = residual[:, part] = problem.xy[:, part] - position
+        f = coupling[:, :, part]
+        f[:, 0], f[:, 1] = jac[0] * w[0] + jac[1] * w[2], jac[0] * w[2] + jac[1] * w[1]
+        # a star stands once in an exposure, so plain indexed addition is right
+        v[0, star] += f[0, 0] * jac[0, 0] + f[0, 1] * jac[1, 0]
+        v[1, star] += f[1, 0] * jac[0, 1] + f[1, 1] * jac[1, 1]
+        v[2, star] += f[0, 0] * jac[0, 1] + f[0, 1] * jac[1, 1]
+        g_star[:, star] += f[:, 0] * r[0] + f[:, 1] * r[1]
+        wr = np.stack([w[0] * r[0] + w[2] * r[1], w[2] * r[0] + w[1] * r[1]])
+        g_exposure[i] = (wr @ b.T).ravel()
+        u[i, :n_modes, :n_modes] = (b * w[0]) @ b.T
+        u[i, n_modes:, n_modes:] = (b * w[1]) @ b.T if problem.unequal else u[i, :n_modes, :n_modes]
+        u[i, :n_modes, n_modes:] = u[i, n_modes:, :n_modes] = (b * w[2]) @ b.T if problem.unequal else 0.0
+    return values, coupling, residual, v, g_star, u, g_exposure

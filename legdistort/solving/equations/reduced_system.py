@@ -1,0 +1,355 @@
+"""The reduced system: stars eliminated, coefficients solved for under the constraints of the gauge.
+
+The reduced matrix ``S = U - E' V^-1 E`` is singular along maps common to all exposures, or nearly so; the
+constraints of the gauge, ``rows d = target``, fill in. Small systems are factorised (`Direct`), large ones solved by
+conjugate gradients that never form S (`Iterative`): the same answer.
+"""
+
+import logging
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from ...exceptions import SolveError
+from . import elimination
+from .criterion import complement
+
+log = logging.getLogger(__name__)
+
+#: Up to this many unknown coefficients the reduced matrix is factorised; beyond, conjugate gradients.
+DIRECT_LIMIT = 3000
+#: ... and while building it costs no more than this many multiplications.
+_DIRECT_COST = 4e9
+#: The data overrule the convention along a direction where that gains this much chi2 (five standard errors)...
+GAIN = 25.0
+#: ... and tell how far to an error below this many times the scatter of single exposures.
+_VAGUE = 3.0
+_SURE = 0.01  # curvature, relative to that of the coefficients, of a direction that is none of the gauge
+_WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not told
+_ROUNDING = 1e-9  # smallest curvature that means something, relative to that of the coefficients
+
+
+def reduced_system(problem, blocks, gauge):
+    """`Direct` or `Iterative`, by the size of the problem."""
+    return (Direct if uses_direct(problem) else Iterative)(problem, blocks, gauge)
+
+
+def uses_direct(problem):
+    """Whether the reduced system is small enough to be factorised; it always is where exposures share modes."""
+    n = problem.unknowns.size
+    return problem.unknowns.shared or (n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= _DIRECT_COST)
+
+
+class _Reduced:
+    """What both ways share.
+
+    Parameters
+    ----------
+    problem : Problem
+    blocks : Blocks
+    gauge : Gauge
+    """
+
+    n_weak = 0  # unknowns that the exposures share and that they do not tell
+
+    def __init__(self, problem, blocks, gauge):
+        self.problem, self.blocks, self.gauge = problem, blocks, gauge
+        self.unknowns = problem.unknowns
+        self.rows = self._on_unknowns(gauge)
+        self.inverse = elimination.inverse_star_blocks(blocks.v)
+
+    def _on_unknowns(self, gauge):
+        """The constraints as rows on the unknowns; those of the gauge act on the modes up to its own degree."""
+        n, size = len(gauge.motion), self.problem.n_modes
+        rows = gauge.orthonormal.reshape(gauge.n_constraints, n, 2, -1)
+        rows = np.pad(rows, ((0, 0), (0, 0), (0, 0), (0, size - rows.shape[3]))).reshape(-1, n, 2 * size)
+        return self.unknowns.gather(rows.transpose(1, 2, 0)).T
+
+    def _couple(self, d):
+        """E d, shape (2, n_stars)."""
+        return elimination.to_stars(self.problem, self.blocks, self.unknowns.spread(d))
+
+    def _gradient(self, own, stars):
+        """``own - E' V^-1 stars``, shape (n,)."""
+        moved = elimination.symmetric_times(self.inverse, stars)
+        return self.unknowns.gather(own - elimination.to_exposures(self.problem, self.blocks, moved))
+
+    def _own(self, d):
+        """U d."""
+        return np.einsum("iab,ib->ia", self.blocks.u, self.unknowns.spread(d))
+
+    def _stars(self, stars):
+        """Star step V^-1 (g_star - E d)."""
+        return elimination.symmetric_times(self.inverse, stars)
+
+    @cached_property
+    def rhs(self):
+        """Right-hand side (n,) of the reduced system: the gradient where the stars follow the coefficients."""
+        return self._gradient(self.blocks.g_exposure, self.blocks.g_star)
+
+    def contradicted(self, told):
+        """Combinations of the constraints that the data contradict by five standard errors or more.
+
+        Along affine maps the data say nothing. Along the others they say little, but with precise positions enough:
+        a static distortion of several pixels that the convention pushes into the star positions leaves residuals of
+        second order. Standard errors are taken at the observed scale if that is larger.
+
+        A map shows only through the distortions in which exposures differ, so where these are small, a trace of
+        anything that is not in the model looks like a map of many pixels. A direction that the data tell worse than to
+        three times the scatter of single exposures is left to the convention, therefore.
+
+        Parameters
+        ----------
+        told : ndarray, shape (n_constraints, n_told)
+            Combinations that are left to the data already, orthonormal.
+
+        Returns
+        -------
+        ndarray, shape (n_constraints, n_more)
+            Further ones, orthonormal and orthogonal to `told`.
+        """
+        kept = complement(np.hstack([told, self.gauge.affine]).T).T
+        inside = kept.T @ self.information @ kept
+        if told.shape[1]:
+            across = kept.T @ self.information @ told
+            inside -= across @ np.linalg.solve(told.T @ self.information @ told, across.T)
+        curvature, vectors = np.linalg.eigh(inside)
+        gain = (vectors.T @ (kept.T @ self.pull)) ** 2 / np.maximum(curvature, _ROUNDING * self.scale)
+        sure = curvature > _SURE * self.scale
+        if self.gauge.prior:  # widths: the curvature is theirs, and the convention is what they say
+            sure[:] = False
+        rest = (self.blocks.chi2 - gain.sum()) / max(self.dof, 1)
+        if self.dof > 0 and rest <= self.explained:
+            maps = self.gauge.left_to_data(kept @ vectors)
+            variance = max(1.0, rest) / np.maximum(curvature, _ROUNDING * self.scale) * np.sum(maps**2, axis=1)
+            sure |= (gain > GAIN * max(1.0, rest)) & (variance < _VAGUE**2 * np.sum(self.gauge.scatter**2))
+        return kept @ vectors[:, sure]
+
+    @property
+    def dof(self):
+        """Degrees of freedom under the gauge; widths of a prior and what is left to the data not allowed for."""
+        n_stars = np.count_nonzero(self.blocks.v[0] > 0)
+        return 2 * np.count_nonzero(self.problem.weight[0]) - 2 * n_stars - self.unknowns.size + len(self.rows)
+
+    @property
+    def explained(self):
+        """chi2/dof up to which the data, freed of a part of the convention, count as explained.
+
+        Two, or a tenth of what it is. Else the residuals have another cause, modes that are not fitted, say, which
+        bending the reference plane by hundreds of pixels can reduce as well.
+        """
+        return max(2.0, 0.1 * self.blocks.chi2 / self.dof)
+
+
+class Direct(_Reduced):
+    """The reduced matrix S, factorised together with the constraints of the gauge.
+
+    Raises
+    ------
+    SolveError
+        If S is singular beyond the gauge, naming the exposures concerned.
+    """
+
+    def __init__(self, problem, blocks, gauge):
+        super().__init__(problem, blocks, gauge)
+        s = elimination.reduced_matrix(problem, blocks)
+        self.scale = np.mean(np.diag(s))
+        s += self.scale * self.rows.T @ self.rows  # lifts the gauge directions; undone by the multipliers
+        # unit diagonal: coefficients of bright and faint exposures then compare
+        diagonal = np.diag(s).copy()
+        if self.unknowns.shared:  # what is left of a common distortion without the stars may be rounding
+            diagonal = np.diag(self.unknowns.matrix(blocks.u) + self.scale * self.rows.T @ self.rows)
+        self._unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
+        s *= self._unit[:, None]
+        s *= self._unit
+        if self.unknowns.shared:
+            self._hold_weak(s)
+        try:
+            self._factor = cho_factor(s, lower=True, overwrite_a=False, check_finite=True)
+            if np.diag(self._factor[0]).min() < 1e-7:
+                raise LinAlgError
+        except (LinAlgError, ValueError):
+            raise SolveError(_singular_message(problem, s)) from None
+        self._lifted = self._apply_inverse(self.rows.T)
+        self._border = np.linalg.inv(self.rows @ self._lifted)
+
+    def _hold_weak(self, s):
+        """Hold what neither dithers nor rolls tell of a common distortion: more rows, that keep to the start.
+
+        Raises
+        ------
+        SolveError
+            If that is all of it.
+        """
+        values, vectors = np.linalg.eigh(s)
+        weak = vectors[:, values < _WEAK]
+        self.n_weak = weak.shape[1]
+        if self.n_weak >= self.unknowns.n_common - 2 * (self.problem.own_degree == 0) * len(set(self.problem.group)):
+            raise SolveError(
+                "static='fit': these exposures cannot tell a distortion that they share from one of the sky; "
+                "dither by a good part of the field and turn the camera, or give a prior with static_sigma"
+            )
+        s += weak @ weak.T
+        self.rows = np.concatenate([self.rows, weak.T / self._unit])
+
+    def _apply_inverse(self, b):
+        unit = self._unit if b.ndim == 1 else self._unit[:, None]
+        return unit * cho_solve(self._factor, unit * b)
+
+    @cached_property
+    def information(self):
+        """What the data tell of the values of the constraints, shape (n_constraints,) squared.
+
+        Half the curvature of J along them, all else refitted; nothing but rounding along the exact directions.
+        """
+        n = self.gauge.n_constraints
+        out = np.linalg.inv(np.linalg.inv(self._border)[:n, :n]) if self.n_weak else self._border
+        out = out - self.scale * np.eye(n)
+        return (out + out.T) / 2
+
+    @cached_property
+    def pull(self):
+        """How the data pull at the values of the constraints (n_constraints,): minus half the slope of J along them."""
+        return (self._border @ (self._lifted.T @ self.rhs))[: self.gauge.n_constraints]
+
+    def solve(self, rhs, target):
+        """d (n,) that minimises d'Sd/2 - rhs'd with rows d = target."""
+        free = self._apply_inverse(rhs)
+        target = np.pad(target, (0, self.n_weak))
+        return free - self._lifted @ (self._border @ (self.rows @ free - target))
+
+    def step(self, target, told, accuracy):
+        """See `newton_step`; exact whatever the accuracy asked for."""
+        if told.shape[1]:
+            target = target - told @ (told.T @ target)
+            pull = told.T @ (self.pull - self.information @ target)
+            target = target + told @ np.linalg.solve(told.T @ self.information @ told, pull)
+        d = self.solve(self.rhs, target)
+        return self._stars(self.blocks.g_star - self._couple(d)), self.unknowns.spread(d)
+
+    def covariance(self):
+        """Covariance of the coefficients of all exposures in the gauge, shape (n_exposures * 2 n_modes,) squared."""
+        full = self._apply_inverse(np.eye(len(self._unit)))
+        out = full - self._lifted @ self._border @ self._lifted.T
+        return self.unknowns.covariance((out + out.T) / 2)
+
+
+def _singular_message(problem, s):
+    values, vectors = np.linalg.eigh(np.nan_to_num(s))
+    energy = (problem.unknowns.spread(vectors[:, 0]) ** 2).sum(axis=1)
+    worst = [problem.names[i] for i in np.argsort(energy)[::-1][:3] if energy[i] > 0.1]
+    return (
+        f"the observations do not determine the distortion of degree {problem.degree} "
+        f"(smallest eigenvalue {values[0]:.1e} of the normalised equations), above all in exposure {', '.join(worst)}: "
+        "lower the degree, add stars, or give a prior with sigma"
+    )
+
+
+class Iterative(_Reduced):
+    """Matrix-free solution of the reduced system on the constraints, preconditioned by the exposure blocks.
+
+    Projected conjugate gradients with the constraint preconditioner of Gould, Hribar & Nocedal (2001): every
+    iterate satisfies the constraints. The coupling E d of the iterate is carried along, so that neither the
+    right-hand side nor the stars need a pass of their own.
+    """
+
+    def __init__(self, problem, blocks, gauge):
+        super().__init__(problem, blocks, gauge)
+        self._block_inverses = [np.linalg.inv(block) for block in self.unknowns.blocks(blocks.u)]
+        self.scale = np.einsum("iaa->", blocks.u) / self.unknowns.size
+
+    def _block_solve(self, r):
+        done, out = 0, []
+        for inverse in self._block_inverses:
+            part = r[done : done + inverse.shape[0] * inverse.shape[1]]
+            out.append(np.einsum("iab,ib->ia", inverse, part.reshape(inverse.shape[:2])).ravel())
+            done += len(part)
+        return np.concatenate(out)
+
+    @cached_property
+    def _moves(self):
+        """Changes of the coefficients (n_constraints, n), each moving one constraint by one, all else fitted."""
+        nothing = np.zeros_like(self.blocks.g_exposure), np.zeros_like(self.blocks.g_star)
+        return np.stack([self._solve(*nothing, self.rows, unit, 1e-5)[1] for unit in np.eye(len(self.rows))])
+
+    @cached_property
+    def information(self):
+        """As for `Direct`."""
+        products = np.stack([self._gradient(self._own(d), self._couple(d)) for d in self._moves])
+        out = self._moves @ products.T
+        return (out + out.T) / 2
+
+    @cached_property
+    def pull(self):
+        """As for `Direct`."""
+        return self._moves @ self.rhs
+
+    def step(self, target, told, accuracy):
+        """See `newton_step`."""
+        kept = complement(told.T)
+        if told.shape[1]:
+            accuracy *= 1e-3  # a small residual is a long way where the curvature is small
+        gradients = self.blocks.g_exposure, self.blocks.g_star
+        stars, d = self._solve(*gradients, kept @ self.rows, kept @ target, accuracy)
+        return stars, self.unknowns.spread(d)
+
+    def contradicted(self, told):
+        """As for `Direct`, but looked for only where chi2 shows that something is amiss: it takes many passes."""
+        if self.blocks.chi2 < self.dof + 5 * np.sqrt(2 * max(self.dof, 1)):
+            return np.zeros((len(self.rows), 0))
+        return super().contradicted(told)
+
+    def _solve(self, g_exposure, g_star, rows, target, tolerance, *, max_iterations=1000):
+        """Star step (2, n_stars) and step of the unknown coefficients for gradients, with rows d = target."""
+        lifted = np.stack([self._block_solve(row) for row in rows], axis=1)
+        border = np.linalg.inv(rows @ lifted)
+
+        def precondition(r):
+            z = self._block_solve(r)
+            return z - lifted @ (border @ (rows @ z))
+
+        d = lifted @ (border @ target)
+        stars = g_star - self._couple(d)
+        r = self._gradient(g_exposure - self._own(d), stars)
+        z = precondition(r)
+        p, rz = z, r @ z
+        goal = max(tolerance**2 * rz, 1e-16 * len(r))  # r'z is in units of chi2: below, only rounding is left
+        for count in range(max_iterations):
+            if rz <= goal:
+                log.debug("conjugate gradients: %d steps", count)
+                break
+            ep = self._couple(p)
+            sp = self._gradient(self._own(p), ep)
+            length = rz / (p @ sp)
+            d = d + length * p
+            r = r - length * sp
+            stars = stars - length * ep
+            z = precondition(r)
+            rz, old = r @ z, rz
+            p = z + rz / old * p
+        else:
+            log.info("conjugate gradients stopped after %d steps at %.1e of the start", max_iterations, np.sqrt(rz))
+        return self._stars(stars), d
+
+
+def newton_step(problem, blocks, gauge, departure, *, accuracy=1e-10):
+    """Gauss-Newton step under the constraints of the gauge.
+
+    Parameters
+    ----------
+    problem : Problem
+    blocks : Blocks
+    gauge : Gauge
+    departure : ndarray, shape (n_exposures, 2 n_modes)
+        A_i - A_0 at the current state.
+    accuracy : float
+        Where conjugate gradients may stop, relative to the size of the step.
+
+    Returns
+    -------
+    d_star : ndarray, shape (2, n_stars)
+    d_exposure : ndarray, shape (n_exposures, 2 n_modes)
+    """
+    target = -gauge.violation(departure)
+    return reduced_system(problem, blocks, gauge).step(target, np.zeros((len(target), 0)), accuracy)

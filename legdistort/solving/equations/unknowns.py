@@ -1,0 +1,151 @@
+"""Which coefficients are unknowns of their own, and which the exposures of a detector share.
+
+Usually every exposure has coefficients of its own. In a self-calibration (Anderson & King 2003) it has little more than
+its pose, and the rest is one static distortion for all exposures of a detector. Either way the normal equations are
+built per exposure, and gathered here.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ...geometry import basis
+from ...geometry.detector_modes import dynamic_basis, similarity_basis
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """The unknown coefficients of a problem as one vector.
+
+    First those that every exposure has for itself, then those of every group. Exposures always have a similarity of
+    their own, which becomes their pose.
+
+    Attributes
+    ----------
+    degree : int
+        Total degree of the distortion.
+    own_degree : int or None
+        Up to this degree exposures have modes of their own; 0 leaves them the similarity alone; None shares nothing.
+    group : ndarray of int, shape (n_exposures,)
+        Exposures with the same number share the rest.
+    shapes : list of (ny, nx)
+        By exposure; one in a group.
+    """
+
+    degree: int
+    own_degree: int | None
+    group: np.ndarray
+    shapes: list
+
+    @property
+    def shared(self):
+        """Whether exposures share anything."""
+        return self.own_degree is not None
+
+    @property
+    def n_modes(self):
+        """Modes per axis of an exposure."""
+        return basis.n_modes(self.degree)
+
+    @property
+    def gauge_degree(self):
+        """Degree of the maps of the reference plane that exposures can take back."""
+        return max(1, self.own_degree) if self.shared else self.degree
+
+    @cached_property
+    def _rows(self):
+        """Orthonormal rows of what is own and of what is common, per group, (n_groups, k, 2 n_modes) each."""
+        n, own, common = self.n_modes, [], []
+        for g in range(int(self.group.max()) + 1):
+            shape = self.shapes[int(np.argmax(self.group == g))]
+            rows = dynamic_basis(shape, n)
+            degree = np.concatenate([[1, 1], np.tile(np.add(*basis.orders(self.degree))[3:], 2)])
+            mine = degree <= self.own_degree
+            own.append(np.concatenate([similarity_basis(shape, n), rows[mine]]))
+            common.append(rows[~mine])
+        return np.stack(own), np.stack(common)
+
+    @property
+    def n_own(self):
+        """Unknowns that every exposure has for itself."""
+        return self._rows[0].shape[1] if self.shared else 2 * self.n_modes
+
+    @property
+    def n_common(self):
+        """Unknowns that exposures share, of all groups."""
+        return self._rows[1].shape[0] * self._rows[1].shape[1] if self.shared else 0
+
+    @property
+    def size(self):
+        """Length of the vector."""
+        return len(self.group) * self.n_own + self.n_common
+
+    def spread(self, unknowns):
+        """The vector (size,) as coefficients of every exposure, (n_exposures, 2 n_modes)."""
+        n = len(self.group)
+        if not self.shared:
+            return unknowns.reshape(n, -1)
+        own, common = self._rows
+        split = n * self.n_own
+        out = np.einsum("ik,ikm->im", unknowns[:split].reshape(n, -1), own[self.group])
+        return out + np.einsum("gk,gkm->gm", unknowns[split:].reshape(len(common), -1), common)[self.group]
+
+    def gather(self, gradient):
+        """The transpose of `spread`: (n_exposures, 2 n_modes, ...) -> (size, ...)."""
+        n, rest = len(self.group), gradient.shape[2:]
+        if not self.shared:
+            return gradient.reshape(-1, *rest)
+        own, common = self._rows
+        mine = np.einsum("ikm,im...->ik...", own[self.group], gradient)
+        total = np.zeros((len(common), *gradient.shape[1:]))
+        np.add.at(total, self.group, gradient)
+        theirs = np.einsum("gkm,gm...->gk...", common, total)
+        return np.concatenate([mine.reshape(n * self.n_own, *rest), theirs.reshape(-1, *rest)])
+
+    def matrix(self, blocks):
+        """Exposure blocks (n_exposures, 2 n_modes, 2 n_modes) as one matrix on the vector, (size, size)."""
+        out = np.zeros((self.size, self.size))
+        k, split = self.n_own, len(self.group) * self.n_own
+        for i, block in enumerate(blocks):
+            mine = slice(i * k, (i + 1) * k)
+            if not self.shared:
+                out[mine, mine] = block
+                continue
+            own, common = (rows[self.group[i]] for rows in self._rows)
+            theirs = slice(split + self.group[i] * len(common), split + (self.group[i] + 1) * len(common))
+            out[mine, mine] = own @ block @ own.T
+            out[mine, theirs] = own @ block @ common.T
+            out[theirs, mine] = out[mine, theirs].T
+            out[theirs, theirs] += common @ block @ common.T
+        return out
+
+    def blocks(self, blocks):
+        """Diagonal blocks of that matrix: of the exposures, and of the groups if there is something in common."""
+        if not self.shared:
+            return [blocks]
+        own, common = self._rows
+        total = np.zeros((len(common), *blocks.shape[1:]))
+        np.add.at(total, self.group, blocks)
+        mine = own[self.group]
+        return [mine @ blocks @ mine.transpose(0, 2, 1), common @ total @ common.transpose(0, 2, 1)]
+
+    def keep_common(self, before, after):
+        """Coefficients (n_exposures, 2 n_modes) with what is own of `after` and what is common of `before`."""
+        if not self.shared:
+            return after
+        own = self._rows[0][self.group]
+        return before + np.einsum("ikm,ikn,in->im", own, own, after - before)
+
+    def common_precision(self, sigma):
+        """What widths (2 n_modes,) say of the common part, a share for each exposure: (n_exposures, 2 n_modes, ...)."""
+        common = self._rows[1]
+        whole = common.transpose(0, 2, 1) @ np.linalg.solve(common * sigma**2 @ common.transpose(0, 2, 1), common)
+        return (whole / np.bincount(self.group)[:, None, None])[self.group]
+
+    def covariance(self, matrix):
+        """Covariance (size, size) of the vector as that of the coefficients, (n_exposures * 2 n_modes,) squared."""
+        if not self.shared:
+            return matrix
+        spread = np.stack([self.spread(unit).ravel() for unit in np.eye(self.size)], axis=1)
+        return spread @ matrix @ spread.T

@@ -1,0 +1,1 @@
+"""What the data do not determine, and the convention that fixes it."""

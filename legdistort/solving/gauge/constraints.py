@@ -1,0 +1,207 @@
+"""Making the gauge of a problem: constraints, their weights, and the poses that carry the similarities."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...exceptions import SolveError
+from ...geometry import basis
+from ...geometry.detector_modes import dynamic_basis, similarity_basis, similarity_part
+from ...results.gauge import Gauge
+from ...runtime.checks import check_choice
+from ..equations.criterion import State, complement
+from .dynamic_scatter import conditional_errors, dynamic_covariance, say
+
+KINDS = ("minimal", "mean")
+#: Below this the constraints of the "mean" gauge leave a direction free.
+_MEAN_LIMIT = 1e-3
+_SETTLED = 0.01  # of a map that an exposure cannot take back: less, and the data hardly tell of it
+_CORNERS = np.array([[-1, 1, 1, -1.0], [-1, -1, 1, 1.0]])
+
+
+def make(kind, problem, state, blocks, *, told=None, common=None, dynamic=None):
+    """The gauge at a state, its weights from the blocks of the criterion and the scatter seen there.
+
+    Maps `told` (n_told, 2 n_modes) of the reference plane are left to the data: see `Gauge`. It holds the plane at the
+    map `common` (2 n_modes,) from where the convention by itself would. The covariance `dynamic` of single exposures,
+    (n_exposures, 2 n_modes, 2 n_modes), is estimated if not given.
+
+    Raises
+    ------
+    InputError
+        For an unknown kind.
+    SolveError
+        If the "mean" gauge leaves a direction free, as for rolls that cancel.
+    """
+    check_choice(kind, KINDS, "gauge")
+    shears = problem.own_degree is None and not (problem.fixed and any(rows[:, 1:3].any() for rows in problem.fixed))
+    problem, state, blocks = own_part(problem, state, blocks)
+    box = reference_box(problem, state)
+    motion = _motion(problem, state.poses, box)
+    if kind == "mean":
+        _check_mean(motion)
+    similar = _by_shape(similarity_basis, problem)
+    others = _by_shape(dynamic_basis, problem)
+    held = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
+    error = conditional_errors(blocks.u_data)
+    if dynamic is None:
+        dynamic = dynamic_covariance(problem, state, error, motion, others)
+    if kind == "mean":
+        constraint = np.broadcast_to(np.eye(motion.shape[1])[:, None], (motion.shape[1], *motion.shape[:2])).copy()
+    else:
+        constraint = _minimal_constraint(motion, error, dynamic, similar, others, box, held=held)
+        told = _settled(problem, constraint, motion, box) if told is None else told
+    made = Gauge(kind, constraint, motion, dynamic, box, problem.static_sigma, bool(held.any()), told, shears=shears)
+    if common is None:
+        return made
+    moved = np.einsum("ika,ikb,ibc,c->ia", others, others, motion, common, optimize=True)  # poses take the rest
+    return replace(made, values=-made.orthonormal @ moved.ravel())
+
+
+def _settled(problem, constraint, motion, box):
+    """Maps (n, 2 n_modes) of the reference plane that some exposure cannot take back, for what is fixed in it; or None.
+
+    They are left to the data; what remains of the constraint is its part for the maps that all exposures take back.
+    """
+    if problem.fixed is None:
+        return None
+    moved = np.concatenate([rows @ n for rows, n in zip(problem.fixed, motion, strict=True)])
+    _, size, maps = np.linalg.svd(moved)
+    n = np.count_nonzero(size > _SETTLED * np.sqrt(problem.n_exposures))
+    common = similarity_basis(2 * box[1, ::-1], problem.n_modes)
+    rows = maps[n:] @ np.concatenate([complement(common), common]).T
+    return complement(rows @ np.einsum("aib,ibc->ac", constraint, motion)) if n else None
+
+
+def own_part(problem, state, blocks):
+    """The same with those modes alone that can take back a common map, where exposures share the others."""
+    unknowns = problem.unknowns
+    if not unknowns.shared:
+        return problem, state, blocks
+    n = basis.n_modes(unknowns.gauge_degree)
+    rows = np.concatenate([np.arange(n), problem.n_modes + np.arange(n)])
+    sigma, static = problem.prior_sigma, problem.static_sigma
+    own = replace(
+        problem,
+        degree=unknowns.gauge_degree,
+        prior_mean=problem.prior_mean[:, :, :n],
+        prior_sigma=None if sigma is None else sigma[:, :, :n],
+        static_sigma=None if static is None else static[:, :n],
+        own_degree=None,
+        group=None,
+    )
+    inner = replace(blocks, u=blocks.u[:, rows[:, None], rows], u_data=blocks.u_data[:, rows[:, None], rows])
+    return own, State(state.positions, state.coefficients[:, :, :n], state.poses), inner
+
+
+def _minimal_constraint(motion, error, dynamic, similar, others, box, *, held):
+    """Rows ``N_i' W_i``: those of all but the common similarities see the departures without their similarity part.
+
+    With prior widths (exposures `held`) the weight is that of the prior alone: the constraint is then where the prior
+    by itself would settle, and the covariance under it that of truths drawn from the prior.
+    """
+    spread = dynamic + np.where(held, 0, 1)[:, None, None] * error
+    inner = others @ spread @ others.transpose(0, 2, 1)
+    weight = others.transpose(0, 2, 1) @ np.linalg.solve(inner, others) if others.shape[1] else np.zeros_like(error)
+    weight = np.where(held, 1, say(error, others))[:, None, None] * weight
+    pose_weight = say(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
+    common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
+    pulled = motion.transpose(0, 2, 1)
+    rows = np.concatenate([complement(common) @ pulled @ weight, common @ pulled @ pose_weight], axis=1)
+    return rows.transpose(1, 0, 2)
+
+
+def reference_box(problem, state):
+    """Centre and half size (2, 2) of the box of the reference plane that all detectors cover."""
+    scale = np.sqrt(np.abs(np.linalg.det(state.poses[:, :, :2])))
+    usual = np.abs(np.log(scale / np.median(scale))) < np.log(2)  # a mismatched exposure may have any scale
+    ends = _by_shape(lambda shape, _: basis.denormalize(_CORNERS[0], _CORNERS[1], shape), problem)[usual]
+    pose_list = state.poses[usual]
+    corners = _apply_inverse(pose_list, ends).reshape(-1, 2)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    return np.stack([(low + high) / 2, (high - low) / 2])
+
+
+def _by_shape(function, problem):
+    """``function(shape, n_modes)`` of every exposure, computed once a shape, stacked."""
+    made = {shape: function(shape, problem.n_modes) for shape in set(problem.shapes)}
+    return np.stack([made[shape] for shape in problem.shapes])
+
+
+def _motion(problem, pose_list, box):
+    """N_i, to first order in the distortion: a displacement g of the reference plane moves q by R g(T^-1 q)."""
+    degree, size = problem.degree, problem.n_modes
+    u, v, w = basis.quadrature(degree)
+    nodes = _by_shape(lambda shape, _: basis.denormalize(u, v, shape), problem)
+    linear = pose_list[:, :, :2]
+    back = _apply_inverse(pose_list, nodes)
+    reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
+    mixing = np.einsum("mk,nik->imn", basis.values(degree, u, v) * w, reference, optimize=True)
+    return np.einsum("iab,imn->iambn", linear, mixing).reshape(-1, 2 * size, 2 * size)
+
+
+def _check_mean(motion):
+    """Refuse the "mean" gauge where the mean of N_i loses a direction that single exposures have."""
+    mean = motion.mean(axis=0)
+    power = np.einsum("iba,ibc->ac", motion, motion) / len(motion)
+    ratio = np.linalg.eigvals(np.linalg.solve(power, mean.T @ mean)).real.min()
+    if ratio < _MEAN_LIMIT:
+        raise SolveError(
+            "gauge='mean' leaves a common map of the reference plane free: the orientations of these exposures cancel "
+            f"in the mean (ratio {max(ratio, 0):.1e}), as for rolls of 0, 90, 180 and 270 degrees; use gauge='minimal'"
+        )
+
+
+def absorb_similarities(problem, state):
+    """Move the similarity part of every dynamic distortion into its pose; D_i stays what it is.
+
+    ``q' = S q`` and ``A' b(q') = q - q' + A b(S^-1 q')``, a polynomial of the same degree, so the change is exact
+    (prior modes beyond the fitted degree excepted: they stay with the detector).
+
+    Returns
+    -------
+    State
+    float
+        Largest move of a detector corner, pixels.
+    """
+    n_modes = problem.n_modes
+    degree = basis.degree_of(state.coefficients.shape[2])
+    u, v, w = basis.quadrature(degree)
+    project = (basis.values(degree, u, v) * w).T
+    nodes = _by_shape(lambda shape, _: basis.denormalize(u, v, shape), problem)
+    ends = _by_shape(lambda shape, _: basis.denormalize(_CORNERS[0], _CORNERS[1], shape), problem)
+    pixels = np.array(problem.shapes)[:, None, ::-1]
+    coefficients, pose_list, largest = state.coefficients.copy(), state.poses, 0.0
+    for _ in range(4):
+        departure = (coefficients - problem.prior_mean)[:, :, :n_modes]
+        shift = similarity_part(departure, problem.shapes)
+        move = float(np.abs(_apply(shift, ends) - ends).max())
+        largest = max(largest, move)
+        if move < 1e-9:
+            break
+        linear = np.linalg.inv(shift[:, :, :2])
+        old = (nodes - shift[:, None, :, 2]) @ linear.transpose(0, 2, 1)
+        values = basis.values(degree, *np.moveaxis((2 * old + 1) / pixels - 1, -1, 0))
+        changed = ((old - nodes).transpose(0, 2, 1) + np.einsum("iam,mik->iak", coefficients, values)) @ project
+        coefficients[:, :, :n_modes] = changed[:, :, :n_modes]
+        turned = shift[:, :, :2] @ pose_list
+        turned[:, :, 2] += shift[:, :, 2]
+        pose_list = turned
+    if problem.unknowns.shared:  # what is common stays with the detector as well
+        before, after = (a[:, :, :n_modes].reshape(len(a), -1) for a in (state.coefficients, coefficients))
+        coefficients[:, :, :n_modes] = problem.unknowns.keep_common(before, after).reshape(-1, 2, n_modes)
+    if problem.fixed is not None:
+        for a, mean, rows in zip(coefficients, problem.prior_mean, problem.fixed, strict=True):
+            departure = (a - mean)[:, :n_modes].ravel()
+            a[:, :n_modes] -= (rows.T @ (rows @ departure)).reshape(2, -1)
+    return State(state.positions, coefficients, pose_list), largest
+
+
+def _apply(pose_list, xy):
+    """Poses (n, 2, 3) applied to positions (n, k, 2)."""
+    return xy @ pose_list[:, :, :2].transpose(0, 2, 1) + pose_list[:, None, :, 2]
+
+
+def _apply_inverse(pose_list, xy):
+    """Positions (n, k, 2) carried back through poses (n, 2, 3)."""
+    return (xy - pose_list[:, None, :, 2]) @ np.linalg.inv(pose_list[:, :, :2]).transpose(0, 2, 1)

@@ -1,0 +1,286 @@
+"""Two ways to minimise the criterion: jointly (Gauss-Newton) and, as published, alternately.
+
+The joint solver eliminates the stars (Schur complement), solves for the coefficients under the constraints of
+the gauge and substitutes back: the structure of bundle adjustment (Triggs et al. 2000), with exposures for
+cameras and stars for points.
+"""
+
+import contextlib
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..exceptions import ConvergenceWarning, SolveError, warn
+from ..geometry import basis
+from ..results.gauge import Gauge
+from ..runtime.checks import check_choice
+from .equations import criterion, elimination, reduced_system
+from .equations.criterion import State
+from .gauge import constraints
+
+log = logging.getLogger(__name__)
+
+LOSSES = ("linear", "huber", "cauchy")
+_TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Where a minimisation ended.
+
+    Attributes
+    ----------
+    state : State
+    blocks : Blocks
+        J and its normal equations there.
+    gauge : Gauge
+    converged : bool
+    status : str
+        What happened, in a sentence.
+    history : list of dict
+        J, the largest changes of positions and coefficients [pix], one entry an iteration.
+    robust : ndarray, shape (n,)
+        Factors on the weights from the loss (ones for a linear one).
+    n_weak : int
+        Unknowns of a distortion common to all exposures that these do not tell.
+    """
+
+    state: State
+    blocks: criterion.Blocks
+    gauge: Gauge
+    converged: bool
+    status: str
+    history: list
+    robust: np.ndarray
+    n_weak: int = 0
+
+
+def loss_factors(squares, loss):
+    """Weight factors of iteratively reweighted least squares for the squared normalised residuals (n,).
+
+    The loss works at the observed scale if that is larger than the stated errors (median of the squares
+    against its expectation for two axes, 2 ln 2).
+    """
+    seen = squares[squares > 0]
+    scale2 = max(1.0, np.median(seen) / (2 * np.log(2))) if len(seen) else 1.0
+    s = squares / (scale2 * _TUNING[loss] ** 2)
+    return 1 / np.maximum(1, np.sqrt(s)) if loss == "huber" else 1 / (1 + s)
+
+
+def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", max_iterations=50, tolerance=5e-5):
+    """Gauss-Newton on all unknowns under the constraints of the gauge.
+
+    Parameters
+    ----------
+    problem : Problem
+    state : State
+        Start values, see `legdistort.solving.start_values.start`.
+    gauge : {"minimal", "mean"}
+    common : ndarray, shape (2 n_modes,), optional
+        Map of the reference plane at which to hold what the data do not tell, see
+        `legdistort.solving.gauge.constraints.make`.
+    loss : {"linear", "huber", "cauchy"}
+    max_iterations : int
+    tolerance : float
+        Converged when the next step would be below this many standard errors, rms over the unknowns; it is not taken.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    SolveError
+        If the unknowns are not determined.
+    """
+    check_choice(loss, LOSSES, "loss")
+    state, _ = constraints.absorb_similarities(problem, state)
+    run = _Descent(problem, state, gauge=gauge, common=common, loss=loss)
+    run.descend(max_iterations, tolerance)
+    while run.converged and (freer := run.freer()) is not None:
+        with contextlib.suppress(SolveError):
+            freer.descend(max_iterations, tolerance)
+        if not (freer.converged and freer.is_explained(run)):
+            break
+        run = freer
+    convention = run.convention
+    if convention.told is not None:
+        convention = _declared(convention, run.weighted, run.blocks, _departure(problem, run.state))
+    status = f"converged after {len(run.history)} iterations"
+    if not run.converged:
+        status = (
+            f"not converged after {max_iterations} iterations: the last step was {run.history[-1]['step']:.2g} "
+            "standard errors; look for mismatched stars (loss='cauchy'), or lower the degree"
+        )
+        warn(status, ConvergenceWarning)
+    return Result(run.state, run.blocks, convention, run.converged, status, run.history, run.factors, run.system.n_weak)
+
+
+class _Descent:
+    """Gauss-Newton iterations under one set of constraints."""
+
+    def __init__(self, problem, state, *, gauge, common, loss, told=None, history=()):
+        self.problem, self.state, self.settings = problem, state, {"gauge": gauge, "common": common, "loss": loss}
+        self.told, self.history, self.converged = told, list(history), False
+        self._reweight(criterion.residuals(problem, state) if loss != "linear" else None)
+        self.blocks = criterion.linearise(self.weighted, state)
+        self._prepare()
+
+    def _reweight(self, residuals):
+        if self.settings["loss"] == "linear":
+            self.factors, self.weighted = np.ones(self.problem.xy.shape[1]), self.problem
+            return
+        self.factors = loss_factors(criterion.squares(self.problem, residuals), self.settings["loss"])
+        self.weighted = self.problem.scaled(self.factors)
+
+    def _prepare(self):
+        """The gauge and the reduced system at the current state."""
+        gauge, common = self.settings["gauge"], self.settings["common"]
+        self.convention = constraints.make(gauge, self.weighted, self.state, self.blocks, told=self.told, common=common)
+        self.system = reduced_system.reduced_system(self.weighted, self.blocks, self.convention)
+
+    def descend(self, max_iterations, tolerance):
+        """Iterate until the next step would be below `tolerance`."""
+        accuracy, size = 1e-3, np.inf
+        for _ in range(max_iterations):
+            target = -self.convention.violation(_departure(self.problem, self.state))
+            d_star, d_exposure = self.system.step(target, self.convention.told_rows, accuracy)
+            size, last = _step_size(self.blocks, d_star, d_exposure), size
+            self.history.append(
+                {
+                    "cost": self.blocks.cost,
+                    "d_positions": float(np.abs(d_star).max()),
+                    "d_coefficients": float(np.abs(d_exposure).max()),
+                    "step": size,
+                }
+            )
+            log.debug("J = %.8g, step %.2g standard errors", self.blocks.cost, size)
+            if size < tolerance:
+                self.converged = True
+                return
+            if size > 0.1 * last:  # slow: exposures hang together weakly, and inner iterations must be more exact
+                accuracy = max(0.01 * accuracy, 1e-10)
+            cost, self.blocks, self.system = self.blocks.cost, None, None  # makes room for the next
+            self.state, self.blocks = _advance(self.weighted, self.state, cost, d_star, d_exposure)
+            if self.settings["loss"] != "linear":
+                self._reweight(self.blocks.residual)
+                self.blocks = criterion.linearise(self.weighted, self.state)
+            self._prepare()
+
+    def freer(self):
+        """The same, less what the data contradict of the convention; None if they contradict nothing."""
+        if self.settings["gauge"] != "minimal" or self.settings["common"] is not None:
+            return None
+        rows = self.convention.told_rows
+        more = self.system.contradicted(rows)
+        if not more.shape[1]:
+            return None
+        log.debug("the data contradict the convention along %d directions", more.shape[1])
+        told = self.convention.left_to_data(np.hstack([rows, more]))
+        return _Descent(self.problem, self.state, told=told, history=self.history, **self.settings)
+
+    def is_explained(self, before):
+        """Whether the data are explained now, or the distortion is shared and the convention plainly not needed."""
+        return self.problem.unknowns.shared or self.blocks.chi2 <= self.system.dof * before.system.explained
+
+
+def _declared(convention, problem, blocks, departure):
+    """The gauge held at the values that the data tell, with their covariance: errors relative to it stay relative."""
+    rows = convention.told_rows
+    information = rows.T @ reduced_system.reduced_system(problem, blocks, convention).information @ rows
+    held = np.zeros(len(rows)) if convention.values is None else convention.values
+    values = held + rows @ (rows.T @ (convention.orthonormal @ departure.ravel() - held))
+    return replace(convention, values=values, told_covariance=np.linalg.inv(information))
+
+
+def _departure(problem, state):
+    """A_i - A_0 in the modes of the gauge, (n_exposures, 2 n_modes)."""
+    n_modes = basis.n_modes(problem.unknowns.gauge_degree)
+    return (state.coefficients - problem.prior_mean)[:, :, :n_modes].reshape(problem.n_exposures, -1)
+
+
+def _step_size(blocks, d_star, d_exposure):
+    """Rms step in standard errors, from the diagonal blocks (stars and exposures conditionally on each other)."""
+    stars = (elimination.symmetric_times(blocks.v, d_star) * d_star).sum()
+    exposures = np.einsum("ia,iab,ib->", d_exposure, blocks.u, d_exposure)
+    return float(np.sqrt((stars + exposures) / (d_star.size + d_exposure.size)))
+
+
+def _advance(problem, state, cost, d_star, d_exposure):
+    """Take the step, halved while it makes J much larger, and hand the similarities to the poses."""
+    n_modes = problem.n_modes
+    for halving in range(10):
+        factor = 0.5**halving
+        coefficients = state.coefficients.copy()
+        coefficients[:, :, :n_modes] += factor * d_exposure.reshape(-1, 2, n_modes)
+        tried = State(state.positions + factor * d_star, coefficients, state.poses)
+        tried, _ = constraints.absorb_similarities(problem, tried)
+        new = criterion.linearise(problem, tried)
+        # the constraints may cost a little J along directions that are only nearly free
+        if new.cost <= 1.5 * cost + 10 * problem.xy.size:
+            return tried, new
+    raise SolveError(
+        "the minimisation diverges: no step, however short, keeps the residuals in bounds; the start is too far off "
+        "(wrong poses or many mismatched stars?)"
+    )
+
+
+def solve_alternating(problem, state, *, gauge="minimal", max_iterations=1000, tolerance=1e-5):
+    """The paper's scheme (section 3.2): stars given A, coefficients given X, until both change by less than 1e-5.
+
+    The norms in its two stopping rules are taken as Euclidean over all unknowns. Where it ends along the directions
+    that the data do not tell depends on the start and the number of sweeps, so compare with `solve_joint` only
+    what is left after a common map of the fitted degree.
+
+    Parameters
+    ----------
+    problem : Problem
+    state : State
+        The static distortion as starting point, see `legdistort.solving.start_values.start`.
+    gauge : {"minimal", "mean"}
+        Convention in which errors are reported.
+    max_iterations : int
+        Cap on the sweeps.
+    tolerance : float
+
+    Returns
+    -------
+    Result
+    """
+    n_modes, history, converged = problem.n_modes, [], False
+    blocks = criterion.linearise(problem, state)
+    for _sweep in range(1, max_iterations + 1):
+        before = state
+        for _ in range(3):  # stars given A: a few Newton steps, each star by itself
+            step = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
+            state = State(state.positions + step, state.coefficients, state.poses)
+            blocks = criterion.linearise(problem, state)
+            if np.abs(step).max() < 1e-9:
+                break
+        coefficients = state.coefficients.copy()  # coefficients given X: linear, each exposure by itself
+        change = np.linalg.solve(blocks.u, blocks.g_exposure[..., None])[..., 0]
+        coefficients[:, :, :n_modes] += change.reshape(-1, 2, n_modes)
+        state = State(state.positions, coefficients, state.poses)
+        blocks = criterion.linearise(problem, state)
+        c_a = _relative_change(before.coefficients, state.coefficients)
+        c_x = _relative_change(before.positions, state.positions)
+        history.append({"cost": blocks.cost, "c_a": c_a, "c_x": c_x})
+        if c_a <= tolerance and c_x <= tolerance:
+            converged = True
+            break
+    status = f"converged after {len(history)} sweeps (|dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e})"
+    if not converged:
+        status = (
+            f"stopped after {max_iterations} sweeps with |dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e}: the coefficients "
+            "drift along directions that the data do not tell; method='joint' fixes these"
+        )
+        warn(status, ConvergenceWarning)
+    state, _ = constraints.absorb_similarities(problem, state)
+    blocks = criterion.linearise(problem, state)
+    convention = constraints.make(gauge, problem, state, blocks)
+    return Result(state, blocks, convention, converged, status, history, np.ones(problem.xy.shape[1]))
+
+
+def _relative_change(old, new):
+    return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))

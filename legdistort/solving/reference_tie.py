@@ -1,0 +1,274 @@
+"""A converged solution tied to a reference catalogue: its gauge alone moves, never the relative positions.
+
+What the reference says about shift, rotation and scale moves positions and poses exactly; what it says about the other
+modes of a common map becomes the value at which the constraints of the gauge are held.
+"""
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..exceptions import AssumptionWarning, warn
+from ..geometry import similarity
+from ..geometry.detector_modes import similarity_basis
+from ..inputs import column_contract
+from ..inputs.matches import robust_similarity
+from ..matching.cross_identification import identify
+from ..results.catalogue_tie import Knowledge
+from . import minimisers
+from .equations import criterion
+from .equations.covariances import Uncertainty
+from .equations.criterion import State
+from .gauge import catalogue_map
+
+log = logging.getLogger(__name__)
+
+_ROUNDS = 10
+#: The plane is settled when it would move by less than this part of its error, rms over the stars.
+_SETTLED = 0.01
+#: Offsets larger than expected by this factor in chi2 are told.
+_LARGE = 2.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Anchor:
+    """What is needed to tie a solution.
+
+    Attributes
+    ----------
+    identified : `legdistort.matching.cross_identification.Identified`
+    label : str
+        How messages call the reference.
+    names : ndarray, shape (n_stars,)
+    free : bool
+        Whether the static distortion is not known beforehand.
+    scale : float
+        Factor on the stated errors of the exposures.
+    options : dict
+        ``gauge``, ``loss`` and perhaps ``max_iterations`` of `legdistort.solving.minimisers.solve_joint`.
+    """
+
+    identified: object
+    label: str
+    names: np.ndarray
+    free: bool
+    scale: float
+    options: dict
+
+    def __repr__(self):
+        return f"<Anchor: {self.identified!r} of {self.label}>"
+
+    def tie(self, problem, result):
+        """The `Result` with the plane where the reference puts it, and the `Tie` in its gauge.
+
+        Parameters
+        ----------
+        problem : Problem
+            With the weights of the used observations, those of the loss aside.
+        result : Result
+            Converged, without the reference.
+
+        Raises
+        ------
+        InputError
+            If most of the reference stars lie elsewhere.
+        """
+        status, first = result.status, self._rough(result.state)
+        if first is not None:
+            result = minimisers.solve_joint(problem, _moved(result.state, first), **self.options)
+        known = self._known(result.gauge, _takes_back(problem))
+        for count in range(_ROUNDS):
+            if count < 2:  # afterwards the plane moves too little for another
+                relative = self._relative(problem, result)
+            step, made = self._estimate(result, relative, known)
+            if count and self._is_settled(result.gauge, result.state, step, made):
+                break
+            similar = similarity_basis(known.size, known.n_modes)
+            shift = similar.T @ (similar @ step)
+            step = step - shift
+            known = replace(known, centre=known.centre - step)
+            state = _moved(result.state, _pose(result.gauge, shift))
+            common = _common(problem, result, step)
+            if common is None:
+                result = replace(result, state=state, blocks=criterion.linearise(problem.scaled(result.robust), state))
+            else:
+                result = minimisers.solve_joint(problem, state, common=common, **self.options)
+        else:
+            log.warning("the tie to %s is not settled after %d rounds", self.label, _ROUNDS)
+        if not _takes_back(problem):
+            made = replace(made, covariance=made.covariance + result.gauge.absolute_covariance)
+        self._warn(made, known)
+        log.info("%s", made.sentence)
+        if result.converged:
+            result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds")
+        return replace(result, gauge=replace(result.gauge, tie=made))
+
+    def _warn(self, made, known):
+        """Tell what makes the absolute errors too small."""
+        n = np.count_nonzero(made.used)
+        if known.free and n < known.n_modes:
+            warn(
+                f"{n} stars of {self.label} do not tell all {known.n_modes} modes of a static distortion that is not "
+                "known beforehand: what they leave open of it is not in the absolute errors; give a prior",
+                AssumptionWarning,
+            )
+        if made.ratio > _LARGE and made.ratio > 1 + 6 * np.sqrt(1 / n):
+            warn(
+                f"the offsets of the stars from {self.label} are {np.sqrt(made.ratio):.1f} times larger than the "
+                "errors of both say: errors stated too small, motions left out, or a static distortion that the "
+                "exposures do not take back; the absolute errors rest on the stated ones",
+                AssumptionWarning,
+            )
+
+    def _rough(self, state):
+        """Shift, rotation and scale from the solution to the reference, gross errors left aside; None if tiny."""
+        source, target = state.positions.T[self.identified.rows], self.identified.xy
+        if len(source) == 1:
+            pose = np.column_stack([np.eye(2), (target - source)[0]])
+        elif len(source) == 2:
+            pose = similarity.fit_similarity(source, target, parity=1)
+        else:
+            pose = robust_similarity(source, target)
+        move = np.abs(similarity.apply(pose, state.positions.T) - state.positions.T)
+        log.debug("first similarity of the tie: %.3g px", move.max())
+        return pose if move.max() > 1e-3 else None
+
+    def _relative(self, problem, result):
+        weighted = problem.scaled(result.robust)
+        blocks = criterion.linearise(weighted, result.state)
+        errors = Uncertainty(weighted, blocks, result.gauge, scale=self.scale)
+        return errors.star_matrix if problem.n_stars <= catalogue_map.DENSE else errors.stars
+
+    def _known(self, gauge, bends):
+        """What is known of the common map beforehand, in three modes at least."""
+        n = gauge.n_constraints // 2
+        k = max(n, 3)
+        covariance = np.zeros((2, k, 2, k))
+        if bends:
+            covariance[:, :n, :, :n] = gauge.absolute_covariance.reshape(2, n, 2, n)
+        size = tuple(2 * gauge.box[1, ::-1])
+        free = self.free and n > 1 and bends
+        return Knowledge(covariance.reshape(2 * k, -1), np.zeros(2 * k), free, size)
+
+    def _estimate(self, result, relative, known):
+        positions = result.state.positions.T
+        offsets = catalogue_map.Offsets(
+            self.identified.rows,
+            self.identified.xy - positions[self.identified.rows],
+            self.identified.covariance,
+        )
+        modes = result.gauge.modes_at(positions, known.n_modes)
+        offered = catalogue_map.Offered(offsets, modes, relative, known)
+        return catalogue_map.estimate(offered, catalogue_map.accepted(offered, self.label), self.names)
+
+    def _is_settled(self, gauge, state, step, made):
+        modes = gauge.modes_at(state.positions.T, len(step) // 2)
+        move = (step.reshape(2, -1) @ modes) ** 2
+        blocks = made.covariance.reshape(2, len(modes), 2, len(modes))
+        variance = [np.einsum("kn,kl,ln->n", modes, blocks[a, :, a], modes) for a in (0, 1)]
+        log.debug("the plane would move by %.2g px", np.sqrt(move.mean()))
+        return move.mean() < max(_SETTLED**2 * np.mean(variance), 1e-16)
+
+
+def _takes_back(problem):
+    """Whether exposures have modes of their own; shears that they share are told by their rolls, not by a reference."""
+    return problem.own_degree != 0
+
+
+def _common(problem, result, step):
+    """The map at which to hold the constraints: the present one and a step; None where there is nothing to hold."""
+    gauge = result.gauge
+    if len(step) > gauge.n_constraints or not _takes_back(problem):
+        return None
+    departure = (result.state.coefficients - problem.prior_mean)[:, :, : gauge.n_constraints // 2]
+    return gauge.common_map(departure) + step
+
+
+def _pose(gauge, shift):
+    """The similarity X -> X + phi(X) g of modes g (2 k,) without anything else, as a pose."""
+    corners = gauge.box[0] + gauge.box[1] * np.array([[0.0, 0], [1, 0], [0, 1]])
+    move = (shift.reshape(2, -1) @ gauge.modes_at(corners, len(shift) // 2)).T
+    linear = np.eye(2) + (move[1:] - move[0]).T / gauge.box[1]
+    return np.column_stack([linear, corners[0] + move[0] - linear @ corners[0]])
+
+
+def _moved(state, pose):
+    """The same solution in a plane moved by a pose: exactly as good."""
+    back = similarity.invert(pose)
+    moved = np.stack([similarity.compose(own, back) for own in state.poses])
+    return State(similarity.apply(pose, state.positions.T).T, state.coefficients, moved)
+
+
+def tie_to(fit, reference, options, *, scale=1.0, epoch=None, pixel_scale=None):
+    """A fit of `legdistort.solve` tied to a reference.
+
+    Parameters
+    ----------
+    fit : dataclass
+        With ``matches``, ``problem``, ``result``, ``used`` and ``blocks``.
+    reference : Reference
+    options : dict
+        ``gauge``, ``loss``, ``limit`` and ``prior`` of `legdistort.solve`.
+    scale : float
+        Factor on the stated errors of the exposures.
+    epoch : float, optional
+        Year of the exposures, if not that of the matches.
+    pixel_scale : float, optional
+        Arcsec.
+
+    Returns
+    -------
+    dataclass
+        The fit with ``matches`` that know the sky, and the tied ``result``.
+
+    Raises
+    ------
+    InputError
+        See `Reference.at`, `legdistort.matching.cross_identification.identify`,
+        `legdistort.solving.gauge.catalogue_map.accepted`.
+    """
+    matches, result = fit.matches, fit.result
+    epoch = matches.epoch if epoch is None else epoch
+    identified = identify(
+        reference.at(epoch),
+        matches.stars,
+        np.where(fit.blocks.v[0] > 0, result.state.positions, np.nan).T,
+        flux=_flux(matches),
+        sky=matches.sky,
+        pixel_scale=pixel_scale,
+    )
+    log.info("%d of the %d stars of %s are in the exposures", len(identified.rows), len(reference), reference.label)
+    known = options["prior"].values() if isinstance(options["prior"], dict) else [options["prior"]]
+    anchor = Anchor(
+        identified,
+        reference.label,
+        matches.stars,
+        free=any(prior is None for prior in known),
+        scale=scale,
+        options={"gauge": options["gauge"], "loss": options["loss"], **options["limit"]},
+    )
+    result = anchor.tie(fit.problem.scaled(fit.used.astype(float)), result)
+    return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
+
+
+def _flux(matches):
+    """Mean flux of every star, or None."""
+    if "flux" not in matches.table.colnames:
+        return None
+    star = matches.observations.star
+    flux = np.nan_to_num(column_contract.values(matches.table, "flux"))
+    return np.bincount(star, flux, len(matches.stars)) / np.bincount(star, minlength=len(matches.stars))
+
+
+def describe(fit, reference, given):
+    """Where the plane lies and what it is tied to, as plain words and numbers for the settings of a solution.
+
+    `given` is the `TangentPlane` that the matches brought, or None.
+    """
+    sky = "exposures" if given is not None else None if fit.matches.sky is None else "reference"
+    if reference is None:
+        return {"sky": sky, "reference": None}
+    made = fit.result.gauge.tie
+    words = {"name": reference.label.removeprefix("the reference").strip(), "epoch": fit.matches.epoch}
+    return {"sky": sky, "reference": words | {"n_stars": int(np.count_nonzero(made.used)), "rms_px": made.rms}}

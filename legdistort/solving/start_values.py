@@ -1,0 +1,155 @@
+"""Start values of a minimisation, and exposures that are too far off to take part in one."""
+
+import numpy as np
+
+from ..exceptions import FoldError, SolveError
+from ..geometry import similarity
+from ..geometry.distortion import Distortion
+from .equations.criterion import State
+
+
+def start(problem, nominal, *, n_sweeps=1, robust=False):
+    """Start values: coefficients at the prior mean, poses refined to one another, positions their weighted mean.
+
+    Parameters
+    ----------
+    problem : Problem
+    nominal : ndarray, shape (n_exposures, 2, 3)
+    n_sweeps : int
+    robust : bool
+        Give deviant observations less weight, so that mismatched exposures do not drag the others along.
+
+    Returns
+    -------
+    State
+    ndarray of bool, shape (n_exposures,)
+        Exposures that are `misplaced`.
+
+    Raises
+    ------
+    SolveError
+        If the prior cannot be inverted at the observed positions.
+    """
+    _check_prior(problem)
+    q = undistorted(problem)
+    full = problem.weight[:2].sum(axis=0) / 2
+    current, weight = np.array(nominal, dtype=float), full
+    n_sweeps *= 12 if robust else 1
+    for sweep in range(n_sweeps + 1):
+        positions = mean_positions(problem, current, q, weight)
+        if sweep == n_sweeps:
+            break
+        if robust:
+            distance2 = distances(problem, current, q, positions)
+            weight = full / (1 + distance2 / (2 * np.median(distance2) + 1e-12))
+        current = refine(problem, current, q, positions, weight)
+    astray = misplaced(problem, distances(problem, current, q, positions))
+    common = _common_similarity(problem, nominal, current, astray)
+    current = np.stack([similarity.compose(pose, common) for pose in current])
+    positions = similarity.apply(similarity.invert(common), positions.T).T
+    return State(positions, problem.prior_mean.copy(), current), astray
+
+
+def _check_prior(problem):
+    """Raise `SolveError` if the map of a prior folds."""
+    checked = set()
+    for shape, mean, name in zip(problem.shapes, problem.prior_mean, problem.names, strict=True):
+        key = (shape, mean.tobytes())
+        if key in checked or not np.any(mean):
+            continue
+        checked.add(key)
+        try:
+            Distortion(mean, shape, name).check_fold()
+        except FoldError as error:
+            raise SolveError(f"the prior is not usable: {error}") from None
+
+
+def undistorted(problem):
+    """Positions (2, n) with the prior distortion taken out to second order, which is enough for a start."""
+    if not np.any(problem.prior_mean):
+        return problem.xy
+    if problem.compiled:
+        from .equations import compiled
+
+        return compiled.undistorted(problem)
+    q = problem.xy.copy()
+    for i, (shape, mean) in enumerate(zip(problem.shapes, problem.prior_mean, strict=True)):
+        distortion, x = Distortion(mean, shape), problem.xy[:, problem.part(i)].T
+        guess = 2 * x - distortion(x)
+        q[:, problem.part(i)] = (x - distortion(guess) + guess).T
+    return q
+
+
+def refine(problem, pose_list, q, positions, weight):
+    """Poses (n_exposures, 2, 3) that carry star positions (2, n_stars) to undistorted ones q (2, n), parity kept."""
+    parity = np.where(np.linalg.det(pose_list[:, :, :2]) > 0, 1, -1)
+    if problem.compiled:
+        from .equations import compiled
+
+        fitted = similarity.similarity_of(*compiled.moments(problem, q, weight, positions), parity)
+        return np.where(np.isfinite(fitted).all(axis=(1, 2), keepdims=True), fitted, pose_list)
+    out = pose_list.copy()
+    for i in range(problem.n_exposures):
+        part = problem.part(i)
+        source = positions[:, problem.star[part]].T
+        if np.count_nonzero(weight[part]) > 1:
+            out[i] = similarity.fit_similarity(source, q[:, part].T, weights=weight[part], parity=parity[i])
+    return out
+
+
+def _common_similarity(problem, nominal, refined, astray):
+    """The similarity of the reference plane that brings refined poses back, in the mean, to the nominal ones.
+
+    Exposures of like quality count equally, bad ones less, misplaced ones not at all.
+    """
+    variance = 1 / np.array([problem.weight[:2, problem.part(i)].sum() for i in range(problem.n_exposures)])
+    weight = 1 / (variance + 10 * np.median(variance))
+    weight[astray] = 0
+    old, new = [], []
+    for i in range(problem.n_exposures):
+        ny, nx = problem.shapes[i]
+        corners = np.array([[0, 0], [nx, 0], [nx, ny], [0, ny]]) - 0.5
+        old.append(similarity.apply(similarity.invert(nominal[i]), corners))
+        new.append(similarity.apply(similarity.invert(refined[i]), corners))
+    return similarity.fit_similarity(np.concatenate(old), np.concatenate(new), weights=np.repeat(weight, 4), parity=1)
+
+
+def misplaced(problem, distance2):
+    """Whether the stars of an exposure lie nowhere near their mean positions, shape (n_exposures,).
+
+    Ten times farther than usual, and more than 1 % of the detector, which no distortion known beforehand explains.
+    """
+    typical = np.array([np.sqrt(np.median(distance2[problem.part(i)])) for i in range(problem.n_exposures)])
+    size = np.max(problem.shapes, axis=1)
+    return (typical > 10 * np.median(typical)) & (typical > 0.01 * size)
+
+
+def distances(problem, pose_list, q, positions):
+    """Squared distance (n,) of undistorted positions from their star's mean position, detector pixels."""
+    if problem.compiled:
+        from .equations import compiled
+
+        return compiled.distances(problem, pose_list, q, positions)
+    distance2 = np.empty(q.shape[1])
+    for i, pose in enumerate(pose_list):
+        part = problem.part(i)
+        off = q[:, part].T - similarity.apply(pose, positions[:, problem.star[part]].T)
+        distance2[part] = (off**2).sum(axis=1)
+    return distance2
+
+
+def mean_positions(problem, pose_list, q, weight):
+    """Weighted mean (2, n_stars) of undistorted positions carried back to the reference plane."""
+    inverse = np.stack([similarity.invert(pose) for pose in pose_list])
+    if problem.compiled:
+        from .equations import compiled
+
+        sums, total = compiled.mean_sums(problem, inverse, q, weight)
+    else:
+        back = np.empty_like(q)
+        for i, pose in enumerate(inverse):
+            part = problem.part(i)
+            back[:, part] = pose[:, :2] @ q[:, part] + pose[:, 2:]
+        total = np.bincount(problem.star, weight, problem.n_stars)
+        sums = np.stack([np.bincount(problem.star, weight * axis, problem.n_stars) for axis in back])
+    return np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)

@@ -1,0 +1,264 @@
+"""Solution -> FITS headers with distortion (TAN-SIP, TPV), and how far a header is from the exact chain.
+
+SIP is what DS9, astropy and Aladin read, TPV what SWarp and SCAMP read. Both are polynomials from pixels to the sky,
+the direction in which a distortion has no closed form: they are fitted, their degree is raised until the error asked
+for holds, and the error found over the whole detector is written in the header. SIP also carries the opposite
+direction, which is the distortion itself.
+"""
+
+import math
+import warnings
+
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.wcs import WCS, FITSFixedWarning
+from astropy.wcs.utils import wcs_to_celestial_frame
+from numpy.polynomial.polynomial import polyval2d
+
+from ..exceptions import ExportError, InputError
+from ..geometry import basis, similarity
+from ..geometry.tangent_plane import TangentPlane
+from ..runtime.checks import check_choice
+
+#: Highest degree of each convention: SIP has one digit, TPV has no keywords beyond.
+MAX_DEGREE = {"sip": 9, "tpv": 7}
+#: The inverse polynomial of SIP is raised in degree until it is that good [pix], or has the highest degree.
+INVERSE_ERROR = 1e-7
+
+#: TPV: number of the first term of each total degree; the terms in the radius (3, 11, 23, 39) stay zero.
+_TPV_FIRST = {1: 1, 2: 4, 3: 7, 4: 12, 5: 17, 6: 24, 7: 31}
+_NODES = 25
+_GRID = 65
+_LAWSON = 12
+
+
+def make_header(solution, name, *, kind="sip", max_error=1e-3):
+    """FITS header of one exposure: WCS keywords only, of the lowest degree that meets an error.
+
+    The reference point is the tangent point of the solution if it falls on the detector, and the middle of the
+    detector otherwise.
+
+    Parameters
+    ----------
+    solution : Solution
+    name : str
+        Exposure.
+    kind : {"sip", "tpv"}
+        Convention: TAN with SIP polynomials, or TPV.
+    max_error : float
+        Largest error allowed over the whole detector, edges and corners included, pixels.
+
+    Returns
+    -------
+    `~astropy.io.fits.Header`
+        With the largest errors that `header_error` found, in pixels, rounded up: ``SIPMXERR`` (pixel to sky) and
+        ``SIPIVERR`` (sky to pixel), or ``TPVMXERR`` and ``TPVIVERR``.
+
+    Raises
+    ------
+    ExportError
+        If no degree meets `max_error`, naming the best.
+    InputError
+        If the solution is not tied to the sky.
+    """
+    check_choice(kind, tuple(MAX_DEGREE), "kind")
+    if not max_error > 0:
+        raise InputError(f"max_error must be a positive number of pixels, got {max_error!r}")
+    origin, tangent = _reference_point(solution, name)
+    nodes = _detector_points(solution.shapes[name], np.cos(np.pi * np.arange(_NODES) / (_NODES - 1)))
+    offset = nodes - origin
+    plane = tangent.from_sky(_exact_sky(solution, name, nodes))
+    top = MAX_DEGREE[kind]
+    for degree in range(2, top + 1):
+        polynomial, missed = _fit(offset, plane, degree)
+        cd = np.stack([polynomial[:, 1, 0], polynomial[:, 0, 1]], axis=1)
+        if degree < top and np.hypot(*np.linalg.solve(cd, missed.T)).max() > max_error:
+            continue
+        header = _linear_header(kind, origin, tangent, cd)
+        header.update(_sip(polynomial, cd, offset, plane) if kind == "sip" else _tpv(degree, cd, offset, plane))
+        errors = [_round_up(error) for error in header_error(header, solution, name)]
+        if max(errors) <= max_error:
+            for key, error, direction in zip(("MXERR", "IVERR"), errors, ("pixel to sky", "sky to pixel"), strict=True):
+                header[kind.upper() + key] = (error, f"[pix] largest error over detector, {direction}")
+            return header
+    raise ExportError(
+        f"{name}: no {kind.upper()} header meets max_error = {max_error:g} px; the best, of degree {top}, has "
+        f"{max(errors):.2g} px: allow that (--max-error), or hand on the ASDF form, which is exact"
+    )
+
+
+def header_error(header, solution, name):
+    """Largest errors [pix] of a FITS header against the exact chain of a solution, as `astropy.wcs` reads it.
+
+    Over a grid of the whole detector with its edges and corners; errors are distances in detector pixels.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        Any celestial WCS: of `make_header`, or of another program.
+    solution : Solution
+    name : str
+        Exposure.
+
+    Returns
+    -------
+    forward : float
+        Pixel to sky.
+    inverse : float
+        Sky to pixel: by the inverse polynomials if the header has them (SIP), otherwise by iteration. Infinite if it
+        fails anywhere.
+
+    Raises
+    ------
+    InputError
+        If the header has no celestial WCS, or the solution is not tied to the sky.
+    """
+    points = _detector_points(solution.distortion(name).shape, np.linspace(-1, 1, _GRID))
+    exact = _exact_sky(solution, name, points)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        wcs = WCS(header)
+    if not wcs.has_celestial:
+        raise InputError(f"the header compared with exposure {name} has no celestial WCS")
+    frame = wcs_to_celestial_frame(wcs)
+    sky = SkyCoord(*wcs.all_pix2world(points, 0).T, unit="deg", frame=frame)
+    undistorted = similarity.apply(solution.poses[name], solution.sky.from_sky(sky))
+    forward = solution.distortion(name)(undistorted)
+    there = exact.transform_to(frame).spherical
+    inverse = _to_pixels(wcs, np.column_stack([there.lon.deg, there.lat.deg]))
+    return tuple(_largest(found - points) for found in (forward, inverse))
+
+
+def _to_pixels(wcs, sky):
+    """Sky [deg] -> pixels (n, 2), from 0, by the inverse polynomials where there are some."""
+    if wcs.sip is None:
+        return wcs.wcs_world2pix(sky, 0)
+    if wcs.sip.ap is None:
+        return wcs.all_world2pix(sky, 0, quiet=True)
+    flat = wcs.wcs_world2pix(sky, 0)
+    return flat + np.stack([polyval2d(*(flat - wcs.wcs.crpix + 1).T, c) for c in (wcs.sip.ap, wcs.sip.bp)], axis=1)
+
+
+def _largest(difference):
+    distance = np.hypot(*difference.T)
+    return float(distance.max()) if np.all(np.isfinite(distance)) else np.inf
+
+
+def _exact_sky(solution, name, points):
+    """Sky (SkyCoord) of detector pixels (n, 2)."""
+    if solution.sky is None:
+        raise InputError(
+            f"the solution does not know the sky, so exposure {name} can have no FITS header: solve exposures whose "
+            "headers have a WCS, or give solve() a reference catalogue with ra and dec"
+        )
+    return solution.sky.to_sky(solution.correct(name, points))
+
+
+def _reference_point(solution, name):
+    """Pixel (2,) of the reference point of a header, and the `TangentPlane` there, in degrees."""
+    ny, nx = solution.distortion(name).shape
+    centre = np.array([nx - 1, ny - 1]) / 2
+    sky = _exact_sky(solution, name, centre[None])[0]
+    tangent = similarity.invert(solution.sky.matrix)[:, 2]
+    pixel = solution.distort(name, tangent)[0]
+    if np.all(np.abs(pixel - centre) <= np.array([nx, ny]) / 2):  # false for NaN: not on the detector
+        return pixel, TangentPlane(solution.sky.lon, solution.sky.lat, similarity.identity())
+    # far from the detector a distortion means nothing, and powers of the distance lose digits
+    return centre, TangentPlane(sky.ra.deg, sky.dec.deg, similarity.identity())
+
+
+def _detector_points(shape, t):
+    """Pixels (n * n, 2) at all pairs of the normalised coordinates `t` in [-1, 1]."""
+    u, v = np.meshgrid(t, t)
+    return basis.denormalize(u.ravel(), v.ravel(), shape)
+
+
+def _fit(points, target, degree):
+    """Polynomial without constant whose largest error is smallest, by Lawson's reweighted least squares.
+
+    Parameters
+    ----------
+    points, target : ndarray, shape (n, 2)
+    degree : int
+        Total degree.
+
+    Returns
+    -------
+    polynomial : ndarray, shape (2, degree + 1, degree + 1)
+        ``[axis, i, j]`` multiplies ``x**i * y**j``.
+    missed : ndarray, shape (n, 2)
+        Target minus fit.
+    """
+    i, j = basis.orders(degree)
+    i, j = i[1:], j[1:]
+    scale = np.abs(points).max()
+    x, y = (points / scale).T
+    # orthonormal columns: the weighted normal equations below stay well conditioned
+    q, r = np.linalg.qr(x[:, None] ** i * y[:, None] ** j)
+    weights = np.full(len(points), 1 / len(points))
+    for _ in range(_LAWSON):
+        weighted = q * weights[:, None]
+        solution = np.linalg.solve(weighted.T @ q, weighted.T @ target)
+        missed = target - q @ solution
+        distance = np.hypot(*missed.T)
+        weights = weights * (distance + 1e-3 * distance.max() + np.finfo(float).tiny)
+        weights /= weights.sum()
+    polynomial = np.zeros((2, degree + 1, degree + 1))
+    polynomial[:, i, j] = np.linalg.solve(r, solution).T / scale ** (i + j)
+    return polynomial, missed
+
+
+def _linear_header(kind, origin, tangent, cd):
+    """The keywords of the linear part."""
+    ends = {"sip": "TAN-SIP", "tpv": "TPV"}[kind]
+    header = fits.Header()
+    header["WCSAXES"] = (2, "number of WCS axes")
+    for k, (axis, centre) in enumerate((("RA--", tangent.lon % 360), ("DEC-", tangent.lat)), start=1):
+        header[f"CTYPE{k}"] = f"{axis}-{ends}"
+        header[f"CUNIT{k}"] = "deg"
+        header[f"CRPIX{k}"] = (float(origin[k - 1]) + 1, "reference pixel, from 1")
+        header[f"CRVAL{k}"] = (float(centre), "[deg] at the reference pixel")
+    for a in (1, 2):
+        for b in (1, 2):
+            header[f"CD{a}_{b}"] = (float(cd[a - 1, b - 1]), "[deg/pix]")
+    header["LONPOLE"] = 180.0
+    header["RADESYS"] = "ICRS"
+    return header
+
+
+def _sip(polynomial, cd, offset, plane):
+    """SIP keywords: A, B from the fit, AP, BP the distortion itself."""
+    flat = np.linalg.solve(cd, plane.T).T
+    for order in range(2, MAX_DEGREE["sip"] + 1):
+        backward, missed = _fit(flat, offset - flat, order)
+        if np.abs(missed).max() <= INVERSE_ERROR:
+            break
+    forward = np.tensordot(np.linalg.inv(cd), polynomial, axes=1)
+    header = fits.Header()
+    for keys, tensors, lowest in ((("A", "B"), forward, 2), (("AP", "BP"), backward, 1)):
+        for key, tensor in zip(keys, tensors, strict=True):
+            degree = len(tensor) - 1
+            header[f"{key}_ORDER"] = degree
+            for i, j in np.transpose(basis.orders(degree)):
+                if i + j >= lowest:
+                    header[f"{key}_{i}_{j}"] = float(tensor[i, j])
+    return header
+
+
+def _tpv(degree, cd, offset, plane):
+    """TPV keywords: the same polynomial in degrees after the CD matrix; axis 2 has x and y exchanged in its terms."""
+    polynomial, _ = _fit(offset @ cd.T, plane, degree)
+    header = fits.Header()
+    for axis, tensor in ((1, polynomial[0]), (2, polynomial[1].T)):
+        for i, j in np.transpose(basis.orders(degree))[1:]:
+            header[f"PV{axis}_{_TPV_FIRST[i + j] + j}"] = float(tensor[i, j])
+    return header
+
+
+def _round_up(value):
+    """To two digits, so that the figure is no smaller than what was found."""
+    if value == 0 or not math.isfinite(value):
+        return value
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / unit) * unit:.1e}")
