@@ -259,7 +259,7 @@ def _corrected_mean(matches, problem, state):
 
 def _convention(gauge, name, plane, **changes):
     """The gauge of a correction, whose plane is told in words; absolute errors come out as NaN."""
-    return replace(gauge, kind=name, plane=plane, dynamic=np.full_like(gauge.dynamic, np.nan), **changes)
+    return replace(gauge, kind=name, plane=plane, unknown_maps=(), **changes)
 
 
 def _solution(matches, problems, state, gauge, covariance=None):

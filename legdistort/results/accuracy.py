@@ -76,7 +76,8 @@ def expected_bias(solution, *, removed=None, absolute=False):
     if not hasattr(type(solution.uncertainty), "star_matrix"):  # of the class: to ask the object would compute it
         raise InputError("a solution read from a file keeps no covariances between stars; call solve again")
     if removed is None:  # each star by itself: the covariances between stars, a large matrix, are not needed
-        variance = (solution.absolute_variance if absolute else solution.uncertainty.stars)[:2, good]
+        blocks = solution.absolute_covariance(without_unknown=True) if absolute else None
+        variance = solution.uncertainty.stars[:2, good] if blocks is None else np.einsum("nkk->kn", blocks)[:, good]
         return float(np.sqrt(np.mean(variance)))
     covariance = solution.uncertainty.star_matrix[np.ix_(np.tile(good, 2), np.tile(good, 2))]
     if absolute:

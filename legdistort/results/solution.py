@@ -16,6 +16,7 @@ from ..geometry.models import like, outside, to_pixels
 from ..geometry.star_hull import support, supported
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
+from . import absolute_errors
 from .diagnostics import Diagnostics
 from .settings import Settings
 
@@ -100,16 +101,18 @@ class Solution:
     def stars(self):
         """One row a star: ``star``, ``x``, ``y``, errors [pix], ``n``, mean ``flux`` and the sky if known.
 
-        ``x_err``, ``y_err`` are relative (in the gauge); ``x_err_abs``, ``y_err_abs`` add what the gauge hides: the
-        mean dynamic distortion of the set and the uncertainty of the static one. Pointing, rotation and
-        scale common to all exposures are those of the nominal poses and are not part of these errors, unless a
-        reference ties them: then they are. On the sky:
+        ``x_err``, ``y_err`` are relative: what is left once a common map of the fitted degree is taken off.
+        ``x_err_abs``, ``y_err_abs`` add that map: the mean dynamic distortion of the set and the uncertainty of the
+        static one; NaN where they are not known (`Gauge.unknown`). ``x_err_known``, ``y_err_known`` are those after the
+        unknown directions are taken off. Pointing, rotation and scale common to all exposures are those of the nominal
+        poses and are not part of these errors, unless a reference ties them: then they are. On the sky:
         ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
         ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue.
         """
         table = QTable({"star": self.star_names, "x": self.positions[:, 0] * u.pix, "y": self.positions[:, 1] * u.pix})
-        variance, absolute = self.uncertainty.stars, self.absolute_variance
-        for suffix, each in (("err", variance), ("err_abs", absolute)):
+        variance = absolute_errors.relative_variance(self.gauge, self.uncertainty, self.positions)
+        absolute, known = self._absolute(False), self._absolute(True)
+        for suffix, each in (("err", variance), ("err_abs", absolute), ("err_known", known)):
             for k, axis in enumerate("xy"):
                 table[f"{axis}_{suffix}"] = np.sqrt(each[k]) * u.pix
         table["xy_corr"] = variance[2] / np.sqrt(variance[0] * variance[1])
@@ -135,23 +138,19 @@ class Solution:
         """
         return self.observations
 
-    def hidden_variance(self, xy):
-        """Variance (n, 2) [pix^2] that the gauge hides at reference positions (n, 2)."""
-        return self._hidden(xy)[:2].T
+    def _absolute(self, without_unknown):
+        return absolute_errors.absolute_variance(
+            self.gauge, self.uncertainty, self.positions, without_unknown=without_unknown
+        )
 
-    def _hidden(self, xy):
-        """xx, yy, xy (3, n)."""
-        covariance = self.gauge.absolute_covariance
-        n = len(covariance) // 2
-        modes = self.gauge.modes_at(xy, n)
-        blocks = covariance[:n, :n], covariance[n:, n:], covariance[:n, n:]
-        return np.stack([np.einsum("mj,mk,kj->j", modes, block, modes) for block in blocks])
+    def absolute_covariance(self, *, without_unknown=False):
+        """Covariance (n_stars, 2, 2) [pix^2] of every star position with the error of the common map.
 
-    @property
-    def absolute_variance(self):
-        """Covariance xx, yy, xy (3, n_stars) [pix^2] of the positions, with what the gauge hides."""
-        tie = self.gauge.tie
-        return self.uncertainty.stars + self._hidden(self.positions) + (0 if tie is None else tie.shared)
+        NaN where that is not known, unless the error asked for is that after the unknown directions
+        (`Gauge.unknown`) are taken off.
+        """
+        xx, yy, xy = self._absolute(without_unknown)
+        return np.stack([np.stack([xx, xy]), np.stack([xy, yy])]).transpose(2, 0, 1)
 
     @property
     def effective_modes(self):
@@ -255,14 +254,16 @@ class Solution:
 
     # -- errors
 
-    @property
-    def static_sigma(self):
-        """Uncertainty of the prior mean, shape (2, n_modes) [pix], or None."""
-        return self.gauge.static_sigma
+    def coefficient_errors(self, name, *, relative=False):
+        """Standard deviations (2, n_modes) of the fitted coefficients of an exposure, pixels.
 
-    def coefficient_errors(self, name):
-        """Standard deviations (2, n_modes) of the fitted coefficients of an exposure in the gauge, pixels."""
-        return np.sqrt(np.diag(self._block(name))).reshape(2, -1)
+        With the error of the common map, and NaN for what changes with an unknown direction (`Gauge.unknown`); or
+        `relative` ones, in the gauge.
+        """
+        block = self._block(name)
+        if relative or self.gauge.plane is not None:
+            return np.sqrt(np.diag(block)).reshape(2, -1)
+        return np.sqrt(absolute_errors.coefficient_variance(self.gauge, block, self.index(name)))
 
     def _block(self, name, other=None):
         size = 2 * basis.n_modes(self.degree)

@@ -24,7 +24,7 @@ from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_tree, read_tree
 from ..runtime.outputs import replacing
 from .catalogue_tie import Tie
 from .diagnostics import AliasedDegree, DegreeChoice, Diagnostics, UsedReference, Validation
-from .gauge import Gauge
+from .gauge import Gauge, UnknownDirection, UnknownMap
 from .settings import Settings
 
 #: Version of the layout under ``legdistort``.
@@ -37,6 +37,8 @@ class StoredUncertainty:
 
     coefficients: np.ndarray
     stars: np.ndarray
+    directions: np.ndarray
+    weak: tuple
 
 
 def write_solution(solution, path, *, overwrite=False):
@@ -55,8 +57,9 @@ def write_solution(solution, path, *, overwrite=False):
         "stars": {"star": np.asarray(solution.star_names), "position": solution.positions},
         "columns": table.colnames,  # their order: that of a mapping is lost in files
         "observations": {name: plain(table[name]) for name in table.colnames},
-        "covariance": {key: getattr(solution.uncertainty, key) for key in ("coefficients", "stars")},
-        "gauge": _fields(solution.gauge) | {"tie": _fields(solution.gauge.tie)},
+        "covariance": {key: getattr(solution.uncertainty, key) for key in ("coefficients", "stars", "directions")}
+        | {"weak": [_fields(each) for each in solution.uncertainty.weak]},
+        "gauge": _gauge_tree(solution.gauge),
         "sky": None
         if solution.sky is None
         else {"lon": solution.sky.lon, "lat": solution.sky.lat, "matrix": solution.sky.matrix},
@@ -68,6 +71,12 @@ def write_solution(solution, path, *, overwrite=False):
     with replacing(path, overwrite=overwrite) as temporary:
         file.write_to(temporary)
     return Path(path)
+
+
+def _gauge_tree(gauge):
+    tree = _fields(gauge) | {"tie": _fields(gauge.tie), "unknown_maps": [_fields(each) for each in gauge.unknown_maps]}
+    del tree["responses"]  # they stand with the covariances
+    return tree
 
 
 def _exposure_tree(solution, name):
@@ -133,7 +142,16 @@ def _tuples(value):
 
 
 def _from_tree(kind, tree):
-    exposures = tree["exposures"]
+    exposures, covariance, gauge = tree["exposures"], tree["covariance"], tree["gauge"]
+    uncertainty = StoredUncertainty(
+        *(np.array(covariance[key]) for key in ("coefficients", "stars", "directions")),
+        tuple(_made(UnknownDirection, each) for each in covariance["weak"]),
+    )
+    gauge = gauge | {
+        "tie": _made(Tie, gauge.get("tie")),
+        "unknown_maps": tuple(_made(UnknownMap, each) for each in gauge["unknown_maps"]),
+        "responses": uncertainty,
+    }
     table = QTable({name: restored(tree["observations"][name]) for name in tree["columns"]})
     sky = tree["sky"]
     solution = kind(
@@ -149,8 +167,8 @@ def _from_tree(kind, tree):
         chi2=tree["chi2"],
         dof=tree["dof"],
         status=tree["status"],
-        gauge=_made(Gauge, tree["gauge"] | {"tie": _made(Tie, tree["gauge"].get("tie"))}),
-        uncertainty=StoredUncertainty(**{key: np.array(value) for key, value in tree["covariance"].items()}),
+        gauge=_made(Gauge, gauge),
+        uncertainty=uncertainty,
         settings=Settings(**tree["settings"]),
         diagnostics=_diagnostics(_tuples(tree["diagnostics"])),
         sky=None if sky is None else TangentPlane(sky["lon"], sky["lat"], np.array(sky["matrix"])),
@@ -175,20 +193,21 @@ def _check_consistent(solution):
         if pose.shape != (2, 3) or not np.isfinite(pose).all() or np.linalg.det(pose[:, :2]) == 0:
             raise ValueError(f"the pose of {name} should be a finite, invertible array (2, 3)")
     own, gauge = 2 * n_modes, solution.gauge
-    held = gauge.n_constraints  # with a shared static distortion those of the modes of single exposures only
-    if held != 2 * basis.n_modes(basis.degree_of(held // 2)):
-        raise ValueError(f"the gauge cannot have {held} constraints")
+    held, modes = gauge.n_constraints, gauge.motion.shape[1]  # those that exposures have for themselves
+    if modes != 2 * basis.n_modes(basis.degree_of(modes // 2)) or held > modes:
+        raise ValueError(f"the gauge cannot have {held} constraints on {modes} modes")
     for what, array, shape in (
         ("positions", solution.positions, (n_stars, 2)),
         ("prior means", solution.prior_mean, solution.coefficients.shape),
         ("covariance of the coefficients", solution.uncertainty.coefficients, (n * own, n * own)),
         ("covariance of the stars", solution.uncertainty.stars, (3, n_stars)),
-        ("gauge.constraint", gauge.constraint, (held, n, held)),
-        ("gauge.motion", gauge.motion, (n, held, held)),
-        ("gauge.dynamic", gauge.dynamic, (n, held, held)),
+        ("directions", solution.uncertainty.directions, (n_stars, 2, modes)),
+        ("gauge.constraint", gauge.constraint, (held, n, modes)),
+        ("gauge.motion", gauge.motion, (n, modes, modes)),
+        ("gauge.dynamic", gauge.dynamic, (n, modes, modes)),
         ("gauge.box", gauge.box, (2, 2)),
-        ("gauge.static_sigma", gauge.static_sigma, (2, held // 2)),
-        ("gauge.told", gauge.told, (0 if gauge.told is None else len(gauge.told), held)),
+        ("gauge.covariance", gauge.covariance, (modes, modes)),
+        *(("map of gauge.unknown_maps", each.map, (modes,)) for each in gauge.unknown_maps),
         ("gauge.values", gauge.values, (held,)),
         ("gauge.tie.shared", None if gauge.tie is None else gauge.tie.shared, (3, n_stars)),
     ):

@@ -1,5 +1,7 @@
 """The one place where arrays of a fit become a `Solution`, in the order and the words of the user."""
 
+from dataclasses import replace
+
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable
@@ -55,7 +57,7 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
         chi2=blocks.chi2 if chi2 is None else chi2,
         dof=dof,
         status=status,
-        gauge=gauge,
+        gauge=replace(gauge, responses=uncertainty),
         uncertainty=uncertainty,
         settings=settings,
         diagnostics=Diagnostics() if diagnostics is None else diagnostics,

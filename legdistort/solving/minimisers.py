@@ -18,6 +18,7 @@ from ..runtime.checks import check_choice
 from .equations import criterion, elimination, reduced_system
 from .equations.problem import State
 from .gauge import constraints
+from .gauge.hierarchy import determined_by_residuals, is_explained
 
 log = logging.getLogger(__name__)
 
@@ -105,12 +106,10 @@ def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", 
     while run.converged and (freer := run.freer()) is not None:
         with contextlib.suppress(SolveError):
             freer.descend(max_iterations, tolerance)
-        if not (freer.converged and freer.is_explained(run)):
+        if not (freer.converged and is_explained(freer.blocks.chi2, run.system)):
             break
         run = freer
-    convention = run.convention
-    if convention.told is not None:
-        convention = _declared(convention, run.weighted, run.blocks, _departure(problem, run.state))
+    convention = run.convention if run.released is None else run.declared()
     status = f"converged after {len(run.history)} iterations"
     if not run.converged:
         status = (
@@ -133,9 +132,9 @@ class _Rules:
 class _Descent:
     """Gauss-Newton iterations under one set of constraints."""
 
-    def __init__(self, problem, state, rules, *, told=None, history=()):
+    def __init__(self, problem, state, rules, *, released=None, history=()):
         self.problem, self.state, self.rules = problem, state, rules
-        self.told, self.history, self.converged = told, list(history), False
+        self.released, self.history, self.converged = released, list(history), False
         self._reweight(criterion.residuals(problem, state) if rules.loss != "linear" else None)
         self.blocks = criterion.linearise(self.weighted, state)
         self._prepare()
@@ -150,7 +149,7 @@ class _Descent:
     def _prepare(self):
         """The gauge and the reduced system at the current state."""
         self.convention = constraints.make(
-            self.rules.gauge, self.weighted, self.state, self.blocks, told=self.told, common=self.rules.common
+            self.rules.gauge, self.weighted, self.state, self.blocks, released=self.released, common=self.rules.common
         )
         self.system = reduced_system.reduced_system(self.weighted, self.blocks, self.convention)
 
@@ -159,7 +158,7 @@ class _Descent:
         accuracy, size = 1e-3, np.inf
         for _ in range(max_iterations):
             target = -self.convention.violation(_departure(self.problem, self.state))
-            d_star, d_exposure = self.system.step(target, self.convention.told_rows, accuracy)
+            d_star, d_exposure = self.system.step(target, accuracy)
             size, last = _step_size(self.blocks, d_star, d_exposure), size
             self.history.append(
                 {
@@ -183,29 +182,32 @@ class _Descent:
             self._prepare()
 
     def freer(self):
-        """The same, less what the data contradict of the convention; None if they contradict nothing."""
-        if self.rules.gauge != "minimal" or self.rules.common is not None:
+        """The same with further unknown maps left to the residuals; None if these determine none."""
+        if self.rules.common is not None:
             return None
-        rows = self.convention.told_rows
-        more = self.system.contradicted(rows)
+        more = determined_by_residuals(self.system, self.convention)
         if not more.shape[1]:
             return None
-        log.debug("the data contradict the convention along %d directions", more.shape[1])
-        told = self.convention.left_to_data(np.hstack([rows, more]))
-        return _Descent(self.problem, self.state, self.rules, told=told, history=self.history)
+        log.debug("residuals determine %d maps that nothing else does", more.shape[1])
+        released = more if self.released is None else np.hstack([self.released, more])
+        return _Descent(self.problem, self.state, self.rules, released=released, history=self.history)
 
-    def is_explained(self, before):
-        """Whether the data are explained now, or the distortion is shared and the convention plainly not needed."""
-        return self.problem.unknowns.shared or self.blocks.chi2 <= self.system.dof * before.system.explained
+    def declared(self):
+        """The gauge with all maps held where they are, so that errors relative to it stay relative.
 
-
-def _declared(convention, problem, blocks, departure):
-    """The gauge held at the values that the data tell, with their covariance: errors relative to it stay relative."""
-    rows = convention.told_rows
-    information = rows.T @ reduced_system.reduced_system(problem, blocks, convention).information @ rows
-    held = np.zeros(len(rows)) if convention.values is None else convention.values
-    values = held + rows @ (rows.T @ (convention.orthonormal @ departure.ravel() - held))
-    return replace(convention, values=values, told_covariance=np.linalg.inv(information))
+        What the residuals determine of the released ones becomes the absolute error.
+        """
+        whole = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks)
+        information = reduced_system.reduced_system(self.weighted, self.blocks, whole).information
+        moved = whole.reach @ self.released
+        error = self.released @ np.linalg.inv(moved.T @ information @ moved) @ self.released.T
+        return replace(
+            whole,
+            values=whole.violation(_departure(self.problem, self.state)),
+            released=self.released,
+            covariance=self.convention.covariance + error,
+            unknown_maps=self.convention.unknown_maps,
+        )
 
 
 def _departure(problem, state):

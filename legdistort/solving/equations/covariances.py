@@ -5,6 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from ...exceptions import AssumptionWarning, warn
+from ...results.gauge import UnknownDirection
 from . import elimination, reduced_system
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
@@ -71,6 +72,30 @@ class Uncertainty:
         out = self._scale**2 * (inverse + np.stack([extra_xx, extra_yy, extra_xy]))
         out[:, blocks.v[0] <= 0] = np.nan
         return out
+
+    @cached_property
+    def _system(self):
+        return reduced_system.reduced_system(self._problem, self._blocks, self._gauge)
+
+    @cached_property
+    def directions(self):
+        """See `legdistort.results.gauge.Gauge.directions`."""
+        gauge, system = self._gauge, self._system
+        moved = np.stack([system.follow(d) for d in system.moves[: gauge.n_constraints]], axis=2)
+        return -(moved @ gauge.reach).transpose(1, 0, 2)
+
+    @cached_property
+    def weak(self):
+        """Directions of a distortion that exposures share and do not determine, as a tuple of `UnknownDirection`."""
+        problem, system = self._problem, self._system
+        if not system.n_weak or problem.static_sigma is not None:
+            return ()
+        made = []
+        for d in system.moves[self._gauge.n_constraints :]:
+            stars, coefficients = system.follow(d).T, problem.unknowns.spread(d)
+            unit = np.sqrt(np.mean(stars[self._blocks.v[0] > 0] ** 2))
+            made.append(UnknownDirection("static", stars / unit, (coefficients / unit).reshape(len(coefficients), 2, -1)))
+        return tuple(made)
 
     @cached_property
     def star_matrix(self):

@@ -40,7 +40,7 @@ def effective_modes(problem, gauge, uncertainty):
     """
     if problem.degree == 0:  # the poses still fit rotation and scale
         return np.full(problem.n_exposures, 4 * (1 - 1 / problem.n_exposures))
-    rows = gauge.orthonormal if gauge.told is None else criterion.complement(gauge.told_rows.T) @ gauge.orthonormal
+    rows = criterion.complement(gauge.measured.T) @ gauge.orthonormal
     shares = (rows.reshape(len(rows), problem.n_exposures, -1) ** 2).sum(axis=(0, 2))
     fixed = 0 if problem.fixed is None else np.array([len(each) for each in problem.fixed])
     return problem.unknowns.n_own - shares - fixed - done_by_prior(replace(problem, static_sigma=None), uncertainty)

@@ -46,6 +46,9 @@ class Problem:
     prior_sigma : ndarray, shape (n_exposures, 2, n_modes), or None
     static_sigma : ndarray, shape (2, n_modes), or None
         Uncertainty of the prior mean; of several priors the largest.
+    mean_sigma : ndarray, shape (n_exposures, 2, n_modes), or None
+        The same by exposure: infinite where there is no prior, zero where it states none and counts as exact. None is
+        zero everywhere.
     own_degree : int or None
         Up to this degree exposures have modes of their own; None: nothing is shared. See `Unknowns`.
     group : ndarray of int, shape (n_exposures,)
@@ -64,6 +67,7 @@ class Problem:
     prior_mean: np.ndarray
     prior_sigma: np.ndarray | None = None
     static_sigma: np.ndarray | None = None
+    mean_sigma: np.ndarray | None = None
     own_degree: int | None = None
     group: np.ndarray | int = 0
 
@@ -215,6 +219,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         prior_mean=mean,
         prior_sigma=None if free.all() else sigma,
         static_sigma=_static_sigma(priors, degree),
+        mean_sigma=np.stack([_mean_sigma(p, degree) for p in priors]),
         own_degree=own_degree,
         group=_groups(matches),
     )
@@ -244,6 +249,14 @@ def _order(obs):
 def _static_sigma(priors, degree):
     given = [p.static_sigma for p in priors if p is not None and p.static_sigma is not None]
     return np.max([basis.change_degree(sigma, degree) for sigma in given], axis=0) if given else None
+
+
+def _mean_sigma(prior, degree):
+    if prior is None:
+        return np.full((2, basis.n_modes(degree)), np.inf)
+    if prior.static_sigma is None:
+        return np.zeros((2, basis.n_modes(degree)))
+    return basis.change_degree(prior.static_sigma, degree)
 
 
 def _highest_degree(count):

@@ -13,7 +13,6 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from ...exceptions import SolveError
 from . import elimination
-from .criterion import complement
 
 log = logging.getLogger(__name__)
 
@@ -21,13 +20,7 @@ log = logging.getLogger(__name__)
 DIRECT_LIMIT = 3000
 #: ... and while building it costs no more than this many multiplications.
 _DIRECT_COST = 4e9
-#: The data overrule the convention along a direction where that gains this much chi2 (five standard errors)...
-GAIN = 25.0
-#: ... and tell how far to an error below this many times the scatter of single exposures.
-_VAGUE = 3.0
-_SURE = 0.01  # curvature, relative to that of the coefficients, of a direction that is none of the gauge
 _WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not told
-_ROUNDING = 1e-9  # smallest curvature that means something, relative to that of the coefficients
 
 
 def reduced_system(problem, blocks, gauge):
@@ -88,58 +81,15 @@ class _Reduced:
         """Right-hand side (n,) of the reduced system: the gradient where the stars follow the coefficients."""
         return self._gradient(self.blocks.g_exposure, self.blocks.g_star)
 
-    def contradicted(self, told):
-        """Combinations of the constraints that the data contradict by five standard errors or more.
-
-        Along affine maps the data say nothing. Along the others they say little, but with precise positions enough:
-        a static distortion of several pixels that the convention pushes into the star positions leaves residuals of
-        second order. Standard errors are taken at the observed scale if that is larger.
-
-        A map shows only through the distortions in which exposures differ, so where these are small, a trace of
-        anything that is not in the model looks like a map of many pixels. A direction that the data tell worse than to
-        three times the scatter of single exposures is left to the convention, therefore.
-
-        Parameters
-        ----------
-        told : ndarray, shape (n_constraints, n_told)
-            Combinations that are left to the data already, orthonormal.
-
-        Returns
-        -------
-        ndarray, shape (n_constraints, n_more)
-            Further ones, orthonormal and orthogonal to `told`.
-        """
-        kept = complement(np.hstack([told, self.gauge.affine]).T).T
-        inside = kept.T @ self.information @ kept
-        if told.shape[1]:
-            across = kept.T @ self.information @ told
-            inside -= across @ np.linalg.solve(told.T @ self.information @ told, across.T)
-        curvature, vectors = np.linalg.eigh(inside)
-        gain = (vectors.T @ (kept.T @ self.pull)) ** 2 / np.maximum(curvature, _ROUNDING * self.scale)
-        sure = curvature > _SURE * self.scale
-        if self.gauge.prior:  # widths: the curvature is theirs, and the convention is what they say
-            sure[:] = False
-        rest = (self.blocks.chi2 - gain.sum()) / max(self.dof, 1)
-        if self.dof > 0 and rest <= self.explained:
-            maps = self.gauge.left_to_data(kept @ vectors)
-            variance = max(1.0, rest) / np.maximum(curvature, _ROUNDING * self.scale) * np.sum(maps**2, axis=1)
-            sure |= (gain > GAIN * max(1.0, rest)) & (variance < _VAGUE**2 * np.sum(self.gauge.scatter**2))
-        return kept @ vectors[:, sure]
+    def follow(self, d):
+        """How the stars (2, n_stars) follow a change (n,) of the unknowns."""
+        return -self._stars(self._couple(d))
 
     @property
     def dof(self):
-        """Degrees of freedom under the gauge; widths of a prior and what is left to the data not allowed for."""
+        """Degrees of freedom under the gauge; widths of a prior not allowed for."""
         n_stars = np.count_nonzero(self.blocks.v[0] > 0)
         return 2 * np.count_nonzero(self.problem.weight[0]) - 2 * n_stars - self.unknowns.size + len(self.rows)
-
-    @property
-    def explained(self):
-        """chi2/dof up to which the data, freed of a part of the convention, count as explained.
-
-        Two, or a tenth of what it is. Else the residuals have another cause, modes that are not fitted, say, which
-        bending the reference plane by hundreds of pixels can reduce as well.
-        """
-        return max(2.0, 0.1 * self.blocks.chi2 / self.dof)
 
 
 class Direct(_Reduced):
@@ -185,7 +135,7 @@ class Direct(_Reduced):
         values, vectors = np.linalg.eigh(s)
         weak = vectors[:, values < _WEAK]
         self.n_weak = weak.shape[1]
-        if self.n_weak >= self.unknowns.n_common - 2 * (self.problem.own_degree == 0) * len(set(self.problem.group)):
+        if self.n_weak >= self.unknowns.n_common:
             raise SolveError(
                 "static='fit': these exposures cannot tell a distortion that they share from one of the sky; "
                 "dither by a good part of the field and turn the camera, or give a prior with static_sigma"
@@ -219,15 +169,13 @@ class Direct(_Reduced):
         target = np.pad(target, (0, self.n_weak))
         return free - self._lifted @ (self._border @ (self.rows @ free - target))
 
-    def step(self, target, told, accuracy):
+    def step(self, target, accuracy):
         """Gauss-Newton step under the constraints of the gauge; exact whatever the accuracy asked for.
 
         Parameters
         ----------
         target : ndarray, shape (n_constraints,)
             What is still lacking to the values of the orthonormal constraints.
-        told : ndarray, shape (n_constraints, n_told)
-            Combinations that are left to the data, orthonormal.
         accuracy : float
             Where conjugate gradients may stop, relative to the size of the step.
 
@@ -236,12 +184,13 @@ class Direct(_Reduced):
         d_star : ndarray, shape (2, n_stars)
         d_exposure : ndarray, shape (n_exposures, 2 n_modes)
         """
-        if told.shape[1]:
-            target = target - told @ (told.T @ target)
-            pull = told.T @ (self.pull - self.information @ target)
-            target = target + told @ np.linalg.solve(told.T @ self.information @ told, pull)
         d = self.solve(self.rhs, target)
         return self._stars(self.blocks.g_star - self._couple(d)), self.unknowns.spread(d)
+
+    @property
+    def moves(self):
+        """Changes of the unknowns (n_constraints + n_weak, n), each moving one constraint by one, all else fitted."""
+        return (self._lifted @ self._border).T
 
     def covariance(self):
         """Covariance of the coefficients of all exposures in the gauge, shape (n_exposures * 2 n_modes,) squared."""
@@ -283,7 +232,7 @@ class Iterative(_Reduced):
         return np.concatenate(out)
 
     @cached_property
-    def _moves(self):
+    def moves(self):
         """Changes of the coefficients (n_constraints, n), each moving one constraint by one, all else fitted."""
         nothing = np.zeros_like(self.blocks.g_exposure), np.zeros_like(self.blocks.g_star)
         return np.stack([self._solve(*nothing, self.rows, unit, 1e-5)[1] for unit in np.eye(len(self.rows))])
@@ -291,29 +240,20 @@ class Iterative(_Reduced):
     @cached_property
     def information(self):
         """As for `Direct`."""
-        products = np.stack([self._gradient(self._own(d), self._couple(d)) for d in self._moves])
-        out = self._moves @ products.T
+        products = np.stack([self._gradient(self._own(d), self._couple(d)) for d in self.moves])
+        out = self.moves @ products.T
         return (out + out.T) / 2
 
     @cached_property
     def pull(self):
         """As for `Direct`."""
-        return self._moves @ self.rhs
+        return self.moves @ self.rhs
 
-    def step(self, target, told, accuracy):
+    def step(self, target, accuracy):
         """As for `Direct`."""
-        kept = complement(told.T)
-        if told.shape[1]:
-            accuracy *= 1e-3  # a small residual is a long way where the curvature is small
         gradients = self.blocks.g_exposure, self.blocks.g_star
-        stars, d = self._solve(*gradients, kept @ self.rows, kept @ target, accuracy)
+        stars, d = self._solve(*gradients, self.rows, target, accuracy)
         return stars, self.unknowns.spread(d)
-
-    def contradicted(self, told):
-        """As for `Direct`, but looked for only where chi2 shows that something is amiss: it takes many passes."""
-        if self.blocks.chi2 < self.dof + 5 * np.sqrt(2 * max(self.dof, 1)):
-            return np.zeros((len(self.rows), 0))
-        return super().contradicted(told)
 
     def _solve(self, g_exposure, g_star, rows, target, tolerance, *, max_iterations=1000):
         """Star step (2, n_stars) and step of the unknown coefficients for gradients, with rows d = target."""

@@ -11,21 +11,31 @@ from ...results.gauge import Gauge
 from ...runtime.checks import check_choice
 from ..equations.criterion import complement
 from ..equations.problem import State
-from .dynamic_scatter import conditional_errors, dynamic_covariance, say
+from .dynamic_scatter import conditional_errors, dynamic_covariance, influence
+from .hierarchy import Hierarchy
 
 KINDS = ("minimal", "mean")
 #: Below this the constraints of the "mean" gauge leave a direction free.
 _MEAN_LIMIT = 1e-3
-_SETTLED = 0.01  # of a map that an exposure cannot take back: less, and the data hardly tell of it
+_SETTLED = 0.01  # of a map that an exposure cannot take back: less, and the data hardly depend on it
 _CORNERS = np.array([[-1, 1, 1, -1.0], [-1, -1, 1, 1.0]])
 
 
-def make(kind, problem, state, blocks, *, told=None, common=None, dynamic=None):
+def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=None):
     """The gauge at a state, its weights from the blocks of the criterion and the scatter seen there.
 
-    Maps `told` (n_told, 2 n_modes) of the reference plane are left to the data: see `Gauge`. It holds the plane at the
-    map `common` (2 n_modes,) from where the convention by itself would. The covariance `dynamic` of single exposures,
-    (n_exposures, 2 n_modes, 2 n_modes), is estimated if not given.
+    Parameters
+    ----------
+    kind : {"minimal", "mean"}
+    problem : Problem
+    state : State
+    blocks : Blocks
+    released : ndarray, shape (2 n_modes, r), optional
+        Maps of the reference plane that are not held, but left to the data.
+    common : ndarray, shape (2 n_modes,), optional
+        Map at which the plane is held, from where the constraints by themselves would have it.
+    dynamic : ndarray, shape (n_exposures, 2 n_modes, 2 n_modes), optional
+        Covariance of single exposures; estimated if not given.
 
     Raises
     ------
@@ -35,43 +45,93 @@ def make(kind, problem, state, blocks, *, told=None, common=None, dynamic=None):
         If the "mean" gauge leaves a direction free, as for rolls that cancel.
     """
     check_choice(kind, KINDS, "gauge")
-    shears = problem.own_degree is None and not (problem.fixed and any(rows[:, 1:3].any() for rows in problem.fixed))
+    used = blocks.v[0] > 0
+    shared, shared_shears = problem.unknowns.shared, problem.own_degree == 0
+    group = np.broadcast_to(problem.group, problem.n_exposures)
     problem, state, blocks = own_part(problem, state, blocks)
     box = reference_box(problem, state)
     motion = _motion(problem, state.poses, box)
     if kind == "mean":
         _check_mean(motion)
-    similar = _by_shape(similarity_basis, problem)
-    others = _by_shape(dynamic_basis, problem)
+    similar, others = _by_shape(similarity_basis, problem), _by_shape(dynamic_basis, problem)
     held = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
     error = conditional_errors(blocks.u_data)
+    maps = _taken_back(problem, motion, box, shared_shears)
+    static = _static_variance(problem, others, group, shared)
     if dynamic is None:
-        dynamic = dynamic_covariance(problem, state, error, motion, others)
-    if kind == "mean":
-        constraint = np.broadcast_to(np.eye(motion.shape[1])[:, None], (motion.shape[1], *motion.shape[:2])).copy()
-    else:
-        constraint = _minimal_constraint(motion, error, dynamic, similar, others, box, held=held)
-        told = _settled(problem, constraint, motion, box) if told is None else told
-    made = Gauge(kind, constraint, motion, dynamic, box, problem.static_sigma, bool(held.any()), told, shears=shears)
+        flat = np.isinf(static).any(axis=1)
+        dynamic = dynamic_covariance(problem, state, error, others @ motion @ maps.T, others, group, flat)
+    spread = others @ (dynamic + np.where(held, 0, 1)[:, None, None] * error) @ others.transpose(0, 2, 1)
+    weight = np.where(held, 1, influence(error, others))[:, None, None] * np.linalg.inv(spread)
+    positions = state.positions.T[used]
+    values = basis.values(problem.degree, *((positions - box[0]) / box[1]).T)
+    hierarchy = Hierarchy(motion, others, dynamic, weight, group, static, maps, tuple(2 * box[1, ::-1]), values)
+    poses = _pose_rows(kind, motion, error, similar, box)
+    known = hierarchy.solve(kind, released)
+    rows = np.concatenate([known.rows, poses])
+    made = Gauge(
+        kind,
+        constraint=rows,
+        motion=motion,
+        dynamic=dynamic,
+        box=box,
+        covariance=hierarchy.covariance(known, poses),
+        unknown_maps=known.unknown,
+        static=_in_a_word(static, shared),
+        prior=bool(held.any()),
+    )
     if common is None:
         return made
     moved = np.einsum("ika,ikb,ibc,c->ia", others, others, motion, common, optimize=True)  # poses take the rest
     return replace(made, values=-made.orthonormal @ moved.ravel())
 
 
-def _settled(problem, constraint, motion, box):
-    """Maps (n, 2 n_modes) of the reference plane that some exposure cannot take back, for what is fixed in it; or None.
-
-    They are left to the data; what remains of the constraint is its part for the maps that all exposures take back.
-    """
+def _taken_back(problem, motion, box, shared_shears):
+    """Orthonormal rows (m, 2 n): maps of the reference plane, similarities aside, that all exposures can take back."""
+    similar = similarity_basis(2 * box[1, ::-1], problem.n_modes)
+    if shared_shears:
+        return np.zeros((0, len(similar.T)))
     if problem.fixed is None:
-        return None
+        return complement(similar)
     moved = np.concatenate([rows @ n for rows, n in zip(problem.fixed, motion, strict=True)])
     _, size, maps = np.linalg.svd(moved)
     n = np.count_nonzero(size > _SETTLED * np.sqrt(problem.n_exposures))
-    common = similarity_basis(2 * box[1, ::-1], problem.n_modes)
-    rows = maps[n:] @ np.concatenate([complement(common), common]).T
-    return complement(rows @ np.einsum("aib,ibc->ac", constraint, motion)) if n else None
+    if not n:
+        return complement(similar)
+    rows = maps[n:] - maps[n:] @ similar.T @ similar
+    _, size, rows = np.linalg.svd(rows)
+    return rows[: np.count_nonzero(size > 1e-6)]
+
+
+def _static_variance(problem, others, group, shared):
+    """Variance (n_groups, K) of the static distortion of every detector: infinite where it is not known beforehand.
+
+    Where exposures share it and its uncertainty is not stated, it is sought and not known.
+    """
+    sigma = np.zeros((problem.n_exposures, 2, problem.n_modes)) if problem.mean_sigma is None else problem.mean_sigma
+    if shared:
+        sigma = np.where(sigma > 0, sigma, np.inf)
+    out = np.zeros((group.max() + 1, others.shape[1]))
+    for mine, rows, g in zip(sigma.reshape(problem.n_exposures, -1), others, group, strict=True):
+        flat = (np.abs(rows) > 0) @ np.isinf(mine)
+        out[g] = np.maximum(out[g], np.where(flat, np.inf, rows**2 @ np.where(np.isinf(mine), 0, mine) ** 2))
+    return out
+
+
+def _in_a_word(static, shared):
+    """What was known of the static distortion beforehand, see `Gauge`."""
+    if np.isinf(static).any():
+        return "fitted" if shared else "none"
+    return "uncertain" if static.any() else "exact"
+
+
+def _pose_rows(kind, motion, error, similar, box):
+    """Rows (4, n_exposures, 2 n) that hold the plane by the poses, mean over the exposures."""
+    common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
+    if kind == "mean":
+        return np.broadcast_to(common[:, None], (len(common), *motion.shape[:2]))
+    weight = influence(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
+    return (common @ motion.transpose(0, 2, 1) @ weight).transpose(1, 0, 2)
 
 
 def own_part(problem, state, blocks):
@@ -81,35 +141,19 @@ def own_part(problem, state, blocks):
         return problem, state, blocks
     n = basis.n_modes(unknowns.gauge_degree)
     rows = np.concatenate([np.arange(n), problem.n_modes + np.arange(n)])
-    sigma, static = problem.prior_sigma, problem.static_sigma
+    sigma, static, mean = problem.prior_sigma, problem.static_sigma, problem.mean_sigma
     own = replace(
         problem,
         degree=unknowns.gauge_degree,
         prior_mean=problem.prior_mean[:, :, :n],
         prior_sigma=None if sigma is None else sigma[:, :, :n],
         static_sigma=None if static is None else static[:, :n],
+        mean_sigma=None if mean is None else mean[:, :, :n],
         own_degree=None,
         group=None,
     )
     inner = replace(blocks, u=blocks.u[:, rows[:, None], rows], u_data=blocks.u_data[:, rows[:, None], rows])
     return own, State(state.positions, state.coefficients[:, :, :n], state.poses), inner
-
-
-def _minimal_constraint(motion, error, dynamic, similar, others, box, *, held):
-    """Rows ``N_i' W_i``: those of all but the common similarities see the departures without their similarity part.
-
-    With prior widths (exposures `held`) the weight is that of the prior alone: the constraint is then where the prior
-    by itself would settle, and the covariance under it that of truths drawn from the prior.
-    """
-    spread = dynamic + np.where(held, 0, 1)[:, None, None] * error
-    inner = others @ spread @ others.transpose(0, 2, 1)
-    weight = others.transpose(0, 2, 1) @ np.linalg.solve(inner, others) if others.shape[1] else np.zeros_like(error)
-    weight = np.where(held, 1, say(error, others))[:, None, None] * weight
-    pose_weight = say(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
-    common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
-    pulled = motion.transpose(0, 2, 1)
-    rows = np.concatenate([complement(common) @ pulled @ weight, common @ pulled @ pose_weight], axis=1)
-    return rows.transpose(1, 0, 2)
 
 
 def reference_box(problem, state):

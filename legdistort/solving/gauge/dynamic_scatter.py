@@ -1,8 +1,10 @@
-"""How far single exposures scatter around the prior mean, how well each is known, and how much say it has."""
+"""How far single exposures scatter around their static distortion, how well each is known, and how much it weighs."""
 
 import numpy as np
 
-from ...geometry import basis
+from ...geometry.detector_modes import dynamic_degrees
+
+_ROUNDS = 20
 
 
 def conditional_errors(u_data):
@@ -12,23 +14,42 @@ def conditional_errors(u_data):
     return np.linalg.inv(u_data + ridge * np.eye(size))
 
 
-def dynamic_covariance(problem, state, error, motion, others):
+def dynamic_covariance(problem, state, error, moved, others, group, flat):
     """Lambda of every exposure: from the prior if it has widths, else from the scatter seen beyond the errors.
 
-    The common map of the reference plane that fits the departures A_i - A_0 best is taken out first, so that the
-    result does not depend on the gauge of the state; then, mode by mode (shears for the linear ones), the variance
-    that makes the weighted scatter what it should be (Paule & Mandel 1982).
+    A common map of the reference plane is fitted to the departures A_i - A_0 and taken out, so that the result does not
+    depend on the gauge of the state; with it a static distortion for every detector whose own is not known beforehand.
+    Then, mode by mode (shears for the linear ones), the variance that makes the weighted squares of what is left their
+    degrees of freedom (Paule & Mandel 1982), the leverage of what was fitted counted.
+
+    Parameters
+    ----------
+    problem : Problem
+    state : State
+    error : ndarray, shape (n_exposures, 2 n, 2 n)
+        C_i.
+    moved : ndarray, shape (n_exposures, K, m)
+        How the m maps of the reference plane change the K modes `others` of every exposure.
+    others : ndarray, shape (n_exposures, K, 2 n)
+    group : ndarray of int, shape (n_exposures,)
+    flat : ndarray of bool, shape (n_groups,)
+        Detectors whose static distortion is not known.
     """
     n_modes = problem.n_modes
     departure = (state.coefficients - problem.prior_mean)[:, :, :n_modes].reshape(problem.n_exposures, -1)
     own = np.einsum("ika,ia->ik", others, departure)
-    moved = others @ motion
-    w = say(error, others)
-    normal = np.einsum("i,ika,ikb->ab", w, moved, moved, optimize=True)
-    common = np.linalg.pinv(normal, rcond=1e-10, hermitian=True) @ np.einsum("i,ika,ik->a", w, moved, own)
     variance = np.einsum("ika,iab,ikb->ik", others, error, others, optimize=True)
-    scatter = _pooled(_excess_scatter(own - moved @ common, variance), problem.n_exposures - 1)
-    out = others.transpose(0, 2, 1) * scatter**2 @ others
+    counts = variance <= 10 * np.median(variance, axis=0)  # values less certain would add noise and nothing else
+    design = np.concatenate([moved, *(_static(others, group == g) for g in np.flatnonzero(flat))], axis=2)
+    scatter2 = np.mean((own - own.mean(axis=0)) ** 2, axis=0)
+    for _ in range(_ROUNDS if own.size else 0):
+        weight = counts / (variance + scatter2 + 1e-300)
+        left, leverage = _fitted(design, weight, own)
+        new = _pooled(_excess(left, variance, counts, counts.sum(axis=0) - leverage), problem.n_exposures - 1)
+        change, scatter2 = np.abs(new - scatter2).max(initial=0), new
+        if change < 1e-3 * new.max(initial=0):
+            break
+    out = others.transpose(0, 2, 1) * scatter2 @ others
     for i in range(problem.n_exposures):
         if problem.has_widths(i):
             width = problem.prior_sigma[i].ravel()
@@ -37,42 +58,47 @@ def dynamic_covariance(problem, state, error, motion, others):
     return out
 
 
-def _pooled(scatter, n_free):
-    """Scatter per mode, shears first, drawn towards the rms of its degree by the weight of three exposures.
+def _static(others, mine):
+    """Columns (n_exposures, K, K) of a static distortion of some exposures."""
+    return mine[:, None, None] * np.eye(others.shape[1])
 
-    A handful of exposures tells the scatter of a single mode badly, and weights that follow its noise make reported
-    errors too small.
+
+def _fitted(design, weight, own):
+    """What a weighted fit leaves of values (n, K), and the leverage of the fit by mode (K,)."""
+    normal = np.einsum("ika,ik,ikb->ab", design, weight, design, optimize=True)
+    inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+    left = own - design @ (inverse @ np.einsum("ika,ik,ik->a", design, weight, own))
+    return left, np.einsum("ika,ab,ikb,ik->k", design, inverse, design, weight, optimize=True)
+
+
+def _pooled(variance, n_free):
+    """Variance per mode, shears first, drawn towards the mean of its degree by the weight of three exposures.
+
+    A handful of exposures determines the scatter of a single mode badly, and weights that follow its noise make
+    reported errors too small.
     """
-    degree = np.repeat(np.arange(basis.MAX_DEGREE + 1), np.arange(basis.MAX_DEGREE + 1) + 1)[3 : len(scatter) // 2 + 2]
-    degree = np.concatenate([[1, 1], degree, degree])[: len(scatter)]
-    number = np.bincount(degree)[degree]
-    usual = np.bincount(degree, scatter**2)[degree] / number
-    return np.sqrt((n_free * scatter**2 + 3 * usual) / (n_free + 3))
+    degree = dynamic_degrees(len(variance) // 2 + 2)
+    usual = np.bincount(degree, variance)[degree] / np.bincount(degree)[degree]
+    return (n_free * variance + 3 * usual) / (n_free + 3)
 
 
-def _excess_scatter(a, variance):
-    """Standard deviation per column of a (n, k) beyond the given variances, by bisection.
-
-    Values ten times less certain than usual would add noise to the answer and nothing else, so they have no say.
-    """
-    counts = variance <= 10 * np.median(variance, axis=0)
-    n = counts.sum(axis=0)
-    low, high = np.zeros(a.shape[1]), (a**2).sum(axis=0) + 1e-300
+def _excess(a, variance, counts, dof):
+    """Variance per column of a (n, K) beyond the given ones that makes the weighted squares `dof`, by bisection."""
+    low, high = np.zeros(a.shape[1]), (counts * a**2).sum(axis=0) / np.maximum(dof, 0.5) * 2 + 1e-300
 
     def excess(extra):
-        w = counts / (variance + extra + 1e-300)
-        return (w * a**2).sum(axis=0) - (n - 1)
+        return (counts * a**2 / (variance + extra + 1e-300)).sum(axis=0) - np.maximum(dof, 0.5)
 
     present = excess(low) > 0
     for _ in range(50):
         middle = (low + high) / 2
         above = excess(middle) > 0
         low, high = np.where(above, middle, low), np.where(above, high, middle)
-    return np.sqrt(high * present)
+    return high * present
 
 
-def say(error, rows):
-    """How much say each exposure has (n_exposures,): 1, fading where the variance exceeds ten times the usual one.
+def influence(error, rows):
+    """How much each exposure weighs (n_exposures,): 1, fading where the variance exceeds ten times the usual one.
 
     The scatter of a convention over a bad exposure's errors would move every star for no gain.
     """

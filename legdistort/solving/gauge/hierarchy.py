@@ -24,18 +24,23 @@ Shift, rotation and scale are always those of the nominal poses, or of a referen
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import eigh
 
 from ...geometry import basis
 from ...geometry.detector_modes import similarity_basis
-from ..equations.problem import complement
+from ...results.gauge import UnknownMap
+from ..equations.criterion import complement
 
 #: A direction whose posterior standard deviation exceeds so many pixels, rms over the stars and axes, is unknown.
 LIMIT = 1.0
+#: Residuals determine an unknown map if it gains so much chi2 (five standard errors) at the observed scale of errors.
+GAIN = 25.0
 #: Share of a pattern that must lie among the unknown maps for one of these to have its name.
 _ALIKE = 0.9
+_RIDGE = 1e-9  # of the metric: few stars leave maps without any displacement
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +60,9 @@ class Hierarchy:
     group : ndarray of int, shape (n_exposures,)
         Detector of every exposure.
     static : ndarray, shape (n_groups, K)
-        Variance of A_0 by detector: infinite where there is no prior, zero where it is exact.
+        Variance of A_0 by detector: infinite where it is not known, zero where it is exact.
+    maps : ndarray, shape (m, 2 n)
+        Orthonormal rows: the maps that every exposure can take back, similarities aside.
     size : tuple
         ``(ny, nx)`` of the box of the reference plane on which the modes are defined, pixels.
     values : ndarray, shape (n, n_stars)
@@ -68,128 +75,159 @@ class Hierarchy:
     weight: np.ndarray
     group: np.ndarray
     static: np.ndarray
+    maps: np.ndarray
     size: tuple
     values: np.ndarray
 
-    @property
-    def similarities(self):
-        """Orthonormal rows (4, 2 n): shift in x and y, scale, rotation of the plane."""
-        return similarity_basis(self.size, self.motion.shape[1] // 2)
-
     def rows(self, static):
-        """Rows of the constraints M' (D + 1 S 1')^-1 for a variance (n_groups, K) of A_0, (2 n - 4, n_exposures, 2 n)."""
-        moved = self.others @ self.motion @ complement(self.similarities).T
-        weighted = self.weight @ moved
+        """Rows M' (D + 1 S 1')^-1 of the constraints, (m, n_exposures, 2 n), for a variance (n_groups, K) of A_0."""
+        weighted = self.weight @ (self.others @ self.motion @ self.maps.T)
         for g, variance in enumerate(static):
             mine = self.group == g
-            if not mine.any():
+            if not (variance.any() and mine.any()):
                 continue
             total, pulled = self.weight[mine].sum(axis=0), weighted[mine].sum(axis=0)
             known = np.isfinite(variance)
             root = np.sqrt(np.where(known, variance, 1.0))
-            # (S^-1 + sum W)^-1 without dividing by a variance of zero; a flat one has no S^-1
+            # (S^-1 + sum W)^-1 without dividing by a variance of zero; one that is infinite has no S^-1
             inner = np.diag(np.where(known, 1.0, 0.0)) + root[:, None] * total * root
             weighted[mine] -= self.weight[mine] @ (root[:, None] * np.linalg.solve(inner, root[:, None] * pulled))
         return np.einsum("ika,ikb->bia", self.others, weighted, optimize=True)
 
-    def metric(self):
-        """Mean square displacement of the stars, per axis, by maps (2 n - 4) once a similarity is taken off."""
-        n = self.values.shape[1]
-        values = np.kron(np.eye(2), self.values.T)
-        others, similar = values @ complement(self.similarities).T, values @ self.similarities.T
-        others = others - similar @ np.linalg.lstsq(similar, others, rcond=None)[0]
-        out = others.T @ others / (2 * n)
-        return out + 1e-9 * np.trace(out) / len(out) * np.eye(len(out))
-
     def convention(self, kind):
-        """Rows (2 n - 4, n_exposures, 2 n) of the convention by itself: A_0 at the prior mean."""
+        """Rows (m, n_exposures, 2 n) of a convention by itself: A_0 at the prior mean."""
         if kind == "mean":
-            pulled = complement(self.similarities)[:, None, :]
-            return np.broadcast_to(pulled, (pulled.shape[0], *self.motion.shape[:2]))
+            return np.broadcast_to(self.maps[:, None], (len(self.maps), *self.motion.shape[:2]))
         return self.rows(np.zeros_like(self.static))
 
-    def solve(self, kind):
-        """What is known and what is not: `Knowledge`."""
-        others = complement(self.similarities)
-        held = self.convention(kind)
-        if not self.static.any():  # exact everywhere: nothing to determine but the scatter of the exposures
-            return Knowledge(held, others.T, np.zeros((others.shape[1], 0)))
-        rows = self.rows(self.static)
-        information = np.einsum("bia,iac,dc->bd", rows, self.motion, others, optimize=True)
-        curvature, vectors = eigh((information + information.T) / 2, self.metric())
-        unknown = np.isinf(self.static).any() & (curvature * LIMIT**2 < 1)
-        known = vectors[:, ~unknown].T, vectors[:, unknown].T
-        rows = np.concatenate([np.tensordot(known[0], rows, 1), np.tensordot(known[1], held, 1)])
-        return Knowledge(rows, (known[0] @ others).T, (known[1] @ others).T)
+    @cached_property
+    def metric(self):
+        """Mean square displacement of the stars, per axis, by modes (2 n,) squared, once a similarity is taken off."""
+        n = self.values.shape[1]
+        modes = np.kron(np.eye(2), self.values.T)
+        similar = modes @ similarity_basis(self.size, len(self.values)).T
+        modes = modes - similar @ np.linalg.lstsq(similar, modes, rcond=None)[0]
+        return modes.T @ modes / (2 * n)
 
-    def covariance(self, rows, maps, n_known):
-        """Covariance (2 n, 2 n) of the common map under constraints `rows`, what is unknown and similarities left out.
+    def solve(self, kind, released=None):
+        """What is known of the common map, with constraints: `Knowledge`.
 
         Parameters
         ----------
-        rows : ndarray, shape (2 n, n_exposures, 2 n)
-        maps : ndarray, shape (2 n, 2 n)
-            Columns: the `n_known` known ones first, unknown ones, similarities.
-        n_known : int
+        kind : {"minimal", "mean"}
+            Convention for what is not known.
+        released : ndarray, shape (2 n, r), optional
+            Unknown maps, for which no constraint is made.
         """
+        held = self.convention(kind)
+        if not (self.static.any() and len(self.maps)):  # exact: the convention is the posterior mean
+            return Knowledge(held, self.maps.T, ())
+        rows = self.rows(self.static)
+        information = np.einsum("bia,iac,dc->bd", rows, self.motion, self.maps, optimize=True)
+        metric = self.maps @ self.metric @ self.maps.T
+        metric += _RIDGE * np.trace(metric) / len(metric) * np.eye(len(metric))
+        curvature, vectors = eigh((information + information.T) / 2, metric)
+        is_unknown = np.isinf(self.static).any() & (curvature * LIMIT**2 < 1)
+        known, unknown = vectors[:, ~is_unknown], vectors[:, is_unknown]
+        if released is not None and unknown.shape[1]:
+            inside = np.linalg.qr(unknown.T @ metric @ self.maps @ released)[0]
+            unknown = unknown @ complement(inside.T).T
+        rows = np.concatenate([np.tensordot(known.T, rows, 1), np.tensordot(unknown.T, held, 1)])
+        return Knowledge(rows, self.maps.T @ known, self._named(self.maps.T @ unknown))
+
+    def covariance(self, known, poses):
+        """Covariance (2 n, 2 n) of what is known of the common map, under its constraints.
+
+        Parameters
+        ----------
+        known : Knowledge
+        poses : ndarray, shape (4, n_exposures, 2 n)
+            Constraints that hold the similarities.
+        """
+        rows = np.concatenate([known.rows, poses])
+        columns = [known.known, *(each.map[:, None] for each in known.unknown), similarity_basis(self.size, len(self.values)).T]
+        maps, n = np.hstack(columns), known.known.shape[1]
         inside = np.einsum("bia,iac,dic->bd", rows, self.dynamic, rows, optimize=True)
         on_modes = np.einsum("bia,ika->bik", rows, self.others, optimize=True)
         for g, variance in enumerate(self.static):
             common = on_modes[:, self.group == g].sum(axis=1)
             inside += common * np.where(np.isfinite(variance), variance, 0) @ common.T
         reach = np.einsum("bia,iac,cd->bd", rows, self.motion, maps, optimize=True)
-        back = np.linalg.inv(reach)[:n_known]
-        return maps[:, :n_known] @ back @ inside @ back.T @ maps[:, :n_known].T
+        back = maps[:, :n] @ np.linalg.inv(reach)[:n]
+        return back @ inside @ back.T
+
+    def _named(self, maps):
+        """Unknown maps (2 n, m) with names: turned, as far as they allow, into those that have one."""
+        found, left = [], np.eye(maps.shape[1])
+        for name, degree, pattern in _patterns(len(self.values), self.size):
+            inside = left @ (left.T @ (maps.T @ self.metric @ pattern))
+            if inside @ inside > _ALIKE * (pattern @ self.metric @ pattern):
+                inside /= np.linalg.norm(inside)
+                found.append(UnknownMap(name, degree, maps @ inside))
+                left = left @ complement((left.T @ inside)[None]).T
+        degrees = np.tile(np.add(*basis.orders(basis.degree_of(len(self.values)))), 2)
+        for rest in (maps @ left).T:
+            power = np.bincount(degrees, rest**2)
+            degree = max(1, int(power[1:].argmax()) + 1)
+            found.append(UnknownMap(f"degree {degree}" if degree > 1 else "shear", degree, rest))
+        return tuple(sorted(found, key=lambda each: each.degree))
 
 
 @dataclass(frozen=True, eq=False)
 class Knowledge:
-    """Constraints on all of a common map but its similarity, and which of them hold what is unknown.
+    """Constraints on all of a common map but its similarity, and what they hold that is not known.
 
     Attributes
     ----------
-    rows : ndarray, shape (2 n - 4, n_exposures, 2 n)
-        First those that determine the known maps.
-    known, unknown : ndarray, shape (2 n, k) and (2 n, 2 n - 4 - k)
-        Maps as columns, of unit rms over stars and axes where something is unknown.
+    rows : ndarray, shape (m, n_exposures, 2 n)
+        Those that determine the known maps first.
+    known : ndarray, shape (2 n, k)
+        Known maps as columns.
+    unknown : tuple of UnknownMap
+        Of unit rms over stars and axes.
     """
 
     rows: np.ndarray
     known: np.ndarray
-    unknown: np.ndarray
+    unknown: tuple
 
 
-def named(maps, metric, size):
-    """Unknown maps with names: turned, as far as they allow, into those that have one.
+def determined_by_residuals(system, gauge):
+    """Unknown maps that residuals of second order determine, as columns (2 n, r).
+
+    To five standard errors, and to an error below `LIMIT`, both at the observed scale of errors if that is larger than
+    the stated one.
 
     Parameters
     ----------
-    maps : ndarray, shape (2 n, m)
-        Columns of unit rms over the stars, orthogonal in the metric.
-    metric : ndarray, shape (2 n, 2 n)
-        Mean square displacement of the stars, similarities taken off.
-    size : tuple
-        ``(ny, nx)`` of the box of the reference plane, pixels.
-
-    Returns
-    -------
-    list of (str, int, ndarray of shape (2 n,))
-        Name, degree and map.
+    system : Direct or Iterative
+        At convergence.
+    gauge : Gauge
+        The convention in force.
     """
-    found, left = [], np.eye(maps.shape[1])
-    for name, degree, pattern in _patterns(maps.shape[0] // 2, size):
-        inside = left @ (left.T @ (maps.T @ metric @ pattern))
-        if inside @ inside > _ALIKE * (pattern @ metric @ pattern):
-            inside /= np.linalg.norm(inside)
-            found.append((name, degree, maps @ inside))
-            left = left @ complement((left.T @ inside)[None]).T
-    degrees = np.tile(np.add(*basis.orders(basis.degree_of(maps.shape[0] // 2))), 2)
-    for rest in (maps @ left).T:
-        power = np.bincount(degrees, rest**2)
-        power[:2] = 0
-        degree = int(power.argmax()) if power.any() else 1
-        found.append((f"degree {degree}" if degree > 1 else "shear", degree, rest))
-    return sorted(found, key=lambda each: each[1])
+    maps = np.stack([each.map for each in gauge.unknown_maps if each.degree > 1], axis=1, dtype=float) if any(
+        each.degree > 1 for each in gauge.unknown_maps
+    ) else np.zeros((2 * gauge.n_modes, 0))
+    if not maps.shape[1] or system.dof <= 0 or system.blocks.chi2 < system.dof + 5 * np.sqrt(2 * system.dof):
+        return maps[:, :0]
+    moved = gauge.reach @ maps
+    curvature, vectors = np.linalg.eigh(moved.T @ system.information @ moved)
+    curvature = np.maximum(curvature, 1e-300)
+    gain = (vectors.T @ (moved.T @ system.pull)) ** 2 / curvature
+    left = (system.blocks.chi2 - gain.sum()) / system.dof
+    scale = max(1.0, left)
+    if not is_explained(system.blocks.chi2 - gain.sum(), system):
+        return maps[:, :0]
+    return maps @ vectors[:, (gain > GAIN * scale) & (curvature * LIMIT**2 > scale)]
+
+
+def is_explained(chi2, system):
+    """Whether a chi2 counts as explained: two per degree of freedom, or a tenth of that of a system.
+
+    Else the residuals have another cause, modes that are not fitted, say, which bending the reference plane by hundreds
+    of pixels can reduce as well.
+    """
+    return chi2 <= max(2.0 * system.dof, 0.1 * system.blocks.chi2)
 
 
 def _patterns(n, size):

@@ -1,0 +1,83 @@
+"""Errors of star positions and coefficients with those of the common map: absolute, up to what is unknown.
+
+Positions are ``X + D g``: the relative ones, as they come out in the gauge, and a common map g of the reference plane
+seen through the directions D (`Gauge.directions`). To first order D are the modes of g, which a map of the same degree
+takes off again. What is left of them, the product of the map with the gradient of the distortions, is part of the
+relative errors.
+"""
+
+import numpy as np
+
+
+def _plain(gauge, xy, n):
+    """Displacements (n_stars, 2, 2 n) by the modes of the reference plane themselves."""
+    return np.kron(np.eye(2), gauge.modes_at(xy, n).T).reshape(2, len(xy), -1).transpose(1, 0, 2)
+
+
+def _directions(gauge, xy):
+    """Directions (n_stars, 2, 2 n) for the modes of `Gauge.absolute_covariance`."""
+    n = len(gauge.absolute_covariance) // 2
+    return gauge.directions if n == gauge.n_modes else _plain(gauge, xy, n)
+
+
+def _spread(directions, covariance):
+    """Covariance xx, yy, xy (3, n_stars) of displacements (n_stars, 2, k) by coefficients."""
+    blocks = directions @ covariance @ directions.transpose(0, 2, 1)
+    return np.stack([blocks[:, 0, 0], blocks[:, 1, 1], blocks[:, 0, 1]])
+
+
+def relative_variance(gauge, uncertainty, xy):
+    """Covariance xx, yy, xy (3, n_stars) of positions (n_stars, 2) once a common map of the fitted degree is taken off.
+
+    That in the gauge, and the part of the common map that is of second order.
+    """
+    good = np.isfinite(xy[:, 0]) & np.isfinite(uncertainty.stars[0])
+    out = np.array(uncertainty.stars)
+    if gauge.plane is not None or not np.count_nonzero(good):
+        return out
+    directions = _directions(gauge, xy)[good]
+    plain = gauge.modes_at(xy[good], directions.shape[2] // 2).T
+    left = directions - np.einsum("jm,mac->jac", plain, np.einsum("mj,jac->mac", np.linalg.pinv(plain), directions))
+    out[:, good] += _spread(left, gauge.absolute_covariance)
+    return out
+
+
+def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
+    """Covariance xx, yy, xy (3, n_stars) of positions with that of the common map.
+
+    NaN, unless `without_unknown`, for a star that an unknown direction of unit rms moves by more than the rest of its
+    error.
+    """
+    if gauge.plane is not None:
+        return np.full_like(uncertainty.stars, np.nan)
+    out = uncertainty.stars + _spread(_directions(gauge, xy), gauge.absolute_covariance)
+    if gauge.tie is not None:
+        out = out + gauge.tie.shared
+    if not without_unknown:
+        for each in gauge.unknown:
+            out[:, np.sum(each.stars**2, axis=1) > out[0] + out[1]] = np.nan
+    return out
+
+
+def map_covariance(gauge, xy):
+    """Covariance xx, yy, xy (3, n) of the common map at any reference positions (n, 2); NaN where it is unknown."""
+    covariance = gauge.absolute_covariance
+    return _spread(_plain(gauge, xy, len(covariance) // 2), covariance)
+
+
+def coefficient_variance(gauge, block, i):
+    """Variance (2, n_modes) of the coefficients of exposure i from their covariance `block` in the gauge.
+
+    NaN for what an unknown direction of unit rms changes by more than the rest of the error.
+    """
+    n, k = gauge.n_modes, len(block) // 2
+    moved = np.zeros((2, k, 2 * n))
+    moved[:, :n] = gauge.motion[i].reshape(2, n, -1)
+    moved = moved.reshape(2 * k, -1)
+    covariance = gauge.covariance if gauge.tie is None or len(gauge.tie.covariance) != 2 * n else gauge.tie.covariance
+    out = (np.diag(block) + np.einsum("ab,bc,ac->a", moved, covariance, moved)).reshape(2, k)
+    for each in gauge.unknown:
+        change = np.zeros((2, k))
+        change[:, : each.coefficients.shape[2]] = each.coefficients[i]
+        out[change**2 > out] = np.nan
+    return out
