@@ -179,8 +179,9 @@ def write_results(solution, target):
 
 
 def write_summary(path, summary):
-    """Write figures as JSON."""
-    Path(path).write_text(json.dumps(summary, indent=1) + "\n")
+    """Write figures as JSON, in the place of those that are there."""
+    with outputs.replacing(path, overwrite=True) as file:
+        file.write(f"{json.dumps(summary, indent=1)}\n".encode())
 
 
 def summarise(solution, *, timings=None):

@@ -52,9 +52,9 @@ def write_report(path, solution, *, mosaic=None, summary=None, comparison=None, 
     InputError
         If the file exists and `overwrite` is false, or its folder does not exist.
     """
-    with replacing(path, overwrite=overwrite) as temporary:
+    with replacing(path, overwrite=overwrite) as file:
         page = render(solution, mosaic=mosaic, summary=summary, comparison=comparison, stacks=stacks)
-        temporary.write_text(page, encoding="utf-8")
+        file.write(page.encode())
     return Path(path)
 
 

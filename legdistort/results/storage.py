@@ -65,11 +65,11 @@ def write_solution(solution, path, *, overwrite=False):
         else {"lon": solution.sky.lon, "lat": solution.sky.lat, "matrix": solution.sky.matrix},
         "left_out": solution.left_out,
     }
-    file = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
+    content = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
     for column in tree["observations"].values():  # names repeat; covariances and coefficients would not get smaller
-        file.set_array_compression(column["values"], "zlib")
-    with replacing(path, overwrite=overwrite) as temporary:
-        file.write_to(temporary)
+        content.set_array_compression(column["values"], "zlib")
+    with replacing(path, overwrite=overwrite) as file:
+        content.write_to(file)
     return Path(path)
 
 
