@@ -9,7 +9,7 @@ relative errors.
 import numpy as np
 
 
-def _plain(gauge, xy, n):
+def plain_directions(gauge, xy, n):
     """Displacements (n_stars, 2, 2 n) by the modes of the reference plane themselves."""
     return np.kron(np.eye(2), gauge.modes_at(xy, n).T).reshape(2, len(xy), -1).transpose(1, 0, 2)
 
@@ -17,7 +17,7 @@ def _plain(gauge, xy, n):
 def _directions(gauge, xy):
     """Directions (n_stars, 2, 2 n) for the modes of `Gauge.absolute_covariance`."""
     n = len(gauge.absolute_covariance) // 2
-    return gauge.directions if n == gauge.n_modes else _plain(gauge, xy, n)
+    return gauge.directions if n == gauge.n_modes else plain_directions(gauge, xy, n)
 
 
 def _spread(directions, covariance):
@@ -62,7 +62,7 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
 def map_covariance(gauge, xy):
     """Covariance xx, yy, xy (3, n) of the common map at any reference positions (n, 2); NaN where it is unknown."""
     covariance = gauge.absolute_covariance
-    return _spread(_plain(gauge, xy, len(covariance) // 2), covariance)
+    return _spread(plain_directions(gauge, xy, len(covariance) // 2), covariance)
 
 
 def coefficient_variance(gauge, block, i):

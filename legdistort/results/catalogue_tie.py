@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry import basis
-from ..geometry.detector_modes import dynamic_basis, similarity_basis
+from ..geometry.detector_modes import dynamic_basis, dynamic_degrees, similarity_basis
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,7 +15,7 @@ class Tie:
     Attributes
     ----------
     covariance : ndarray, shape (2 k, 2 k)
-        Of the map that the exposures do not tell, px^2, in the k modes of the gauge (3 if it has one).
+        Of the common map, px^2, in the k modes of the gauge (3 if it has one); without what is unknown.
     shared : ndarray, shape (3, n_stars)
         xx, yy, xy [px^2]: what to add to relative variance and that of the map at each star, for their errors have
         the noise of the star in common.
@@ -65,8 +65,7 @@ class Tie:
 
         NaN for rotation and scale if the reference does not tell them. `size` (ny, nx) is that of the box of the modes.
         """
-        known = Knowledge(self.covariance, np.zeros(len(self.covariance)), False, size)
-        similar, parts = known.similarities, known.by_degree()
+        similar, *parts = map_parts(size, len(self.covariance) // 2)
         if self.alone:
             groups = {"shift": similar[:, :2], "rotation, scale": np.full((len(similar), 2), np.nan)}
         else:
@@ -95,44 +94,12 @@ class Tie:
         return f"<Tie: {np.count_nonzero(self.used)} of {len(self.used)} reference stars, {self.rms:.2g} px rms>"
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Knowledge:
-    """What is known of the common map before the reference is asked.
+def map_parts(size, n):
+    """Orthonormal columns (2 n, ...) of a map: similarities, the two shears, then those of each further degree.
 
-    Attributes
-    ----------
-    covariance : ndarray, shape (2 k, 2 k)
-        Of all but its similarity, px^2.
-    centre : ndarray, shape (2 k,)
-        Its most probable value, in modes.
-    free : bool
-        Whether a static distortion that nobody knows adds to it: its size, degree by degree, is then found.
-    size : tuple
-        ``(ny, nx)`` of the box of the modes, pixels.
+    `size` (ny, nx) is that of the box of the modes, pixels.
     """
-
-    covariance: np.ndarray
-    centre: np.ndarray
-    free: bool
-    size: tuple
-
-    def __repr__(self):
-        return f"<Knowledge: {self.n_modes} modes an axis>"
-
-    @property
-    def n_modes(self):
-        """k."""
-        return len(self.centre) // 2
-
-    @property
-    def similarities(self):
-        """Orthonormal columns (2 k, 4): shift in x and y, scale, rotation."""
-        return similarity_basis(self.size, self.n_modes).T
-
-    def by_degree(self):
-        """Orthonormal columns of all but the similarities: the two shears, then those of each further degree."""
-        columns = dynamic_basis(self.size, self.n_modes).T
-        degree = basis.degree_of(self.n_modes)
-        orders = np.sum(basis.orders(degree), axis=0)[3:]
-        which = np.concatenate([[1, 1], orders, orders])
-        return [columns[:, which == d] for d in range(1, degree + 1)]
+    columns = dynamic_basis(size, n).T
+    orders = dynamic_degrees(n)
+    degrees = range(1, basis.degree_of(n) + 1)
+    return [similarity_basis(size, n).T, *(columns[:, orders == d] for d in degrees)]

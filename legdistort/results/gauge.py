@@ -156,7 +156,9 @@ class Gauge:
     @property
     def measured(self):
         """Combinations of the orthonormal constraints, as columns, at which residuals determine the values."""
-        return np.linalg.qr(self.reach @ (np.zeros((2 * self.n_modes, 0)) if self.released is None else self.released))[0]
+        return np.linalg.qr(self.reach @ (np.zeros((2 * self.n_modes, 0)) if self.released is None else self.released))[
+            0
+        ]
 
     def modes_at(self, xy, n_modes=None):
         """Values (n_modes, n) of the reference-plane modes, by default of the gauge, at reference positions (n, 2)."""
@@ -247,7 +249,9 @@ class Gauge:
         error = np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()]))
         tied = f"{self.tie.sentence}; " if self.tie is not None else ""
         after = f" after {_listed(self.unknown_names)}" if self.unknown_names else ""
-        known = f"{tied}absolute to {error:.2g} px rms per axis{after}" + (", pointing aside" if self.tie is None else "")
+        known = f"{tied}absolute to {error:.2g} px rms per axis{after}" + (
+            ", pointing aside" if self.tie is None else ""
+        )
         return f"{self.kind} ({_CONVENTIONS[self.kind]}), {self.n_constraints} modes of a common map; {known}"
 
     def __repr__(self):

@@ -15,13 +15,13 @@ from ..geometry.detector_modes import similarity_basis
 from ..inputs import column_contract
 from ..inputs.matches import robust_similarity
 from ..matching.cross_identification import identify
-from ..results.catalogue_tie import Knowledge
+from ..results.absolute_errors import plain_directions
 from ..results.diagnostics import UsedReference
 from . import minimisers
 from .equations import criterion
 from .equations.covariances import Uncertainty
 from .equations.problem import State
-from .gauge import catalogue_map
+from .gauge import catalogue_map, hierarchy
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +42,6 @@ class Anchor:
     label : str
         How messages call the reference.
     names : ndarray, shape (n_stars,)
-    free : bool
-        Whether the static distortion is not known beforehand.
     scale : float
         Factor on the stated errors of the exposures.
     options : SolveOptions
@@ -52,7 +50,6 @@ class Anchor:
     identified: object
     label: str
     names: np.ndarray
-    free: bool
     scale: float
     options: object
 
@@ -77,17 +74,20 @@ class Anchor:
         status, first = result.status, self._rough(result.state)
         if first is not None:
             result = self._solved(problem, _moved(result.state, first))
-        known = self._known(result.gauge, _takes_back(problem))
+        prior = None
         for count in range(_ROUNDS):
             if count < 2:  # afterwards the plane moves too little for another
-                relative = self._relative(problem, result)
-            step, made = self._estimate(result, relative, known)
-            if count and self._is_settled(result.gauge, result.state, step, made):
+                errors = self._errors(problem, result)
+                directions = self._directions(result.gauge, errors, result.state.positions.T)
+                prior = self._prior(result.gauge, directions) if prior is None else prior
+            offered = self._offered(result, directions, errors, prior)
+            step, made = catalogue_map.estimate(offered, catalogue_map.accepted(offered, self.label), self.names)
+            if count and self._is_settled(directions, step, made):
                 break
-            similar = similarity_basis(known.size, known.n_modes)
+            similar = similarity_basis(prior.size, prior.n_modes)
             shift = similar.T @ (similar @ step)
             step = step - shift
-            known = replace(known, centre=known.centre - step)
+            prior = replace(prior, centre=prior.centre - step)
             state = _moved(result.state, _pose(result.gauge, shift))
             common = _common(problem, result, step)
             if common is None:
@@ -96,28 +96,21 @@ class Anchor:
                 result = self._solved(problem, state, common=common)
         else:
             log.warning("the tie to %s is not settled after %d rounds", self.label, _ROUNDS)
-        if not _takes_back(problem):
-            made = replace(made, covariance=made.covariance + result.gauge.absolute_covariance)
-        self._warn(made, known)
+        unknown = hierarchy.named(offered.determined(made.used)[2], result.gauge, result.state.positions.T)
+        self._warn(made)
         log.info("%s", made.sentence)
         if result.converged:
             result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds")
-        return replace(result, gauge=replace(result.gauge, tie=made))
+        return replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown))
 
     def _solved(self, problem, state, *, common=None):
         of = self.options
         how = {"gauge": of.gauge, "loss": of.loss, "max_iterations": of.max_iterations}
         return minimisers.solve_joint(problem, state, common=common, **how)
 
-    def _warn(self, made, known):
+    def _warn(self, made):
         """Tell what makes the absolute errors too small."""
         n = np.count_nonzero(made.used)
-        if known.free and n < known.n_modes:
-            warn(
-                f"{n} stars of {self.label} do not tell all {known.n_modes} modes of a static distortion that is not "
-                "known beforehand: what they leave open of it is not in the absolute errors; give a prior",
-                AssumptionWarning,
-            )
         if made.ratio > _LARGE and made.ratio > 1 + 6 * np.sqrt(1 / n):
             warn(
                 f"the offsets of the stars from {self.label} are {np.sqrt(made.ratio):.1f} times larger than the "
@@ -139,54 +132,48 @@ class Anchor:
         log.debug("first similarity of the tie: %.3g px", move.max())
         return pose if move.max() > 1e-3 else None
 
-    def _relative(self, problem, result):
+    def _errors(self, problem, result):
         weighted = problem.scaled(result.robust)
         blocks = criterion.linearise(weighted, result.state)
-        errors = Uncertainty(weighted, blocks, result.gauge, scale=self.scale)
-        return errors.star_matrix if problem.n_stars <= catalogue_map.DENSE else errors.stars
+        return Uncertainty(weighted, blocks, result.gauge, scale=self.scale)
 
-    def _known(self, gauge, bends):
-        """What is known of the common map beforehand, in three modes at least."""
-        n = gauge.n_constraints // 2
-        k = max(n, 3)
+    def _directions(self, gauge, errors, positions):
+        """How maps of three modes at least move the stars."""
+        if gauge.n_modes >= 3:
+            return errors.directions
+        return plain_directions(gauge, positions, 3)
+
+    def _prior(self, gauge, directions):
+        """What is known of the common map beforehand."""
+        n, k = gauge.n_modes, directions.shape[2] // 2
         covariance = np.zeros((2, k, 2, k))
-        if bends:
-            covariance[:, :n, :, :n] = gauge.absolute_covariance.reshape(2, n, 2, n)
-        size = tuple(2 * gauge.box[1, ::-1])
-        free = self.free and n > 1 and bends
-        return Knowledge(covariance.reshape(2 * k, -1), np.zeros(2 * k), free, size)
+        covariance[:, :n, :, :n] = gauge.covariance.reshape(2, n, 2, n)
+        maps = np.array([each.map for each in gauge.unknown_maps]).reshape(-1, 2 * n).T
+        return catalogue_map.map_prior(covariance.reshape(2 * k, -1), maps, directions, tuple(2 * gauge.box[1, ::-1]))
 
-    def _estimate(self, result, relative, known):
+    def _offered(self, result, directions, errors, prior):
         positions = result.state.positions.T
         offsets = catalogue_map.Offsets(
             self.identified.rows,
             self.identified.xy - positions[self.identified.rows],
             self.identified.covariance,
         )
-        modes = result.gauge.modes_at(positions, known.n_modes)
-        offered = catalogue_map.Offered(offsets, modes, relative, known)
-        return catalogue_map.estimate(offered, catalogue_map.accepted(offered, self.label), self.names)
+        relative = errors.star_matrix if len(positions) <= catalogue_map.DENSE else errors.stars
+        return catalogue_map.Offered(offsets, directions, relative, prior)
 
-    def _is_settled(self, gauge, state, step, made):
-        modes = gauge.modes_at(state.positions.T, len(step) // 2)
-        move = (step.reshape(2, -1) @ modes) ** 2
-        blocks = made.covariance.reshape(2, len(modes), 2, len(modes))
-        variance = [np.einsum("kn,kl,ln->n", modes, blocks[a, :, a], modes) for a in (0, 1)]
-        log.debug("the plane would move by %.2g px", np.sqrt(move.mean()))
-        return move.mean() < max(_SETTLED**2 * np.mean(variance), 1e-16)
-
-
-def _takes_back(problem):
-    """Whether exposures have modes of their own; shears that they share are told by their rolls, not by a reference."""
-    return problem.own_degree != 0
+    def _is_settled(self, directions, step, made):
+        move = np.mean((directions @ step) ** 2)
+        variance = np.mean(np.einsum("nak,kl,nal->na", directions, made.covariance, directions, optimize=True))
+        log.debug("the plane would move by %.2g px", np.sqrt(move))
+        return move < max(_SETTLED**2 * variance, 1e-16)
 
 
 def _common(problem, result, step):
     """The map at which to hold the constraints: the present one and a step; None where there is nothing to hold."""
     gauge = result.gauge
-    if len(step) > gauge.n_constraints or not _takes_back(problem):
+    if len(step) > 2 * gauge.n_modes or problem.own_degree == 0:  # shears that are shared: rolls determine them
         return None
-    departure = (result.state.coefficients - problem.prior_mean)[:, :, : gauge.n_constraints // 2]
+    departure = (result.state.coefficients - problem.prior_mean)[:, :, : gauge.n_modes]
     return gauge.common_map(departure) + step
 
 
@@ -241,13 +228,10 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         pixel_scale=pixel_scale,
     )
     log.info("%d of the %d stars of %s are in the exposures", len(identified.rows), len(reference), reference.label)
-    prior = fit.options.prior
-    known = prior.values() if isinstance(prior, dict) else [prior]
     anchor = Anchor(
         identified,
         reference.label,
         matches.stars,
-        free=any(each is None for each in known),
         scale=scale,
         options=fit.options,
     )

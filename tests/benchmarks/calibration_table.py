@@ -58,7 +58,9 @@ def displacement(c, q):
     return np.column_stack([chebyshev.chebval2d(x, y, each) for each in c])
 
 
-def simulated(seed, *, n_exposures=11, n_stars=70, dither=150.0, rolls=False, sigma=0.02, static=STATIC, dynamic=DYNAMIC):
+def simulated(
+    seed, *, n_exposures=11, n_stars=70, dither=150.0, rolls=False, sigma=0.02, static=STATIC, dynamic=DYNAMIC
+):
     """Matches, true positions by star, and the Chebyshev coefficients of the static distortion."""
     rng = np.random.default_rng(seed)
     common = random_field(rng, static)
@@ -92,7 +94,7 @@ def as_prior(common, rng, static_sigma=None):
         for (i, j), value in np.ndenumerate(c):
             setattr(part, f"c{i}_{j}", value)
     model = models.Identity(2) + (models.Mapping((0, 1, 0, 1)) | parts[0] & parts[1])
-    prior = ld.Prior.from_model(model, shape=(SIZE, SIZE), degree=DEGREE)
+    prior = ld.Prior.from_model(model, shape=(SIZE, SIZE), degree=DEGREE, direction="reference_to_detector")
     if static_sigma is None:
         return prior
     mean = prior.mean + rng.normal(size=prior.mean.shape) * static_sigma
@@ -184,7 +186,9 @@ def main():
         for n in arguments.exposures if arguments.only in name else []:
             true, reported, unknown = row(name, arguments.sets, n_exposures=n)
             words = ", ".join(dict.fromkeys(unknown)) or "-"
-            print(f"{name:32s} {n:9d} {true**0.5:9.4f} {reported**0.5:9.4f} {true / reported:8.2f}  {words}", flush=True)
+            print(
+                f"{name:32s} {n:9d} {true**0.5:9.4f} {reported**0.5:9.4f} {true / reported:8.2f}  {words}", flush=True
+            )
 
 
 if __name__ == "__main__":

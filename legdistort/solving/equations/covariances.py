@@ -94,7 +94,9 @@ class Uncertainty:
         for d in system.moves[self._gauge.n_constraints :]:
             stars, coefficients = system.follow(d).T, problem.unknowns.spread(d)
             unit = np.sqrt(np.mean(stars[self._blocks.v[0] > 0] ** 2))
-            made.append(UnknownDirection("static", stars / unit, (coefficients / unit).reshape(len(coefficients), 2, -1)))
+            made.append(
+                UnknownDirection("static", stars / unit, (coefficients / unit).reshape(len(coefficients), 2, -1))
+            )
         return tuple(made)
 
     @cached_property

@@ -1,23 +1,27 @@
-"""What a reference catalogue tells of the maps that exposures cannot: an estimate of them, with its errors.
+"""What a reference catalogue determines of a common map: an estimate of it, with its errors.
 
-A common map g of the reference plane, X -> X + phi(X) g, is all that a reference is asked for. Its stars lie
-``r_j = X_cat,j - X_j`` off the relative solution, ``r = phi g`` but for the errors of both; what is known of g
-beforehand is the size of the mean distortion of the set, and of its similarity nothing.
+A common map g of the reference plane, X -> X + D g, is all that a reference is asked for. Its stars lie
+``r_j = X_cat,j - X_j`` off the relative solution, ``r = D g`` but for the errors of both. What the exposures and a prior
+determine of g (`legdistort.solving.gauge.hierarchy`) counts with its information, that is, of shift, rotation and scale
+nothing. What neither determines to `LIMIT` stays where the convention has it.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import eigh
 
 from ...exceptions import InputError
-from ...results.catalogue_tie import Tie
+from ...results.catalogue_tie import Tie, map_parts
+from ..equations.criterion import complement
+from .hierarchy import LIMIT
 
 #: Offsets beyond so many standard errors, at the observed scale if that is larger, are mismatches.
 CLIP = 5.0
 #: Up to so many stars their relative errors are taken with all covariances, beyond star by star.
 DENSE = 1000
 _ROUNDS = 20
+_EXACT = 1e-12  # px^2: what counts as known without error
 _SQRT = np.sqrt(2 * np.log(2))  # median of the length of a normal vector in two dimensions
 
 
@@ -43,32 +47,74 @@ class Offsets:
         return f"<Offsets: {len(self.rows)} reference stars>"
 
 
+@dataclass(frozen=True, eq=False)
+class MapPrior:
+    """What is known of the common map before a reference is asked.
+
+    Attributes
+    ----------
+    information : ndarray, shape (2 k, 2 k)
+        Inverse of its covariance, px^-2; nothing along similarities and what is unknown.
+    centre : ndarray, shape (2 k,)
+        Its most probable value, in modes.
+    size : tuple
+        ``(ny, nx)`` of the box of the modes, pixels.
+    """
+
+    information: np.ndarray
+    centre: np.ndarray
+    size: tuple
+
+    @property
+    def n_modes(self):
+        """k."""
+        return len(self.centre) // 2
+
+
+def map_prior(covariance, unknown, directions, size):
+    """The `MapPrior` of a covariance (2 k, 2 k) that leaves out similarities and `unknown` maps (2 k, m)."""
+    metric = _metric(directions)
+    similar = map_parts(size, len(covariance) // 2)[0]
+    root = np.linalg.cholesky(metric).T
+    free = np.linalg.qr(root @ np.hstack([similar, unknown]))[0]
+    known = root.T @ complement(free.T).T  # what of a map is in its known part, in orthonormal coordinates
+    inner = known.T @ covariance @ known
+    inner += max(_EXACT, 1e-9 * np.trace(inner)) * np.eye(len(inner))
+    return MapPrior(known @ np.linalg.solve(inner, known.T), np.zeros(len(covariance)), size)
+
+
+def _metric(directions):
+    """Mean square displacement of the stars, per axis, by maps (2 k,) squared; no map is without."""
+    design = directions.reshape(-1, directions.shape[2])
+    out = design.T @ design / len(design)
+    return out + 1e-9 * np.trace(out) / len(out) * np.eye(len(out))
+
+
 class Offered:
     """The equations that the offsets of a reference give for the common map.
 
     Parameters
     ----------
     offsets : Offsets
-    modes : ndarray, shape (k, n_stars)
-        Modes of the reference plane at all stars.
+    directions : ndarray, shape (n_stars, 2, 2 k)
+        How maps move all stars.
     relative : ndarray, shape (2 n_stars, 2 n_stars) or (3, n_stars)
         Covariance of the relative positions, all x first; or xx, yy, xy of each.
-    knowledge : Knowledge
+    prior : MapPrior
     """
 
-    def __init__(self, offsets, modes, relative, knowledge):
-        self.offsets, self.modes, self.relative, self.knowledge = offsets, modes, relative, knowledge
-        rows, n = offsets.rows, modes.shape[1]
+    def __init__(self, offsets, directions, relative, prior):
+        self.offsets, self.directions, self.relative, self.prior = offsets, directions, relative, prior
+        rows, n = offsets.rows, len(directions)
         self.dense = len(relative) == 2 * n
         self.own = np.stack([_own(relative, star, n, self.dense) for star in rows])
         self.blocks = offsets.covariance + self.own
-        design = modes[:, rows].T
-        self.design = np.zeros((len(rows), 2, 2 * len(modes)))
-        self.design[:, 0, : len(modes)] = self.design[:, 1, len(modes) :] = design
+        self.design = directions[rows]
+        self.metric = _metric(directions)
 
     def matrix(self, used):
         """Covariance (2 n, 2 n) of the used offsets, x and y of a star side by side."""
-        n = self.modes.shape[1]
+        n = len(self.directions)
         index = (self.offsets.rows[used, None] + [0, n]).ravel()
         out = self.relative[np.ix_(index, index)].copy()
         for k, block in enumerate(self.offsets.covariance[used]):
@@ -89,53 +135,33 @@ class Offered:
             weighted = (precision @ self.design[used]).reshape(-1, design.shape[1]).T
         return weighted @ design, weighted
 
-    def solve(self, used, scales, weights=None):
+    def determined(self, used, weights=None):
+        """Maps (2 k, m) that offsets and prior determine, with their information (m,), and the others (2 k, 2 k - m).
+
+        Unit rms over the stars. Shift, rotation and scale count as determined wherever there is a star for them.
+        """
+        information = self.prior.information + self.gain(used, weights)[0]
+        curvature, maps = eigh((information + information.T) / 2, self.metric)
+        similar = map_parts(self.prior.size, self.prior.n_modes)[0]
+        inside = similar @ np.linalg.solve(similar.T @ self.metric @ similar, similar.T @ self.metric @ maps)
+        pointing = np.einsum("am,ab,bm->m", inside, self.metric, inside) > 0.5
+        known = (curvature * LIMIT**2 > 1) | (pointing & (curvature > 1e-9 * curvature[-1]))
+        return maps[:, known], curvature[known], maps[:, ~known]
+
+    def solve(self, used, weights=None):
         """The map (2 k,), its covariance, and the matrix (2 k, 2 n) that takes used offsets to it."""
-        information, right = self.gain(used, weights)
-        known = self.knowledge
-        columns = np.hstack([self.similar(used), _root(known.covariance)])
-        columns = np.hstack([columns, *(s * c for s, c in zip(scales, known.by_degree(), strict=True))])
-        inner = columns.T @ information @ columns
-        n = self.similar(used).shape[1]
-        inner[range(n, len(inner)), range(n, len(inner))] += 1
-        covariance = columns @ np.linalg.solve(inner, columns.T)
-        offsets = self.offsets.values[used].ravel() - self.design[used].reshape(-1, len(information)) @ known.centre
-        gain = covariance @ right
-        return known.centre + gain @ offsets, covariance, gain
+        maps, curvature, _ = self.determined(used, weights)
+        covariance = maps / curvature @ maps.T
+        gain = covariance @ self.gain(used, weights)[1]
+        value = covariance @ self.prior.information @ self.prior.centre + gain @ self.offsets.values[used].ravel()
+        return value, covariance, gain
 
-    def similar(self, used):
-        """Similarities that the used stars tell: all, or of a single one the shift."""
-        columns = self.knowledge.similarities
-        return columns if np.count_nonzero(used) > 1 else columns[:, :2]
-
-    def scales(self, used):
-        """Size of the unknown static distortion, a coefficient's, by degree, by evidence (an EM iteration)."""
-        parts = self.knowledge.by_degree()
-        if not self.knowledge.free:
-            return [0.0] * len(parts)
-        information, right = self.gain(used)
-        pull = right @ self.offsets.values[used].ravel()
-        fixed = np.hstack([self.similar(used), _root(self.knowledge.covariance)])
-        n, ends = self.similar(used).shape[1], np.cumsum([fixed.shape[1], *(p.shape[1] for p in parts)])
-        out = np.full(len(parts), 2 * np.sqrt(np.mean(self.offsets.values[used] ** 2)) + 1e-6)
-        for _ in range(200):
-            columns = np.hstack([fixed, *(s * p for s, p in zip(out, parts, strict=True))])
-            inner = columns.T @ information @ columns
-            inner[range(n, len(inner)), range(n, len(inner))] += 1
-            covariance = np.linalg.inv(inner)
-            power = (covariance @ (columns.T @ pull)) ** 2 + np.diag(covariance)
-            before = out
-            out = out * np.sqrt([power[a:b].mean() for a, b in pairwise(ends)])
-            if np.allclose(out, before, rtol=1e-3, atol=0):
-                break
-        return out
-
-    def pulls(self, used, scales, weights=None):
+    def pulls(self, used, weights=None):
         """Length of every offset less the map, in its standard errors.
 
         Without `weights` it is allowed for that the used ones have drawn the map towards them.
         """
-        value, covariance, _ = self.solve(used, scales, None if weights is None else weights[used])
+        value, covariance, _ = self.solve(used, None if weights is None else weights[used])
         left = self.offsets.values - self.design @ value
         whole = self.blocks
         if weights is None:
@@ -157,13 +183,6 @@ def _own(relative, star, n, dense):
     return np.array([[xx, xy], [xy, yy]])
 
 
-def _root(covariance):
-    """Columns C with ``C C'`` = covariance."""
-    values, vectors = np.linalg.eigh(covariance)
-    keep = values > 1e-12 * max(values[-1], 1e-300)
-    return vectors[:, keep] * np.sqrt(values[keep])
-
-
 def accepted(offered, label):
     """Which offsets are no mismatches: those that deviate are taken away, round by round, and never come back.
 
@@ -176,16 +195,15 @@ def accepted(offered, label):
     used, weights = np.ones(n, dtype=bool), np.ones(n)
     if n < 3:
         return used
-    scales = offered.scales(used)
     for _ in range(_ROUNDS):  # a robust start, which a few gross errors hardly move
-        pull = offered.pulls(used, scales, weights)
+        pull = offered.pulls(used, weights)
         scale = max(1.0, np.median(pull) / _SQRT)
         weights, before = 1 / (1 + (pull / (2.385 * scale)) ** 2), weights
         if np.abs(weights - before).max() < 0.01:
             break
     for count in range(_ROUNDS):
         if count:
-            pull = offered.pulls(used, offered.scales(used))
+            pull = offered.pulls(used)
         fresh = used & (pull > CLIP * max(1.0, np.median(pull[used]) / _SQRT))
         if count and not fresh.any():
             break
@@ -214,24 +232,20 @@ def estimate(offered, used, names):
     Tie
         With offsets as if that map were taken out already.
     """
-    scales = offered.scales(used)
-    value, covariance, gain = offered.solve(used, scales)
+    value, covariance, gain = offered.solve(used)
     left = offered.offsets.values - offered.design @ value
     offered_matrix = offered.matrix(used) if offered.dense else None
-    known = offered.knowledge
-    kinds = [known.similarities, *known.by_degree()]
-    prior = known.covariance + sum(s**2 * c @ c.T for s, c in zip(scales, known.by_degree(), strict=True))
-    measured = [offered.similar(used).shape[1] / known.similarities.shape[1]]
-    for columns in kinds[1:]:
-        before, after = (np.trace(columns.T @ c @ columns) for c in (prior, covariance))
-        measured.append(1 - after / before if before > 0 else 0.0)
+    information = offered.gain(used)[0]
+    share = covariance @ information
+    measured = [
+        np.trace(part.T @ share @ part) / part.shape[1] for part in map_parts(offered.prior.size, offered.prior.n_modes)
+    ]
     whitened = left[used].ravel()
     if offered_matrix is None:
         chi2 = np.einsum("na,nab,nb->", left[used], np.linalg.inv(offered.blocks[used]), left[used])
     else:
         chi2 = whitened @ np.linalg.solve(offered_matrix, whitened)
-    information = offered.gain(used)[0]
-    dof = len(whitened) - np.trace(covariance @ information)
+    dof = len(whitened) - np.trace(share)
     return value, Tie(
         covariance=covariance,
         shared=_shared(offered, used, gain),
@@ -245,15 +259,15 @@ def estimate(offered, used, names):
 
 def _shared(offered, used, gain):
     """See `Tie.shared`: minus the covariance of each star's relative error with the map at it, both ways."""
-    n, rows = offered.modes.shape[1], offered.offsets.rows[used]
-    out, k = np.zeros((3, n)), len(offered.modes)
-    gain = gain.reshape(2, k, len(rows), 2)
+    n, rows = len(offered.directions), offered.offsets.rows[used]
+    out = np.zeros((3, n))
     if offered.dense:
-        relative = offered.relative.reshape(2, n, 2, n)[:, rows]
-        drawn = np.einsum("akjb,bjcn->akcn", gain, relative, optimize=True)
-        at = np.einsum("kn,akcn->acn", offered.modes, drawn)
-        out[:] = -2 * at[0, 0], -2 * at[1, 1], -at[0, 1] - at[1, 0]
+        index = (rows[:, None] + [0, n]).ravel()
+        drawn = gain @ offered.relative[index]
+        both = np.stack([np.einsum("nk,kn->n", offered.directions[:, a], drawn[:, b * n : (b + 1) * n])
+                         for a, b in ((0, 0), (1, 1), (0, 1), (1, 0))])  # fmt: skip
+        out[:] = -2 * both[0], -2 * both[1], -both[2] - both[3]
     else:
-        at = np.einsum("kj,akjb,jbc->acj", offered.modes[:, rows], gain, offered.own[used])
+        at = np.einsum("jak,kjb,jbc->acj", offered.design[used], gain.reshape(len(gain), -1, 2), offered.own[used])
         out[:, rows] = -2 * at[0, 0], -2 * at[1, 1], -at[0, 1] - at[1, 0]
     return out

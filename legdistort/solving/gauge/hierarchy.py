@@ -101,16 +101,16 @@ class Hierarchy:
         return self.rows(np.zeros_like(self.static))
 
     @cached_property
+    def _pointed(self):
+        return _pointing_off(self.values, self.size)
+
+    @cached_property
     def metric(self):
         """Mean square displacement of the stars, per axis, by modes (2 n,) squared, once a similarity is taken off."""
-        n = self.values.shape[1]
-        modes = np.kron(np.eye(2), self.values.T)
-        similar = modes @ similarity_basis(self.size, len(self.values)).T
-        modes = modes - similar @ np.linalg.lstsq(similar, modes, rcond=None)[0]
-        return modes.T @ modes / (2 * n)
+        return _metric(self.values, self._pointed)
 
     def solve(self, kind, released=None):
-        """What is known of the common map, with constraints: `Knowledge`.
+        """What is known of the common map, with constraints: `Constraints`.
 
         Parameters
         ----------
@@ -121,7 +121,7 @@ class Hierarchy:
         """
         held = self.convention(kind)
         if not (self.static.any() and len(self.maps)):  # exact: the convention is the posterior mean
-            return Knowledge(held, self.maps.T, ())
+            return Constraints(held, self.maps.T, ())
         rows = self.rows(self.static)
         information = np.einsum("bia,iac,dc->bd", rows, self.motion, self.maps, optimize=True)
         metric = self.maps @ self.metric @ self.maps.T
@@ -133,48 +133,34 @@ class Hierarchy:
             inside = np.linalg.qr(unknown.T @ metric @ self.maps @ released)[0]
             unknown = unknown @ complement(inside.T).T
         rows = np.concatenate([np.tensordot(known.T, rows, 1), np.tensordot(unknown.T, held, 1)])
-        return Knowledge(rows, self.maps.T @ known, self._named(self.maps.T @ unknown))
+        return Constraints(
+            rows, self.maps.T @ known, _named(self.maps.T @ unknown, self._pointed, self.metric, self.size)
+        )
 
     def covariance(self, known, poses):
         """Covariance (2 n, 2 n) of what is known of the common map, under its constraints.
 
         Parameters
         ----------
-        known : Knowledge
+        known : Constraints
         poses : ndarray, shape (4, n_exposures, 2 n)
             Constraints that hold the similarities.
         """
-        rows = np.concatenate([known.rows, poses])
-        columns = [known.known, *(each.map[:, None] for each in known.unknown), similarity_basis(self.size, len(self.values)).T]
-        maps, n = np.hstack(columns), known.known.shape[1]
+        rows, similar = np.concatenate([known.rows, poses]), similarity_basis(self.size, len(self.values)).T
+        maps = np.hstack([known.known, *(each.map[:, None] for each in known.unknown), similar])
+        n = known.known.shape[1]
         inside = np.einsum("bia,iac,dic->bd", rows, self.dynamic, rows, optimize=True)
         on_modes = np.einsum("bia,ika->bik", rows, self.others, optimize=True)
         for g, variance in enumerate(self.static):
             common = on_modes[:, self.group == g].sum(axis=1)
             inside += common * np.where(np.isfinite(variance), variance, 0) @ common.T
         reach = np.einsum("bia,iac,cd->bd", rows, self.motion, maps, optimize=True)
-        back = maps[:, :n] @ np.linalg.inv(reach)[:n]
+        back = self._pointed @ maps[:, :n] @ np.linalg.inv(reach)[:n]
         return back @ inside @ back.T
-
-    def _named(self, maps):
-        """Unknown maps (2 n, m) with names: turned, as far as they allow, into those that have one."""
-        found, left = [], np.eye(maps.shape[1])
-        for name, degree, pattern in _patterns(len(self.values), self.size):
-            inside = left @ (left.T @ (maps.T @ self.metric @ pattern))
-            if inside @ inside > _ALIKE * (pattern @ self.metric @ pattern):
-                inside /= np.linalg.norm(inside)
-                found.append(UnknownMap(name, degree, maps @ inside))
-                left = left @ complement((left.T @ inside)[None]).T
-        degrees = np.tile(np.add(*basis.orders(basis.degree_of(len(self.values)))), 2)
-        for rest in (maps @ left).T:
-            power = np.bincount(degrees, rest**2)
-            degree = max(1, int(power[1:].argmax()) + 1)
-            found.append(UnknownMap(f"degree {degree}" if degree > 1 else "shear", degree, rest))
-        return tuple(sorted(found, key=lambda each: each.degree))
 
 
 @dataclass(frozen=True, eq=False)
-class Knowledge:
+class Constraints:
     """Constraints on all of a common map but its similarity, and what they hold that is not known.
 
     Attributes
@@ -192,6 +178,48 @@ class Knowledge:
     unknown: tuple
 
 
+def named(maps, gauge, positions):
+    """Unknown maps (2 k, m) of a gauge, without those that are similarities, as a tuple of `UnknownMap`."""
+    if not maps.shape[1] or len(maps) != 2 * gauge.n_modes:
+        return ()
+    size, values = tuple(2 * gauge.box[1, ::-1]), gauge.modes_at(positions[np.isfinite(positions[:, 0])])
+    pointed = _pointing_off(values, size)
+    metric = _metric(values, pointed)
+    power, vectors = np.linalg.eigh(maps.T @ metric @ maps)
+    kept = power > 0.5
+    return _named(maps @ vectors[:, kept] / np.sqrt(power[kept]), pointed, metric, size)
+
+
+def _pointing_off(values, size):
+    """Takes off modes (2 n,) of a map the similarity that they do to the stars, (2 n, 2 n)."""
+    modes = np.kron(np.eye(2), values.T)
+    similar = similarity_basis(size, len(values)).T
+    return np.eye(len(similar)) - similar @ np.linalg.lstsq(modes @ similar, modes, rcond=None)[0]
+
+
+def _metric(values, pointed):
+    """Mean square displacement of the stars, per axis, by modes (2 n,) squared, once a similarity is taken off."""
+    modes = np.kron(np.eye(2), values.T) @ pointed
+    return modes.T @ modes / len(modes)
+
+
+def _named(maps, pointed, metric, size):
+    """Unknown maps (2 n, m) with names: turned, as far as they allow, into those that have one."""
+    found, left, n = [], np.eye(maps.shape[1]), len(maps) // 2
+    for name, degree, pattern in _patterns(n, size):
+        inside = left @ (left.T @ (maps.T @ metric @ pattern))
+        if inside @ inside > _ALIKE * (pattern @ metric @ pattern):
+            inside /= np.linalg.norm(inside)
+            found.append(UnknownMap(name, degree, pointed @ maps @ inside))
+            left = left @ complement((left.T @ inside)[None]).T
+    degrees = np.tile(np.add(*basis.orders(basis.degree_of(n))), 2)
+    for rest in (pointed @ maps @ left).T:
+        power = np.bincount(degrees, rest**2)
+        degree = int(power[1:].argmax()) + 1
+        found.append(UnknownMap(f"degree {degree}" if degree > 1 else "shear", degree, rest))
+    return tuple(sorted(found, key=lambda each: each.degree))
+
+
 def determined_by_residuals(system, gauge):
     """Unknown maps that residuals of second order determine, as columns (2 n, r).
 
@@ -205,9 +233,11 @@ def determined_by_residuals(system, gauge):
     gauge : Gauge
         The convention in force.
     """
-    maps = np.stack([each.map for each in gauge.unknown_maps if each.degree > 1], axis=1, dtype=float) if any(
-        each.degree > 1 for each in gauge.unknown_maps
-    ) else np.zeros((2 * gauge.n_modes, 0))
+    maps = (
+        np.stack([each.map for each in gauge.unknown_maps if each.degree > 1], axis=1, dtype=float)
+        if any(each.degree > 1 for each in gauge.unknown_maps)
+        else np.zeros((2 * gauge.n_modes, 0))
+    )
     if not maps.shape[1] or system.dof <= 0 or system.blocks.chi2 < system.dof + 5 * np.sqrt(2 * system.dof):
         return maps[:, :0]
     moved = gauge.reach @ maps
