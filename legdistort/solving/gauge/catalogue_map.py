@@ -237,9 +237,9 @@ def estimate(offered, used, names):
     offered_matrix = offered.matrix(used) if offered.dense else None
     information = offered.gain(used)[0]
     share = covariance @ information
-    measured = [
-        np.trace(part.T @ share @ part) / part.shape[1] for part in map_parts(offered.prior.size, offered.prior.n_modes)
-    ]
+    parts = map_parts(offered.prior.size, offered.prior.n_modes)[1:]
+    pointing = 1.0 if np.count_nonzero(used) > 1 else 0.5  # a single star determines the shift alone
+    measured = [pointing, *(np.trace(part.T @ share @ part) / part.shape[1] for part in parts)]
     whitened = left[used].ravel()
     if offered_matrix is None:
         chi2 = np.einsum("na,nab,nb->", left[used], np.linalg.inv(offered.blocks[used]), left[used])

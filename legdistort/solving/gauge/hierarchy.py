@@ -97,7 +97,7 @@ class Hierarchy:
     def convention(self, kind):
         """Rows (m, n_exposures, 2 n) of a convention by itself: A_0 at the prior mean."""
         if kind == "mean":
-            return np.broadcast_to(self.maps[:, None], (len(self.maps), *self.motion.shape[:2]))
+            return np.einsum("bc,ikc,ika->bia", self.maps, self.others, self.others, optimize=True)
         return self.rows(np.zeros_like(self.static))
 
     @cached_property
