@@ -13,7 +13,7 @@ from ..exceptions import InputError
 from ..geometry import basis
 from ..geometry import similarity as poses
 from ..geometry.distortion import Distortion
-from ..geometry.models import like, outside, to_pixels
+from ..geometry.models import exposure_model, like, outside, to_pixels
 from ..geometry.star_hull import support, supported
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
@@ -69,6 +69,8 @@ class Solution:
         ``created``, ``versions`` of packages and, if files went in, ``inputs`` ``{base name: SHA-256}``.
     form : `legdistort.solving.model_forms.Form` or None
         The model that was given to `solve`. Files do not keep it: `model` then has the usual form, the same function.
+    inverses : dict
+        ``{exposure: Inverse}`` as they were certified when the file was written that this solution was read from.
     """
 
     names: tuple
@@ -90,6 +92,7 @@ class Solution:
     settings: dict = field(default_factory=dict)
     provenance: dict = field(default_factory=dict)
     form: object = None
+    inverses: dict = field(default_factory=dict)
 
     # -- tables
 
@@ -176,7 +179,10 @@ class Solution:
 
     @cached_property
     def _distortions(self):
-        return [Distortion(a, self.shapes[name], name) for name, a in zip(self.names, self.coefficients, strict=True)]
+        return [
+            Distortion(a, self.shapes[name], name, self.inverses.get(name))
+            for name, a in zip(self.names, self.coefficients, strict=True)
+        ]
 
     def distortion(self, name):
         """The `Distortion` of an exposure: undistorted -> detector pixels, without the pose."""
@@ -205,8 +211,6 @@ class Solution:
 
     def model(self, name):
         """Reference plane -> detector pixels as an astropy compound model with inverse."""
-        from ..wcs.exposure_wcs import exposure_model
-
         distortion = self.distortion(name)
         return exposure_model(self.poses[name], distortion, self.form)
 

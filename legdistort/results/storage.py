@@ -150,14 +150,15 @@ def _from_tree(kind, tree):
         left_out=dict(tree["left_out"]),
         settings=dict(tree["settings"]),
         provenance=dict(tree["provenance"]),
+        inverses={e["name"]: _inverse(e["inverse"]) for e in exposures if e["inverse"] is not None},
     )
     _check_consistent(solution)
-    for exposure in exposures:
-        if exposure["inverse"] is not None:
-            kept = exposure["inverse"]
-            inverse = Inverse(np.array(kept["tensors"]), kept["error_px"], tuple(kept["valid_undistorted_px"]))
-            solution.distortion(exposure["name"]).adopt(inverse)
+    solution.distortion(solution.names[0])  # checks the certificates of all
     return solution
+
+
+def _inverse(tree):
+    return Inverse(np.array(tree["tensors"]), tree["error_px"], tuple(tree["valid_undistorted_px"]))
 
 
 def _check_consistent(solution):
