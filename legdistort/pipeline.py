@@ -23,7 +23,7 @@ from .results.diagnostics import FOUND
 from .runtime import outputs, provenance
 from .solving.estimation import solve
 from .solving.options import check_options, check_reference
-from .wcs.files import write_wcs
+from .wcs.storage import write_wcs
 
 log = logging.getLogger(__name__)
 

@@ -29,7 +29,7 @@ from legdistort.results.solution import Solution
 from legdistort.runtime import provenance
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 from legdistort.solving.estimation import solve
-from legdistort.wcs.files import write_wcs
+from legdistort.wcs.storage import write_wcs
 
 
 def small(**changes):

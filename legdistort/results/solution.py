@@ -225,7 +225,8 @@ class Solution:
         """FITS header of an exposure, TAN-SIP or TPV, with its error in it (`legdistort.wcs.fits_headers`)."""
         from ..wcs.fits_headers import make_header
 
-        return make_header(self, name, kind=kind, max_error=max_error)
+        distortion = self.distortion(name)
+        return make_header(self.poses[name], distortion, self.sky, kind=kind, max_error=max_error)
 
     def fits_wcs(self, name, *, max_error=1e-3):
         """The nearest `astropy.wcs.WCS` of an exposure, TAN-SIP, for what takes no other (`CCDData`, `Cutout2D`).
@@ -243,9 +244,7 @@ class Solution:
         InputError
             If the sky is not known.
         """
-        from ..wcs.fits_headers import make_header
-
-        wcs = WCS(make_header(self, name, max_error=max_error))
+        wcs = WCS(self.header(name, max_error=max_error))
         wcs.array_shape = self.shapes[name]
         return wcs
 
