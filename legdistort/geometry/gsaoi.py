@@ -15,7 +15,7 @@ from astropy.modeling import models
 from numpy.polynomial import polynomial
 
 from ..exceptions import FoldError, InputError
-from . import similarity as poses
+from .similarity import apply, compose, describe, fit_similarity, invert
 
 #: Pixels along a side of a GSAOI detector.
 GSAOI_SIZE = 2048
@@ -126,16 +126,16 @@ class GsaoiMap:
         grid = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2)
         grid = ((grid + 1) * self.size - 1) / 2
         weights = np.outer(weights, weights).ravel()
-        similarity = poses.fit_similarity(grid, self.to_arcsec(grid), weights=weights, parity=1)
+        pose = fit_similarity(grid, self.to_arcsec(grid), weights=weights, parity=1)
         for _ in range(6):  # each time 50 to 100 times nearer
-            rest = poses.fit_similarity(grid, self._invert(poses.apply(similarity, grid), grid), weights=weights)
-            similarity = poses.compose(similarity, poses.invert(rest))
-        return similarity
+            rest = fit_similarity(grid, self._invert(apply(pose, grid), grid), weights=weights)
+            pose = compose(pose, invert(rest))
+        return pose
 
     @property
     def pixel_scale(self):
         """Size of an undistorted pixel, arcsec."""
-        return poses.describe(self.similarity)["scale"]
+        return describe(self.similarity)["scale"]
 
     def to_arcsec(self, xy):
         """Detector pixels (..., 2), 0-based -> arcsec (..., 2): the published polynomials."""
@@ -144,7 +144,7 @@ class GsaoiMap:
 
     def undistort(self, xy):
         """Detector pixels (..., 2) -> undistorted pixels."""
-        return poses.apply(poses.invert(self.similarity), self.to_arcsec(xy))
+        return apply(invert(self.similarity), self.to_arcsec(xy))
 
     def distort(self, q):
         """Undistorted pixels (..., 2) -> detector pixels, inverse of `undistort`.
@@ -154,7 +154,7 @@ class GsaoiMap:
         FoldError
             If Newton's method does not get there, which happens only far off the detector.
         """
-        return self._invert(poses.apply(self.similarity, q), q)
+        return self._invert(apply(self.similarity, q), q)
 
     def _invert(self, arcsec, start):
         xy = np.array(start, dtype=float)

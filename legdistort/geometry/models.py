@@ -3,7 +3,7 @@
 import numpy as np
 from astropy import units as u
 from astropy.modeling import models
-from astropy.modeling.core import FittableModel  # astropy.modeling is half imported when it looks for our fitter
+from astropy.modeling.core import FittableModel, Model  # astropy.modeling is half imported when it looks for our fitter
 from astropy.modeling.parameters import Parameter
 
 from ..exceptions import InputError
@@ -69,6 +69,16 @@ def rebuilt(kind, series, **changed):
     known = {name: getattr(series, name) for name in ("x_domain", "y_domain", "x_window", "y_window", "name", "fixed")}
     values = dict(zip(series.param_names, series.parameters, strict=True))
     return kind(series.x_degree, series.y_degree, **known | values | changed)
+
+
+def nodes(model):
+    """All models that a model is made of, itself the last."""
+    return [n for n in model.traverse_postorder() if isinstance(n, Model)] if model.n_submodels > 1 else [model]
+
+
+def leaves(model):
+    """The simple models that a model is made of, from left to right."""
+    return [node for node in nodes(model) if node.n_submodels == 1]
 
 
 def to_pixels(x):

@@ -173,7 +173,8 @@ def _from_hdulist(hdulist, ext, name):
         try:
             return _from_header(hdulist[ext].header, f"{name}[{ext}]", hdulist)
         except (KeyError, IndexError):
-            raise InputError(f"{name}: no extension {ext!r}; it has {_contents(hdulist)}") from None
+            contents = ", ".join(f"{i} {hdu.name}".strip() for i, hdu in enumerate(hdulist))
+            raise InputError(f"{name}: no extension {ext!r}; it has {contents}") from None
     refusals = []
     for i, hdu in sorted(enumerate(hdulist), key=lambda pair: pair[1].name != "SCI"):
         try:
@@ -181,10 +182,6 @@ def _from_hdulist(hdulist, ext, name):
         except InputError as error:
             refusals.append(str(error))
     raise InputError(next((r for r in refusals if "no celestial" not in r), refusals[0]))
-
-
-def _contents(hdulist):
-    return ", ".join(f"{i} {hdu.name}".strip() for i, hdu in enumerate(hdulist))
 
 
 def _from_header(header, name, hdulist=None):

@@ -13,8 +13,8 @@ from astropy.modeling import CompoundModel, Model, models
 from ..exceptions import FoldError, InputError
 from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
-from ..geometry.fitter import free_coefficients, leaves, legendre_coefficients, linear_parts, set_values
-from ..geometry.models import FastLegendre2D, rebuilt
+from ..geometry.fitter import free_coefficients, legendre_coefficients, linear_parts, set_values
+from ..geometry.models import FastLegendre2D, leaves, rebuilt
 from ..priors.prior import Prior
 
 #: A form must be a polynomial to this, pixels.

@@ -126,11 +126,11 @@ def header_error(header, pose, distortion, sky):
     said = SkyCoord(*wcs.all_pix2world(points, 0).T, unit="deg", frame=frame)
     forward = distortion(similarity.apply(pose, sky.from_sky(said)))
     there = exact.transform_to(frame).spherical
-    inverse = _to_pixels(wcs, np.column_stack([there.lon.deg, there.lat.deg]))
+    inverse = _pixels(wcs, np.column_stack([there.lon.deg, there.lat.deg]))
     return tuple(_largest(found - points) for found in (forward, inverse))
 
 
-def _to_pixels(wcs, sky):
+def _pixels(wcs, sky):
     """Sky [deg] -> pixels (n, 2), from 0, by the inverse polynomials where there are some."""
     if wcs.sip is None:
         return wcs.wcs_world2pix(sky, 0)

@@ -5,12 +5,12 @@ from pathlib import Path
 import asdf
 import gwcs
 import numpy as np
-from astropy.modeling import CompoundModel, models
+from astropy.modeling import models
 
 from ..exceptions import InputError
 from ..geometry import basis
 from ..geometry.distortion import Distortion, Inverse
-from ..geometry.models import correction_model, displacement_model
+from ..geometry.models import correction_model, displacement_model, leaves
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, WITH_WCS, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
@@ -92,8 +92,7 @@ def _checked_wcs(meta):
 
 def _series(model):
     """The two Legendre series, x and y, of a displacement model."""
-    parts = model.traverse_postorder() if isinstance(model, CompoundModel) else [model]
-    parts = [part for part in parts if isinstance(part, models.Legendre2D)]
+    parts = [part for part in leaves(model) if isinstance(part, models.Legendre2D)]
     if len(parts) != 2:
         raise ValueError(f"the distortion should be made of two Legendre2D, got {len(parts)}")
     return parts
