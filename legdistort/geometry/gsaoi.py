@@ -7,7 +7,7 @@ polynomials from the DRAGONS reduction package; source and licence stand in
 
 import json
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from importlib import resources
 
 import numpy as np
@@ -19,12 +19,6 @@ from .similarity import apply, compose, describe, fit_similarity, invert
 
 #: Pixels along a side of a GSAOI detector.
 GSAOI_SIZE = 2048
-
-
-@lru_cache
-def _gsaoi_table():
-    text = resources.files("legdistort").joinpath("data/gsaoi_static_distortion.json").read_text(encoding="utf-8")
-    return json.loads(text)
 
 
 def gsaoi_polynomials(detector=2):
@@ -47,10 +41,12 @@ def gsaoi_polynomials(detector=2):
     """
     if detector not in (1, 2, 3, 4):
         raise InputError(f"detector must be 1, 2, 3 or 4, got {detector!r}")
+    published = resources.files("legdistort").joinpath("data/gsaoi_static_distortion.json")
+    table = json.loads(published.read_text(encoding="utf-8"))
     out = np.zeros((2, 4, 4))
     for part in ("linear", "nonlinear"):
         for axis, letter in enumerate("xy"):
-            for name, value in _gsaoi_table()[part][detector - 1][letter].items():
+            for name, value in table[part][detector - 1][letter].items():
                 i, j = map(int, name[1:].split("_"))
                 out[axis, i, j] += value
     return out

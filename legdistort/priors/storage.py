@@ -54,8 +54,8 @@ def read_prior(path, kind):
         raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
     check_tree({"legdistort_prior": tree}, "prior-1.schema.yaml", path)
     try:
-        arrays = {key: tree[key] for key in ("sigma", "static_sigma", "plane")}
-        arrays = {key: np.array(value) if hasattr(value, "shape") else value for key, value in arrays.items()}
+        given = ((key, tree[key]) for key in ("sigma", "static_sigma", "plane"))
+        arrays = {key: np.array(value) if hasattr(value, "shape") else value for key, value in given}
         if arrays["plane"] is not None:
             similarity.check(arrays["plane"], "plane")
         prior = kind(
