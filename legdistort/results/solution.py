@@ -1,7 +1,7 @@
 """The result of `solve`: positions, distortions, their errors, and everything made from them."""
 
 import textwrap
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -71,8 +71,12 @@ class Solution:
         ``created``, ``versions`` of packages and, if files went in, ``inputs`` ``{base name: SHA-256}``.
     form : `legdistort.solving.model_forms.Form` or None
         The model that was given to `solve`. Files do not keep it: `model` then has the usual form, the same function.
-    inverses : dict
-        ``{exposure: Inverse}`` as they were certified when the file was written that this solution was read from.
+
+    Parameters
+    ----------
+    inverses : dict, optional
+        ``{exposure: Inverse}`` that were certified for these coefficients earlier; checked again where they are used.
+        What `dataclasses.replace` makes finds its own.
     """
 
     names: tuple
@@ -95,7 +99,10 @@ class Solution:
     left_out: dict = field(default_factory=dict)
     provenance: dict = field(default_factory=dict)
     form: object = None
-    inverses: dict = field(default_factory=dict)
+    inverses: InitVar[dict | None] = None
+
+    def __post_init__(self, inverses):
+        object.__setattr__(self, "_inverses", inverses or {})
 
     # -- tables
 
@@ -183,7 +190,7 @@ class Solution:
     @cached_property
     def _distortions(self):
         return [
-            Distortion(a, self.shapes[name], name, self.inverses.get(name))
+            Distortion(a, self.shapes[name], name, self._inverses.get(name))
             for name, a in zip(self.names, self.coefficients, strict=True)
         ]
 
