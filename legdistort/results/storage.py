@@ -115,13 +115,15 @@ def _made(kind, tree):
     return kind(**{key: np.array(value) if hasattr(value, "shape") else value for key, value in known.items()})
 
 
-def _diagnostics(tree):
-    """`Diagnostics` from their fields by name, sequences as tuples."""
+def _diagnostics(tree, names):
+    """`Diagnostics` from their fields by name, sequences as tuples; exposures in order, which files do not keep."""
     kinds = {"reference": UsedReference, "selection": DegreeChoice, "validation": Validation}
     found = {key: kind(**tree[key]) for key, kind in kinds.items() if tree[key] is not None}
     if chosen := found.get("selection"):
         degrees = tuple(AliasedDegree(**each) for each in chosen.aliasing)
         found["selection"] = dataclasses.replace(chosen, aliasing=degrees)
+    if (effective := tree["effective_modes"]) is not None:
+        found["effective_modes"] = {name: effective[name] for name in names}
     return Diagnostics(**tree | found)
 
 
@@ -152,7 +154,7 @@ def _from_tree(kind, tree):
         gauge=_made(Gauge, tree["gauge"] | {"tie": _made(Tie, tree["gauge"].get("tie"))}),
         uncertainty=StoredUncertainty(**{key: np.array(value) for key, value in tree["covariance"].items()}),
         settings=Settings(**tree["settings"]),
-        diagnostics=_diagnostics(_tuples(tree["diagnostics"])),
+        diagnostics=_diagnostics(_tuples(tree["diagnostics"]), [e["name"] for e in exposures]),
         sky=None if sky is None else TangentPlane(sky["lon"], sky["lat"], np.array(sky["matrix"])),
         left_out=dict(tree["left_out"]),
         provenance=dict(tree["provenance"]),

@@ -8,7 +8,7 @@ import numpy as np
 from ..exceptions import InputError
 from ..geometry import basis
 from ..inputs.reference_catalogue import read_reference, year
-from ..priors.prior import Prior
+from ..results.settings import Settings
 from ..runtime.checks import check_choice
 from .choices.degree_choice import AUTO
 from .equations.problem import check_error_floor
@@ -19,29 +19,15 @@ METHODS = ("joint", "alternating")
 ERRORS = ("stated", "scale", "floor")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SolveOptions:
-    """Those arguments of `legdistort.solve` that can be judged without data; see there.
+@dataclass(frozen=True, eq=False)
+class SolveOptions(Settings):
+    """Those arguments of `legdistort.solve` that can be judged without data, with the prior and the model themselves.
 
     Raises
     ------
     InputError
         For options that are out of range or contradict one another.
     """
-
-    degree: int | str = 3
-    prior: Prior | dict | None = None
-    model: object = None
-    static: str | None = None
-    exposure_degree: int | None = None
-    gauge: str = "minimal"
-    method: str = "joint"
-    loss: str = "linear"
-    clip: float | None = None
-    error_floor: float = 0.0
-    errors: str = "stated"
-    max_iterations: int | None = None
-    validate: float | None = None
 
     def __post_init__(self):
         self._check_model_of_distortion()

@@ -68,10 +68,6 @@ def undistorted(problem):
     """Positions (2, n) with the prior distortion taken out to second order, which is enough for a start."""
     if not np.any(problem.prior_mean):
         return problem.xy
-    if problem.uses_compiled_loops:
-        from .equations import compiled
-
-        return compiled.undistorted(problem)
     q = problem.xy.copy()
     for i, (shape, mean) in enumerate(zip(problem.shapes, problem.prior_mean, strict=True)):
         distortion, x = Distortion(mean, shape), problem.xy[:, problem.part(i)].T
@@ -140,16 +136,10 @@ def distances(problem, pose_list, q, positions):
 
 def mean_positions(problem, pose_list, q, weight):
     """Weighted mean (2, n_stars) of undistorted positions carried back to the reference plane."""
-    inverse = np.stack([similarity.invert(pose) for pose in pose_list])
-    if problem.uses_compiled_loops:
-        from .equations import compiled
-
-        sums, total = compiled.mean_sums(problem, inverse, q, weight)
-    else:
-        back = np.empty_like(q)
-        for i, pose in enumerate(inverse):
-            part = problem.part(i)
-            back[:, part] = pose[:, :2] @ q[:, part] + pose[:, 2:]
-        total = np.bincount(problem.star, weight, problem.n_stars)
-        sums = np.stack([np.bincount(problem.star, weight * axis, problem.n_stars) for axis in back])
+    back = np.empty_like(q)
+    for i, pose in enumerate(pose_list):
+        part, inverse = problem.part(i), similarity.invert(pose)
+        back[:, part] = inverse[:, :2] @ q[:, part] + inverse[:, 2:]
+    total = np.bincount(problem.star, weight, problem.n_stars)
+    sums = np.stack([np.bincount(problem.star, weight * axis, problem.n_stars) for axis in back])
     return np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)

@@ -73,7 +73,7 @@ class Widths:
         They are in units of errors that were stated `scale` times too small.
         """
         if isinstance(prior, dict):
-            return {str(key): self.describe(each, scale) for key, each in prior.items()}
+            return {str(key): self.describe(prior[key], scale) for key in sorted(prior, key=str)}
         k = self.number(prior)
         return None if k < 0 else tuple((scale * self.values[k]).tolist())
 
