@@ -17,6 +17,7 @@ from ..geometry.star_hull import support, supported
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from .diagnostics import Diagnostics
+from .gauge import Gauge
 from .settings import Settings
 
 
@@ -91,7 +92,7 @@ class Solution:
     chi2: float
     dof: int
     status: str
-    gauge: object
+    gauge: Gauge
     uncertainty: object
     settings: Settings
     diagnostics: Diagnostics
