@@ -11,6 +11,7 @@ from ..exceptions import InputError
 from ..runtime.checks import check_choice
 from .grids import checked_wcs
 from .resampling.drizzling import Drop
+from .resampling.engines import Resampling, uses_compiled_splines
 
 METHODS = ("mean", "median", "clipped")
 ALGORITHMS = ("interp", "adaptive", "exact", "drizzle")
@@ -67,13 +68,20 @@ class CoaddOptions:
         object.__setattr__(self, "scale", _choice_or_numbers("scale", self.scale, SCALES))
         if self.grid is not None:
             checked_wcs(self.grid)
-        if self.algorithm == "drizzle":
-            Drop(self.kernel, self.pixfrac)
+        self.resampling()  # a drop checks itself
 
-    @property
-    def drop(self):
-        """The `~legdistort.coaddition.resampling.drizzling.Drop` of drizzle, None for other algorithms."""
-        return Drop(self.kernel, self.pixfrac) if self.algorithm == "drizzle" else None
+    def resampling(self, n_pixels=0):
+        """The `~legdistort.coaddition.resampling.engines.Resampling` of so many pixels of all exposures."""
+        drop = Drop(self.kernel, self.pixfrac) if self.algorithm == "drizzle" else None
+        compiled = uses_compiled_splines(self.algorithm, self.order, n_pixels)
+        return Resampling(self.algorithm, self.order, drop, compiled)
+
+    def check_names(self, names):
+        """Raise `InputError` if weights or flux scales are given for other exposures than these."""
+        for argument, given in (("weights", self.weights), ("scale", self.scale)):
+            unknown = [str(name) for name in given if name not in names] if isinstance(given, Mapping) else []
+            if unknown:
+                raise InputError(f"{argument}: no exposure of that name is co-added: {', '.join(unknown)}")
 
 
 def _choice_or_numbers(argument, given, allowed):

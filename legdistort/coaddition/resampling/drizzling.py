@@ -30,6 +30,9 @@ class Drop:
     kernel: str = "square"
     pixfrac: float = 1.0
 
+    def __str__(self):
+        return f"{self.kernel} {self.pixfrac:g}"
+
     def __post_init__(self):
         if self.kernel not in KERNELS:
             raise InputError(f"kernel must be one of {', '.join(map(repr, KERNELS))}, got {self.kernel!r}")
