@@ -39,9 +39,6 @@ class Background:
         """Median of all."""
         return float(np.median(self.medians))
 
-    def __repr__(self):
-        return f"<Background of {self.name!r}: noise {self.noise:.4g}, level {self.level:.4g}>"
-
     def sky_variance(self, data, variance):
         """Variance of pixels without the photons of stars, which would give stars less weight the brighter they are.
 

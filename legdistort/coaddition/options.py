@@ -10,7 +10,6 @@ from astropy.wcs import WCS
 from ..exceptions import InputError
 from ..runtime.checks import check_choice
 from .grids import checked_wcs
-from .resampling.drizzling import Drop
 from .resampling.engines import Resampling, uses_compiled_splines
 
 METHODS = ("mean", "median", "clipped")
@@ -20,6 +19,7 @@ CONSERVE = ("flux", "surface_brightness")
 WEIGHTS = ("noise", "variance", "exptime", "seeing", "sigma_map")
 SCALES = ("auto", "exptime", "stars")
 EXTRAPOLATED = ("flag", "mask", "keep")
+KERNELS = ("square", "turbo", "point")  # of drizzle, those that conserve flux
 
 
 @dataclass(frozen=True)
@@ -56,25 +56,34 @@ class CoaddOptions:
     scratch: object = None
 
     def __post_init__(self):
-        check_choice(self.method, METHODS, "method")
-        check_choice(self.algorithm, ALGORITHMS, "algorithm")
-        check_choice(self.conserve, CONSERVE, "conserve")
-        check_choice(self.extrapolated, EXTRAPOLATED, "extrapolated")
+        choices = {"method": METHODS, "algorithm": ALGORITHMS, "conserve": CONSERVE, "extrapolated": EXTRAPOLATED}
+        for name, allowed in choices.items():
+            check_choice(getattr(self, name), allowed, name)
         order = ORDERS.get(self.order, self.order) if isinstance(self.order, str) else self.order
         if isinstance(order, bool) or order not in range(6):
             raise InputError(f"order must be an integer from 0 to 5 or one of {', '.join(ORDERS)}, got {order!r}")
         object.__setattr__(self, "order", int(order))
-        object.__setattr__(self, "weights", _choice_or_numbers("weights", self.weights, WEIGHTS))
-        object.__setattr__(self, "scale", _choice_or_numbers("scale", self.scale, SCALES))
+        for name, allowed in (("weights", WEIGHTS), ("scale", SCALES)):
+            object.__setattr__(self, name, _choice_or_numbers(name, getattr(self, name), allowed))
         if self.grid is not None:
             checked_wcs(self.grid)
-        self.resampling()  # a drop checks itself
+        if self.algorithm == "drizzle":
+            self._check_drops()
 
-    def resampling(self, n_pixels=0):
+    def _check_drops(self):
+        check_choice(self.kernel, KERNELS, "kernel")
+        is_number = isinstance(self.pixfrac, (int, float, np.number)) and not isinstance(self.pixfrac, bool)
+        if not (is_number and 0 < self.pixfrac <= 1):
+            raise InputError(f"pixfrac must be a number above 0 and up to 1, got {self.pixfrac!r}")
+        try:
+            import drizzle.resample  # noqa: F401
+        except ImportError:
+            raise InputError("algorithm='drizzle' needs the package drizzle: pip install legdistort[drizzle]") from None
+
+    def resampling(self, n_pixels):
         """The `~legdistort.coaddition.resampling.engines.Resampling` of so many pixels of all exposures."""
-        drop = Drop(self.kernel, self.pixfrac) if self.algorithm == "drizzle" else None
         compiled = uses_compiled_splines(self.algorithm, self.order, n_pixels)
-        return Resampling(self.algorithm, self.order, drop, compiled)
+        return Resampling(self.algorithm, self.order, self.kernel, self.pixfrac, compiled)
 
     def check_names(self, names):
         """Raise `InputError` if weights or flux scales are given for other exposures than these."""

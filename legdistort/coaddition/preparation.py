@@ -40,13 +40,17 @@ def prepare(frame, folder):
         The reason why it cannot be used.
     """
     exposure = frame.read()
-    bad = bad_pixels(exposure)
+    bad, full = ~np.isfinite(exposure.data), np.zeros(exposure.shape, dtype=bool)
+    if exposure.mask is not None:
+        bad |= exposure.mask
     if bad.all():
         return "every pixel is masked"
     data, variance = fill_bad(exposure.data, bad), None
     if not data.any():
         return "every pixel is 0"
-    background, full = measure_background(exposure, bad=bad, filled=data), saturated_pixels(exposure) & ~bad
+    if exposure.saturation is not None:
+        full = ~bad & (data >= exposure.saturation)
+    background = measure_background(exposure, bad=bad, filled=data)
     rough = rough_pixels(data, bad, full, background.noise)
     if exposure.uncertainty is not None:
         variance = np.square(exposure.uncertainty, dtype=np.float32)
@@ -54,20 +58,6 @@ def prepare(frame, folder):
     masks = {"bad": bad, "full": full, "rough": rough}
     planes = {"data": data, "variance": variance} | {name: mask for name, mask in masks.items() if mask.any()}
     return Prepared(store(folder, frame.name, planes), background)
-
-
-def bad_pixels(exposure):
-    """Pixels of an exposure that must not be used, a boolean plane."""
-    bad = ~np.isfinite(exposure.data)
-    return bad if exposure.mask is None else bad | exposure.mask
-
-
-def saturated_pixels(exposure):
-    """Pixels of an exposure at or above its saturation level, a boolean plane."""
-    if exposure.saturation is None:
-        return np.zeros(exposure.shape, dtype=bool)
-    with np.errstate(invalid="ignore"):
-        return exposure.data >= exposure.saturation
 
 
 def rough_pixels(data, bad, full, noise):

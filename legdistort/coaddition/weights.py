@@ -51,9 +51,6 @@ class Weight:
     by_pixel: bool = False
     map: tuple | None = None
 
-    def __repr__(self):
-        return f"<Weight {self.value:.4g}{' by pixel' * self.by_pixel}{' with map' * (self.map is not None)}>"
-
     def at(self, xy):
         """The weight (a number or an array) at detector pixels ``xy``, shape (2, ...), but for `by_pixel`."""
         if self.map is None:

@@ -13,7 +13,6 @@ from astropy.coordinates import SkyCoord
 from astropy.wcs.wcsapi import BaseLowLevelWCS
 
 from ...runtime.optional import has_fast
-from .drizzling import Drop
 
 _FORGETS = 2, 2, 12, 16, 20, 24  # pixels by which a spline of that order has forgotten, to 1e-8
 #: Pixels of all exposures from which compiled splines are used, if numba is installed.
@@ -30,20 +29,24 @@ class Resampling:
         Which of reproject's, or that of STScI.
     order : int
         Of the spline, for 'interp'.
-    drop : Drop or None
-        For 'drizzle'.
+    kernel : {'square', 'turbo', 'point'}
+        Of drizzle's drops: a square that turns and shears with the distortion, one along the axes of the output, or a
+        point.
+    pixfrac : float
+        Side of a drop, as a fraction of the pixel's, above 0 up to 1.
     compiled : bool
         Splines by compiled loops, see `uses_compiled_splines`.
     """
 
     algorithm: str = "interp"
     order: int = 3
-    drop: Drop | None = None
+    kernel: str = "square"
+    pixfrac: float = 1.0
     compiled: bool = False
 
     def __str__(self):
-        kind = {"interp": f" {self.order}", "drizzle": f" {self.drop}"}.get(self.algorithm, "")
-        return f"{self.algorithm}{kind}"
+        kind = {"interp": f" {self.order}", "drizzle": f" {self.kernel} {self.pixfrac:g}"}
+        return self.algorithm + kind.get(self.algorithm, "")
 
     @property
     def margin(self):

@@ -59,8 +59,8 @@ def resample_exposure(data, masks, variance, pixel_map, resampling, *, gain=None
     Resampled
     """
     masks = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
-    if resampling.drop:
-        return _drizzle(data, masks, variance, pixel_map, resampling.drop)
+    if resampling.algorithm == "drizzle":
+        return _drizzle(data, masks, variance, pixel_map, resampling)
     spline = resampling.algorithm == "interp"
     spoilt = [name for name in ("bad", "full") if name in masks]
     extra = list(np.reshape(variance, (-1, *data.shape)) if np.ndim(variance) else [])
@@ -99,11 +99,11 @@ def _hits(mask, pixel_map):
     return hits
 
 
-def _drizzle(data, masks, variance, pixel_map, drop):
+def _drizzle(data, masks, variance, pixel_map, resampling):
     variances = np.broadcast_to(variance, (*np.shape(variance)[:-2], *data.shape))
     good = ~masks.get("bad", np.zeros(data.shape, dtype=bool))
-    value, spread, coverage = drizzle(data, good, variances.reshape(-1, *data.shape), pixel_map, drop)
+    value, spread, coverage = drizzle(data, good, variances.reshape(-1, *data.shape), pixel_map, resampling)
     full = None
     if "full" in masks:
-        full = drizzle(masks["full"], good, [], pixel_map, drop)[0] > _BAD_WEIGHT
+        full = drizzle(masks["full"], good, [], pixel_map, resampling)[0] > _BAD_WEIGHT
     return Resampled(value, np.reshape(spread, (*variances.shape[:-2], *value.shape)), full, coverage)

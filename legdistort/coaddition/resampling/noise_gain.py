@@ -37,8 +37,8 @@ def white_gain(exposure_map, resampling):
         found = exposure_map.piece(window, margin=24, border=resampling.algorithm == "adaptive")
         if found is not None:
             noise = np.random.default_rng(1).standard_normal([s.stop - s.start for s in found[1]])
-            if resampling.drop:
-                out = drizzle(noise, np.ones(noise.shape, dtype=bool), [], found[0], resampling.drop)[0]
+            if resampling.algorithm == "drizzle":
+                out = drizzle(noise, np.ones(noise.shape, dtype=bool), [], found[0], resampling)[0]
             else:
                 out = resample(noise[None], found[0], resampling)
             return float(np.nanvar(out))
