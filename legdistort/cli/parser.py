@@ -12,7 +12,8 @@ from pathlib import Path
 
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from ..coaddition.options import ALGORITHMS, CONSERVE, EXTRAPOLATED, KERNELS, ORDERS, SCALES, WEIGHTS
+from ..coaddition.options import ALGORITHMS, CONSERVE, EXTRAPOLATED, ORDERS, SCALES, WEIGHTS
+from ..coaddition.resampling.drizzling import KERNELS
 from ..exceptions import LegdistortError, LegdistortWarning
 from ..priors.source import DIRECTIONS
 from ..runtime.outputs import RESULTS

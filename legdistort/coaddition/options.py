@@ -10,6 +10,7 @@ from astropy.wcs import WCS
 from ..exceptions import InputError
 from ..runtime.checks import check_choice
 from .grids import checked_wcs
+from .resampling.drizzling import KERNELS
 from .resampling.engines import Resampling, uses_compiled_splines
 
 METHODS = ("mean", "median", "clipped")
@@ -19,7 +20,6 @@ CONSERVE = ("flux", "surface_brightness")
 WEIGHTS = ("noise", "variance", "exptime", "seeing", "sigma_map")
 SCALES = ("auto", "exptime", "stars")
 EXTRAPOLATED = ("flag", "mask", "keep")
-KERNELS = ("square", "turbo", "point")  # of drizzle, those that conserve flux
 
 
 @dataclass(frozen=True)
