@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from legdistort.coaddition.combination import combine, confirmed, margin
-from legdistort.coaddition.resampling.engines import Resampling
-from legdistort.coaddition.resampling.exposure_pieces import resample_exposure
+from legdistort.coaddition.resampling.engines import Resampling, resample_exposure
 from legdistort.coaddition.resampling.pixel_maps import PixelMap
 
 SHAPE = (300, 300)

@@ -10,8 +10,7 @@ from ..geometry.star_hull import supported
 from ..runtime.scratch import Stored, forget, spill
 from .background import Background
 from .combination import PixelFlag, combine, margin
-from .resampling.engines import Resampling
-from .resampling.exposure_pieces import resample_exposure
+from .resampling.engines import Resampling, resample_exposure
 from .resampling.pixel_maps import ExposureMap
 from .weights import Weight
 
@@ -42,7 +41,7 @@ class Layer:
     fwhm : float or None
         Of its stars [px].
     gain : float or None
-        See `legdistort.coaddition.resampling.exposure_pieces.resample_exposure`.
+        See `legdistort.coaddition.resampling.engines.resample_exposure`.
     photons : float
         See `legdistort.coaddition.combination.combine`.
     support : ndarray or None
@@ -116,14 +115,15 @@ def assemble(layers, recipe, folder, share):
     list of ndarray
         Data, variance, weight, count, flags and context, as `stack` gives them for a block.
     """
-    context = n_planes(len(layers)), *recipe.shape
     planes = [spill(recipe.shape, np.float32, value, folder) for value in (np.nan, np.nan, 0)]
     planes += [spill(recipe.shape, dtype, 0, folder) for dtype in (np.int32, np.uint8)]
-    planes += [spill(context, np.uint32, 0, folder)]
+    planes += [spill((n_planes(len(layers)), *recipe.shape), np.uint32, 0, folder)]
     pieces = list(blocks(layers, recipe))
     work = partial(stack, recipe=recipe, n_exposures=len(layers))
     stacked = share(work, pieces, description="co-adding", unit="block")
     for block, values in zip(pieces, stacked, strict=True):
+        if values is None:  # the planes have what stands for nothing
+            continue
         for plane, value in zip(planes, values, strict=True):
             plane[..., *block.window] = value
             forget(plane)
@@ -189,6 +189,8 @@ def stack(block, *, recipe, n_exposures):
         Bits of `legdistort.coaddition.combination.PixelFlag`.
     context : ndarray of uint32, shape (n_planes, ny, nx)
         Bit i % 32 of plane i // 32 is set where exposure i contributes.
+
+    It is None where no exposure meets the block.
     """
     outer = _widen(block.window, margin(recipe.method, recipe.widths), recipe.shape)
     shape = tuple(s.stop - s.start for s in outer)
@@ -199,13 +201,9 @@ def stack(block, *, recipe, n_exposures):
     for layer in block.layers:
         if _resample(layer, outer, recipe, [plane[len(met)] for plane in (data, variance, weight, doubt)]):
             met.append(layer)
-    inner = _inner(block.window, outer)
-    shape = tuple(s.stop - s.start for s in inner)
-    context = np.zeros((n_planes(n_exposures), *shape), dtype=np.uint32)
     if not met:
-        empty = np.full(shape, np.nan, dtype=np.float32)
-        nothing = (np.zeros(shape, dtype=dtype) for dtype in (np.float32, np.int32, np.uint8))
-        return empty, empty, *nothing, context
+        return None
+    inner = _inner(block.window, outer)
     n = len(met)
     photons = [layer.photons for layer in met]
     spare = doubt[:n] & PixelFlag.SATURATED > 0
@@ -225,6 +223,7 @@ def stack(block, *, recipe, n_exposures):
     if recipe.method == "clipped":
         rejected = np.isfinite(data[:n]) & ~spare & ~combined.keep
         flags |= rejected.any(axis=0) * np.uint8(PixelFlag.REJECTED)
+    context = np.zeros((n_planes(n_exposures), *keep.shape[1:]), dtype=np.uint32)
     for layer, used in zip(met, keep, strict=True):
         plane, bit = divmod(layer.index, _BITS)
         context[plane] |= used.astype(np.uint32) << np.uint32(bit)

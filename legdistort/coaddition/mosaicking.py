@@ -18,7 +18,8 @@ from .grids import given_grid, reference_grid
 from .mosaic import Mosaic
 from .options import CoaddOptions
 from .preparation import prepare
-from .resampling.noise_gain import noise_correlation, white_gain
+from .resampling.engines import white_gain
+from .resampling.noise_gain import noise_correlation
 from .resampling.pixel_maps import map_exposure
 from .weights import make_weights, stellar_widths
 

@@ -7,43 +7,6 @@ import numpy as np
 from numpy.polynomial.polynomial import polyfit, polyval
 from scipy.ndimage import map_coordinates
 
-from .drizzling import drizzle
-from .engines import resample
-
-
-def white_gain(exposure_map, resampling):
-    """What an algorithm leaves of the variance of white noise; found in the middle of an exposure, but for splines.
-
-    The sum over many pixels keeps its variance: it is the inverse of this times the sum of the variances of single
-    pixels, since neighbours are correlated.
-
-    Parameters
-    ----------
-    exposure_map : `~legdistort.coaddition.resampling.pixel_maps.ExposureMap`
-    resampling : `~legdistort.coaddition.resampling.engines.Resampling`
-
-    Returns
-    -------
-    float
-        The mean over 128 x 128 px of the output.
-    """
-    if resampling.algorithm == "interp":
-        fraction = (np.arange(100) + 0.5) / 100
-        return float(polyval(fraction * (1 - fraction), _gain_series(resampling.order)).mean() ** 2)
-    middle = tuple(
-        slice(max(s.start, (s.start + s.stop) // 2 - 64), (s.start + s.stop) // 2 + 64) for s in exposure_map.window
-    )
-    for window in (middle, exposure_map.window):  # an exposure may meet the grid with a corner only
-        found = exposure_map.piece(window, margin=24, border=resampling.algorithm == "adaptive")
-        if found is not None:
-            noise = np.random.default_rng(1).standard_normal([s.stop - s.start for s in found[1]])
-            if resampling.algorithm == "drizzle":
-                out = drizzle(noise, np.ones(noise.shape, dtype=bool), [], found[0], resampling)[0]
-            else:
-                out = resample(noise[None], found[0], resampling)
-            return float(np.nanvar(out))
-    return 1.0
-
 
 def noise_correlation(exposure_map, gain, resampling):
     """Noise of the sum of many pixels over that by the sum of their variances, in the middle of an exposure.
@@ -96,6 +59,12 @@ def spline_gain(order, xy, compiled):
         gain *= fraction
         gain += np.float32(c)
     return gain[0] * gain[1]
+
+
+def mean_spline_gain(order):
+    """The mean of `spline_gain` over the fractions of a pixel."""
+    fraction = (np.arange(100) + 0.5) / 100
+    return float(polyval(fraction * (1 - fraction), _gain_series(order)).mean() ** 2)
 
 
 @lru_cache
