@@ -12,10 +12,8 @@ from pathlib import Path
 
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from ..coaddition.levels import SCALES
+from ..coaddition.options import ALGORITHMS, CONSERVE, EXTRAPOLATED, ORDERS, SCALES, WEIGHTS
 from ..coaddition.resampling.drizzling import KERNELS
-from ..coaddition.resampling.engines import ALGORITHMS, CONSERVE, ORDERS
-from ..coaddition.weights import EXTRAPOLATED, WEIGHTS
 from ..exceptions import LegdistortError, LegdistortWarning
 from ..priors.source import DIRECTIONS
 from ..runtime.outputs import RESULTS
