@@ -7,7 +7,7 @@ from math import ceil
 import numpy as np
 
 from ..geometry.star_hull import supported
-from ..runtime.parallel import each
+from ..runtime.parallel import map_items
 from ..runtime.scratch import Stored, forget, spill
 from .combination import PixelFlag, combine, margin
 from .levels import Survey, sky_variance
@@ -124,7 +124,7 @@ def assemble(layers, recipe, folder, **share):
     folder : path
         The planes are arrays on the disk of this folder.
     **share
-        How the work is shared, see `legdistort.runtime.parallel.each`.
+        How the work is shared, see `legdistort.runtime.parallel.map_items`.
 
     Returns
     -------
@@ -137,7 +137,7 @@ def assemble(layers, recipe, folder, **share):
     planes += [spill(context, np.uint32, 0, folder)]
     pieces = list(blocks(layers, recipe))
     work = partial(stack, recipe=recipe, n_exposures=len(layers))
-    stacked = each(work, pieces, description="co-adding", unit="block", **share)
+    stacked = map_items(work, pieces, description="co-adding", unit="block", **share)
     for block, values in zip(pieces, stacked, strict=True):
         for plane, value in zip(planes, values, strict=True):
             plane[..., *block.window] = value

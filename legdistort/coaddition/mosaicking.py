@@ -10,7 +10,7 @@ from astropy.io import fits
 
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry.star_hull import support
-from ..runtime.parallel import each
+from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder, store
 from .block_stack import Layer, Recipe, assemble, n_bytes
 from .grids import given_grid, reference_grid
@@ -155,7 +155,7 @@ def _coadd(exposures, solution, options, share):
     with scratch_folder(
         options.scratch, need, f"a mosaic of {nx} x {ny} px and the pixels of {len(frames)} exposures"
     ) as folder:
-        kept = each(partial(_keep, folder=folder), frames, description="reading", **share)
+        kept = map_items(partial(_keep, folder=folder), frames, description="reading", **share)
         kept = dict(zip([f.name for f in frames], kept, strict=True))
         empty = {name: found for name, found in kept.items() if isinstance(found, str)}
         _warn(empty)
