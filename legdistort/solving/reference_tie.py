@@ -12,8 +12,8 @@ import numpy as np
 from ..exceptions import AssumptionWarning, warn
 from ..geometry import similarity
 from ..geometry.detector_modes import similarity_basis
+from ..geometry.similarity import robust_similarity
 from ..inputs import column_contract
-from ..inputs.matches import robust_similarity
 from ..matching.cross_identification import identify
 from ..results.catalogue_tie import Knowledge
 from . import minimisers
