@@ -336,7 +336,7 @@ def _tying(a):
 def _prior_with_sigma(a, shape=None):
     """The prior asked for, no static distortion if there is none, with the widths asked for at every degree fitted."""
     from ..priors.prior import EVIDENCE, Prior
-    from ..solving.choices.held_out_stars import AUTO, HIGHEST
+    from ..solving.choices.degree_choice import AUTO, HIGHEST
 
     prior = _prior(a.prior, shape)
     if a.prior_sigma is None:
