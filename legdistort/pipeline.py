@@ -19,10 +19,9 @@ from .matching.matcher import match
 from .measurement.positions import measure
 from .reporting.page import write_report
 from .results import accuracy
-from .results.diagnostics import FOUND
 from .runtime import outputs, provenance
 from .solving.estimation import solve
-from .solving.options import check_options, check_reference
+from .solving.options import SolveOptions, check_reference
 from .wcs.files import write_wcs
 
 log = logging.getLogger(__name__)
@@ -118,7 +117,7 @@ def run(
     """
     out = Path(out)
     check_folder(out, overwrite)
-    check_options(degree=degree, clip=clip, **(solving or {}))
+    SolveOptions(degree=degree, clip=clip, **(solving or {}))
     method = (solving or {}).get("method", "joint")
     reference, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
     timings = {}
@@ -180,8 +179,9 @@ def write_results(solution, target):
 
 
 def write_summary(path, summary):
-    """Write figures as JSON."""
-    Path(path).write_text(json.dumps(summary, indent=1) + "\n")
+    """Write figures as JSON, in the place of those that are there."""
+    with outputs.replacing(path, overwrite=True) as file:
+        file.write(f"{json.dumps(summary, indent=1)}\n".encode())
 
 
 def summarise(solution, *, timings=None):
@@ -190,7 +190,7 @@ def summarise(solution, *, timings=None):
     ``rms_px``: unweighted rms residual per axis, used observations. ``sigma_px``: the paper's sigma (section 3.4) over
     the fitted stars, per axis.
     """
-    sigma = accuracy.scatter(accuracy.corrected_positions(solution))
+    found, sigma = solution.diagnostics, accuracy.scatter(accuracy.corrected_positions(solution))
     return {
         "n_exposures": len(solution.names),
         "n_stars": int(np.count_nonzero(np.isfinite(solution.positions[:, 0]))),
@@ -201,10 +201,10 @@ def summarise(solution, *, timings=None):
         "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
         "gauge": solution.gauge.sentence,
         "sky": solution.sky_sentence,
-        "reference": solution.settings.get("reference"),
+        "reference": found.reference and asdict(found.reference),
         "max_inverse_error_px": float(solution.max_inverse_error),
         "left_out": dict(solution.left_out),
-        **{key: found for key in FOUND if (found := solution.settings.get(key)) is not None},
+        **found.summary(),
         "timings": {step: round(seconds, 3) for step, seconds in (timings or {}).items()},
     }
 

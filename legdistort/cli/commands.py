@@ -97,8 +97,8 @@ def do_noise(a):
     )
     curves.write(a.out, overwrite=a.overwrite)
     if a.plot is not None:
-        with replacing(a.plot, overwrite=a.overwrite) as temporary:
-            curves.plot().figure.savefig(temporary, format="png", dpi=120)
+        with replacing(a.plot, overwrite=a.overwrite) as file:
+            curves.plot().figure.savefig(file, format="png", dpi=120)
     laws = [dict(zip(curves.laws.colnames, row, strict=True)) for row in curves.laws.as_array().tolist()]
     laws = [{key: value if value == value else None for key, value in law.items()} for law in laws]  # no NaN in JSON
     _say(a, curves, {"laws": laws, "out": str(a.out)})
@@ -244,8 +244,8 @@ def do_predict(a):
         seed=a.seed,
     )
     if a.plot is not None:
-        with replacing(a.plot, overwrite=a.overwrite) as temporary:
-            prediction.plot().figure.savefig(temporary, format="png", dpi=120)
+        with replacing(a.plot, overwrite=a.overwrite) as file:
+            prediction.plot().figure.savefig(file, format="png", dpi=120)
     plans = prediction.alternatives()
     rows = [dict(zip(plans.colnames, row, strict=True)) for row in plans.as_array().tolist()]
     own, *others = ({key: None if value != value else value for key, value in row.items()} for row in rows)  # no NaN
@@ -336,7 +336,7 @@ def _tying(a):
 def _prior_with_sigma(a, shape=None):
     """The prior asked for, no static distortion if there is none, with the widths asked for at every degree fitted."""
     from ..priors.prior import EVIDENCE, Prior
-    from ..solving.choices.held_out_stars import AUTO, HIGHEST
+    from ..solving.choices.degree_choice import AUTO, HIGHEST
 
     prior = _prior(a.prior, shape)
     if a.prior_sigma is None:
@@ -379,7 +379,6 @@ def _grid(path, solution):
 
 
 def _write_table(table, a):
-    from ..runtime.outputs import replacing
+    from ..inputs.table_files import write_table
 
-    with replacing(a.out, overwrite=a.overwrite) as temporary:
-        table.write(temporary, format="ascii.ecsv")
+    write_table(table, a.out, overwrite=a.overwrite)

@@ -9,7 +9,7 @@ from astropy.io import fits
 
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry.star_hull import support
-from ..runtime.parallel import each
+from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
 from .background import match_backgrounds
 from .block_stack import Layer, Recipe, assemble, n_bytes
@@ -123,11 +123,11 @@ def coadd(
         kernel=kernel,
         scratch=scratch,
     )
-    return _coadd(exposures, solution, options, partial(each, workers=workers, threads=True, progress=progress))
+    return _coadd(exposures, solution, options, partial(map_items, workers=workers, threads=True, progress=progress))
 
 
 def _coadd(exposures, solution, options, share):
-    """The mosaic; `share` is `each`, told who shares the work."""
+    """The mosaic; `share` is `map_items`, told who shares the work."""
     frames, left_out = _select(exposures, solution)
     options.check_names([*(f.name for f in frames), *left_out])
     if options.grid is None:
@@ -301,7 +301,7 @@ def _header(frames, left_out, factors, settings):
             header[key] = (value, meaning)
     header["CREATOR"] = f"legdistort {version('legdistort')}"
     for i, frame in enumerate(frames[:999], start=1):
-        header[f"IMCMB{i:03d}"] = frame.name
+        header[f"IMCMB{i:03d}"] = frame.name.encode("ascii", "backslashreplace").decode()  # as FITS has it
     for name, reason in left_out.items():
         header.add_history(f"left out {name}: {reason}")
     return header

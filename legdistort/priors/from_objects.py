@@ -10,7 +10,8 @@ from astropy.modeling import Model, models
 from gwcs import coordinate_frames as cf
 
 from ..exceptions import InputError
-from .source import DIRECTIONS, Source, check_shape, tangent
+from ..geometry.tangent_plane import gnomonic
+from .source import DIRECTIONS, Source, check_shape
 
 #: Frames of a gwcs where the distortion ends and pointing has not begun, in order of preference.
 PLANES = ("undistorted", "v2v3")
@@ -127,11 +128,10 @@ def _of_fits_wcs(wcs, name):
         return sky[wcs.wcs.lng], sky[wcs.wcs.lat]
 
     crval, centre = wcs.wcs.crval, wcs.wcs.crpix - 1
-    plane = tangent(function, crval[wcs.wcs.lng], crval[wcs.wcs.lat])
     grid = (np.stack(np.meshgrid(*[np.linspace(-500, 500, 5)] * 2), axis=-1).reshape(-1, 2)) + centre
     linear = np.column_stack([grid, np.ones(len(grid))])
     with np.errstate(all="ignore"):
-        sky = np.column_stack(plane(*grid.T))
+        sky = np.column_stack(gnomonic(*function(*grid.T), crval[wcs.wcs.lng], crval[wcs.wcs.lat]))
         matrix = np.linalg.lstsq(linear, np.nan_to_num(sky), rcond=None)[0]
         left = np.abs(linear @ matrix - sky).max() / np.sqrt(abs(np.linalg.det(matrix[:2])))
     if left < NOTHING:  # not if it is NaN
