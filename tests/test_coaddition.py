@@ -624,6 +624,15 @@ class TestBadInput:
         with pytest.raises(InputError, match="scale: no exposure of that name is co-added: frame9"):
             coadd(frames[:1], solution, scale={"frame0": 1, "frame9": 2})
 
+    def test_names_with_other_letters_go_into_the_file(self, tmp_path):
+        solution, *_, exposures, _ = plain()
+        strange = Exposure("né", np.ones(SHAPE))
+        with pytest.warns(AssumptionWarning, match="left out of the mosaic: né"):
+            mosaic = coadd([*exposures, strange], solution)
+        mosaic.write(tmp_path / "m.fits")
+        history = str(fits.getheader(tmp_path / "m.fits")["HISTORY"])
+        assert "left out n\\xe9: it is not in the solution" in history
+
     def test_a_coarse_grid_is_for_other_algorithms(self):
         solution, *_, exposures, mosaic = plain()
         grid = mosaic.wcs.deepcopy()

@@ -301,7 +301,12 @@ def _header(frames, left_out, factors, settings):
             header[key] = (value, meaning)
     header["CREATOR"] = f"legdistort {version('legdistort')}"
     for i, frame in enumerate(frames[:999], start=1):
-        header[f"IMCMB{i:03d}"] = frame.name.encode("ascii", "backslashreplace").decode()  # as FITS has it
+        header[f"IMCMB{i:03d}"] = _ascii(frame.name)
     for name, reason in left_out.items():
-        header.add_history(f"left out {name}: {reason}")
+        header.add_history(_ascii(f"left out {name}: {reason}"))
     return header
+
+
+def _ascii(text):
+    """As FITS has it; other letters by their numbers."""
+    return text.encode("ascii", "backslashreplace").decode()
