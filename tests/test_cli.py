@@ -18,7 +18,7 @@ from astropy.wcs import WCS
 from legdistort import Solution, coadd, open_exposures
 from legdistort.cli import commands
 from legdistort.cli.parser import main
-from legdistort.coaddition import mosaicking
+from legdistort.coaddition import mosaicking, preparation
 from legdistort.exceptions import InputError
 from legdistort.simulation.observations import simulate_exposures
 
@@ -148,7 +148,7 @@ def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, numb
     """By Ctrl-C, or by a batch system."""
     (tmp_path / "scratch").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
-    monkeypatch.setattr(mosaicking, "survey", lambda *args, **options: os.kill(os.getpid(), number))
+    monkeypatch.setattr(preparation, "measure_background", lambda *args, **options: os.kill(os.getpid(), number))
     usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
     before = signal.signal(number, usual)
     try:
