@@ -27,6 +27,9 @@ from .wcs.files import write_wcs
 
 log = logging.getLogger(__name__)
 
+#: What `run` and the command ``solve`` leave in their folder, and replace there.
+RESULTS = ("solution.asdf", "stars.ecsv", "wcs", "mosaic.fits", "report.html", "summary.json")
+
 
 @dataclass(frozen=True, eq=False)
 class Run:
@@ -221,7 +224,7 @@ def _if_possible(judge, *args, **kwargs):
 def check_folder(out, overwrite):
     """Raise `InputError` if `out` cannot be a folder, or holds results and `overwrite` is false."""
     outputs.check_folder(out)
-    there = [name for name in outputs.RESULTS if (Path(out) / name).exists()]
+    there = [name for name in RESULTS if (Path(out) / name).exists()]
     if there and not overwrite:
         raise InputError(
             f"{out} already holds {', '.join(there)}; give overwrite=True (--overwrite) to replace a run, or another "
