@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 from scipy.spatial import cKDTree
 
-from legdistort.measurement.positions import UNUSABLE
+from legdistort.measurement.flags import UNUSABLE
 
 SKY, GAIN, READ_NOISE = 100.0, 2.0, 10.0
 

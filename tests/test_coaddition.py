@@ -2,8 +2,9 @@
 
 import gzip
 import itertools
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
+from inspect import signature
 
 import asdf
 import gwcs.coordinate_frames as cf
@@ -20,6 +21,7 @@ from scipy.optimize import least_squares
 
 from legdistort.coaddition.grids import reference_grid
 from legdistort.coaddition.mosaicking import coadd
+from legdistort.coaddition.options import CoaddOptions
 from legdistort.coaddition.resampling.engines import fill_bad
 from legdistort.coaddition.resampling.pixel_maps import tabulate, trace
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError
@@ -29,6 +31,7 @@ from legdistort.geometry.distortion import Distortion
 from legdistort.geometry.models import outside
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.exposures import Exposure, read_exposures
+from legdistort.runtime.checks import options_from
 
 SHAPE = (300, 400)
 SIGMA = 1.4  # of the Gaussian stars, px
@@ -535,6 +538,33 @@ class TestBadInput:
         solution, *_, exposures, _ = plain()
         with pytest.raises(InputError, match=message):
             coadd(exposures, solution, **settings)
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"order": 9}, "coadding: order must be an integer from 0 to 5"),
+            ({"weights": {"a": -1}}, "coadding: weights of exposure a must be a positive number, got -1"),
+            ({"scale": "sky"}, "coadding: scale must be one of 'auto', 'exptime', 'stars', None or a dict"),
+            ({"grid": WCS(naxis=2)}, "coadding: grid must have two axes, both celestial"),
+            ({"workers": 2}, "coadding has no option 'workers'; it takes method, order"),
+        ],
+    )
+    def test_options_need_no_exposures_to_be_refused(self, settings, message):
+        with pytest.raises(InputError, match=message):
+            options_from(CoaddOptions, settings, "coadding")
+
+    def test_options_are_the_arguments(self):
+        arguments = signature(coadd).parameters
+        for option in fields(CoaddOptions):
+            assert arguments[option.name].default == option.default
+        shared = {"exposures", "solution", "workers", "progress"}
+        assert set(arguments) - shared == {option.name for option in fields(CoaddOptions)}
+
+    def test_options_are_kept_as_they_were(self):
+        given = {"a": 2}
+        options = CoaddOptions(order="bicubic", weights=given)
+        given["a"] = -1
+        assert (options.order, options.weights) == (3, {"a": 2.0})
 
     def test_grids(self):
         solution, *_, exposures, mosaic = plain()

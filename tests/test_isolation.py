@@ -10,8 +10,7 @@ import legdistort as ld
 from legdistort.exceptions import InputError
 from legdistort.inputs.exposures import Exposure
 from legdistort.measurement import crowding as isolation
-from legdistort.measurement.flags import Flag
-from legdistort.measurement.positions import UNUSABLE
+from legdistort.measurement.flags import UNUSABLE, Flag
 from legdistort.simulation.rendering import Moffat, add_noise, render
 
 SKY, GAIN, READ_NOISE = 100.0, 2.0, 10.0

@@ -16,6 +16,7 @@ from test_coaddition import SHAPE, SIGMA, StandIn, check_stars, covered, expose,
 from legdistort.coaddition.combination import PixelFlag
 from legdistort.coaddition.levels import flux_scales, sky_variance, survey
 from legdistort.coaddition.mosaicking import coadd
+from legdistort.coaddition.options import CoaddOptions
 from legdistort.coaddition.weights import make_weights, stellar_widths
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry.distortion import Distortion
@@ -111,7 +112,7 @@ class TestFluxScale:
         with pytest.raises(
             InputError, match=r"scale must be one of 'auto', 'exptime', 'stars', None or a dict .* 'sky'"
         ):
-            flux_scales(blank(2), "sky", solution)
+            CoaddOptions(scale="sky")
 
     def test_mosaic_through_clouds(self):
         solution, stars, flux, exposures, _ = plain()
@@ -199,7 +200,7 @@ class TestWeights:
         with pytest.raises(InputError, match="weights='seeing': the solution has no FWHM"):
             make_weights("seeing", noise, measured(solution, table))
         with pytest.raises(InputError, match=r"weights must be one of 'noise', 'variance', .*, got 'ivar'"):
-            make_weights("ivar", noise, solution)
+            CoaddOptions(weights="ivar")
 
 
 class TestSupport:

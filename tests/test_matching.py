@@ -1,5 +1,8 @@
 """Matching: synthetic fields of known truth, headers that lie, frames that do not belong, two real sets."""
 
+import inspect
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from astropy.table import QTable, Table, vstack
@@ -23,6 +26,7 @@ from legdistort.geometry import similarity
 from legdistort.matching.linking import Group, interlink, label_stars, tie
 from legdistort.matching.matcher import match
 from legdistort.matching.merging import unite
+from legdistort.matching.options import MatchOptions
 from legdistort.matching.registration import Registration, register
 from legdistort.matching.seeds import offset_candidates, triangle_candidates
 from legdistort.matching.star_lists import StarList, Warp
@@ -349,6 +353,13 @@ def test_no_star_in_enough_exposures():
     table = vstack([detections(f"e{k}", c) for k, c in enumerate(chain)])
     with pytest.raises(MatchError, match="no star was found in min_exposures=4 exposures, the best in 2"):
         match(table, shape=SHAPE)
+
+
+def test_options_are_the_arguments():
+    parameters = inspect.signature(match).parameters
+    options = {option.name: option.default for option in fields(MatchOptions)}
+    assert options == {name: parameters[name].default for name in options}
+    assert parameters.keys() - options == {"detections", "exposures", "shape"}
 
 
 def test_candidates_hold_the_truth():

@@ -1,6 +1,8 @@
 """Detection and profile fits against images rendered by code of their own."""
 
+import inspect
 import warnings
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -25,7 +27,9 @@ from star_images import (
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.column_contract import DETECTED, check
 from legdistort.inputs.exposures import Exposure, read_exposures
-from legdistort.measurement.positions import Flag, measure
+from legdistort.measurement.flags import Flag
+from legdistort.measurement.options import MeasureOptions
+from legdistort.measurement.positions import measure
 from legdistort.measurement.profiles import levenberg_marquardt, moffat
 from legdistort.measurement.profiles.blends import group_stars, members
 
@@ -449,6 +453,13 @@ def test_frames_are_independent_and_inputs_untouched():
 def test_bad_arguments(arguments, message):
     with pytest.raises(InputError, match=message):
         measure([Exposure("a", np.zeros((9, 9)))], **arguments)
+
+
+def test_options_are_the_arguments():
+    parameters = inspect.signature(measure).parameters
+    options = {option.name: option.default for option in fields(MeasureOptions)}
+    assert options == {name: parameters[name].default for name in options}
+    assert parameters.keys() - options == {"exposures", "workers", "progress"}
 
 
 def test_exposures_only():

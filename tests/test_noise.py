@@ -14,8 +14,8 @@ from legdistort.cli import parser
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
 from legdistort.measurement import injection
+from legdistort.measurement.flags import UNUSABLE
 from legdistort.measurement.noise_curves import NoiseCurves
-from legdistort.measurement.positions import UNUSABLE
 from legdistort.results import accuracy
 from legdistort.simulation.rendering import Moffat, add_noise, render
 

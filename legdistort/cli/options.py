@@ -2,11 +2,9 @@
 
 from pathlib import Path
 
-from ..coaddition.combination import METHODS as COMBINATIONS
-from ..coaddition.levels import SCALES
+from ..coaddition.options import ALGORITHMS, CONSERVE, EXTRAPOLATED, ORDERS, SCALES, WEIGHTS
+from ..coaddition.options import METHODS as COMBINATIONS
 from ..coaddition.resampling.drizzling import KERNELS
-from ..coaddition.resampling.engines import ALGORITHMS, CONSERVE, ORDERS
-from ..coaddition.weights import EXTRAPOLATED, WEIGHTS
 from ..measurement.noise_curves import SOURCES
 from ..priors.source import DIRECTIONS
 from ..solving.gauge.constraints import KINDS

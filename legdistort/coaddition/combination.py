@@ -6,7 +6,6 @@ from enum import IntFlag
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
-METHODS = ("mean", "median", "clipped")
 _CLIP_SIGMA = 4.0  # limit of what is kept, in units of the noise
 _GROW_SIGMA = 2.0  # ... beside what was rejected: the skirts of cosmic rays
 _TOLERANCE = 0.15  # share of the signal by which equally sharp exposures may differ

@@ -100,8 +100,8 @@ def reference_grid(names, solution):
     return Grid((int(ny), int(nx)), wcs, (int(low[0]), int(low[1])), solution.sky)
 
 
-def given_grid(grid, solution):
-    """The `Grid` of a celestial WCS or FITS header with a shape; `InputError` if it is none."""
+def checked_wcs(grid):
+    """The WCS, a copy, of a grid given as a celestial WCS or FITS header with a shape; `InputError` if it is none."""
     if isinstance(grid, fits.Header):
         try:
             wcs = WCS(grid)
@@ -117,6 +117,18 @@ def given_grid(grid, solution):
     if wcs.array_shape is None:
         raise InputError("grid has no shape: give NAXIS1 and NAXIS2 in the header, or set wcs.array_shape = (ny, nx)")
     _check_pixels(wcs, "grid")
+    return wcs
+
+
+def given_grid(grid, solution):
+    """The `Grid` of a celestial WCS or FITS header with a shape.
+
+    Raises
+    ------
+    InputError
+        If it is none, or the solution is not tied to the sky.
+    """
+    wcs = checked_wcs(grid)
     if solution.sky is None:
         raise InputError(
             "the solution is not tied to the sky, so it cannot be put on a celestial grid; "

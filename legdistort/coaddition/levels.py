@@ -8,12 +8,11 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from ..exceptions import AssumptionWarning, InputError, warn
+from .options import by_name
 from .resampling.pixel_maps import trace
-from .weights import by_name
 
 logger = logging.getLogger(__name__)
 
-SCALES = ("auto", "exptime", "stars")
 _SAME_SCALE = 0.02  # by which fluxes of stars must differ from the exposure times to be preferred
 _FEW = 5  # common stars that two exposures must have for a flux scale
 _BLOCK = 32  # side of the blocks whose medians stand for the background, px
@@ -209,15 +208,11 @@ def flux_scales(frames, scale, solution):
     Raises
     ------
     InputError
-        If the option is none of these, or the fluxes of common stars do not join all exposures.
+        If the fluxes of common stars do not join all exposures, or a number by exposure is missing.
     """
     names = [f.name for f in frames]
     if isinstance(scale, Mapping):
         return by_name("scale", scale, names), "given"
-    if scale is not None and scale not in SCALES:
-        raise InputError(
-            f"scale must be one of {', '.join(map(repr, SCALES))}, None or a dict by exposure, got {scale!r}"
-        )
     if scale is None:
         return dict.fromkeys(names, 1.0), "none"
     times = [f.exposure_time or None for f in frames]

@@ -13,15 +13,11 @@ from ..geometry.star_hull import support
 from ..runtime.parallel import each
 from ..runtime.scratch import scratch_folder, store
 from .block_stack import Layer, Recipe, assemble, n_bytes
-from .combination import METHODS
 from .grids import given_grid, reference_grid
 from .levels import bad_pixels, flux_scales, match_backgrounds, saturated_pixels, survey
 from .mosaic import Mosaic
-from .resampling.drizzling import Drop
+from .options import CoaddOptions
 from .resampling.engines import (
-    ALGORITHMS,
-    CONSERVE,
-    ORDERS,
     fill_bad,
     is_compiled,
     noise_correlation,
@@ -29,7 +25,7 @@ from .resampling.engines import (
     white_gain,
 )
 from .resampling.pixel_maps import map_exposure
-from .weights import EXTRAPOLATED, check_names, make_weights, stellar_widths
+from .weights import check_names, make_weights, stellar_widths
 
 _STORED = 5  # bytes a pixel in the scratch folder, about
 _COARSE = 1.5  # pixels of the grid in those of an exposure from which interpolation leaves out too much
@@ -127,20 +123,37 @@ def coadd(
     DiskFullError
         If the disk of `scratch` is full, or has less room than will be needed. Nothing is left behind.
     """
-    order = _check_options(method, order, algorithm, conserve, extrapolated)
-    drop = Drop(kernel, pixfrac) if algorithm == "drizzle" else None
+    options = CoaddOptions(
+        method=method,
+        order=order,
+        algorithm=algorithm,
+        grid=grid,
+        conserve=conserve,
+        match_background=match_background,
+        weights=weights,
+        scale=scale,
+        extrapolated=extrapolated,
+        pixfrac=pixfrac,
+        kernel=kernel,
+        scratch=scratch,
+    )
+    return _coadd(exposures, solution, options, {"workers": workers, "threads": True, "progress": progress})
+
+
+def _coadd(exposures, solution, options, share):
+    """The mosaic; `share` tells `each` how the work is shared."""
     frames, left_out = _select(exposures, solution)
-    for argument, given in (("weights", weights), ("scale", scale)):
-        check_names(argument, given, [*(f.name for f in frames), *left_out])
+    for argument in ("weights", "scale"):
+        check_names(argument, getattr(options, argument), [*(f.name for f in frames), *left_out])
+    grid, algorithm, order = options.grid, options.algorithm, options.order
     output = reference_grid([f.name for f in frames], solution) if grid is None else given_grid(grid, solution)
     maps = {f.name: map_exposure(f.name, solution, output, corners=algorithm in ("exact", "drizzle")) for f in frames}
     left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
     frames = [f for f in frames if maps[f.name] is not None]
-    share = {"workers": workers, "threads": True, "progress": progress}
     need = n_bytes(output.shape, len(frames)) + _STORED * sum(int(np.prod(f.shape)) for f in frames)
     ny, nx = output.shape
     with scratch_folder(
-        scratch, need, f"a mosaic of {nx} x {ny} px and the pixels of {len(frames)} exposures"
+        options.scratch, need, f"a mosaic of {nx} x {ny} px and the pixels of {len(frames)} exposures"
     ) as folder:
         kept = each(partial(_keep, folder=folder), frames, description="reading", **share)
         kept = dict(zip([f.name for f in frames], kept, strict=True))
@@ -152,26 +165,22 @@ def coadd(
             raise InputError(f"no exposure meets the output grid: {_reasons(left_out)}")
         recipe = Recipe(
             shape=output.shape,
-            method=method,
+            method=options.method,
             algorithm=algorithm,
             order=order,
-            conserve=conserve,
-            mask=extrapolated == "mask",
-            drop=drop,
+            conserve=options.conserve,
+            mask=options.extrapolated == "mask",
+            drop=options.drop,
             compiled=is_compiled(algorithm, order, sum(np.prod(f.shape) for f in frames)),
         )
-        factors, origin = flux_scales(frames, scale, solution)
+        factors, origin = flux_scales(frames, options.scale, solution)
         sky = match_backgrounds([kept[f.name][1] for f in frames], solution, output, factors)
-        layers, recipe = _layers(
-            frames, kept, maps, solution, recipe, factors=factors, weights=weights, sky=sky, matched=match_background
-        )
-        if extrapolated != "keep":
+        layers, recipe = _layers(frames, kept, maps, solution, recipe, options, factors=factors, sky=sky)
+        if options.extrapolated != "keep":
             layers = [replace(each, support=support(each.survey.name, solution)) for each in layers]
         planes = assemble(layers, recipe, folder.parent, **share)
     _warn_of_misuse(frames, maps, algorithm)
-    settings = {"COMBINE": method, "RESAMPLE": _in_words(algorithm, order, drop), "CONSERVE": conserve}
-    settings |= {"SKYLEVEL": recipe.level if match_background else None, "FLXSCALE": origin, "EXTRAPOL": extrapolated}
-    settings |= {"WEIGHTS": weights if isinstance(weights, str) else "equal" if weights is None else "given"}
+    settings = _settings(options, recipe.level, origin)
     correlation = noise_correlation(maps[frames[0].name], layers[0].gain, algorithm=algorithm, order=order)
     settings["NOISECOR"] = correlation if np.isfinite(correlation) else None
     header = _header(frames, left_out, factors, settings)
@@ -179,13 +188,27 @@ def coadd(
     return Mosaic(*planes, wcs=output.wcs, exposures=names, left_out=left_out, offset=output.offset, header=header)
 
 
-def _layers(frames, kept, maps, solution, recipe, *, factors, weights, sky, matched):
+def _settings(options, level, origin):
+    """Keywords of the file that tell how the mosaic was made."""
+    weights = options.weights
+    return {
+        "COMBINE": options.method,
+        "RESAMPLE": _in_words(options),
+        "CONSERVE": options.conserve,
+        "SKYLEVEL": level if options.match_background else None,
+        "FLXSCALE": origin,
+        "EXTRAPOL": options.extrapolated,
+        "WEIGHTS": weights if isinstance(weights, str) else "equal" if weights is None else "given",
+    }
+
+
+def _layers(frames, kept, maps, solution, recipe, options, *, factors, sky):
     """The layers, and the recipe with the common background level and the widths of stars."""
     noise = {f.name: factors[f.name] * kept[f.name][1].noise for f in frames}
-    weight = make_weights(weights, noise, solution, times={f.name: f.exposure_time for f in frames})
+    weight = make_weights(options.weights, noise, solution, times={f.name: f.exposure_time for f in frames})
     fwhm = stellar_widths(solution, list(noise))
     level = float(np.mean(list(sky.values())))
-    if recipe.conserve == "flux" and not matched:  # the sky counts as flux as well
+    if recipe.conserve == "flux" and not options.match_background:  # the sky counts as flux as well
         level *= float(np.mean([_area(maps[f.name]) for f in frames]))
     layers = [
         Layer(
@@ -195,7 +218,7 @@ def _layers(frames, kept, maps, solution, recipe, *, factors, weights, sky, matc
             survey=kept[f.name][1],
             factor=factors[f.name],
             variance=noise[f.name] ** 2,
-            sky=sky[f.name] if matched else None,
+            sky=sky[f.name] if options.match_background else None,
             weight=weight[f.name],
             fwhm=fwhm and fwhm[f.name],
             gain=white_gain(maps[f.name], algorithm=recipe.algorithm, order=recipe.order, drop=recipe.drop),
@@ -220,30 +243,15 @@ def _area(exposure_map):
     return area if np.isfinite(area) else 1.0
 
 
-def _check_options(method, order, algorithm, conserve, extrapolated):
-    """The order as an integer, all options being sound."""
-    for name, value, allowed in (
-        ("method", method, METHODS),
-        ("algorithm", algorithm, ALGORITHMS),
-        ("conserve", conserve, CONSERVE),
-        ("extrapolated", extrapolated, EXTRAPOLATED),
-    ):
-        if value not in allowed:
-            raise InputError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
-    order = ORDERS.get(order, order) if isinstance(order, str) else order
-    if isinstance(order, bool) or order not in range(6):
-        raise InputError(f"order must be an integer from 0 to 5 or one of {', '.join(ORDERS)}, got {order!r}")
-    return int(order)
-
-
 def _span(widths):
     return (min(widths.values()), max(widths.values())) if widths else None
 
 
-def _in_words(algorithm, order, drop):
-    return {"interp": f"interp {order}", "drizzle": drop and f"drizzle {drop.kernel} {drop.pixfrac:g}"}.get(
-        algorithm, algorithm
-    )
+def _in_words(options):
+    """Algorithm, and what it depends on."""
+    if options.algorithm == "interp":
+        return f"interp {options.order}"
+    return f"drizzle {options.kernel} {options.pixfrac:g}" if options.algorithm == "drizzle" else options.algorithm
 
 
 def _select(exposures, solution):

@@ -8,37 +8,10 @@ from astropy import units as u
 from scipy.ndimage import map_coordinates
 
 from ..exceptions import InputError
+from .options import by_name
 
-WEIGHTS = ("noise", "variance", "exptime", "seeing", "sigma_map")
-EXTRAPOLATED = ("flag", "mask", "keep")
 _OWN = 0.02  # error of the position of a star of signal-to-noise ratio 20, in units of the FWHM
 _FWHM = 3.0  # taken where it is not known, px
-
-
-def by_name(argument, given, names):
-    """A dict of positive numbers by exposure, checked.
-
-    Parameters
-    ----------
-    argument : str
-        Its name, for the message.
-    given : mapping
-    names : sequence of str
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    InputError
-        If a number is missing or not positive.
-    """
-    for name in names:
-        value = given.get(name)
-        if not (isinstance(value, (int, float, np.number)) and np.isfinite(value) and value > 0):
-            raise InputError(f"{argument} of exposure {name} must be a positive number, got {value!r}")
-    return {name: float(given[name]) for name in names}
 
 
 def stellar_widths(solution, names):
@@ -119,14 +92,10 @@ def make_weights(weights, noise, solution, *, times=None):
     Raises
     ------
     InputError
-        If the option is none of these, or what it needs is not known, naming the exposures.
+        If what the option needs is not known, naming the exposures.
     """
     if isinstance(weights, Mapping):
         return {name: Weight(value) for name, value in by_name("weights", weights, noise).items()}
-    if weights is not None and weights not in WEIGHTS:
-        raise InputError(
-            f"weights must be one of {', '.join(map(repr, WEIGHTS))}, None or a dict by exposure, got {weights!r}"
-        )
     if weights is None:
         return dict.fromkeys(noise, Weight(1.0))
     if weights == "exptime":

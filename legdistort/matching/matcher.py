@@ -14,12 +14,13 @@ from ..inputs import column_contract
 from ..inputs.matches import Matches, estimate_poses
 from ..inputs.reference_catalogue import mean_epoch
 from ..measurement.crowding import LIMIT, is_isolated
-from ..measurement.positions import UNUSABLE
+from ..measurement.flags import UNUSABLE
 from .linking import interlink, label_stars, standing, tie
 from .merging import unite
+from .options import MatchOptions
 from .star_lists import StarList
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 #: Fewest detections with which an exposure can take part.
 FEWEST = 5
@@ -84,13 +85,17 @@ def match(
     MatchError
         For a single exposure, exposures in groups without a star in common, or no star in `min_exposures` exposures.
     """
+    options = MatchOptions(
+        min_exposures=min_exposures, columns=columns, tolerance=tolerance, reject_flags=reject_flags,
+        isolation=isolation, progress=progress,
+    )  # fmt: skip
     if columns:
         detections = column_contract.rename(detections, columns)
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
     table["exposure"] = table["exposure"].astype(str)
     named = None if exposures is None else {e.name: e for e in exposures}
     names = list(named or dict.fromkeys(table["exposure"].tolist()))
-    _check_arguments(table, names, min_exposures, tolerance)
+    _check_names(table, names, min_exposures)
     shapes = _shapes(table, names, named, shape)
     if "flags" in table.colnames:
         table = table[(np.asarray(table["flags"]).astype(int) & int(reject_flags)) == 0]
@@ -101,13 +106,13 @@ def match(
     left_out = {n: f"only {len(r)} usable detections of at least {FEWEST}" for n, r in rows.items() if len(r) < FEWEST}
     kept = [name for name in names if name not in left_out]
     lists = [_star_list(table[rows[name]], shapes[name]) for name in kept]
-    stars = _associate(lists, kept, headers, left_out, tolerance=tolerance, progress=progress)
+    stars = _associate(lists, kept, headers, left_out, options)
     star = np.full(len(table), -1)
     for name, labels in stars.items():
         star[rows[name]] = labels
     isolated = is_isolated(table, isolation)
     if not isolated.all():
-        logger.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
+        log.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
         star[~isolated] = -1
     table, star = _keep_common(table, star, min_exposures, left_out)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
@@ -119,20 +124,16 @@ def _without_repetitions(table):
     place = np.rec.fromarrays([table["exposure"], table["x"].value, table["y"].value])
     first = np.sort(np.unique(place, return_index=True)[1])
     if len(first) < len(table):
-        logger.warning("%d detections stand twice at the very same place; one of each is kept", len(table) - len(first))
+        log.warning("%d detections stand twice at the very same place; one of each is kept", len(table) - len(first))
     return table[first]
 
 
-def _check_arguments(table, names, min_exposures, tolerance):
+def _check_names(table, names, min_exposures):
     unknown = sorted(set(table["exposure"].tolist()) - set(names))
     if unknown:
         raise InputError(
             f"the table of detections names exposure {unknown[0]!r}, which is not among exposures= ({', '.join(names)})"
         )
-    if int(min_exposures) != min_exposures or min_exposures < 2:
-        raise InputError(f"min_exposures must be an integer of at least 2, got {min_exposures!r}")
-    if tolerance is not None and not 0 < tolerance < np.inf:
-        raise InputError(f"tolerance must be a positive number of pixels, got {tolerance!r}")
     if len(names) == 1:
         raise MatchError(f"only one exposure ({names[0]}): give at least two of the same field")
     if len(names) < min_exposures:
@@ -168,10 +169,12 @@ def _star_list(table, shape):
     return StarList(np.column_stack([x, y]), np.hypot(x_err, y_err), shape, flux)
 
 
-def _associate(lists, names, headers, left_out, *, tolerance, progress):
+def _associate(lists, names, headers, left_out, options):
     """Star labels by exposure name; exposures without a place are added to `left_out`."""
     if len(lists) < 2:
         raise MatchError(f"fewer than two exposures have stars: {_reasons(left_out)}")
+
+    tolerance, progress = options.tolerance, options.progress
 
     def guess(i, j):
         return headers.step(names[i], names[j])
@@ -179,14 +182,14 @@ def _associate(lists, names, headers, left_out, *, tolerance, progress):
     groups = unite(lists, tie(lists, guess, tolerance=tolerance, progress=progress), guess, tolerance=tolerance)
     hot = standing(lists, groups[0])
     if any(h.any() for h in hot):
-        logger.info("%d detections stand still while the sky moves: hot pixels, not used", sum(h.sum() for h in hot))
+        log.info("%d detections stand still while the sky moves: hot pixels, not used", sum(h.sum() for h in hot))
         lists = [stars.subset(~h) for stars, h in zip(lists, hot, strict=True)]
         groups = unite(lists, tie(lists, guess, tolerance=tolerance, progress=progress), guess, tolerance=tolerance)
     _check_groups(groups, lists, names, left_out)
     registrations, misfits = interlink(lists, groups[0], tolerance=tolerance, progress=progress)
     left_out.update({names[i]: reason for i, reason in misfits.items()})
     good = {pair: r for pair, r in registrations.items() if not misfits.keys() & set(pair)}
-    logger.info("%d pairs of exposures registered", len(good))
+    log.info("%d pairs of exposures registered", len(good))
     labels = [np.full(len(h), -1) for h in hot]
     for label, h, found in zip(labels, hot, label_stars([len(stars) for stars in lists], good), strict=True):
         label[~h] = found
@@ -253,7 +256,7 @@ def _finish(table, star, shapes, headers, left_out, epoch):
     if found is not None:
         found, sky = headers.place(found)
     for name, reason in left_out.items():
-        logger.warning("%s is left out: %s", name, reason)
+        log.warning("%s is left out: %s", name, reason)
     return Matches.from_table(table, shape=shapes, poses=found, sky=sky, left_out=left_out, epoch=epoch)
 
 

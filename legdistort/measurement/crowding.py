@@ -26,6 +26,12 @@ _QUARTILE_OF_CHI2 = 1.923  # with 4 degrees of freedom
 _FEWEST = 20  # stars that tell what shape is usual
 
 
+def check_isolation(limit):
+    """Raise `InputError` if a limit of `is_isolated` is neither positive nor None."""
+    if limit is not None and not limit > 0:
+        raise InputError(f"isolation must be a positive number of standard errors, or None, got {limit!r}")
+
+
 def is_isolated(table, limit=LIMIT):
     """Whether detections have neither `crowding` above a limit nor the flag ``DEFORMED``.
 
@@ -47,8 +53,7 @@ def is_isolated(table, limit=LIMIT):
     InputError
         If the limit is not positive.
     """
-    if limit is not None and not limit > 0:
-        raise InputError(f"isolation must be a positive number of standard errors, or None, got {limit!r}")
+    check_isolation(limit)
     if limit is None or limit == np.inf or "crowding" not in table.colnames:
         return np.ones(len(table), dtype=bool)
     isolated = np.asarray(table["crowding"], dtype=float) <= limit

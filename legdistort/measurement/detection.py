@@ -10,7 +10,7 @@ from photutils.background import Background2D
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _CLIPPED = 0.986  # standard deviation of a unit normal after clipping at 3 sigma until nothing changes
 _KERNEL = 0.7  # width relative to the stars: costs 6 % of the signal-to-noise ratio, tells apart closer pairs
@@ -44,11 +44,9 @@ class Frame:
     noise_given: bool = False
 
 
-def prepare(exposure, *, gain=None, read_noise=None, saturation=None, mesh=MESH):
-    """An `Exposure` as a `Frame`; the numbers stand in for its own, `mesh` is that of the sky."""
-    gain = gain or exposure.gain
-    read_noise = read_noise or exposure.read_noise
-    saturation = saturation or exposure.saturation
+def prepare(exposure, *, mesh=MESH):
+    """An `Exposure` as a `Frame`; `mesh` is that of the sky [pix]."""
+    gain, read_noise, saturation = exposure.gain, exposure.read_noise, exposure.saturation
     data = np.where(exposure.mask, 0, exposure.data).astype(np.float32)
     saturated = (data >= saturation) & ~exposure.mask if saturation else np.zeros(data.shape, dtype=bool)
     bad = exposure.mask | saturated
@@ -77,7 +75,7 @@ def _background(data, mask, mesh, *, steep=False):
                     data, box, mask=mask, sigma_clip=clip, exclude_percentile=exclude, filter_size=1 if steep else 3
                 )
             except ValueError:
-                logger.debug("background: too few good pixels with exclude_percentile=%g", exclude)
+                log.debug("background: too few good pixels with exclude_percentile=%g", exclude)
             else:
                 rms = found.background_rms_mesh
                 sky = _enlarge(found.background_mesh, box, data.shape, degree=3 if steep else 1)

@@ -19,7 +19,7 @@ from .profiles import moffat
 from .profiles.cutouts import Stamps
 from .profiles.frame_fit import box_half, fit_stars, locate_stars
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 #: Distance of injected stars from one another and from the detections of the frame, in FWHM.
 APART, AWAY = 8.0, 3.0
@@ -64,7 +64,7 @@ def calibrate_frame(exposure, remeasure, *, threshold=5.0, widths=None, fluxes=N
         For a frame without stars if `widths` or the gain are missing, without room, or saturated at the faintest stars.
     """
     name, rng = exposure.name, np.random.default_rng([seed, zlib.crc32(exposure.name.encode())])
-    frame, centres, shape = locate_stars(exposure, {}, threshold=threshold)
+    frame, centres, shape = locate_stars(exposure, threshold=threshold)
     if not len(centres) and widths is None:
         raise InputError(f"{name}: no star above {threshold:g} times the noise tells how wide stars are; give fwhm")
     photon = _photon_noise(frame, exposure, centres, shape)
@@ -77,7 +77,7 @@ def calibrate_frame(exposure, remeasure, *, threshold=5.0, widths=None, fluxes=N
         again = remeasure if width == own else partial(remeasure, fwhm=width)
         each = np.repeat(levels[::-1], n_positions)  # stars of about the same flux come into one frame
         off = _offsets(exposure, centres, each, profile, photon=photon, again=again, rng=rng)
-        logger.info("%s: FWHM %.2f px, %d stars put in at %d fluxes", name, width, len(each), len(levels))
+        log.info("%s: FWHM %.2f px, %d stars put in at %d fluxes", name, width, len(each), len(levels))
         for flux in levels:
             rows.append({"exposure": name, "fwhm": width * u.pix, "flux": flux} | _statistics(off[each == flux]))
     return NoiseCurves(QTable(rows, meta={"fwhm": {name: own}, "photon": {name: float(photon)}}))
@@ -111,35 +111,6 @@ def default_fluxes(exposure, frame, centres, shape, threshold):
     if highest < 2 * lowest:
         raise InputError(f"{exposure.name}: stars saturate before they are detected; give fluxes, or check saturation")
     return np.geomspace(lowest, highest, N_FLUXES)
-
-
-def measure_calibrated(exposure, *, measuring, source, threshold, known):
-    """What `measuring` gives for an exposure, errors taken from its noise curve
-    (`legdistort.measurement.noise_curves.SOURCES`).
-
-    Parameters
-    ----------
-    exposure : `~legdistort.inputs.exposures.Exposure`
-        Or what its ``read()`` gives one for.
-    measuring : callable
-        ``measuring(exposure)``: a tuple, the table of detections first.
-    source : {"injected", "scaled"}
-    threshold : float
-        Detection limit of `measuring`.
-    known : dict
-        ``gain``, ``read_noise``, ``saturation`` in place of the exposure's; None: as it says.
-    """
-    exposure = exposure.read()
-    table, *rest = measuring(exposure)
-    if np.any((table["flags"] & UNUSABLE) == 0):
-
-        def remeasure(image, **changes):
-            return measuring(image, max_stars=None, **changes)[0]
-
-        exposure = replace(exposure, **{key: value for key, value in known.items() if value is not None})
-        curves = calibrate_frame(exposure, remeasure, threshold=threshold)
-        table = curves.apply(table, source)
-    return table, *rest
 
 
 def _offsets(exposure, centres, flux, shape, *, photon, again, rng):

@@ -1,6 +1,5 @@
 """Noise curves of exposures, by measuring stars put into them as `legdistort.measure` measures all others."""
 
-import warnings
 from dataclasses import replace
 from functools import partial
 
@@ -9,12 +8,12 @@ from astropy.table import vstack
 
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..inputs.exposure_files import listed
+from ..runtime.checks import options_from
 from ..runtime.parallel import each
 from .injection import calibrate_frame
 from .noise_curves import NoiseCurves
-from .positions import measure
-
-_KNOWN = ("gain", "read_noise", "saturation")
+from .options import MeasureOptions
+from .positions import measure_exposure
 
 
 def calibrate_noise(
@@ -60,11 +59,10 @@ def calibrate_noise(
     AssumptionWarning
         If exposures lack a gain: the photon noise put in is estimated from their stars.
     """
-    exposures, measuring = listed(exposures, "calibrate_noise"), dict(measuring or {})
+    exposures = listed(exposures, "calibrate_noise")
     fluxes, widths = _check_arguments(fluxes, fwhm, n_positions, seed)
-    measure([], **measuring)  # checks its arguments
-    options = {"fluxes": fluxes, "widths": widths, "n_positions": n_positions, "seed": seed}
-    work = partial(_calibrate, measuring=measuring, options=options)
+    options = options_from(MeasureOptions, measuring, "measuring")
+    work = partial(_calibrate, options=options, fluxes=fluxes, widths=widths, n_positions=n_positions, seed=seed)
     results = list(each(work, exposures, workers=workers, progress=progress, description="noise"))
     assumed = {name: photon for _, photons in results for name, photon in photons.items()}
     if assumed:
@@ -82,17 +80,14 @@ def calibrate_noise(
     return NoiseCurves(table)
 
 
-def _calibrate(exposure, *, measuring, options):
-    """Curves of one exposure, and its photon noise by name if that is an estimate."""
-    known = {key: measuring[key] for key in _KNOWN if measuring.get(key) is not None}
-    exposure = replace(exposure.read(), **known)
+def _calibrate(exposure, *, options, **stars):
+    """Curves of one exposure, and its photon noise by name if that is an estimate; `stars` put in."""
+    exposure = options.with_detector(exposure.read())
 
-    def remeasure(image, **changes):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AssumptionWarning)  # of the gain, said once for the frame
-            return measure([image], **measuring | {"workers": 1} | changes)
+    def remeasure(image, *, fwhm=options.fwhm):
+        return measure_exposure(image, replace(options, fwhm=fwhm))[0]
 
-    curves = calibrate_frame(exposure, remeasure, threshold=measuring.get("threshold", 5.0), **options)
+    curves = calibrate_frame(exposure, remeasure, threshold=options.threshold, **stars)
     return curves, {} if exposure.gain else curves.table.meta["photon"]
 
 

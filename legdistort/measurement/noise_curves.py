@@ -4,7 +4,6 @@ Bernard et al. 2017, section 5.2.2 and Figure "noiseflux". Where sky and detecto
 star's own photons do, as 1/sqrt(flux): ``sigma^2 = (a / flux)^2 + b^2 / flux + floor^2``.
 """
 
-import logging
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,8 +16,6 @@ from scipy.optimize import nnls
 from ..exceptions import InputError
 from ..runtime.checks import check_choice
 from ..runtime.outputs import replacing
-
-logger = logging.getLogger(__name__)
 
 #: Where the errors of `legdistort.measure` come from: the fit, the curve, or the fit scaled to the curve.
 SOURCES = ("fit", "injected", "scaled")

@@ -1,6 +1,7 @@
 """Positions of stars, and how well every one is known."""
 
 import logging
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -8,21 +9,18 @@ from astropy import units as u
 from astropy.table import QTable, vstack
 from scipy.spatial import cKDTree
 
-from ..exceptions import AssumptionWarning, InputError, warn
+from ..exceptions import AssumptionWarning, warn
 from ..inputs.exposure_files import listed
-from ..runtime.checks import check_choice
 from ..runtime.parallel import each
 from .crowding import crowding, is_deformed
 from .flags import UNUSABLE, Flag
-from .injection import measure_calibrated
-from .noise_curves import SOURCES
+from .injection import calibrate_frame
+from .options import MeasureOptions
 from .profiles import moffat
 from .profiles.cutouts import Stamps
-from .profiles.frame_fit import BLENDS, PROFILES, box_half, fit_stars, locate_stars
+from .profiles.frame_fit import box_half, fit_stars, locate_stars
 
-__all__ = ["UNUSABLE", "Flag", "measure"]
-
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _COLUMNS = ("x", "y", "x_err", "y_err", "xy_corr", "flux", "flux_err", "fwhm", "chi2")
 _PIXELS = ("x", "y", "x_err", "y_err", "fwhm")
@@ -107,18 +105,11 @@ def measure(
         Once, if exposures lack a gain: the photon noise is then estimated from the residuals of the fits.
     """
     exposures = listed(exposures, "measure")
-    _check_arguments(fwhm, threshold, max_stars, box)
-    check_choice(errors, SOURCES, "errors")
-    check_choice(profile, PROFILES, "profile")
-    check_choice(blends, BLENDS, "blends")
-    known = {"gain": gain, "read_noise": read_noise, "saturation": saturation}
-    for key, value in known.items():
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError(f"{key} must be a positive number, got {value!r}")
-    options = {"max_stars": max_stars, "box": box, "profile": profile, "blends": blends}
-    work = partial(_measure_frame, known=known, fwhm=fwhm, threshold=threshold, **options)
-    if errors != "fit":
-        work = partial(measure_calibrated, measuring=work, source=errors, threshold=threshold, known=known)
+    options = MeasureOptions(
+        fwhm=fwhm, threshold=threshold, max_stars=max_stars, box=box, profile=profile, blends=blends, gain=gain,
+        read_noise=read_noise, saturation=saturation, errors=errors,
+    )  # fmt: skip
+    work = partial(measure_exposure, options=options)
     measured = each(work, exposures, workers=workers, progress=progress, description="measuring")
     tables, assumed = [], {}
     for exposure, (table, photon, assuming) in zip(exposures, measured, strict=True):
@@ -129,17 +120,6 @@ def measure(
         _warn_gain(assumed)
     filled = [table for table in tables if len(table)]
     return vstack(filled) if filled else _empty()
-
-
-def _check_arguments(fwhm, threshold, max_stars, box):
-    if fwhm is not None and not 0.5 <= fwhm <= 200:
-        raise InputError(f"fwhm must lie between 0.5 and 200 pixels, got {fwhm!r}")
-    if not threshold >= 2:
-        raise InputError(f"threshold must be at least 2 (signal-to-noise ratio), got {threshold!r}")
-    if max_stars is not None and max_stars < 1:
-        raise InputError(f"max_stars must be at least 1, got {max_stars!r}")
-    if box is not None and not (box >= 5 and box % 2 == 1):
-        raise InputError(f"box must be an odd number of pixels, at least 5, got {box!r}")
 
 
 def _warn_gain(assumed):
@@ -154,28 +134,57 @@ def _warn_gain(assumed):
     )
 
 
-def _measure_frame(exposure, *, known, fwhm, threshold, max_stars, box, **fitting):
-    """Table of the detections of one frame, the photon noise used [variance / ADU], whether that was a guess."""
-    exposure, name = exposure.read(), exposure.name
-    frame, centres, shape = locate_stars(exposure, known, threshold=threshold, fwhm=fwhm)
+def measure_exposure(exposure, options):
+    """Detections of one exposure.
+
+    Parameters
+    ----------
+    exposure : `~legdistort.inputs.exposures.Exposure`
+        Or what its ``read()`` gives one for.
+    options : `~legdistort.measurement.options.MeasureOptions`
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        As from `measure`.
+    photon : float
+        Variance per unit of star light that was used.
+    assumed : bool
+        Whether that is an estimate, for want of a gain.
+    """
+    exposure = options.with_detector(exposure.read())
+    table, photon, assumed = _measure_frame(exposure, options)
+    if options.errors != "fit" and np.any((table["flags"] & UNUSABLE) == 0):
+
+        def remeasure(image, *, fwhm=options.fwhm):
+            return _measure_frame(image, replace(options, max_stars=None, fwhm=fwhm))[0]
+
+        table = calibrate_frame(exposure, remeasure, threshold=options.threshold).apply(table, options.errors)
+    return table, photon, assumed
+
+
+def _measure_frame(exposure, options):
+    """What `measure_exposure` gives, errors as the fits state them."""
+    name, max_stars = exposure.name, options.max_stars
+    frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
     if len(centres) == 0:
-        logger.warning("%s: no star above %g times the noise", name, threshold)
+        log.warning("%s: no star above %g times the noise", name, options.threshold)
         return _empty(), frame.photon, False
     if max_stars is not None:
         centres = centres[: 3 * max_stars]  # some will turn out to be hot pixels or saturated
     fwhm = float(moffat.fwhm(shape))
-    stamps = Stamps(frame, centres, box // 2 if box else box_half(fwhm))
-    fit, flags, snr, photon = fit_stars(stamps, shape, **fitting)
+    stamps = Stamps(frame, centres, options.box // 2 if options.box else box_half(fwhm))
+    fit, flags, snr, photon = fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     shapes, covariance = fit.params[:, 3:7], fit.covariance[:, 3:7, 3:7]
-    usable = ((flags & UNUSABLE) == 0) & (fitting["profile"] == "own")  # other profiles have nothing to compare
+    usable = ((flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
     deformed = is_deformed(shapes, covariance, snr=snr, usable=usable)
     table = _table(name, stamps, fit, flags=flags | np.where(deformed, Flag.DEFORMED, 0), snr=snr)
     table = table[_distinct(table, fwhm)]
     table["crowding"] = crowding(table, fwhm)
     if max_stars is not None:
         table = table[(table["flags"] & UNUSABLE) == 0][:max_stars]
-    logger.info("%s: %d detections, FWHM %.2f px", name, len(table), fwhm)
-    assumed = len(table) > 0 and not (known["gain"] or exposure.gain) and exposure.uncertainty is None
+    log.info("%s: %d detections, FWHM %.2f px", name, len(table), fwhm)
+    assumed = len(table) > 0 and not exposure.gain and exposure.uncertainty is None
     return table, photon, assumed
 
 

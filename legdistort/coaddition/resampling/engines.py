@@ -19,9 +19,6 @@ from scipy.ndimage import binary_dilation, map_coordinates
 from ...runtime.optional import has_fast
 from .drizzling import drizzle
 
-ALGORITHMS = ("interp", "adaptive", "exact", "drizzle")
-CONSERVE = ("flux", "surface_brightness")
-ORDERS = {"nearest-neighbor": 0, "bilinear": 1, "biquadratic": 2, "bicubic": 3}  # of splines, as reproject names them
 _BAD_WEIGHT = 0.05  # an output pixel with a larger share of bad pixels is left empty
 #: Pixels of all exposures from which compiled splines are used, if numba is installed.
 COMPILED_FROM = 1 << 22

@@ -68,14 +68,12 @@ def find_stars(frame, threshold, fwhm=None):
     return centres, shape
 
 
-def locate_stars(exposure, known, *, threshold, fwhm=None):
+def locate_stars(exposure, *, threshold, fwhm=None):
     """An exposure prepared for fitting, and its stars: `legdistort.measurement.detection.prepare` and `find_stars`.
 
     Parameters
     ----------
     exposure : `~legdistort.inputs.exposures.Exposure`
-    known : dict
-        ``gain``, ``read_noise``, ``saturation`` instead of what the exposure says; None: as it says.
     threshold : float
         Signal-to-noise ratio.
     fwhm : float, optional
@@ -87,10 +85,10 @@ def locate_stars(exposure, known, *, threshold, fwhm=None):
     centres : ndarray of int, shape (n, 2)
     shape : ndarray, shape (4,)
     """
-    frame = prepare(exposure, **known)
+    frame = prepare(exposure)
     centres, shape = find_stars(frame, threshold, fwhm)
     if moffat.fwhm(shape) > MESH / 8:  # stars as wide as that would pass for sky
-        frame = prepare(exposure, **known, mesh=int(8 * moffat.fwhm(shape)))
+        frame = prepare(exposure, mesh=int(8 * moffat.fwhm(shape)))
         centres, shape = find_stars(frame, threshold, fwhm)
     return frame, centres, shape
 

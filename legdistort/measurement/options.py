@@ -1,0 +1,56 @@
+"""Options of `legdistort.measure`, checked before a frame is read."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..exceptions import InputError
+from ..runtime.checks import check_choice
+from .noise_curves import SOURCES
+from .profiles.frame_fit import BLENDS, PROFILES
+
+_DETECTOR = ("gain", "read_noise", "saturation")
+
+
+@dataclass(frozen=True)
+class MeasureOptions:
+    """How to measure; the fields are arguments of `legdistort.measure`, which explains them.
+
+    Raises
+    ------
+    InputError
+        For a value out of range.
+    """
+
+    fwhm: float | None = None
+    threshold: float = 5.0
+    max_stars: int | None = None
+    box: int | None = None
+    profile: str = "own"
+    blends: str = "together"
+    gain: float | None = None
+    read_noise: float | None = None
+    saturation: float | None = None
+    errors: str = "fit"
+
+    def __post_init__(self):
+        if self.fwhm is not None and not 0.5 <= self.fwhm <= 200:
+            raise InputError(f"fwhm must lie between 0.5 and 200 pixels, got {self.fwhm!r}")
+        if not self.threshold >= 2:
+            raise InputError(f"threshold must be at least 2 (signal-to-noise ratio), got {self.threshold!r}")
+        if self.max_stars is not None and self.max_stars < 1:
+            raise InputError(f"max_stars must be at least 1, got {self.max_stars!r}")
+        if self.box is not None and not (self.box >= 5 and self.box % 2 == 1):
+            raise InputError(f"box must be an odd number of pixels, at least 5, got {self.box!r}")
+        check_choice(self.errors, SOURCES, "errors")
+        check_choice(self.profile, PROFILES, "profile")
+        check_choice(self.blends, BLENDS, "blends")
+        for key in _DETECTOR:
+            value = getattr(self, key)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise InputError(f"{key} must be a positive number, got {value!r}")
+
+    def with_detector(self, exposure):
+        """The exposure with the gain, read noise and saturation that are given here in place of its own."""
+        given = {key: value for key in _DETECTOR if (value := getattr(self, key)) is not None}
+        return replace(exposure, **given) if given else exposure
