@@ -25,6 +25,8 @@ from legdistort.cli.parser import main
 from legdistort.coaddition import mosaicking
 from legdistort.demo import run_demo
 from legdistort.exceptions import InputError
+from legdistort.measurement.noise_curves import SOURCES
+from legdistort.measurement.profiles.frame_fit import BLENDS, PROFILES
 from legdistort.simulation.observations import simulate_exposures
 from legdistort.wcs.attachment import attach
 
@@ -318,6 +320,11 @@ def test_options_have_the_names_of_arguments(function, groups):
     own = {"prior_sigma", "tpv", "asdf_only", "where", "ext", "frame", "solution"}
     known = inspect.signature(function).parameters
     assert {name for group in groups for name in group if name not in known} <= own
+
+
+def test_words_of_measuring():
+    choices = {name: option.settings.get("choices") for name, option in options.MEASURING.items()}
+    assert (choices["profile"], choices["blends"], choices["errors"]) == (PROFILES, BLENDS, SOURCES)
 
 
 def test_what_stands_for_none():
