@@ -118,11 +118,14 @@ def do_run(a):
 def do_measure(a):
     """``legdistort measure``."""
     from ..inputs.exposures import expand_paths
+    from ..measurement.options import MeasureOptions
     from ..measurement.positions import measure
     from ..runtime.provenance import checksums
 
+    measuring = given(a, options.MEASURING)
+    MeasureOptions(**measuring)  # which refuses them before a frame is read
     exposures = _open(a)
-    table = measure(exposures, **given(a, options.MEASURING), workers=a.workers, progress=wants_progress(a))
+    table = measure(exposures, **measuring, workers=a.workers, progress=wants_progress(a))
     shapes = {e.name: list(e.shape) for e in exposures}
     table.meta |= {"shapes": shapes, "inputs": checksums(expand_paths(a.frames))}
     _write_table(table, a)
@@ -141,15 +144,14 @@ def do_measure(a):
 )
 def do_noise(a):
     """``legdistort noise``."""
-    from ..measurement.noise_calibration import calibrate_noise
+    from ..measurement.noise_calibration import calibrate_noise, check_injection
+    from ..measurement.options import MeasureOptions
 
-    curves = calibrate_noise(
-        _open(a),
-        **given(a, options.INJECTING),
-        measuring=given(a, options.DETECTOR),
-        workers=a.workers,
-        progress=wants_progress(a),
-    )
+    injecting, measuring = given(a, options.INJECTING), given(a, options.DETECTOR)
+    check_injection(**injecting)  # before a frame is read
+    MeasureOptions(**measuring)
+    share = {"workers": a.workers, "progress": wants_progress(a)}
+    curves = calibrate_noise(_open(a), **injecting, measuring=measuring, **share)
     curves.write(a.out, overwrite=a.overwrite)
     _draw(curves, a)
     _say(a, curves, {"laws": _records(curves.laws), "out": str(a.out)})
@@ -251,12 +253,14 @@ def do_coadd(a):
     """``legdistort coadd``."""
     from ..coaddition.mosaic import check_ending
     from ..coaddition.mosaicking import coadd
+    from ..coaddition.options import CoaddOptions
 
     check_ending(a.out)
     solution = _solution(a)
-    grid = _grid(a.grid, solution)
+    coadding = given(a, options.COADDING) | {"grid": _grid(a.grid, solution)}
+    CoaddOptions(**coadding)  # which refuses them before a frame is read
     share = {"workers": a.workers, "progress": wants_progress(a)}
-    mosaic = coadd(_open(a), solution, grid=grid, **given(a, options.COADDING), **share)
+    mosaic = coadd(_open(a), solution, **coadding, **share)
     mosaic.write(a.out, overwrite=a.overwrite)
     figures = {"shape": list(mosaic.shape), "n_exposures": len(mosaic.exposures), "left_out": mosaic.left_out}
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
@@ -380,7 +384,9 @@ def _records(table):
 
 def _open(a):
     from ..inputs.exposure_files import open_exposures
+    from ..runtime.parallel import check_workers
 
+    check_workers(a.workers)
     return open_exposures(**given(a, options.FRAMES), progress=wants_progress(a))
 
 
