@@ -24,7 +24,7 @@ from legdistort.geometry.distortion import Distortion
 from legdistort.plots import solution_plots, stack_plots
 from legdistort.results import accuracy
 from legdistort.solving import minimisers, start_values
-from legdistort.solving.equations import problem_builder
+from legdistort.solving.equations.problem import build_problem
 
 IMAGES = Path(__file__).parent / "images"
 BLUE, GREEN, ORANGE = "#0072B2", "#009E73", "#D55E00"
@@ -51,7 +51,7 @@ def sweeps(n_sweeps=300, n_seeds=10):
     for seed in range(n_seeds):
         sim = ld.simulate_matches(seed=seed)
         true = sim.truth.positions
-        problem = problem_builder.build(sim.matches, 3, prior=ld.Prior(sim.truth.static))
+        problem = build_problem(sim.matches, 3, prior=ld.Prior(sim.truth.static))
         start, _ = start_values.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
         for name, solver, n in (
             ("alternating", minimisers.solve_alternating, n_sweeps),

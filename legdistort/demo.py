@@ -9,7 +9,6 @@ from .geometry.gsaoi import gsaoi_static
 from .pipeline import check_folder, run, write_summary
 from .priors.prior import Prior
 from .results import accuracy
-from .runtime.outputs import replacing
 from .simulation.observations import simulate_exposures
 
 #: Degree of the prior: the static map is then followed to 3e-6 px.
@@ -48,8 +47,7 @@ def run_demo(*, out, small=False, seed=0, overwrite=False, progress=False):
     )
     result = run(paths, out=out, prior=prior, overwrite=overwrite, progress=progress)
     result.summary.update(compare(result.solution, night.truth, seed=seed))
-    with replacing(out / "summary.json", overwrite=True) as temporary:
-        write_summary(temporary, result.summary)
+    write_summary(out / "summary.json", result.summary)
     return result
 
 

@@ -22,12 +22,11 @@ from .measurement.options import MeasureOptions
 from .measurement.positions import measure
 from .reporting.page import write_report
 from .results import accuracy
-from .results.diagnostics import FOUND
 from .runtime import outputs, provenance
 from .runtime.checks import options_from
 from .runtime.parallel import check_workers
 from .solving.estimation import solve
-from .solving.options import check_options, check_reference
+from .solving.options import SolveOptions, check_reference
 from .wcs.files import write_wcs
 
 log = logging.getLogger(__name__)
@@ -128,11 +127,10 @@ def run(
     check_folder(out, overwrite)
     measuring = _step_options(MeasureOptions, measuring, "measuring")
     matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures)
-    solving = {"degree": degree, "prior": prior, "clip": clip} | (solving or {})
-    check_options(**{name: value for name, value in solving.items() if name not in ("prior", "model")})
+    solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=prior, clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
     tying = {"epoch": epoch, "pixel_scale": pixel_scale}
-    reference, tying["epoch"] = check_reference(reference, **tying, method=solving.get("method", "joint"))
+    reference, tying["epoch"] = check_reference(reference, **tying, method=solving.method)
     check_workers(workers)
     share, timings = {"workers": workers, "progress": progress}, {}
     with _timed(timings, "read"):
@@ -143,7 +141,7 @@ def run(
     with _timed(timings, "match"):
         matches = match(detections, exposures=exposures, **vars(matching))
     with _timed(timings, "solve"):
-        solution = solve(matches, **solving, reference=reference, **tying)
+        solution = solve(matches, **vars(solving), reference=reference, **tying)
         solution = provenance.with_inputs(solution, provenance.checksums(expand_paths(paths)))
     with _timed(timings, "coadd"):
         kept = [exposure for exposure in exposures if exposure.name in solution.names]
@@ -200,8 +198,9 @@ def write_results(solution, target):
 
 
 def write_summary(path, summary):
-    """Write figures as JSON."""
-    Path(path).write_text(json.dumps(summary, indent=1) + "\n")
+    """Write figures as JSON, in the place of those that are there."""
+    with outputs.replacing(path, overwrite=True) as file:
+        file.write(f"{json.dumps(summary, indent=1)}\n".encode())
 
 
 def summarise(solution, *, timings=None):
@@ -210,7 +209,7 @@ def summarise(solution, *, timings=None):
     ``rms_px``: unweighted rms residual per axis, used observations. ``sigma_px``: the paper's sigma (section 3.4) over
     the fitted stars, per axis.
     """
-    sigma = accuracy.scatter(accuracy.corrected_positions(solution))
+    found, sigma = solution.diagnostics, accuracy.scatter(accuracy.corrected_positions(solution))
     return {
         "n_exposures": len(solution.names),
         "n_stars": int(np.count_nonzero(np.isfinite(solution.positions[:, 0]))),
@@ -221,10 +220,10 @@ def summarise(solution, *, timings=None):
         "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
         "gauge": solution.gauge.sentence,
         "sky": solution.sky_sentence,
-        "reference": solution.settings.get("reference"),
+        "reference": found.reference and asdict(found.reference),
         "max_inverse_error_px": float(solution.max_inverse_error),
         "left_out": dict(solution.left_out),
-        **{key: found for key in FOUND if (found := solution.settings.get(key)) is not None},
+        **found.summary(),
         "timings": {step: round(seconds, 3) for step, seconds in (timings or {}).items()},
     }
 

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import warnings
+from pathlib import Path
 
 import asdf
 import numpy as np
@@ -333,12 +334,17 @@ def test_nothing_is_written_unless_all_can_be(geometry, tmp_path):  # noqa: F811
 def test_a_full_disk_leaves_the_frame(one, frame, tmp_path, monkeypatch, where):
     before = frame.read_bytes()
 
-    def full(self, data):
-        with open(self, "wb") as file:
-            file.write(data[:1000])
-        raise OSError(28, "No space left on device")
+    class Full(io.FileIO):
+        def write(self, data):
+            super().write(data[:1000])
+            raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    usual = Path.open
+
+    def opened(self, mode="r", **options):
+        return Full(self, mode) if mode == "wb" else usual(self, mode, **options)
+
+    monkeypatch.setattr("pathlib.Path.open", opened)
     with pytest.raises(OSError, match="No space left"):
         attach(one, frame, kind=None, **({"in_place": True} if where == "in place" else {"out": tmp_path / "out"}))
     assert frame.read_bytes() == before

@@ -173,7 +173,7 @@ def test_baselines_are_whole_solutions(compared, tmp_path):
         again = Solution.read(solution.write(tmp_path / f"{name}.asdf"))
         assert_allclose(again.positions, solution.positions)
         assert np.all(np.isnan(again.stars["y_err_abs"]))
-        assert again.settings["method"] == name
+        assert again.settings.method == name
         xy = np.array([[100.0, 200.0]])
         assert_allclose(solution.distort(solution.names[0], solution.correct(solution.names[0], xy)), xy, atol=1e-8)
 

@@ -18,8 +18,10 @@ from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
 from legdistort.simulation.prediction import predict
+from legdistort.solving import single_fit
 from legdistort.solving.choices import prior_widths
-from legdistort.solving.equations.criterion import State
+from legdistort.solving.equations.problem import State
+from legdistort.solving.options import SolveOptions
 
 SHAPE = (2048, 2048)
 SPECTRA = {
@@ -100,11 +102,7 @@ def likelihoods():
     solution = []
 
     def fit(problem_prior):
-        from legdistort.solving import single_fit
-
-        options = {"degree": 3, "own_degree": None, "gauge": "minimal", "method": "joint", "loss": "linear"}
-        options |= {"clip": None, "limit": {}, "prior": problem_prior}
-        return single_fit.minimise(sim.matches, 0.0, options)
+        return single_fit.minimise(sim.matches, SolveOptions(prior=problem_prior))
 
     done = fit(Prior(sim.truth.static, sigma=0.5))
     solution.append(done)
@@ -163,7 +161,7 @@ def test_where_the_fit_stood_does_not_matter(likelihoods):
 
 
 def test_widths_are_those_put_in():
-    widths = found(simulate(40, n_exposures=40)).settings["widths"]
+    widths = found(simulate(40, n_exposures=40)).diagnostics.widths
     assert_allclose(widths, [0.9, 0.3, 0.1], rtol=0.15)
 
 
@@ -186,14 +184,14 @@ def test_modes_that_the_mean_lacks_have_widths_too():
     sim = simulate(8, n_exposures=12)
     flat = with_table(sim, lambda table: None)
     solution = solve(flat, prior=Prior(np.zeros((2, 1)), sigma="evidence"))
-    assert len(solution.settings["widths"]) == 3
+    assert len(solution.diagnostics.widths) == 3
     assert solution.degree == 3
 
 
 def test_what_is_not_there_gets_no_width():
     sim = simulate(15, "zero")
     solution = found(sim)
-    assert solution.settings["widths"] == [0, 0, 0]
+    assert solution.diagnostics.widths == (0, 0, 0)
     lowest = solve(sim.matches, degree=0, prior=Prior(sim.truth.static))
     assert_allclose(solution.positions, lowest.positions, atol=1e-3)
     assert solution.dof == lowest.dof
@@ -201,7 +199,7 @@ def test_what_is_not_there_gets_no_width():
 
 def test_degree_0_has_nothing_that_scatters():
     solution = found(simulate(6), degree=0)
-    assert solution.settings["widths"] == []
+    assert solution.diagnostics.widths == ()
 
 
 def test_order_of_exposures_does_not_matter():
@@ -209,7 +207,7 @@ def test_order_of_exposures_does_not_matter():
     order = np.random.default_rng(0).permutation(len(sim.matches.table))
     turned = Matches.from_table(sim.matches.table[order], shape=SHAPE, poses=sim.matches.poses)
     prior = Prior(sim.truth.static, sigma="evidence")
-    assert_allclose(solve(turned, prior=prior).settings["widths"], found(sim).settings["widths"], rtol=0.02)
+    assert_allclose(solve(turned, prior=prior).diagnostics.widths, found(sim).diagnostics.widths, rtol=0.02)
 
 
 def test_errors_known_up_to_a_factor():
@@ -224,9 +222,9 @@ def test_errors_known_up_to_a_factor():
     prior = Prior(sim.truth.static, sigma="evidence")
     wrong = solve(with_table(sim, halve), prior=prior, errors="scale")
     again = found(sim, errors="scale")
-    assert_allclose(wrong.settings["widths"], again.settings["widths"], rtol=0.02)
-    assert_allclose(wrong.settings["widths"], right.settings["widths"], rtol=0.1)
-    assert wrong.settings["error_scale"] == pytest.approx(2 * again.settings["error_scale"], rel=0.01)
+    assert_allclose(wrong.diagnostics.widths, again.diagnostics.widths, rtol=0.02)
+    assert_allclose(wrong.diagnostics.widths, right.diagnostics.widths, rtol=0.1)
+    assert wrong.diagnostics.error_scale == pytest.approx(2 * again.diagnostics.error_scale, rel=0.01)
 
 
 def test_mismatches_do_not_widen_them():
@@ -239,9 +237,9 @@ def test_mismatches_do_not_widen_them():
     matches, prior = with_table(sim, spoil), Prior(sim.truth.static, sigma="evidence")
     solution = solve(matches, prior=prior, clip=5)
     assert not solution.residuals["used"][bad].any()
-    assert_allclose(solution.settings["widths"], found(sim).settings["widths"], rtol=0.1)
+    assert_allclose(solution.diagnostics.widths, found(sim).diagnostics.widths, rtol=0.1)
     assert_allclose(
-        solve(matches, prior=prior, loss="cauchy").settings["widths"], found(sim).settings["widths"], rtol=0.1
+        solve(matches, prior=prior, loss="cauchy").diagnostics.widths, found(sim).diagnostics.widths, rtol=0.1
     )
 
 
@@ -253,21 +251,21 @@ def test_one_prior_one_set_of_widths():
         table["detector"] = ["even" if int(name[3:]) % 2 == 0 else "odd" for name in table["exposure"]]
 
     matches, one = with_table(sim, detector), Prior(sim.truth.static, sigma="evidence")
-    pooled = solve(matches, prior={"even": one, "odd": one}).settings["widths"]
+    pooled = solve(matches, prior={"even": one, "odd": one}).diagnostics.widths
     assert pooled["even"] == pooled["odd"]
-    assert_allclose(pooled["even"], found(sim).settings["widths"], rtol=0.02)
-    apart = solve(matches, prior={"even": one, "odd": Prior(sim.truth.static, sigma="evidence")}).settings["widths"]
+    assert_allclose(pooled["even"], found(sim).diagnostics.widths, rtol=0.02)
+    apart = solve(matches, prior={"even": one, "odd": Prior(sim.truth.static, sigma="evidence")}).diagnostics.widths
     assert apart["even"] != apart["odd"]
-    mixed = solve(matches, prior={"even": one, "odd": Prior(sim.truth.static, sigma=0.5)}).settings
-    assert mixed["widths"]["odd"] is None
-    assert len(mixed["widths"]["even"]) == 3
+    mixed = solve(matches, prior={"even": one, "odd": Prior(sim.truth.static, sigma=0.5)}).diagnostics.widths
+    assert mixed["odd"] is None
+    assert len(mixed["even"]) == 3
 
 
 def test_some_of_many_exposures_are_enough(monkeypatch):
     sim = simulate(12, n_exposures=30)
-    whole = found(sim).settings["widths"]
+    whole = found(sim).diagnostics.widths
     monkeypatch.setattr(prior_widths, "MOST", 15 * 20)
-    part = found(sim).settings["widths"]
+    part = found(sim).diagnostics.widths
     assert part != whole
     assert_allclose(part, whole, rtol=0.5)
 
@@ -278,7 +276,7 @@ def test_with_a_static_distortion_that_is_fitted():
         n_stars=40, n_exposures=12, dynamic=spectrum, dither=200, rotations=30 * np.arange(12), seed=2
     )
     solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma="evidence"), static="fit")
-    assert_allclose(solution.settings["widths"], [0.5], rtol=0.3)
+    assert_allclose(solution.diagnostics.widths, [0.5], rtol=0.3)
 
 
 def test_the_highest_likelihood_is_found(monkeypatch):
@@ -340,13 +338,14 @@ def test_they_grow_with_the_width_and_the_stars():
 
 def test_solution_says_what_was_found(tmp_path):
     solution = found(simulate(10))
-    widths = ", ".join(f"{width:.3g}" for width in solution.settings["widths"])
+    widths = ", ".join(f"{width:.3g}" for width in solution.diagnostics.widths)
     text = " ".join(str(solution).split())
     assert f"widths scatter of a coefficient, found from the exposures: {widths} px" in text
     assert re.search(r"modes \d+\.\d to \d+\.\d an exposure, both axes together, are determined by the data", text)
     solution.write(tmp_path / "solution.asdf")
     again = Solution.read(tmp_path / "solution.asdf")
     assert again.settings == solution.settings
+    assert again.diagnostics == solution.diagnostics
     assert again.effective_modes == solution.effective_modes
 
 
@@ -463,7 +462,7 @@ def test_wrong_priors_are_told():
         for mean, factor in ((0, 1), (0, 2), (0, 0.5), (off, 1)):
             solution = solve(sim.matches, prior=Prior(sim.truth.static + mean, sigma=factor * widths))
             b = accuracy.bias(solution.positions, sim.truth.positions, removed="similarity")
-            row.append([b, solution.chi2 / solution.dof, solution.settings["departure_ratio"]])
+            row.append([b, solution.chi2 / solution.dof, solution.diagnostics.departure_ratio])
         rows.append(row)
     (b, chi2, ratio) = np.mean(rows, axis=0).T
     assert_allclose([chi2[0], ratio[0]], 1, atol=0.1)

@@ -17,7 +17,7 @@ from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving import minimisers
 from legdistort.solving.equations import reduced_system
-from legdistort.solving.equations.problem_builder import build
+from legdistort.solving.equations.problem import build_problem
 from legdistort.solving.estimation import solve
 
 RNG = np.random.default_rng
@@ -29,7 +29,7 @@ def carried(sim, solution, prior, *, told=False):
     With `told`, the combinations that the data tell are left to the noise-free data.
     Returns positions (n_stars, 2) and fitted coefficients (n_exposures, 2 n_modes).
     """
-    problem = build(sim.matches, solution.degree, prior=prior)
+    problem = build_problem(sim.matches, solution.degree, prior=prior)
     gauge = solution.gauge
     free = gauge.told_rows if told else gauge.told_rows[:, :0]
     exact = np.empty_like(problem.xy)
@@ -333,13 +333,13 @@ def test_errors_found_on_request():
     matches = Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses)
     prior = Prior(sim.truth.static)
     stated, scaled, floored = (solve(matches, prior=prior, errors=kind) for kind in ("stated", "scale", "floor"))
-    assert stated.settings["error_scale"] == 1
-    assert scaled.settings["error_scale"] == pytest.approx(np.sqrt(stated.chi2 / stated.dof))
-    assert_allclose(scaled.stars["x_err"].value, stated.stars["x_err"].value * scaled.settings["error_scale"])
-    assert floored.settings["error_floor"] == pytest.approx(0.1, abs=0.01)
+    assert stated.diagnostics.error_scale == 1
+    assert scaled.diagnostics.error_scale == pytest.approx(np.sqrt(stated.chi2 / stated.dof))
+    assert_allclose(scaled.stars["x_err"].value, stated.stars["x_err"].value * scaled.diagnostics.error_scale)
+    assert floored.diagnostics.error_floor == pytest.approx(0.1, abs=0.01)
     assert floored.chi2 / floored.dof == pytest.approx(1, abs=0.01)
     quiet = solve(sim.matches, prior=prior, errors="floor")
-    assert quiet.settings["error_floor"] == 0 or quiet.settings["error_floor"] < 0.03
+    assert quiet.diagnostics.error_floor == 0 or quiet.diagnostics.error_floor < 0.03
 
 
 def test_gauge_says_what_pinned_what():

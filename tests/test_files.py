@@ -25,11 +25,15 @@ def half(path):
     raise RuntimeError
 
 
+def half_written(file):
+    """The same into an open file."""
+    file.write(b"half")
+    raise RuntimeError
+
+
 def test_a_file_appears_when_it_is_whole(tmp_path):
-    with replacing(tmp_path / "A.FITS.gz") as temporary:
-        assert temporary.name.endswith("a.fits.gz")  # writers choose compression by the ending, in small letters
-        assert not temporary.exists()
-        temporary.write_text("new")
+    with replacing(tmp_path / "A.FITS.gz") as file:
+        file.write(b"new")
         assert not (tmp_path / "A.FITS.gz").exists()
     assert (tmp_path / "A.FITS.gz").read_text() == "new"
     assert names(tmp_path) == ["A.FITS.gz"]
@@ -37,16 +41,10 @@ def test_a_file_appears_when_it_is_whole(tmp_path):
 
 def test_a_failure_leaves_the_old_file(tmp_path):
     (tmp_path / "a").write_text("old")
-    with pytest.raises(RuntimeError), replacing(tmp_path / "a", overwrite=True) as temporary:
-        half(temporary)
+    with pytest.raises(RuntimeError), replacing(tmp_path / "a", overwrite=True) as file:
+        half_written(file)
     assert (tmp_path / "a").read_text() == "old"
     assert names(tmp_path) == ["a"]
-
-
-def test_a_writer_that_writes_nothing_is_noticed(tmp_path):
-    with pytest.raises(FileNotFoundError), replacing(tmp_path / "a"):
-        pass
-    assert names(tmp_path) == []
 
 
 def test_refusals(tmp_path):
@@ -63,8 +61,8 @@ def test_refusals(tmp_path):
 
 def test_permissions_are_those_of_any_new_file(tmp_path):
     (tmp_path / "plain").write_text("")
-    with replacing(tmp_path / "ours") as temporary:
-        temporary.write_text("")
+    with replacing(tmp_path / "ours") as file:
+        file.write(b"")
     with replacing_folder(tmp_path / "folder") as temporary:
         (temporary / "inner").write_text("")
     (tmp_path / "other").mkdir()

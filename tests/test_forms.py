@@ -268,8 +268,8 @@ def test_a_file_keeps_the_solution_and_says_what_the_form_was(obedient, tmp_path
     solution = solve(obedient[0], model=PARTLY)
     again = Solution.read(solution.write(tmp_path / "s.asdf"))
     assert again.form is None
-    assert again.settings["model"]["fixed"]["c3_0_2"] == 0.3
-    assert again.settings["model"]["n_free"] == 17
+    assert again.settings.model["fixed"]["c3_0_2"] == 0.3
+    assert again.settings.model["n_free"] == 17
     assert_array_equal(again.coefficients, solution.coefficients)
     assert_allclose(values(again, "exp02"), values(solution, "exp02"), rtol=0, atol=1e-9)
 

@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 from legdistort.priors.prior import Prior
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving import start_values
-from legdistort.solving.equations import criterion, elimination, problem_builder, reduced_system
+from legdistort.solving.equations import criterion, elimination, reduced_system
+from legdistort.solving.equations.problem import build_problem
 from legdistort.solving.estimation import solve
 
 pytest.importorskip("numba", reason="the compiled loops need the extra 'fast'")
@@ -26,13 +27,13 @@ def _set(**settings):
 @pytest.mark.parametrize("settings", [{"sigma": 0.05}, {"sigma": RNG.uniform(0.02, 0.2, (9, 120, 2)), "corr": 0.4}])
 def test_compiled_sums_are_the_plain_ones(monkeypatch, settings):
     sim, prior = _set(**settings)
-    problem = problem_builder.build(sim.matches, 3, prior=prior)
+    problem = build_problem(sim.matches, 3, prior=prior)
     state, _ = start_values.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
     plain = criterion.linearise(problem, state)
     a, y = RNG.normal(size=plain.g_exposure.shape), RNG.normal(size=(2, problem.n_stars))
     sums = elimination.to_stars(problem, plain, a), elimination.to_exposures(problem, plain, y)
-    monkeypatch.setattr(criterion, "COMPILED_FROM", 0)
-    assert problem.compiled
+    monkeypatch.setattr("legdistort.solving.equations.problem.COMPILED_FROM", 0)
+    assert problem.uses_compiled_loops
     fast = criterion.linearise(problem, state)
     for name in ("chi2", "residual", "v", "g_star", "u", "g_exposure", "coupling", "values"):
         expected = getattr(plain, name)
@@ -47,7 +48,7 @@ def test_compiled_sums_are_the_plain_ones(monkeypatch, settings):
 def test_compiled_solution_is_the_plain_one(monkeypatch, direct):
     sim, prior = _set(sigma=0.05)
     plain = solve(sim.matches, prior=prior)
-    monkeypatch.setattr(criterion, "COMPILED_FROM", 0)
+    monkeypatch.setattr("legdistort.solving.equations.problem.COMPILED_FROM", 0)
     monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: direct)
     fast = solve(sim.matches, prior=prior)
     assert_allclose(fast.positions, plain.positions, atol=1e-5)  # both stop within 5e-5 standard errors
@@ -58,11 +59,11 @@ def test_compiled_solution_is_the_plain_one(monkeypatch, direct):
 @pytest.mark.parametrize("robust", [True, False])
 def test_compiled_start_is_the_plain_one(monkeypatch, robust):
     sim, prior = _set(sigma=0.05, flips=[i in (1, 4) for i in range(9)])
-    problem = problem_builder.build(sim.matches, 3, prior=prior)
+    problem = build_problem(sim.matches, 3, prior=prior)
     nominal = np.stack([sim.matches.poses[name] for name in sim.matches.names])
     nominal[:, :, 2] += RNG.normal(scale=3, size=(9, 2))
     plain, astray = start_values.start(problem, nominal, robust=robust)
-    monkeypatch.setattr(criterion, "COMPILED_FROM", 0)
+    monkeypatch.setattr("legdistort.solving.equations.problem.COMPILED_FROM", 0)
     fast, also_astray = start_values.start(problem, nominal, robust=robust)
     assert_allclose(fast.positions, plain.positions, atol=1e-8)
     assert_allclose(fast.poses, plain.poses, atol=1e-8)

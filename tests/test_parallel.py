@@ -416,10 +416,10 @@ class TestMosaicInBlocks:
             mosaic.write(path)
         before = [(p.name, p.read_bytes()) for p in tmp_path.iterdir()]
 
-        def write(self, data):
+        def forget(written):
             raise OSError("Not enough space on disk: requested 9, available 6")
 
-        monkeypatch.setattr(fits.StreamingHDU, "write", write)
+        monkeypatch.setattr("legdistort.coaddition.mosaic.forget", forget)
         with pytest.raises(DiskFullError, match=r"No space left on the disk for .*m.fits: nothing was replaced"):
             mosaic.write(path, overwrite=True)
         assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == before

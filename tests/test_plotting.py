@@ -13,6 +13,8 @@ from matplotlib.quiver import Quiver, QuiverKey
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
 from legdistort.plots import elements, solution_plots
+from legdistort.results.diagnostics import Diagnostics
+from legdistort.results.settings import Settings
 from legdistort.results.solution import Solution
 
 
@@ -54,6 +56,8 @@ def make_solution(
         status="converged after 4 iterations",
         gauge=SimpleNamespace(sentence="minimal: by convention"),
         uncertainty=None,
+        settings=Settings(degree, "joint"),
+        diagnostics=Diagnostics(),
         left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},
     )
 

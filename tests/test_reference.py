@@ -402,7 +402,7 @@ def test_matches_know_the_epoch(night):
     assert Matches.read_meta(matches.to_meta())["epoch"] == 2021.0
     assert matches.without({matches.names[0]: "not wanted"}).epoch == 2021.0
     solution = solve(matches, prior=Prior(night.truth.static), reference=gaia(night))
-    assert solution.settings["reference"]["epoch"] == 2021.0
+    assert solution.diagnostics.reference.epoch == 2021.0
     assert np.median(separation(night, solution)) < 1.0
 
 

@@ -13,7 +13,7 @@ from legdistort.exceptions import AssumptionWarning, FoldError, InputError, Solv
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
-from legdistort.solving.choices import held_out_stars
+from legdistort.solving.choices import degree_choice, held_out
 
 SHAPE = (2048, 2048)
 
@@ -38,7 +38,7 @@ def solved(sim, **options):
 def test_what_is_kept_out_has_no_say():
     """The same as solving the table without these stars, whatever their positions are."""
     sim = simulate(40, 0.5, 0.5, 0.5, dither=200, seen=0.8)
-    kept, table = held_out_stars.hold_out(sim.matches, 0.2)
+    kept, table = held_out.hold_out(sim.matches, 0.2)
     assert len(np.unique(table["star"])) == 8
     assert len(kept.table) + len(table) == len(sim.matches.table)
     assert not set(kept.stars) & set(table["star"])
@@ -53,12 +53,12 @@ def test_what_is_kept_out_has_no_say():
         assert np.array_equal(other.positions, solution.positions)
         assert np.array_equal(other.coefficients, solution.coefficients)
     assert not np.isin(solution.residuals["star"], table["star"]).any()
-    assert "validation" not in plain.settings
+    assert plain.diagnostics.validation is None
 
 
 def test_the_choice_is_seeded():
     sim = simulate(30, 0.5, 0.5)
-    first, second, other = (held_out_stars.hold_out(sim.matches, 0.3, seed=seed)[1]["star"] for seed in (0, 0, 1))
+    first, second, other = (held_out.hold_out(sim.matches, 0.3, seed=seed)[1]["star"] for seed in (0, 0, 1))
     assert np.array_equal(first, second)
     assert not np.array_equal(first, other)
 
@@ -70,31 +70,31 @@ def test_scatter_is_what_the_errors_say():
     for seed in range(12):
         sigma = 0.1 * np.exp(0.5 * rng.normal(size=(10, 40)))
         sim = simulate(40, 0.5, 0.5, 0.5, seed=seed, dither=200, sigma=sigma)
-        ratios.append(solved(sim, degree=2, validate=0.25).settings["validation"]["ratio"])
+        ratios.append(solved(sim, degree=2, validate=0.25).diagnostics.validation.ratio)
     assert np.mean(ratios) == pytest.approx(1, abs=0.06)
 
 
 def test_scatter_tells_a_degree_that_is_too_low():
     sim = simulate(60, 0.5, 0.5, 0.5, 0.5)
-    right, low = (solved(sim, degree=d, validate=0.2).settings["validation"] for d in (3, 1))
-    assert low["ratio"] > 3 > 1.3 > right["ratio"]
-    assert low["scatter"] > 3 * right["scatter"]
+    right, low = (solved(sim, degree=d, validate=0.2).diagnostics.validation for d in (3, 1))
+    assert low.ratio > 3 > 1.3 > right.ratio
+    assert low.scatter > 3 * right.scatter
 
 
 def test_reported_scatter_is_that_of_the_corrected_positions():
     sim = simulate(30, 0.5, 0.5, seen=0.9)
-    _, table = held_out_stars.hold_out(sim.matches, 0.2)
+    _, table = held_out.hold_out(sim.matches, 0.2)
     solution = solved(sim, degree=1, validate=0.2)
     by_star = []
     for star in np.unique(table["star"]):
         rows = table[table["star"] == star]
         xy = [solution.correct(r["exposure"], [[r["x"].value, r["y"].value]])[0] for r in rows]
         by_star.append(np.var(xy, axis=0).sum() / 2)
-    got = solution.settings["validation"]
-    assert got["scatter"] == pytest.approx(np.sqrt(np.mean(by_star)), rel=1e-9)
-    assert (got["n_stars"], got["n_observations"]) == (6, len(table))
-    assert got["ratio"] == got["scatter"] / got["expected"]
-    assert got["fraction"] == 0.2
+    got = solution.diagnostics.validation
+    assert got.scatter == pytest.approx(np.sqrt(np.mean(by_star)), rel=1e-9)
+    assert (got.n_stars, got.n_observations) == (6, len(table))
+    assert got.ratio == got.scatter / got.expected
+    assert got.fraction == 0.2
 
 
 def test_scaled_and_floored_errors_count():
@@ -105,7 +105,7 @@ def test_scaled_and_floored_errors_count():
     table["y_err"] /= 2
     matches = Matches.from_table(table, shape=SHAPE, poses=sim.matches.poses)
     ratio = {
-        errors: solve(matches, degree=1, errors=errors, validate=0.2).settings["validation"]["ratio"]
+        errors: solve(matches, degree=1, errors=errors, validate=0.2).diagnostics.validation.ratio
         for errors in ("stated", "scale", "floor")
     }
     assert ratio["stated"] == pytest.approx(2, rel=0.15)
@@ -115,25 +115,25 @@ def test_scaled_and_floored_errors_count():
 
 def test_a_mismatch_among_them_is_clipped():
     sim = simulate(40, 0.5, 0.5)
-    _, kept = held_out_stars.hold_out(sim.matches, 0.2)
+    _, kept = held_out.hold_out(sim.matches, 0.2)
     table = sim.matches.table.copy()
     bad = np.flatnonzero((table["star"] == kept["star"][0]) & (table["exposure"] == kept["exposure"][0]))
     table["x"][bad] += 20 * u.pix
     matches = Matches.from_table(table, shape=SHAPE, poses=sim.matches.poses)
-    clean = solve(sim.matches, degree=1, clip=5, validate=0.2).settings["validation"]
-    plain, clipped = (solve(matches, degree=1, clip=c, validate=0.2).settings["validation"] for c in (None, 5))
-    assert plain["ratio"] > 5
-    assert clipped["n_clipped"] == 1
-    assert clipped["ratio"] == pytest.approx(clean["ratio"], rel=0.05)
+    clean = solve(sim.matches, degree=1, clip=5, validate=0.2).diagnostics.validation
+    plain, clipped = (solve(matches, degree=1, clip=c, validate=0.2).diagnostics.validation for c in (None, 5))
+    assert plain.ratio > 5
+    assert clipped.n_clipped == 1
+    assert clipped.ratio == pytest.approx(clean.ratio, rel=0.05)
 
 
 def test_solution_says_it(tmp_path):
     solution = solved(simulate(30, 0.5, 0.5), degree=1, validate=0.1)
-    got = solution.settings["validation"]
+    got = solution.diagnostics.validation
     text = " ".join(str(solution).split())
-    assert f"kept 3 stars, 30 observations: they scatter by {got['scatter']:.4f} px per axis, " in text
+    assert f"kept 3 stars, 30 observations: they scatter by {got.scatter:.4f} px per axis, " in text
     solution.write(tmp_path / "solution.asdf")
-    assert Solution.read(tmp_path / "solution.asdf").settings["validation"] == got
+    assert Solution.read(tmp_path / "solution.asdf").diagnostics.validation == got
 
 
 @pytest.mark.parametrize("fraction", [0, 0.5, 1, -0.1, np.nan, True, "0.1"])
@@ -147,7 +147,7 @@ def test_too_few_stars_to_keep_any_out():
     table = table[[0, 2, 3]]
     matches = Matches.from_table(table, shape=SHAPE, poses={name: np.eye(2, 3) for name in set(table["exposure"])})
     with pytest.raises(InputError, match="stars that two exposures or more see; there are 1 of them"):
-        held_out_stars.hold_out(matches, 0.4)
+        held_out.hold_out(matches, 0.4)
     with pytest.raises(InputError, match="degree='auto' needs stars that two exposures or more see; there are 1"):
         solve(matches, degree="auto")
 
@@ -155,7 +155,7 @@ def test_too_few_stars_to_keep_any_out():
 def test_an_exposure_that_would_have_no_stars():
     sim = simulate(10, 0.5)
     table = sim.matches.table
-    _, kept = held_out_stars.hold_out(sim.matches, 0.4)
+    _, kept = held_out.hold_out(sim.matches, 0.4)
     table = table[(table["exposure"] != "exp00") | np.isin(table["star"], kept["star"])]
     matches = Matches.from_table(table, shape=SHAPE, poses=sim.matches.poses)
     with pytest.raises(InputError, match="no star is left in exposure exp00, others are kept out"):
@@ -169,13 +169,13 @@ def test_an_exposure_that_would_have_no_stars():
 def test_the_degree_put_in_is_chosen(degree):
     sim = simulate(60, *[0.5] * (degree + 1), n_exposures=6)
     solution = solved(sim, degree="auto")
-    chosen = solution.settings["selection"]
-    assert solution.degree == chosen["degree"] == solution.settings["degree"] == degree
-    assert chosen["degrees"] == list(range(min(degree + held_out_stars.N_WORSE, held_out_stars.HIGHEST) + 1))
-    assert chosen["scores"][degree] == min(chosen["scores"])
-    assert chosen["scores"][degree] == pytest.approx(1 + (degree + 1) * (degree + 2) / 2 / 54, rel=0.2)
-    assert not chosen["alarm"]
-    assert f"degree {degree}, of 0 to {chosen['degrees'][-1]}: stars kept out scatter least with it" in " ".join(
+    chosen = solution.diagnostics.selection
+    assert solution.degree == chosen.degree == solution.settings.degree == degree
+    assert chosen.degrees == tuple(range(min(degree + degree_choice.N_WORSE, degree_choice.HIGHEST) + 1))
+    assert chosen.scores[degree] == min(chosen.scores)
+    assert chosen.scores[degree] == pytest.approx(1 + (degree + 1) * (degree + 2) / 2 / 54, rel=0.2)
+    assert not chosen.alarm
+    assert f"degree {degree}, of 0 to {chosen.degrees[-1]}: stars kept out scatter least with it" in " ".join(
         str(solution).split()
     )
 
@@ -183,23 +183,23 @@ def test_the_degree_put_in_is_chosen(degree):
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.AssumptionWarning")  # the alarm is not what is tested
 def test_no_more_than_the_stars_allow():
     """Nine stars, eight or nine at a time: enough for six modes, not for ten."""
-    chosen = solved(simulate(9, 0.5, 0.5, 0.02, sigma=0.02), degree="auto").settings["selection"]
-    assert chosen["degrees"] == [0, 1, 2]
+    chosen = solved(simulate(9, 0.5, 0.5, 0.02, sigma=0.02), degree="auto").diagnostics.selection
+    assert chosen.degrees == (0, 1, 2)
 
 
 def test_of_equal_degrees_the_lowest():
     """With widths that are found, degrees that are not there change nothing."""
     sim = simulate(20, 0.5, 0.5, n_exposures=5)
-    chosen = solve(sim.matches, prior=Prior(sim.truth.static, sigma="evidence"), degree="auto").settings["selection"]
-    assert chosen["degree"] == 1
+    chosen = solve(sim.matches, prior=Prior(sim.truth.static, sigma="evidence"), degree="auto").diagnostics.selection
+    assert chosen.degree == 1
 
 
 @pytest.mark.slow
 def test_widths_allow_more():
     sim = simulate(8, 0.5, 0.5, 0.3, n_exposures=5)
-    chosen = solve(sim.matches, prior=Prior(sim.truth.static, sigma="evidence"), degree="auto").settings["selection"]
-    assert max(chosen["degrees"]) > 2  # without widths eight stars, less one or two, end at degree 1
-    assert chosen["degree"] >= 2
+    chosen = solve(sim.matches, prior=Prior(sim.truth.static, sigma="evidence"), degree="auto").diagnostics.selection
+    assert max(chosen.degrees) > 2  # without widths eight stars, less one or two, end at degree 1
+    assert chosen.degree >= 2
 
 
 def test_a_mismatched_star_has_no_say():
@@ -214,9 +214,9 @@ def test_a_mismatched_star_has_no_say():
 def test_kept_out_stars_do_not_choose():
     """What validate keeps out is not in the folds either."""
     sim = simulate(40, 0.5, 0.5, n_exposures=5)
-    kept, _ = held_out_stars.hold_out(sim.matches, 0.2)
-    both = solved(sim, degree="auto", validate=0.2).settings["selection"]
-    assert both == solve(kept, degree="auto", prior=Prior(sim.truth.static)).settings["selection"]
+    kept, _ = held_out.hold_out(sim.matches, 0.2)
+    both = solved(sim, degree="auto", validate=0.2).diagnostics.selection
+    assert both == solve(kept, degree="auto", prior=Prior(sim.truth.static)).diagnostics.selection
 
 
 # --- the alarm ---------------------------------------------------------------------------------------------------
@@ -239,22 +239,22 @@ def test_x4_folds_as_foretold(margin):
     shift, modes of the same parity.
     """
     sim = fourth(margin=margin)
-    told = held_out_stars.folding(solved(sim, degree=4), 3, 4)
-    assert told["mode"] == [4, 0]
+    told = degree_choice.folding(solved(sim, degree=4), 3, 4)
+    assert told.mode == (4, 0)
     put_in = np.sqrt(np.mean(sim.truth.dynamic[:, 0, 10] ** 2) / 2) / 2  # rms over both axes and the field
-    assert told["energy"] == pytest.approx(put_in, rel=0.05)
-    assert told["noise"] < 0.1 * told["energy"]
+    assert told.energy == pytest.approx(put_in, rel=0.05)
+    assert told.noise < 0.1 * told.energy
     low = solved(sim, degree=3)
     wrong = (low.coefficients - low.prior_mean)[:, :, :10]
     for degree in (2, 3):  # those below are, in part, in the poses
         part = slice(degree * (degree + 1) // 2, (degree + 1) * (degree + 2) // 2)
         done = np.sqrt((wrong[:, :, part] ** 2).mean(axis=(0, 1)).sum()) / 2
-        assert told["folds_into"][degree] == pytest.approx(done, rel=0.1, abs=0.003)
+        assert told.folds_into[degree] == pytest.approx(done, rel=0.1, abs=0.003)
     if margin:
-        assert told["into"] == [2, 0]
-        assert min(told["folds_into"][0], told["folds_into"][2]) > 3 * max(told["folds_into"][1], told["folds_into"][3])
+        assert told.into == (2, 0)
+        assert min(told.folds_into[0], told.folds_into[2]) > 3 * max(told.folds_into[1], told.folds_into[3])
     else:
-        assert max(told["folds_into"]) < 0.1 * told["energy"]
+        assert max(told.folds_into) < 0.1 * told.energy
 
 
 def test_few_stars_fold_more():
@@ -264,7 +264,7 @@ def test_few_stars_fold_more():
         width = np.zeros(10)
         width[6:] = 0.4
         sim = simulate_matches(n_stars=25, dynamic=width, sigma=0.01, noise=0, seed=seed)
-        told.append(held_out_stars.folding(solved(sim), 2, 3)["folds_into"][2])
+        told.append(degree_choice.folding(solved(sim), 2, 3).folds_into[2])
         low = solved(sim, degree=2)
         wrong = (low.coefficients - low.prior_mean)[:, :, 3:6]
         done.append(np.sqrt((wrong**2).mean(axis=(0, 1)).sum()) / 2)
@@ -272,11 +272,9 @@ def test_few_stars_fold_more():
 
 
 def test_noise_is_no_energy():
-    excess = [
-        held_out_stars.folding(solved(simulate(40, 0.5, 0.5, seed=s), degree=3), 1, 3)["excess"] for s in range(12)
-    ]
+    excess = [degree_choice.folding(solved(simulate(40, 0.5, 0.5, seed=s), degree=3), 1, 3).excess for s in range(12)]
     assert abs(np.mean(excess)) < 0.7
-    assert max(np.abs(excess)) < held_out_stars.ALARM
+    assert max(np.abs(excess)) < degree_choice.ALARM
 
 
 def test_alarm_is_raised():
@@ -284,12 +282,10 @@ def test_alarm_is_raised():
     sim = simulate(16, 0.5, 0.5, 0.5, 0.3, 0.3, sigma=0.01, seed=2)
     with pytest.warns(AssumptionWarning, match=r"degree \d, of 0 to .*Degree \d is there as well, .* px rms beyond"):
         solution = solved(sim, degree="auto")
-    chosen = solution.settings["selection"]
-    assert chosen["alarm"]
-    assert [a["degree"] for a in chosen["aliasing"]] == [solution.degree + 1, solution.degree + 2][
-        : len(chosen["aliasing"])
-    ]
-    assert any(a["excess"] > held_out_stars.ALARM for a in chosen["aliasing"])
+    chosen = solution.diagnostics.selection
+    assert chosen.alarm
+    assert [a.degree for a in chosen.aliasing] == [solution.degree + 1, solution.degree + 2][: len(chosen.aliasing)]
+    assert any(a.excess > degree_choice.ALARM for a in chosen.aliasing)
     assert "is there as well" in " ".join(str(solution).split())
 
 

@@ -14,7 +14,8 @@ from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving import start_values
-from legdistort.solving.equations import criterion, problem_builder, reduced_system
+from legdistort.solving.equations import criterion, reduced_system
+from legdistort.solving.equations.problem import State, build_problem
 from legdistort.solving.estimation import solve
 
 RNG = np.random.default_rng
@@ -80,12 +81,12 @@ def test_model_is_the_published_formula():
 
 def test_jacobian_is_the_finite_difference():
     sim = small(corr=0.3)
-    problem = problem_builder.build(sim.matches, 2, prior=Prior(sim.truth.static))
+    problem = build_problem(sim.matches, 2, prior=Prior(sim.truth.static))
     state, _ = start_values.start(problem, np.stack([sim.matches.poses[n] for n in sim.matches.names]))
     blocks = criterion.linearise(problem, state)
 
     def cost(positions, coefficients):
-        moved = criterion.State(positions, coefficients, state.poses)
+        moved = State(positions, coefficients, state.poses)
         return criterion.squares(problem, criterion.residuals(problem, moved)).sum()
 
     for axis, star in ((0, 3), (1, 7)):

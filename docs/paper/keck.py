@@ -95,7 +95,7 @@ def held_out(matches, solution, prior=None, *, n=5, seed=0):
     """
     table = matches.table
     part = np.random.default_rng(seed).integers(0, n, len(table))
-    floor, squares = solution.settings["error_floor"], []
+    floor, squares = solution.diagnostics.error_floor, []
     for k in range(n):
         kept = ld.Matches.from_table(table[part != k], shape=matches.shapes, poses=matches.poses)
         other = ld.solve(kept, degree=solution.degree, prior=prior, error_floor=floor, clip=5.0)
@@ -117,7 +117,7 @@ def wanted_scale(matches, solution, prior):
     """
     table = matches.table[np.asarray(solution.residuals["used"])]
     same = ld.Matches.from_table(table, shape=matches.shapes, poses={n: matches.poses[n] for n in solution.names})
-    floor, multiples = solution.settings["error_floor"], np.array([-2.0, -1.0, 0.0, 1.0])
+    floor, multiples = solution.diagnostics.error_floor, np.array([-2.0, -1.0, 0.0, 1.0])
     fits = [
         ld.solve(same, degree=solution.degree, prior=ld.Prior(k * prior.mean), error_floor=floor) for k in multiples
     ]
@@ -134,7 +134,7 @@ def summary(folder):
         fits = by_degree(matches, choices)
         out[label] = {
             "matches": matches,
-            "floor": {key: s.settings["error_floor"] for key, s in fits.items()},
+            "floor": {key: s.diagnostics.error_floor for key, s in fits.items()},
             "used": {key: int(np.count_nonzero(s.residuals["used"])) for key, s in fits.items()},
             "held_out": {key: held_out(matches, s, choices[key[1]]) for key, s in fits.items()},
             "scale": {

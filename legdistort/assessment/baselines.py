@@ -7,24 +7,23 @@ available (NaN): nothing in these fits tells how far their plane is from the sky
 """
 
 import logging
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
-from astropy import units as u
-from astropy.table import QTable
+from scipy.linalg import block_diag
 
 from ..exceptions import InputError, LegdistortError, SolveError
-from ..geometry import basis, similarity
+from ..geometry import similarity
+from ..geometry.distortion import Distortion
 from ..inputs.matches import Matches
 from ..priors.prior import means
-from ..results.gauge import Gauge
-from ..results.solution import Solution
+from ..results.diagnostics import Diagnostics
+from ..results.settings import Settings
 from ..solving import minimisers
+from ..solving.assembly import assemble
 from ..solving.equations import criterion
-from ..solving.equations import problem_builder as problems
 from ..solving.equations.covariances import Uncertainty
-from ..solving.equations.criterion import State
+from ..solving.equations.problem import State, build_problem
 from ..solving.gauge import constraints
 
 log = logging.getLogger(__name__)
@@ -53,16 +52,16 @@ def solve_shifts(matches, *, prior=None, weighted=False):
     Returns
     -------
     Solution
-        Of degree 0, in pixels of the undistorted detector: ``settings["method"]`` is "shift" or "static + shift".
+        Of degree 0, in pixels of the undistorted detector: ``settings.method`` is "shift" or "static + shift".
     """
     matches = replace(_checked(matches), poses=_without_own_turns(matches))
-    stated = replace(problems.build(matches, 0, prior=means(prior)), prior_sigma=None, static_sigma=None)
+    stated = replace(build_problem(matches, 0, prior=means(prior)), prior_sigma=None, static_sigma=None)
     problem = stated if weighted else _equal(stated)
     state = State(matches.positions.T.copy(), problem.prior_mean.copy(), _stacked(matches))
     result = minimisers.solve_joint(problem, state)
     name = "shift" if prior is None else "static + shift"
     convention = _convention(result.gauge, name, "the mean of all exposures")
-    return _solution(matches, (stated, problem), result.state, convention, Uncertainty)
+    return _solution(matches, (stated, problem), result.state, convention)
 
 
 def solve_relative(matches, *, degree=3, reference=None, weighted=True, error_floor=0.0):
@@ -97,7 +96,7 @@ def solve_relative(matches, *, degree=3, reference=None, weighted=True, error_fl
     SolveError
         Naming an exposure that shares fewer stars with the reference than the polynomial has modes.
     """
-    problem = problems.build(_checked(matches), degree, error_floor=error_floor)
+    problem = build_problem(_checked(matches), degree, error_floor=error_floor)
     target, variance, name = _reference(matches, problem, reference)
     state = State(target, np.zeros((problem.n_exposures, 2, problem.n_modes)), _stacked(matches))
     state = State(target, state.coefficients, _fit_poses(problem, state, variance))
@@ -110,12 +109,8 @@ def solve_relative(matches, *, degree=3, reference=None, weighted=True, error_fl
     plane = "the mean of all exposures" if name is None else f"the detector of exposure {name}, undistorted by decree"
     convention = _convention(convention, "relative polynomial", plane, constraint=rows)
     state = State(_corrected_mean(matches, problem, state), state.coefficients, state.poses)
-
-    def uncertainty(problem, blocks, gauge, *, scale):
-        return _Conditional(problem, blocks, gauge, covariance, scale)
-
     weights = problem if weighted else _equal(problem)
-    return _solution(matches, (problem, weights), state, convention, uncertainty)
+    return _solution(matches, (problem, weights), state, convention, covariance)
 
 
 def compare(matches, solution, *, prior=None):
@@ -141,7 +136,7 @@ def compare(matches, solution, *, prior=None):
     table = table[matches.table.colnames]
     kept = {name: matches.poses[name] for name in solution.names}
     same = Matches.from_table(table, shape=solution.shapes, poses=kept, sky=matches.sky)
-    floor = solution.settings.get("error_floor", 0.0)
+    floor = solution.diagnostics.error_floor
     calls = {
         "shift": lambda: solve_shifts(same),
         "static + shift": lambda: solve_shifts(same, prior=prior),
@@ -252,8 +247,6 @@ def _fit_polynomials(problem, state, variance, *, weighted):
 
 def _corrected_mean(matches, problem, state):
     """Weighted mean (2, n_stars) of the corrected positions of every star."""
-    from ..geometry.distortion import Distortion
-
     weight = problem.weight[:2].sum(axis=0)
     sums = np.zeros((2, problem.n_stars))
     for i, name in enumerate(problem.names):
@@ -264,71 +257,32 @@ def _corrected_mean(matches, problem, state):
     return sums / np.bincount(problem.star, weight, problem.n_stars)
 
 
-class _Conditional(Uncertainty):
-    """Errors where the coefficients of every exposure were fitted by themselves: no covariance between exposures."""
-
-    def __init__(self, problem, blocks, gauge, covariance, scale):
-        super().__init__(problem, blocks, gauge, scale=scale)
-        self._blockwise = covariance
-
-    @cached_property
-    def coefficients(self):
-        n, size, _ = self._blockwise.shape
-        out = np.zeros((n, size, n, size))
-        out[np.arange(n), :, np.arange(n)] = self._scale**2 * self._blockwise
-        return out.reshape(n * size, n * size)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class _Convention(Gauge):
-    """The plane of a baseline, in words; what it hides is not known."""
-
-    words: str = ""
-
-    @property
-    def sentence(self):
-        """The convention in a sentence."""
-        return self.words
-
-    def __str__(self):
-        return self.words
-
-
 def _convention(gauge, name, plane, **changes):
-    given = {field.name: getattr(gauge, field.name) for field in fields(gauge)} | changes
-    given["dynamic"] = np.full_like(gauge.dynamic, np.nan)  # absolute errors come out as NaN, from a file too
-    return _Convention(**given, words=f"{name}: the plane is {plane}; absolute errors are not available")
+    """The gauge of a correction, whose plane is told in words; absolute errors come out as NaN."""
+    return replace(gauge, kind=name, plane=plane, dynamic=np.full_like(gauge.dynamic, np.nan), **changes)
 
 
-def _solution(matches, problems, state, gauge, uncertainty):
-    """The frozen result: chi2 by the stated errors, reported errors scaled by what the weights in force leave."""
+def _solution(matches, problems, state, gauge, covariance=None):
+    """The frozen result: chi2 by the stated errors, reported errors scaled by what the weights in force leave.
+
+    A `covariance` of the coefficients, one block an exposure, is that at the stated errors where each exposure was
+    fitted by itself: there is none between exposures.
+    """
     stated, problem = problems
     blocks = criterion.linearise(problem, state)
-    table = QTable(matches.table, copy=False)
-    back = np.empty_like(blocks.residual)
-    back[:, problem.order] = blocks.residual
-    table["dx"], table["dy"] = back * u.pix
-    table["used"] = np.ones(len(table), dtype=bool)
-    dof = 2 * len(table) - 2 * problem.n_stars - (problem.n_exposures - 1) * 2 * problem.n_modes
+    dof = 2 * len(matches.table) - 2 * problem.n_stars - (problem.n_exposures - 1) * 2 * problem.n_modes
     scale = float(np.sqrt(blocks.chi2 / dof)) if dof > 0 else 1.0
-    method = gauge.words.split(":")[0]
-    degree = basis.degree_of(problem.n_modes)
-    return Solution(
-        names=problem.names,
-        degree=degree,
-        shapes=dict(matches.shapes),
-        poses=dict(zip(problem.names, state.poses, strict=True)),
-        coefficients=state.coefficients,
-        prior_mean=problem.prior_mean,
-        star_names=np.asarray(matches.stars),
-        positions=state.positions.T.copy(),
-        observations=table,
-        chi2=float(criterion.squares(stated, blocks.residual).sum()),
+    coefficients = None if covariance is None else block_diag(*(scale**2 * covariance))
+    return assemble(
+        matches,
+        problem,
+        state,
+        blocks,
+        gauge,
+        Uncertainty(problem, blocks, gauge, scale=scale, coefficients=coefficients),
+        settings=Settings(problem.degree, gauge.kind, errors="scale"),
+        diagnostics=Diagnostics(error_scale=scale),
+        status=f"{gauge.kind}: solved directly",
         dof=dof,
-        status=f"{method}: solved directly",
-        gauge=gauge,
-        uncertainty=uncertainty(problem, blocks, gauge, scale=scale),
-        sky=matches.sky,
-        left_out=dict(matches.left_out),
-        settings={"method": method, "degree": degree, "errors": "scale"},
+        chi2=float(criterion.squares(stated, blocks.residual).sum()),
     )

@@ -118,6 +118,7 @@ def do_run(a):
 def do_measure(a):
     """``legdistort measure``."""
     from ..inputs.exposures import expand_paths
+    from ..inputs.table_files import write_table
     from ..measurement.options import MeasureOptions
     from ..measurement.positions import measure
     from ..runtime.provenance import checksums
@@ -128,7 +129,7 @@ def do_measure(a):
     table = measure(exposures, **measuring, workers=a.workers, progress=wants_progress(a))
     shapes = {e.name: list(e.shape) for e in exposures}
     table.meta |= {"shapes": shapes, "inputs": checksums(expand_paths(a.frames))}
-    _write_table(table, a)
+    write_table(table, a.out, overwrite=a.overwrite)
     _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
 
 
@@ -167,7 +168,7 @@ def do_noise(a):
 )
 def do_match(a):
     """``legdistort match``."""
-    from ..inputs.table_files import stack
+    from ..inputs.table_files import stack, write_table
     from ..matching.matcher import match
 
     tables = [_read_table(path, a) for path in a.tables]
@@ -182,7 +183,7 @@ def do_match(a):
     made = matches.table.copy()
     inputs = {name: checksum for each in tables for name, checksum in each.meta["inputs"].items()}
     made.meta = matches.to_meta() | {"inputs": inputs}
-    _write_table(made, a)
+    write_table(made, a.out, overwrite=a.overwrite)
     figures = {"n_exposures": len(matches.names), "n_stars": len(matches.stars), "n_observations": len(made)}
     _say(a, repr(matches)[1:-1], figures | {"left_out": matches.left_out})
 
@@ -393,7 +394,7 @@ def _open(a):
 def _solving(a, shape=None):
     """The arguments of `solve`; the prior read, no static distortion if there is none, with the widths asked for."""
     from ..priors.prior import EVIDENCE, Prior
-    from ..solving.choices.held_out_stars import AUTO, HIGHEST
+    from ..solving.choices.degree_choice import AUTO, HIGHEST
 
     keywords, prior = given(a, options.SOLVING), _prior(a.prior, shape)
     sigma = keywords.pop("prior_sigma", None)
@@ -436,17 +437,10 @@ def _grid(path, solution):
     return grid
 
 
-def _write_table(table, a):
-    from ..runtime.outputs import replacing
-
-    with replacing(a.out, overwrite=a.overwrite) as temporary:
-        table.write(temporary, format="ascii.ecsv")
-
-
 def _draw(result, a):
     """The picture of a result, if it is asked for."""
     from ..runtime.outputs import replacing
 
     if a.plot is not None:
-        with replacing(a.plot, overwrite=a.overwrite) as temporary:
-            result.plot().figure.savefig(temporary, format="png", dpi=120)
+        with replacing(a.plot, overwrite=a.overwrite) as file:
+            result.plot().figure.savefig(file, format="png", dpi=120)

@@ -185,7 +185,7 @@ def _check_pixels(wcs, name):
 
 def _of_image(path):
     first = None
-    with fits.open(path, memmap=False) as hdulist:
+    with path.open("rb") as file, fits.open(file, memmap=False) as hdulist:
         for hdu in hdulist:
             if hdu.is_image:
                 wcs = WCS(hdu.header, hdulist)

@@ -1,5 +1,7 @@
 """The co-added image and its file."""
 
+import bz2
+import gzip
 import re
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -10,10 +12,12 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from ..exceptions import InputError
+from ..runtime.fits_bytes import BLOCK
 from ..runtime.outputs import replacing
 from ..runtime.scratch import forget
 
 _ENDING = re.compile(r"\.(?:(?P<asdf>asdf)|(?:fits|fit|fts)(?P<packed>\.gz|\.bz2)?)$", re.IGNORECASE)
+_PACKERS = {".gz": gzip.open, ".bz2": bz2.open}
 _ROWS = 256  # that are written at a time
 
 
@@ -145,14 +149,15 @@ class Mosaic:
             For another ending; if the file exists and `overwrite` is false, or its folder does not exist.
         """
         ending = check_ending(path)
-        with replacing(path, overwrite=overwrite) as temporary:
+        with replacing(path, overwrite=overwrite) as file:
             if ending["asdf"]:
-                asdf.AsdfFile({"mosaic": self._tree()}).write_to(temporary)
+                asdf.AsdfFile({"mosaic": self._tree()}).write_to(file)
             elif ending["packed"]:
-                self.to_hdulist().writeto(temporary)
+                with _PACKERS[ending["packed"].lower()](file, "wb") as packer:
+                    self.to_hdulist().writeto(packer)
             else:
                 for hdu in self.to_hdulist():
-                    _append(temporary, hdu)
+                    _append(file, hdu)
 
     def _tree(self):
         tree = {each.name: getattr(self, each.name) for each in fields(self)}
@@ -182,10 +187,14 @@ def check_ending(path):
     return ending
 
 
-def _append(path, hdu):
-    """Add an HDU to a FITS file, a few rows at a time: astropy would turn the bytes of all of it in memory."""
+def _append(file, hdu):
+    """Add an HDU to a FITS file, a few rows at a time: astropy would turn the bytes of all of it in memory.
+
+    ``StreamingHDU``, which would not, closes the file after each.
+    """
+    file.write(hdu.header.tostring().encode("ascii"))
     rows = hdu.data.reshape(-1, hdu.data.shape[-1])
-    with fits.StreamingHDU(str(path), hdu.header) as stream:  # of a path it takes the last part for the name
-        for start in range(0, len(rows), _ROWS):
-            stream.write(rows[start : start + _ROWS])
-            forget(rows)
+    for start in range(0, len(rows), _ROWS):
+        file.write(rows[start : start + _ROWS].astype(rows.dtype.newbyteorder(">")))
+        forget(rows)
+    file.write(bytes(-file.tell() % BLOCK))

@@ -351,7 +351,7 @@ def _header(frames, left_out, factors, settings):
             header[key] = (value, _MEANING[key])
     header["CREATOR"] = f"legdistort {version('legdistort')}"
     for i, frame in enumerate(frames[:999], start=1):
-        header[f"IMCMB{i:03d}"] = frame.name
+        header[f"IMCMB{i:03d}"] = frame.name.encode("ascii", "backslashreplace").decode()  # as FITS has it
     for name, reason in left_out.items():
         header.add_history(f"left out {name}: {reason}")
     return header

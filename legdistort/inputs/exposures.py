@@ -18,6 +18,7 @@ from astropy.wcs.utils import proj_plane_pixel_scales
 from tqdm import tqdm
 
 from ..exceptions import InputError
+from .exposure_names import check_exposure_name, exposure_name
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +39,6 @@ PIXEL_SCALES = (0.0001 / 3600, 0.1)
 #: ... and a reference pixel not farther from the centre than this many frame sizes (mosaics need several).
 REFERENCE_DISTANCE = 20
 
-_SUFFIX = re.compile(r"\.(fits|fit|fts)(\.(gz|fz|bz2|zip))?$", re.IGNORECASE)
 _FILTERS = threading.Lock()  # warning filters belong to the process, not to the thread that changes them
 _UNREADABLE = (OSError, EOFError, TypeError, ValueError, KeyError, IndexError, zlib.error, fits.VerifyError)
 
@@ -72,7 +72,8 @@ class Exposure:
     Raises
     ------
     InputError
-        If the data are not a 2-D image, planes differ in shape, or no pixel is good.
+        If the data are not a 2-D image, planes differ in shape, no pixel is good, or the name could not be that of a
+        file.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Exposure:
     path: Path | None = None
 
     def __post_init__(self):
+        check_exposure_name(self.name, self.path)
         data = _as_float(np.asarray(self.data), self.name)
         mask = ~np.isfinite(data)
         if self.mask is not None:
@@ -159,7 +161,7 @@ def read_exposures(paths, *, ext=None, progress=False):
     ------
     InputError
         Naming the file: missing, not FITS, truncated, without a 2-D image or the extension wanted,
-        without a good pixel, or with the name of another one.
+        without a good pixel, with the name of another one, or with a name that ``wcs/NAME.asdf`` could not have.
     """
     return [exposure for _, exposure in each_exposure(paths, ext, progress=progress)]
 
@@ -191,7 +193,7 @@ def expand_paths(paths):
     sources = []
     for source in paths:
         if isinstance(source, str) and any(c in source for c in "*?") and not Path(source).exists():
-            found = sorted(glob.glob(source))
+            found = sorted(glob.glob(source)) or sorted(glob.glob(source.replace("[", "[[]")))
             if not found:
                 raise InputError(f"no file matches {source!r}")
             sources += found
@@ -215,7 +217,7 @@ def _read(source, ext, default):
     if not path.is_file():
         raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
     try:
-        with fits.open(path, memmap=False) as hdulist:
+        with path.open("rb") as file, fits.open(file, memmap=False) as hdulist:
             return _from_hdulist(hdulist, ext, str(path), path)
     except InputError:
         raise
@@ -244,14 +246,6 @@ def _from_hdulist(hdulist, ext, label, path):
         logger.info("%s: WCS of the header not used: %s", name, error)
         wcs = None
     return _assemble(name, data, header, integer, mask=mask, uncertainty=uncertainty, wcs=wcs, path=path)
-
-
-def exposure_name(path, ext=None):
-    """Name of the exposure in a file, or in one of its extensions (see `read_exposures`)."""
-    name = _SUFFIX.sub("", Path(path).name)
-    if ext is None:
-        return name
-    return name + "_" + ("".join(str(e) for e in ext) if isinstance(ext, tuple) else str(ext))
 
 
 def _is_image(hdu):

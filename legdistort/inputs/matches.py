@@ -12,6 +12,7 @@ from ..exceptions import InputError, MatchError
 from ..geometry import similarity as poses
 from ..geometry.tangent_plane import TangentPlane
 from . import column_contract
+from .exposure_names import check_exposure_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +165,7 @@ class Matches:
         table["exposure"] = table["exposure"].astype(str)
         names, exposure_index = _first_seen(table["exposure"])
         for name in names:
-            if not name.strip(". ") or "/" in name or "\\" in name:
-                raise InputError(f"exposure {name!r} cannot be the name of a file; rename it (no slashes, not empty)")
+            check_exposure_name(name)
         shapes = _by_exposure(shape, names)
         _check_inside(table, exposure_index, names, shapes)
         stars, star_index = _ranked(table["star"])

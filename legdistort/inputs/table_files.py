@@ -1,5 +1,6 @@
 """Tables of positions from files of many kinds, and tables of stars into files of some."""
 
+import io
 import logging
 import re
 from pathlib import Path
@@ -13,6 +14,7 @@ from ..exceptions import InputError
 from ..runtime.outputs import replacing
 from ..runtime.provenance import checksums
 from . import column_contract, sextractor
+from .exposure_names import check_exposure_name, exposure_name
 
 logger = logging.getLogger(__name__)
 
@@ -58,18 +60,14 @@ def read_table(path, *, columns=None, origin=None):
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     if "exposure" not in table.colnames:
-        table["exposure"] = np.full(len(table), exposure_name(path))
+        name = exposure_name(path.stem)
+        check_exposure_name(name, path)
+        table["exposure"] = np.full(len(table), name)
         if "shape" in table.meta:
-            table.meta["shapes"] = {exposure_name(path): table.meta.pop("shape")}
+            table.meta["shapes"] = {name: table.meta.pop("shape")}
     inputs = table.meta.get("inputs")
     table.meta["inputs"] = (inputs if isinstance(inputs, dict) else {}) | checksums(path)
     return table
-
-
-def exposure_name(path):
-    """The name of an exposure: that of its list, without ending."""
-    stem = Path(path).stem if Path(path).suffix else Path(path).name
-    return re.sub(r"\.(fits|fit|fts|ldac)$", "", stem)
 
 
 def stack(tables):
@@ -115,7 +113,8 @@ def _read(path):
         errors = []
         for kind in _text_formats(head, suffix):
             try:
-                return Table.read(path, format=kind)
+                with path.open("rb") as file:
+                    return Table.read(file, format=kind)
             except Exception as error:  # readers raise what they like
                 errors.append(_line(error))
     except InputError:
@@ -143,7 +142,7 @@ def _line(error):
 
 def _read_fits(path):
     """The first table of a FITS file, or all detections of an LDAC file."""
-    with fits.open(path, memmap=False) as hdus:
+    with path.open("rb") as file, fits.open(file, memmap=False) as hdus:
         tables = [k for k, hdu in enumerate(hdus) if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU))]
         objects = [k for k in tables if hdus[k].name == "LDAC_OBJECTS"]
         if not tables:
@@ -153,7 +152,7 @@ def _read_fits(path):
         return found[0]
     shapes = {}
     for k, table in enumerate(found):
-        name = f"{exposure_name(path)}_{k + 1}"
+        name = f"{exposure_name(path.stem)}_{k + 1}"
         table["exposure"] = np.full(len(table), name)
         if "shape" in table.meta:
             shapes[name] = table.meta.pop("shape")
@@ -199,7 +198,16 @@ def write_stars(solution, path, *, overwrite=False):
     kind = WRITTEN.get(Path(path).suffix.lower())
     if kind is None:
         raise InputError(f"{path}: the ending says the format, give one of {', '.join(WRITTEN)}")
-    table = QTable(solution.stars)
-    with replacing(path, overwrite=overwrite) as temporary:
-        table.write(temporary, format=kind)
+    write_table(QTable(solution.stars), path, kind=kind, overwrite=overwrite)
     return Path(path)
+
+
+def write_table(table, path, *, kind="ascii.ecsv", overwrite=False):
+    """Write a table to a file, in any format that astropy knows; as `legdistort.runtime.outputs.replacing`."""
+    with replacing(path, overwrite=overwrite) as file:
+        if kind.startswith("ascii"):
+            text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+            table.write(text, format=kind)
+            text.detach()
+        else:
+            table.write(file, format=kind)

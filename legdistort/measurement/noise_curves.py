@@ -14,8 +14,8 @@ from astropy.table import QTable
 from scipy.optimize import nnls
 
 from ..exceptions import InputError
+from ..inputs.table_files import write_table
 from ..runtime.checks import check_choice
-from ..runtime.outputs import replacing
 
 #: Where the errors of `legdistort.measure` come from: the fit, the curve, or the fit scaled to the curve.
 SOURCES = ("fit", "injected", "scaled")
@@ -193,8 +193,7 @@ class NoiseCurves:
 
     def write(self, path, *, overwrite=False):
         """Write the table as ECSV."""
-        with replacing(path, overwrite=overwrite) as temporary:
-            self.table.write(temporary, format="ascii.ecsv")
+        write_table(self.table, path, overwrite=overwrite)
 
     @classmethod
     def read(cls, path):
@@ -202,7 +201,8 @@ class NoiseCurves:
         if not Path(path).is_file():
             raise InputError(f"{path} does not exist")
         try:
-            table = QTable.read(path, format="ascii.ecsv")
+            with open(path, "rb") as file:
+                table = QTable.read(file, format="ascii.ecsv")
         except (ValueError, OSError, UnicodeDecodeError) as error:
             raise InputError(f"{path} is no ECSV table: {error}") from error
         return cls(table)

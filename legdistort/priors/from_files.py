@@ -4,7 +4,6 @@ import contextlib
 import difflib
 import io
 import re
-import tempfile
 import warnings
 from pathlib import Path
 
@@ -151,7 +150,7 @@ def _reference_model(model, tree, name):
 
 def _read_fits(path, ext, frame):
     try:
-        with fits.open(path, memmap=False) as hdulist:
+        with path.open("rb") as file, fits.open(file, memmap=False) as hdulist:
             if ext is None and "ASDF" in hdulist:
                 return _from_hdu(hdulist["ASDF"], frame, str(path))
             return _refuse(_from_hdulist(hdulist, ext, str(path)), frame=frame)
@@ -163,10 +162,8 @@ def _read_fits(path, ext, frame):
 
 def _from_hdu(hdu, frame, name):
     """The gwcs that JWST and legdistort put into a table of one row (`stdatamodels.asdf_in_fits`)."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, Path(name).name + "[ASDF]")
-        path.write_bytes(np.asarray(hdu.data["ASDF_METADATA"]).tobytes())
-        return _from_tree(read_tree(path, tags=TAGS), None, frame, f"{name}[ASDF]")
+    name, content = f"{name}[ASDF]", np.asarray(hdu.data["ASDF_METADATA"]).tobytes()
+    return _from_tree(read_tree(name, content=content, tags=TAGS), None, frame, name)
 
 
 def _from_hdulist(hdulist, ext, name):

@@ -34,8 +34,8 @@ def write_prior(prior, path, *, overwrite=False):
         "plane": prior.plane,
         "source": prior.source,
     }
-    with replacing(path, overwrite=overwrite) as temporary:
-        asdf.AsdfFile({"legdistort_prior": tree}, version=ASDF_STANDARD).write_to(temporary)
+    with replacing(path, overwrite=overwrite) as file:
+        asdf.AsdfFile({"legdistort_prior": tree}, version=ASDF_STANDARD).write_to(file)
     return Path(path)
 
 

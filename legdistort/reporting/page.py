@@ -11,7 +11,6 @@ from ..exceptions import FoldError
 from ..geometry import similarity
 from ..inputs import column_contract
 from ..plots import solution_plots
-from ..results.diagnostics import in_words
 from ..runtime.outputs import replacing
 from .comparison import compared_corrections, compared_stacks, sharpness
 from .html import STYLE, count, detached_figure, figure, wide_table
@@ -53,9 +52,9 @@ def write_report(path, solution, *, mosaic=None, summary=None, comparison=None, 
     InputError
         If the file exists and `overwrite` is false, or its folder does not exist.
     """
-    with replacing(path, overwrite=overwrite) as temporary:
+    with replacing(path, overwrite=overwrite) as file:
         page = render(solution, mosaic=mosaic, summary=summary, comparison=comparison, stacks=stacks)
-        temporary.write_text(page, encoding="utf-8")
+        file.write(page.encode())
     return Path(path)
 
 
@@ -126,7 +125,7 @@ def _facts_table(solution, facts):
     rows["Largest error of an inverse"] = escape(error) if isinstance(error, str) else f"{error:.1e} px"
     rows["Minimisation"] = escape(str(solution.status))
     rows["Gauge"] = escape(solution.gauge.sentence)
-    rows |= {key.capitalize(): escape(sentence) for key, sentence in in_words(solution.settings).items()}
+    rows |= {key.capitalize(): escape(sentence) for key, sentence in solution.diagnostics.in_words().items()}
     rows["Sky"] = escape(solution.sky_sentence)
     rows["Left out"] = (
         "<br>".join(f"{escape(str(n))}: {escape(str(r))}" for n, r in facts["left_out"].items()) or "none"

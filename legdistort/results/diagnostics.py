@@ -1,57 +1,193 @@
-"""What `solve` found out by the way, as its settings keep it, in words."""
+"""What `solve` found out beside the solution itself, in numbers and in words."""
+
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
-#: Settings that are results, for summaries.
-FOUND = "widths", "effective_modes", "departure_ratio", "selection", "validation"
 
+@dataclass(frozen=True)
+class AliasedDegree:
+    """What the modes of a degree beyond the fit do to it (paper, section 4.3).
 
-def in_words(settings):
-    """Sentences on the widths of a prior, the degree chosen, and the stars that were kept out.
-
-    Parameters
+    Attributes
     ----------
-    settings : dict
-        Of a `legdistort.results.solution.Solution`.
-
-    Returns
-    -------
-    dict
-        ``{"widths" | "modes" | "degree" | "kept": sentence}``, those that there is something to say on.
+    degree : int
+    found, noise : float
+        Rms of its modes over the field, per axis, and what their errors explain of it, pixels.
+    excess : float
+        Of the energy over that of noise, in standard deviations.
+    energy : float
+        Rms beyond the noise, pixels.
+    folds_into : tuple of float
+        The same as it appears at degree 0, 1 ... of the fit.
+    mode, into : tuple of int
+        The mode with most energy and the mode in which most of it appears, orders in x and y.
     """
-    words = {}
-    if (widths := settings.get("widths")) is not None:
-        words["widths"] = f"scatter of a coefficient, found from the exposures: {_widths(widths)}"
-    if (effective := settings.get("effective_modes")) and _has_widths(settings.get("prior")):
-        number = np.array(list(effective.values()))
-        words["modes"] = (
-            f"{number.min():.1f} to {number.max():.1f} an exposure, both axes together, are determined by the data, "
-            "the others by the prior or the gauge"
+
+    degree: int
+    found: float
+    noise: float
+    excess: float
+    energy: float
+    folds_into: tuple
+    mode: tuple
+    into: tuple
+
+
+@dataclass(frozen=True)
+class DegreeChoice:
+    """How the degree was chosen.
+
+    Attributes
+    ----------
+    degree : int
+    degrees : tuple of int
+        Those that were tried: as many as the stars allow, until three in a row are no better.
+    scores : tuple of float
+        Of these, the squared scatter of stars kept out over that of their errors.
+    n_folds : int
+        Parts of the stars that were kept out in turn.
+    aliasing : tuple of AliasedDegree
+    alarm : bool
+        Whether one of these is there beyond doubt.
+    sentence : str
+    """
+
+    degree: int
+    degrees: tuple
+    scores: tuple
+    n_folds: int
+    aliasing: tuple
+    alarm: bool
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Validation:
+    """How stars that a solution has not seen scatter.
+
+    Attributes
+    ----------
+    fraction : float
+        As it was asked for.
+    n_stars, n_observations, n_clipped : int
+    scatter, expected : float
+        Rms over the stars, per axis, pixels (paper, section 3.4, second criterion).
+    ratio : float
+        Of the two.
+    """
+
+    fraction: float
+    n_stars: int
+    n_observations: int
+    n_clipped: int
+    scatter: float
+    expected: float
+    ratio: float
+
+    def __str__(self):
+        return (
+            f"{self.n_stars} stars, {self.n_observations} observations: they scatter by {self.scatter:.4f} px "
+            f"per axis, {self.expected:.4f} expected from the errors (ratio {self.ratio:.2f})"
         )
-        if (ratio := settings.get("departure_ratio")) is not None:
-            words["modes"] += (
-                f"; departures from the prior mean are {ratio:.2f} of those that its widths lead to expect"
+
+
+@dataclass(frozen=True)
+class UsedReference:
+    """The reference catalogue to which a solution is tied.
+
+    Attributes
+    ----------
+    name : str
+    epoch : float or None
+        Of the exposures, years.
+    n_stars : int
+        That were used.
+    rms_px : float
+        Of their offsets per axis, pixels.
+    """
+
+    name: str
+    epoch: float | None
+    n_stars: int
+    rms_px: float
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What `solve` found out; None for what was not asked for.
+
+    Attributes
+    ----------
+    error_floor : float
+        Pixels, added in quadrature to every stated error.
+    error_scale : float
+        Factor on the stated errors.
+    sky : {"exposures", "reference", None}
+        From which the place on the sky is known.
+    reference : UsedReference or None
+    widths : tuple of float, dict of them, or None
+        Widths of the prior that were found, pixels, of a coefficient of degree 1, 2 and so on; by detector or exposure
+        if the prior was given so. In units of the errors as they are scaled.
+    prior_has_widths : bool
+    effective_modes : dict or None
+        ``{exposure: number}`` of its modes, both axes together, that the data determine.
+    departure_ratio : float or None
+        Rms departure of the exposures from the mean of the prior against what its widths lead to expect.
+    selection : DegreeChoice or None
+    validation : Validation or None
+    """
+
+    error_floor: float = 0.0
+    error_scale: float = 1.0
+    sky: str | None = None
+    reference: UsedReference | None = None
+    widths: tuple | dict | None = None
+    prior_has_widths: bool = False
+    effective_modes: dict | None = None
+    departure_ratio: float | None = None
+    selection: DegreeChoice | None = None
+    validation: Validation | None = None
+
+    def in_words(self):
+        """Sentences on the widths of a prior, the degree chosen, and the stars that were kept out.
+
+        Returns
+        -------
+        dict
+            ``{"widths" | "modes" | "degree" | "kept": sentence}``, those that there is something to say on.
+        """
+        words = {}
+        if widths := _in_words(self.widths):
+            words["widths"] = f"scatter of a coefficient, found from the exposures: {widths}"
+        if self.effective_modes and self.prior_has_widths:
+            number = np.array(list(self.effective_modes.values()))
+            words["modes"] = (
+                f"{number.min():.1f} to {number.max():.1f} an exposure, both axes together, are determined by the "
+                "data, the others by the prior or the gauge"
             )
-    if (chosen := settings.get("selection")) is not None:
-        words["degree"] = chosen["sentence"]
-    if (kept := settings.get("validation")) is not None:
-        words["kept"] = (
-            f"{kept['n_stars']} stars, {kept['n_observations']} observations: they scatter by {kept['scatter']:.4f} px "
-            f"per axis, {kept['expected']:.4f} expected from the errors (ratio {kept['ratio']:.2f})"
-        )
-    return words
+            if self.departure_ratio is not None:
+                words["modes"] += (
+                    f"; departures from the prior mean are {self.departure_ratio:.2f} of those that its widths lead to "
+                    "expect"
+                )
+        if self.selection is not None:
+            words["degree"] = self.selection.sentence
+        if self.validation is not None:
+            words["kept"] = str(self.validation)
+        return words
+
+    def summary(self):
+        """What there is of it as plain numbers and strings by name, for summaries."""
+        names = "widths", "effective_modes", "departure_ratio", "selection", "validation"
+        return {name: found for name, found in asdict(self).items() if name in names and found is not None}
 
 
-def _widths(widths):
+def _in_words(widths):
+    """Widths by degree, or a dict of them; empty where nothing was found, or nothing scatters (degree 0)."""
     if isinstance(widths, dict):
-        return "; ".join(f"{name} {_widths(each)}" for name, each in widths.items() if each is not None)
-    return ", ".join(f"{width:.3g}" for width in widths) + " px at degree 1, 2, ..."[: 14 + 3 * len(widths)]
-
-
-def _has_widths(prior):
-    """Whether a description of a prior, or one of a dict of them, has widths."""
-    if not isinstance(prior, dict):
-        return False
-    if "sigma" in prior:
-        return prior["sigma"] is not None
-    return any(_has_widths(each) for each in prior.values())
+        return "; ".join(f"{name} {_in_words(each)}" for name, each in widths.items() if each)
+    if not widths:
+        return ""
+    degrees = ", ".join(["1", "2", "..."][: len(widths)])
+    return f"{', '.join(f'{width:.3g}' for width in widths)} px at degree {degrees}"

@@ -27,7 +27,8 @@ class Gauge:
 
     Attributes
     ----------
-    kind : {"minimal", "mean"}
+    kind : {"minimal", "mean"} or str
+        Or the name of a simpler correction, which comes with a `plane`.
     constraint : ndarray, shape (2 n_modes, n_exposures, 2 n_modes)
         Rows of the constraints; they act on A_i - A_0, x modes first.
     motion : ndarray, shape (n_exposures, 2 n_modes, 2 n_modes)
@@ -51,6 +52,9 @@ class Gauge:
         Whether exposures take back shears, of which the data then say nothing.
     tie : `legdistort.results.catalogue_tie.Tie` or None
         How a reference catalogue measured the maps that the data do not tell.
+    plane : str or None
+        What the plane of a simpler correction is, in words. How far it is from the sky is not known then, and `dynamic`
+        is NaN.
     """
 
     kind: str
@@ -65,6 +69,7 @@ class Gauge:
     values: np.ndarray | None = None
     shears: bool = True
     tie: object = None
+    plane: str | None = None
 
     @property
     def n_constraints(self):
@@ -171,6 +176,8 @@ class Gauge:
     @property
     def sentence(self):
         """The convention in a sentence."""
+        if self.plane is not None:
+            return f"{self.kind}: the plane is {self.plane}; absolute errors are not available"
         how = {
             "minimal": "the smallest dynamic part, weighted by its scatter and errors",
             "mean": "dynamic parts that sum to zero",
@@ -193,6 +200,8 @@ class Gauge:
         return f"<Gauge {self.kind!r}: {self.n_constraints} constraints, {len(self.motion)} exposures>"
 
     def __str__(self):
+        if self.plane is not None:
+            return self.sentence
         convention = {
             "minimal": "the constraint (smallest dynamic part, weighted by its scatter and errors)",
             "mean": "the constraint (dynamic parts that sum to zero)",

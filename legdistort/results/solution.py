@@ -10,14 +10,14 @@ from astropy.table import QTable
 from astropy.wcs import WCS
 
 from ..exceptions import InputError
-from ..geometry import basis
-from ..geometry import similarity as poses
+from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
 from ..geometry.models import like, outside, to_pixels
 from ..geometry.star_hull import support, supported
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
-from .diagnostics import in_words
+from .diagnostics import Diagnostics
+from .settings import Settings
 
 
 def _wrapped(key, text):
@@ -60,11 +60,13 @@ class Solution:
     gauge : Gauge
     uncertainty : Uncertainty
         Covariances in the gauge.
+    settings : Settings
+        How `solve` was called.
+    diagnostics : Diagnostics
+        What it found out beside all this.
     sky : TangentPlane or None
     left_out : dict
         ``{exposure: reason}``.
-    settings : dict
-        How `solve` was called.
     provenance : dict
         ``created``, ``versions`` of packages and, if files went in, ``inputs`` ``{base name: SHA-256}``.
     form : `legdistort.solving.model_forms.Form` or None
@@ -85,9 +87,10 @@ class Solution:
     status: str
     gauge: object
     uncertainty: object
+    settings: Settings
+    diagnostics: Diagnostics
     sky: TangentPlane | None = None
     left_out: dict = field(default_factory=dict)
-    settings: dict = field(default_factory=dict)
     provenance: dict = field(default_factory=dict)
     form: object = None
 
@@ -157,7 +160,7 @@ class Solution:
         The trace of the influence of the data on the coefficients. Without prior widths it is their number, less what
         the gauge fixes. None if the solution does not know it.
         """
-        return self.settings.get("effective_modes")
+        return self.diagnostics.effective_modes
 
     # -- geometry
 
@@ -188,7 +191,7 @@ class Solution:
         A quantity in pixels gives a quantity.
         """
         distortion = self.distortion(name)
-        q = poses.apply(self.poses[name], np.atleast_2d(to_pixels(xy)))
+        q = similarity.apply(self.poses[name], np.atleast_2d(to_pixels(xy)))
         p = distortion(q)
         p[outside(distortion.inverse.valid, q[:, 0], q[:, 1])] = np.nan
         return like(xy, p)
@@ -201,7 +204,7 @@ class Solution:
         distortion = self.distortion(name)
         distortion.check_fold()
         q = distortion.invert(np.atleast_2d(to_pixels(xy)))
-        return like(xy, poses.apply(poses.invert(self.poses[name]), q))
+        return like(xy, similarity.apply(similarity.invert(self.poses[name]), q))
 
     def model(self, name):
         """Reference plane -> detector pixels as an astropy compound model with inverse."""
@@ -319,7 +322,7 @@ class Solution:
         """Where the reference plane lies on the sky, and how that is known."""
         if self.sky is None:
             return "not known: no WCS in the headers that proved right, no reference catalogue with ra, dec"
-        source = {"exposures": "from the headers", "reference": "from the reference"}.get(self.settings.get("sky"), "")
+        source = {"exposures": "from the headers", "reference": "from the reference"}.get(self.diagnostics.sky, "")
         tied = ", tied to the reference" if source and self.gauge.tie is not None and "head" in source else ""
         words = f"tangent point {self.sky.lon:.6f} {self.sky.lat:+.6f} deg, {self.sky.pixel_scale:.5g} arcsec/px"
         return f"{words}{', ' * bool(source)}{source}{tied}"
@@ -331,9 +334,9 @@ class Solution:
         )
 
     def _static_in_words(self):
-        if self.settings.get("static") != "fit":
+        if self.settings.static != "fit":
             return []
-        own = self.settings["exposure_degree"]
+        own = self.settings.exposure_degree
         mine = f"modes up to degree {own}" if own else "its pose alone"
         return [f"static  fitted: one distortion for all exposures of a detector, {mine} for every exposure"]
 
@@ -347,14 +350,14 @@ class Solution:
             f"sky     {self.sky_sentence}",
             f"rms     {self.rms[0]:.4f}, {self.rms[1]:.4f} px in x, y; "
             f"{np.count_nonzero(used)} of {len(used)} observations used",
-            *(line for key, text in in_words(self.settings).items() for line in _wrapped(key, text)),
+            *(line for key, text in self.diagnostics.in_words().items() for line in _wrapped(key, text)),
             "",
             f"{'exposure':24s} {'stars':>5s} {'shift x':>9s} {'shift y':>9s} {'rotation':>9s} {'scale':>9s} "
             f"{'rms x':>7s} {'rms y':>7s} {'distortion':>10s}",
         ]
         for name, a in zip(self.names, self.coefficients, strict=True):
             rows = self.observations[used & (self.observations["exposure"] == name)]
-            d = poses.describe(self.poses[name])
+            d = similarity.describe(self.poses[name])
             rms = [np.sqrt(np.mean(rows[k].to_value(u.pix) ** 2)) if len(rows) else np.nan for k in ("dx", "dy")]
             lines.append(
                 f"{name[:24]:24s} {len(rows):5d} {d['dx']:9.2f} {d['dy']:9.2f} {d['rotation']:9.4f} {d['scale']:9.6f} "

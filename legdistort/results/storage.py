@@ -1,8 +1,8 @@
-"""Solutions and WCSs as ASDF files that any gwcs user can open.
+"""Solutions as ASDF files, plain trees that any asdf reads.
 
-Files follow ASDF standard 1.5.0, which stacks of early 2025 read as well. The tree of a solution is plain: arrays,
-numbers and strings under ``legdistort``; the WCS of an exposure stands at ``meta.wcs``. Both have a schema in
-``legdistort/data``. Inverses are written with their certificate, which is checked again when they are read.
+Files follow ASDF standard 1.5.0, which stacks of early 2025 read as well: arrays, numbers and strings under
+``legdistort``, with a schema in ``legdistort/data``. Inverses are written with their certificate, which is checked
+again when they are read.
 """
 
 import dataclasses
@@ -20,21 +20,23 @@ from ..geometry.distortion import Inverse
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from ..inputs.plain_columns import plain, plain_columns, restored
-from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
 from .catalogue_tie import Tie
+from .diagnostics import AliasedDegree, DegreeChoice, Diagnostics, UsedReference, Validation
 from .gauge import Gauge
-from .stored_covariances import StoredUncertainty
+from .settings import Settings
 
 #: Version of the layout under ``legdistort``.
-LAYOUT = 2
+LAYOUT = 1
 
 
-# -- one WCS
+@dataclasses.dataclass(frozen=True, eq=False)
+class StoredUncertainty:
+    """Covariances read from a file; see `legdistort.solving.equations.covariances.Uncertainty`."""
 
-
-# -- solutions
+    coefficients: np.ndarray
+    stars: np.ndarray
 
 
 def write_solution(solution, path, *, overwrite=False):
@@ -42,8 +44,9 @@ def write_solution(solution, path, *, overwrite=False):
     table = plain_columns(solution.observations)
     tree = {
         "layout": LAYOUT,
-        "provenance": solution.provenance or provenance.stamp(),
-        "settings": solution.settings,
+        "provenance": solution.provenance,
+        "settings": dataclasses.asdict(solution.settings),
+        "diagnostics": dataclasses.asdict(solution.diagnostics),
         "status": solution.status,
         "degree": solution.degree,
         "chi2": float(solution.chi2),
@@ -52,18 +55,18 @@ def write_solution(solution, path, *, overwrite=False):
         "stars": {"star": np.asarray(solution.star_names), "position": solution.positions},
         "columns": table.colnames,  # their order: that of a mapping is lost in files
         "observations": {name: plain(table[name]) for name in table.colnames},
-        "covariance": solution.uncertainty.stored(),
+        "covariance": {key: getattr(solution.uncertainty, key) for key in ("coefficients", "stars")},
         "gauge": _fields(solution.gauge) | {"tie": _fields(solution.gauge.tie)},
         "sky": None
         if solution.sky is None
         else {"lon": solution.sky.lon, "lat": solution.sky.lat, "matrix": solution.sky.matrix},
         "left_out": solution.left_out,
     }
-    file = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
+    content = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
     for column in tree["observations"].values():  # names repeat; covariances and coefficients would not get smaller
-        file.set_array_compression(column["values"], "zlib")
-    with replacing(path, overwrite=overwrite) as temporary:
-        file.write_to(temporary)
+        content.set_array_compression(column["values"], "zlib")
+    with replacing(path, overwrite=overwrite) as file:
+        content.write_to(file)
     return Path(path)
 
 
@@ -93,25 +96,10 @@ def read_solution(path, kind, *, max_bytes=None):
     tree = read_tree(path, max_bytes=MAX_BYTES if max_bytes is None else max_bytes).get("legdistort")
     if not isinstance(tree, dict) or "layout" not in tree:
         raise InputError(f"{path} holds no legdistort solution (no entry 'legdistort'); give a solution.asdf")
-    if tree["layout"] not in (1, LAYOUT):
-        raise InputError(f"{path} has layout {tree['layout']}, this version reads 1 to {LAYOUT}; update legdistort")
-    if tree["layout"] == 1:
-        tree = understood(path, layout_2, tree)
-    check_tree({"legdistort": tree}, "solution-2.schema.yaml", path)
+    if tree["layout"] != LAYOUT:
+        raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
+    check_tree({"legdistort": tree}, "solution-1.schema.yaml", path)
     return understood(path, partial(_from_tree, kind), tree)
-
-
-def layout_2(tree):
-    """A tree of layout 1 as one of layout 2: text as arrays, and room for the certified inverses, which it lacks."""
-    return tree | {
-        "layout": 2,
-        "exposures": [{**exposure, "inverse": None} for exposure in tree["exposures"]],
-        "stars": tree["stars"] | {"star": np.array(tree["stars"]["star"])},
-        "observations": {
-            name: {"values": np.array(column["values"]), "unit": column["unit"]}
-            for name, column in tree["observations"].items()
-        },
-    }
 
 
 def _fields(thing):
@@ -125,6 +113,23 @@ def _made(kind, tree):
         return None
     known = {field.name: tree[field.name] for field in dataclasses.fields(kind) if field.name in tree}
     return kind(**{key: np.array(value) if hasattr(value, "shape") else value for key, value in known.items()})
+
+
+def _diagnostics(tree):
+    """`Diagnostics` from their fields by name, sequences as tuples."""
+    kinds = {"reference": UsedReference, "selection": DegreeChoice, "validation": Validation}
+    found = {key: kind(**tree[key]) for key, kind in kinds.items() if tree[key] is not None}
+    if chosen := found.get("selection"):
+        degrees = tuple(AliasedDegree(**each) for each in chosen.aliasing)
+        found["selection"] = dataclasses.replace(chosen, aliasing=degrees)
+    return Diagnostics(**tree | found)
+
+
+def _tuples(value):
+    """A tree with tuples for lists, as frozen objects have them."""
+    if isinstance(value, dict):
+        return {key: _tuples(each) for key, each in value.items()}
+    return tuple(_tuples(each) for each in value) if isinstance(value, list) else value
 
 
 def _from_tree(kind, tree):
@@ -145,10 +150,11 @@ def _from_tree(kind, tree):
         dof=tree["dof"],
         status=tree["status"],
         gauge=_made(Gauge, tree["gauge"] | {"tie": _made(Tie, tree["gauge"].get("tie"))}),
-        uncertainty=StoredUncertainty(*(np.array(tree["covariance"][key]) for key in ("coefficients", "stars"))),
+        uncertainty=StoredUncertainty(**{key: np.array(value) for key, value in tree["covariance"].items()}),
+        settings=Settings(**tree["settings"]),
+        diagnostics=_diagnostics(_tuples(tree["diagnostics"])),
         sky=None if sky is None else TangentPlane(sky["lon"], sky["lat"], np.array(sky["matrix"])),
         left_out=dict(tree["left_out"]),
-        settings=dict(tree["settings"]),
         provenance=dict(tree["provenance"]),
     )
     _check_consistent(solution)

@@ -6,12 +6,14 @@ Only then does asdf open it.
 """
 
 import hashlib
+import io
 import math
 import mmap
 import re
 import struct
 import warnings
 import zlib
+from contextlib import nullcontext
 from importlib import resources
 from pathlib import Path
 
@@ -45,12 +47,14 @@ _BLOCK = b"\xd3BLK"
 _HEADER = struct.Struct(">I4sQQQ16s")  # flags, compression, allocated, used, unpacked, checksum
 
 
-def read_tree(path, *, tags=CORE, max_bytes=MAX_BYTES):
+def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
     """The tree of an ASDF file, all arrays in memory.
 
     Parameters
     ----------
     path : str or path
+    content : bytes, optional
+        What stands in the file, if it is part of another one; `path` then is a name for messages.
     tags : tuple of str
         Beginnings of the YAML tags that may stand in the file; a tag makes asdf call a converter.
     max_bytes : int
@@ -61,19 +65,20 @@ def read_tree(path, *, tags=CORE, max_bytes=MAX_BYTES):
     InputError
         Naming the file and what is wrong with it.
     """
-    path = Path(path)
     if not isinstance(max_bytes, int) or max_bytes < 1:
         raise InputError(f"max_bytes must be a positive number of bytes, got {max_bytes!r}")
-    if not path.exists():
+    inside = content is not None
+    if not inside and not Path(path).exists():
         raise InputError(f"{path}: no such file")
-    if not path.is_file():
+    if not inside and not Path(path).is_file():
         raise InputError(f"{path} is not a readable ASDF file: not a file")
     try:
-        with path.open("rb") as file, warnings.catch_warnings():
+        # absolute, since asdf takes ~x for somebody's home
+        with io.BytesIO(content) if inside else Path(path).absolute().open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore", asdf.exceptions.AsdfWarning)  # of other versions; the schema has the say
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                end = _check_yaml(content, tags, max_bytes)
-                _check_blocks(content, end, max_bytes)
+            with nullcontext(content) if inside else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
+                end = _check_yaml(whole, tags, max_bytes)
+                _check_blocks(whole, end, max_bytes)
             _check_node(asdf.util.load_yaml(file, tagged=True), "", [max_bytes])
             file.seek(0)
             with asdf.open(file, memmap=False, lazy_load=False) as opened:
@@ -103,9 +108,11 @@ def check_tree(tree, schema, path):
     InputError
         Naming the entry, what stands there and what should.
     """
-    place = resources.files("legdistort") / "data" / schema
+    place, uri = resources.files("legdistort") / "data" / schema, f"asdf://legdistort/{schema}"
     try:
-        asdf.AsdfFile(tree, custom_schema=str(place)).validate()
+        with asdf.config_context() as config:  # under a name of its own: asdf would take the path for a URL
+            config.add_resource_mapping({uri: place.read_bytes()})
+            asdf.AsdfFile(tree, custom_schema=uri).validate()
     except asdf.exceptions.ValidationError as error:
         entry = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in error.absolute_path).lstrip(".")
         meaning = "" if error.validator == "required" else error.schema.get("description", "")

@@ -1,8 +1,13 @@
-"""Outputs appear under their name only when they are complete, and replace nothing unless asked."""
+"""Outputs appear under their name only when they are complete, and replace nothing unless asked.
+
+Libraries that write are handed open files, never paths: some take parts of a path for those of a URL, or for a home
+folder, and would write elsewhere.
+"""
 
 import os
 import shutil
 import tempfile
+import uuid
 from contextlib import contextmanager
 from errno import EDQUOT, ENOSPC
 from pathlib import Path
@@ -91,7 +96,7 @@ def _told_when_full(path):
 
 @contextmanager
 def replacing(path, *, overwrite=False):
-    """A temporary name beside `path` that becomes `path` when the block ends well.
+    """An open binary file, to be written, that becomes `path` when the block ends well.
 
     Parameters
     ----------
@@ -108,16 +113,15 @@ def replacing(path, *, overwrite=False):
     """
     path = Path(path)
     check_file(path, overwrite=overwrite)
-    # the whole suffix is kept, since writers choose compression by it; they know it in small letters only
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".partial-", suffix=f"-{path.name.lower()}")
-    os.close(handle)
-    os.unlink(temporary)  # some writers refuse an existing file
+    # a name of its own, since a long one would become too long; absolute, since asdf takes ~x for somebody's home
+    temporary = path.absolute().with_name(f".partial-{uuid.uuid4().hex}")
     try:
         with _told_when_full(path):
-            yield Path(temporary)
+            with temporary.open("wb") as file:
+                yield file
             os.replace(temporary, path)
     finally:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -141,7 +145,7 @@ def replacing_folder(out):
     out = Path(out)
     check_folder(out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".partial-{out.name}-"))
+    temporary = Path(tempfile.mkdtemp(dir=out.parent, prefix=".partial-"))
     try:
         with _told_when_full(out):
             yield temporary

@@ -15,6 +15,7 @@ from ..geometry import basis
 from ..priors.prior import Prior
 from ..solving.equations import criterion, elimination
 from ..solving.equations.covariances import Uncertainty
+from ..solving.equations.problem import State
 
 
 def spectrum_of(given, degree, name="spectrum"):
@@ -136,7 +137,7 @@ def alias(problem, state, gauge, covariance, *, independent, common):
     degree = basis.degree_of(max(independent.shape[1], common.shape[1]))
     mean = basis.change_degree(problem.prior_mean, max(degree, basis.degree_of(problem.prior_mean.shape[2])))
     full = replace(problem, degree=degree, prior_mean=mean, prior_sigma=None, static_sigma=None)
-    blocks = criterion.linearise(full, criterion.State(state.positions, mean, state.poses))
+    blocks = criterion.linearise(full, State(state.positions, mean, state.poses))
     normal = elimination.reduced_matrix(full, blocks)
     fitted = np.tile(np.arange(full.n_modes) < n_fit, 2 * n_exposures)
     left = np.zeros((len(normal), np.count_nonzero(~fitted)))  # of all modes, for unit amplitudes of those left out
@@ -145,8 +146,7 @@ def alias(problem, state, gauge, covariance, *, independent, common):
     independent, common = (basis.change_degree(a, degree)[:, n_fit:].ravel() for a in (independent, common))
     together = left.reshape(len(left), n_exposures, -1).sum(axis=1)
     factor = np.hstack([left * np.tile(independent, n_exposures), together * common])
-    spread = Uncertainty(full, blocks, gauge)
-    spread.coefficients = factor @ factor.T
+    spread = Uncertainty(full, blocks, gauge, coefficients=factor @ factor.T)
     stars = spread.stars[:2] - elimination.inverse_star_blocks(blocks.v)[:2]  # without noise of their own
     folded = np.einsum("kc,kc->k", factor, factor)[fitted].reshape(n_exposures, 2, n_fit)
     return Aliasing(spread.coefficients, stars, np.sqrt(folded.mean(axis=0)))

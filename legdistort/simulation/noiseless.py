@@ -3,13 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-from astropy import units as u
-from astropy.table import QTable
 
 from ..geometry.detector_modes import dynamic_basis
-from ..results.solution import Solution
+from ..results.settings import Settings
+from ..solving.assembly import assemble
 from ..solving.equations import criterion
 from ..solving.equations.covariances import Uncertainty
+from ..solving.equations.problem import State
 from ..solving.gauge import constraints
 
 #: Without an assumption the scatter of single exposures is taken to be this many times the errors.
@@ -37,29 +37,21 @@ def noiseless_solution(matches, problem, layout, kind, scatter):
     Solution
     State
     """
-    stars = np.asarray(matches.stars)
-    positions = layout.positions[stars]
-    state = criterion.State(positions.T.copy(), problem.prior_mean.copy(), np.stack(list(layout.poses.values())))
+    positions = layout.positions[np.asarray(matches.stars)]
+    state = State(positions.T.copy(), problem.prior_mean.copy(), np.stack(list(layout.poses.values())))
     blocks = criterion.linearise(problem, state)
     gauge = _gauge(kind, problem, state, blocks, scatter, layout.sigma)
-    table = QTable(matches.table, copy=False)
-    table["dx"] = table["dy"] = np.zeros(len(table)) * u.pix
-    table["used"] = np.ones(len(table), dtype=bool)
-    solution = Solution(
-        names=problem.names,
-        degree=problem.degree,
-        shapes=dict(matches.shapes),
-        poses=dict(layout.poses),
-        coefficients=state.coefficients,
-        prior_mean=problem.prior_mean,
-        star_names=stars,
-        positions=positions,
-        observations=table,
-        chi2=0.0,
-        dof=0,
+    exact = replace(blocks, residual=np.zeros_like(blocks.residual), chi2=0.0)
+    solution = assemble(
+        matches,
+        problem,
+        state,
+        exact,
+        gauge,
+        Uncertainty(problem, blocks, gauge),
+        settings=Settings(problem.degree, "predicted", gauge=kind),
         status="predicted: nothing was measured",
-        gauge=gauge,
-        uncertainty=Uncertainty(problem, blocks, gauge),
+        dof=0,
     )
     return solution, state
 

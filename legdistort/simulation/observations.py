@@ -15,7 +15,9 @@ from tqdm import tqdm
 from ..exceptions import InputError
 from ..geometry import similarity
 from ..inputs.matches import Matches
+from ..inputs.table_files import write_table
 from ..runtime.checks import check_counts
+from ..runtime.outputs import replacing
 from . import gsaoi_night, rendering
 from .truth import (
     Truth,
@@ -60,8 +62,9 @@ class SimulatedExposures:
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / f"{name}.fits" for name in self.hdus]
         for path, hdulist in zip(paths, self.hdus.values(), strict=True):
-            hdulist.writeto(path, overwrite=True)
-        self.truth.table().write(folder / "truth.ecsv", overwrite=True)
+            with replacing(path, overwrite=True) as file:
+                hdulist.writeto(file)
+        write_table(self.truth.table(), folder / "truth.ecsv", overwrite=True)
         return paths
 
     def __repr__(self):

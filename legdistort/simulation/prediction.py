@@ -14,7 +14,7 @@ from ..geometry import basis
 from ..results import accuracy
 from ..results.solution import Solution
 from ..runtime.checks import check_choice, check_counts
-from ..solving.equations import problem_builder
+from ..solving.equations.problem import build_problem
 from ..solving.gauge.constraints import KINDS
 from .aliasing import alias, assumed_spectra
 from .noiseless import noiseless_solution
@@ -320,7 +320,7 @@ def predict(
     )  # fmt: skip
     sigma_meas = layout.sigma
     matches = layout.matches(np.zeros((2, 1)) if prior is None else prior.mean)
-    problem = problem_builder.build(matches, degree, prior=prior)
+    problem = build_problem(matches, degree, prior=prior)
     fitted = independent[:, : problem.n_modes]
     known = bool(np.isfinite(fitted).all())
     solution, state = noiseless_solution(matches, problem, layout, gauge, fitted if known else None)

@@ -12,7 +12,7 @@ from .equations import criterion, elimination
 MAX_ROUNDS = 8
 
 
-def solve_clipped(problem, start, *, clip, gauge="minimal", loss="linear", **limit):
+def solve_clipped(problem, start, *, clip, gauge="minimal", loss="linear", max_iterations=None):
     """Joint solution without the observations that deviate by more than `clip` standard errors.
 
     A solution with the Cauchy loss, which gross errors hardly move, says which observations deviate. They
@@ -25,10 +25,8 @@ def solve_clipped(problem, start, *, clip, gauge="minimal", loss="linear", **lim
     problem : Problem
     start : State
     clip : float
-    gauge, loss
+    gauge, loss, max_iterations
         As for `legdistort.solving.minimisers.solve_joint`.
-    **limit
-        ``max_iterations``.
 
     Returns
     -------
@@ -53,9 +51,8 @@ def solve_clipped(problem, start, *, clip, gauge="minimal", loss="linear", **lim
         unfit = unfit_exposures(problem, used)
         if unfit:
             break
-        result = minimisers.solve_joint(
-            problem.scaled(used.astype(float)), result.state, gauge=gauge, loss=loss, **limit
-        )
+        kept = problem.scaled(used.astype(float))
+        result = minimisers.solve_joint(kept, result.state, gauge=gauge, loss=loss, max_iterations=max_iterations)
     return result, used, unfit
 
 

@@ -2,20 +2,21 @@
 
 import logging
 import warnings
+from dataclasses import fields, replace
 
 import numpy as np
-from astropy import units as u
-from astropy.table import QTable
 
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, warn
 from ..inputs.matches import Matches
-from ..results.solution import Solution
-from ..runtime import provenance
+from ..results.diagnostics import Diagnostics
+from ..results.settings import Settings
 from . import model_forms, reference_tie, single_fit
-from .choices import held_out_stars, prior_widths
+from .assembly import assemble
+from .choices.degree_choice import choose_degree
+from .choices.held_out import hold_out, validation
 from .equations import effective_modes
 from .equations.covariances import Uncertainty
-from .options import check_options, check_reference, own_degree
+from .options import SolveOptions, check_reference
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +51,7 @@ def solve(
     matches : Matches
     degree : int or "auto"
         Total degree of the Legendre series, 0 to 30; or the one up to 6 whose distortions serve stars best that are
-        left out of the fit (`legdistort.solving.choices.held_out_stars`).
+        left out of the fit (`legdistort.solving.choices.degree_choice`).
     prior : Prior or dict, optional
         Static distortion; one, or by ``detector`` or exposure name. None starts from no distortion.
     model : `~astropy.modeling.Model`, optional
@@ -81,11 +82,11 @@ def solve(
         Pixels, added in quadrature to every stated error.
     errors : {"stated", "scale", "floor"}
         Take the stated errors as they are; or scale the reported errors by sqrt(chi2/dof); or find the error floor
-        that makes chi2 its degrees of freedom (zero if it is smaller already). What was found is in ``settings``.
+        that makes chi2 its degrees of freedom (zero if it is smaller already). What was found is in ``diagnostics``.
     max_iterations : int, optional
     validate : float, optional
         Keep this fraction of the stars, 0 to 0.5, out of everything, and report their scatter beside the one to be
-        expected: ``settings["validation"]``. They are not in the tables of the solution.
+        expected: ``diagnostics.validation``. They are not in the tables of the solution.
     reference : `~astropy.table.Table` or path, optional
         Positions with errors that tie shift, rotation and scale, and the maps that the exposures do not tell; relative
         positions stay as precise as they are. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error`` [mas]
@@ -108,85 +109,62 @@ def solve(
     SolveError
         If an exposure has fewer stars than modes, or the unknowns are not determined.
     """
-    check_options(
-        degree=degree, gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
-        max_iterations=max_iterations, validate=validate, static=static, exposure_degree=exposure_degree,
+    asked = SolveOptions(
+        degree=degree, prior=prior, model=model, static=static, exposure_degree=exposure_degree, gauge=gauge,
+        method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors, max_iterations=max_iterations,
+        validate=validate,
     )  # fmt: skip
-    if model is not None and (degree == held_out_stars.AUTO or static is not None):
-        raise InputError("a model says what is fitted in every exposure: leave degree='auto' and static out")
     catalogue, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
     if not isinstance(matches, Matches):
         raise InputError(
             f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
         )
-    form = None if model is None else model_forms.read(model, matches, degree=degree, prior=prior, gauge=gauge)
-    degree = degree if form is None else form.degree
-    options = {
-        "degree": degree,
-        "prior": prior if form is None else form.prior(),
-        "own_degree": None if degree == held_out_stars.AUTO else own_degree(static, exposure_degree, degree, method),
-        "gauge": gauge,
-        "method": method,
-        "loss": loss,
-        "clip": clip,
-        "limit": {} if max_iterations is None else {"max_iterations": max_iterations},
-        "scale": errors == "scale",
-    }
-    matches, kept_out = (matches, None) if validate is None else held_out_stars.hold_out(matches, validate)
-    with single_fit.threads(matches):
-        chosen = _choose(matches, error_floor, options) if degree == held_out_stars.AUTO else None
-        fit = single_fit.estimate(matches, error_floor, options)
+    options, form, selection = asked, None, None
+    if model is not None:
+        form = model_forms.read(model, matches, degree=degree, gauge=gauge)
+        options = replace(asked, degree=form.degree, model=None, prior=form.prior())
+    given, kept_out = (matches, None) if validate is None else hold_out(matches, validate)
+    with single_fit.threads(given):
+        if options.chooses_degree:
+            selection = _choose_degree(given, options)
+            options = replace(options, degree=selection.degree)
+        fit = single_fit.estimate(given, options)
         if errors == "floor":
-            fit = single_fit.estimate_with_floor(matches, fit, options)
-    log.info("%s; chi2 %.1f for %d degrees of freedom", fit.result.status, fit.chi2, fit.dof)
-    scale = np.sqrt(fit.chi2 / fit.dof) if errors == "scale" and fit.dof > 0 else 1.0
-    settings = {
-        "degree": int(options["degree"]),
-        "selection": chosen,
-        "gauge": gauge,
-        "method": method,
-        "loss": loss,
-        "clip": None if clip is None else float(clip),
-        "errors": errors,
-        "error_floor": float(fit.error_floor),
-        "error_scale": float(scale),
-        "prior": _describe(prior),
-        "model": None if form is None else form.describe(),
-        "widths": prior_widths.describe(prior, fit.widths, scale),
-        "effective_modes": dict(zip(fit.problem.names, fit.effective_modes.round(3).tolist(), strict=True)),
-        "departure_ratio": effective_modes.departure_ratio(fit.problem, fit.result.gauge, fit.blocks, fit.uncertainty),
-        "static": static,
-        "exposure_degree": options["own_degree"],
-    }
-    _warn_of_untold(fit)
-    if catalogue is not None:
-        with single_fit.threads(matches):
-            fit = reference_tie.tie_to(fit, catalogue, options, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
-    settings |= reference_tie.describe(fit, catalogue, matches.sky)
-    solution = _solution(fit, scale, settings, form)
-    if kept_out is not None:
-        settings["validation"] = held_out_stars.validation(solution, kept_out, validate)
-    return solution
+            fit = single_fit.estimate_with_floor(given, fit, options)
+        _tell(fit, given)
+        scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
+        diagnostics = _diagnostics(fit, prior, scale, selection)
+        if catalogue is not None:
+            fit = reference_tie.tie_to(fit, catalogue, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
+    sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
+    found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue))
+    solution = _solution(fit, scale, _settings(asked, options, form), found, form)
+    if kept_out is None:
+        return solution
+    return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
 
 
-def _choose(matches, error_floor, options):
-    """Put the degree that serves best into the options, and return how it was found."""
+def _choose_degree(matches, options):
+    """The `DegreeChoice`; an alarm is told."""
 
     def fit(part, degree):
-        trial = single_fit.estimate(part, error_floor, options | {"degree": degree, "trial": True})
-        return _solution(trial, 1.0, {"error_floor": error_floor}, None)
+        trial = single_fit.estimate(part, replace(options, degree=degree))
+        return _solution(trial, 1.0, Settings(degree, options.method), Diagnostics(error_floor=options.error_floor))
 
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", LegdistortWarning)  # of fits that are thrown away
-        chosen = held_out_stars.choose_degree(matches, fit)
-    options["degree"] = chosen["degree"]
-    if chosen["alarm"]:
-        warn(f"degree {chosen['sentence']}", AssumptionWarning)
+        chosen = choose_degree(matches, fit)
+    if chosen.alarm:
+        warn(f"degree {chosen.sentence}", AssumptionWarning)
     return chosen
 
 
-def _warn_of_untold(fit):
-    """Say how much of a shared distortion these exposures cannot tell."""
+def _tell(fit, matches):
+    """Log how the fit ended and what it left out, and warn of what these exposures cannot tell."""
+    log.info("%s; chi2 %.1f for %d degrees of freedom", fit.result.status, fit.chi2, fit.dof)
+    for name, reason in fit.matches.left_out.items():
+        if name not in matches.left_out:
+            log.warning("exposure %s is left out: %s", name, reason)
     if fit.problem.unknowns.shared and (n_weak := fit.result.n_weak):
         warn(
             f"static='fit': {n_weak} of {fit.problem.unknowns.n_common} unknowns of the shared distortion are not told "
@@ -195,45 +173,51 @@ def _warn_of_untold(fit):
         )
 
 
-def _describe(prior):
-    """A prior as plain numbers and strings, by detector or exposure if it was given so; None if there is none.
+def _diagnostics(fit, prior, scale, selection):
+    """What was found before a reference is asked."""
+    each = prior.values() if isinstance(prior, dict) else [prior]
+    return Diagnostics(
+        error_floor=float(fit.options.error_floor),
+        error_scale=scale,
+        widths=None if fit.widths is None else fit.widths.describe(prior, scale),
+        prior_has_widths=any(p is not None and p.sigma is not None for p in each),
+        effective_modes=dict(zip(fit.problem.names, fit.effective_modes.round(3).tolist(), strict=True)),
+        departure_ratio=effective_modes.departure_ratio(fit.problem, fit.result.gauge, fit.blocks, fit.uncertainty),
+        selection=selection,
+    )
 
-    Its mean is in the solution already, by exposure.
+
+def _settings(asked, options, form):
+    """The options in plain numbers and strings.
+
+    The mean of a prior is in the solution already, by exposure.
     """
-    if prior is None or not isinstance(prior, dict):
-        return None if prior is None else prior.describe()
-    return {str(name): None if each is None else each.describe() for name, each in prior.items()}
+    made = {field.name: getattr(asked, field.name) for field in fields(Settings)}
+    made |= {"degree": int(options.degree), "exposure_degree": options.own_degree}
+    for name in ("clip", "error_floor", "validate"):
+        made[name] = None if made[name] is None else float(made[name])
+    prior = asked.prior
+    if isinstance(prior, dict):
+        prior = {str(name): None if each is None else each.describe() for name, each in prior.items()}
+    elif prior is not None:
+        prior = prior.describe()
+    return Settings(**made | {"prior": prior, "model": None if form is None else form.describe()})
 
 
-def _solution(fit, scale, settings, form):
-    """Bring the solver's arrays back into the order and the words of the user."""
-    matches, problem, result = fit.matches, fit.problem, fit.result
-    table = QTable(matches.table, copy=False)
-    back = np.empty_like(fit.blocks.residual)
-    back[:, problem.order] = fit.blocks.residual
-    table["dx"], table["dy"] = back * u.pix
-    table["used"] = np.zeros(len(table), dtype=bool)
-    table["used"][problem.order] = fit.used
-    positions = result.state.positions.T.copy()
-    positions[fit.blocks.v[0] <= 0] = np.nan
-    return Solution(
-        names=problem.names,
-        degree=problem.degree,
-        shapes=dict(matches.shapes),
-        poses=dict(zip(problem.names, result.state.poses, strict=True)),
-        coefficients=result.state.coefficients if form is None else form.hold(problem.names, result.state.coefficients),
-        prior_mean=problem.prior_mean,
-        star_names=np.asarray(matches.stars),
-        positions=positions,
-        observations=table,
-        chi2=fit.chi2,
-        dof=fit.dof,
-        status=result.status,
-        gauge=result.gauge,
-        uncertainty=fit.uncertainty if scale == 1 else Uncertainty(fit.weighted, fit.blocks, result.gauge, scale=scale),
-        sky=matches.sky,
-        left_out=dict(matches.left_out),
+def _solution(fit, scale, settings, diagnostics, form=None):
+    uncertainty = fit.uncertainty
+    if scale != 1:
+        uncertainty = Uncertainty(fit.weighted, fit.blocks, fit.result.gauge, scale=scale)
+    return assemble(
+        fit.matches,
+        fit.weighted,
+        fit.result.state,
+        fit.blocks,
+        fit.result.gauge,
+        uncertainty,
         settings=settings,
+        diagnostics=diagnostics,
+        status=fit.result.status,
+        dof=fit.dof,
         form=form,
-        provenance=provenance.stamp(),
     )

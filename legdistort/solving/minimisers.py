@@ -16,12 +16,14 @@ from ..geometry import basis
 from ..results.gauge import Gauge
 from ..runtime.checks import check_choice
 from .equations import criterion, elimination, reduced_system
-from .equations.criterion import State
+from .equations.problem import State
 from .gauge import constraints
 
 log = logging.getLogger(__name__)
 
 LOSSES = ("linear", "huber", "cauchy")
+#: Iterations of the joint solver and sweeps of the alternating one at most, unless another number is given.
+MAX_ITERATIONS, MAX_SWEEPS = 50, 1000
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
 
 
@@ -68,7 +70,7 @@ def loss_factors(squares, loss):
     return 1 / np.maximum(1, np.sqrt(s)) if loss == "huber" else 1 / (1 + s)
 
 
-def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", max_iterations=50, tolerance=5e-5):
+def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", max_iterations=None, tolerance=5e-5):
     """Gauss-Newton on all unknowns under the constraints of the gauge.
 
     Parameters
@@ -81,7 +83,8 @@ def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", 
         Map of the reference plane at which to hold what the data do not tell, see
         `legdistort.solving.gauge.constraints.make`.
     loss : {"linear", "huber", "cauchy"}
-    max_iterations : int
+    max_iterations : int, optional
+        50 if not given.
     tolerance : float
         Converged when the next step would be below this many standard errors, rms over the unknowns; it is not taken.
 
@@ -95,8 +98,9 @@ def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", 
         If the unknowns are not determined.
     """
     check_choice(loss, LOSSES, "loss")
+    max_iterations = MAX_ITERATIONS if max_iterations is None else max_iterations
     state, _ = constraints.absorb_similarities(problem, state)
-    run = _Descent(problem, state, gauge=gauge, common=common, loss=loss)
+    run = _Descent(problem, state, _Rules(gauge, common, loss))
     run.descend(max_iterations, tolerance)
     while run.converged and (freer := run.freer()) is not None:
         with contextlib.suppress(SolveError):
@@ -117,27 +121,37 @@ def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", 
     return Result(run.state, run.blocks, convention, run.converged, status, run.history, run.factors, run.system.n_weak)
 
 
+@dataclass(frozen=True, eq=False)
+class _Rules:
+    """What a descent follows; see `solve_joint`."""
+
+    gauge: str
+    common: np.ndarray | None
+    loss: str
+
+
 class _Descent:
     """Gauss-Newton iterations under one set of constraints."""
 
-    def __init__(self, problem, state, *, gauge, common, loss, told=None, history=()):
-        self.problem, self.state, self.settings = problem, state, {"gauge": gauge, "common": common, "loss": loss}
+    def __init__(self, problem, state, rules, *, told=None, history=()):
+        self.problem, self.state, self.rules = problem, state, rules
         self.told, self.history, self.converged = told, list(history), False
-        self._reweight(criterion.residuals(problem, state) if loss != "linear" else None)
+        self._reweight(criterion.residuals(problem, state) if rules.loss != "linear" else None)
         self.blocks = criterion.linearise(self.weighted, state)
         self._prepare()
 
     def _reweight(self, residuals):
-        if self.settings["loss"] == "linear":
+        if self.rules.loss == "linear":
             self.factors, self.weighted = np.ones(self.problem.xy.shape[1]), self.problem
             return
-        self.factors = loss_factors(criterion.squares(self.problem, residuals), self.settings["loss"])
+        self.factors = loss_factors(criterion.squares(self.problem, residuals), self.rules.loss)
         self.weighted = self.problem.scaled(self.factors)
 
     def _prepare(self):
         """The gauge and the reduced system at the current state."""
-        gauge, common = self.settings["gauge"], self.settings["common"]
-        self.convention = constraints.make(gauge, self.weighted, self.state, self.blocks, told=self.told, common=common)
+        self.convention = constraints.make(
+            self.rules.gauge, self.weighted, self.state, self.blocks, told=self.told, common=self.rules.common
+        )
         self.system = reduced_system.reduced_system(self.weighted, self.blocks, self.convention)
 
     def descend(self, max_iterations, tolerance):
@@ -163,14 +177,14 @@ class _Descent:
                 accuracy = max(0.01 * accuracy, 1e-10)
             cost, self.blocks, self.system = self.blocks.cost, None, None  # makes room for the next
             self.state, self.blocks = _advance(self.weighted, self.state, cost, d_star, d_exposure)
-            if self.settings["loss"] != "linear":
+            if self.rules.loss != "linear":
                 self._reweight(self.blocks.residual)
                 self.blocks = criterion.linearise(self.weighted, self.state)
             self._prepare()
 
     def freer(self):
         """The same, less what the data contradict of the convention; None if they contradict nothing."""
-        if self.settings["gauge"] != "minimal" or self.settings["common"] is not None:
+        if self.rules.gauge != "minimal" or self.rules.common is not None:
             return None
         rows = self.convention.told_rows
         more = self.system.contradicted(rows)
@@ -178,7 +192,7 @@ class _Descent:
             return None
         log.debug("the data contradict the convention along %d directions", more.shape[1])
         told = self.convention.left_to_data(np.hstack([rows, more]))
-        return _Descent(self.problem, self.state, told=told, history=self.history, **self.settings)
+        return _Descent(self.problem, self.state, self.rules, told=told, history=self.history)
 
     def is_explained(self, before):
         """Whether the data are explained now, or the distortion is shared and the convention plainly not needed."""
@@ -226,7 +240,7 @@ def _advance(problem, state, cost, d_star, d_exposure):
     )
 
 
-def solve_alternating(problem, state, *, gauge="minimal", max_iterations=1000, tolerance=1e-5):
+def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, tolerance=1e-5):
     """The paper's scheme (section 3.2): stars given A, coefficients given X, until both change by less than 1e-5.
 
     The norms in its two stopping rules are taken as Euclidean over all unknowns. Where it ends along the directions
@@ -240,14 +254,15 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=1000, t
         The static distortion as starting point, see `legdistort.solving.start_values.start`.
     gauge : {"minimal", "mean"}
         Convention in which errors are reported.
-    max_iterations : int
-        Cap on the sweeps.
+    max_iterations : int, optional
+        Cap on the sweeps, 1000 if not given.
     tolerance : float
 
     Returns
     -------
     Result
     """
+    max_iterations = MAX_SWEEPS if max_iterations is None else max_iterations
     n_modes, history, converged = problem.n_modes, [], False
     blocks = criterion.linearise(problem, state)
     for _sweep in range(1, max_iterations + 1):

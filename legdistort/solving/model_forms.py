@@ -128,7 +128,7 @@ class Form:
         return out
 
 
-def read(model, matches, *, degree, prior, gauge):
+def read(model, matches, *, degree, gauge):
     """The `Form` that `solve` was given, once its other arguments are seen to go with it.
 
     Raises
@@ -136,8 +136,6 @@ def read(model, matches, *, degree, prior, gauge):
     InputError
         For a model that cannot be the form of a distortion, or arguments that contradict it.
     """
-    if prior is not None:
-        raise InputError("the static distortion is in the coefficients of model: leave prior out")
     form = Form(model, matches.shapes)
     if degree not in (3, form.degree):  # 3 where the caller said nothing
         raise InputError(

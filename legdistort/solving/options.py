@@ -1,5 +1,6 @@
 """Options of `legdistort.solve`, checked before anything is computed."""
 
+from dataclasses import dataclass
 from numbers import Real
 
 import numpy as np
@@ -7,63 +8,105 @@ import numpy as np
 from ..exceptions import InputError
 from ..geometry import basis
 from ..inputs.reference_catalogue import read_reference, year
+from ..priors.prior import Prior
 from ..runtime.checks import check_choice
-from . import minimisers
-from .choices import held_out_stars
-from .equations import problem_builder
+from .choices.degree_choice import AUTO
+from .equations.problem import check_error_floor
 from .gauge.constraints import KINDS
+from .minimisers import LOSSES
 
 METHODS = ("joint", "alternating")
 ERRORS = ("stated", "scale", "floor")
 
 
-def check_options(*, degree=3, gauge="minimal", method="joint", loss="linear", clip=None, error_floor=0.0,
-                  errors="stated", max_iterations=None, static=None, exposure_degree=None, validate=None):  # fmt: skip
-    """Raise `InputError` for options of `solve` that are out of range or contradict one another."""
-    held_out_stars.check_degree(degree)
-    held_out_stars.check_validate(validate)
-    if degree == held_out_stars.AUTO and static is not None:
-        raise InputError("static='fit' needs a degree in numbers, not 'auto'")
-    own_degree(static, exposure_degree, degree, method)
-    check_choice(gauge, KINDS, "gauge")
-    problem_builder.check_error_floor(error_floor)
-    check_choice(method, METHODS, "method")
-    if method == "alternating" and (loss != "linear" or clip is not None):
-        raise InputError("method='alternating' is the published scheme: it takes neither loss nor clip")
-    check_choice(loss, minimisers.LOSSES, "loss")
-    check_choice(errors, ERRORS, "errors")
-    if errors != "stated" and loss != "linear":
-        raise InputError(f"errors={errors!r} compares chi2 with its expectation, which loss={loss!r} changes; use clip")
-    if errors == "floor" and error_floor:
-        raise InputError("errors='floor' finds the error floor itself: leave error_floor out")
-    if max_iterations is not None and not (isinstance(max_iterations, int) and max_iterations > 0):
-        raise InputError(f"max_iterations must be a positive integer, got {max_iterations!r}")
-    if clip is not None and not (isinstance(clip, Real) and clip > 1):
-        raise InputError(f"clip must be a number of standard errors above 1, got {clip!r}")
-
-
-def own_degree(static, exposure_degree, degree, method):
-    """Up to which degree exposures have modes of their own; None if they share nothing.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SolveOptions:
+    """Those arguments of `legdistort.solve` that can be judged without data; see there.
 
     Raises
     ------
     InputError
         For options that are out of range or contradict one another.
     """
-    check_choice(static, (None, "fit"), "static")
-    if static is None:
-        if exposure_degree is not None:
-            raise InputError("exposure_degree belongs to static='fit', where exposures share the modes above it")
-        return None
-    if method != "joint":
-        raise InputError("static='fit' needs method='joint'")
-    own = 1 if exposure_degree is None else basis.check_degree(exposure_degree, "exposure_degree")
-    if own >= degree or degree < 2:
-        raise InputError(
-            f"static='fit' shares the modes above exposure_degree={own} up to degree={degree}: there are none; raise "
-            "degree (at least 2) or lower exposure_degree"
-        )
-    return own
+
+    degree: int | str = 3
+    prior: Prior | dict | None = None
+    model: object = None
+    static: str | None = None
+    exposure_degree: int | None = None
+    gauge: str = "minimal"
+    method: str = "joint"
+    loss: str = "linear"
+    clip: float | None = None
+    error_floor: float = 0.0
+    errors: str = "stated"
+    max_iterations: int | None = None
+    validate: float | None = None
+
+    def __post_init__(self):
+        self._check_model_of_distortion()
+        check_choice(self.gauge, KINDS, "gauge")
+        check_error_floor(self.error_floor)
+        check_choice(self.method, METHODS, "method")
+        if self.method == "alternating" and (self.loss != "linear" or self.clip is not None):
+            raise InputError("method='alternating' is the published scheme: it takes neither loss nor clip")
+        check_choice(self.loss, LOSSES, "loss")
+        check_choice(self.errors, ERRORS, "errors")
+        if self.errors != "stated" and self.loss != "linear":
+            raise InputError(
+                f"errors={self.errors!r} compares chi2 with its expectation, which loss={self.loss!r} changes; use clip"
+            )
+        if self.errors == "floor" and self.error_floor:
+            raise InputError("errors='floor' finds the error floor itself: leave error_floor out")
+        if self.max_iterations is not None and not (isinstance(self.max_iterations, int) and self.max_iterations > 0):
+            raise InputError(f"max_iterations must be a positive integer, got {self.max_iterations!r}")
+        if self.clip is not None and not (isinstance(self.clip, Real) and self.clip > 1):
+            raise InputError(f"clip must be a number of standard errors above 1, got {self.clip!r}")
+
+    def _check_model_of_distortion(self):
+        """The degree, what is shared, what is kept out, and a model that says it all."""
+        if not isinstance(self.degree, str):
+            basis.check_degree(self.degree)
+        elif not self.chooses_degree:
+            raise InputError(f"degree must be an integer or {AUTO!r}, got {self.degree!r}")
+        real = isinstance(self.validate, Real) and not isinstance(self.validate, bool)
+        if self.validate is not None and not (real and 0 < self.validate < 0.5):
+            raise InputError(f"validate must be a fraction of the stars between 0 and 0.5, got {self.validate!r}")
+        if self.chooses_degree and self.static is not None:
+            raise InputError("static='fit' needs a degree in numbers, not 'auto'")
+        self._check_static()
+        if self.model is not None and (self.chooses_degree or self.static is not None):
+            raise InputError("a model says what is fitted in every exposure: leave degree='auto' and static out")
+        if self.model is not None and self.prior is not None:
+            raise InputError("the static distortion is in the coefficients of model: leave prior out")
+
+    def _check_static(self):
+        check_choice(self.static, (None, "fit"), "static")
+        if self.static is None:
+            if self.exposure_degree is not None:
+                raise InputError("exposure_degree belongs to static='fit', where exposures share the modes above it")
+            return
+        if self.method != "joint":
+            raise InputError("static='fit' needs method='joint'")
+        if self.exposure_degree is not None:
+            basis.check_degree(self.exposure_degree, "exposure_degree")
+        if self.own_degree >= self.degree or self.degree < 2:
+            raise InputError(
+                f"static='fit' shares the modes above exposure_degree={self.own_degree} up to degree={self.degree}: "
+                "there are none; raise degree (at least 2) or lower exposure_degree"
+            )
+
+    @property
+    def chooses_degree(self):
+        """Whether the degree is to be found from the stars."""
+        return self.degree == AUTO
+
+    @property
+    def own_degree(self):
+        """Up to which degree exposures have modes of their own; None if they share nothing."""
+        if self.static is None:
+            return None
+        return 1 if self.exposure_degree is None else int(self.exposure_degree)
 
 
 def check_reference(reference, *, epoch=None, pixel_scale=None, method="joint"):

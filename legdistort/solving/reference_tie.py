@@ -16,10 +16,11 @@ from ..inputs import column_contract
 from ..inputs.matches import robust_similarity
 from ..matching.cross_identification import identify
 from ..results.catalogue_tie import Knowledge
+from ..results.diagnostics import UsedReference
 from . import minimisers
 from .equations import criterion
 from .equations.covariances import Uncertainty
-from .equations.criterion import State
+from .equations.problem import State
 from .gauge import catalogue_map
 
 log = logging.getLogger(__name__)
@@ -45,8 +46,7 @@ class Anchor:
         Whether the static distortion is not known beforehand.
     scale : float
         Factor on the stated errors of the exposures.
-    options : dict
-        ``gauge``, ``loss`` and perhaps ``max_iterations`` of `legdistort.solving.minimisers.solve_joint`.
+    options : SolveOptions
     """
 
     identified: object
@@ -54,7 +54,7 @@ class Anchor:
     names: np.ndarray
     free: bool
     scale: float
-    options: dict
+    options: object
 
     def __repr__(self):
         return f"<Anchor: {self.identified!r} of {self.label}>"
@@ -76,7 +76,7 @@ class Anchor:
         """
         status, first = result.status, self._rough(result.state)
         if first is not None:
-            result = minimisers.solve_joint(problem, _moved(result.state, first), **self.options)
+            result = self._solved(problem, _moved(result.state, first))
         known = self._known(result.gauge, _takes_back(problem))
         for count in range(_ROUNDS):
             if count < 2:  # afterwards the plane moves too little for another
@@ -93,7 +93,7 @@ class Anchor:
             if common is None:
                 result = replace(result, state=state, blocks=criterion.linearise(problem.scaled(result.robust), state))
             else:
-                result = minimisers.solve_joint(problem, state, common=common, **self.options)
+                result = self._solved(problem, state, common=common)
         else:
             log.warning("the tie to %s is not settled after %d rounds", self.label, _ROUNDS)
         if not _takes_back(problem):
@@ -103,6 +103,11 @@ class Anchor:
         if result.converged:
             result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds")
         return replace(result, gauge=replace(result.gauge, tie=made))
+
+    def _solved(self, problem, state, *, common=None):
+        of = self.options
+        how = {"gauge": of.gauge, "loss": of.loss, "max_iterations": of.max_iterations}
+        return minimisers.solve_joint(problem, state, common=common, **how)
 
     def _warn(self, made, known):
         """Tell what makes the absolute errors too small."""
@@ -200,16 +205,13 @@ def _moved(state, pose):
     return State(similarity.apply(pose, state.positions.T).T, state.coefficients, moved)
 
 
-def tie_to(fit, reference, options, *, scale=1.0, epoch=None, pixel_scale=None):
+def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     """A fit of `legdistort.solve` tied to a reference.
 
     Parameters
     ----------
-    fit : dataclass
-        With ``matches``, ``problem``, ``result``, ``used`` and ``blocks``.
+    fit : `legdistort.solving.single_fit.Fit`
     reference : Reference
-    options : dict
-        ``gauge``, ``loss``, ``limit`` and ``prior`` of `legdistort.solve`.
     scale : float
         Factor on the stated errors of the exposures.
     epoch : float, optional
@@ -219,8 +221,8 @@ def tie_to(fit, reference, options, *, scale=1.0, epoch=None, pixel_scale=None):
 
     Returns
     -------
-    dataclass
-        The fit with ``matches`` that know the sky, and the tied ``result``.
+    Fit
+        With ``matches`` that know the sky, and the tied ``result``.
 
     Raises
     ------
@@ -239,14 +241,15 @@ def tie_to(fit, reference, options, *, scale=1.0, epoch=None, pixel_scale=None):
         pixel_scale=pixel_scale,
     )
     log.info("%d of the %d stars of %s are in the exposures", len(identified.rows), len(reference), reference.label)
-    known = options["prior"].values() if isinstance(options["prior"], dict) else [options["prior"]]
+    prior = fit.options.prior
+    known = prior.values() if isinstance(prior, dict) else [prior]
     anchor = Anchor(
         identified,
         reference.label,
         matches.stars,
-        free=any(prior is None for prior in known),
+        free=any(each is None for each in known),
         scale=scale,
-        options={"gauge": options["gauge"], "loss": options["loss"], **options["limit"]},
+        options=fit.options,
     )
     result = anchor.tie(fit.problem.scaled(fit.used.astype(float)), result)
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
@@ -261,14 +264,14 @@ def _flux(matches):
     return np.bincount(star, flux, len(matches.stars)) / np.bincount(star, minlength=len(matches.stars))
 
 
-def describe(fit, reference, given):
-    """Where the plane lies and what it is tied to, as plain words and numbers for the settings of a solution.
-
-    `given` is the `TangentPlane` that the matches brought, or None.
-    """
-    sky = "exposures" if given is not None else None if fit.matches.sky is None else "reference"
+def used_reference(fit, reference):
+    """The `UsedReference` of a tied fit; None where there is no reference."""
     if reference is None:
-        return {"sky": sky, "reference": None}
+        return None
     made = fit.result.gauge.tie
-    words = {"name": reference.label.removeprefix("the reference").strip(), "epoch": fit.matches.epoch}
-    return {"sky": sky, "reference": words | {"n_stars": int(np.count_nonzero(made.used)), "rms_px": made.rms}}
+    return UsedReference(
+        name=reference.label.removeprefix("the reference").strip(),
+        epoch=fit.matches.epoch,
+        n_stars=int(np.count_nonzero(made.used)),
+        rms_px=made.rms,
+    )

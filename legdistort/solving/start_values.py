@@ -5,7 +5,7 @@ import numpy as np
 from ..exceptions import FoldError, SolveError
 from ..geometry import similarity
 from ..geometry.distortion import Distortion
-from .equations.criterion import State
+from .equations.problem import State
 
 
 def start(problem, nominal, *, n_sweeps=1, robust=False):
@@ -68,7 +68,7 @@ def undistorted(problem):
     """Positions (2, n) with the prior distortion taken out to second order, which is enough for a start."""
     if not np.any(problem.prior_mean):
         return problem.xy
-    if problem.compiled:
+    if problem.uses_compiled_loops:
         from .equations import compiled
 
         return compiled.undistorted(problem)
@@ -83,7 +83,7 @@ def undistorted(problem):
 def refine(problem, pose_list, q, positions, weight):
     """Poses (n_exposures, 2, 3) that carry star positions (2, n_stars) to undistorted ones q (2, n), parity kept."""
     parity = np.where(np.linalg.det(pose_list[:, :, :2]) > 0, 1, -1)
-    if problem.compiled:
+    if problem.uses_compiled_loops:
         from .equations import compiled
 
         fitted = similarity.similarity_of(*compiled.moments(problem, q, weight, positions), parity)
@@ -126,7 +126,7 @@ def misplaced(problem, distance2):
 
 def distances(problem, pose_list, q, positions):
     """Squared distance (n,) of undistorted positions from their star's mean position, detector pixels."""
-    if problem.compiled:
+    if problem.uses_compiled_loops:
         from .equations import compiled
 
         return compiled.distances(problem, pose_list, q, positions)
@@ -141,7 +141,7 @@ def distances(problem, pose_list, q, positions):
 def mean_positions(problem, pose_list, q, weight):
     """Weighted mean (2, n_stars) of undistorted positions carried back to the reference plane."""
     inverse = np.stack([similarity.invert(pose) for pose in pose_list])
-    if problem.compiled:
+    if problem.uses_compiled_loops:
         from .equations import compiled
 
         sums, total = compiled.mean_sums(problem, inverse, q, weight)

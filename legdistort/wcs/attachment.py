@@ -15,7 +15,8 @@ from astropy.io import fits
 from tqdm import tqdm
 
 from ..exceptions import ExportError, InputError
-from ..inputs.exposures import expand_paths, exposure_name, find_image
+from ..inputs.exposure_names import exposure_name
+from ..inputs.exposures import expand_paths, find_image
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, splice
 from ..runtime.outputs import replacing, replacing_folder
@@ -126,12 +127,13 @@ def attach(
         raise InputError("none of the frames is part of the solution; give those it was made from")
     if in_place:
         for plan in plans:
-            with replacing(plan.target, overwrite=True) as temporary:
-                plan.write(temporary)
+            with replacing(plan.target, overwrite=True) as file:
+                plan.write(file)
     else:
         with replacing_folder(out) as folder:
             for plan in plans:
-                plan.write(folder / plan.target.name)
+                with replacing(folder / plan.target.name) as file:
+                    plan.write(file)
     return [Attachment(plan.target, *item) for plan in plans for item in plan.headers.items()]
 
 
@@ -145,12 +147,12 @@ class _Plan:
     headers: dict
     edits: list
 
-    def write(self, to):
+    def write(self, file):
         raw, pack = read_bytes(self.path)
         if zlib.crc32(raw) != self.crc:
             raise InputError(f"{self.path} changed while it was worked on; try again")
-        to.write_bytes(pack(splice(raw, self.edits)))
-        shutil.copymode(self.path, to)
+        file.write(pack(splice(raw, self.edits)))
+        shutil.copymode(self.path, file.name)
 
 
 def _files(paths):

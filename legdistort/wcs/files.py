@@ -32,8 +32,8 @@ def wcs_tree(solution, name):
 
 def write_wcs(solution, name, path, *, overwrite=False):
     """Write the gwcs of one exposure, with its measured inverse error, to an ASDF file."""
-    with replacing(path, overwrite=overwrite) as temporary:
-        asdf.AsdfFile(wcs_tree(solution, name), version=ASDF_STANDARD).write_to(temporary)
+    with replacing(path, overwrite=overwrite) as file:
+        asdf.AsdfFile(wcs_tree(solution, name), version=ASDF_STANDARD).write_to(file)
     return Path(path)
 
 

@@ -101,7 +101,7 @@ def wrong_row(name, n_stars, n_seeds, **geometry):
         except LegdistortError:
             return None
         b, sigma, _ = errors(solution, sim, noise=0.14)
-        ratio = solution.settings["departure_ratio"]
+        ratio = solution.diagnostics.departure_ratio
         rows.append([b, sigma, solution.chi2 / solution.dof, np.nan if ratio is None else ratio])
     return np.concatenate([np.mean(rows, axis=0), np.std(rows, axis=0)[2:]])
 

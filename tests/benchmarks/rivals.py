@@ -5,7 +5,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_array
 
 from legdistort.solving.equations import criterion
-from legdistort.solving.equations.criterion import State
+from legdistort.solving.equations.problem import State
 
 
 def solve_scipy(problem, state):

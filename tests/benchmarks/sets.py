@@ -6,7 +6,7 @@ from legdistort.geometry.gsaoi import gsaoi_static
 from legdistort.priors.prior import Prior
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 from legdistort.solving import start_values
-from legdistort.solving.equations import problem_builder
+from legdistort.solving.equations.problem import build_problem
 
 
 def make(name, *, n_exposures=100, n_stars=10_000):
@@ -23,6 +23,6 @@ def make(name, *, n_exposures=100, n_stars=10_000):
 
 def problem(sim, prior, degree=3):
     """The criterion and its start values."""
-    posed = problem_builder.build(sim.matches, degree, prior=prior)
+    posed = build_problem(sim.matches, degree, prior=prior)
     nominal = np.stack([sim.matches.poses[name] for name in sim.matches.names])
     return posed, start_values.start(posed, nominal)[0]

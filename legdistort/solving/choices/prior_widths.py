@@ -19,7 +19,8 @@ from ...exceptions import ConvergenceWarning, warn
 from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...priors.prior import Prior
-from ..equations import criterion, elimination, problem_builder
+from ..equations import criterion, elimination
+from ..equations.problem import State, by_exposure
 
 log = logging.getLogger(__name__)
 
@@ -36,32 +37,57 @@ PARSIMONY = 2.0
 _RIDGE = 1e-10  # on what is eliminated, relative: a similarity common to all exposures is not determined
 
 
+@dataclass(frozen=True, eq=False)
+class Widths:
+    """Widths of priors that left them to be found.
+
+    Attributes
+    ----------
+    priors : tuple of Prior
+        Each once: exposures and detectors that were given the same object share its widths.
+    values : ndarray, shape (n_priors, degree)
+        Of a coefficient of degree 1, 2 and more, pixels.
+    """
+
+    priors: tuple
+    values: np.ndarray
+
+    def number(self, prior):
+        """Which of the priors this one is; -1 if it is none of them."""
+        return next((k for k, each in enumerate(self.priors) if each is prior), -1)
+
+    def resolve(self, prior):
+        """The prior, or dict of priors, with these widths in the place of "evidence"."""
+        if isinstance(prior, dict):
+            return {key: self.resolve(each) for key, each in prior.items()}
+        if (k := self.number(prior)) < 0:
+            return prior
+        found = self.values[k]
+        if not len(found):  # at degree 0 there is nothing that scatters
+            return prior.with_sigma(None)
+        return prior.with_sigma(found[np.maximum(np.add(*basis.orders(len(found))), 1) - 1], degree=len(found))
+
+    def describe(self, prior, scale=1.0):
+        """By degree from 1 a tuple; by detector or exposure if the prior came so; None for one with its own widths.
+
+        They are in units of errors that were stated `scale` times too small.
+        """
+        if isinstance(prior, dict):
+            return {str(key): self.describe(each, scale) for key, each in prior.items()}
+        k = self.number(prior)
+        return None if k < 0 else tuple((scale * self.values[k]).tolist())
+
+
 def is_wanted(prior):
     """Whether a prior, or one of a dict of them, leaves its widths to be found."""
-    priors = prior.values() if isinstance(prior, dict) else [prior]
-    return any(isinstance(p, Prior) and isinstance(p.sigma, str) for p in priors)
+    return bool(_sought(prior))
 
 
-def resolve(prior, widths):
-    """The prior, or dict of priors, with widths found, ``{id(Prior): (degree,)}``, in the place of "evidence"."""
-    if isinstance(prior, dict):
-        return {key: resolve(p, widths) for key, p in prior.items()}
-    if id(prior) not in widths:
-        return prior
-    found = widths[id(prior)]
-    if not len(found):  # at degree 0 there is nothing that scatters
-        return prior.with_sigma(None)
-    return prior.with_sigma(found[np.maximum(np.add(*basis.orders(len(found))), 1) - 1], degree=len(found))
-
-
-def describe(prior, widths, scale=1.0):
-    """Widths found, by degree from 1, as plain numbers: a list, by detector or exposure if the prior came so, or None.
-
-    They are in units of errors that were stated `scale` times too small.
-    """
-    if isinstance(prior, dict):
-        return {str(key): describe(p, widths, scale) for key, p in prior.items()} if widths else None
-    return (scale * widths[id(prior)]).tolist() if id(prior) in widths else None
+def _sought(prior):
+    """The priors whose widths are to be found, each object once."""
+    priors = list(prior.values()) if isinstance(prior, dict) else [prior]
+    first = [p for k, p in enumerate(priors) if not any(p is earlier for earlier in priors[:k])]
+    return tuple(p for p in first if isinstance(p, Prior) and isinstance(p.sigma, str))
 
 
 def find_widths(fit, prior, degree, unit, *, scale=False):
@@ -85,41 +111,40 @@ def find_widths(fit, prior, degree, unit, *, scale=False):
     Returns
     -------
     fit
-    dict
-        ``{id(Prior): widths (degree,) [pix]}`` of degrees 1, 2 and more; 0 where it was held at the smallest one.
+    Widths
+        0 where one was held at the smallest.
     """
-    wanted = list(prior.values()) if isinstance(prior, dict) else [prior]
-    wanted = list({id(p): p for p in wanted if is_wanted(p)}.values())
-    widths, bounds = np.full((len(wanted), degree), unit), unit * np.array(RANGE)
+    wanted, bounds = _sought(prior), unit * np.array(RANGE)
+    widths = Widths(wanted, np.full((len(wanted), degree), unit))
 
     def fitted():
         with warnings.catch_warnings(record=True) as caught:  # of the last fit they are told
             warnings.simplefilter("always")
-            return fit(resolve(prior, dict(zip(map(id, wanted), widths, strict=True)))), caught
+            return fit(widths.resolve(prior)), caught
 
     for _ in range(MAX_ROUNDS if degree else 0):
         done, caught = fitted()
-        labels = _labels(problem_builder.by_exposure(done.matches, prior), wanted, degree)
+        labels = _labels(widths, by_exposure(done.matches, prior))
         seen = evidence(*_sample(done.weighted, done.result.state, labels, done.result.gauge.motion))
-        found = seen.best(widths.size, bounds, scale=scale).reshape(widths.shape)
+        before, found = widths.values, seen.best(widths.values.size, bounds, scale=scale).reshape(-1, degree)
         log.debug("widths by degree: %s px", found)
-        if np.all(np.abs(found - widths) <= TOLERANCE * np.maximum(found, unit)):
+        if np.all(np.abs(found - before) <= TOLERANCE * np.maximum(found, unit)):
             break
-        widths = found
+        widths = Widths(wanted, found)
     else:
         done, caught = fitted()
         if degree:
-            words = f"the widths of the prior have not settled after {MAX_ROUNDS} fits, the last are {widths} px"
+            words = f"the widths of the prior have not settled after {MAX_ROUNDS} fits, the last are {widths.values} px"
             warn(words, ConvergenceWarning)
     for warning in caught:
         warn(warning.message, warning.category)
-    return done, dict(zip(map(id, wanted), np.where(widths > 1.01 * bounds[0], widths, 0), strict=True))
+    return done, Widths(wanted, np.where(widths.values > 1.01 * bounds[0], widths.values, 0))
 
 
-def _labels(priors, wanted, degree):
+def _labels(widths, priors):
     """Number of the width of every exposure and degree (n_exposures, degree), -1 where none is sought."""
-    numbers = {id(p): k for k, p in enumerate(wanted)}
-    prior = np.array([numbers.get(id(p), -1) for p in priors])
+    degree = widths.values.shape[1]
+    prior = np.array([widths.number(p) for p in priors])
     return np.where(prior[:, None] >= 0, prior[:, None] * degree + np.arange(degree), -1)
 
 
@@ -147,7 +172,7 @@ def _sample(problem, state, labels, motion):
         prior_sigma=problem.prior_sigma[keep],
         group=group,
     )
-    state = criterion.State(state.positions[:, stars], state.coefficients[keep], state.poses[keep])
+    state = State(state.positions[:, stars], state.coefficients[keep], state.poses[keep])
     return part, state, labels[keep], motion[keep]
 
 

@@ -25,14 +25,19 @@ class Uncertainty:
     gauge : Gauge
     scale : float
         Factor on all standard deviations (1: the stated errors are taken as they are).
+    coefficients : ndarray, optional
+        Covariance of the coefficients, if they were found in another way than with the stars, `scale` in it.
     """
 
-    def __init__(self, problem, blocks, gauge, *, scale=1.0):
+    def __init__(self, problem, blocks, gauge, *, scale=1.0, coefficients=None):
         self._problem, self._blocks, self._gauge, self._scale = problem, blocks, gauge, scale
+        self._given = coefficients
 
     @cached_property
     def coefficients(self):
         """Covariance of the fitted coefficients, shape (n_exposures * 2 n_modes,) squared, px^2; x modes first."""
+        if self._given is not None:
+            return self._given
         problem, blocks = self._problem, self._blocks
         n = problem.n_exposures * 2 * problem.n_modes
         if n <= DENSE_LIMIT:
@@ -85,10 +90,6 @@ class Uncertainty:
             coupling[:, problem.star[part], i] = np.einsum("can,mn->cnam", f, b).reshape(2, b.shape[1], -1)
         spread = alone @ coupling.reshape(2 * n, -1)
         return self._scale**2 * alone + spread @ self.coefficients @ spread.T
-
-    def stored(self):
-        """The arrays that a file keeps."""
-        return {"coefficients": self.coefficients, "stars": self.stars}
 
 
 def _block_diagonal(factor, covariance):

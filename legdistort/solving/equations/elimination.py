@@ -19,7 +19,7 @@ def symmetric_times(block, x):
 
 def to_stars(problem, blocks, a):
     """E a: coefficients (n_exposures, 2 n_modes) -> stars (2, n_stars)."""
-    if problem.compiled:
+    if problem.uses_compiled_loops:
         from . import compiled
 
         return compiled.to_stars(problem, blocks, a)
@@ -35,7 +35,7 @@ def to_stars(problem, blocks, a):
 
 def to_exposures(problem, blocks, y):
     """E' y: stars (2, n_stars) -> coefficients (n_exposures, 2 n_modes)."""
-    if problem.compiled:
+    if problem.uses_compiled_loops:
         from . import compiled
 
         return compiled.to_exposures(problem, blocks, y)

@@ -220,7 +220,22 @@ class Direct(_Reduced):
         return free - self._lifted @ (self._border @ (self.rows @ free - target))
 
     def step(self, target, told, accuracy):
-        """See `newton_step`; exact whatever the accuracy asked for."""
+        """Gauss-Newton step under the constraints of the gauge; exact whatever the accuracy asked for.
+
+        Parameters
+        ----------
+        target : ndarray, shape (n_constraints,)
+            What is still lacking to the values of the orthonormal constraints.
+        told : ndarray, shape (n_constraints, n_told)
+            Combinations that are left to the data, orthonormal.
+        accuracy : float
+            Where conjugate gradients may stop, relative to the size of the step.
+
+        Returns
+        -------
+        d_star : ndarray, shape (2, n_stars)
+        d_exposure : ndarray, shape (n_exposures, 2 n_modes)
+        """
         if told.shape[1]:
             target = target - told @ (told.T @ target)
             pull = told.T @ (self.pull - self.information @ target)
@@ -286,7 +301,7 @@ class Iterative(_Reduced):
         return self._moves @ self.rhs
 
     def step(self, target, told, accuracy):
-        """See `newton_step`."""
+        """As for `Direct`."""
         kept = complement(told.T)
         if told.shape[1]:
             accuracy *= 1e-3  # a small residual is a long way where the curvature is small
@@ -331,25 +346,3 @@ class Iterative(_Reduced):
         else:
             log.info("conjugate gradients stopped after %d steps at %.1e of the start", max_iterations, np.sqrt(rz))
         return self._stars(stars), d
-
-
-def newton_step(problem, blocks, gauge, departure, *, accuracy=1e-10):
-    """Gauss-Newton step under the constraints of the gauge.
-
-    Parameters
-    ----------
-    problem : Problem
-    blocks : Blocks
-    gauge : Gauge
-    departure : ndarray, shape (n_exposures, 2 n_modes)
-        A_i - A_0 at the current state.
-    accuracy : float
-        Where conjugate gradients may stop, relative to the size of the step.
-
-    Returns
-    -------
-    d_star : ndarray, shape (2, n_stars)
-    d_exposure : ndarray, shape (n_exposures, 2 n_modes)
-    """
-    target = -gauge.violation(departure)
-    return reduced_system(problem, blocks, gauge).step(target, np.zeros((len(target), 0)), accuracy)

@@ -9,7 +9,8 @@ from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis, similarity_basis, similarity_part
 from ...results.gauge import Gauge
 from ...runtime.checks import check_choice
-from ..equations.criterion import State, complement
+from ..equations.criterion import complement
+from ..equations.problem import State
 from .dynamic_scatter import conditional_errors, dynamic_covariance, say
 
 KINDS = ("minimal", "mean")

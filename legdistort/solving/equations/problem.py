@@ -1,13 +1,139 @@
-"""Posing the problem: matches, a degree and what is known beforehand become arrays for the criterion."""
+"""The problem: matches, a degree and what is known beforehand as arrays, and the unknowns that are sought."""
 
+from dataclasses import dataclass, replace
+from functools import cached_property
 from numbers import Real
 
 import numpy as np
 
 from ...exceptions import InputError, SolveError
 from ...geometry import basis
+from ...geometry.detector_modes import dynamic_basis
 from ...priors.prior import Prior
-from .criterion import Problem
+from ...runtime.optional import has_fast
+from .unknowns import Unknowns
+
+#: Number of observations from which compiled loops are used, if numba is installed.
+COMPILED_FROM = 30_000
+
+
+def uses_compiled_loops(n):
+    """Whether the compiled loops of `legdistort.solving.equations.compiled` serve a problem of n observations."""
+    return n >= COMPILED_FROM and has_fast()
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Everything in J that does not change while it is minimised.
+
+    Attributes
+    ----------
+    degree : int
+        Total degree that is fitted; modes of the prior beyond it stay at the prior.
+    names : tuple of str
+    shapes : list of (ny, nx), one an exposure
+    n_stars : int
+    order : ndarray of int, shape (n,), or slice
+        Row of the table behind every observation.
+    start : ndarray of int, shape (n_exposures + 1,)
+        Observations ``start[i]:start[i + 1]`` belong to exposure i.
+    star : ndarray of int, shape (n,)
+        Ascending within an exposure.
+    xy : ndarray, shape (2, n)
+    weight : ndarray, shape (3, n)
+        Inverse covariance: xx, yy, xy [1/pix^2]; zero for an observation that is left out.
+    prior_mean : ndarray, shape (n_exposures, 2, n_all)
+    prior_sigma : ndarray, shape (n_exposures, 2, n_modes), or None
+    static_sigma : ndarray, shape (2, n_modes), or None
+        Uncertainty of the prior mean; of several priors the largest.
+    own_degree : int or None
+        Up to this degree exposures have modes of their own; None: nothing is shared. See `Unknowns`.
+    group : ndarray of int, shape (n_exposures,)
+        Detector of every exposure; exposures of one share what is not their own.
+    """
+
+    degree: int
+    names: tuple
+    shapes: list
+    n_stars: int
+    order: np.ndarray | slice
+    start: np.ndarray
+    star: np.ndarray
+    xy: np.ndarray
+    weight: np.ndarray
+    prior_mean: np.ndarray
+    prior_sigma: np.ndarray | None = None
+    static_sigma: np.ndarray | None = None
+    own_degree: int | None = None
+    group: np.ndarray | int = 0
+
+    @cached_property
+    def unequal(self):
+        """Whether some observation has different or correlated axis weights."""
+        return bool(np.any(self.weight[0] != self.weight[1]) or np.any(self.weight[2]))
+
+    @property
+    def uses_compiled_loops(self):
+        """Whether the compiled loops of `legdistort.solving.equations.compiled` serve this problem."""
+        return uses_compiled_loops(self.xy.shape[1])
+
+    @property
+    def n_exposures(self):
+        """Number of exposures."""
+        return len(self.shapes)
+
+    @cached_property
+    def unknowns(self):
+        """The unknown coefficients as one vector."""
+        return Unknowns(self.degree, self.own_degree, self.group, self.shapes)
+
+    @property
+    def has_prior(self):
+        """Whether widths of a prior take part in J."""
+        return self.prior_sigma is not None or (self.unknowns.shared and self.static_sigma is not None)
+
+    @property
+    def n_modes(self):
+        """Number of fitted modes per axis."""
+        return basis.n_modes(self.degree)
+
+    def has_widths(self, i):
+        """Whether the prior has widths for exposure i: neither infinite, which is free, nor zero, which is `fixed`."""
+        if self.prior_sigma is None:
+            return False
+        return bool(np.any((self.prior_sigma[i] > 0) & np.isfinite(self.prior_sigma[i])))
+
+    def n_free(self, i):
+        """Number of modes (of the axis that has more) without a prior width: stars that exposure i needs at least."""
+        return self.n_modes if self.prior_sigma is None else int(np.isinf(self.prior_sigma[i]).sum(axis=1).max())
+
+    @cached_property
+    def fixed(self):
+        """Directions of every exposure's coefficients that stay at the prior mean, for its width is zero there.
+
+        List of orthonormal rows (n_fixed, 2 n_modes); None if nothing is fixed.
+        """
+        if self.prior_sigma is None or np.all(self.prior_sigma > 0):
+            return None
+        rows = [dynamic_basis(shape, self.n_modes) for shape in self.shapes]
+        return [r[~np.any((r != 0) & (s.ravel() > 0), axis=1)] for r, s in zip(rows, self.prior_sigma, strict=True)]
+
+    def part(self, i):
+        """Observations of exposure i, as a slice."""
+        return slice(self.start[i], self.start[i + 1])
+
+    def scaled(self, factor):
+        """The same problem with all weights multiplied by `factor` (n,); zero leaves an observation out."""
+        return replace(self, weight=self.weight * factor)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The unknowns: positions (2, n_stars), coefficients (n_exposures, 2, n_all), poses (n_exposures, 2, 3)."""
+
+    positions: np.ndarray
+    coefficients: np.ndarray
+    poses: np.ndarray
 
 
 def check_error_floor(error_floor):
@@ -16,7 +142,7 @@ def check_error_floor(error_floor):
         raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
 
 
-def build(matches, degree, *, prior=None, error_floor=0.0, own_degree=None):
+def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=None):
     """The problem posed by `legdistort.inputs.matches.Matches`.
 
     Parameters

@@ -1,0 +1,29 @@
+"""Names of exposures: from those of their files, and fit to be those of other files."""
+
+import re
+from pathlib import Path
+
+from ..exceptions import InputError
+
+_SUFFIX = re.compile(r"\.(fits|fit|fts|ldac)(\.(gz|fz|bz2|zip))?$", re.IGNORECASE)
+#: What no name has: slashes, control characters and line breaks, bytes of a file name that are no UTF-8.
+_UNFIT = re.compile("[/\\\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+_LONGEST = 250  # bytes; with the ending .asdf the 255 that file systems allow
+
+
+def exposure_name(path, ext=None):
+    """Name of the exposure in a file, or in one of its extensions (see `legdistort.read_exposures`)."""
+    name = _SUFFIX.sub("", Path(path).name)
+    if ext is None:
+        return name
+    return name + "_" + ("".join(str(e) for e in ext) if isinstance(ext, tuple) else str(ext))
+
+
+def check_exposure_name(name, origin=None):
+    """Raise `InputError` if a name of an exposure cannot be that of a file; `origin` is the file it comes from."""
+    if not name.strip(". ") or _UNFIT.search(name) or len(name.encode()) > _LONGEST:
+        where = "" if origin is None else f"{str(origin)!r}: "
+        raise InputError(
+            f"{where}exposure {name!r} cannot be the name of a file; rename it (no slashes, line breaks or control "
+            f"characters, at most {_LONGEST} bytes, not empty)"
+        )

@@ -1,0 +1,66 @@
+"""The one place where arrays of a fit become a `Solution`, in the order and the words of the user."""
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+
+from ..results.diagnostics import Diagnostics
+from ..results.solution import Solution
+from ..runtime import provenance
+
+
+def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, status, dof, chi2=None,
+             diagnostics=None, form=None):  # fmt: skip
+    """A solution from where a fit ended.
+
+    Parameters
+    ----------
+    matches : Matches
+    problem : Problem
+        Made of them, with the weights that were in force: zero for what was not used.
+    state : State
+    blocks : Blocks
+        With these weights, at this state.
+    gauge : Gauge
+    uncertainty : Uncertainty
+    settings : Settings
+    status : str
+    dof : int
+    chi2 : float, optional
+        That of the blocks, if not given.
+    diagnostics : Diagnostics, optional
+    form : `legdistort.solving.model_forms.Form`, optional
+
+    Returns
+    -------
+    Solution
+    """
+    table = QTable(matches.table, copy=False)
+    residual, used = np.empty_like(blocks.residual), np.empty(len(table), dtype=bool)
+    residual[:, problem.order], used[problem.order] = blocks.residual, problem.weight[0] > 0
+    table["dx"], table["dy"] = residual * u.pix
+    table["used"] = used
+    positions = state.positions.T.copy()
+    positions[blocks.v[0] <= 0] = np.nan
+    return Solution(
+        names=problem.names,
+        degree=problem.degree,
+        shapes=dict(matches.shapes),
+        poses=dict(zip(problem.names, state.poses, strict=True)),
+        coefficients=state.coefficients if form is None else form.hold(problem.names, state.coefficients),
+        prior_mean=problem.prior_mean,
+        star_names=np.asarray(matches.stars),
+        positions=positions,
+        observations=table,
+        chi2=blocks.chi2 if chi2 is None else chi2,
+        dof=dof,
+        status=status,
+        gauge=gauge,
+        uncertainty=uncertainty,
+        settings=settings,
+        diagnostics=Diagnostics() if diagnostics is None else diagnostics,
+        sky=matches.sky,
+        left_out=dict(matches.left_out),
+        provenance=provenance.stamp(),
+        form=form,
+    )
