@@ -124,7 +124,7 @@ def run(
         With the file, exposure or argument at fault.
     """
     out = Path(out)
-    check_folder(out, overwrite)
+    check_results(out, overwrite)
     measuring = _step_options(MeasureOptions, measuring, "measuring")
     matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures)
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=prior, clip=clip)
@@ -237,7 +237,7 @@ def _if_possible(judge, *args, **kwargs):
         return None
 
 
-def check_folder(out, overwrite):
+def check_results(out, overwrite):
     """Raise `InputError` if `out` cannot be a folder, or holds results and `overwrite` is false."""
     outputs.check_folder(out)
     there = [name for name in RESULTS if (Path(out) / name).exists()]

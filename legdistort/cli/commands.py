@@ -199,13 +199,13 @@ def do_match(a):
 def do_solve(a):
     """``legdistort solve``."""
     from ..inputs.matches import Matches
-    from ..pipeline import check_folder, summarise, write_results, write_summary
+    from ..pipeline import check_results, summarise, write_results, write_summary
     from ..reporting.page import write_report
     from ..runtime.outputs import replacing_folder
     from ..runtime.provenance import with_inputs
     from ..solving.estimation import solve
 
-    check_folder(a.out, a.overwrite)
+    check_results(a.out, a.overwrite)
     table = _read_table(a.table, a)
     shape = tuple(a.shape) if a.shape else table.meta.get("shapes")
     if shape is None:
