@@ -4,7 +4,9 @@ import inspect
 import json
 import os
 import re
+import runpy
 import signal
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -287,6 +289,14 @@ def test_wrong_usage_exits_with_2(capsys):
         main(["solve", "t.ecsv", "--out", "o", "--columns", "star"])
     assert end.value.code == 2
     capsys.readouterr()
+
+
+def test_the_package_runs_as_the_command(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["python -m legdistort", "--version"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module("legdistort", run_name="__main__")
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"legdistort {legdistort.__version__}\n"
 
 
 @pytest.mark.parametrize("command", ["demo", "run", "measure", "match", "solve", "coadd", "simulate", "show", "report"])

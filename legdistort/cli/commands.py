@@ -95,8 +95,7 @@ def do_run(a):
         coadding=given(a, options.COADDING),
         compare=a.compare,
         overwrite=a.overwrite,
-        workers=a.workers,
-        progress=wants_progress(a),
+        **_share(a),
     )
     _report(a, result.solution, result.summary)
     if a.compare and not a.json:
@@ -126,7 +125,7 @@ def do_measure(a):
     measuring = given(a, options.MEASURING)
     MeasureOptions(**measuring)  # which refuses them before a frame is read
     exposures = _open(a)
-    table = measure(exposures, **measuring, workers=a.workers, progress=wants_progress(a))
+    table = measure(exposures, **measuring, **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
     table.meta |= {"shapes": shapes, "inputs": checksums(expand_paths(a.frames))}
     write_table(table, a.out, overwrite=a.overwrite)
@@ -151,8 +150,7 @@ def do_noise(a):
     injecting, measuring = given(a, options.INJECTING), given(a, options.DETECTOR)
     check_injection(**injecting)  # before a frame is read
     MeasureOptions(**measuring)
-    share = {"workers": a.workers, "progress": wants_progress(a)}
-    curves = calibrate_noise(_open(a), **injecting, measuring=measuring, **share)
+    curves = calibrate_noise(_open(a), **injecting, measuring=measuring, **_share(a))
     curves.write(a.out, overwrite=a.overwrite)
     _draw(curves, a)
     _say(a, curves, {"laws": _records(curves.laws), "out": str(a.out)})
@@ -260,8 +258,7 @@ def do_coadd(a):
     solution = _solution(a)
     coadding = given(a, options.COADDING) | {"grid": _grid(a.grid, solution)}
     CoaddOptions(**coadding)  # which refuses them before a frame is read
-    share = {"workers": a.workers, "progress": wants_progress(a)}
-    mosaic = coadd(_open(a), solution, **coadding, **share)
+    mosaic = coadd(_open(a), solution, **coadding, **_share(a))
     mosaic.write(a.out, overwrite=a.overwrite)
     figures = {"shape": list(mosaic.shape), "n_exposures": len(mosaic.exposures), "left_out": mosaic.left_out}
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
@@ -381,6 +378,10 @@ def _records(table):
     """The rows of a table for JSON, which knows no NaN."""
     rows = [zip(table.colnames, row, strict=True) for row in table.as_array().tolist()]
     return [{name: value if value == value else None for name, value in row} for row in rows]
+
+
+def _share(a):
+    return {"workers": a.workers, "progress": wants_progress(a)}
 
 
 def _open(a):
