@@ -1,6 +1,7 @@
 """Predictions against simulations, against a dense twin, and against the rules of thumb of the paper."""
 
 import json
+from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
@@ -424,6 +425,15 @@ def test_prints_a_table():
     assert "aliasing   together" in more
     with pytest.raises(AttributeError):
         p.b = 0
+
+
+def test_what_was_asked_for_stays_as_it_was():
+    settings = predict(**GOOD).settings
+    assert (settings.n_exposures, settings.n_stars, settings.sigma) == (GOOD["n_exposures"], None, GOOD["sigma"])
+    assert np.shape(settings.stars) == (GOOD["n_stars"], 2)  # those that were drawn
+    assert repr(settings) == f"<Plan: {GOOD['n_exposures']} exposures, degree 3, gauge minimal>"
+    with pytest.raises(FrozenInstanceError):
+        settings.degree = 2
 
 
 def test_alternatives():

@@ -226,7 +226,8 @@ def do_attach(a):
 def do_predict(a):
     """``legdistort predict``."""
     from ..runtime.outputs import replacing
-    from ..simulation.prediction import predict, show
+    from ..simulation.prediction import predict
+    from ..simulation.prediction_text import describe_plans
 
     prediction = predict(
         n_exposures=a.n_exposures,
@@ -249,7 +250,7 @@ def do_predict(a):
     plans = prediction.alternatives()
     rows = [dict(zip(plans.colnames, row, strict=True)) for row in plans.as_array().tolist()]
     own, *others = ({key: None if value != value else value for key, value in row.items()} for row in rows)  # no NaN
-    _say(a, f"{prediction}\n\n{show(plans)}", own | {"alternatives": others, "failed": plans.meta["failed"]})
+    _say(a, f"{prediction}\n\n{describe_plans(plans)}", own | {"alternatives": others, "failed": plans.meta["failed"]})
 
 
 def do_simulate(a):
