@@ -12,7 +12,7 @@ from ..geometry.tangent_plane import TangentPlane
 from ..inputs.matches import robust_similarity
 from ..inputs.reference_catalogue import directions
 from .registration import register
-from .seeds import scale_candidates
+from .similarity_candidates import scale_candidates
 from .star_lists import StarList
 
 log = logging.getLogger(__name__)

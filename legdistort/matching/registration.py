@@ -1,6 +1,6 @@
 """Two star lists of the same sky laid on one another: seeds, growth, and a test against chance.
 
-A candidate similarity (from a header or `legdistort.matching.seeds`) grows to a
+A candidate similarity (from a header or `legdistort.matching.similarity_candidates`) grows to a
 polynomial map while the tolerance shrinks: all neighbours within reach count
 with a Gaussian weight, so that a few wrong ones do not lead astray. The growth
 starts with bright stars, or without fluxes with one corner of the field, where
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry import similarity
 from ..inputs.matches import robust_similarity
-from . import seeds as asterisms
+from .similarity_candidates import offset_candidates, triangle_candidates
 from .star_lists import Warp, allowed_degree, fit_warp
 
 #: How far above chance the number of pairs must be, ``k ln(k/expected) - k + expected`` (natural units,
@@ -189,7 +189,7 @@ def _blind_seeds(source, target, guess):
         rows, others, order = selection
         if order is not None:
             yield from _shifts(source, target, guess, selection)
-        for pose in asterisms.triangle_candidates(source.xy[rows], target.xy[others]):
+        for pose in triangle_candidates(source.xy[rows], target.xy[others]):
             yield pose, order
 
 
@@ -200,7 +200,7 @@ def _shifts(source, target, guess, selection):
         orientations.pop()
     for m in orientations:
         turned = source.xy[rows] @ m.T
-        for shift in asterisms.offset_candidates(turned, target.xy[others], size=max(np.ptp(turned, axis=0))):
+        for shift in offset_candidates(turned, target.xy[others], size=max(np.ptp(turned, axis=0))):
             yield np.column_stack([m, shift]), order
 
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from ..geometry import similarity
 from ..inputs.matches import robust_similarity
-from .linking import Group, interlink, label_stars
+from .exposure_groups import Group, interlink
 from .registration import Registration, register
+from .star_labels import label_stars
 from .star_lists import StarList, Warp, allowed_degree, fit_warp
 
 
@@ -25,7 +26,7 @@ class _Sky:
 
 
 def unite(lists, groups, guess, *, tolerance=None):
-    """Tie to the largest group whatever fits the stars that its exposures share.
+    """Link to the largest group whatever fits the stars that its exposures share.
 
     Parameters
     ----------
@@ -33,7 +34,7 @@ def unite(lists, groups, guess, *, tolerance=None):
     groups : list of Group
         The largest first.
     guess, tolerance
-        As in `legdistort.matching.linking.tie`.
+        As in `legdistort.matching.exposure_groups.link`.
 
     Returns
     -------
@@ -113,17 +114,17 @@ def _united(main, sky, other, other_sky, guess, tolerance):
     partner[found.source] = found.target
     distance = np.zeros(len(sky.stars))
     distance[found.target] = found.distance
-    ties = dict(main.registrations) | other.registrations
+    registrations = dict(main.registrations) | other.registrations
     for i, (mine, stars) in sky.seen.items():
         for j, (theirs, other_stars) in other_sky.seen.items():
             shared, a, b = np.intersect1d(stars, partner[other_stars], return_indices=True)
             if len(shared):
                 warp = Warp.from_pose(similarity.compose(placed[j], similarity.invert(main.poses[i])), sky.stars.shape)
                 pairs = (mine[a], theirs[b]) if i < j else (theirs[b], mine[a])
-                ties[min(i, j), max(i, j)] = Registration(
+                registrations[min(i, j), max(i, j)] = Registration(
                     *pairs, distance[shared], warp, found.tolerance, found.strength
                 )
-    return Group(main.poses | placed, ties)
+    return Group(main.poses | placed, registrations)
 
 
 def _guessed(main, sky, other, other_sky, guess):

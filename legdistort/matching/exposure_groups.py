@@ -1,21 +1,18 @@
-"""From registered pairs of exposures to stars: who belongs to whom, checked for mutual consistency.
+"""Which exposures show the same stars: groups of exposures registered with one another.
 
-Exposures are tied as a graph, never as a chain: a spanning tree from the
-richest exposure gives every exposure a rough pose, then every pair that
-overlaps is registered directly. A star is a connected set of detections in
-which each is paired with at least half of those it was compared with.
+They are linked as a graph, never as a chain: a spanning tree from the richest exposure gives every exposure a rough
+pose, then every pair that overlaps is registered directly.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from tqdm import tqdm
 
-from ..geometry import similarity as poses
+from ..geometry import similarity
 from ..inputs.matches import robust_similarity
 from .registration import continue_from, grow, outwards, register, settle
+from .star_labels import label_stars
 
 #: Exposures of a group with which a stray one is compared at any rotation.
 BLIND_TRIES = 8
@@ -29,7 +26,7 @@ COMPLETE = 0.97
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Exposures tied together.
+    """Exposures linked by registrations.
 
     Attributes
     ----------
@@ -42,7 +39,7 @@ class Group:
     registrations: dict
 
 
-def tie(lists, guess, *, tolerance=None, progress=False):
+def link(lists, guess, *, tolerance=None, progress=False):
     """Group exposures by registering them along a spanning tree.
 
     Parameters
@@ -71,8 +68,8 @@ def tie(lists, guess, *, tolerance=None, progress=False):
 
 
 def _gather(lists, hub, left, guess, tolerance):
-    """Take out of `left` all that can be tied to the hub, directly or through others."""
-    found, registrations = {hub: poses.identity()}, {}
+    """Take out of `left` all that can be linked to the hub, directly or through others."""
+    found, registrations = {hub: similarity.identity()}, {}
     for blind in (False, True):
         queue = list(found)[:BLIND_TRIES] if blind else list(found)
         tries = 0
@@ -84,7 +81,7 @@ def _gather(lists, hub, left, guess, tolerance):
                 r = register(lists[i], lists[j], guess=guess(i, j), blind=blind, tolerance=tolerance)
                 if r is not None:
                     step = robust_similarity(lists[i].xy[r.source], lists[j].xy[r.target])
-                    found[other] = poses.compose(step if base == i else poses.invert(step), found[base])
+                    found[other] = similarity.compose(step if base == i else similarity.invert(step), found[base])
                     registrations[i, j] = r
                     left.remove(other)
                     queue.append(other)
@@ -114,8 +111,8 @@ def standing(lists, group, *, radius=0.6, moved=1.5):
         xy = lists[i].xy
         shifted, same = np.zeros(len(xy)), np.zeros(len(xy))
         for j in group.poses:
-            step = poses.compose(group.poses[j], poses.invert(group.poses[i]))
-            away = np.linalg.norm(poses.apply(step, xy) - xy, axis=1) > moved
+            step = similarity.compose(group.poses[j], similarity.invert(group.poses[i]))
+            away = np.linalg.norm(similarity.apply(step, xy) - xy, axis=1) > moved
             shifted += away
             same += away & (lists[j].tree.query(xy, distance_upper_bound=radius)[0] < radius)
         out[i] = (same >= 3) & (same >= 0.5 * shifted)
@@ -130,7 +127,7 @@ def interlink(lists, group, *, tolerance=None, progress=False):
     lists : list of StarList
     group : Group
     tolerance, progress
-        As in `tie`.
+        As in `link`.
 
     Returns
     -------
@@ -149,15 +146,15 @@ def interlink(lists, group, *, tolerance=None, progress=False):
             rows, columns = rows[shared >= 0], columns[shared >= 0]
             before = known.get((i, j))
             if before is None or len(before.source) < COMPLETE * len(rows):
-                step = poses.compose(group.poses[j], poses.invert(group.poses[i]))
-                found = _link(lists[i], lists[j], rows, columns, step, tolerance)
+                step = similarity.compose(group.poses[j], similarity.invert(group.poses[i]))
+                found = _register_again(lists[i], lists[j], rows, columns, step, tolerance)
                 if found is not None and (before is None or len(found.source) > len(before.source)):
                     known[i, j] = found
     telling = [pair for pair in partners if overlaps[pair] >= TELLING]
     return known, _misfits(known, telling)
 
 
-def _link(source, target, rows, columns, step, tolerance):
+def _register_again(source, target, rows, columns, step, tolerance):
     """Register two exposures of a group from the stars they share through third ones, or else from their poses."""
     if len(rows) >= 8:
         found = continue_from(source, target, rows, columns, tolerance=tolerance)
@@ -174,7 +171,7 @@ def _overlaps(lists, rough):
     for i in sorted(rough):
         for j in sorted(rough):
             if i < j:
-                there = poses.apply(poses.compose(rough[j], poses.invert(rough[i])), lists[i].xy)
+                there = similarity.apply(similarity.compose(rough[j], similarity.invert(rough[i])), lists[i].xy)
                 inside = np.all((there > -0.5) & (there < np.array(lists[j].shape[::-1]) - 0.5), axis=1)
                 part = np.count_nonzero(inside) / len(lists[i])
                 out[i, j] = part * min(len(lists[i]), len(lists[j]))
@@ -203,83 +200,3 @@ def _misfits(known, telling):
             return out
         out[worst] = f"it agrees with only {sum(votes[worst])} of {len(votes[worst])} exposures that it should overlap"
         pairs = [pair for pair in pairs if worst not in pair]
-
-
-def components(sizes, registrations):
-    """Connected detections, regardless of contradictions.
-
-    Parameters
-    ----------
-    sizes : list of int
-        Detections of every exposure.
-    registrations : dict of (int, int) to Registration
-
-    Returns
-    -------
-    list of ndarray of int
-        A label for every detection; alone means unpaired.
-    """
-    first, a, b, _ = _edges(sizes, registrations)
-    n = first[-1]
-    labels = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)[1]
-    return np.split(labels, first[1:-1])
-
-
-def label_stars(sizes, registrations):
-    """Detections of the same star get the same label.
-
-    A connected set that holds two detections of one exposure is taken apart: its closest pairs join first,
-    and a pair that would bring the two together is ignored. Then whoever is paired with fewer than half of
-    its companions (among the exposures registered with its own) is dismissed: hot pixels under a slow drift hang
-    together only from one exposure to the next.
-
-    Parameters
-    ----------
-    sizes : list of int
-    registrations : dict of (int, int) to Registration
-
-    Returns
-    -------
-    list of ndarray of int
-        By exposure and detection; -1 for no star.
-    """
-    first, a, b, distance = _edges(sizes, registrations)
-    exposure = np.repeat(np.arange(len(sizes)), sizes)
-    labels = np.concatenate(components(sizes, registrations))
-    _, inverse, count = np.unique(labels * len(sizes) + exposure, return_inverse=True, return_counts=True)
-    torn = np.unique(labels[count[inverse] > 1])
-    edges = np.flatnonzero(np.isin(labels[a], torn))
-    _take_apart(labels, exposure, a[edges], b[edges], distance[edges])
-
-    together = labels[a] == labels[b]
-    degree = np.bincount(np.concatenate([a[together], b[together]]), minlength=len(labels))
-    compared = np.zeros((len(sizes), len(sizes)))
-    for i, j in registrations:
-        compared[i, j] = compared[j, i] = 1
-    present = coo_array((np.ones(len(labels)), (labels, exposure)), shape=(labels.max() + 1, len(sizes)))
-    companions = (present @ compared)[labels, exposure]
-    return np.split(np.where((degree > 0) & (degree >= 0.5 * companions), labels, -1), first[1:-1])
-
-
-def _edges(sizes, registrations):
-    """All pairs as serial numbers of detections; where each exposure's serials start; relative distances."""
-    first = np.concatenate([[0], np.cumsum(sizes)])
-    empty = [np.zeros(0, int)]
-    a = np.concatenate([first[i] + r.source for (i, _), r in registrations.items()] or empty)
-    b = np.concatenate([first[j] + r.target for (_, j), r in registrations.items()] or empty)
-    return first, a, b, np.concatenate([r.distance / r.tolerance for r in registrations.values()] or empty)
-
-
-def _take_apart(labels, exposure, a, b, distance):
-    """Join pairs in order of distance unless an exposure would come twice; new labels in place."""
-    members = {node: {node} for node in np.union1d(a, b).tolist()}
-    for k in np.argsort(distance, kind="stable"):
-        one, two = members[int(a[k])], members[int(b[k])]
-        if one is not two and not {exposure[i] for i in one} & {exposure[i] for i in two}:
-            one |= two
-            for i in two:
-                members[i] = one
-    fresh = labels.max() + 1
-    for group in {id(m): m for m in members.values()}.values():
-        labels[list(group)] = fresh
-        fresh += 1
