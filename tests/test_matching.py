@@ -23,8 +23,7 @@ from star_fields import (
 
 from legdistort.exceptions import AssumptionWarning, InputError, MatchError
 from legdistort.geometry import similarity
-from legdistort.matching.exposure_groups import Group, interlink, link
-from legdistort.matching.group_merging import unite
+from legdistort.matching.exposure_groups import Group, interlink, link, unite
 from legdistort.matching.matcher import match
 from legdistort.matching.options import MatchOptions
 from legdistort.matching.registration import Registration, register

@@ -12,8 +12,7 @@ from ..inputs.matches import Matches
 from ..inputs.reference_catalogue import mean_epoch
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
-from .exposure_groups import interlink, link, standing
-from .group_merging import unite
+from .exposure_groups import interlink, link, standing, unite
 from .header_poses import HeaderPoses
 from .options import MatchOptions
 from .star_labels import label_stars

@@ -144,9 +144,7 @@ def _statistics(off):
     out = {"n": len(off), "found": len(found) / len(off)}
     for k, axis in enumerate("xy"):
         d, err = found[:, k], found[:, 2 + k]
-        enough = len(found) > 2
-        sigma = biweight_scale(d, M=np.zeros(1)) if enough else np.nan
-        pull = biweight_scale(d / err, M=np.zeros(1)) if enough else np.nan
+        sigma, pull = (biweight_scale(v, M=np.zeros(1)) if len(d) > 2 else np.nan for v in (d, d / err))
         figures = {
             "rms": np.sqrt(np.mean(d**2)) if len(d) else np.nan,
             "sigma": sigma,

@@ -28,22 +28,22 @@ class Plan:
     """
 
     n_exposures: int
-    stars: object = None
-    n_stars: int | None = None
-    density: float | None = None
-    sigma: object = None
-    degree: int = 3
-    shape: tuple = (2048, 2048)
-    dithers: object = 0.0
-    poses: dict | None = None
-    prior: Prior | None = None
-    gauge: str = "minimal"
-    dynamic: object = None
-    spectrum: object = None
-    static_spectrum: object = None
-    min_exposures: int | None = None
-    n_grid: int = 50
-    seed: int = 0
+    stars: object
+    n_stars: int | None
+    density: float | None
+    sigma: object
+    degree: int
+    shape: tuple
+    dithers: object
+    poses: dict | None
+    prior: Prior | None
+    gauge: str
+    dynamic: object
+    spectrum: object
+    static_spectrum: object
+    min_exposures: int | None
+    n_grid: int
+    seed: int
 
     def __post_init__(self):
         check_counts(n_grid=self.n_grid, n_exposures=self.n_exposures)

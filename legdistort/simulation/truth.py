@@ -80,8 +80,8 @@ class Truth:
 
     def table(self):
         """Stars as a QTable (``star``, ``x``, ``y``, ``flux``, and ``ra``, ``dec`` if known); the rest in its meta."""
-        out = QTable({"star": np.arange(len(self.positions)), "x": self.positions[:, 0] * u.pix})
-        out["y"] = self.positions[:, 1] * u.pix
+        x, y = self.positions.T * u.pix
+        out = QTable({"star": np.arange(len(x)), "x": x, "y": y})
         if self.flux is not None:
             out["flux"] = self.flux
         if self.sky is not None:
