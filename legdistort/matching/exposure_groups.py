@@ -234,17 +234,13 @@ def unite(lists, groups, guess, *, tolerance=None):
     main, *others = groups
     if not others or len(main.poses) == 1:
         return groups
-    main, k = _linked(lists, main, tolerance), 0
-    view = _view(lists, main)
-    while k < len(others):
-        other = _linked(lists, others[k], tolerance)
-        whole = _united(main, view, other, _view(lists, other), guess, tolerance)
-        if whole is None:
-            k += 1
-            continue
-        main, k = _linked(lists, whole, tolerance), 0
-        view = _view(lists, main)
+    whole = main
+    while whole is not None:
+        main = _linked(lists, whole, tolerance)
         others = [o for o in others if not o.poses.keys() & main.poses.keys()]
+        view, linked = _view(lists, main), (_linked(lists, o, tolerance) for o in others)
+        united = (_united(main, view, o, _view(lists, o), guess, tolerance) for o in linked)
+        whole = next((both for both in united if both is not None), None)
     return [main, *others]
 
 

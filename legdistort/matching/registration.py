@@ -230,7 +230,7 @@ def grow(source, target, pose, order=None):
     order = source.ranking if ranked else np.arange(len(source)) if order is None else order
     parity = np.sign(np.linalg.det(pose[:, :2]))
     warp = Warp.from_pose(pose, source.shape)
-    total, n, width = len(source), min(FIRST, len(source)), REACH * source.field
+    total, n, width = len(source), min(FIRST, len(source)), REACH * max(source.shape)
     best, best_strength = None, 0.0
     for stage in range(100):
         chosen = order[:n][:: -(-n // MOST)]

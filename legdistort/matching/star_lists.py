@@ -45,11 +45,6 @@ class StarList:
         return None if self.flux is None else np.argsort(-self.flux, kind="stable")
 
     @property
-    def field(self):
-        """Longer side of the detector, pixels."""
-        return float(max(self.shape))
-
-    @property
     def area(self):
         """Area of the detector, pixels squared."""
         return float(self.shape[0] * self.shape[1])

@@ -73,7 +73,6 @@ def calibrate_frame(exposure, remeasure, *, threshold=5.0, widths=None, fluxes=N
     for width in widths or [own]:
         profile = scaled(shape, width)
         levels = np.sort(fluxes if fluxes is not None else default_fluxes(exposure, frame, centres, profile, threshold))
-
         again = remeasure if width == own else partial(remeasure, fwhm=width)
         each = np.repeat(levels[::-1], n_positions)  # stars of about the same flux come into one frame
         off = _offsets(exposure, centres, each, profile, photon=photon, again=again, rng=rng)
@@ -98,7 +97,7 @@ def _photon_noise(frame, exposure, centres, shape):
 
 def default_fluxes(exposure, frame, centres, shape, threshold):
     """Fluxes from the detection limit to bright stars, evenly spaced in their logarithm; see `calibrate_frame`."""
-    params = np.array([[0, 0, 1.0, *shape, 0]])
+    params = moffat.parameters(np.ones(1), shape)
     unit = moffat.evaluate(params, box_half(moffat.fwhm(shape)), moffat.CENTRES)[0] / moffat.flux(params)
     variance = np.median(frame.variance[frame.good])
     lowest = _FAINTEST * threshold * np.sqrt(variance / (unit**2).sum())
@@ -245,8 +244,7 @@ def _light(image_shape, xy, flux, shape):
     for k in range(0, len(xy), 100):
         part = slice(k, k + 100)
         pixel = np.round(xy[part]).astype(int)
-        params = np.zeros((len(pixel), 8))
-        params[:, :2], params[:, 2], params[:, 3:7] = xy[part] - pixel, 1.0, shape
+        params = moffat.parameters(np.ones(len(pixel)), shape, xy[part] - pixel)
         params[:, 2] = flux[part] / moffat.flux(params)
         stamp = moffat.evaluate(params, wide, moffat.CENTRES)
         stamp[:, core] = moffat.evaluate(params, half, nodes)

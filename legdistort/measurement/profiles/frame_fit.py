@@ -26,10 +26,7 @@ _POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no
 
 def _start(stamps, shape):
     middle = stamps.data.shape[1] // 2
-    start = np.zeros((len(stamps.centres), 8))
-    start[:, 3:7] = shape
-    start[:, 2] = np.maximum(stamps.data[:, middle], np.sqrt(stamps.variance[:, middle]))
-    return start
+    return moffat.parameters(np.maximum(stamps.data[:, middle], np.sqrt(stamps.variance[:, middle])), shape)
 
 
 def _weights(good, variance):
@@ -187,8 +184,8 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
         models = stamps.models(found.params, nodes)
         done = _is_hot(stamps, found, models, weights > 0)
         hot = done | (hot if sigma is HELD else moffat.fwhm(found.params) < 0.6 * width)
-    wild = np.flatnonzero(_is_wild(found, width) & ~done)
-    if len(wild):
+    wild = _is_wild(found, width) & ~done
+    if wild.any():
         known = np.broadcast_to(centre, (len(hot), 4))[wild]
         found = _share_shape(stamps.data - models[1], weights, found, wild, shape=known, nodes=nodes)
         models[0][wild] = moffat.evaluate(found.params[wild], stamps.half, nodes)
@@ -204,17 +201,18 @@ def _ratio(models, weights):
 
 def _flags(stamps, found, good, troubles, width):
     wild, hot, snr = troubles
-    flags = np.zeros(len(good), dtype=int)
-    flags[wild] |= Flag.SHARED_SHAPE
-    flags[hot] |= Flag.HOT
-    flags[_is_wild(found, width)] |= Flag.NOT_CONVERGED
-    flags[snr < 3] |= Flag.INSIGNIFICANT
     near = stamps.near(found.params, width)
-    flags[(near & stamps.inside & ~good & ~stamps.saturated).any(axis=1)] |= Flag.MASKED
-    flags[(near & stamps.saturated).any(axis=1)] |= Flag.SATURATED
     seen = stamps.inside & stamps.cut(stamps.frame.good)
-    flags[(near & ~seen).sum(axis=1) > _GAP * near.sum(axis=1)] |= Flag.EDGE
-    return flags
+    raised = {
+        Flag.SHARED_SHAPE: wild,
+        Flag.HOT: hot,
+        Flag.NOT_CONVERGED: _is_wild(found, width),
+        Flag.INSIGNIFICANT: snr < 3,
+        Flag.MASKED: (near & stamps.inside & ~good & ~stamps.saturated).any(axis=1),
+        Flag.SATURATED: (near & stamps.saturated).any(axis=1),
+        Flag.EDGE: (near & ~seen).sum(axis=1) > _GAP * near.sum(axis=1),
+    }
+    return sum(np.where(stars, flag, 0) for flag, stars in raised.items())
 
 
 def _touching(stamps, found, hot, done, radius):
@@ -253,7 +251,5 @@ def _is_wild(fit, width):
 def _share_shape(data, weights, found, rows, *, shape, nodes):
     """The fit with some stars fitted anew and alone, their shape held at that of the frame."""
     data = data[rows]
-    start = np.zeros((len(rows), 8))
-    start[:, 2] = np.maximum(found.params[rows, 2], 1e-3 * np.abs(data).max(axis=1))
-    start[:, 3:7] = shape
+    start = moffat.parameters(np.maximum(found.params[rows, 2], 1e-3 * np.abs(data).max(axis=1)), shape)
     return found.updated(rows, fit(data, weights[rows], start, nodes=nodes, centre=shape, sigma=HELD))

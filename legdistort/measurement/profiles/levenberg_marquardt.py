@@ -100,12 +100,10 @@ def fit(stamps, weights, start, *, nodes, centre, sigma=SHAPE_SIGMA, max_iterati
     limits = max_iterations, tolerance
     parts = [
         _fit(_Pixels(stamps[i:j], weights[i:j], offsets[i:j], nodes), start[i:j], (centre[i:j], sigma), limits)
-        for i, j in ((i, i + size) for i in range(0, n, size))
+        for i, j in ((i, i + size) for i in range(0, max(n, 1), size))
     ]
     held = np.count_nonzero(np.asarray(sigma) <= HELD)
     dof = np.count_nonzero(weights, axis=1) - (width - held)
-    if not parts:
-        return Fit(start, np.zeros((0, width, width)), np.zeros(0), dof, np.zeros(0, dtype=bool))
     params, covariance, chi2, converged = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Fit(params, covariance, chi2, dof, converged)
 
