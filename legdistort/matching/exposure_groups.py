@@ -8,6 +8,7 @@ several exposures share are more complete and hardly ever false: groups are laid
 """
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from tqdm import tqdm
@@ -172,13 +173,10 @@ def _register_again(source, target, rows, columns, step, tolerance):
 def _overlaps(lists, rough):
     """Number of stars that the poses let two exposures share at most, for every pair of them."""
     out = {}
-    for i in sorted(rough):
-        for j in sorted(rough):
-            if i < j:
-                there = similarity.apply(similarity.compose(rough[j], similarity.invert(rough[i])), lists[i].xy)
-                inside = np.all((there > -0.5) & (there < np.array(lists[j].shape[::-1]) - 0.5), axis=1)
-                part = np.count_nonzero(inside) / len(lists[i])
-                out[i, j] = part * min(len(lists[i]), len(lists[j]))
+    for i, j in combinations(sorted(rough), 2):
+        there = similarity.apply(similarity.compose(rough[j], similarity.invert(rough[i])), lists[i].xy)
+        part = np.count_nonzero(lists[j].on_detector(there)) / len(lists[i])
+        out[i, j] = part * min(len(lists[i]), len(lists[j]))
     return out
 
 

@@ -107,7 +107,7 @@ def _spread(source, target, found, tolerance):
     while True:
         p = source.xy[found.source]
         if len(p) > MOST / 2 and np.all(
-            p.std(axis=0) > 0.95 * source.xy[_inside(source, target, found.warp)].std(axis=0)
+            p.std(axis=0) > 0.95 * source.xy[target.on_detector(found.warp(source.xy))].std(axis=0)
         ):
             return found
         order = None if source.ranking is not None else outwards(source, p.mean(axis=0))
@@ -338,16 +338,10 @@ def _settle(source, target, warp, limit, tolerance, degree):
     predicted = warp(source.xy)
     i, j, distance = _mutual(warp, source, target, limit, max(most, limit), lone=True)
     strength = _strength(predicted, target.tree, limit, len(warp.coefficients))
-    possible = np.mean(_inside(source, target, warp)) * min(len(source), len(target))
+    possible = np.mean(target.on_detector(predicted)) * min(len(source), len(target))
     if strength < MIN_STRENGTH or len(i) < max(5, MIN_SHARE * possible):
         return None
     return Registration(i, j, distance, warp, float(limit), float(strength))
-
-
-def _inside(source, target, warp):
-    """Which stars of the source a map puts on the target's detector."""
-    predicted = warp(source.xy)
-    return np.all((predicted > -0.5) & (predicted < np.array(target.shape[::-1]) - 0.5), axis=1)
 
 
 def _mutual(warp, source, target, limit, most, lone=False):

@@ -40,8 +40,8 @@ def spectrum_of(given, degree, name="spectrum"):
         For a wrong shape, degree or value.
     """
     n_fit = basis.n_modes(degree)
-    if given is None:
-        out = np.full((2, n_fit), np.nan)
+    if given is None or isinstance(given, Real):
+        out = np.full((2, n_fit), np.nan if given is None else float(given))
     elif isinstance(given, dict):
         degrees = [basis.check_degree(key, f"a degree in {name}") for key in given]
         out = np.zeros((2, basis.n_modes(max([degree, *degrees]))))
@@ -49,8 +49,6 @@ def spectrum_of(given, degree, name="spectrum"):
             out[:, :n_fit] = np.nan
         for d, value in zip(degrees, given.values(), strict=True):
             out[:, d * (d + 1) // 2 : basis.n_modes(d)] = value
-    elif isinstance(given, Real):
-        out = np.full((2, n_fit), float(given))
     else:
         values = np.asarray(given, dtype=float)
         if values.ndim not in (1, 2) or values.shape[:-1] not in ((), (2,)):

@@ -196,7 +196,8 @@ def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **set
     InputError
         For an unknown setting or one out of range.
     """
-    night, truth, rng = gsaoi_night.draw_night(small, seed, settings)
+    night = gsaoi_night.make_night(small, **settings)
+    truth, rng = gsaoi_night.draw_night(night, seed)
     hdus = {}
     for i, name in enumerate(tqdm(truth.names, desc="simulate", disable=not progress)):
         psf = replace(
@@ -230,7 +231,8 @@ def simulate_gsaoi_matches(*, small=False, seed=0, **settings):
     -------
     Simulation
     """
-    night, truth, rng = gsaoi_night.draw_night(small, seed, settings)
+    night = gsaoi_night.make_night(small, **settings)
+    truth, rng = gsaoi_night.draw_night(night, seed)
     observed = gsaoi_night.stars_inside(truth, night, truth.positions)
     observed &= np.count_nonzero(observed, axis=0) >= min(4, night.n_exposures)
     sigma = np.broadcast_to(night.position_error(truth.flux)[None, :, None], (*observed.shape, 2))

@@ -129,11 +129,10 @@ class Prediction:
 
     def summary(self):
         """All figures as a dict of numbers."""
-        out = {"n_exposures": self.n_exposures, "n_stars": self.n_stars, "degree": self.degree}
-        out |= {f.name: getattr(self, f.name) for f in fields(self) if f.type is float}
-        thumb_b, thumb_sigma = self.thumb
-        out |= {name: getattr(self, name) for name in ("b_total", "sigma_total", "s_b", "s_sigma")}
-        return out | {"thumb_b": thumb_b, "thumb_sigma": thumb_sigma}
+        counts = {"n_exposures": self.n_exposures, "n_stars": self.n_stars, "degree": self.degree}
+        names = [f.name for f in fields(self) if f.type is float] + ["b_total", "sigma_total", "s_b", "s_sigma"]
+        thumb = dict(zip(("thumb_b", "thumb_sigma"), self.thumb, strict=True))
+        return counts | {name: getattr(self, name) for name in names} | thumb
 
     def plot(self, *, ax=None):
         """Map of the expected scatter of new positions, aliasing included, with stars and contour; returns the axes.
