@@ -355,6 +355,22 @@ def test_no_star_in_enough_exposures():
         match(table, shape=SHAPE)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"min_exposures": None}, "min_exposures must be an integer of at least 2, got None"),
+        ({"min_exposures": 2.5}, "min_exposures must be an integer of at least 2, got 2.5"),
+        ({"columns": "star"}, "columns must be a dict .*, got 'star'"),
+        ({"tolerance": "1"}, "tolerance must be a positive number of pixels, got '1'"),
+        ({"reject_flags": "hot"}, "reject_flags must be an integer, .* got 'hot'"),
+        ({"isolation": "much"}, "isolation must be a positive number of standard errors, or None, got 'much'"),
+    ],
+)
+def test_options_of_the_wrong_kind(options, message):
+    with pytest.raises(InputError, match=message):
+        MatchOptions(**options)
+
+
 def test_options_are_the_arguments():
     parameters = inspect.signature(match).parameters
     options = {option.name: option.default for option in fields(MatchOptions)}
