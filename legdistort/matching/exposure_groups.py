@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from ..geometry import similarity
 from ..inputs.matches import robust_similarity
-from .registration import Registration, continue_from, grow, outwards, register, settle
+from .registration import Registration, continue_from_pairs, continue_from_pose, outwards, register
 from .star_labels import label_stars
 from .star_lists import StarList, Warp, allowed_degree, fit_warp
 
@@ -162,12 +162,11 @@ def interlink(lists, group, *, tolerance=None, progress=False):
 def _register_again(source, target, rows, columns, step, tolerance):
     """Register two exposures of a group from the stars they share through third ones, or else from their poses."""
     if len(rows) >= 8:
-        found = continue_from(source, target, rows, columns, tolerance=tolerance)
+        found = continue_from_pairs(source, target, rows, columns, tolerance=tolerance)
         if found is not None:
             return found
     order = outwards(source) if source.ranking is None or target.ranking is None else None
-    grown = grow(source, target, step, order)
-    return None if grown is None else settle(source, target, *grown, tolerance=tolerance)
+    return continue_from_pose(source, target, step, order, tolerance=tolerance)
 
 
 def _overlaps(lists, rough):

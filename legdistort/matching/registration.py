@@ -96,9 +96,8 @@ def _first(source, target, seeds, tolerance):
     """The first seed that grows to something significant."""
     if min(len(source), len(target)) < 5:
         return None
-    grown = (grow(source, target, pose, order) for pose, order in seeds)
-    settled = (settle(source, target, *g, tolerance=tolerance) for g in grown if g is not None)
-    found = next((s for s in settled if s is not None), None)
+    grown = (continue_from_pose(source, target, pose, order, tolerance=tolerance) for pose, order in seeds)
+    found = next((g for g in grown if g is not None), None)
     return None if found is None else _spread(source, target, found, tolerance)
 
 
@@ -111,8 +110,8 @@ def _spread(source, target, found, tolerance):
         ):
             return found
         order = None if source.ranking is not None else outwards(source, p.mean(axis=0))
-        grown = grow(source, target, robust_similarity(p, target.xy[found.target]), order)
-        again = None if grown is None else settle(source, target, *grown, tolerance=tolerance)
+        pose = robust_similarity(p, target.xy[found.target])
+        again = continue_from_pose(source, target, pose, order, tolerance=tolerance)
         if again is None or len(again.source) <= len(found.source):
             return found
         enough = len(again.source) < 1.05 * len(found.source)
@@ -121,7 +120,27 @@ def _spread(source, target, found, tolerance):
             return found
 
 
-def continue_from(source, target, rows, columns, *, tolerance=None):
+def continue_from_pose(source, target, pose, order=None, *, tolerance=None):
+    """Registration of two lists of which a rough pose is known.
+
+    Parameters
+    ----------
+    source, target : StarList
+    pose : ndarray, shape (2, 3)
+    order : ndarray of int, optional
+        As in `grow`.
+    tolerance : float, optional
+        As in `register`.
+
+    Returns
+    -------
+    Registration or None
+    """
+    grown = grow(source, target, pose, order)
+    return None if grown is None else settle(source, target, *grown, tolerance=tolerance)
+
+
+def continue_from_pairs(source, target, rows, columns, *, tolerance=None):
     """Registration of two lists of which some pairs are known.
 
     Parameters

@@ -194,11 +194,10 @@ def free_positions(exposure, taken, fwhm, *, n, rng):
         xy = xy[cKDTree(taken).query(xy)[0] > AWAY * fwhm]
     if not len(xy):
         return xy
-    tree, keep = cKDTree(xy), np.ones(len(xy), dtype=bool)
-    for i in range(len(xy)):
+    keep = np.ones(len(xy), dtype=bool)
+    for i, j in sorted(cKDTree(xy).query_pairs(APART * fwhm)):  # i < j: who came first stays
         if keep[i]:
-            near = np.array(tree.query_ball_point(xy[i], APART * fwhm))
-            keep[near[near > i]] = False
+            keep[j] = False
     return xy[keep][:n]
 
 
