@@ -64,9 +64,9 @@ class HeaderPoses:
 
     def step(self, source, target):
         """Nominal pose from one exposure's pixels to another's, or None."""
-        if source in self.poses and target in self.poses:
-            return similarity.compose(self.poses[target], similarity.invert(self.poses[source]))
-        return None
+        if not {source, target} <= self.poses.keys():
+            return None
+        return similarity.compose(self.poses[target], similarity.invert(self.poses[source]))
 
     def place(self, found):
         """Poses in any plane carried to the headers' plane, by the mean of the headers that agree.

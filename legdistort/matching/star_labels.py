@@ -61,8 +61,5 @@ def _take_apart(labels, exposure, a, b, distance):
             one |= two
             for i in two:
                 members[i] = one
-    fresh = labels.max() + 1
-    for node, group in members.items():
-        if node == min(group):
-            labels[list(group)] = fresh
-            fresh += 1
+    for group in members.values():
+        labels[list(group)] = len(labels) + min(group)

@@ -80,9 +80,8 @@ def assumed_spectra(plan):
             "the widths of the prior state the scatter of the modes that are fitted: leave dynamic out, and let "
             f"spectrum begin at degree {degree + 1}"
         )
-    if plan.static_spectrum is None:
-        return independent, np.zeros_like(independent)
-    return independent, spectrum_of(plan.static_spectrum, degree, "static_spectrum")
+    common = 0.0 if plan.static_spectrum is None else plan.static_spectrum
+    return independent, spectrum_of(common, degree, "static_spectrum")
 
 
 @dataclass(frozen=True, eq=False)
