@@ -50,7 +50,9 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
     """
     if gauge.plane is not None:
         return np.full_like(uncertainty.stars, np.nan)
-    out = np.where(np.isfinite(xy[:, 0]), uncertainty.stars, np.nan) + _spread(_directions(gauge, xy), gauge.absolute_covariance)
+    out = np.where(np.isfinite(xy[:, 0]), uncertainty.stars, np.nan) + _spread(
+        _directions(gauge, xy), gauge.absolute_covariance
+    )
     if gauge.tie is not None:
         out = out + gauge.tie.shared
     if not without_unknown:

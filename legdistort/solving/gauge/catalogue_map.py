@@ -1,9 +1,9 @@
 """What a reference catalogue determines of a common map: an estimate of it, with its errors.
 
 A common map g of the reference plane, X -> X + D g, is all that a reference is asked for. Its stars lie
-``r_j = X_cat,j - X_j`` off the relative solution, ``r = D g`` but for the errors of both. What the exposures and a prior
-determine of g (`legdistort.solving.gauge.hierarchy`) counts with its information, that is, of shift, rotation and scale
-nothing. What neither determines to `LIMIT` stays where the convention has it.
+``r_j = X_cat,j - X_j`` off the relative solution, ``r = D g`` but for the errors of both. What the exposures and a
+prior determine of g (`legdistort.solving.gauge.hierarchy`) counts with its information, that is, of shift, rotation and
+scale nothing. What neither determines to `LIMIT` stays where the convention has it.
 """
 
 from dataclasses import dataclass
