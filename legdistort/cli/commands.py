@@ -170,7 +170,7 @@ def do_match(a):
     from ..matching.matcher import match
 
     tables = [_read_table(path, a) for path in a.tables]
-    names = [name for table in tables for name in set(table["exposure"])]
+    names = [name for table in tables for name in dict.fromkeys(table["exposure"])]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
