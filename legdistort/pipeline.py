@@ -27,7 +27,7 @@ from .runtime.checks import options_from
 from .runtime.parallel import check_workers
 from .solving.estimation import solve
 from .solving.options import SolveOptions, check_reference
-from .wcs.files import write_wcs
+from .wcs.storage import write_wcs
 
 log = logging.getLogger(__name__)
 

@@ -24,7 +24,7 @@ from legdistort.cli import options, parser
 from legdistort.cli.arguments import given
 from legdistort.cli.commands import COMMANDS
 from legdistort.cli.parser import main
-from legdistort.coaddition import mosaicking
+from legdistort.coaddition import mosaicking, preparation
 from legdistort.demo import run_demo
 from legdistort.exceptions import InputError
 from legdistort.measurement.noise_curves import SOURCES
@@ -158,7 +158,7 @@ def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, numb
     """By Ctrl-C, or by a batch system."""
     (tmp_path / "scratch").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
-    monkeypatch.setattr(mosaicking, "survey", lambda *args, **options: os.kill(os.getpid(), number))
+    monkeypatch.setattr(preparation, "measure_background", lambda *args, **options: os.kill(os.getpid(), number))
     usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
     before = signal.signal(number, usual)
     try:

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..exceptions import InputError, MatchError
 from ..geometry import similarity as poses
+from ..geometry.similarity import robust_similarity
 from ..geometry.tangent_plane import TangentPlane
 from . import column_contract
 from .exposure_names import check_exposure_name
@@ -303,23 +304,6 @@ def _star_means(xy, star, n_stars, weights=None):
     sums = np.column_stack([np.bincount(star, w * xy[:, k], n_stars) for k in (0, 1)])
     with np.errstate(invalid="ignore"):
         return sums / total[:, None]
-
-
-def robust_similarity(source, target, *, weights=None, n_iterations=10):
-    """Similarity by iteratively reweighted least squares with Cauchy weights at the observed scale.
-
-    Parameters as for `legdistort.geometry.similarity.fit_similarity`. The scale is the median residual.
-    """
-    base = np.ones(len(source)) if weights is None else weights
-    w = base
-    for _ in range(n_iterations):
-        pose = poses.fit_similarity(source, target, weights=w)
-        r2 = ((poses.apply(pose, source) - target) ** 2).sum(axis=1)
-        scale2 = np.median(r2)
-        if scale2 <= 1e-20 * np.ptp(target, axis=0).max() ** 2:
-            break
-        w = base / (1 + r2 / (2 * scale2))
-    return pose
 
 
 def estimate_poses(exposure, star, xy, *, names=None):

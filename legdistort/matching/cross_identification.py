@@ -8,9 +8,8 @@ from scipy.spatial import cKDTree
 
 from ..exceptions import InputError
 from ..geometry import similarity
-from ..geometry.tangent_plane import TangentPlane
-from ..inputs.matches import robust_similarity
-from ..inputs.reference_catalogue import directions
+from ..geometry.similarity import robust_similarity
+from ..geometry.tangent_plane import TangentPlane, angles, directions
 from .registration import register
 from .seeds import scale_candidates
 from .star_lists import StarList
@@ -191,8 +190,7 @@ def _by_pattern(reference, positions, flux, pixel_scale):
 
 def _middle(sky, scale):
     """The plane that touches the sky in the middle of positions (n, 2), in pixels of `scale` degrees."""
-    place = np.mean(directions(sky), axis=0)
-    lon, lat = np.degrees([np.arctan2(place[1], place[0]), np.arctan2(place[2], np.hypot(place[0], place[1]))])
+    lon, lat = np.degrees(angles(np.mean(directions(*np.radians(sky).T), axis=0)))
     return TangentPlane(float(lon) % 360, float(lat), scale * similarity.identity())
 
 

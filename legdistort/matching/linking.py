@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from tqdm import tqdm
 
 from ..geometry import similarity as poses
-from ..inputs.matches import robust_similarity
+from ..geometry.similarity import robust_similarity
 from .registration import continue_from, grow, outwards, register, settle
 
 #: Exposures of a group with which a stray one is compared at any rotation.

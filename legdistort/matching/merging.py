@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..geometry import similarity
-from ..inputs.matches import robust_similarity
+from ..geometry.similarity import robust_similarity
 from .linking import Group, interlink, label_stars
 from .registration import Registration, register
 from .star_lists import StarList, Warp, allowed_degree, fit_warp

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..geometry import similarity
-from ..inputs.matches import robust_similarity
+from ..geometry.similarity import robust_similarity
 from . import seeds as asterisms
 from .star_lists import Warp, allowed_degree, fit_warp
 

@@ -9,7 +9,7 @@ from astropy.table import vstack
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..inputs.exposure_files import listed
 from ..runtime.checks import options_from
-from ..runtime.parallel import each
+from ..runtime.parallel import map_items
 from .injection import calibrate_frame
 from .noise_curves import NoiseCurves
 from .options import MeasureOptions
@@ -63,7 +63,7 @@ def calibrate_noise(
     fluxes, widths = check_injection(fluxes, fwhm, n_positions, seed)
     options = options_from(MeasureOptions, measuring, "measuring")
     work = partial(_calibrate, options=options, fluxes=fluxes, widths=widths, n_positions=n_positions, seed=seed)
-    results = list(each(work, exposures, workers=workers, progress=progress, description="noise"))
+    results = list(map_items(work, exposures, workers=workers, progress=progress, description="noise"))
     assumed = {name: photon for _, photons in results for name, photon in photons.items()}
     if assumed:
         gains = [f"{name} {1 / photon:.3g}" if photon else f"{name} none seen" for name, photon in assumed.items()]

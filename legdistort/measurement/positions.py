@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, warn
 from ..inputs.exposure_files import listed
-from ..runtime.parallel import each
+from ..runtime.parallel import map_items
 from .crowding import crowding, is_deformed
 from .flags import UNUSABLE, Flag
 from .injection import calibrate_frame
@@ -110,7 +110,7 @@ def measure(
         read_noise=read_noise, saturation=saturation, errors=errors,
     )  # fmt: skip
     work = partial(measure_exposure, options=options)
-    measured = each(work, exposures, workers=workers, progress=progress, description="measuring")
+    measured = map_items(work, exposures, workers=workers, progress=progress, description="measuring")
     tables, assumed = [], {}
     for exposure, (table, photon, assuming) in zip(exposures, measured, strict=True):
         if assuming:

@@ -3,6 +3,10 @@
 A file is looked at three times: its blocks (what they declare to hold), its YAML as a stream of events (length,
 nesting, repetition by aliases, tags), and its tree before any object is made of it (references, sizes of arrays).
 Only then does asdf open it.
+
+It guards those who read a solution, a prior or a WCS that somebody sent them or that lies on a server: against files
+that fill the memory (a few kilobytes can unpack to any size), name files elsewhere, or call whatever converters are
+installed; and against those that were cut off or damaged on the way, for which asdf alone has no words.
 """
 
 import hashlib
