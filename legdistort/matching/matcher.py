@@ -11,8 +11,9 @@ from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
-from ..inputs.matches import Matches, estimate_poses
+from ..inputs.matches import Matches
 from ..inputs.reference_catalogue import mean_epoch
+from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
 from .linking import interlink, label_stars, standing, tie
