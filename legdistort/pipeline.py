@@ -12,8 +12,7 @@ import numpy as np
 from .assessment import baselines, stack_quality
 from .coaddition.mosaicking import coadd
 from .exceptions import InputError, MatchError
-from .inputs.exposure_files import open_exposures
-from .inputs.exposures import expand_paths
+from .inputs.exposure_files import file_checksums, open_exposures
 from .inputs.table_files import write_stars
 from .matching.matcher import match
 from .measurement.positions import measure
@@ -137,7 +136,7 @@ def run(
     with _timed(timings, "solve"):
         tying = {"reference": reference, "epoch": epoch, "pixel_scale": pixel_scale}
         solution = solve(matches, degree=degree, prior=prior, clip=clip, **tying, **(solving or {}))
-        solution = provenance.with_inputs(solution, provenance.checksums(expand_paths(paths)))
+        solution = provenance.with_inputs(solution, file_checksums(exposures))
     comparison = None
     if compare:
         with _timed(timings, "compare"):

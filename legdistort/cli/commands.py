@@ -68,16 +68,14 @@ def do_run(a):
 
 def do_measure(a):
     """``legdistort measure``."""
-    from ..inputs.exposure_files import open_exposures
-    from ..inputs.exposures import expand_paths
+    from ..inputs.exposure_files import file_checksums, open_exposures
     from ..measurement.positions import measure
-    from ..runtime.provenance import checksums
 
     exposures = open_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
     given = _given(a, "fwhm", "profile", "blends", *_DETECTOR) | {"errors": a.position_errors}
     table = measure(exposures, workers=a.workers, progress=wants_progress(a), **given)
     shapes = {e.name: list(e.shape) for e in exposures}
-    table.meta |= {"shapes": shapes, "inputs": checksums(expand_paths(a.frames))}
+    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures)}
     _write_table(table, a)
     _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
 

@@ -12,7 +12,7 @@ from astropy.table import Table
 
 from ..exceptions import InputError
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 #: Kinds of positions, the most precise first.
 KINDS = ("PSF", "WIN", "")
@@ -86,7 +86,7 @@ def understand(table, columns):
             out[name] = column
     if not np.all(good):
         bad = np.count_nonzero(~good)
-        logger.warning("%d of %d detections have no usable error of position and are left out", bad, len(table))
+        log.warning("%d of %d detections have no usable error of position and are left out", bad, len(table))
         out = out[good]
     return out, None if "x" in taken else f"X{kind}_IMAGE"
 

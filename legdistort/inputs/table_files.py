@@ -16,7 +16,7 @@ from ..runtime.provenance import checksums
 from . import column_contract, sextractor
 from .exposure_names import check_exposure_name, exposure_name
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 #: Formats that are written, by suffix.
 WRITTEN = {".ecsv": "ascii.ecsv", ".fits": "fits", ".csv": "ascii.csv", ".vot": "votable", ".xml": "votable"}
@@ -95,7 +95,7 @@ def _understood(table, columns, origin):
     if origin is None:
         origin = 1 if source is not None and sextractor.is_pixel(source) else 0
     if origin:
-        logger.info("pixels of the table count from 1; 1 is taken off")
+        log.info("pixels of the table count from 1; 1 is taken off")
         for name in ("x", "y"):
             if name in table.colnames:
                 table[name] = column_contract.values(table, name, u.pix) - origin
