@@ -11,6 +11,7 @@ import numpy as np
 from astropy.table import Table
 
 from ..exceptions import InputError
+from .column_contract import values
 
 log = logging.getLogger(__name__)
 
@@ -93,15 +94,9 @@ def understand(table, columns):
 
 def _numbers(table, *names):
     """Columns as float arrays; None if one is missing."""
-    if not all(name in table.colnames for name in names):
-        return None
-    several = [name for name in names if table[name].ndim != 1]
-    if several:
-        raise InputError(f"column {several[0]!r} must hold one number a row, it has shape {table[several[0]].shape}")
-    try:
-        return [np.ma.filled(np.ma.asarray(table[name]).astype(float), np.nan) for name in names]
-    except (TypeError, ValueError):
-        raise InputError(f"the columns {', '.join(names)} must hold numbers") from None
+    if all(name in table.colnames for name in names):
+        return [values(table, name) for name in names]
+    return None
 
 
 def _covariance(table, kind):
