@@ -29,7 +29,7 @@ _PLACES = {
     "open_exposures": "inputs.exposure_files",
     "predict": "simulation.prediction",
     "read_exposures": "inputs.exposure_files",
-    "read_wcs": "wcs.files",
+    "read_wcs": "wcs.storage",
     "run": "pipeline",
     "simulate_exposures": "simulation.observations",
     "simulate_matches": "simulation.observations",

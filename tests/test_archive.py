@@ -29,7 +29,7 @@ from legdistort.results.solution import Solution
 from legdistort.runtime import provenance
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 from legdistort.solving.estimation import solve
-from legdistort.wcs.files import write_wcs
+from legdistort.wcs.storage import write_wcs
 
 
 def small(**changes):
@@ -420,6 +420,15 @@ def test_the_inverse_that_was_certified_is_the_one_used(solution, tmp_path):
         kept, made = back.distortion(name).inverse, solution.distortion(name).inverse
         assert_array_equal(kept.tensors, made.tensors)
         assert (kept.error, kept.valid) == (made.error, made.valid)
+
+
+def test_other_coefficients_have_another_inverse(solution, tmp_path):
+    back = Solution.read(solution.write(tmp_path / "s.asdf"))
+    name = solution.names[0]
+    half = replace(back, coefficients=0.5 * back.coefficients)
+    p = np.array([[100.0, 200.0]])
+    correction = half.distortion(name).model().inverse
+    assert_allclose(np.column_stack(correction(*p.T)), half.distortion(name).invert(p), rtol=0, atol=1e-6)
 
 
 # --- single WCS files ----------------------------------------------------------------------------------------------

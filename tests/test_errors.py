@@ -16,7 +16,7 @@ from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving import minimisers
-from legdistort.solving.equations import reduced_system
+from legdistort.solving.equations import criterion, reduced_system
 from legdistort.solving.equations.problem import build_problem
 from legdistort.solving.estimation import solve
 
@@ -40,7 +40,7 @@ def carried(sim, solution, prior, *, told=False):
     fixed = np.stack([solution.poses[name] for name in solution.names])
     state = minimisers.State(solution.positions.T.copy(), solution.coefficients.copy(), fixed)
     for _ in range(6):
-        blocks = minimisers.criterion.linearise(problem, state)
+        blocks = criterion.linearise(problem, state)
         departure = (state.coefficients - problem.prior_mean)[:, :, : problem.n_modes].reshape(problem.n_exposures, -1)
         system = reduced_system.reduced_system(problem, blocks, gauge)
         d_star, d_exposure = system.step(-gauge.violation(departure), free, 1e-10)

@@ -10,8 +10,7 @@ from scipy.optimize import least_squares
 
 from legdistort.exceptions import InputError, SolveError
 from legdistort.geometry import basis
-from legdistort.geometry.fitter import leaves
-from legdistort.geometry.models import FastLegendre2D
+from legdistort.geometry.models import FastLegendre2D, leaves
 from legdistort.inputs.matches import Matches
 from legdistort.results.solution import Solution
 from legdistort.simulation.observations import simulate_matches

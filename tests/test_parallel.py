@@ -24,7 +24,7 @@ from astropy.nddata import CCDData
 from test_coaddition import SHAPE, expose, scene
 
 import legdistort as ld
-from legdistort.coaddition import block_stack, levels, mosaicking
+from legdistort.coaddition import block_stack, preparation
 from legdistort.coaddition.resampling import engines
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError, LegdistortError
 from legdistort.inputs.exposure_files import ExposureFile, file_checksums
@@ -412,8 +412,8 @@ class TestMosaicInBlocks:
             with pytest.raises(DiskFullError, match=r"No space left on the disk of .* give another folder as scratch="):
                 ld.coadd(exposures, solution, scratch=tmp_path)
         assert not any(tmp_path.iterdir())
-        survey = levels.survey
-        monkeypatch.setattr(mosaicking, "survey", lambda *args, **kwargs: time.sleep(0.5) or survey(*args, **kwargs))
+        measure = preparation.measure_background
+        monkeypatch.setattr(preparation, "measure_background", lambda *a, **k: time.sleep(0.5) or measure(*a, **k))
         threading.Timer(1, _thread.interrupt_main).start()
         with pytest.raises(KeyboardInterrupt):
             [ld.coadd(exposures, solution, workers=2, scratch=tmp_path) for _ in range(20)]

@@ -56,7 +56,7 @@ def make_solution(
         status="converged after 4 iterations",
         gauge=SimpleNamespace(sentence="minimal: by convention"),
         uncertainty=None,
-        settings=Settings(degree, "joint"),
+        settings=Settings(degree),
         diagnostics=Diagnostics(),
         left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},
     )

@@ -60,7 +60,7 @@ def calibrate_noise(
         If exposures lack a gain: the photon noise put in is estimated from their stars.
     """
     exposures = listed(exposures, "calibrate_noise")
-    fluxes, widths = _check_arguments(fluxes, fwhm, n_positions, seed)
+    fluxes, widths = check_injection(fluxes, fwhm, n_positions, seed)
     options = options_from(MeasureOptions, measuring, "measuring")
     work = partial(_calibrate, options=options, fluxes=fluxes, widths=widths, n_positions=n_positions, seed=seed)
     results = list(map_items(work, exposures, workers=workers, progress=progress, description="noise"))
@@ -91,8 +91,8 @@ def _calibrate(exposure, *, options, **stars):
     return curves, {} if exposure.gain else curves.table.meta["photon"]
 
 
-def _check_arguments(fluxes, fwhm, n_positions, seed):
-    """Fluxes and widths as lists, or None."""
+def check_injection(fluxes=None, fwhm=None, n_positions=100, seed=0):
+    """The stars asked for, checked: fluxes and widths as lists, or None."""
     if fluxes is not None:
         fluxes = np.unique(np.asarray(fluxes, dtype=float))
         if not fluxes.size or not (np.isfinite(fluxes) & (fluxes > 0)).all():

@@ -37,22 +37,14 @@ def plot_zooms(zooms, *, fig=None):
 
 
 def _draw_row(axes, zoom):
-    from matplotlib import colormaps
-
     images = [image for image, _ in zoom.cuts.values()]
     best = images[-1]
     sky, low = np.nanpercentile(best, [50, 16])
     soft = 3 * (sky - low) or 1.0
-    height = np.nanmax(_middle(best)) - sky
+    # the core is saturated to show the wings and faint stars
+    low, high = np.arcsinh([-1.0, 0.3 * (np.nanmax(_middle(best)) - sky) / soft])
     for ax, (name, (image, extent)) in zip(axes, zoom.cuts.items(), strict=True):
-        ax.imshow(
-            np.ma.masked_invalid(np.arcsinh((image - sky) / soft)),
-            vmin=np.arcsinh(-1.0),
-            vmax=np.arcsinh(0.3 * height / soft),  # the core is saturated to show the wings and faint stars
-            cmap=colormaps["gray_r"].with_extremes(bad="#cfe0f1"),
-            origin="lower",
-            extent=extent,
-        )
+        elements.draw_image(ax, image, sky=sky, soft=soft, low=low, high=high, extent=extent)
         own = np.nanmax(_middle(image)) - sky
         if own > 0:
             x, y = (a + 0.5 + np.arange(n) for a, n in zip(extent[::2], image.shape[::-1], strict=True))

@@ -1,6 +1,6 @@
 """Models, WCSs and SIAF apertures as sources of a static distortion."""
 
-import dataclasses
+from dataclasses import replace
 
 import gwcs
 import numpy as np
@@ -19,7 +19,7 @@ PLANES = ("undistorted", "v2v3")
 NOTHING = 1e-6
 
 
-def describe(model, *, frame=None, name="the model"):
+def as_source(model, *, frame=None, name="the model"):
     """What is known of a model, WCS, aperture or function, as a `Source`.
 
     Parameters
@@ -101,7 +101,7 @@ def _of_gwcs(wcs, frame, name):
         known["sphere"] = float(end.unit[0].to(u.deg)) if hasattr(end, "unit") else 1.0
         if getattr(end, "axes_order", None) == (1, 0):
             transform = transform | models.Mapping((1, 0))
-    return dataclasses.replace(of_model(transform, name, **known), kind="gwcs")
+    return replace(of_model(transform, name, **known), kind="gwcs")
 
 
 def _shape_of(wcs):

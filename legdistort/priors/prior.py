@@ -1,6 +1,6 @@
 """What is known of the distortion beforehand."""
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
@@ -12,10 +12,10 @@ EVIDENCE = "evidence"
 
 
 def _per_mode(value, n, name):
-    """A width given as a number, per mode or per axis and mode -> (2, n_modes), non-negative."""
+    """A width given as a number, per mode or per axis and mode -> (2, n_modes), non-negative; None as None."""
+    if value is None or (isinstance(value, str) and name == "sigma" and value == EVIDENCE):
+        return value
     if isinstance(value, str):
-        if name == "sigma" and value == EVIDENCE:
-            return EVIDENCE
         words = "widths in pixels" + (f", or {EVIDENCE!r}: found from the exposures" if name == "sigma" else "")
         raise InputError(f"{name} must be {words}, got {value!r}")
     out = np.asarray(value, dtype=float)
@@ -30,7 +30,7 @@ def _per_mode(value, n, name):
     return out
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False)
 class Prior:
     """Static distortion known beforehand, and how far to trust it.
 
@@ -65,30 +65,24 @@ class Prior:
     """
 
     mean: np.ndarray
-    sigma: np.ndarray | str | None
-    static_sigma: np.ndarray | None
-    shape: tuple | None
-    truncation: float
-    plane: np.ndarray | None
-    source: str | dict | None
+    _: KW_ONLY
+    sigma: np.ndarray | str | None = None
+    static_sigma: np.ndarray | None = None
+    shape: tuple | None = None
+    truncation: float = 0.0
+    plane: np.ndarray | None = None
+    source: str | dict | None = None
 
-    def __init__(self, mean, *, sigma=None, static_sigma=None, shape=None, truncation=0.0, plane=None, source=None):
-        mean = np.array(mean, dtype=float)
+    def __post_init__(self):
+        mean = np.array(self.mean, dtype=float)
         if mean.ndim != 2 or mean.shape[0] != 2:
             raise InputError(f"mean must have shape (2, n_modes), x then y, got {mean.shape}")
         if not np.all(np.isfinite(mean)):
             raise InputError("mean has values that are not finite")
         basis.degree_of(mean.shape[1])
-        widths = [
-            None if value is None else _per_mode(value, mean.shape[1], name)
-            for value, name in ((sigma, "sigma"), (static_sigma, "static_sigma"))
-        ]
-        for name, value in zip(
-            ("mean", "sigma", "static_sigma", "shape", "truncation", "plane", "source"),
-            (mean, *widths, shape, truncation, plane, source),
-            strict=True,
-        ):
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "mean", mean)
+        for name in ("sigma", "static_sigma"):
+            object.__setattr__(self, name, _per_mode(getattr(self, name), mean.shape[1], name))
 
     @property
     def degree(self):
@@ -131,9 +125,8 @@ class Prior:
             given = np.asarray(sigma, dtype=float)
             sigma = np.full((*given.shape[:-1], basis.n_modes(degree)), np.inf)
             sigma[..., : given.shape[-1]] = given[..., : sigma.shape[-1]]
-        known = {name: getattr(self, name) for name in ("shape", "truncation", "plane", "source")}
         static = None if self.static_sigma is None else basis.change_degree(self.static_sigma, degree)
-        return Prior(basis.change_degree(self.mean, degree), sigma=sigma, static_sigma=static, **known)
+        return replace(self, mean=basis.change_degree(self.mean, degree), sigma=sigma, static_sigma=static)
 
     def __repr__(self):
         words = [f"degree {self.degree}", f"{self.mean.shape[1]} modes an axis"]
@@ -191,9 +184,9 @@ class Prior:
             For a wrong direction or origin, or a model that cannot be followed over the detector.
         """
         from .expansion import expand
-        from .from_objects import describe
+        from .from_objects import as_source
 
-        source = describe(model, frame=frame).stated(shape=shape, direction=direction, origin=origin)
+        source = as_source(model, frame=frame).stated(shape=shape, direction=direction, origin=origin)
         mean, plane, truncation = expand(source, basis.check_degree(degree), parity)
         known = {"shape": source.shape, "truncation": truncation, "plane": plane, "source": source.record()}
         return cls(mean, sigma=sigma, static_sigma=static_sigma, **known)

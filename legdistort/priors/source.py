@@ -5,8 +5,7 @@ V2 and V3) are projected from the centre of the sphere on the plane that touches
 since angles themselves are no plane.
 """
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.interpolate import NdBSpline, make_interp_spline
@@ -61,7 +60,7 @@ class Source:
     usual: str | None = None
     from_middle: bool = False
     files: tuple = ()
-    details: dict = dataclasses.field(default_factory=dict)
+    details: dict = field(default_factory=dict)
 
     def __repr__(self):
         return f"<Source {self.name}: {self.kind}>"
@@ -95,7 +94,7 @@ class Source:
             raise InputError(
                 f"{self.name} ({self.kind}) does not tell the size of the detector: give shape=(ny, nx) (--shape NY NX)"
             )
-        return dataclasses.replace(self, **given)
+        return replace(self, **given)
 
     def record(self):
         """Where it comes from as plain numbers and strings; files with their SHA-256."""

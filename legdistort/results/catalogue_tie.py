@@ -65,7 +65,7 @@ class Tie:
 
         NaN for rotation and scale if the reference does not tell them. `size` (ny, nx) is that of the box of the modes.
         """
-        known = Knowledge(self.covariance, np.zeros(len(self.covariance)), False, size)
+        known = MapPrior(self.covariance, np.zeros(len(self.covariance)), False, size)
         similar, parts = known.similarities, known.by_degree()
         if self.alone:
             groups = {"shift": similar[:, :2], "rotation, scale": np.full((len(similar), 2), np.nan)}
@@ -96,7 +96,7 @@ class Tie:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Knowledge:
+class MapPrior:
     """What is known of the common map before the reference is asked.
 
     Attributes
@@ -115,9 +115,6 @@ class Knowledge:
     centre: np.ndarray
     free: bool
     size: tuple
-
-    def __repr__(self):
-        return f"<Knowledge: {self.n_modes} modes an axis>"
 
     @property
     def n_modes(self):

@@ -40,8 +40,8 @@ class Result:
     converged : bool
     status : str
         What happened, in a sentence.
-    history : list of dict
-        J, the largest changes of positions and coefficients [pix], one entry an iteration.
+    n_iterations : int
+        Steps of the joint solver, sweeps of the alternating one.
     robust : ndarray, shape (n,)
         Factors on the weights from the loss (ones for a linear one).
     n_weak : int
@@ -53,7 +53,7 @@ class Result:
     gauge: Gauge
     converged: bool
     status: str
-    history: list
+    n_iterations: int
     robust: np.ndarray
     n_weak: int = 0
 
@@ -111,14 +111,16 @@ def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", 
     convention = run.convention
     if convention.told is not None:
         convention = _declared(convention, run.weighted, run.blocks, _departure(problem, run.state))
-    status = f"converged after {len(run.history)} iterations"
+    status = f"converged after {len(run.steps)} iterations"
     if not run.converged:
         status = (
-            f"not converged after {max_iterations} iterations: the last step was {run.history[-1]['step']:.2g} "
+            f"not converged after {max_iterations} iterations: the last step was {run.steps[-1]:.2g} "
             "standard errors; look for mismatched stars (loss='cauchy'), or lower the degree"
         )
         warn(status, ConvergenceWarning)
-    return Result(run.state, run.blocks, convention, run.converged, status, run.history, run.factors, run.system.n_weak)
+    return Result(
+        run.state, run.blocks, convention, run.converged, status, len(run.steps), run.factors, run.system.n_weak
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +135,9 @@ class _Rules:
 class _Descent:
     """Gauss-Newton iterations under one set of constraints."""
 
-    def __init__(self, problem, state, rules, *, told=None, history=()):
+    def __init__(self, problem, state, rules, *, told=None, steps=()):
         self.problem, self.state, self.rules = problem, state, rules
-        self.told, self.history, self.converged = told, list(history), False
+        self.told, self.steps, self.converged = told, list(steps), False
         self._reweight(criterion.residuals(problem, state) if rules.loss != "linear" else None)
         self.blocks = criterion.linearise(self.weighted, state)
         self._prepare()
@@ -161,14 +163,7 @@ class _Descent:
             target = -self.convention.violation(_departure(self.problem, self.state))
             d_star, d_exposure = self.system.step(target, self.convention.told_rows, accuracy)
             size, last = _step_size(self.blocks, d_star, d_exposure), size
-            self.history.append(
-                {
-                    "cost": self.blocks.cost,
-                    "d_positions": float(np.abs(d_star).max()),
-                    "d_coefficients": float(np.abs(d_exposure).max()),
-                    "step": size,
-                }
-            )
+            self.steps.append(size)
             log.debug("J = %.8g, step %.2g standard errors", self.blocks.cost, size)
             if size < tolerance:
                 self.converged = True
@@ -192,7 +187,7 @@ class _Descent:
             return None
         log.debug("the data contradict the convention along %d directions", more.shape[1])
         told = self.convention.left_to_data(np.hstack([rows, more]))
-        return _Descent(self.problem, self.state, self.rules, told=told, history=self.history)
+        return _Descent(self.problem, self.state, self.rules, told=told, steps=self.steps)
 
     def is_explained(self, before):
         """Whether the data are explained now, or the distortion is shared and the convention plainly not needed."""
@@ -263,9 +258,9 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
     Result
     """
     max_iterations = MAX_SWEEPS if max_iterations is None else max_iterations
-    n_modes, history, converged = problem.n_modes, [], False
+    n_modes = problem.n_modes
     blocks = criterion.linearise(problem, state)
-    for _sweep in range(1, max_iterations + 1):
+    for sweep in range(1, max_iterations + 1):
         before = state
         for _ in range(3):  # stars given A: a few Newton steps, each star by itself
             step = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
@@ -280,11 +275,9 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
         blocks = criterion.linearise(problem, state)
         c_a = _relative_change(before.coefficients, state.coefficients)
         c_x = _relative_change(before.positions, state.positions)
-        history.append({"cost": blocks.cost, "c_a": c_a, "c_x": c_x})
-        if c_a <= tolerance and c_x <= tolerance:
-            converged = True
+        status = f"converged after {sweep} sweeps (|dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e})"
+        if converged := c_a <= tolerance and c_x <= tolerance:
             break
-    status = f"converged after {len(history)} sweeps (|dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e})"
     if not converged:
         status = (
             f"stopped after {max_iterations} sweeps with |dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e}: the coefficients "
@@ -294,7 +287,7 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
     state, _ = constraints.absorb_similarities(problem, state)
     blocks = criterion.linearise(problem, state)
     convention = constraints.make(gauge, problem, state, blocks)
-    return Result(state, blocks, convention, converged, status, history, np.ones(problem.xy.shape[1]))
+    return Result(state, blocks, convention, converged, status, sweep, np.ones(problem.xy.shape[1]))
 
 
 def _relative_change(old, new):

@@ -6,6 +6,7 @@ modes of a common map becomes the value at which the constraints of the gauge ar
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from ..geometry.detector_modes import similarity_basis
 from ..geometry.similarity import robust_similarity
 from ..inputs import column_contract
 from ..matching.cross_identification import identify
-from ..results.catalogue_tie import Knowledge
+from ..results.catalogue_tie import MapPrior
 from ..results.diagnostics import UsedReference
 from . import minimisers
 from .equations import criterion
@@ -33,7 +34,7 @@ _LARGE = 2.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Anchor:
+class ReferenceTie:
     """What is needed to tie a solution.
 
     Attributes
@@ -46,7 +47,8 @@ class Anchor:
         Whether the static distortion is not known beforehand.
     scale : float
         Factor on the stated errors of the exposures.
-    options : SolveOptions
+    solve : callable
+        ``solve(problem, state, common=None)``: `legdistort.solving.minimisers.solve_joint` with the options of the fit.
     """
 
     identified: object
@@ -54,10 +56,7 @@ class Anchor:
     names: np.ndarray
     free: bool
     scale: float
-    options: object
-
-    def __repr__(self):
-        return f"<Anchor: {self.identified!r} of {self.label}>"
+    solve: object
 
     def tie(self, problem, result):
         """The `Result` with the plane where the reference puts it, and the `Tie` in its gauge.
@@ -76,7 +75,7 @@ class Anchor:
         """
         status, first = result.status, self._rough(result.state)
         if first is not None:
-            result = self._solved(problem, _moved(result.state, first))
+            result = self.solve(problem, _moved(result.state, first))
         known = self._known(result.gauge, _takes_back(problem))
         for count in range(_ROUNDS):
             if count < 2:  # afterwards the plane moves too little for another
@@ -93,7 +92,7 @@ class Anchor:
             if common is None:
                 result = replace(result, state=state, blocks=criterion.linearise(problem.scaled(result.robust), state))
             else:
-                result = self._solved(problem, state, common=common)
+                result = self.solve(problem, state, common=common)
         else:
             log.warning("the tie to %s is not settled after %d rounds", self.label, _ROUNDS)
         if not _takes_back(problem):
@@ -103,11 +102,6 @@ class Anchor:
         if result.converged:
             result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds")
         return replace(result, gauge=replace(result.gauge, tie=made))
-
-    def _solved(self, problem, state, *, common=None):
-        of = self.options
-        how = {"gauge": of.gauge, "loss": of.loss, "max_iterations": of.max_iterations}
-        return minimisers.solve_joint(problem, state, common=common, **how)
 
     def _warn(self, made, known):
         """Tell what makes the absolute errors too small."""
@@ -154,7 +148,7 @@ class Anchor:
             covariance[:, :n, :, :n] = gauge.absolute_covariance.reshape(2, n, 2, n)
         size = tuple(2 * gauge.box[1, ::-1])
         free = self.free and n > 1 and bends
-        return Knowledge(covariance.reshape(2 * k, -1), np.zeros(2 * k), free, size)
+        return MapPrior(covariance.reshape(2 * k, -1), np.zeros(2 * k), free, size)
 
     def _estimate(self, result, relative, known):
         positions = result.state.positions.T
@@ -164,8 +158,8 @@ class Anchor:
             self.identified.covariance,
         )
         modes = result.gauge.modes_at(positions, known.n_modes)
-        offered = catalogue_map.Offered(offsets, modes, relative, known)
-        return catalogue_map.estimate(offered, catalogue_map.accepted(offered, self.label), self.names)
+        equations = catalogue_map.MapEquations(offsets, modes, relative, known)
+        return catalogue_map.estimate(equations, catalogue_map.accepted(equations, self.label), self.names)
 
     def _is_settled(self, gauge, state, step, made):
         modes = gauge.modes_at(state.positions.T, len(step) // 2)
@@ -241,17 +235,17 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         pixel_scale=pixel_scale,
     )
     log.info("%d of the %d stars of %s are in the exposures", len(identified.rows), len(reference), reference.label)
-    prior = fit.options.prior
-    known = prior.values() if isinstance(prior, dict) else [prior]
-    anchor = Anchor(
+    of = fit.options
+    known = of.prior.values() if isinstance(of.prior, dict) else [of.prior]
+    tying = ReferenceTie(
         identified,
         reference.label,
         matches.stars,
         free=any(each is None for each in known),
         scale=scale,
-        options=fit.options,
+        solve=partial(minimisers.solve_joint, gauge=of.gauge, loss=of.loss, max_iterations=of.max_iterations),
     )
-    result = anchor.tie(fit.problem.scaled(fit.used.astype(float)), result)
+    result = tying.tie(fit.problem.scaled(fit.used.astype(float)), result)
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
 
 

@@ -39,11 +39,8 @@ class Offsets:
     values: np.ndarray
     covariance: np.ndarray
 
-    def __repr__(self):
-        return f"<Offsets: {len(self.rows)} reference stars>"
 
-
-class Offered:
+class MapEquations:
     """The equations that the offsets of a reference give for the common map.
 
     Parameters
@@ -53,11 +50,11 @@ class Offered:
         Modes of the reference plane at all stars.
     relative : ndarray, shape (2 n_stars, 2 n_stars) or (3, n_stars)
         Covariance of the relative positions, all x first; or xx, yy, xy of each.
-    knowledge : Knowledge
+    map_prior : MapPrior
     """
 
-    def __init__(self, offsets, modes, relative, knowledge):
-        self.offsets, self.modes, self.relative, self.knowledge = offsets, modes, relative, knowledge
+    def __init__(self, offsets, modes, relative, map_prior):
+        self.offsets, self.modes, self.relative, self.map_prior = offsets, modes, relative, map_prior
         rows, n = offsets.rows, modes.shape[1]
         self.dense = len(relative) == 2 * n
         self.own = np.stack([_own(relative, star, n, self.dense) for star in rows])
@@ -92,7 +89,7 @@ class Offered:
     def solve(self, used, scales, weights=None):
         """The map (2 k,), its covariance, and the matrix (2 k, 2 n) that takes used offsets to it."""
         information, right = self.gain(used, weights)
-        known = self.knowledge
+        known = self.map_prior
         columns = np.hstack([self.similar(used), _root(known.covariance)])
         columns = np.hstack([columns, *(s * c for s, c in zip(scales, known.by_degree(), strict=True))])
         inner = columns.T @ information @ columns
@@ -105,17 +102,17 @@ class Offered:
 
     def similar(self, used):
         """Similarities that the used stars tell: all, or of a single one the shift."""
-        columns = self.knowledge.similarities
+        columns = self.map_prior.similarities
         return columns if np.count_nonzero(used) > 1 else columns[:, :2]
 
     def scales(self, used):
         """Size of the unknown static distortion, a coefficient's, by degree, by evidence (an EM iteration)."""
-        parts = self.knowledge.by_degree()
-        if not self.knowledge.free:
+        parts = self.map_prior.by_degree()
+        if not self.map_prior.free:
             return [0.0] * len(parts)
         information, right = self.gain(used)
         pull = right @ self.offsets.values[used].ravel()
-        fixed = np.hstack([self.similar(used), _root(self.knowledge.covariance)])
+        fixed = np.hstack([self.similar(used), _root(self.map_prior.covariance)])
         n, ends = self.similar(used).shape[1], np.cumsum([fixed.shape[1], *(p.shape[1] for p in parts)])
         out = np.full(len(parts), 2 * np.sqrt(np.mean(self.offsets.values[used] ** 2)) + 1e-6)
         for _ in range(200):
@@ -164,7 +161,7 @@ def _root(covariance):
     return vectors[:, keep] * np.sqrt(values[keep])
 
 
-def accepted(offered, label):
+def accepted(equations, label):
     """Which offsets are no mismatches: those that deviate are taken away, round by round, and never come back.
 
     Raises
@@ -172,20 +169,20 @@ def accepted(offered, label):
     InputError
         If most of them deviate.
     """
-    n = len(offered.offsets.rows)
+    n = len(equations.offsets.rows)
     used, weights = np.ones(n, dtype=bool), np.ones(n)
     if n < 3:
         return used
-    scales = offered.scales(used)
+    scales = equations.scales(used)
     for _ in range(_ROUNDS):  # a robust start, which a few gross errors hardly move
-        pull = offered.pulls(used, scales, weights)
+        pull = equations.pulls(used, scales, weights)
         scale = max(1.0, np.median(pull) / _SQRT)
         weights, before = 1 / (1 + (pull / (2.385 * scale)) ** 2), weights
         if np.abs(weights - before).max() < 0.01:
             break
     for count in range(_ROUNDS):
         if count:
-            pull = offered.pulls(used, offered.scales(used))
+            pull = equations.pulls(used, equations.scales(used))
         fresh = used & (pull > CLIP * max(1.0, np.median(pull[used]) / _SQRT))
         if count and not fresh.any():
             break
@@ -198,12 +195,12 @@ def accepted(offered, label):
     return used
 
 
-def estimate(offered, used, names):
+def estimate(equations, used, names):
     """The map that the used offsets tell, and the tie.
 
     Parameters
     ----------
-    offered : Offered
+    equations : MapEquations
     used : ndarray of bool, shape (n,)
     names : ndarray, shape (n_stars,)
         Of all stars.
@@ -214,46 +211,45 @@ def estimate(offered, used, names):
     Tie
         With offsets as if that map were taken out already.
     """
-    scales = offered.scales(used)
-    value, covariance, gain = offered.solve(used, scales)
-    left = offered.offsets.values - offered.design @ value
-    offered_matrix = offered.matrix(used) if offered.dense else None
-    known = offered.knowledge
+    scales = equations.scales(used)
+    value, covariance, gain = equations.solve(used, scales)
+    left = equations.offsets.values - equations.design @ value
+    known = equations.map_prior
     kinds = [known.similarities, *known.by_degree()]
     prior = known.covariance + sum(s**2 * c @ c.T for s, c in zip(scales, known.by_degree(), strict=True))
-    measured = [offered.similar(used).shape[1] / known.similarities.shape[1]]
+    measured = [equations.similar(used).shape[1] / known.similarities.shape[1]]
     for columns in kinds[1:]:
         before, after = (np.trace(columns.T @ c @ columns) for c in (prior, covariance))
         measured.append(1 - after / before if before > 0 else 0.0)
-    whitened = left[used].ravel()
-    if offered_matrix is None:
-        chi2 = np.einsum("na,nab,nb->", left[used], np.linalg.inv(offered.blocks[used]), left[used])
+    flat = left[used].ravel()
+    if equations.dense:
+        chi2 = flat @ np.linalg.solve(equations.matrix(used), flat)
     else:
-        chi2 = whitened @ np.linalg.solve(offered_matrix, whitened)
-    information = offered.gain(used)[0]
-    dof = len(whitened) - np.trace(covariance @ information)
+        chi2 = np.einsum("na,nab,nb->", left[used], np.linalg.inv(equations.blocks[used]), left[used])
+    information = equations.gain(used)[0]
+    dof = len(flat) - np.trace(covariance @ information)
     return value, Tie(
         covariance=covariance,
-        shared=_shared(offered, used, gain),
+        shared=_shared(equations, used, gain),
         measured=np.clip(measured, 0, 1),
-        stars=np.asarray(names)[offered.offsets.rows],
+        stars=np.asarray(names)[equations.offsets.rows],
         offsets=left,
         used=used,
         ratio=float(chi2 / dof) if dof > 2 else np.nan,
     )
 
 
-def _shared(offered, used, gain):
+def _shared(equations, used, gain):
     """See `Tie.shared`: minus the covariance of each star's relative error with the map at it, both ways."""
-    n, rows = offered.modes.shape[1], offered.offsets.rows[used]
-    out, k = np.zeros((3, n)), len(offered.modes)
+    n, rows = equations.modes.shape[1], equations.offsets.rows[used]
+    out, k = np.zeros((3, n)), len(equations.modes)
     gain = gain.reshape(2, k, len(rows), 2)
-    if offered.dense:
-        relative = offered.relative.reshape(2, n, 2, n)[:, rows]
+    if equations.dense:
+        relative = equations.relative.reshape(2, n, 2, n)[:, rows]
         drawn = np.einsum("akjb,bjcn->akcn", gain, relative, optimize=True)
-        at = np.einsum("kn,akcn->acn", offered.modes, drawn)
+        at = np.einsum("kn,akcn->acn", equations.modes, drawn)
         out[:] = -2 * at[0, 0], -2 * at[1, 1], -at[0, 1] - at[1, 0]
     else:
-        at = np.einsum("kj,akjb,jbc->acj", offered.modes[:, rows], gain, offered.own[used])
+        at = np.einsum("kj,akjb,jbc->acj", equations.modes[:, rows], gain, equations.own[used])
         out[:, rows] = -2 * at[0, 0], -2 * at[1, 1], -at[0, 1] - at[1, 0]
     return out

@@ -4,6 +4,8 @@ import numpy as np
 
 from ...geometry import basis
 
+_SMALLEST = 1e-6  # scatter, pixels: where none is seen beyond the errors, Lambda stays invertible
+
 
 def conditional_errors(u_data):
     """C_i, covariance of the coefficients if the stars were known; huge where the data say nothing."""
@@ -32,7 +34,8 @@ def dynamic_covariance(problem, state, error, motion, others):
     for i in range(problem.n_exposures):
         if problem.has_widths(i):
             width = problem.prior_sigma[i].ravel()
-            given = np.where(np.isfinite(width) & (width > 0), width**2, np.diag(out[i]))
+            seen = np.maximum(np.diag(out[i]), _SMALLEST**2)
+            given = np.where(np.isfinite(width) & (width > 0), width**2, seen)
             out[i] = others[i].T @ (others[i] * given @ others[i].T) @ others[i]
     return out
 
