@@ -17,7 +17,7 @@ from legdistort.results.diagnostics import DegreeChoice, Diagnostics, UsedRefere
 from legdistort.results.settings import Settings
 from legdistort.runtime.provenance import with_inputs
 from legdistort.simulation import prediction
-from legdistort.simulation.noiseless import noiseless_solution
+from legdistort.simulation.noiseless_solution import noiseless_solution
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 
 FEW = simulate_matches(n_stars=14, n_exposures=6, degree=2, seed=3)

@@ -292,7 +292,8 @@ def do_attach(a):
 )
 def do_predict(a):
     """``legdistort predict``."""
-    from ..simulation.prediction import predict, show
+    from ..simulation.prediction import predict
+    from ..simulation.prediction_text import describe_plans
 
     keywords = given(a, options.PREDICTING) | {"prior": _prior(a.prior, a.shape)}
     if a.stars is not None:
@@ -303,7 +304,7 @@ def do_predict(a):
     _draw(prediction, a)
     plans = prediction.alternatives()
     own, *others = _records(plans)
-    _say(a, f"{prediction}\n\n{show(plans)}", own | {"alternatives": others, "failed": plans.meta["failed"]})
+    _say(a, f"{prediction}\n\n{describe_plans(plans)}", own | {"alternatives": others, "failed": plans.meta["failed"]})
 
 
 @command(
