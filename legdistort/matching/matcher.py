@@ -10,7 +10,6 @@ from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..inputs import column_contract
 from ..inputs.matches import Matches
 from ..inputs.reference_catalogue import mean_epoch
-from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
 from .exposure_groups import interlink, link, standing, unite
