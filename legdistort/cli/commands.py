@@ -116,18 +116,17 @@ def do_run(a):
 )
 def do_measure(a):
     """``legdistort measure``."""
-    from ..inputs.exposures import expand_paths
+    from ..inputs.exposure_files import file_checksums
     from ..inputs.table_files import write_table
     from ..measurement.options import MeasureOptions
     from ..measurement.positions import measure
-    from ..runtime.provenance import checksums
 
     measuring = given(a, options.MEASURING)
     MeasureOptions(**measuring)  # which refuses them before a frame is read
     exposures = _open(a)
     table = measure(exposures, **measuring, **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
-    table.meta |= {"shapes": shapes, "inputs": checksums(expand_paths(a.frames))}
+    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures)}
     write_table(table, a.out, overwrite=a.overwrite)
     _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
 
