@@ -28,7 +28,7 @@ _PLACES = {
     "measure": "measurement.positions",
     "open_exposures": "inputs.exposure_files",
     "predict": "simulation.prediction",
-    "read_exposures": "inputs.exposures",
+    "read_exposures": "inputs.exposure_files",
     "read_wcs": "wcs.storage",
     "run": "pipeline",
     "simulate_exposures": "simulation.observations",

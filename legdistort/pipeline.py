@@ -13,8 +13,7 @@ from .assessment import baselines, stack_quality
 from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
 from .exceptions import InputError, MatchError
-from .inputs.exposure_files import open_exposures
-from .inputs.exposures import expand_paths
+from .inputs.exposure_files import file_checksums, open_exposures
 from .inputs.table_files import write_stars
 from .matching.matcher import match
 from .matching.options import MatchOptions
@@ -142,7 +141,7 @@ def run(
         matches = match(detections, exposures=exposures, **vars(matching))
     with _timed(timings, "solve"):
         solution = solve(matches, **vars(solving), reference=reference, **tying)
-        solution = provenance.with_inputs(solution, provenance.checksums(expand_paths(paths)))
+        solution = provenance.with_inputs(solution, file_checksums(exposures))
     with _timed(timings, "coadd"):
         kept = [exposure for exposure in exposures if exposure.name in solution.names]
         mosaic = coadd(kept, solution, **vars(coadding), **share)

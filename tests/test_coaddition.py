@@ -30,7 +30,8 @@ from legdistort.geometry.basis import from_tensor
 from legdistort.geometry.distortion import Distortion
 from legdistort.geometry.models import outside
 from legdistort.geometry.tangent_plane import TangentPlane
-from legdistort.inputs.exposures import Exposure, read_exposures
+from legdistort.inputs.exposure_files import read_exposures
+from legdistort.inputs.exposures import Exposure
 from legdistort.runtime.checks import options_from
 
 SHAPE = (300, 400)

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from legdistort.exceptions import AssumptionWarning
 from legdistort.geometry import similarity
 from legdistort.geometry.distortion import Distortion
-from legdistort.inputs.exposures import read_exposures
+from legdistort.inputs.exposure_files import read_exposures
 from legdistort.inputs.matches import Matches
 from legdistort.matching.matcher import match
 from legdistort.measurement.positions import measure

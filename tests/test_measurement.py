@@ -26,7 +26,8 @@ from star_images import (
 
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.column_contract import DETECTED, check
-from legdistort.inputs.exposures import Exposure, read_exposures
+from legdistort.inputs.exposure_files import read_exposures
+from legdistort.inputs.exposures import Exposure
 from legdistort.measurement.flags import Flag
 from legdistort.measurement.options import MeasureOptions
 from legdistort.measurement.positions import measure

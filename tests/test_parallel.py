@@ -27,9 +27,10 @@ import legdistort as ld
 from legdistort.coaddition import block_stack, preparation
 from legdistort.coaddition.resampling import engines
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError, LegdistortError
-from legdistort.inputs.exposure_files import ExposureFile
+from legdistort.inputs.exposure_files import ExposureFile, file_checksums
 from legdistort.runtime import scratch
 from legdistort.runtime.parallel import map_items
+from legdistort.runtime.provenance import checksums
 
 COMPILED = pytest.mark.parametrize("compiled_from", [0, 1 << 62], ids=["compiled", "plain"])
 WORK = {"serial": {"workers": 1}, "threads": {"workers": 2, "threads": True}, "processes": {"workers": 2}}
@@ -165,6 +166,16 @@ class TestExposureFiles:
                     np.testing.assert_array_equal(getattr(read, name), getattr(exposure, name))
             assert exposure.read() is exposure
             assert repr(handle) == f"<ExposureFile {handle.name!r}: 150 x 120 px in {handle.path}>"
+
+    def test_what_is_small_is_worked_out_once(self, frames, monkeypatch):
+        handles = ld.open_exposures([*frames[:2], CCDData(np.ones((5, 5)), unit="adu")])
+        assert file_checksums(handles) == checksums(*frames[:2])
+        for name in ("believable_wcs", "known_from_header"):
+            monkeypatch.setattr(f"legdistort.inputs.exposure_files.{name}", lambda *_, **__: pytest.fail("once more"))
+        for handle in handles[:2]:
+            read = handle.read()
+            assert read.header is handle.header
+            assert read.wcs is handle.wcs
 
     def test_an_extension_is_remembered(self, frames):
         (handle,) = ld.open_exposures(frames[1], ext="ERR")

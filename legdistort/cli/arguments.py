@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..inputs.exposures import expand_paths
+from ..inputs.exposure_files import expand_paths
 from ..runtime.outputs import check_file, check_folder, check_not_read
 
 # -- values from their text

@@ -116,18 +116,17 @@ def do_run(a):
 )
 def do_measure(a):
     """``legdistort measure``."""
-    from ..inputs.exposures import expand_paths
+    from ..inputs.exposure_files import file_checksums
     from ..inputs.table_files import write_table
     from ..measurement.options import MeasureOptions
     from ..measurement.positions import measure
-    from ..runtime.provenance import checksums
 
     measuring = given(a, options.MEASURING)
     MeasureOptions(**measuring)  # which refuses them before a frame is read
     exposures = _open(a)
     table = measure(exposures, **measuring, **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
-    table.meta |= {"shapes": shapes, "inputs": checksums(expand_paths(a.frames))}
+    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures)}
     write_table(table, a.out, overwrite=a.overwrite)
     _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
 
@@ -170,7 +169,7 @@ def do_match(a):
     from ..matching.matcher import match
 
     tables = [_read_table(path, a) for path in a.tables]
-    names = [name for table in tables for name in set(table["exposure"])]
+    names = [name for table in tables for name in dict.fromkeys(table["exposure"])]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")

@@ -18,7 +18,7 @@ from astropy.wcs import WCS
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis
 from ..geometry.gsaoi import GSAOI_SIZE, gsaoi_static
-from ..inputs.exposures import read_exposures
+from ..inputs.exposure_files import read_exposures
 from ..runtime.asdf_files import WITH_WCS, read_tree
 from .from_objects import as_source, of_model
 from .source import DIRECTIONS, of_maps, of_powers

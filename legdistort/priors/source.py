@@ -99,7 +99,7 @@ class Source:
     def record(self):
         """Where it comes from as plain numbers and strings; files with their SHA-256."""
         known = {"kind": self.kind, "name": self.name, "direction": self.direction, "origin": self.origin}
-        return known | self.details | ({"files": checksums(self.files)} if self.files else {})
+        return known | self.details | ({"files": checksums(*self.files)} if self.files else {})
 
     def on_plane(self):
         """The function with its outputs on a plane; of a complete source only."""

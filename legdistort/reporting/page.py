@@ -10,7 +10,7 @@ import numpy as np
 from ..exceptions import FoldError
 from ..geometry import similarity
 from ..inputs import column_contract
-from ..plots import solution_plots
+from ..plots import solution_plots, stack_plots
 from ..runtime.outputs import replacing
 from .comparison import compared_corrections, compared_stacks, sharpness
 from .html import STYLE, count, detached_figure, figure, wide_table
@@ -28,7 +28,7 @@ def write_report(path, solution, *, mosaic=None, summary=None, comparison=None, 
         Of the page.
     solution : `~legdistort.results.solution.Solution`
         What is reported.
-    mosaic : `~legdistort.coaddition.mosaicking.Mosaic`, optional
+    mosaic : `~legdistort.coaddition.mosaic.Mosaic`, optional
         The co-added image.
     summary : dict, optional
         Results of the run that replace or complete what follows from the solution: ``n_exposures``, ``n_stars``,
@@ -219,7 +219,7 @@ def _pictures(solution, mosaic):
     if mosaic is not None:
         figures.append(
             figure(
-                solution_plots.plot_mosaic(mosaic, ax=detached_figure(7.5, 7.5).subplots()),
+                stack_plots.plot_mosaic(mosaic, ax=detached_figure(7.5, 7.5).subplots()),
                 "The co-added image, pale blue where no exposure contributes: double or elongated stars, more so "
                 "towards one edge, would mean that the exposures are not aligned there.",
             )

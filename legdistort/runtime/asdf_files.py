@@ -27,6 +27,7 @@ import yaml
 from asdf.tags.core.ndarray import asdf_datatype_to_numpy_dtype
 
 from ..exceptions import InputError
+from .checks import first_line
 
 #: Version of the ASDF standard that is written.
 ASDF_STANDARD = "1.5.0"
@@ -93,7 +94,7 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
             "with max_bytes= (--max-bytes)"
         ) from None
     except Exception as error:  # whatever a broken file provokes
-        raise InputError(f"{path} is not a readable ASDF file: {_first_line(error)}") from None
+        raise InputError(f"{path} is not a readable ASDF file: {first_line(error)}") from None
 
 
 def check_tree(tree, schema, path):
@@ -121,20 +122,15 @@ def check_tree(tree, schema, path):
         entry = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in error.absolute_path).lstrip(".")
         meaning = "" if error.validator == "required" else error.schema.get("description", "")
         raise InputError(
-            f"{path} is damaged: entry {entry or 'tree'}: {_first_line(error)[:200]}"
+            f"{path} is damaged: entry {entry or 'tree'}: {first_line(error)[:200]}"
             + (f"; it should be {meaning}" if meaning else "")
         ) from None
     except Exception as error:  # a tree that asdf cannot take
-        raise InputError(f"{path} is damaged: {_first_line(error)}") from None
+        raise InputError(f"{path} is damaged: {first_line(error)}") from None
 
 
 class _TooLargeError(Exception):
     """A size beyond the limit; the sentence without the limit."""
-
-
-def _first_line(error):
-    text = getattr(error, "message", None) or str(error) or type(error).__name__
-    return f"{text}".strip().splitlines()[0]
 
 
 def _check_yaml(content, tags, max_bytes):

@@ -15,8 +15,8 @@ from astropy.io import fits
 from tqdm import tqdm
 
 from ..exceptions import ExportError, InputError
+from ..inputs.exposure_files import expand_paths, find_image
 from ..inputs.exposure_names import exposure_name
-from ..inputs.exposures import expand_paths, find_image
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, splice
 from ..runtime.outputs import replacing, replacing_folder
