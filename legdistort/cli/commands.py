@@ -237,7 +237,7 @@ def do_predict(a):
         degree=a.degree,
         shape=tuple(a.shape or (2048, 2048)),
         dithers=a.dither,
-        prior=_prior(a.prior, a.shape),
+        prior=_prior(a.prior, a.shape, a.static_sigma),
         gauge=a.gauge,
         dynamic=a.dynamic,
         spectrum=a.spectrum,
@@ -334,22 +334,27 @@ def _tying(a):
 
 
 def _prior_with_sigma(a, shape=None):
-    """The prior asked for, no static distortion if there is none, with the widths asked for at every degree fitted."""
+    """The prior asked for, with the widths asked for at every degree fitted.
+
+    A scatter of exposures alone is one around no distortion.
+    """
     from ..priors.prior import EVIDENCE, Prior
     from ..solving.choices.degree_choice import AUTO, HIGHEST
 
-    prior = _prior(a.prior, shape)
+    prior = _prior(a.prior, shape, a.static_sigma)
     if a.prior_sigma is None:
         return prior
     degree = 0 if a.prior_sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
     return (prior or Prior([[0.0], [0.0]])).with_sigma(a.prior_sigma, degree=degree)
 
 
-def _prior(text, shape=None):
-    """Whatever `Prior.from_file` recognises."""
+def _prior(text, shape, static_sigma):
+    """Whatever `Prior.from_file` recognises; without a text, a distortion of which the size alone is known."""
     from ..priors.prior import Prior
 
-    return None if text is None else Prior.from_file(text, shape=shape)
+    if text is None:
+        return None if static_sigma is None else Prior(None, static_sigma=static_sigma)
+    return Prior.from_file(text, shape=shape, static_sigma=static_sigma)
 
 
 def _read_table(path, a):

@@ -191,7 +191,7 @@ def _predict(p):
     p.add_argument(
         "--dither", type=float, default=0.0, metavar="RMS", help="rms length of the shifts, pixels (default 0)"
     )
-    p.add_argument("--prior", help="known static distortion: see the command prior")
+    _known_static(p)
     p.add_argument("--dynamic", type=float, help="rms of a coefficient from exposure to exposure, pixels")
     p.add_argument("--spectrum", type=spectrum, metavar="DEGREE=RMS,...", help="the same by degree, beyond the fit too")
     p.add_argument("--gauge", choices=("minimal", "mean"), default="minimal", help="see the docs (default minimal)")
@@ -337,7 +337,7 @@ def _table(p):
 
 def _fit(p, *, clip):
     p.add_argument("--degree", type=word_or(int, "auto"), default=3, help="total degree, or auto (default 3)")
-    p.add_argument("--prior", help="known static distortion: see the command prior")
+    _known_static(p)
     p.add_argument(
         "--prior-sigma",
         type=word_or(float, "evidence"),
@@ -356,6 +356,16 @@ def _fit(p, *, clip):
     p.add_argument("--reference", metavar="TABLE", help="catalogue to tie the positions to, such as one of Gaia")
     p.add_argument("--epoch", type=float, metavar="YEAR", help="of the exposures, for proper motions (default: header)")
     p.add_argument("--pixel-scale", type=float, metavar="ARCSEC", help="helps to find the stars without a header WCS")
+
+
+def _known_static(p):
+    p.add_argument("--prior", help="known static distortion: see the command prior")
+    p.add_argument(
+        "--static-sigma",
+        type=float,
+        metavar="PIXELS",
+        help="uncertainty of a coefficient of it; without --prior its size, nothing else being known",
+    )
 
 
 def _combination(p):

@@ -319,7 +319,7 @@ def predict(
         dithers=dithers, poses=poses, min_exposures=min_exposures, seed=seed,
     )  # fmt: skip
     sigma_meas = layout.sigma
-    matches = layout.matches(np.zeros((2, 1)) if prior is None else prior.mean)
+    matches = layout.matches(np.zeros((2, 1)) if prior is None or prior.mean is None else prior.mean)
     problem = build_problem(matches, degree, prior=prior)
     fitted = independent[:, : problem.n_modes]
     known = bool(np.isfinite(fitted).all())
