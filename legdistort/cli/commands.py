@@ -282,6 +282,15 @@ def do_stars(a):
     _say(a, f"{len(solution.star_names)} stars in {a.out}", {"n_stars": len(solution.star_names), "out": str(a.out)})
 
 
+def do_correct(a):
+    """``legdistort correct``."""
+    from ..inputs.table_files import write_by_ending
+
+    table = _solution(a).correct_table(_read_table(a.table, a))
+    write_by_ending(table, a.out, overwrite=a.overwrite)
+    _say(a, f"{len(table)} positions in {a.out}", {"n_positions": len(table), "out": str(a.out)})
+
+
 def do_report(a):
     """``legdistort report``."""
     from ..pipeline import summarise

@@ -216,6 +216,13 @@ def _stars(p):
     _out(p, "table (.ecsv, .fits, .vot, .xml or .csv)")
 
 
+def _correct(p):
+    _show(p)
+    p.add_argument("table", metavar="TABLE", help="exposure, x, y, x_err, y_err")
+    _out(p, "table (.ecsv, .fits, .vot, .xml or .csv)")
+    _columns(p)
+
+
 def _report(p):
     _show(p)
     _out(p, "page (HTML)")
@@ -252,6 +259,11 @@ _COMMANDS = {
     "simulate": ("frames of a simulated night with their truth", "--out night --small", _simulate),
     "show": ("print a solution", "results/solution.asdf", _show),
     "stars": ("the stars of a solution as a table", "results/solution.asdf --out stars.fits", _stars),
+    "correct": (
+        "positions measured elsewhere in its exposures to the reference plane and the sky, with errors",
+        "results/solution.asdf faint.ecsv --out corrected.ecsv",
+        _correct,
+    ),
     "report": ("HTML page of a solution", "results/solution.asdf --out report.html", _report),
 }
 
@@ -329,9 +341,13 @@ def _limit(p):
     p.add_argument("--max-bytes", type=int, help="accept arrays of so many bytes, unpacked (default 2147483648)")
 
 
-def _table(p):
+def _columns(p):
     p.add_argument("--columns", type=columns, default=[], metavar="OURS=THEIRS,...", help="names of columns")
     p.add_argument("--origin", type=int, choices=(0, 1), help="of pixels in the table (default 0; SExtractor 1)")
+
+
+def _table(p):
+    _columns(p)
     p.add_argument("--shape", type=int, nargs=2, metavar=("NY", "NX"), help="of the detector, pixels")
 
 
