@@ -68,6 +68,7 @@ def render(solution, *, mosaic=None, summary=None, comparison=None, stacks=None)
     )
     body = [
         f'<h1>{title}</h1><p class="lead">{lead}</p>',
+        _warning(solution.gauge),
         _facts_table(solution, facts),
         "<h2>Exposures</h2>",
         _exposures_table(solution),
@@ -83,6 +84,12 @@ def render(solution, *, mosaic=None, summary=None, comparison=None, stacks=None)
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<style>{STYLE}</style>\n</head>\n<body>\n" + "\n".join(body) + "\n</body>\n</html>\n"
     )
+
+
+def _warning(gauge):
+    """That absolute positions are not known, and what to do, if that is so."""
+    text = gauge.warning
+    return f'<p class="warning">{escape(text[0].upper() + text[1:])}.</p>' if text else ""
 
 
 def _facts(solution, summary):
@@ -218,6 +225,7 @@ def _pictures(solution, mosaic):
                 "there is one: large values in the highest orders would mean a degree too low or too few stars.",
             )
         )
+        figures += _error_figure(solution)
         if mosaic is not None:
             figures.append(
                 figure(
@@ -227,6 +235,21 @@ def _pictures(solution, mosaic):
                 )
             )
     return "\n".join(figures)
+
+
+def _error_figure(solution):
+    """The error of the correction over the exposure with the most stars; none where its distortion folds."""
+    name = solution.names[int(np.argmax(_exposure_rms(solution)[2]))]
+    try:
+        drawn = solution.sigma_map(name)
+    except FoldError:
+        return
+    text = (
+        "Relative error of the correction, rms per axis, over the exposure with the most stars: what it adds to that of "
+        "a new position, once a common map of the fitted degree is taken off. White is outside the stars, where the "
+        "correction is extrapolated. Absolute errors are those of the row Gauge above."
+    )
+    yield figure(solution_plots.plot_sigma_map(*drawn, ax=new_figure(6.4, 5.4).subplots()), text)
 
 
 def _distortion_figures(solution):

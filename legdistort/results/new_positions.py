@@ -1,18 +1,16 @@
 """Positions that took no part in the solution, corrected with it, and their errors.
 
-A pixel p of exposure i is corrected to ``X = T_i^-1 D_i^-1(p)``, so that an error dp of its measurement and an error dA_i
-of the coefficients move it by ``(D_i' T_i)^-1 (dp - B dA_i)``, B the basis there. A map g common to all exposures changes
-A_i by ``-N_i g``. Taken as independent are the three: the measurement, the coefficients in the gauge, and the common map.
-The second and the third are so without a reference, up to second order. A reference brings in the noise of the stars that
-tie the plane, which is in the coefficients as well; what they have in common averages out over the exposures, as the
-constraint of the gauge has it, and is neglected.
+A pixel p of exposure i is corrected to ``X = T_i^-1 D_i^-1(p)``. An error dp of its measurement and one dA_i of the
+coefficients move it by ``(D_i' T_i)^-1 (dp - B dA_i)``, B the basis there. A common map g of the plane changes A_i by
+``-N_i g``, to first order in the distortion of this exposure alone. Measurement, coefficients in the gauge and common
+map count as independent. With a reference the noise of its stars is in coefficients and map alike. What the two share
+sums to zero over the exposures, as the constraint of the gauge has it for the coefficients, and is neglected.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from astropy import units as u
-from astropy.table import QTable
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity

@@ -202,11 +202,15 @@ class Solution:
         xy : array_like, shape (n, 2)
             Any pixels of the exposure.
         errors : array_like, shape (n, 2) or (n, 2, 2), optional
-            Of the measurement: standard deviations per axis [pix], or covariances [pix^2]; zero is that of the
-            correction alone. Then the result is a `legdistort.results.new_positions.Corrected`, ``(xy, relative,
-            absolute)``, with two covariances (n, 2, 2) of the reference positions. They hold for positions that took no
-            part in the solution; those of its stars stand in `stars`. Outside the stars of the exposure (`supported`) the
-            correction is extrapolated.
+            Of the measurement: standard deviations per axis [pix], or covariances [pix^2]; zeros leave the errors of
+            the correction alone.
+
+        Returns
+        -------
+        ndarray, shape (n, 2), or `legdistort.results.new_positions.Corrected`
+            With `errors` ``(xy, relative, absolute)``: two covariances (n, 2, 2) [pix^2] beside the positions. They
+            hold for positions that took no part in the solution; those of its stars are in `stars`. Outside the stars
+            of the exposure (`supported`) the correction is extrapolated.
 
         Raises
         ------
@@ -228,8 +232,8 @@ class Solution:
         Parameters
         ----------
         table : `~astropy.table.Table`
-            Columns ``exposure``, ``x``, ``y``, ``x_err``, ``y_err`` [pix] and perhaps ``xy_corr``, of positions that took no
-            part in the solution.
+            Columns ``exposure``, ``x``, ``y``, ``x_err``, ``y_err`` [pix] and perhaps ``xy_corr``, of positions that
+            took no part in the solution.
 
         Returns
         -------
@@ -322,7 +326,8 @@ class Solution:
         support : bool
             NaN outside the convex hull of the stars used in this exposure, where the correction is extrapolated.
         absolute : bool
-            With the error of the common map, NaN where that is not known (`Gauge.unknown`); else relative, in the gauge.
+            With the error of the common map, NaN where that is not known (`Gauge.unknown`); else relative, in the
+            gauge.
 
         Returns
         -------

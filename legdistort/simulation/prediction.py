@@ -4,6 +4,7 @@ Positions without noise, the normal equations there, the gauge and the covarianc
 no simulation (Bernard et al. 2017, section 4, measures the same by Monte Carlo).
 """
 
+import textwrap
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -37,8 +38,9 @@ class Prediction:
     b : float
         Expected error of the reference positions, relative (in the gauge).
     b_abs : float
-        With what the gauge hides: mean dynamic distortion of the set, uncertainty of the static one; pointing,
-        rotation and scale of the field aside. NaN where nothing was assumed of the dynamic distortion.
+        With the common map: mean dynamic distortion of the set, uncertainty of the static one; pointing, rotation and
+        scale of the field aside, and what is unknown (``solution.gauge.unknown``: without a prior, shears at least).
+        NaN where nothing was assumed of the dynamic distortion.
     sigma : float
         Expected scatter of new corrected positions inside the contour of the stars, a square that holds most of them.
     sigma_field : float
@@ -185,6 +187,17 @@ class Prediction:
                 table[name].info.format = ".3f" if slope else f".{self._decimals}f"
         return table
 
+    def _absolute(self, row):
+        unknown = ", ".join(self.solution.gauge.unknown_names)
+        if unknown and np.isfinite(self.b_abs):
+            return [row(f"b, absolute, after {unknown}", self.b_abs)]
+        return [row("b, absolute (mean dynamic distortion too)", self.b_abs)]
+
+    @property
+    def _relative(self):
+        words = f"what is left once a common map of degree {self.degree} is taken off"
+        return "; ".join(filter(None, [words, self.solution.gauge.warning]))
+
     @property
     def _decimals(self):
         """Decimal places that show three digits of errors like these."""
@@ -219,9 +232,10 @@ class Prediction:
                 f"errors of {self.sigma_meas:.4g} px",
                 f"{'expected, rms per axis [px]':44s}" + "".join(f"{cell:>11s}" for cell in head),
                 row("b, star positions, relative", self.b, self.b_alias, self.s_b, thumb_b),
-                row("b, absolute (mean dynamic distortion too)", self.b_abs),
+                *self._absolute(row),
                 row("sigma, new positions inside the contour", self.sigma, self.sigma_alias, self.s_sigma, thumb_sigma),
                 row("sigma, new positions over the whole field", self.sigma_field, _rms(self.alias_map)),
+                *textwrap.wrap(f"All but b, absolute, are relative: {self._relative}", 110),
                 f"gauge {self.solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), "
                 "s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
             ]
