@@ -245,8 +245,8 @@ def _error_figure(solution):
     except FoldError:
         return
     text = (
-        "Relative error of the correction, rms per axis, over the exposure with the most stars: what it adds to that of "
-        "a new position, once a common map of the fitted degree is taken off. White is outside the stars, where the "
+        "Relative error of the correction, rms per axis, over the exposure with the most stars: what it adds to that "
+        "of a new position, once a common map of the fitted degree is taken off. White is outside the stars, where the "
         "correction is extrapolated. Absolute errors are those of the row Gauge above."
     )
     yield figure(solution_plots.plot_sigma_map(*drawn, ax=new_figure(6.4, 5.4).subplots()), text)
