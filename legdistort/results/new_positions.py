@@ -67,13 +67,13 @@ def _covariance(errors, n):
             f"errors must be standard deviations of shape ({n}, 2) or covariances of shape ({n}, 2, 2), one for each "
             f"position, got shape {given.shape}"
         ) from None
+    finite = np.isfinite(given).reshape(n, -1).all(axis=1)
+    known = np.where(finite.reshape(-1, *[1] * (given.ndim - 1)), given, -1.0)
     if given.ndim == 2:
-        bad, out = ~(given >= 0).all(axis=1), given[:, :, None] ** 2 * np.eye(2)
+        bad, out = (known < 0).any(axis=1), known[:, :, None] ** 2 * np.eye(2)
     else:
-        determinant = given[:, 0, 0] * given[:, 1, 1] - given[:, 0, 1] * given[:, 1, 0]
-        bad = (given[:, 0, 1] != given[:, 1, 0]) | ~(determinant >= 0) | ~(given[:, [0, 1], [0, 1]] >= 0).all(axis=1)
-        out = given
-    bad = bad | ~np.isfinite(out).all(axis=(1, 2))
+        bad, out = (known[:, 0, 1] != known[:, 1, 0]) | (known[:, [0, 1], [0, 1]] < 0).any(axis=1), known
+        bad |= known[:, 0, 0] * known[:, 1, 1] < known[:, 0, 1] ** 2
     if bad.any():
         k = int(np.flatnonzero(bad)[0])
         raise InputError(
@@ -146,7 +146,7 @@ def correct_table(solution, table):
     corr = np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else 0.0
     measured = _blocks(np.stack([x_err**2, y_err**2, corr * x_err * y_err]))
     xy, relative, absolute = np.empty_like(pixels), np.empty_like(measured), np.empty_like(measured)
-    for name in dict.fromkeys(exposures):
+    for name in dict.fromkeys(exposures.tolist()):
         mine = exposures == name
         xy[mine], relative[mine], absolute[mine] = correct_with_errors(solution, name, pixels[mine], measured[mine])
     out = table.copy()
