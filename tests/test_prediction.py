@@ -224,7 +224,8 @@ def test_aliasing_is_that_of_a_dense_fit():
 def test_the_sky_takes_the_mean_distortion_whatever_is_fitted(degree):
     """What is not fitted is aliased instead of hidden: the absolute error of undithered exposures stays the same."""
     spectrum = {1: 0.0, 2: 0.4, 3: 0.3, 4: 0.2}
-    p = predict(n_exposures=8, n_stars=60, sigma=0.001, degree=degree, spectrum=spectrum)
+    exact = Prior(np.zeros((2, 1)))
+    p = predict(n_exposures=8, n_stars=60, sigma=0.001, degree=degree, spectrum=spectrum, prior=exact)
     xy = p.solution.positions
     squares = [displacement(np.eye(15)[[m, m]], xy, SHAPE) ** 2 * spectrum.get(i + j, 0) ** 2
                for m, (i, j) in enumerate(modes(4))]  # fmt: skip
@@ -420,7 +421,7 @@ def test_prints_a_table():
     assert "not known" in text
     assert "aliasing" not in text
     assert all(len(line) <= 110 for line in text.splitlines())
-    more = str(predict(**GOOD, dynamic=0.5, spectrum={4: 0.1}))
+    more = str(predict(**GOOD, dynamic=0.5, spectrum={4: 0.1}, prior=Prior(np.zeros((2, 1)))))
     assert "not known" not in more
     assert "aliasing   together" in more
     with pytest.raises(AttributeError):

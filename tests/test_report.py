@@ -96,7 +96,7 @@ def test_every_name_is_there_literally(page):
 
 
 def test_pictures_open_and_each_has_its_sentence(page, text):
-    assert len(page.images) == 6  # residuals, scatter, distortion, dynamic part, coefficients, mosaic
+    assert len(page.images) == 7  # residuals, scatter, distortion, dynamic part, coefficients, error, mosaic
     for attrs in page.images:
         with Image.open(BytesIO(base64.b64decode(attrs["src"].split(",")[1]))) as image:
             assert min(image.size) > 300
@@ -172,7 +172,7 @@ def test_two_exposures_without_flux_prior_or_mosaic(degree):
     solution = make_solution(2, 30, degree, flux=False, prior=False)
     page = Page(report.render(solution))
     assert set(solution.names) <= set(page.cells)
-    assert len(page.images) == 4
+    assert len(page.images) == 5
 
 
 def test_strong_distortion_is_magnified_less():

@@ -55,7 +55,8 @@ def solve_shifts(matches, *, prior=None, weighted=False):
         Of degree 0, in pixels of the undistorted detector: ``settings.method`` is "shift" or "static + shift".
     """
     matches = replace(_checked(matches), poses=_without_own_turns(matches))
-    stated = replace(build_problem(matches, 0, prior=means(prior)), prior_sigma=None, static_sigma=None)
+    prior = means(prior)
+    stated = replace(build_problem(matches, 0, prior=prior), prior_sigma=None, static_sigma=None)
     problem = stated if weighted else _equal(stated)
     state = State(matches.positions.T.copy(), problem.prior_mean.copy(), _stacked(matches))
     result = minimisers.solve_joint(problem, state)
@@ -142,7 +143,7 @@ def compare(matches, solution, *, prior=None):
         "static + shift": lambda: solve_shifts(same, prior=prior),
         "relative polynomial": lambda: solve_relative(same, degree=max(solution.degree, 1), error_floor=floor),
     }
-    if prior is None:
+    if means(prior) is None:
         del calls["static + shift"]
     out = {}
     for name, call in calls.items():

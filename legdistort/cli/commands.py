@@ -295,7 +295,8 @@ def do_predict(a):
     from ..simulation.prediction import predict
     from ..simulation.prediction_text import describe_plans
 
-    keywords = given(a, options.PREDICTING) | {"prior": _prior(a.prior, a.shape)}
+    keywords = given(a, options.PREDICTING) | {"prior": _prior(a.prior, a.shape, a.static_sigma)}
+    keywords.pop("static_sigma", None)
     if a.stars is not None:
         keywords["stars"] = _read_table(a.stars, a)
     if a.shape is not None:
@@ -351,6 +352,23 @@ def do_stars(a):
 
 
 @command(
+    "positions measured elsewhere in its exposures to the reference plane and the sky, with errors",
+    "results/solution.asdf faint.ecsv --out corrected.ecsv",
+    options.SOLUTION,
+    options.POSITIONS,
+    options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
+    options.COLUMNS,
+)
+def do_correct(a):
+    """``legdistort correct``."""
+    from ..inputs.table_files import write_by_ending
+
+    table = _solution(a).correct_table(_read_table(a.table, a))
+    write_by_ending(table, a.out, overwrite=a.overwrite)
+    _say(a, f"{len(table)} positions in {a.out}", {"n_positions": len(table), "out": str(a.out)})
+
+
+@command(
     "HTML page of a solution", "results/solution.asdf --out report.html", options.SOLUTION, options.out("page (HTML)")
 )
 def do_report(a):
@@ -397,7 +415,8 @@ def _solving(a, shape=None):
     from ..priors.prior import EVIDENCE, Prior
     from ..solving.choices.degree_choice import AUTO, HIGHEST
 
-    keywords, prior = given(a, options.SOLVING), _prior(a.prior, shape)
+    keywords, prior = given(a, options.SOLVING), _prior(a.prior, shape, a.static_sigma)
+    keywords.pop("static_sigma", None)
     sigma = keywords.pop("prior_sigma", None)
     if sigma is not None:
         degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
@@ -405,11 +424,13 @@ def _solving(a, shape=None):
     return keywords | {"prior": prior}
 
 
-def _prior(text, shape=None):
-    """Whatever `Prior.from_file` recognises."""
+def _prior(text, shape, static_sigma):
+    """Whatever `Prior.from_file` recognises; without a text, a distortion of which the size alone is known."""
     from ..priors.prior import Prior
 
-    return None if text is None else Prior.from_file(text, shape=shape)
+    if text is None:
+        return None if static_sigma is None else Prior(None, static_sigma=static_sigma)
+    return Prior.from_file(text, shape=shape, static_sigma=static_sigma)
 
 
 def _read_table(path, a):

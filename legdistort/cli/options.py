@@ -27,9 +27,12 @@ SOLUTION = {
     "solution": Option("solution.asdf", "solution", path="read"),
     "max_bytes": Option("accept arrays of so many bytes, unpacked (default 2147483648)", type=int),
 }
-TABLE = {
+COLUMNS = {
     "columns": Option("names of columns", type=columns, default=[], metavar="OURS=THEIRS,..."),
     "origin": Option("of pixels in the table (default 0; SExtractor 1)", type=int, choices=(0, 1)),
+}
+TABLE = {
+    **COLUMNS,
     "shape": Option("of the detector, pixels", type=int, nargs=2, metavar=("NY", "NX")),
 }
 TABLES = {
@@ -37,6 +40,7 @@ TABLES = {
         "positions; without a column exposure, one exposure", "tables", nargs="+", metavar="TABLE", path="read"
     )
 }
+POSITIONS = {"table": Option("exposure, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
 MATCHED = {"table": Option("exposure, star, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
 WORKERS = {"workers": Option("cores to use (default 1)", type=int, metavar="N")}
 
@@ -55,6 +59,15 @@ def picture(what):
 
 
 REPLACING = {"overwrite": Option("replace a picture that exists", action="store_true")}
+
+KNOWN_STATIC = {
+    "prior": Option("known static distortion: see the command prior", path="read"),
+    "static_sigma": Option(
+        "uncertainty of a coefficient of it; without --prior its size, nothing else being known",
+        type=float,
+        metavar="PIXELS",
+    ),
+}
 
 # -- options of the functions
 
@@ -99,7 +112,7 @@ def clipping(default):
 
 SOLVING = {
     "degree": Option("total degree, or auto (default 3)", type=word_or(int, "auto"), default=3),
-    "prior": Option("known static distortion: see the command prior", path="read"),
+    **KNOWN_STATIC,
     "prior_sigma": Option(
         "scatter of exposures around it; evidence: found from them", type=word_or(float, "evidence"), metavar="PIXELS"
     ),
@@ -166,7 +179,7 @@ PREDICTING = {
     "sigma": Option("error of one measured position, pixels (default: x_err, y_err)", type=float),
     "degree": Option("total degree to be fitted (default 3)", type=int),
     "dithers": Option("rms length of the shifts, pixels (default 0)", "--dither", type=float, metavar="RMS"),
-    "prior": Option("known static distortion: see the command prior", path="read"),
+    **KNOWN_STATIC,
     "dynamic": Option("rms of a coefficient from exposure to exposure, pixels", type=float),
     "spectrum": Option("the same by degree, beyond the fit too", type=spectrum, metavar="DEGREE=RMS,..."),
     "gauge": Option("see the docs (default minimal)", choices=KINDS),

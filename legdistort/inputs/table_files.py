@@ -192,11 +192,16 @@ def write_stars(solution, path, *, overwrite=False):
     InputError
         For another ending, or a file that exists.
     """
+    write_by_ending(QTable(solution.stars), path, overwrite=overwrite)
+    return Path(path)
+
+
+def write_by_ending(table, path, *, overwrite=False):
+    """Write a table in the format that the ending of the path says: as for `write_stars`."""
     kind = WRITTEN.get(Path(path).suffix.lower())
     if kind is None:
         raise InputError(f"{path}: the ending says the format, give one of {', '.join(WRITTEN)}")
-    write_table(QTable(solution.stars), path, kind=kind, overwrite=overwrite)
-    return Path(path)
+    write_table(table, path, kind=kind, overwrite=overwrite)
 
 
 def write_table(table, path, *, kind="ascii.ecsv", overwrite=False):

@@ -1,6 +1,7 @@
 """What is known of the distortion beforehand."""
 
 from dataclasses import KW_ONLY, dataclass, replace
+from numbers import Real
 
 import numpy as np
 
@@ -30,21 +31,38 @@ def _per_mode(value, n, name):
     return out
 
 
+def _declared(sigma, static_sigma):
+    """The size of a static distortion of which nothing else is known, a positive number."""
+    if sigma is not None:
+        raise InputError("sigma is the scatter of exposures around a mean: give the mean as well, or leave sigma out")
+    given = isinstance(static_sigma, Real) and not isinstance(static_sigma, bool)
+    if not (given and 0 < static_sigma < np.inf):
+        raise InputError(
+            "without a mean, static_sigma must be a positive number: the size of every coefficient of the static "
+            f"distortion in pixels, got {static_sigma!r}"
+        )
+    return float(static_sigma)
+
+
 @dataclass(frozen=True, eq=False)
 class Prior:
     """Static distortion known beforehand, and how far to trust it.
 
     Parameters
     ----------
-    mean : array_like, shape (2, n_modes)
-        Static distortion A_0 in the normalised Legendre basis, pixels, x then y (reference -> detector).
+    mean : array_like, shape (2, n_modes), or None
+        Static distortion A_0 in the normalised Legendre basis, pixels, x then y (reference -> detector). None: only how
+        large it is, see `static_sigma`.
     sigma : array_like, optional
         Scatter of single exposures around the mean, pixels: a number, (n_modes,) or (2, n_modes). It shrinks
         what the data cannot tell. None leaves the exposures free. Zero keeps a mode at the mean, infinity leaves it
         free. "evidence" lets `legdistort.solve` find it from the exposures, one width a degree
         (`legdistort.solving.choices.prior_widths`).
     static_sigma : array_like, optional
-        Uncertainty of the mean itself, same forms. It is common to all exposures and does not average down.
+        Uncertainty of the mean itself, same forms. It is common to all exposures and does not average down. None takes
+        the mean as exact. Without a mean, a number s: every coefficient of the degree d that is fitted is about that
+        large, in pixels, either sign. This makes ``s sqrt(((d + 1) (d + 2) - 4) / 8)`` px of distortion, rms per axis
+        over the detector, shift, rotation and scale aside: s at degree 2, 1.4 s at 3, 1.8 s at 4, 2.2 s at 5.
     shape : tuple, optional
         ``(ny, nx)`` of the detector it belongs to; solving exposures of another shape with it is then an error.
     source : str or dict, optional
@@ -64,16 +82,19 @@ class Prior:
         For arrays of the wrong length or values that are not finite.
     """
 
-    mean: np.ndarray
+    mean: np.ndarray | None
     _: KW_ONLY
     sigma: np.ndarray | str | None = None
-    static_sigma: np.ndarray | None = None
+    static_sigma: np.ndarray | float | None = None
     shape: tuple | None = None
     truncation: float = 0.0
     plane: np.ndarray | None = None
     source: str | dict | None = None
 
     def __post_init__(self):
+        if self.mean is None:
+            object.__setattr__(self, "static_sigma", _declared(self.sigma, self.static_sigma))
+            return
         mean = np.array(self.mean, dtype=float)
         if mean.ndim != 2 or mean.shape[0] != 2:
             raise InputError(f"mean must have shape (2, n_modes), x then y, got {mean.shape}")
@@ -86,21 +107,24 @@ class Prior:
 
     @property
     def degree(self):
-        """Total degree of the mean."""
-        return basis.degree_of(self.mean.shape[1])
+        """Total degree of the mean; 0 without one."""
+        return 0 if self.mean is None else basis.degree_of(self.mean.shape[1])
+
+    def static_widths(self, degree):
+        """Uncertainty (2, n_modes) of the static distortion to a total degree, pixels; zero where it is exact."""
+        if self.mean is None:
+            return np.full((2, basis.n_modes(degree)), self.static_sigma)
+        return basis.change_degree(np.zeros((2, 1)) if self.static_sigma is None else self.static_sigma, degree)
 
     def describe(self):
         """Everything but the mean as plain numbers and strings, as files of solutions keep it."""
         widths = {"sigma": self.sigma, "static_sigma": self.static_sigma}
         return {
             "source": self.source,
-            "degree": self.degree,
+            "degree": None if self.mean is None else self.degree,
             "shape": None if self.shape is None else [int(n) for n in self.shape],
             "truncation_px": float(self.truncation),
-            **{
-                name: value if value is None or isinstance(value, str) else value.tolist()
-                for name, value in widths.items()
-            },
+            **{name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in widths.items()},
         }
 
     @property
@@ -125,17 +149,23 @@ class Prior:
             given = np.asarray(sigma, dtype=float)
             sigma = np.full((*given.shape[:-1], basis.n_modes(degree)), np.inf)
             sigma[..., : given.shape[-1]] = given[..., : sigma.shape[-1]]
+        if self.mean is None:
+            return replace(self, sigma=sigma)
         static = None if self.static_sigma is None else basis.change_degree(self.static_sigma, degree)
         return replace(self, mean=basis.change_degree(self.mean, degree), sigma=sigma, static_sigma=static)
 
     def __repr__(self):
+        if self.mean is None:
+            return f"<Prior: not known, {self.static_sigma:g} px a mode>"
         words = [f"degree {self.degree}", f"{self.mean.shape[1]} modes an axis"]
         words += [f"{name} given" for name in ("sigma", "static_sigma") if getattr(self, name) is not None]
         return f"<Prior: {', '.join(words)}>"
 
     @property
     def rms(self):
-        """Root mean square of the mean over the detector [pix], x and y."""
+        """Root mean square of the mean over the detector [pix], x and y; zero without one."""
+        if self.mean is None:
+            return np.zeros(2)
         return np.sqrt((self.mean**2).sum(axis=1)) / 2  # the basis has unit norm on [-1, 1]^2, of area 4
 
     @classmethod
@@ -231,7 +261,9 @@ class Prior:
 
 
 def means(prior):
-    """A prior, or dict of priors, without the widths."""
+    """A prior, or dict of priors, without the widths; None for one without a mean."""
     if isinstance(prior, dict):
         return {key: means(each) for key, each in prior.items()}
-    return prior.with_sigma(None) if isinstance(prior, Prior) else prior
+    if isinstance(prior, Prior):
+        return None if prior.mean is None else prior.with_sigma(None)
+    return prior

@@ -54,12 +54,12 @@ def read_prior(path, kind):
         raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
     check_tree({"legdistort_prior": tree}, "prior-1.schema.yaml", path)
     try:
-        given = ((key, tree[key]) for key in ("sigma", "static_sigma", "plane"))
+        given = ((key, tree[key]) for key in ("coefficients", "sigma", "static_sigma", "plane"))
         arrays = {key: np.array(value) if hasattr(value, "shape") else value for key, value in given}
         if arrays["plane"] is not None:
             similarity.check(arrays["plane"], "plane")
         prior = kind(
-            np.array(tree["coefficients"]),
+            arrays.pop("coefficients"),
             shape=None if tree["shape"] is None else tuple(tree["shape"]),
             truncation=float(tree["truncation_px"]),
             source=tree["source"],

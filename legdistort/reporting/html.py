@@ -13,6 +13,7 @@ body { margin: 2rem auto; max-width: 62rem; padding: 0 1.2rem; background: #fff;
        font: 16px/1.5 system-ui, "Segoe UI", Helvetica, Arial, sans-serif; }
 h1 { font-size: 1.7rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; }
 p.lead { margin: .2rem 0 1.4rem; color: #51606d; }
+p.warning { border-left: 4px solid #a84300; padding-left: .8rem; font-weight: 600; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .28rem .7rem; border-bottom: 1px solid #dde3e8; text-align: left; vertical-align: top; }
 table.facts th { white-space: nowrap; font-weight: 600; }

@@ -72,6 +72,7 @@ def render(solution, *, mosaic=None, summary=None, comparison=None, stacks=None)
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # a name in a script that the font lacks
         body = [
             f'<h1>{title}</h1><p class="lead">{lead}</p>',
+            _warning(solution.gauge),
             _facts_table(solution, facts),
             "<h2>Exposures</h2>",
             _exposures_table(solution),
@@ -87,6 +88,12 @@ def render(solution, *, mosaic=None, summary=None, comparison=None, stacks=None)
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<style>{STYLE}</style>\n</head>\n<body>\n" + "\n".join(body) + "\n</body>\n</html>\n"
     )
+
+
+def _warning(gauge):
+    """That absolute positions are not known, and what to do, if that is so."""
+    text = gauge.warning
+    return f'<p class="warning">{escape(text[0].upper() + text[1:])}.</p>' if text else ""
 
 
 def _facts(solution, summary):
@@ -216,6 +223,7 @@ def _pictures(solution, mosaic):
         "there is one: large values in the highest orders would mean a degree too low or too few stars.",
     )
     figures = [f'<div class="pair">{residuals}{scatter}</div>', *_distortion_figures(solution), coefficients]
+    figures += _error_figure(solution)
     if mosaic is not None:
         figures.append(
             figure(
@@ -225,6 +233,21 @@ def _pictures(solution, mosaic):
             )
         )
     return "\n".join(figures)
+
+
+def _error_figure(solution):
+    """The error of the correction over the exposure with the most stars; none where its distortion folds."""
+    name = solution.names[int(np.argmax(_exposure_rms(solution)[2]))]
+    try:
+        drawn = solution.sigma_map(name)
+    except FoldError:
+        return
+    text = (
+        "Relative error of the correction, rms per axis, over the exposure with the most stars: what it adds to that "
+        "of a new position, once a common map of the fitted degree is taken off. White is outside the stars, where the "
+        "correction is extrapolated. Absolute errors are those of the row Gauge above."
+    )
+    yield figure(solution_plots.plot_sigma_map(*drawn, ax=detached_figure(6.4, 5.4).subplots()), text)
 
 
 def _distortion_figures(solution):

@@ -24,6 +24,7 @@ _CONVENTIONS = {
 }
 #: What was known of the static distortion: how the errors come about, and why something is unknown.
 _STATIC = {
+    "open": ("no scatter of single exposures was assumed", ""),
     "none": ("no static distortion was given", "the scatter of single exposures"),
     "fitted": ("no uncertainty of the static distortion was given", "the scatter of single exposures"),
     "exact": ("", "the scatter of single exposures; the static distortion given is taken as exact"),
@@ -94,8 +95,9 @@ class Gauge:
     covariance : ndarray, shape (2 n_modes, 2 n_modes)
         Of the common map, px^2; without what is unknown and without shift, rotation and scale.
     unknown_maps : tuple of UnknownMap
-    static : {"none", "fitted", "exact", "uncertain"}
-        What was known beforehand of the static distortion.
+    static : {"none", "fitted", "exact", "uncertain", "open"}
+        What was known beforehand of the static distortion; "open" where nothing was assumed of the dynamic part either,
+        in a prediction.
     prior : bool
         Whether the prior has widths, which then pin the modes together with the constraints.
     values : ndarray, shape (n_constraints,), or None
@@ -240,7 +242,8 @@ class Gauge:
         if not self.unknown_names:
             return ""
         why = _STATIC[self.static][0]
-        return f"absolute positions are not known: {why} ({', '.join(self.unknown_names)} unknown); {CURE}"
+        cure = "give dynamic (--dynamic)" if self.static == "open" else CURE
+        return f"absolute positions are not known: {why} ({', '.join(self.unknown_names)} unknown); {cure}"
 
     @property
     def sentence(self):
@@ -283,6 +286,8 @@ class Gauge:
                 "second order; the absolute error is theirs."
             )
         lines += [self.warning[0].upper() + self.warning[1:] + "."] if self.warning else []
+        if self.static == "open":
+            return "\n".join(lines)
         dynamic = np.sqrt(np.sum(self.scatter**2) / 8)
         lines.append(
             f"Absolute errors (rms over the field, per axis) come from {_STATIC[self.static][1]}; single exposures "

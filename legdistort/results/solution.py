@@ -16,7 +16,7 @@ from ..geometry.models import exposure_model, like, outside, to_pixels
 from ..geometry.star_hull import support, supported
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
-from . import absolute_errors
+from . import absolute_errors, new_positions
 from .diagnostics import Diagnostics
 from .gauge import Gauge
 from .settings import Settings
@@ -134,11 +134,7 @@ class Solution:
             with np.errstate(invalid="ignore"):
                 table["flux"] = np.bincount(index, used["flux"], len(table)) / table["n"]
         if self.sky is not None:
-            sky = self.sky.to_sky(self.positions)
-            table["ra"], table["dec"] = u.Quantity(sky.ra, subok=False), u.Quantity(sky.dec, subok=False)
-            errors = self.sky.to_sky_errors(self.positions, variance)
-            table["ra_error"], table["dec_error"], table["ra_dec_corr"] = errors
-            table["ra_error_abs"], table["dec_error_abs"], _ = self.sky.to_sky_errors(self.positions, absolute)
+            new_positions.add_sky(table, self.sky, self.positions, variance, absolute)
         return column_contract.describe_stars(table)
 
     @property
@@ -209,15 +205,63 @@ class Solution:
         p[outside(distortion.inverse.valid, q[:, 0], q[:, 1])] = np.nan
         return like(xy, p)
 
-    def correct(self, name, xy):
+    def correct(self, name, xy, *, errors=None):
         """Detector pixels (n, 2) -> reference positions (n, 2), exact (section 3.3, criterion J_3).
 
         A quantity in pixels gives a quantity.
+
+        Parameters
+        ----------
+        name : str
+        xy : array_like, shape (n, 2)
+            Any pixels of the exposure.
+        errors : array_like, shape (n, 2) or (n, 2, 2), optional
+            Of the measurement: standard deviations per axis [pix], or covariances [pix^2]; zeros leave the errors of
+            the correction alone.
+
+        Returns
+        -------
+        ndarray, shape (n, 2), or `legdistort.results.new_positions.Corrected`
+            With `errors` ``(xy, relative, absolute)``: two covariances (n, 2, 2) [pix^2] beside the positions. They
+            hold for positions that took no part in the solution; those of its stars are in `stars`. Outside the stars
+            of the exposure (`supported`) the correction is extrapolated.
+
+        Raises
+        ------
+        InputError
+            If there is no such exposure, or for errors of another shape, negative ones or such that are not finite.
+        FoldError
+            If the distortion folds.
         """
+        if errors is not None:
+            return new_positions.correct_with_errors(self, name, xy, errors)
         distortion = self.distortion(name)
         distortion.check_fold()
         q = distortion.invert(np.atleast_2d(to_pixels(xy)))
         return like(xy, similarity.apply(similarity.invert(self.poses[name]), q))
+
+    def correct_table(self, table):
+        """Positions measured in any exposures -> the reference plane and the sky, with their errors, as a table.
+
+        Parameters
+        ----------
+        table : `~astropy.table.Table`
+            Columns ``exposure``, ``x``, ``y``, ``x_err``, ``y_err`` [pix] and perhaps ``xy_corr``, of positions that
+            took no part in the solution.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            Row by row, with columns that are named as in `stars`: ``x``, ``y``, their errors relative and absolute, and
+            if the sky is known ``ra``, ``dec``, ``ra_error``, ``dec_error`` [mas], ``ra_dec_corr``, ``ra_error_abs``,
+            ``dec_error_abs``; and the other columns of the table.
+
+        Raises
+        ------
+        InputError
+            For a table that lacks columns or has bad values, or names an exposure that the solution does not have.
+        """
+        return new_positions.correct_table(self, table)
 
     def model(self, name):
         """Reference plane -> detector pixels as an astropy compound model with inverse."""
@@ -271,17 +315,18 @@ class Solution:
         With the error of the common map, and NaN for what changes with an unknown direction (`Gauge.unknown`); or
         `relative` ones, in the gauge.
         """
-        block = self._block(name)
+        block = self.coefficient_covariance(name)
         if relative or self.gauge.plane is not None:
             return np.sqrt(np.diag(block)).reshape(2, -1)
         return np.sqrt(absolute_errors.coefficient_variance(self.gauge, block, self.index(name)))
 
-    def _block(self, name, other=None):
+    def coefficient_covariance(self, name):
+        """Covariance (2 n_modes, 2 n_modes) of the fitted coefficients of an exposure in the gauge, px^2; x first."""
         size = 2 * basis.n_modes(self.degree)
-        i, k = self.index(name), self.index(name if other is None else other)
-        return self.uncertainty.coefficients[i * size : (i + 1) * size, k * size : (k + 1) * size]
+        mine = slice(self.index(name) * size, (self.index(name) + 1) * size)
+        return self.uncertainty.coefficients[mine, mine]
 
-    def sigma_map(self, name, *, n=64, support=True):
+    def sigma_map(self, name, *, n=64, support=True, absolute=False):
         """Error of the distortion correction over a detector (paper's Figure "ergrid", noise of the position excluded).
 
         Parameters
@@ -291,6 +336,9 @@ class Solution:
             Points along the longer side.
         support : bool
             NaN outside the convex hull of the stars used in this exposure, where the correction is extrapolated.
+        absolute : bool
+            With the error of the common map, NaN where that is not known (`Gauge.unknown`); else relative, in the
+            gauge.
 
         Returns
         -------
@@ -306,12 +354,12 @@ class Solution:
         y = np.linspace(-0.5, ny - 0.5, max(2, round(ny / step)))
         grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         q = distortion.invert(grid)
-        b = basis.values(self.degree, *basis.normalize(q, self.shapes[name]))
-        m = len(b)
-        block = self._block(name).reshape(2, m, 2, m)
-        detector = np.einsum("mn,ambk,kn->nab", b, block, b, optimize=True)
-        back = np.linalg.inv(distortion.jacobian(q) @ self.poses[name][:, :2])
-        variance = np.einsum("nab,nbc,nac->na", back, detector, back)
+        if absolute:
+            covariance = new_positions.covariances(self, name, q, np.zeros((len(q), 2, 2)))[1]
+        else:
+            by_modes = new_positions.response(self, name, q)[0]
+            covariance = new_positions.carried(by_modes, self.coefficient_covariance(name))
+        variance = np.einsum("naa->na", covariance)
         sigma = np.sqrt(np.maximum(variance, 0)).reshape(len(y), len(x), 2)
         if support:
             sigma[~self.supported(name, grid).reshape(len(y), len(x))] = np.nan

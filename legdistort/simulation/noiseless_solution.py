@@ -11,6 +11,7 @@ from ..solving.equations import criterion
 from ..solving.equations.covariances import Uncertainty
 from ..solving.equations.problem import State
 from ..solving.gauge import constraints
+from ..solving.gauge.hierarchy import named
 
 #: Without an assumption the scatter of single exposures is taken to be this many times the errors.
 _LARGE = 100.0
@@ -59,12 +60,16 @@ def noiseless_solution(matches, problem, layout, kind, scatter):
 def _gauge(kind, problem, state, blocks, scatter, sigma):
     """The gauge, its weights from the scatter assumed, since there are no data to show it.
 
-    Where nothing was assumed it counts as large beside the errors, and the gauge knows no absolute error.
+    Where nothing was assumed it counts as large beside the errors, and all of a common map is unknown.
     """
     if any(problem.has_widths(i) for i in range(problem.n_exposures)):
         return constraints.make(kind, problem, state, blocks)
     others = dynamic_basis(problem.shapes[0], problem.n_modes)
     assumed = np.full(2 * problem.n_modes, _LARGE * sigma) if scatter is None else scatter.ravel()
     dynamic = np.stack([others.T @ (others * assumed**2 @ others.T) @ others] * problem.n_exposures)
-    gauge = constraints.make(kind, problem, state, blocks, dynamic=dynamic)
-    return replace(gauge, dynamic=np.zeros_like(dynamic)) if scatter is None else gauge
+    if scatter is not None:
+        return constraints.make(kind, problem, state, blocks, dynamic=dynamic)
+    gauge = constraints.make(kind, replace(problem, mean_sigma=None), state, blocks, dynamic=dynamic)
+    unknown = named(10 * dynamic_basis(2 * gauge.box[1, ::-1], gauge.n_modes).T, gauge, state.positions.T)  # any size
+    nothing = {"dynamic": np.zeros_like(dynamic), "covariance": np.zeros_like(gauge.covariance)}
+    return replace(gauge, **nothing, unknown_maps=unknown, static="open")

@@ -36,8 +36,9 @@ class Prediction:
     b : float
         Expected error of the reference positions, relative (in the gauge).
     b_abs : float
-        With what the gauge hides: mean dynamic distortion of the set, uncertainty of the static one; pointing,
-        rotation and scale of the field aside. NaN where nothing was assumed of the dynamic distortion.
+        With the common map: mean dynamic distortion of the set, uncertainty of the static one; pointing, rotation and
+        scale of the field aside, and what is unknown (``solution.gauge.unknown``: without a prior, shears at least).
+        NaN where nothing was assumed of the dynamic distortion.
     sigma : float
         Expected scatter of new corrected positions inside the contour of the stars, a square that holds most of them.
     sigma_field : float
@@ -285,7 +286,7 @@ def _predict(plan):
     """The `Prediction` of a `Plan`."""
     independent, common = assumed_spectra(plan)
     layout = lay_out(plan)
-    matches = layout.matches(np.zeros((2, 1)) if plan.prior is None else plan.prior.mean)
+    matches = layout.matches(np.zeros((2, 1)) if plan.prior is None or plan.prior.mean is None else plan.prior.mean)
     problem = build_problem(matches, plan.degree, prior=plan.prior)
     fitted = independent[:, : problem.n_modes]
     known = bool(np.isfinite(fitted).all())

@@ -1,5 +1,7 @@
 """Predictions as text."""
 
+import textwrap
+
 import numpy as np
 
 
@@ -44,12 +46,25 @@ def describe(prediction):
                 ["noise", *(["aliasing", "together"] if aliased else []), "/ sigma", "thumb"],
             ),
             row("b, star positions, relative", *b, prediction.s_b, thumb_b),
-            row("b, absolute (mean dynamic distortion too)", prediction.b_abs),
+            row(_absolute(prediction), prediction.b_abs),
             row("sigma, new positions inside the contour", *sigma, prediction.s_sigma, thumb_sigma),
             row("sigma, new positions over the whole field", prediction.sigma_field, finite_rms(prediction.alias_map)),
+            *textwrap.wrap(f"All but b, absolute, are relative: {_relative(prediction)}", 110),
             f"gauge {solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
         ]
     )
+
+
+def _absolute(prediction):
+    unknown = ", ".join(prediction.solution.gauge.unknown_names)
+    if unknown and np.isfinite(prediction.b_abs):
+        return f"b, absolute, after {unknown}"
+    return "b, absolute (mean dynamic distortion too)"
+
+
+def _relative(prediction):
+    words = f"what is left once a common map of degree {prediction.degree} is taken off"
+    return "; ".join(filter(None, [words, prediction.solution.gauge.warning]))
 
 
 def describe_plans(plans):

@@ -139,6 +139,8 @@ def solve(
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue))
     solution = _solution(fit, scale, _settings(asked, options, form), found, form)
+    if solution.gauge.warning:
+        log.warning("%s", solution.gauge.warning)
     if kept_out is None:
         return solution
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))

@@ -8,6 +8,7 @@ off.
 """
 
 import argparse
+import logging
 import warnings
 
 import numpy as np
@@ -24,9 +25,9 @@ STATIC, DYNAMIC = 3.0, 0.4
 DEGREE = 3
 
 
-def similarity_fields(xy):
-    """Displacements (2 n, 4), x first, by which a similarity moves positions (n, 2)."""
-    x, y = (xy - xy.mean(axis=0)).T
+def similarity_fields(xy, *, centre=None):
+    """Displacements (2 n, 4), x first, by which a similarity about a centre (their mean) moves positions (n, 2)."""
+    x, y = (xy - (xy.mean(axis=0) if centre is None else centre)).T
     one, zero = np.ones(len(x)), np.zeros(len(x))
     return np.stack([np.r_[one, zero], np.r_[zero, one], np.r_[x, y], np.r_[-y, x]], axis=1)
 
@@ -182,6 +183,7 @@ def main():
     parser.add_argument("--exposures", type=int, nargs="+", default=[11, 6, 4])
     parser.add_argument("--only", default="", help="settings whose names contain this")
     arguments = parser.parse_args()
+    logging.getLogger("legdistort").setLevel(logging.ERROR)
     print(f"{'setting':32s} {'exposures':>9s} {'true rms':>9s} {'reported':>9s} {'ratio^2':>8s}  unknown")
     for name in settings():
         for n in arguments.exposures if arguments.only in name else []:

@@ -196,7 +196,8 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
     sigma = np.full((len(priors), 2, n_fit), np.inf)
     for i, p in enumerate(priors):
         if p is not None:
-            mean[i, :, : p.mean.shape[1]] = p.mean
+            if p.mean is not None:
+                mean[i, :, : p.mean.shape[1]] = p.mean
             if p.sigma is not None:
                 given = p.in_numbers[:, :n_fit]
                 sigma[i, :, : given.shape[1]] = given
@@ -253,16 +254,12 @@ def _order(obs):
 
 
 def _static_sigma(priors, degree):
-    given = [p.static_sigma for p in priors if p is not None and p.static_sigma is not None]
-    return np.max([basis.change_degree(sigma, degree) for sigma in given], axis=0) if given else None
+    given = [p.static_widths(degree) for p in priors if p is not None and p.static_sigma is not None]
+    return np.max(given, axis=0) if given else None
 
 
 def _mean_sigma(prior, degree):
-    if prior is None:
-        return np.full((2, basis.n_modes(degree)), np.inf)
-    if prior.static_sigma is None:
-        return np.zeros((2, basis.n_modes(degree)))
-    return basis.change_degree(prior.static_sigma, degree)
+    return np.full((2, basis.n_modes(degree)), np.inf) if prior is None else prior.static_widths(degree)
 
 
 def _highest_degree(count):

@@ -59,8 +59,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     maps = _taken_back(problem, motion, box, shared_shears)
     static = _static_variance(problem, others, group, shared)
     if dynamic is None:
-        flat = np.isinf(static).any(axis=1)
-        dynamic = dynamic_covariance(problem, state, error, others @ motion @ maps.T, others, group, flat)
+        dynamic = dynamic_covariance(problem, state, error, others @ motion @ maps.T, others, group, static)
     spread = others @ (dynamic + np.where(held, 0, 1)[:, None, None] * error) @ others.transpose(0, 2, 1)
     weight = np.where(held, 1, influence(error, others))[:, None, None] * np.linalg.inv(spread)
     positions = state.positions.T[used]

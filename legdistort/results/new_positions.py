@@ -1,0 +1,177 @@
+"""Positions that took no part in the solution, corrected with it, and their errors.
+
+A pixel p of exposure i is corrected to ``X = T_i^-1 D_i^-1(p)``. An error dp of its measurement and one dA_i of the
+coefficients move it by ``(D_i' T_i)^-1 (dp - B dA_i)``, B the basis there. A common map g of the plane changes A_i by
+``-N_i g``, to first order in the distortion of this exposure alone. Measurement, coefficients in the gauge and common
+map count as independent. With a reference the noise of its stars is in coefficients and map alike. What the two share
+sums to zero over the exposures, as the constraint of the gauge has it for the coefficients, and is neglected.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from astropy import units as u
+
+from ..exceptions import InputError
+from ..geometry import basis, similarity
+from ..geometry.models import like, to_pixels
+from ..inputs import column_contract
+from . import absolute_errors
+
+
+class Corrected(NamedTuple):
+    """Corrected positions with their errors, as `Solution.correct` gives them.
+
+    Attributes
+    ----------
+    xy : ndarray, shape (n, 2)
+        Reference positions, pixels.
+    relative : ndarray, shape (n, 2, 2)
+        Covariance once a common map of the fitted degree is taken off, px^2: the measurement and the distortion of this
+        exposure. It compares positions of one field, from one exposure to another and with ``solution.stars``.
+    absolute : ndarray, shape (n, 2, 2)
+        Covariance with the common map, px^2; NaN where that is not known (`Gauge.unknown`).
+    """
+
+    xy: np.ndarray
+    relative: np.ndarray
+    absolute: np.ndarray
+
+
+def correct_with_errors(solution, name, xy, errors):
+    """`Solution.correct` with errors; see there."""
+    pixels = np.atleast_2d(to_pixels(xy))
+    measured = _covariance(errors, len(pixels))
+    distortion = solution.distortion(name)
+    distortion.check_fold()
+    q = distortion.invert(pixels)
+    corrected = similarity.apply(similarity.invert(solution.poses[name]), q)
+    relative, absolute = covariances(solution, name, q, measured)
+    if isinstance(xy, u.Quantity):
+        relative, absolute = relative * u.pix**2, absolute * u.pix**2
+    return Corrected(like(xy, corrected), relative, absolute)
+
+
+def _covariance(errors, n):
+    """Covariance (n, 2, 2) of measured positions from what was given."""
+    if isinstance(errors, u.Quantity):
+        unit = u.pix**2 if errors.ndim == 3 else u.pix
+        if not errors.unit.is_equivalent(unit):
+            raise InputError(f"errors must be in {unit}, got {errors.unit}")
+        errors = errors.to_value(unit)
+    given = np.asarray(errors, dtype=float)
+    try:
+        given = np.broadcast_to(given, (n, 2, 2) if given.ndim == 3 else (n, 2))
+    except ValueError:
+        raise InputError(
+            f"errors must be standard deviations of shape ({n}, 2) or covariances of shape ({n}, 2, 2), one for each "
+            f"position, got shape {given.shape}"
+        ) from None
+    finite = np.isfinite(given).reshape(n, -1).all(axis=1)
+    known = np.where(finite.reshape(-1, *[1] * (given.ndim - 1)), given, -1.0)
+    if given.ndim == 2:
+        bad, out = (known < 0).any(axis=1), known[:, :, None] ** 2 * np.eye(2)
+    else:
+        bad, out = (known[:, 0, 1] != known[:, 1, 0]) | (known[:, [0, 1], [0, 1]] < 0).any(axis=1), known
+        bad |= known[:, 0, 0] * known[:, 1, 1] < known[:, 0, 1] ** 2
+    if bad.any():
+        k = int(np.flatnonzero(bad)[0])
+        raise InputError(
+            "errors must be standard deviations, finite and not negative, or covariances, symmetric and positive; "
+            f"row {k} has {given[k].tolist()}"
+        )
+    return out
+
+
+def response(solution, name, q):
+    """How coefficients move corrected positions, up to the sign, (n, 2, 2 n_modes), and detector pixels, (n, 2, 2).
+
+    `q` (n, 2) are undistorted pixels of an exposure.
+    """
+    back = np.linalg.inv(solution.distortion(name).jacobian(q) @ solution.poses[name][:, :2])
+    b = basis.values(solution.degree, *basis.normalize(q, solution.shapes[name]))
+    return np.einsum("nac,mn->nacm", back, b).reshape(len(q), 2, -1), back
+
+
+def covariances(solution, name, q, measured):
+    """Relative and absolute covariance (n, 2, 2) of positions corrected to undistorted pixels q (n, 2) of an exposure.
+
+    `measured` (n, 2, 2) is the covariance on the detector.
+    """
+    gauge, i = solution.gauge, solution.index(name)
+    by_modes, back = response(solution, name, q)
+    own = carried(back, measured) + carried(by_modes, solution.coefficient_covariance(name))
+    if gauge.plane is not None:
+        return own, np.full_like(own, np.nan)
+    xy = similarity.apply(similarity.invert(solution.poses[name]), q)
+    hidden = gauge.absolute_covariance
+    plain = absolute_errors.plain_directions(gauge, xy, len(hidden) // 2)
+    relative, directions = own, plain
+    if len(hidden) == 2 * gauge.n_modes:
+        directions = by_modes @ widened(gauge.motion[i], solution.degree)
+        relative = own + carried(directions - plain @ _taken_off(gauge, solution.positions), hidden)
+    absolute = own + carried(directions, hidden)
+    for each in gauge.unknown:
+        moved = by_modes @ widened(each.coefficients[i].reshape(-1, 1), solution.degree)
+        absolute[np.sum(moved**2, axis=(1, 2)) > np.trace(absolute, axis1=1, axis2=2)] = np.nan
+    return relative, absolute
+
+
+def carried(through, covariance):
+    """Covariance (n, 2, 2) of what depends linearly, (n, 2, k), on something with a covariance (k, k) or (n, k, k)."""
+    return through @ covariance @ through.transpose(0, 2, 1)
+
+
+def widened(changes, degree):
+    """Changes (2 n, k) of coefficients of a lower degree as those of all modes fitted, (2 n_modes, k)."""
+    by_mode = np.moveaxis(changes.reshape(2, len(changes) // 2, -1), 1, 2)
+    return np.moveaxis(basis.change_degree(by_mode, degree), 1, 2).reshape(-1, changes.shape[1])
+
+
+def _taken_off(gauge, positions):
+    """The modes (2 n, 2 n) of a map that a fit to the stars takes off each of the gauge's directions."""
+    good = np.isfinite(positions[:, 0])
+    directions = gauge.directions[good]
+    plain = absolute_errors.plain_directions(gauge, positions[good], gauge.n_modes)
+    flat = (-1, directions.shape[2])
+    return np.linalg.lstsq(plain.reshape(flat), directions.reshape(flat), rcond=None)[0]
+
+
+def correct_table(solution, table):
+    """`Solution.correct_table`; see there."""
+    table = column_contract.check(table, column_contract.DETECTED, "the table of positions")
+    exposures = np.asarray(table["exposure"]).astype(str)
+    pixels, x_err, y_err = (table[name].to_value(u.pix) for name in ("x", "x_err", "y_err"))
+    pixels = np.column_stack([pixels, table["y"].to_value(u.pix)])
+    corr = np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else 0.0
+    measured = _blocks(np.stack([x_err**2, y_err**2, corr * x_err * y_err]))
+    xy, relative, absolute = np.empty_like(pixels), np.empty_like(measured), np.empty_like(measured)
+    for name in dict.fromkeys(exposures.tolist()):
+        mine = exposures == name
+        xy[mine], relative[mine], absolute[mine] = correct_with_errors(solution, name, pixels[mine], measured[mine])
+    out = table.copy()
+    out["x"], out["y"] = xy.T * u.pix
+    for suffix, each in (("err", relative), ("err_abs", absolute)):
+        out[f"x_{suffix}"], out[f"y_{suffix}"] = np.sqrt(np.einsum("nkk->kn", each)) * u.pix
+    out["xy_corr"] = relative[:, 0, 1] / np.sqrt(relative[:, 0, 0] * relative[:, 1, 1])
+    if solution.sky is not None:
+        add_sky(out, solution.sky, xy, _variances(relative), _variances(absolute))
+    return column_contract.describe_stars(out)
+
+
+def _blocks(variances):
+    """Variances xx, yy, xy (3, n) as covariances (n, 2, 2)."""
+    xx, yy, xy = variances
+    return np.stack([np.stack([xx, xy]), np.stack([xy, yy])]).transpose(2, 0, 1)
+
+
+def _variances(blocks):
+    return np.stack([blocks[:, 0, 0], blocks[:, 1, 1], blocks[:, 0, 1]])
+
+
+def add_sky(table, sky, xy, relative, absolute):
+    """Add the columns on the sky, named as in the Gaia catalogue, of positions (n, 2) with their variances (3, n)."""
+    places = sky.to_sky(xy)
+    table["ra"], table["dec"] = u.Quantity(places.ra, subok=False), u.Quantity(places.dec, subok=False)
+    table["ra_error"], table["dec_error"], table["ra_dec_corr"] = sky.to_sky_errors(xy, relative)
+    table["ra_error_abs"], table["dec_error_abs"], _ = sky.to_sky_errors(xy, absolute)
