@@ -1,4 +1,7 @@
-"""The commands: what each does, an example, its options, and the function that does it with the parsed command line."""
+"""The commands: what each does, an example, its options, and the function that does it with the parsed command line.
+
+The verbs are taken from the package itself, which loads each when it is called.
+"""
 
 import json
 import sys
@@ -6,7 +9,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import legdistort
+
+from ..coaddition.grids import given_grid, read_grid
+from ..coaddition.mosaic import check_ending
+from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
+from ..inputs.exposure_files import file_checksums
+from ..inputs.table_files import read_table, stack, write_stars, write_table
+from ..priors.prior import EVIDENCE
+from ..runtime.outputs import replacing, replacing_folder
+from ..runtime.parallel import check_workers
+from ..runtime.provenance import with_inputs
+from ..solving.choices.degree_choice import AUTO, HIGHEST
 from . import options
 from .arguments import given
 
@@ -79,13 +94,11 @@ def do_demo(a):
 )
 def do_run(a):
     """``legdistort run``."""
-    from ..pipeline import run
-
     matching, solving = given(a, options.MATCHING), _solving(a)
     if a.method == "alternating":
         solving.setdefault("clip", None)  # the published scheme has none
     own = ("degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
-    result = run(
+    result = legdistort.run(
         **given(a, options.FRAMES),
         out=a.out,
         **{name: group.pop(name) for group in (matching, solving) for name in own if name in group},
@@ -116,15 +129,12 @@ def do_run(a):
 )
 def do_measure(a):
     """``legdistort measure``."""
-    from ..inputs.exposure_files import file_checksums
-    from ..inputs.table_files import write_table
     from ..measurement.options import MeasureOptions
-    from ..measurement.positions import measure
 
     measuring = given(a, options.MEASURING)
     MeasureOptions(**measuring)  # which refuses them before a frame is read
     exposures = _open(a)
-    table = measure(exposures, **measuring, **_share(a))
+    table = legdistort.measure(exposures, **measuring, **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
     table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures)}
     write_table(table, a.out, overwrite=a.overwrite)
@@ -143,13 +153,13 @@ def do_measure(a):
 )
 def do_noise(a):
     """``legdistort noise``."""
-    from ..measurement.noise_calibration import calibrate_noise, check_injection
+    from ..measurement.noise_calibration import check_injection
     from ..measurement.options import MeasureOptions
 
     injecting, measuring = given(a, options.INJECTING), given(a, options.DETECTOR)
     check_injection(**injecting)  # before a frame is read
     MeasureOptions(**measuring)
-    curves = calibrate_noise(_open(a), **injecting, measuring=measuring, **_share(a))
+    curves = legdistort.calibrate_noise(_open(a), **injecting, measuring=measuring, **_share(a))
     curves.write(a.out, overwrite=a.overwrite)
     _draw(curves, a)
     _say(a, curves, {"laws": _records(curves.laws), "out": str(a.out)})
@@ -165,16 +175,15 @@ def do_noise(a):
 )
 def do_match(a):
     """``legdistort match``."""
-    from ..inputs.table_files import stack, write_table
-    from ..matching.matcher import match
-
     tables = [_read_table(path, a) for path in a.tables]
     names = [name for table in tables for name in dict.fromkeys(table["exposure"])]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
-    matches = match(stack(tables), shape=tuple(a.shape) if a.shape else shapes or None, **given(a, options.MATCHING))
+    matches = legdistort.match(
+        stack(tables), shape=tuple(a.shape) if a.shape else shapes or None, **given(a, options.MATCHING)
+    )
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
     matches = replace(matches, left_out=matches.left_out | empty)
     made = matches.table.copy()
@@ -195,20 +204,16 @@ def do_match(a):
 )
 def do_solve(a):
     """``legdistort solve``."""
-    from ..inputs.matches import Matches
     from ..pipeline import check_results, summarise, write_results, write_summary
     from ..reporting.page import write_report
-    from ..runtime.outputs import replacing_folder
-    from ..runtime.provenance import with_inputs
-    from ..solving.estimation import solve
 
     check_results(a.out, a.overwrite)
     table = _read_table(a.table, a)
     shape = tuple(a.shape) if a.shape else table.meta.get("shapes")
     if shape is None:
         raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
-    matches = Matches.from_table(table, shape=shape, **Matches.read_meta(table.meta))
-    solution = with_inputs(solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
+    matches = legdistort.Matches.from_table(table, shape=shape, **legdistort.Matches.read_meta(table.meta))
+    solution = with_inputs(legdistort.solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
     summary = summarise(solution)
     with replacing_folder(a.out) as target:
         write_results(solution, target)
@@ -226,9 +231,7 @@ def do_solve(a):
 )
 def do_prior(a):
     """``legdistort prior``."""
-    from ..priors.prior import Prior
-
-    prior = Prior.from_file(**given(a, options.EXPANDING))
+    prior = legdistort.Prior.from_file(**given(a, options.EXPANDING))
     prior.write(a.out, overwrite=a.overwrite)
     rms_x, rms_y = map(float, prior.rms)
     figures = {"degree": prior.degree, "truncation_px": prior.truncation, "rms_px": [rms_x, rms_y]}
@@ -249,15 +252,11 @@ def do_prior(a):
 )
 def do_coadd(a):
     """``legdistort coadd``."""
-    from ..coaddition.mosaic import check_ending
-    from ..coaddition.mosaicking import coadd
-    from ..coaddition.options import CoaddOptions
-
     check_ending(a.out)
     solution = _solution(a)
     coadding = given(a, options.COADDING) | {"grid": _grid(a.grid, solution)}
     CoaddOptions(**coadding)  # which refuses them before a frame is read
-    mosaic = coadd(_open(a), solution, **coadding, **_share(a))
+    mosaic = legdistort.coadd(_open(a), solution, **coadding, **_share(a))
     mosaic.write(a.out, overwrite=a.overwrite)
     figures = {"shape": list(mosaic.shape), "n_exposures": len(mosaic.exposures), "left_out": mosaic.left_out}
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
@@ -292,7 +291,6 @@ def do_attach(a):
 )
 def do_predict(a):
     """``legdistort predict``."""
-    from ..simulation.prediction import predict
     from ..simulation.prediction_text import describe_plans
 
     keywords = given(a, options.PREDICTING) | {"prior": _prior(a.prior, a.shape)}
@@ -300,7 +298,7 @@ def do_predict(a):
         keywords["stars"] = _read_table(a.stars, a)
     if a.shape is not None:
         keywords["shape"] = tuple(a.shape)
-    prediction = predict(**keywords)
+    prediction = legdistort.predict(**keywords)
     _draw(prediction, a)
     plans = prediction.alternatives()
     own, *others = _records(plans)
@@ -315,12 +313,9 @@ def do_predict(a):
 )
 def do_simulate(a):
     """``legdistort simulate``."""
-    from ..runtime.outputs import replacing_folder
-    from ..simulation.observations import simulate_exposures
-
     if Path(a.out, "truth.ecsv").exists() and not a.overwrite:
         raise InputError(f"{a.out} already holds a simulated night; give --overwrite or another folder")
-    night = simulate_exposures(**given(a, options.NIGHT), progress=wants_progress(a))
+    night = legdistort.simulate_exposures(**given(a, options.NIGHT), progress=wants_progress(a))
     with replacing_folder(a.out) as target:
         paths = night.write(target)
     _say(a, f"{len(paths)} frames and truth.ecsv in {a.out}", {"frames": [path.name for path in paths]})
@@ -343,8 +338,6 @@ def do_show(a):
 )
 def do_stars(a):
     """``legdistort stars``."""
-    from ..inputs.table_files import write_stars
-
     solution = _solution(a)
     write_stars(solution, a.out, overwrite=a.overwrite)
     _say(a, f"{len(solution.star_names)} stars in {a.out}", {"n_stars": len(solution.star_names), "out": str(a.out)})
@@ -385,49 +378,38 @@ def _share(a):
 
 
 def _open(a):
-    from ..inputs.exposure_files import open_exposures
-    from ..runtime.parallel import check_workers
 
     check_workers(a.workers)
-    return open_exposures(**given(a, options.FRAMES), progress=wants_progress(a))
+    return legdistort.open_exposures(**given(a, options.FRAMES), progress=wants_progress(a))
 
 
 def _solving(a, shape=None):
     """The arguments of `solve`; the prior read, no static distortion if there is none, with the widths asked for."""
-    from ..priors.prior import EVIDENCE, Prior
-    from ..solving.choices.degree_choice import AUTO, HIGHEST
-
     keywords, prior = given(a, options.SOLVING), _prior(a.prior, shape)
     sigma = keywords.pop("prior_sigma", None)
     if sigma is not None:
         degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
-        prior = (prior or Prior([[0.0], [0.0]])).with_sigma(sigma, degree=degree)
+        prior = (prior or legdistort.Prior([[0.0], [0.0]])).with_sigma(sigma, degree=degree)
     return keywords | {"prior": prior}
 
 
 def _prior(text, shape=None):
-    """Whatever `Prior.from_file` recognises."""
-    from ..priors.prior import Prior
-
-    return None if text is None else Prior.from_file(text, shape=shape)
+    """Whatever `legdistort.Prior.from_file` recognises."""
+    return None if text is None else legdistort.Prior.from_file(text, shape=shape)
 
 
 def _read_table(path, a):
-    from ..inputs.table_files import read_table
 
     return read_table(path, columns=dict(a.columns), origin=a.origin)
 
 
 def _solution(a):
-    from ..results.solution import Solution
 
-    return Solution.read(a.solution, max_bytes=a.max_bytes)
+    return legdistort.Solution.read(a.solution, max_bytes=a.max_bytes)
 
 
 def _grid(path, solution):
     """The grid of a file, known to be one for the solution before any frame is read."""
-    from ..coaddition.grids import given_grid, read_grid
-
     if path is None:
         return None
     grid = read_grid(path)
@@ -440,8 +422,6 @@ def _grid(path, solution):
 
 def _draw(result, a):
     """The picture of a result, if it is asked for."""
-    from ..runtime.outputs import replacing
-
     if a.plot is not None:
         with replacing(a.plot, overwrite=a.overwrite) as file:
             result.plot().figure.savefig(file, format="png", dpi=120)
