@@ -52,6 +52,11 @@ class AssumptionWarning(LegdistortWarning):
     """Something was missing from the input and a stated value was assumed."""
 
 
+def some_of(names, most):
+    """The first `most` names for a message, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 #: Frames of these do not count as a caller's: the package, and what calls its functions for it.
 _INSIDE = str(Path(__file__).parent) + os.sep
 _BETWEEN = {functools.__file__, contextlib.__file__}

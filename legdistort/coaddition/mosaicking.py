@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from ..exceptions import AssumptionWarning, InputError, warn
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.star_hull import support
 from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
@@ -244,12 +244,7 @@ def _warn(left_out):
 
 def _reasons(left_out):
     names = {reason: [n for n, other in left_out.items() if other == reason] for reason in left_out.values()}
-    return "; ".join(f"{_few(same)}: {reason}" for reason, same in names.items())
-
-
-def _few(names, most=5):
-    more = f" and {len(names) - most} more" * (len(names) > most)
-    return ", ".join(names[:most]) + more
+    return "; ".join(f"{some_of(same, 5)}: {reason}" for reason, same in names.items())
 
 
 def _warn_of_misuse(frames, maps, algorithm):
@@ -300,8 +295,7 @@ def _header(frames, left_out, factors, settings):
         if isinstance(value, str) or (value is not None and np.isfinite(value)):
             header[key] = (value, meaning)
     header["CREATOR"] = f"legdistort {version('legdistort')}"
-    for i, frame in enumerate(frames[:999], start=1):
-        header[f"IMCMB{i:03d}"] = _ascii(frame.name)
+    header.extend((f"IMCMB{i:03d}", _ascii(frame.name)) for i, frame in enumerate(frames[:999], start=1))
     for name, reason in left_out.items():
         header.add_history(_ascii(f"left out {name}: {reason}"))
     return header

@@ -222,8 +222,7 @@ def _open(source, default, ext):
 @contextmanager
 def _quiet():
     """Headers are often a little off the standard; what matters is checked."""
-    with _FILTERS, warnings.catch_warnings():
-        warnings.simplefilter("ignore", AstropyWarning)
+    with _FILTERS, warnings.catch_warnings(action="ignore", category=AstropyWarning):
         yield
 
 

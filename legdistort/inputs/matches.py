@@ -8,7 +8,7 @@ from astropy import units as u
 from astropy.table import QTable
 from scipy.sparse.csgraph import connected_components
 
-from ..exceptions import InputError, MatchError
+from ..exceptions import InputError, MatchError, some_of
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
 from . import column_contract
@@ -189,7 +189,7 @@ class Matches:
         seen = Observations.of(table)
         for name in seen.names:
             check_exposure_name(name)
-        shapes = _by_exposure(shape, seen.names)
+        shapes = shapes_by_exposure(shape, seen.names)
         _check_inside(seen, shapes)
         _check_duplicates(seen)
         _check_connected(seen)
@@ -201,7 +201,8 @@ class Matches:
         return cls(table, shapes, poses, sky, dict(left_out or {}), epoch, seen)
 
 
-def _by_exposure(shape, names):
+def shapes_by_exposure(shape, names):
+    """Shapes (ny, nx), checked, of the exposures named: from a dict of them, or from one shape for all."""
     if not isinstance(shape, dict):
         shape = dict.fromkeys(names, shape)
     missing = [name for name in names if name not in shape]
@@ -292,11 +293,7 @@ def _check_connected(seen):
     count, group = connected_components(tied, directed=False)
     if count > 1:
         groups = [[name for name, g in zip(seen.names, group, strict=True) if g == label] for label in range(count)]
-        listed = "; ".join(_shorten(g) for g in groups)
+        listed = "; ".join(some_of(g, 6) for g in groups)
         raise MatchError(
             f"the exposures form {len(groups)} groups with no star in common: {listed}; solve each group by itself"
         )
-
-
-def _shorten(names, most=6):
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

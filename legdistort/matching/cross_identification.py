@@ -8,7 +8,6 @@ from scipy.spatial import cKDTree
 
 from ..exceptions import InputError
 from ..geometry import similarity
-from ..geometry.similarity import robust_similarity
 from ..geometry.tangent_plane import TangentPlane, angles, directions
 from .registration import register
 from .similarity_candidates import scale_candidates
@@ -200,7 +199,7 @@ def _tangent_plane(reference, positions):
             "scale and parity: 3 are needed"
         )
     plane = _middle(reference.sky, 1.0)
-    matrix = robust_similarity(positions, reference.on_plane(plane)[0])
+    matrix = similarity.robust_similarity(positions, reference.on_plane(plane)[0])
     return TangentPlane(plane.lon, plane.lat, matrix)
 
 
@@ -208,7 +207,7 @@ def _check_agreement(label, positions, xy, size):
     """Raise `InputError` if a similarity does not carry one to the other, roughly."""
     if len(positions) < 3:
         return
-    off = np.hypot(*(similarity.apply(robust_similarity(positions, xy), positions) - xy).T)
+    off = np.hypot(*(similarity.apply(similarity.robust_similarity(positions, xy), positions) - xy).T)
     if not np.median(off) < _AGREEMENT * size:
         raise InputError(
             f"the {len(positions)} stars that {label} shares with the exposures by name do not lie as they do there "

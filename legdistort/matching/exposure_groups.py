@@ -14,7 +14,6 @@ import numpy as np
 from tqdm import tqdm
 
 from ..geometry import similarity
-from ..geometry.similarity import robust_similarity
 from .registration import Registration, continue_from_pairs, continue_from_pose, outwards, register
 from .star_labels import label_stars
 from .star_lists import StarList, Warp, allowed_degree, fit_warp
@@ -85,7 +84,7 @@ def _gather(lists, hub, left, guess, tolerance):
                 i, j = sorted((base, other))
                 r = register(lists[i], lists[j], guess=guess(i, j), blind=blind, tolerance=tolerance)
                 if r is not None:
-                    step = robust_similarity(lists[i].xy[r.source], lists[j].xy[r.target])
+                    step = similarity.robust_similarity(lists[i].xy[r.source], lists[j].xy[r.target])
                     found[other] = similarity.compose(step if base == i else similarity.invert(step), found[base])
                     registrations[i, j] = r
                     left.remove(other)
@@ -288,7 +287,7 @@ def _united(main, view, other, other_view, guess, tolerance):
     found = register(other_view.stars, view.stars, guess=start, tolerance=tolerance)
     if found is None:
         return None
-    step = robust_similarity(other_view.stars.xy[found.source], view.stars.xy[found.target])
+    step = similarity.robust_similarity(other_view.stars.xy[found.source], view.stars.xy[found.target])
     to_other = similarity.compose(
         similarity.invert(other_view.pose), similarity.compose(similarity.invert(step), view.pose)
     )

@@ -8,7 +8,7 @@ from astropy import units as u
 
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..inputs import column_contract
-from ..inputs.matches import Matches
+from ..inputs.matches import Matches, shapes_by_exposure
 from ..inputs.reference_catalogue import mean_epoch
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
@@ -142,11 +142,6 @@ def _check_names(table, names, min_exposures):
 def _shapes(table, names, named, shape):
     if named is not None:
         return {name: named[name].shape for name in names}
-    if isinstance(shape, dict):
-        missing = [name for name in names if name not in shape]
-        if missing:
-            raise InputError(f"shape has no entry for exposure {missing[0]!r}; give (ny, nx) for every exposure")
-        return {name: tuple(shape[name]) for name in names}
     if shape is None:
         shape = tuple(int(np.ceil(table[c].to_value(u.pix).max() + 0.5)) for c in ("y", "x"))
         warn(
@@ -154,7 +149,7 @@ def _shapes(table, names, named, shape):
             "pass shape=(ny, nx) or exposures=",
             AssumptionWarning,
         )
-    return dict.fromkeys(names, tuple(shape))
+    return shapes_by_exposure(shape, names)
 
 
 def _star_list(table, shape):

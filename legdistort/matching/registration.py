@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..geometry import similarity
-from ..geometry.similarity import robust_similarity
 from .similarity_candidates import offset_candidates, triangle_candidates
 from .star_lists import Warp, allowed_degree, fit_warp
 
@@ -110,7 +109,7 @@ def _spread(source, target, found, tolerance):
         ):
             return found
         order = None if source.ranking is not None else outwards(source, p.mean(axis=0))
-        pose = robust_similarity(p, target.xy[found.target])
+        pose = similarity.robust_similarity(p, target.xy[found.target])
         again = continue_from_pose(source, target, pose, order, tolerance=tolerance)
         if again is None or len(again.source) <= len(found.source):
             return found

@@ -9,7 +9,7 @@ from astropy import units as u
 from astropy.table import QTable, vstack
 from scipy.spatial import cKDTree
 
-from ..exceptions import AssumptionWarning, warn
+from ..exceptions import AssumptionWarning, some_of, warn
 from ..inputs.exposure_files import listed
 from ..runtime.parallel import map_items
 from .crowding import crowding, is_deformed
@@ -122,10 +122,9 @@ def _warn_of_gain(photons):
     if names:
         gains = [1 / photon for photon in photons.values() if photon]
         found = f"equivalent gain {min(gains):.3g} to {max(gains):.3g} e-/ADU" if gains else "none could be seen"
-        some = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
         warn(
-            f"no gain known for {some}: photon noise estimated from the residuals of the star fits ({found}); "
-            "give gain= or the keyword GAIN to have it exact",
+            f"no gain known for {some_of(names, 3)}: photon noise estimated from the residuals of the star fits "
+            f"({found}); give gain= or the keyword GAIN to have it exact",
             AssumptionWarning,
         )
 

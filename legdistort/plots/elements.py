@@ -44,15 +44,17 @@ def shorten(name, length=44):
     return name if len(name) <= length else f"{name[: length // 2]}…{name[1 - length // 2 :]}"
 
 
-def set_log_ticks(axis):
-    """Labels at 1, 2, 5 where a logarithmic axis is short, at powers of ten where it is long."""
+def set_log_grid(ax):
+    """Grid, and labels at 1, 2, 5 where a logarithmic axis is short, at powers of ten where it is long."""
     from matplotlib import ticker
 
-    low, high = axis.get_view_interval()
-    axis.set_minor_formatter(ticker.NullFormatter())
-    if high < 300 * low:
-        axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if high > 8 * low else (1, 1.5, 2, 3, 4, 5, 6, 8)))
-        axis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+    for axis in (ax.xaxis, ax.yaxis):
+        low, high = axis.get_view_interval()
+        axis.set_minor_formatter(ticker.NullFormatter())
+        if high < 300 * low:
+            axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if high > 8 * low else (1, 1.5, 2, 3, 4, 5, 6, 8)))
+            axis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+    ax.grid(linewidth=0.3)
 
 
 def peak(coefficients):

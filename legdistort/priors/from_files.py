@@ -75,8 +75,8 @@ def read_source(where, *, ext=None, frame=None):
             f"{path}: {'not a file' if path.exists() else 'no such file'}; give a file, gsaoi-1 ... gsaoi-4, or "
             "siaf:INSTRUMENT/APERTURE"
         )
-    with warnings.catch_warnings():  # files are often a little off the standard; what matters is checked here
-        warnings.simplefilter("ignore", AstropyWarning)
+    # files are often a little off the standard; what matters is checked here
+    with warnings.catch_warnings(action="ignore", category=AstropyWarning):
         return _read_file(path, ext, frame)
 
 
@@ -295,8 +295,7 @@ def _aperture(text):
     except ImportError:
         raise InputError(f"{text}: SIAF apertures need pysiaf; pip install pysiaf") from None
     try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), contextlib.redirect_stdout(io.StringIO()):
             siaf = pysiaf.Siaf(instrument)
     except Exception as error:  # it knows its instruments by its own files
         raise InputError(f"{text}: pysiaf has no instrument {instrument!r} ({error})") from None

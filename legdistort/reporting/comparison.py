@@ -47,9 +47,7 @@ def plot_comparison(solutions, *, noise=None, ax=None):
         curve = noise(at)
     ax.plot(at, curve, color="#E69F00", linewidth=2, label="error of one measured position")
     ax.set(xscale="log", yscale="log", xlabel=label, ylabel="scatter σ_j of corrected positions, per axis [px]")
-    ax.grid(linewidth=0.3)
-    elements.set_log_ticks(ax.xaxis)
-    elements.set_log_ticks(ax.yaxis)
+    elements.set_log_grid(ax)
     ax.legend(fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)  # clear of the marks
     return ax
 

@@ -59,8 +59,7 @@ def read_bytes(path):
 
 def open_bytes(raw, **options):
     """An HDUList of the content of a file, its oddities left alone."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AstropyWarning)
+    with warnings.catch_warnings(action="ignore", category=AstropyWarning):
         hdulist = fits.open(io.BytesIO(raw), memmap=False, **options)
         len(hdulist)  # astropy reads headers when they are asked for
     return hdulist

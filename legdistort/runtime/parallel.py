@@ -137,8 +137,7 @@ def _attempt(function, item):
     log = logging.getLogger("legdistort")
     log.handlers[:], log.propagate = [QueueHandler(records)], False
     log.setLevel(logging.INFO)
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as warned:
         try:
             result = function(item)
         except Exception as error:

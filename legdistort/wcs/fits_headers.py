@@ -117,8 +117,7 @@ def header_error(header, pose, distortion, sky):
     """
     points = _detector_points(distortion.shape, np.linspace(-1, 1, _GRID))
     exact = _exact_sky(pose, distortion, sky, points)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FITSFixedWarning)
+    with warnings.catch_warnings(action="ignore", category=FITSFixedWarning):
         wcs = WCS(header)
     if not wcs.has_celestial:
         raise InputError(f"the header compared with exposure {distortion.name} has no celestial WCS")
@@ -214,19 +213,16 @@ def _fit(points, target, degree):
 def _linear_header(kind, origin, tangent, cd):
     """The keywords of the linear part."""
     ends = {"sip": "TAN-SIP", "tpv": "TPV"}[kind]
-    header = fits.Header()
-    header["WCSAXES"] = (2, "number of WCS axes")
+    cards = [("WCSAXES", 2, "number of WCS axes")]
     for k, (axis, centre) in enumerate((("RA--", tangent.lon % 360), ("DEC-", tangent.lat)), start=1):
-        header[f"CTYPE{k}"] = f"{axis}-{ends}"
-        header[f"CUNIT{k}"] = "deg"
-        header[f"CRPIX{k}"] = (float(origin[k - 1]) + 1, "reference pixel, from 1")
-        header[f"CRVAL{k}"] = (float(centre), "[deg] at the reference pixel")
-    for a in (1, 2):
-        for b in (1, 2):
-            header[f"CD{a}_{b}"] = (float(cd[a - 1, b - 1]), "[deg/pix]")
-    header["LONPOLE"] = 180.0
-    header["RADESYS"] = "ICRS"
-    return header
+        cards += [
+            (f"CTYPE{k}", f"{axis}-{ends}"),
+            (f"CUNIT{k}", "deg"),
+            (f"CRPIX{k}", float(origin[k - 1]) + 1, "reference pixel, from 1"),
+            (f"CRVAL{k}", float(centre), "[deg] at the reference pixel"),
+        ]
+    cards += [(f"CD{a + 1}_{b + 1}", float(cd[a, b]), "[deg/pix]") for a, b in np.ndindex(2, 2)]
+    return fits.Header([*cards, ("LONPOLE", 180.0), ("RADESYS", "ICRS")])
 
 
 def _sip(polynomial, cd, offset, plane):

@@ -113,8 +113,7 @@ def find_widths(fit, prior, degree, unit, *, scale=False):
     widths = Widths(wanted, np.full((len(wanted), degree), unit))
 
     def fitted():
-        with warnings.catch_warnings(record=True) as caught:  # of the last fit they are told
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:  # of the last fit they are told
             return fit(widths.resolve(prior)), caught
 
     for _ in range(MAX_ROUNDS if degree else 0):
