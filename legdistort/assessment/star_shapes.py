@@ -48,8 +48,7 @@ def measure_shapes(image, xy, *, fwhm, bad=None, saturation=None):
     if len(inside) == 0:
         return out
     params, converged = _fit(data, good, xy[inside] - centres[inside], fwhm)
-    model = moffat.evaluate(params, half, moffat.quadrature(fwhm))
-    light = np.where(good, data - params[:, 7:], model)
+    light = np.where(good, data - params[:, 7:], moffat.evaluate(params, half, moffat.quadrature(fwhm)))
     distance = np.hypot(dx - params[:, :1], dy - params[:, 1:2])
     flux = (np.clip(2 * fwhm + 0.5 - distance, 0, 1) * light).sum(axis=1)
     a, b = np.exp(params[:, 3:5]).T

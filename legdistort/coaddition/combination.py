@@ -144,8 +144,7 @@ def _median(data, variance, weight, use, *, level, photons):
         spread = of_mean**few * of_many ** (1 - few)
         excess = np.where(count > 2, np.pi / 2 * count / (count + np.where(count % 2, 0.48, 1.3)), 1)
         spread = np.where(count > 0, excess * spread, np.nan)
-    total = np.where(use, weight, 0).sum(axis=0)
-    return Combined(centre.astype(np.float32), spread.astype(np.float32), total, use)
+    return Combined(centre.astype(np.float32), spread.astype(np.float32), np.where(use, weight, 0).sum(axis=0), use)
 
 
 def confirmed(data, variance, use, *, level=0.0, fwhm=None, widths=None):

@@ -74,8 +74,7 @@ class ExposureFile:
             if hdu.shape != self.shape:
                 raise InputError(f"{self.path} has changed: its image had shape {self.shape}, now {hdu.shape}")
             planes = _planes(hdulist, hdu)
-        known = {name: getattr(self, name) for name in _SHARED}
-        return Exposure(**known, **planes)
+        return Exposure(**{name: getattr(self, name) for name in _SHARED}, **planes)
 
     def __repr__(self):
         ny, nx = self.shape
@@ -323,6 +322,5 @@ def _from_ccddata(ccd, default):
     if ccd.unit is not None:
         header["BUNIT"] = ccd.unit.to_string()
     wcs = believable_wcs(ccd.wcs, np.shape(ccd.data), name) if isinstance(ccd.wcs, WCS) else None
-    integer = ccd.data.dtype.kind in "iu"
-    known = known_from_header(header, ccd.data, integer=integer)
+    known = known_from_header(header, ccd.data, integer=ccd.data.dtype.kind in "iu")
     return Exposure(name, ccd.data, ccd.mask, uncertainty, wcs, header, **known)

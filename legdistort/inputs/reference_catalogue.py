@@ -108,8 +108,7 @@ class Reference:
         step = np.hstack([np.eye(2), np.zeros((2, 2))]) + years[:, None, None] * np.hstack(
             [np.zeros((2, 2)), np.eye(2)]
         )
-        full = np.where(np.isfinite(self.covariance), self.covariance, 0)
-        covariance = step @ full @ step.transpose(0, 2, 1)
+        covariance = step @ np.where(np.isfinite(self.covariance), self.covariance, 0) @ step.transpose(0, 2, 1)
         moved = replace(self, sky=_degrees(place), covariance=covariance, motion=None, epoch=np.full(len(self), epoch))
         return moved.subset(known | still)
 

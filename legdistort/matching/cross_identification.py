@@ -145,16 +145,14 @@ def _registered(source, target, source_flux, target_flux, near, *, guess):
         low, span = xy.min(axis=0) - shift, np.ptp(xy, axis=0) + shift
         lists.append((low, StarList(xy - low, np.zeros(len(xy)), tuple(np.ceil(span[::-1]).astype(int) + 1), flux)))
     (low, stars), (other, catalogue) = lists
-    pose = np.column_stack([np.eye(2), low - other]) if guess else None
-    found = register(stars, catalogue, guess=pose)
+    found = register(stars, catalogue, guess=np.column_stack([np.eye(2), low - other]) if guess else None)
     return None if found is None else (found.source, found.target)
 
 
 def _neighbours(positions, plane, span):
     """Mutual neighbours nearer than chance allows; for lists that are too short for a pattern."""
     limit = np.sqrt(_CHANCE * np.prod(np.maximum(span, 1)) / (np.pi * len(positions)))
-    stars = cKDTree(positions)
-    distance, row = stars.query(plane, distance_upper_bound=limit)
+    distance, row = cKDTree(positions).query(plane, distance_upper_bound=limit)
     back = cKDTree(plane).query(positions)[1]
     good = [k for k in np.flatnonzero(np.isfinite(distance)) if back[row[k]] == k]
     return row[good], np.array(good, dtype=int)
@@ -199,8 +197,7 @@ def _tangent_plane(reference, positions):
             "scale and parity: 3 are needed"
         )
     plane = _middle(reference.sky, 1.0)
-    matrix = similarity.robust_similarity(positions, reference.on_plane(plane)[0])
-    return TangentPlane(plane.lon, plane.lat, matrix)
+    return TangentPlane(plane.lon, plane.lat, similarity.robust_similarity(positions, reference.on_plane(plane)[0]))
 
 
 def _check_agreement(label, positions, xy, size):

@@ -154,8 +154,7 @@ def interlink(lists, group, *, tolerance=None, progress=False):
                 found = _register_again(lists[i], lists[j], rows, columns, step, tolerance)
                 if found is not None and (before is None or len(found.source) > len(before.source)):
                     known[i, j] = found
-    telling = [pair for pair in partners if overlaps[pair] >= TELLING]
-    return known, _misfits(known, telling)
+    return known, _misfits(known, [pair for pair in partners if overlaps[pair] >= TELLING])
 
 
 def _register_again(source, target, rows, columns, step, tolerance):

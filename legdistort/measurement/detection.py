@@ -134,8 +134,7 @@ def detect(frame, fwhm, threshold):
     y, x = np.nonzero(ratio > threshold)
     peak = _is_highest(ratio, x, y, max(1, int(fwhm / 2)))
     x, y = x[peak], y[peak]
-    order = np.argsort(-ratio[y, x], kind="stable")
-    return np.column_stack([x, y])[order]
+    return np.column_stack([x, y])[np.argsort(-ratio[y, x], kind="stable")]
 
 
 def _blur(image, sigma):

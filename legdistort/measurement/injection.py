@@ -99,8 +99,7 @@ def default_fluxes(exposure, frame, centres, shape, threshold):
     """Fluxes from the detection limit to bright stars, evenly spaced in their logarithm; see `calibrate_frame`."""
     params = moffat.parameters(np.ones(1), shape)
     unit = moffat.evaluate(params, box_half(moffat.fwhm(shape)), moffat.CENTRES)[0] / moffat.flux(params)
-    variance = np.median(frame.variance[frame.good])
-    lowest = _FAINTEST * threshold * np.sqrt(variance / (unit**2).sum())
+    lowest = _FAINTEST * threshold * np.sqrt(np.median(frame.variance[frame.good]) / (unit**2).sum())
     highest = _RANGE * lowest
     if len(centres):
         highest = max(highest, frame.signal[centres[:, 1], centres[:, 0]].max() / unit.max())

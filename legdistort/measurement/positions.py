@@ -208,8 +208,7 @@ def _table(name, stamps, fit, *, flags, snr):
     flags = flags | np.where(lost, Flag.NOT_CONVERGED, 0) | np.where(to_edge < width, Flag.EDGE, 0)
     columns = (xy[:, 0], xy[:, 1], error[:, 0], error[:, 1], corr, flux, scale * flux_err, width, chi2)
     named = {key: v * u.pix if key in _PIXELS else v for key, v in zip(_COLUMNS, columns, strict=True)}
-    table = QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})
-    return table[np.argsort(-flux, kind="stable")]
+    return QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})[np.argsort(-flux, kind="stable")]
 
 
 def _distinct(table, fwhm):

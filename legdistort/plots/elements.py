@@ -108,8 +108,7 @@ def draw_image(ax, image, *, sky, soft, low, high, extent):
 
 def running_median(x, y, per_bin=8):
     """Medians of x and y in bins of about equal number along x, by increasing x."""
-    order = np.argsort(x)
-    bins = np.array_split(order, int(np.clip(len(x) // per_bin, 1, 20)))
+    bins = np.array_split(np.argsort(x), int(np.clip(len(x) // per_bin, 1, 20)))
     if len(bins) == 1:
         return np.sort(x), np.full(len(x), np.median(y))
     return np.array([np.median(x[b]) for b in bins]), np.array([np.median(y[b]) for b in bins])

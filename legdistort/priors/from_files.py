@@ -197,8 +197,7 @@ def _from_header(header, name, hdulist=None):
     except Exception as error:  # wcslib raises many kinds
         raise InputError(f"{name}: its WCS cannot be read ({' '.join(str(error).split())})") from None
     kind = "FITS header, " + str(header.get("CTYPE1", "WCS"))
-    shape = source.shape or _shape(header)
-    return replace(source, kind=kind, shape=shape)
+    return replace(source, kind=kind, shape=source.shape or _shape(header))
 
 
 def _shape(header):

@@ -194,8 +194,7 @@ def _plan(solution, path, target, *, kind, max_error, ext, overwrite):
         if kind is not None:
             headers[name] = _header(solution, name, kind, max_error)
             start, data, stop, _ = spans[image]
-            renewed = exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)
-            edits.append((start, data, renewed))
+            edits.append((start, data, exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)))
     if images:
         edits += _asdf_edits(solution, images, spans, path=path, overwrite=overwrite)
     return _Plan(path, target, zlib.crc32(raw), headers, edits)

@@ -92,8 +92,7 @@ def _folds(matches):
     if len(seen) < 2:
         raise InputError(f"degree={AUTO!r} needs stars that two exposures or more see; there are {len(seen)} of them")
     n = len(seen) if len(seen) <= FEW else N_FOLDS
-    parts = np.array_split(np.random.default_rng(0).permutation(seen), n)
-    return [np.isin(star, part) for part in parts]
+    return [np.isin(star, part) for part in np.array_split(np.random.default_rng(0).permutation(seen), n)]
 
 
 def _squares(solution, table):
