@@ -13,17 +13,14 @@ from .assessment import baselines, stack_quality
 from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
 from .exceptions import InputError, MatchError
-from .inputs.exposure_files import file_checksums, open_exposures
-from .inputs.table_files import write_stars
+from .inputs import exposure_files, table_files
 from .matching.matcher import match
 from .matching.options import MatchOptions
 from .measurement.options import MeasureOptions
 from .measurement.positions import measure
 from .reporting.page import write_report
 from .results import accuracy
-from .runtime import outputs, provenance
-from .runtime.checks import options_from
-from .runtime.parallel import check_workers
+from .runtime import checks, outputs, parallel, provenance
 from .solving.estimation import solve
 from .solving.options import SolveOptions, check_reference
 from .wcs.storage import write_wcs
@@ -130,10 +127,10 @@ def run(
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
     tying = {"epoch": epoch, "pixel_scale": pixel_scale}
     reference, tying["epoch"] = check_reference(reference, **tying, method=solving.method)
-    check_workers(workers)
+    parallel.check_workers(workers)
     share, timings = {"workers": workers, "progress": progress}, {}
     with _timed(timings, "read"):
-        exposures = open_exposures(paths, ext=ext, progress=progress)
+        exposures = exposure_files.open_exposures(paths, ext=ext, progress=progress)
         _check_exposures(exposures, min_exposures)
     with _timed(timings, "measure"):
         detections = measure(exposures, **vars(measuring), **share)
@@ -141,7 +138,7 @@ def run(
         matches = match(detections, exposures=exposures, **vars(matching))
     with _timed(timings, "solve"):
         solution = solve(matches, **vars(solving), reference=reference, **tying)
-        solution = provenance.with_inputs(solution, file_checksums(exposures))
+        solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
     with _timed(timings, "coadd"):
         kept = [exposure for exposure in exposures if exposure.name in solution.names]
         mosaic = coadd(kept, solution, **vars(coadding), **share)
@@ -172,7 +169,7 @@ def _step_options(kind, given, argument, *, defaults=None, **own):
         for name in own.keys() & given:
             raise InputError(f"{argument} has the option {name!r}: give it as the argument {name} of run itself")
         given = (defaults or {}) | own | given
-    return options_from(kind, given, argument)
+    return checks.options_from(kind, given, argument)
 
 
 def _assessed(quality, comparison, stacks):
@@ -190,7 +187,7 @@ def _assessed(quality, comparison, stacks):
 def write_results(solution, target):
     """Write ``solution.asdf``, ``stars.ecsv`` and ``wcs/NAME.asdf`` of a solution into an existing folder."""
     solution.write(target / "solution.asdf")
-    write_stars(solution, target / "stars.ecsv")
+    table_files.write_stars(solution, target / "stars.ecsv")
     (target / "wcs").mkdir()
     for name in solution.names:
         write_wcs(solution, name, target / "wcs" / f"{name}.asdf")

@@ -19,8 +19,7 @@ from ..inputs.matches import Matches
 from ..priors.prior import means
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
-from ..solving import minimisers
-from ..solving.assembly import assemble
+from ..solving import assembly, minimisers
 from ..solving.equations import criterion
 from ..solving.equations.covariances import Uncertainty
 from ..solving.equations.problem import State, build_problem
@@ -273,7 +272,7 @@ def _solution(matches, problems, state, gauge, covariance=None):
     dof = 2 * len(matches.table) - 2 * problem.n_stars - (problem.n_exposures - 1) * 2 * problem.n_modes
     scale = float(np.sqrt(blocks.chi2 / dof)) if dof > 0 else 1.0
     coefficients = None if covariance is None else block_diag(*(scale**2 * covariance))
-    return assemble(
+    return assembly.assemble(
         matches,
         problem,
         state,

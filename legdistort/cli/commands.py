@@ -18,9 +18,7 @@ from ..exceptions import InputError
 from ..inputs.exposure_files import file_checksums
 from ..inputs.table_files import read_table, stack, write_stars, write_table
 from ..priors.prior import EVIDENCE
-from ..runtime.outputs import replacing, replacing_folder
-from ..runtime.parallel import check_workers
-from ..runtime.provenance import with_inputs
+from ..runtime import outputs, parallel, provenance
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from . import options
 from .arguments import given
@@ -213,9 +211,9 @@ def do_solve(a):
     if shape is None:
         raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
     matches = legdistort.Matches.from_table(table, shape=shape, **legdistort.Matches.read_meta(table.meta))
-    solution = with_inputs(legdistort.solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
+    solution = provenance.with_inputs(legdistort.solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
     summary = summarise(solution)
-    with replacing_folder(a.out) as target:
+    with outputs.replacing_folder(a.out) as target:
         write_results(solution, target)
         write_report(target / "report.html", solution, summary=summary)
         write_summary(target / "summary.json", summary)
@@ -316,7 +314,7 @@ def do_simulate(a):
     if Path(a.out, "truth.ecsv").exists() and not a.overwrite:
         raise InputError(f"{a.out} already holds a simulated night; give --overwrite or another folder")
     night = legdistort.simulate_exposures(**given(a, options.NIGHT), progress=wants_progress(a))
-    with replacing_folder(a.out) as target:
+    with outputs.replacing_folder(a.out) as target:
         paths = night.write(target)
     _say(a, f"{len(paths)} frames and truth.ecsv in {a.out}", {"frames": [path.name for path in paths]})
 
@@ -379,7 +377,7 @@ def _share(a):
 
 def _open(a):
 
-    check_workers(a.workers)
+    parallel.check_workers(a.workers)
     return legdistort.open_exposures(**given(a, options.FRAMES), progress=wants_progress(a))
 
 
@@ -423,5 +421,5 @@ def _grid(path, solution):
 def _draw(result, a):
     """The picture of a result, if it is asked for."""
     if a.plot is not None:
-        with replacing(a.plot, overwrite=a.overwrite) as file:
+        with outputs.replacing(a.plot, overwrite=a.overwrite) as file:
             result.plot().figure.savefig(file, format="png", dpi=120)

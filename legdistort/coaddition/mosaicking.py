@@ -18,9 +18,7 @@ from .grids import given_grid, reference_grid
 from .mosaic import Mosaic
 from .options import CoaddOptions
 from .preparation import prepare
-from .resampling.engines import white_gain
-from .resampling.noise_gain import noise_correlation
-from .resampling.pixel_maps import map_exposure
+from .resampling import engines, noise_gain, pixel_maps
 from .weights import make_weights, stellar_widths
 
 _STORED = 5  # bytes a pixel in the scratch folder, about
@@ -135,7 +133,7 @@ def _coadd(exposures, solution, options, share):
     else:
         output = given_grid(options.grid, solution)
     corners = options.algorithm in ("exact", "drizzle")
-    maps = {f.name: map_exposure(f.name, solution, output, corners=corners) for f in frames}
+    maps = {f.name: pixel_maps.map_exposure(f.name, solution, output, corners=corners) for f in frames}
     left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
     frames = [f for f in frames if maps[f.name] is not None]
     need = n_bytes(output.shape, len(frames)) + _STORED * sum(int(np.prod(f.shape)) for f in frames)
@@ -154,7 +152,7 @@ def _coadd(exposures, solution, options, share):
         layers, recipe = _layers(frames, prepared, maps, factors, solution, output, options)
         planes = assemble(layers, recipe, folder.parent, share)
     _warn_of_misuse(frames, maps, options.algorithm)
-    correlation = noise_correlation(layers[0].map, layers[0].gain, recipe.resampling)
+    correlation = noise_gain.noise_correlation(layers[0].map, layers[0].gain, recipe.resampling)
     header = _header(frames, left_out, factors, _settings(options, recipe, origin, correlation))
     names = tuple(f.name for f in frames)
     return Mosaic(*planes, wcs=output.wcs, exposures=names, left_out=left_out, offset=output.offset, header=header)
@@ -181,7 +179,7 @@ def _layers(frames, prepared, maps, factors, solution, output, options):
             sky=sky[f.name] if options.match_background else None,
             weight=weights[f.name],
             fwhm=fwhm and fwhm[f.name],
-            gain=white_gain(maps[f.name], resampling),
+            gain=engines.white_gain(maps[f.name], resampling),
             photons=_photons(f, prepared[f.name], factors[f.name], noise[f.name] ** 2 * area[f.name]),
             support=support(f.name, solution) if options.extrapolated != "keep" else None,
         )

@@ -11,9 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from ..exceptions import InputError, MatchError, some_of
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
-from . import column_contract
-from .exposure_names import check_exposure_name
-from .start_poses import estimate_poses, star_means
+from . import column_contract, exposure_names, start_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +107,7 @@ class Matches:
         for i, name in enumerate(self.names):
             rows = obs.exposure == i
             back[rows] = similarity.apply(similarity.invert(self.poses[name]), obs.xy[rows])
-        return star_means(back, obs.star, len(self.stars))
+        return start_poses.star_means(back, obs.star, len(self.stars))
 
     def without(self, reasons):
         """The same matches without some exposures, ``{name: reason}``, which join `left_out`.
@@ -188,13 +186,13 @@ class Matches:
         table["exposure"] = table["exposure"].astype(str)
         seen = Observations.of(table)
         for name in seen.names:
-            check_exposure_name(name)
+            exposure_names.check_exposure_name(name)
         shapes = shapes_by_exposure(shape, seen.names)
         _check_inside(seen, shapes)
         _check_duplicates(seen)
         _check_connected(seen)
         if poses is None:
-            found = estimate_poses(seen.exposure, seen.star, seen.xy, names=seen.names)
+            found = start_poses.estimate_poses(seen.exposure, seen.star, seen.xy, names=seen.names)
             poses = dict(zip(seen.names, found, strict=True))
         else:
             poses = _check_poses(poses, seen.names)

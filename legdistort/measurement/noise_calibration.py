@@ -8,8 +8,7 @@ from astropy.table import vstack
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs.exposure_files import listed
-from ..runtime.checks import options_from
-from ..runtime.parallel import map_items
+from ..runtime import checks, parallel
 from .injection import calibrate_frame
 from .noise_curves import NoiseCurves
 from .options import MeasureOptions
@@ -61,9 +60,9 @@ def calibrate_noise(
     """
     exposures = listed(exposures, "calibrate_noise")
     fluxes, widths = check_injection(fluxes, fwhm, n_positions, seed)
-    options = options_from(MeasureOptions, measuring, "measuring")
+    options = checks.options_from(MeasureOptions, measuring, "measuring")
     work = partial(_calibrate, options=options, fluxes=fluxes, widths=widths, n_positions=n_positions, seed=seed)
-    curves = list(map_items(work, exposures, workers=workers, progress=progress, description="noise"))
+    curves = list(parallel.map_items(work, exposures, workers=workers, progress=progress, description="noise"))
     photons = {exposure.name: photon for exposure, (_, photon) in zip(exposures, curves, strict=True)}
     gains = [f"{name} {1 / p:.3g}" if p else f"{name} none seen" for name, p in photons.items() if p is not None]
     if gains:

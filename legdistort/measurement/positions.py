@@ -16,9 +16,8 @@ from .crowding import crowding, is_deformed
 from .flags import UNUSABLE, Flag
 from .injection import calibrate_frame
 from .options import MeasureOptions
-from .profiles import moffat
+from .profiles import frame_fit, moffat
 from .profiles.cutouts import Stamps
-from .profiles.frame_fit import box_half, fit_stars, locate_stars
 
 log = logging.getLogger(__name__)
 
@@ -159,15 +158,15 @@ def measure_exposure(exposure, options):
 def _measure_frame(exposure, options):
     """What `measure_exposure` gives, errors as the fits state them."""
     name, max_stars = exposure.name, options.max_stars
-    frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
+    frame, centres, shape = frame_fit.locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
     if len(centres) == 0:
         log.warning("%s: no star above %g times the noise", name, options.threshold)
         return _empty(), None
     if max_stars is not None:
         centres = centres[: 3 * max_stars]  # some will turn out to be hot pixels or saturated
     fwhm = float(moffat.fwhm(shape))
-    stamps = Stamps(frame, centres, options.box // 2 if options.box else box_half(fwhm))
-    fit, flags, snr, photon = fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
+    stamps = Stamps(frame, centres, options.box // 2 if options.box else frame_fit.box_half(fwhm))
+    fit, flags, snr, photon = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     shapes, covariance = fit.params[:, 3:7], fit.covariance[:, 3:7, 3:7]
     usable = ((flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
     deformed = is_deformed(shapes, covariance, snr=snr, usable=usable)

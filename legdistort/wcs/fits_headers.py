@@ -17,8 +17,7 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from numpy.polynomial.polynomial import polyval2d
 
 from ..exceptions import ExportError, InputError
-from ..geometry import basis, similarity
-from ..geometry.models import outside
+from ..geometry import basis, models, similarity
 from ..geometry.tangent_plane import TangentPlane
 from ..runtime.checks import check_choice
 
@@ -162,7 +161,9 @@ def _reference_point(pose, distortion, sky):
     there = _exact_sky(pose, distortion, sky, centre[None])[0]
     tangent = similarity.apply(pose, similarity.invert(sky.matrix)[None, :, 2])
     pixel = distortion(tangent)[0]
-    near = not outside(distortion.inverse.valid, *tangent[0])  # elsewhere the series means nothing and may fold back
+    near = not models.outside(
+        distortion.inverse.valid, *tangent[0]
+    )  # elsewhere the series means nothing and may fold back
     if near and np.all(np.abs(pixel - centre) <= np.array([nx, ny]) / 2):
         return pixel, TangentPlane(sky.lon, sky.lat, similarity.identity())
     # far from the detector powers of the distance would lose digits
