@@ -193,9 +193,7 @@ def _reference(matches, problem, reference):
     if reference == "mean":
         total = np.stack([np.bincount(problem.star, w, problem.n_stars) for w in problem.weight[:2]])
         return target, 1 / total, None
-    name = reference
-    if name is None:
-        name = problem.names[int(np.argmax(np.diff(problem.start)))]
+    name = problem.names[int(np.argmax(np.diff(problem.start)))] if reference is None else reference
     if name not in problem.names:
         raise InputError(f"reference must be 'mean' or one of {', '.join(problem.names)}, got {reference!r}")
     part = problem.part(problem.names.index(name))

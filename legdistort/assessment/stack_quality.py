@@ -327,9 +327,7 @@ def _common(found, single, compared):
 
 def _summary(values, single, true=None, *, removed=None, position=None):
     """`Quality` of stars measured (n, 5), given medians in single exposures and true positions."""
-    ratios = ()
-    if single is not None:
-        ratios = (float(np.median(values[:, k] / single[:, k])) for k in (2, 4))
+    ratios = () if single is None else (float(np.median(values[:, k] / single[:, k])) for k in (2, 4))
     if position is None:
         position = _robust(accuracy.bias_by_star(values[:, :2], true, removed=removed))
     fwhm, ellipticity, peak = map(float, np.median(values[:, 2:], axis=0))

@@ -92,9 +92,8 @@ def combine(data, variance, weight, *, method="mean", level=0.0, photons=None, s
     weight = np.broadcast_to(np.asarray(weight, dtype=np.float32), data.shape)
     if method == "median":
         return _median(data, variance, weight, use, level=level, photons=photons)
-    keep = use
-    if method == "clipped":
-        keep = confirmed(data, variance, use, level=level, fwhm=fwhm, widths=widths)
+    clipped = method == "clipped"
+    keep = confirmed(data, variance, use, level=level, fwhm=fwhm, widths=widths) if clipped else use
     total, mean, spread = np.zeros((3, *data.shape[1:]))
     with np.errstate(invalid="ignore", divide="ignore"):
         for w, d, k in zip(weight, data, keep, strict=True):

@@ -77,8 +77,7 @@ class ExposureFile:
         return Exposure(**{name: getattr(self, name) for name in _SHARED}, **planes)
 
     def __repr__(self):
-        ny, nx = self.shape
-        return f"<ExposureFile {self.name!r}: {nx} x {ny} px in {self.path}>"
+        return f"<ExposureFile {self.name!r}: {self.shape[1]} x {self.shape[0]} px in {self.path}>"
 
 
 #: What an `Exposure` and an `ExposureFile` both have.
@@ -316,9 +315,7 @@ def _planes(hdulist, hdu):
 def _from_ccddata(ccd, default):
     header = fits.Header(ccd.header)
     name = exposure_name(str(header.get("FILENAME", default)))
-    uncertainty = None
-    if ccd.uncertainty is not None:
-        uncertainty = ccd.uncertainty.represent_as(StdDevUncertainty).array
+    uncertainty = None if ccd.uncertainty is None else ccd.uncertainty.represent_as(StdDevUncertainty).array
     if ccd.unit is not None:
         header["BUNIT"] = ccd.unit.to_string()
     wcs = believable_wcs(ccd.wcs, np.shape(ccd.data), name) if isinstance(ccd.wcs, WCS) else None

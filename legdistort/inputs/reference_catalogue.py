@@ -118,7 +118,8 @@ class Reference:
         middle = directions(*np.radians([plane.lon, plane.lat]))
         far = place @ middle < 0.5  # beyond 60 degrees; the projection ends at 90
         step = 1e-6
-        xy, x_east, x_north = (_project(plane, place + step * shift) for shift in (0 * east, east, north))
+        near = (SkyCoord(*_degrees(place + step * shift).T * u.deg, frame="icrs") for shift in (0 * east, east, north))
+        xy, x_east, x_north = map(plane.from_sky, near)
         slope = np.stack([x_east - xy, x_north - xy], axis=-1) * _MAS / step
         xy[far] = np.nan
         return xy, slope @ self.covariance[:, :2, :2] @ slope.transpose(0, 2, 1)
@@ -133,10 +134,6 @@ def _axes(sky):
 def _degrees(place):
     lon, lat = np.degrees(angles(place))
     return np.stack([lon % 360, lat], axis=1)
-
-
-def _project(plane, place):
-    return plane.from_sky(SkyCoord(*_degrees(place).T * u.deg, frame="icrs"))
 
 
 def year(epoch):

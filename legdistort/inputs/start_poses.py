@@ -41,8 +41,6 @@ def estimate_poses(exposure, star, xy, *, names=None):
     rows = [np.flatnonzero(exposure == i) for i in range(n_exposures)]
     first = int(np.argmax([len(r) for r in rows]))
     found = {first: similarity.identity()}
-    back = np.full_like(xy, np.nan)
-    back[rows[first]] = xy[rows[first]]
     sums, counts = np.zeros((n_stars, 2)), np.zeros(n_stars)
     np.add.at(sums, star[rows[first]], xy[rows[first]])
     np.add.at(counts, star[rows[first]], 1)

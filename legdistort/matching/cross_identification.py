@@ -137,9 +137,7 @@ def _registered(source, target, source_flux, target_flux, near, *, guess):
     """Rows of source and target by `registration.register`; None if nothing stands out from chance."""
     if min(len(source), len(target)) < 5:
         return None
-    fluxes = (source_flux, None if target_flux is None else target_flux[near])
-    if any(f is None for f in fluxes):
-        fluxes = None, None
+    fluxes = (None, None) if source_flux is None or target_flux is None else (source_flux, target_flux[near])
     lists = []
     for xy, flux, shift in ((source, fluxes[0], 0.0), (target, fluxes[1], 10.0)):  # so that nothing stands still
         low, span = xy.min(axis=0) - shift, np.ptp(xy, axis=0) + shift

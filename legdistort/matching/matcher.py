@@ -154,9 +154,8 @@ def _shapes(table, names, named, shape):
 
 def _star_list(table, shape):
     x, y, x_err, y_err = (table[c].to_value(u.pix) for c in ("x", "y", "x_err", "y_err"))
-    flux = None
-    if "flux" in table.colnames:
-        flux = np.nan_to_num(column_contract.values(table, "flux"), nan=-np.inf)
+    has_flux = "flux" in table.colnames
+    flux = np.nan_to_num(column_contract.values(table, "flux"), nan=-np.inf) if has_flux else None
     return StarList(np.column_stack([x, y]), np.hypot(x_err, y_err), shape, flux)
 
 

@@ -76,8 +76,8 @@ def calibrate_frame(exposure, remeasure, *, threshold=5.0, widths=None, fluxes=N
         each = np.repeat(levels[::-1], n_positions)  # stars of about the same flux come into one frame
         off = _offsets(exposure, centres, each, profile, photon=photon, again=again, rng=rng)
         log.info("%s: FWHM %.2f px, %d stars put in at %d fluxes", name, width, len(each), len(levels))
-        for flux in levels:
-            rows.append({"exposure": name, "fwhm": width * u.pix, "flux": flux} | _statistics(off[each == flux]))
+        known = {"exposure": name, "fwhm": width * u.pix}
+        rows += [known | {"flux": flux} | _statistics(off[each == flux]) for flux in levels]
     return NoiseCurves(QTable(rows, meta={"fwhm": {name: own}, "photon": {name: float(photon)}}))
 
 
@@ -224,9 +224,8 @@ def inject(exposure, xy, flux, shape, *, photon, rng):
     """
     light = _light(exposure.shape, xy, flux, shape)
     added = light if not photon else photon * rng.poisson(light / photon)
-    uncertainty = exposure.uncertainty
-    if uncertainty is not None:
-        uncertainty = np.sqrt(uncertainty**2 + photon * light)
+    before = exposure.uncertainty
+    uncertainty = None if before is None else np.sqrt(before**2 + photon * light)
     return replace(exposure, data=exposure.data + added, uncertainty=uncertainty)
 
 

@@ -144,9 +144,7 @@ def _with_checksum(header, data):
 def _sum32(content):
     """Sum of 32-bit words in ones' complement (FITS standard 4.0, appendix J.1)."""
     total = int(np.frombuffer(content, ">u4").sum(dtype=np.uint64))
-    while total >> 32:
-        total = (total & 0xFFFFFFFF) + (total >> 32)
-    return total
+    return (total - 1) % 0xFFFFFFFF + 1  # carries come back at the low end; a header is never all 0
 
 
 def _encode(value):

@@ -110,11 +110,9 @@ def _executor(workers, threads, client):
     if client is not None:
         yield partial(client.submit, pure=False)
         return
-    pool = (
-        ThreadPoolExecutor(workers)
-        if threads
-        else ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin)
-    )
+    # a worker leaves Ctrl-C to the process that it works for, which then stops it
+    deaf = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+    pool = ThreadPoolExecutor(workers) if threads else ProcessPoolExecutor(workers, get_context("spawn"), **deaf)
     try:
         yield pool.submit
     except BrokenProcessPool:
@@ -124,11 +122,6 @@ def _executor(workers, threads, client):
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _begin():
-    """In a new worker: Ctrl-C is for the process that it works for, which then stops it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _attempt(function, item):

@@ -149,7 +149,11 @@ def read(model, matches, *, degree, gauge):
 
 def _without_pose(model):
     """The model behind a leading similarity: every exposure has a pose of its own."""
-    if not isinstance(model, CompoundModel) or model.op != "|" or _has_series(model.left):
+    if (
+        not isinstance(model, CompoundModel)
+        or model.op != "|"
+        or any(isinstance(part, models.Legendre2D) for part in leaves(model.left))
+    ):
         return model
     if (model.left.n_inputs, model.left.n_outputs) != (2, 2):
         return model
@@ -162,10 +166,6 @@ def _without_pose(model):
             f"each exposure), not {model.left!r}; put a static distortion into the sum"
         )
     return model.right
-
-
-def _has_series(model):
-    return any(isinstance(part, models.Legendre2D) for part in leaves(model))
 
 
 def _expand(model, shape):

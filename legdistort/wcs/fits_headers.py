@@ -235,24 +235,21 @@ def _sip(polynomial, cd, offset, plane):
             break
     forward = np.tensordot(np.linalg.inv(cd), polynomial, axes=1)
     header = fits.Header()
-    for keys, tensors, lowest in ((("A", "B"), forward, 2), (("AP", "BP"), backward, 1)):
-        for key, tensor in zip(keys, tensors, strict=True):
-            degree = len(tensor) - 1
-            header[f"{key}_ORDER"] = degree
-            for i, j in np.transpose(basis.orders(degree)):
-                if i + j >= lowest:
-                    header[f"{key}_{i}_{j}"] = float(tensor[i, j])
+    for key, tensor, lowest in zip(("A", "B", "AP", "BP"), (*forward, *backward), (2, 2, 1, 1), strict=True):
+        degree = header[f"{key}_ORDER"] = len(tensor) - 1
+        terms = [(i, j) for i, j in np.transpose(basis.orders(degree)) if i + j >= lowest]
+        header.extend((f"{key}_{i}_{j}", float(tensor[i, j])) for i, j in terms)
     return header
 
 
 def _tpv(degree, cd, offset, plane):
     """TPV keywords: the same polynomial in degrees after the CD matrix; axis 2 has x and y exchanged in its terms."""
     polynomial, _ = _fit(offset @ cd.T, plane, degree)
-    header = fits.Header()
-    for axis, tensor in ((1, polynomial[0]), (2, polynomial[1].T)):
-        for i, j in np.transpose(basis.orders(degree))[1:]:
-            header[f"PV{axis}_{_TPV_FIRST[i + j] + j}"] = float(tensor[i, j])
-    return header
+    return fits.Header(
+        (f"PV{axis}_{_TPV_FIRST[i + j] + j}", float(tensor[i, j]))
+        for axis, tensor in ((1, polynomial[0]), (2, polynomial[1].T))
+        for i, j in np.transpose(basis.orders(degree))[1:]
+    )
 
 
 def _round_up(value):

@@ -154,7 +154,7 @@ def folding(solution, degree, higher):
     alone = np.mean([_fold(solution, name, low, high)[:, strongest] ** 2 for name in solution.names], axis=0)
     size = beyond * np.sqrt((folded**2).mean(axis=(0, 2)))  # per mode: rms over exposures and axes
     degrees = orders[:low].sum(axis=1)
-    found = _rms(departure)
+    found = float(np.sqrt((departure**2).mean(axis=(0, 1)).sum()) / 2)  # rms over the detector, exposures and axes
     return AliasedDegree(
         degree=int(higher),
         found=found,
@@ -183,11 +183,6 @@ def _fold(solution, name, low, high):
     b = basis.values(solution.degree, *basis.normalize(q, solution.shapes[name]))
     weight = 1 / np.hypot(rows["x_err"].to_value(u.pix), rows["y_err"].to_value(u.pix))
     return np.linalg.lstsq((b[:low] * weight).T, (b[high] * weight).T, rcond=None)[0]
-
-
-def _rms(coefficients):
-    """Rms over field, exposures and axes of (n_exposures, 2, n) coefficients, pixels."""
-    return float(np.sqrt((coefficients**2).mean(axis=(0, 1)).sum()) / 2)
 
 
 def _sentence(degree, degrees, scores, aliasing):
