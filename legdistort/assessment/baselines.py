@@ -191,8 +191,7 @@ def _reference(matches, problem, reference):
     variance = np.full((2, problem.n_stars), np.inf)
     target = matches.positions.T.copy()
     if reference == "mean":
-        total = np.stack([np.bincount(problem.star, w, problem.n_stars) for w in problem.weight[:2]])
-        return target, 1 / total, None
+        return target, 1 / np.stack([np.bincount(problem.star, w, problem.n_stars) for w in problem.weight[:2]]), None
     name = problem.names[int(np.argmax(np.diff(problem.start)))] if reference is None else reference
     if name not in problem.names:
         raise InputError(f"reference must be 'mean' or one of {', '.join(problem.names)}, got {reference!r}")

@@ -190,8 +190,10 @@ def compare_stacks(exposures, comparison, *, mosaic, fwhm=None, max_stars=500, *
     true = sample.positions(method)[keep]
     removed = next((d for d in range(method.degree, 1, -1) if len(true) >= 3 * basis.n_modes(d)), "similarity")
     each = single[0][keep]
-    qualities = {SINGLE: _summary(each, each, position=_robust(single[1][:, keep].reshape(-1, 2)))}
-    qualities |= {name: _summary(values[keep], each, true, removed=removed) for name, values in found.items()}
+    qualities = {
+        SINGLE: _summary(each, each, position=_robust(single[1][:, keep].reshape(-1, 2))),
+        **{name: _summary(values[keep], each, true, removed=removed) for name, values in found.items()},
+    }
     zooms = [
         Zoom(
             star=sample.stars[place],

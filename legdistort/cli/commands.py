@@ -232,8 +232,13 @@ def do_prior(a):
     prior = legdistort.Prior.from_file(**given(a, options.EXPANDING))
     prior.write(a.out, overwrite=a.overwrite)
     rms_x, rms_y = map(float, prior.rms)
-    figures = {"degree": prior.degree, "truncation_px": prior.truncation, "rms_px": [rms_x, rms_y]}
-    figures |= {"shape": prior.shape, "source": prior.source}
+    figures = {
+        "degree": prior.degree,
+        "truncation_px": prior.truncation,
+        "rms_px": [rms_x, rms_y],
+        "shape": prior.shape,
+        "source": prior.source,
+    }
     words = f"degree {prior.degree}, truncation error {prior.truncation:.2g} px"
     _say(a, f"{words}; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y; {a.out}", figures)
 

@@ -268,16 +268,13 @@ def _is_image(hdu):
 
 def find_image(hdulist, ext, label):
     """The HDU to read (see `read_exposures`); `label` names the file in errors."""
-    if ext is not None:
-        try:
-            hdu = hdulist[ext]
-        except (KeyError, IndexError):
-            present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
-            raise InputError(f"{label}: no extension {ext!r}; the file has {present}") from None
-        candidates = [hdu] if _is_image(hdu) else []
-    else:
-        candidates = [hdu for hdu in hdulist if _is_image(hdu)]
-        candidates.sort(key=lambda hdu: hdu.name != "SCI")  # stable: SCI first, else the order of the file
+    try:
+        chosen = hdulist if ext is None else [hdulist[ext]]
+    except (KeyError, IndexError):
+        present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
+        raise InputError(f"{label}: no extension {ext!r}; the file has {present}") from None
+    # stable: SCI first, else the order of the file
+    candidates = sorted(filter(_is_image, chosen), key=lambda hdu: hdu.name != "SCI")
     for hdu in candidates:
         if len(hdu.shape) == 2:
             return hdu

@@ -87,10 +87,10 @@ class Truth:
         if self.sky is not None:
             sky = self.sky.to_sky(self.positions)
             out["ra"], out["dec"] = sky.ra, sky.dec
-        out.meta["shape"] = list(self.shape)
-        out.meta["static"] = self.static.tolist()
-        for i, name in enumerate(self.names):
-            out.meta[name] = {"pose": self.poses[name].tolist(), "coefficients": self.coefficients[i].tolist()}
+        out.meta |= {"shape": list(self.shape), "static": self.static.tolist()} | {
+            name: {"pose": self.poses[name].tolist(), "coefficients": coefficients.tolist()}
+            for name, coefficients in zip(self.names, self.coefficients, strict=True)
+        }
         return out
 
     def _known(self, name):

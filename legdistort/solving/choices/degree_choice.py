@@ -187,8 +187,10 @@ def _fold(solution, name, low, high):
 
 def _sentence(degree, degrees, scores, aliasing):
     """The choice and the alarm in words."""
-    words = f"{degree}, of {degrees[0]} to {degrees[-1]}: stars kept out scatter least with it, by "
-    words += f"{np.sqrt(scores[degrees.index(degree)]):.2f} of their errors"
+    words = (
+        f"{degree}, of {degrees[0]} to {degrees[-1]}: stars kept out scatter least with it, by "
+        f"{np.sqrt(scores[degrees.index(degree)]):.2f} of their errors"
+    )
     if degree == HIGHEST:
         words += "; it is the highest that was tried"
     elif degree == degrees[-1]:
@@ -205,5 +207,4 @@ def _in_words(a, degree):
 
 
 def _mode(orders):
-    factors = [f"{axis}^{n}" if n > 1 else axis for axis, n in zip("xy", orders, strict=True) if n]
-    return " ".join(factors) or "a shift"
+    return " ".join(f"{axis}^{n}" if n > 1 else axis for axis, n in zip("xy", orders, strict=True) if n) or "a shift"
