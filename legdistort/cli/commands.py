@@ -69,6 +69,7 @@ def do_demo(a):
     "frames to WCS, mosaic and report",
     "frames/*.fits --out results --degree 3",
     options.FRAMES,
+    options.STOPPING,
     options.out("folder for the results", path="results"),
     options.MEASURING,
     options.MATCHING,
@@ -81,12 +82,12 @@ def do_run(a):
     """``legdistort run``."""
     from ..pipeline import run
 
-    matching, solving = given(a, options.MATCHING), _solving(a)
+    matching, solving = given(a, options.MATCHING), _solving(a, with_headers=True)
     if a.method == "alternating":
         solving.setdefault("clip", None)  # the published scheme has none
     own = ("degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
     result = run(
-        **given(a, options.FRAMES),
+        **given(a, options.FRAMES, options.STOPPING),
         out=a.out,
         **{name: group.pop(name) for group in (matching, solving) for name in own if name in group},
         measuring=given(a, options.MEASURING),
@@ -110,6 +111,7 @@ def do_run(a):
     "frames to a table of positions",
     "frames/*.fits --out stars.ecsv",
     options.FRAMES,
+    options.STOPPING,
     options.out("table (ECSV) of detections"),
     options.MEASURING,
     options.WORKERS,
@@ -123,12 +125,17 @@ def do_measure(a):
 
     measuring = given(a, options.MEASURING)
     MeasureOptions(**measuring)  # which refuses them before a frame is read
-    exposures = _open(a)
+    bad = {}
+    exposures = _open(a, left_out=bad, stop_at_bad=a.stop_at_bad)
     table = measure(exposures, **measuring, **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
-    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures)}
+    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures), "left_out": bad}
     write_table(table, a.out, overwrite=a.overwrite)
-    _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
+    _say(
+        a,
+        f"{len(table)} detections in {len(exposures)} exposures",
+        {"n_detections": len(table), "shapes": shapes, "left_out": bad},
+    )
 
 
 @command(
@@ -176,7 +183,9 @@ def do_match(a):
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
     matches = match(stack(tables), shape=tuple(a.shape) if a.shape else shapes or None, **given(a, options.MATCHING))
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
-    matches = replace(matches, left_out=matches.left_out | empty)
+    bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
+    bad = {name: reason for name, reason in bad.items() if name not in names}
+    matches = replace(matches, left_out=bad | matches.left_out | empty)
     made = matches.table.copy()
     inputs = {name: checksum for each in tables for name, checksum in each.meta["inputs"].items()}
     made.meta = matches.to_meta() | {"inputs": inputs}
@@ -384,21 +393,24 @@ def _share(a):
     return {"workers": a.workers, "progress": wants_progress(a)}
 
 
-def _open(a):
+def _open(a, **options_of_reading):
     from ..inputs.exposure_files import open_exposures
     from ..runtime.parallel import check_workers
 
     check_workers(a.workers)
-    return open_exposures(**given(a, options.FRAMES), progress=wants_progress(a))
+    return open_exposures(**given(a, options.FRAMES), **options_of_reading, progress=wants_progress(a))
 
 
-def _solving(a, shape=None):
+def _solving(a, shape=None, *, with_headers=False):
     """The arguments of `solve`; the prior read, no static distortion if there is none, with the widths asked for."""
-    from ..priors.prior import EVIDENCE, Prior
+    from ..priors.prior import EVIDENCE, HEADER, HeaderPrior, Prior
     from ..solving.choices.degree_choice import AUTO, HIGHEST
 
-    keywords, prior = given(a, options.SOLVING), _prior(a.prior, shape)
+    keywords = given(a, options.SOLVING)
     sigma = keywords.pop("prior_sigma", None)
+    if with_headers and a.prior == HEADER:
+        return keywords | {"prior": HeaderPrior(sigma)}
+    prior = _prior(a.prior, shape)
     if sigma is not None:
         degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
         prior = (prior or Prior([[0.0], [0.0]])).with_sigma(sigma, degree=degree)
@@ -407,8 +419,10 @@ def _solving(a, shape=None):
 
 def _prior(text, shape=None):
     """Whatever `Prior.from_file` recognises."""
-    from ..priors.prior import Prior
+    from ..priors.prior import HEADER, Prior
 
+    if text == HEADER and not Path(text).exists():
+        raise InputError("--prior header takes the distortion from the headers of frames, which only run reads")
     return None if text is None else Prior.from_file(text, shape=shape)
 
 

@@ -30,11 +30,12 @@ UNCERTAINTY_NAMES = {"ERR": "StdDev", "UNCERT": "StdDev", "VAR": "Variance", "VA
 MASK_NAMES = ("DQ", "MASK")
 #: Words in the names of extensions that are no images of the sky but stand beside one: errors, masks, weights, times,
 #: backgrounds, and the look-up tables of a WCS, as the archives of HST, JWST, ESO, NOIRLab and Astropy name them.
-_BESIDE = set(
-    "ERR ERROR ERRORS UNCERT UNCERTAINTY VAR VARIANCE IVAR INVVAR STAT STDDEV SIGMA RMS NOISE "
-    "DQ PIXELDQ GROUPDQ MASK BPM FLAG FLAGS QUAL QUALITY WHT WEIGHT WEIGHTS CON CTX CONTEXT CONFIDENCE COVERAGE "
-    "FOOTPRINT EXP EXPTIME EXPMAP TIME SAMP AREA BKG BACKGROUND SKY PSF PSFIMAGE WCSDVARR D2IMARR".split()
-)
+_BESIDE = {
+    "ERR", "ERROR", "ERRORS", "UNCERT", "UNCERTAINTY", "VAR", "VARIANCE", "IVAR", "INVVAR", "STAT", "STDDEV",
+    "SIGMA", "RMS", "NOISE", "DQ", "PIXELDQ", "GROUPDQ", "MASK", "BPM", "FLAG", "FLAGS", "QUAL", "QUALITY", "WHT",
+    "WEIGHT", "WEIGHTS", "CON", "CTX", "CONTEXT", "CONFIDENCE", "COVERAGE", "FOOTPRINT", "EXP", "EXPTIME", "EXPMAP",
+    "TIME", "SAMP", "AREA", "BKG", "BACKGROUND", "SKY", "PSF", "PSFIMAGE", "WCSDVARR", "D2IMARR",
+}  # fmt: skip
 #: Images of a file that a message names.
 _MOST_NAMED = 8
 
@@ -127,7 +128,8 @@ def read_exposures(paths, *, ext=None, progress=False):
     ------
     InputError
         Naming the file: missing, not FITS, truncated, without a 2-D image or the extension wanted, with several
-        images and no `ext`, without a good pixel, with the name of another one, or with a name that ``wcs/NAME.asdf`` could not have.
+        images and no `ext`, without a good pixel, with the name of another one, or with a name that ``wcs/NAME.asdf``
+        could not have.
     """
     return _read_each(paths, _read, ext, progress)
 
@@ -144,8 +146,8 @@ def open_exposures(paths, *, ext=None, left_out=None, stop_at_bad=False, progres
     paths, ext, progress
         As for `legdistort.read_exposures`; the names are the same.
     left_out : dict, optional
-        If given, what is blank (all pixels alike, hidden or NaN), truncated, damaged or without the image wanted is left
-        out with one warning, and added here, ``{name: reason}``.
+        If given, what is blank (all pixels alike, hidden or NaN), truncated, damaged or without the image wanted is
+        left out with one warning, and added here, ``{name: reason}``.
     stop_at_bad : bool
         Refuse such files instead, naming all of them.
 
@@ -373,10 +375,8 @@ def _listed_images(hdulist, images):
     more = f" and {len(images) - _MOST_NAMED} more" * (len(images) > _MOST_NAMED)
     name, comma, version = forms[0].partition(",")
     python = f"({name!r}, {version})" if comma else name
-    return (
-        f"{len(images)} images, {', '.join(named)}{more} (ny, nx): choose one with ext={python} (--ext {forms[0]}) and the "
-        "like"
-    )
+    listed_so = f"{len(images)} images, {', '.join(named)}{more} (ny, nx)"
+    return f"{listed_so}: choose one with ext, as in ext={python} (--ext {forms[0]})"
 
 
 def _planes(hdulist, hdu):
