@@ -20,6 +20,10 @@ class InputError(LegdistortError, ValueError):
     """An argument, file or table is not what was asked for; correct it and call again."""
 
 
+class DamagedError(InputError):
+    """An image file is blank, truncated, damaged or without the image wanted; leave it out, or mend it."""
+
+
 class MatchError(LegdistortError, ValueError):
     """Exposures cannot be tied together; check overlap, the number of stars or the nominal poses."""
 
@@ -50,6 +54,11 @@ class ConvergenceWarning(LegdistortWarning):
 
 class AssumptionWarning(LegdistortWarning):
     """Something was missing from the input and a stated value was assumed."""
+
+
+def some_of(names, most):
+    """The first `most` names for a message, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 #: Frames of these do not count as a caller's: the package, and what calls its functions for it.

@@ -24,7 +24,7 @@ from legdistort.cli import options, parser
 from legdistort.cli.arguments import given
 from legdistort.cli.commands import COMMANDS
 from legdistort.cli.parser import main
-from legdistort.coaddition import mosaicking, preparation
+from legdistort.coaddition import preparation
 from legdistort.demo import run_demo
 from legdistort.exceptions import InputError
 from legdistort.measurement.noise_curves import SOURCES
@@ -395,9 +395,7 @@ def test_coadd_on_the_grid_of_a_file(demo, tmp_path, capsys):
     ],
 )
 def test_grids_without_sense_are_named_before_any_work(demo, tmp_path, capsys, monkeypatch, spoil, words):
-    monkeypatch.setattr(
-        "legdistort.inputs.exposure_files.open_exposures", lambda *_, **__: pytest.fail("the work began")
-    )
+    monkeypatch.setattr("legdistort.open_exposures", lambda *_, **__: pytest.fail("the work began"))
     header = _grid(demo)
     spoil(header)
     header.totextfile(tmp_path / "bad.head")
@@ -413,7 +411,7 @@ def test_options_of_coadd_reach_it(demo, tmp_path, capsys, monkeypatch):
         given.update(options)
         raise InputError("enough")
 
-    monkeypatch.setattr(mosaicking, "coadd", stand_in)
+    monkeypatch.setattr("legdistort.coadd", stand_in)
     failed(capsys, main(_coadd(demo, tmp_path / "m.fits")), "enough")
     own = {name: p.default for name, p in inspect.signature(coadd).parameters.items() if p.kind is p.KEYWORD_ONLY}
     assert own | given == own | {"method": "clipped"}
@@ -527,9 +525,7 @@ def test_the_frames_of_a_mosaic_survive_it(demo, tmp_path, capsys):
 
 
 def test_the_ending_of_a_mosaic_is_looked_at_first(demo, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(
-        "legdistort.inputs.exposure_files.open_exposures", lambda *_, **__: pytest.fail("the work began")
-    )
+    monkeypatch.setattr("legdistort.open_exposures", lambda *_, **__: pytest.fail("the work began"))
     failed(capsys, main(_coadd(demo, tmp_path / "m.png")), "m.png: the ending says the format of a mosaic")
 
 

@@ -227,7 +227,7 @@ class TestScratch:
     def test_planes_come_back_by_pieces(self, tmp_path):
         plane = np.arange(30.0).reshape(5, 6)
         with scratch.scratch_folder(tmp_path, 1) as folder:
-            stored = scratch.store(folder, "a / b", {"data": plane, "bad": None})
+            stored = scratch.store(folder, {"data": plane, "bad": None})
             piece = stored.piece("data", (slice(1, 3), slice(2, 6)))
             np.testing.assert_array_equal(piece, plane[1:3, 2:6])
             assert type(piece) is np.ndarray  # and not what keeps the file mapped
@@ -238,7 +238,7 @@ class TestScratch:
     def test_nothing_is_left(self, tmp_path, error):
         def fail():
             with scratch.scratch_folder(tmp_path, 1) as folder:
-                scratch.store(folder, "a", {"data": np.ones(3)})
+                scratch.store(folder, {"data": np.ones(3)})
                 raise error
 
         with pytest.raises((KeyboardInterrupt, ValueError, DiskFullError)):

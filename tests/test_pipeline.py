@@ -16,8 +16,8 @@ KINDS = {
 
 @pytest.fixture(autouse=True)
 def _unread(monkeypatch):
-    for place in ("pipeline", "inputs.exposure_files"):
-        monkeypatch.setattr(f"legdistort.{place}.open_exposures", lambda *_, **__: pytest.fail("a frame was read"))
+    for place in ("legdistort", "legdistort.inputs.exposure_files"):
+        monkeypatch.setattr(f"{place}.open_exposures", lambda *_, **__: pytest.fail("a frame was read"))
 
 
 @pytest.mark.parametrize("argument", KINDS)

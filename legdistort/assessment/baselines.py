@@ -19,8 +19,7 @@ from ..inputs.matches import Matches
 from ..priors.prior import means
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
-from ..solving import minimisers
-from ..solving.assembly import assemble
+from ..solving import assembly, minimisers
 from ..solving.equations import criterion
 from ..solving.equations.covariances import Uncertainty
 from ..solving.equations.problem import State, build_problem
@@ -193,11 +192,8 @@ def _reference(matches, problem, reference):
     variance = np.full((2, problem.n_stars), np.inf)
     target = matches.positions.T.copy()
     if reference == "mean":
-        total = np.stack([np.bincount(problem.star, w, problem.n_stars) for w in problem.weight[:2]])
-        return target, 1 / total, None
-    name = reference
-    if name is None:
-        name = problem.names[int(np.argmax(np.diff(problem.start)))]
+        return target, 1 / np.stack([np.bincount(problem.star, w, problem.n_stars) for w in problem.weight[:2]]), None
+    name = problem.names[int(np.argmax(np.diff(problem.start)))] if reference is None else reference
     if name not in problem.names:
         raise InputError(f"reference must be 'mean' or one of {', '.join(problem.names)}, got {reference!r}")
     part = problem.part(problem.names.index(name))
@@ -274,7 +270,7 @@ def _solution(matches, problems, state, gauge, covariance=None):
     dof = 2 * len(matches.table) - 2 * problem.n_stars - (problem.n_exposures - 1) * 2 * problem.n_modes
     scale = float(np.sqrt(blocks.chi2 / dof)) if dof > 0 else 1.0
     coefficients = None if covariance is None else block_diag(*(scale**2 * covariance))
-    return assemble(
+    return assembly.assemble(
         matches,
         problem,
         state,

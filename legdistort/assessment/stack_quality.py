@@ -190,8 +190,10 @@ def compare_stacks(exposures, comparison, *, mosaic, fwhm=None, max_stars=500, *
     true = sample.positions(method)[keep]
     removed = next((d for d in range(method.degree, 1, -1) if len(true) >= 3 * basis.n_modes(d)), "similarity")
     each = single[0][keep]
-    qualities = {SINGLE: _summary(each, each, position=_robust(single[1][:, keep].reshape(-1, 2)))}
-    qualities |= {name: _summary(values[keep], each, true, removed=removed) for name, values in found.items()}
+    qualities = {
+        SINGLE: _summary(each, each, position=_robust(single[1][:, keep].reshape(-1, 2))),
+        **{name: _summary(values[keep], each, true, removed=removed) for name, values in found.items()},
+    }
     zooms = [
         Zoom(
             star=sample.stars[place],
@@ -327,9 +329,7 @@ def _common(found, single, compared):
 
 def _summary(values, single, true=None, *, removed=None, position=None):
     """`Quality` of stars measured (n, 5), given medians in single exposures and true positions."""
-    ratios = ()
-    if single is not None:
-        ratios = (float(np.median(values[:, k] / single[:, k])) for k in (2, 4))
+    ratios = () if single is None else (float(np.median(values[:, k] / single[:, k])) for k in (2, 4))
     if position is None:
         position = _robust(accuracy.bias_by_star(values[:, :2], true, removed=removed))
     fwhm, ellipticity, peak = map(float, np.median(values[:, 2:], axis=0))

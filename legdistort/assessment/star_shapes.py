@@ -6,9 +6,7 @@ a star and whatever else there is: a star doubled or smeared by a wrong distorti
 
 import numpy as np
 
-from ..measurement.profiles import moffat
-from ..measurement.profiles.frame_fit import box_half
-from ..measurement.profiles.levenberg_marquardt import fit
+from ..measurement.profiles import frame_fit, levenberg_marquardt, moffat
 
 
 def measure_shapes(image, xy, *, fwhm, bad=None, saturation=None):
@@ -32,7 +30,7 @@ def measure_shapes(image, xy, *, fwhm, bad=None, saturation=None):
         x, y, FWHM, ellipticity, peak over flux; NaN for a star near the edge, with bad pixels at its centre or many
         around it, or without a fit.
     """
-    half, (ny, nx) = box_half(fwhm), np.shape(image)
+    half, (ny, nx) = frame_fit.box_half(fwhm), np.shape(image)
     xy = np.asarray(xy, dtype=float).reshape(-1, 2)
     out = np.full((len(xy), 5), np.nan)
     centres = np.round(np.nan_to_num(xy, nan=-1e6)).astype(int)
@@ -48,8 +46,7 @@ def measure_shapes(image, xy, *, fwhm, bad=None, saturation=None):
     if len(inside) == 0:
         return out
     params, converged = _fit(data, good, xy[inside] - centres[inside], fwhm)
-    model = moffat.evaluate(params, half, moffat.quadrature(fwhm))
-    light = np.where(good, data - params[:, 7:], model)
+    light = np.where(good, data - params[:, 7:], moffat.evaluate(params, half, moffat.quadrature(fwhm)))
     distance = np.hypot(dx - params[:, :1], dy - params[:, 1:2])
     flux = (np.clip(2 * fwhm + 0.5 - distance, 0, 1) * light).sum(axis=1)
     a, b = np.exp(params[:, 3:5]).T
@@ -73,5 +70,5 @@ def _fit(data, good, offset, fwhm):
     # the noise only sets the weight of the prior of the shape, which must not count
     noise = np.where(start[:, 2:3] > 0, 1e-3 * start[:, 2:3], 1.0)
     nodes, shape = moffat.quadrature(fwhm), moffat.shape(fwhm)
-    found = fit(np.where(good, data, 0), good / noise**2, start, nodes=nodes, centre=shape)
+    found = levenberg_marquardt.fit(np.where(good, data, 0), good / noise**2, start, nodes=nodes, centre=shape)
     return found.params, found.converged

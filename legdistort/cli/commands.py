@@ -1,4 +1,7 @@
-"""The commands: what each does, an example, its options, and the function that does it with the parsed command line."""
+"""The commands: what each does, an example, its options, and the function that does it with the parsed command line.
+
+The verbs are taken from the package itself, which loads each when it is called.
+"""
 
 import json
 import sys
@@ -6,7 +9,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import legdistort
+
+from ..coaddition.grids import given_grid, read_grid
+from ..coaddition.mosaic import check_ending
+from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
+from ..inputs.exposure_files import file_checksums
+from ..inputs.table_files import read_table, stack, write_stars, write_table
+from ..priors.prior import EVIDENCE, HEADER, HeaderPrior
+from ..runtime import outputs, parallel, provenance
+from ..solving.choices.degree_choice import AUTO, HIGHEST
 from . import options
 from .arguments import given
 
@@ -69,6 +82,7 @@ def do_demo(a):
     "frames to WCS, mosaic and report",
     "frames/*.fits --out results --degree 3",
     options.FRAMES,
+    options.STOPPING,
     options.out("folder for the results", path="results"),
     options.MEASURING,
     options.MATCHING,
@@ -79,14 +93,12 @@ def do_demo(a):
 )
 def do_run(a):
     """``legdistort run``."""
-    from ..pipeline import run
-
-    matching, solving = given(a, options.MATCHING), _solving(a)
+    matching, solving = given(a, options.MATCHING), _solving(a, with_headers=True)
     if a.method == "alternating":
         solving.setdefault("clip", None)  # the published scheme has none
     own = ("degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
-    result = run(
-        **given(a, options.FRAMES),
+    result = legdistort.run(
+        **given(a, options.FRAMES, options.STOPPING),
         out=a.out,
         **{name: group.pop(name) for group in (matching, solving) for name in own if name in group},
         measuring=given(a, options.MEASURING),
@@ -110,25 +122,28 @@ def do_run(a):
     "frames to a table of positions",
     "frames/*.fits --out stars.ecsv",
     options.FRAMES,
+    options.STOPPING,
     options.out("table (ECSV) of detections"),
     options.MEASURING,
     options.WORKERS,
 )
 def do_measure(a):
     """``legdistort measure``."""
-    from ..inputs.exposure_files import file_checksums
-    from ..inputs.table_files import write_table
     from ..measurement.options import MeasureOptions
-    from ..measurement.positions import measure
 
     measuring = given(a, options.MEASURING)
     MeasureOptions(**measuring)  # which refuses them before a frame is read
-    exposures = _open(a)
-    table = measure(exposures, **measuring, **_share(a))
+    bad = {}
+    exposures = _open(a, left_out=bad, stop_at_bad=a.stop_at_bad)
+    table = legdistort.measure(exposures, **measuring, **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
-    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures)}
+    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures), "left_out": bad}
     write_table(table, a.out, overwrite=a.overwrite)
-    _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
+    _say(
+        a,
+        f"{len(table)} detections in {len(exposures)} exposures",
+        {"n_detections": len(table), "shapes": shapes, "left_out": bad},
+    )
 
 
 @command(
@@ -143,13 +158,13 @@ def do_measure(a):
 )
 def do_noise(a):
     """``legdistort noise``."""
-    from ..measurement.noise_calibration import calibrate_noise, check_injection
+    from ..measurement.noise_calibration import check_injection
     from ..measurement.options import MeasureOptions
 
     injecting, measuring = given(a, options.INJECTING), given(a, options.DETECTOR)
     check_injection(**injecting)  # before a frame is read
     MeasureOptions(**measuring)
-    curves = calibrate_noise(_open(a), **injecting, measuring=measuring, **_share(a))
+    curves = legdistort.calibrate_noise(_open(a), **injecting, measuring=measuring, **_share(a))
     curves.write(a.out, overwrite=a.overwrite)
     _draw(curves, a)
     _say(a, curves, {"laws": _records(curves.laws), "out": str(a.out)})
@@ -165,18 +180,19 @@ def do_noise(a):
 )
 def do_match(a):
     """``legdistort match``."""
-    from ..inputs.table_files import stack, write_table
-    from ..matching.matcher import match
-
     tables = [_read_table(path, a) for path in a.tables]
     names = [name for table in tables for name in dict.fromkeys(table["exposure"])]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
-    matches = match(stack(tables), shape=tuple(a.shape) if a.shape else shapes or None, **given(a, options.MATCHING))
+    matches = legdistort.match(
+        stack(tables), shape=tuple(a.shape) if a.shape else shapes or None, **given(a, options.MATCHING)
+    )
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
-    matches = replace(matches, left_out=matches.left_out | empty)
+    bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
+    bad = {name: reason for name, reason in bad.items() if name not in names}
+    matches = replace(matches, left_out=bad | matches.left_out | empty)
     made = matches.table.copy()
     inputs = {name: checksum for each in tables for name, checksum in each.meta["inputs"].items()}
     made.meta = matches.to_meta() | {"inputs": inputs}
@@ -195,22 +211,18 @@ def do_match(a):
 )
 def do_solve(a):
     """``legdistort solve``."""
-    from ..inputs.matches import Matches
     from ..pipeline import check_results, summarise, write_results, write_summary
     from ..reporting.page import write_report
-    from ..runtime.outputs import replacing_folder
-    from ..runtime.provenance import with_inputs
-    from ..solving.estimation import solve
 
     check_results(a.out, a.overwrite)
     table = _read_table(a.table, a)
     shape = tuple(a.shape) if a.shape else table.meta.get("shapes")
     if shape is None:
         raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
-    matches = Matches.from_table(table, shape=shape, **Matches.read_meta(table.meta))
-    solution = with_inputs(solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
+    matches = legdistort.Matches.from_table(table, shape=shape, **legdistort.Matches.read_meta(table.meta))
+    solution = provenance.with_inputs(legdistort.solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
     summary = summarise(solution)
-    with replacing_folder(a.out) as target:
+    with outputs.replacing_folder(a.out) as target:
         write_results(solution, target)
         write_report(target / "report.html", solution, summary=summary)
         write_summary(target / "summary.json", summary)
@@ -226,13 +238,16 @@ def do_solve(a):
 )
 def do_prior(a):
     """``legdistort prior``."""
-    from ..priors.prior import Prior
-
-    prior = Prior.from_file(**given(a, options.EXPANDING))
+    prior = legdistort.Prior.from_file(**given(a, options.EXPANDING))
     prior.write(a.out, overwrite=a.overwrite)
     rms_x, rms_y = map(float, prior.rms)
-    figures = {"degree": prior.degree, "truncation_px": prior.truncation, "rms_px": [rms_x, rms_y]}
-    figures |= {"shape": prior.shape, "source": prior.source}
+    figures = {
+        "degree": prior.degree,
+        "truncation_px": prior.truncation,
+        "rms_px": [rms_x, rms_y],
+        "shape": prior.shape,
+        "source": prior.source,
+    }
     words = f"degree {prior.degree}, truncation error {prior.truncation:.2g} px"
     _say(a, f"{words}; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y; {a.out}", figures)
 
@@ -249,15 +264,11 @@ def do_prior(a):
 )
 def do_coadd(a):
     """``legdistort coadd``."""
-    from ..coaddition.mosaic import check_ending
-    from ..coaddition.mosaicking import coadd
-    from ..coaddition.options import CoaddOptions
-
     check_ending(a.out)
     solution = _solution(a)
     coadding = given(a, options.COADDING) | {"grid": _grid(a.grid, solution)}
     CoaddOptions(**coadding)  # which refuses them before a frame is read
-    mosaic = coadd(_open(a), solution, **coadding, **_share(a))
+    mosaic = legdistort.coadd(_open(a), solution, **coadding, **_share(a))
     mosaic.write(a.out, overwrite=a.overwrite)
     figures = {"shape": list(mosaic.shape), "n_exposures": len(mosaic.exposures), "left_out": mosaic.left_out}
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
@@ -292,7 +303,6 @@ def do_attach(a):
 )
 def do_predict(a):
     """``legdistort predict``."""
-    from ..simulation.prediction import predict
     from ..simulation.prediction_text import describe_plans
 
     keywords = given(a, options.PREDICTING) | {"prior": _prior(a.prior, a.shape, a.static_sigma)}
@@ -301,7 +311,7 @@ def do_predict(a):
         keywords["stars"] = _read_table(a.stars, a)
     if a.shape is not None:
         keywords["shape"] = tuple(a.shape)
-    prediction = predict(**keywords)
+    prediction = legdistort.predict(**keywords)
     _draw(prediction, a)
     plans = prediction.alternatives()
     own, *others = _records(plans)
@@ -316,13 +326,10 @@ def do_predict(a):
 )
 def do_simulate(a):
     """``legdistort simulate``."""
-    from ..runtime.outputs import replacing_folder
-    from ..simulation.observations import simulate_exposures
-
     if Path(a.out, "truth.ecsv").exists() and not a.overwrite:
         raise InputError(f"{a.out} already holds a simulated night; give --overwrite or another folder")
-    night = simulate_exposures(**given(a, options.NIGHT), progress=wants_progress(a))
-    with replacing_folder(a.out) as target:
+    night = legdistort.simulate_exposures(**given(a, options.NIGHT), progress=wants_progress(a))
+    with outputs.replacing_folder(a.out) as target:
         paths = night.write(target)
     _say(a, f"{len(paths)} frames and truth.ecsv in {a.out}", {"frames": [path.name for path in paths]})
 
@@ -344,8 +351,6 @@ def do_show(a):
 )
 def do_stars(a):
     """``legdistort stars``."""
-    from ..inputs.table_files import write_stars
-
     solution = _solution(a)
     write_stars(solution, a.out, overwrite=a.overwrite)
     _say(a, f"{len(solution.star_names)} stars in {a.out}", {"n_stars": len(solution.star_names), "out": str(a.out)})
@@ -402,53 +407,46 @@ def _share(a):
     return {"workers": a.workers, "progress": wants_progress(a)}
 
 
-def _open(a):
-    from ..inputs.exposure_files import open_exposures
-    from ..runtime.parallel import check_workers
-
-    check_workers(a.workers)
-    return open_exposures(**given(a, options.FRAMES), progress=wants_progress(a))
+def _open(a, **reading):
+    parallel.check_workers(a.workers)
+    return legdistort.open_exposures(**given(a, options.FRAMES), **reading, progress=wants_progress(a))
 
 
-def _solving(a, shape=None):
+def _solving(a, shape=None, *, with_headers=False):
     """The arguments of `solve`; the prior read, no static distortion if there is none, with the widths asked for."""
-    from ..priors.prior import EVIDENCE, Prior
-    from ..solving.choices.degree_choice import AUTO, HIGHEST
-
-    keywords, prior = given(a, options.SOLVING), _prior(a.prior, shape, a.static_sigma)
-    keywords.pop("static_sigma", None)
+    keywords = given(a, options.SOLVING)
+    static_sigma = keywords.pop("static_sigma", None)
     sigma = keywords.pop("prior_sigma", None)
+    if with_headers and a.prior == HEADER:
+        return keywords | {"prior": HeaderPrior(sigma)}
+    prior = _prior(a.prior, shape, static_sigma)
     if sigma is not None:
         degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
-        prior = (prior or Prior([[0.0], [0.0]])).with_sigma(sigma, degree=degree)
+        prior = (prior or legdistort.Prior([[0.0], [0.0]])).with_sigma(sigma, degree=degree)
     return keywords | {"prior": prior}
 
 
 def _prior(text, shape, static_sigma):
-    """Whatever `Prior.from_file` recognises; without a text, a distortion of which the size alone is known."""
-    from ..priors.prior import Prior
-
+    """Whatever `legdistort.Prior.from_file` recognises; without a text, a distortion of which the size alone is known."""
+    if text == HEADER and not Path(text).exists():
+        raise InputError("--prior header takes the distortion from the headers of frames, which only run reads")
     if text is None:
-        return None if static_sigma is None else Prior(None, static_sigma=static_sigma)
-    return Prior.from_file(text, shape=shape, static_sigma=static_sigma)
+        return None if static_sigma is None else legdistort.Prior(None, static_sigma=static_sigma)
+    return legdistort.Prior.from_file(text, shape=shape, static_sigma=static_sigma)
 
 
 def _read_table(path, a):
-    from ..inputs.table_files import read_table
 
     return read_table(path, columns=dict(a.columns), origin=a.origin)
 
 
 def _solution(a):
-    from ..results.solution import Solution
 
-    return Solution.read(a.solution, max_bytes=a.max_bytes)
+    return legdistort.Solution.read(a.solution, max_bytes=a.max_bytes)
 
 
 def _grid(path, solution):
     """The grid of a file, known to be one for the solution before any frame is read."""
-    from ..coaddition.grids import given_grid, read_grid
-
     if path is None:
         return None
     grid = read_grid(path)
@@ -461,8 +459,6 @@ def _grid(path, solution):
 
 def _draw(result, a):
     """The picture of a result, if it is asked for."""
-    from ..runtime.outputs import replacing
-
     if a.plot is not None:
-        with replacing(a.plot, overwrite=a.overwrite) as file:
+        with outputs.replacing(a.plot, overwrite=a.overwrite) as file:
             result.plot().figure.savefig(file, format="png", dpi=120)

@@ -22,6 +22,7 @@ FRAMES = {
     "paths": Option("FITS files, plain or compressed", "frames", nargs="+", metavar="FRAME", path="read"),
     "ext": Option("extension: number, name, or NAME,VERSION", type=extension),
 }
+STOPPING = {"stop_at_bad": Option("refuse blank and damaged frames, do not leave them out", action="store_true")}
 NAMED_SOLUTION = {"solution": Option("solution.asdf", required=True, path="read")}
 SOLUTION = {
     "solution": Option("solution.asdf", "solution", path="read"),
@@ -61,7 +62,9 @@ def picture(what):
 REPLACING = {"overwrite": Option("replace a picture that exists", action="store_true")}
 
 KNOWN_STATIC = {
-    "prior": Option("known static distortion: see the command prior", path="read"),
+    "prior": Option(
+        "known static distortion: see the command prior; of run also header: that of the frames", path="read"
+    ),
     "static_sigma": Option(
         "uncertainty of a coefficient of it; without --prior its size, nothing else being known",
         type=float,

@@ -94,8 +94,7 @@ def _noise(frame, bad):
     if not difference.any():
         return 0.0
     # The median of whole numbers is coarse: the rms within 3 sigma of it, 0.987 of that of a Gaussian, is finer.
-    quantum = difference[difference > 0].min()
-    core = difference[difference <= 3 * max(1.4826 * np.median(difference), quantum)]
+    core = difference[difference <= 3 * max(1.4826 * np.median(difference), difference[difference > 0].min())]
     sigma = float(np.sqrt(np.mean(core**2)) / 0.987 / np.sqrt(2))
     return sigma if sigma > np.finfo(np.float32).eps * np.max(np.abs(frame.data), where=~bad, initial=0) else 0.0
 

@@ -120,8 +120,7 @@ def assemble(layers, recipe, folder, share):
     planes += [spill((n_planes(len(layers)), *recipe.shape), np.uint32, 0, folder)]
     pieces = list(blocks(layers, recipe))
     work = partial(stack, recipe=recipe, n_exposures=len(layers))
-    stacked = share(work, pieces, description="co-adding", unit="block")
-    for block, values in zip(pieces, stacked, strict=True):
+    for block, values in zip(pieces, share(work, pieces, description="co-adding", unit="block"), strict=True):
         if values is None:  # the planes have what stands for nothing
             continue
         for plane, value in zip(planes, values, strict=True):

@@ -92,9 +92,8 @@ def combine(data, variance, weight, *, method="mean", level=0.0, photons=None, s
     weight = np.broadcast_to(np.asarray(weight, dtype=np.float32), data.shape)
     if method == "median":
         return _median(data, variance, weight, use, level=level, photons=photons)
-    keep = use
-    if method == "clipped":
-        keep = confirmed(data, variance, use, level=level, fwhm=fwhm, widths=widths)
+    clipped = method == "clipped"
+    keep = confirmed(data, variance, use, level=level, fwhm=fwhm, widths=widths) if clipped else use
     total, mean, spread = np.zeros((3, *data.shape[1:]))
     with np.errstate(invalid="ignore", divide="ignore"):
         for w, d, k in zip(weight, data, keep, strict=True):
@@ -144,8 +143,7 @@ def _median(data, variance, weight, use, *, level, photons):
         spread = of_mean**few * of_many ** (1 - few)
         excess = np.where(count > 2, np.pi / 2 * count / (count + np.where(count % 2, 0.48, 1.3)), 1)
         spread = np.where(count > 0, excess * spread, np.nan)
-    total = np.where(use, weight, 0).sum(axis=0)
-    return Combined(centre.astype(np.float32), spread.astype(np.float32), total, use)
+    return Combined(centre.astype(np.float32), spread.astype(np.float32), np.where(use, weight, 0).sum(axis=0), use)
 
 
 def confirmed(data, variance, use, *, level=0.0, fwhm=None, widths=None):

@@ -115,5 +115,4 @@ def _star_scales(names, solution):
     values = values_from_differences(difference, count, np.zeros(len(names)))
     rest = logs - values[:, None]
     rest -= np.nanmedian(rest, axis=0)
-    n = np.isfinite(rest).sum(axis=1)
-    return -values, 1.4826 * 1.2533 * np.nanmedian(np.abs(rest), axis=1) / np.sqrt(n)
+    return -values, 1.4826 * 1.2533 * np.nanmedian(np.abs(rest), axis=1) / np.sqrt(np.isfinite(rest).sum(axis=1))

@@ -166,8 +166,7 @@ def read_grid(path):
         raise InputError(f"{path}: neither a FITS file nor the text of a FITS header")
     is_image = packed or re.match(rb"SIMPLE  =[^\n]*\Z", start)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AstropyWarning)  # of headers that astropy repairs
+        with warnings.catch_warnings(action="ignore", category=AstropyWarning):  # of headers that astropy repairs
             wcs = _of_image(path) if is_image else _of_text(path)
             wcs.wcs.set()
     except Exception as error:  # whatever a broken file provokes, in wcslib too

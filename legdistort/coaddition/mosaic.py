@@ -109,9 +109,14 @@ class Mosaic:
                 header[f"LTM{axis}_{axis}"] = (1.0, "reference-plane pixels are mosaic pixels")
                 header[f"LTV{axis}"] = (-float(shift), "reference plane + LTV = mosaic pixel")
         context = self.context.view(np.int32)  # the sign is the last bit, as drizzled images have it
-        planes = {"SCI": self.data, "VAR": self.variance, "WEIGHT": self.weight, "FOOTPRINT": self.footprint}
-        planes["FLAGS"] = self.flags
-        planes["CONTEXT"] = context[0] if len(context) == 1 else context
+        planes = {
+            "SCI": self.data,
+            "VAR": self.variance,
+            "WEIGHT": self.weight,
+            "FOOTPRINT": self.footprint,
+            "FLAGS": self.flags,
+            "CONTEXT": context[0] if len(context) == 1 else context,
+        }
         hdulist = fits.HDUList()
         for name, plane in planes.items():
             hdu = (fits.ImageHDU if hdulist else fits.PrimaryHDU)(plane, header)

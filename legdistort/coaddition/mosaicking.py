@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from ..exceptions import AssumptionWarning, InputError, warn
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.star_hull import support
 from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
@@ -18,9 +18,7 @@ from .grids import given_grid, reference_grid
 from .mosaic import Mosaic
 from .options import CoaddOptions
 from .preparation import prepare
-from .resampling.engines import white_gain
-from .resampling.noise_gain import noise_correlation
-from .resampling.pixel_maps import map_exposure
+from .resampling import engines, noise_gain, pixel_maps
 from .weights import make_weights, stellar_widths
 
 _STORED = 5  # bytes a pixel in the scratch folder, about
@@ -135,7 +133,7 @@ def _coadd(exposures, solution, options, share):
     else:
         output = given_grid(options.grid, solution)
     corners = options.algorithm in ("exact", "drizzle")
-    maps = {f.name: map_exposure(f.name, solution, output, corners=corners) for f in frames}
+    maps = {f.name: pixel_maps.map_exposure(f.name, solution, output, corners=corners) for f in frames}
     left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
     frames = [f for f in frames if maps[f.name] is not None]
     need = n_bytes(output.shape, len(frames)) + _STORED * sum(int(np.prod(f.shape)) for f in frames)
@@ -154,7 +152,7 @@ def _coadd(exposures, solution, options, share):
         layers, recipe = _layers(frames, prepared, maps, factors, solution, output, options)
         planes = assemble(layers, recipe, folder.parent, share)
     _warn_of_misuse(frames, maps, options.algorithm)
-    correlation = noise_correlation(layers[0].map, layers[0].gain, recipe.resampling)
+    correlation = noise_gain.noise_correlation(layers[0].map, layers[0].gain, recipe.resampling)
     header = _header(frames, left_out, factors, _settings(options, recipe, origin, correlation))
     names = tuple(f.name for f in frames)
     return Mosaic(*planes, wcs=output.wcs, exposures=names, left_out=left_out, offset=output.offset, header=header)
@@ -181,7 +179,7 @@ def _layers(frames, prepared, maps, factors, solution, output, options):
             sky=sky[f.name] if options.match_background else None,
             weight=weights[f.name],
             fwhm=fwhm and fwhm[f.name],
-            gain=white_gain(maps[f.name], resampling),
+            gain=engines.white_gain(maps[f.name], resampling),
             photons=_photons(f, prepared[f.name], factors[f.name], noise[f.name] ** 2 * area[f.name]),
             support=support(f.name, solution) if options.extrapolated != "keep" else None,
         )
@@ -244,12 +242,7 @@ def _warn(left_out):
 
 def _reasons(left_out):
     names = {reason: [n for n, other in left_out.items() if other == reason] for reason in left_out.values()}
-    return "; ".join(f"{_few(same)}: {reason}" for reason, same in names.items())
-
-
-def _few(names, most=5):
-    more = f" and {len(names) - most} more" * (len(names) > most)
-    return ", ".join(names[:most]) + more
+    return "; ".join(f"{some_of(same, 5)}: {reason}" for reason, same in names.items())
 
 
 def _warn_of_misuse(frames, maps, algorithm):
@@ -300,8 +293,7 @@ def _header(frames, left_out, factors, settings):
         if isinstance(value, str) or (value is not None and np.isfinite(value)):
             header[key] = (value, meaning)
     header["CREATOR"] = f"legdistort {version('legdistort')}"
-    for i, frame in enumerate(frames[:999], start=1):
-        header[f"IMCMB{i:03d}"] = _ascii(frame.name)
+    header.extend((f"IMCMB{i:03d}", _ascii(frame.name)) for i, frame in enumerate(frames[:999], start=1))
     for name, reason in left_out.items():
         header.add_history(_ascii(f"left out {name}: {reason}"))
     return header

@@ -57,7 +57,7 @@ def prepare(frame, folder):
         variance[bad] = np.mean(variance, where=~bad)
     masks = {"bad": bad, "full": full, "rough": rough}
     planes = {"data": data, "variance": variance} | {name: mask for name, mask in masks.items() if mask.any()}
-    return Prepared(store(folder, frame.name, planes), background)
+    return Prepared(store(folder, planes), background)
 
 
 def rough_pixels(data, bad, full, noise):

@@ -48,8 +48,7 @@ def check_degree(degree, name="degree"):
 @lru_cache
 def orders(degree):
     """Orders ``(l-k, k)`` in x and y of every mode, as two read-only int arrays (n_modes,)."""
-    pairs = [(total - k, k) for total in range(degree + 1) for k in range(total + 1)]
-    out = np.array(pairs, dtype=int).T
+    out = np.array([(total - k, k) for total in range(degree + 1) for k in range(total + 1)], dtype=int).T
     out.setflags(write=False)
     return out[0], out[1]
 

@@ -48,13 +48,12 @@ def check(pose, name="pose"):
 def describe(pose):
     """Shift [pix], rotation [deg], scale and parity (+1 or -1) of a pose, as a dict."""
     m = pose[:, :2]
-    parity = 1 if np.linalg.det(m) > 0 else -1
     return {
         "dx": float(pose[0, 2]),
         "dy": float(pose[1, 2]),
         "rotation": float(np.degrees(np.arctan2(m[1, 0], m[0, 0]))),
         "scale": float(np.sqrt(abs(np.linalg.det(m)))),
-        "parity": parity,
+        "parity": 1 if np.linalg.det(m) > 0 else -1,
     }
 
 

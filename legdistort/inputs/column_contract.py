@@ -132,16 +132,12 @@ def rename(table, columns):
     return out
 
 
-def _is_positive(values):
-    return np.isfinite(values) & (values > 0)
-
-
 #: What values must be, and the words if they are not, by column.
 _RULES = (
     (("x", "y"), np.isfinite, "not finite", ""),
     (
         ("x_err", "y_err"),
-        _is_positive,
+        lambda values: np.isfinite(values) & (values > 0),
         "not a positive finite number",
         "; errors are standard deviations in pixels, leave out rows without one",
     ),

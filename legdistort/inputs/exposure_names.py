@@ -14,9 +14,8 @@ _LONGEST = 250  # bytes; with the ending .asdf the 255 that file systems allow
 def exposure_name(path, ext=None):
     """Name of the exposure in a file, or in one of its extensions (see `legdistort.read_exposures`)."""
     name = _SUFFIX.sub("", Path(path).name)
-    if ext is None:
-        return name
-    return name + "_" + ("".join(str(e) for e in ext) if isinstance(ext, tuple) else str(ext))
+    parts = ext if isinstance(ext, tuple) else (ext,)
+    return name if ext is None else f"{name}_{''.join(map(str, parts))}"
 
 
 def check_exposure_name(name, origin=None):

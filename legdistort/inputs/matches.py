@@ -8,12 +8,10 @@ from astropy import units as u
 from astropy.table import QTable
 from scipy.sparse.csgraph import connected_components
 
-from ..exceptions import InputError, MatchError
+from ..exceptions import InputError, MatchError, some_of
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
-from . import column_contract
-from .exposure_names import check_exposure_name
-from .start_poses import estimate_poses, star_means
+from . import column_contract, exposure_names, start_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +73,8 @@ class Matches:
         ``{exposure: reason}`` of exposures that could not be used.
     epoch : float or None
         Mean of the exposures, a Julian year, if their headers tell it.
+    header_distortion : str or None
+        The largest distortion of the headers, in words, if they have one; it is not in the poses.
     observations : Observations
         The table as plain arrays; need not be given.
     """
@@ -85,6 +85,7 @@ class Matches:
     sky: TangentPlane | None = None
     left_out: dict = field(default_factory=dict)
     epoch: float | None = None
+    header_distortion: str | None = None
     observations: Observations | None = None
 
     def __post_init__(self):
@@ -109,7 +110,7 @@ class Matches:
         for i, name in enumerate(self.names):
             rows = obs.exposure == i
             back[rows] = similarity.apply(similarity.invert(self.poses[name]), obs.xy[rows])
-        return star_means(back, obs.star, len(self.stars))
+        return start_poses.star_means(back, obs.star, len(self.stars))
 
     def without(self, reasons):
         """The same matches without some exposures, ``{name: reason}``, which join `left_out`.
@@ -188,20 +189,21 @@ class Matches:
         table["exposure"] = table["exposure"].astype(str)
         seen = Observations.of(table)
         for name in seen.names:
-            check_exposure_name(name)
-        shapes = _by_exposure(shape, seen.names)
+            exposure_names.check_exposure_name(name)
+        shapes = shapes_by_exposure(shape, seen.names)
         _check_inside(seen, shapes)
         _check_duplicates(seen)
         _check_connected(seen)
         if poses is None:
-            found = estimate_poses(seen.exposure, seen.star, seen.xy, names=seen.names)
+            found = start_poses.estimate_poses(seen.exposure, seen.star, seen.xy, names=seen.names)
             poses = dict(zip(seen.names, found, strict=True))
         else:
             poses = _check_poses(poses, seen.names)
-        return cls(table, shapes, poses, sky, dict(left_out or {}), epoch, seen)
+        return cls(table, shapes, poses, sky, dict(left_out or {}), epoch, observations=seen)
 
 
-def _by_exposure(shape, names):
+def shapes_by_exposure(shape, names):
+    """Shapes (ny, nx), checked, of the exposures named: from a dict of them, or from one shape for all."""
     if not isinstance(shape, dict):
         shape = dict.fromkeys(names, shape)
     missing = [name for name in names if name not in shape]
@@ -292,11 +294,7 @@ def _check_connected(seen):
     count, group = connected_components(tied, directed=False)
     if count > 1:
         groups = [[name for name, g in zip(seen.names, group, strict=True) if g == label] for label in range(count)]
-        listed = "; ".join(_shorten(g) for g in groups)
+        listed = "; ".join(some_of(g, 6) for g in groups)
         raise MatchError(
             f"the exposures form {len(groups)} groups with no star in common: {listed}; solve each group by itself"
         )
-
-
-def _shorten(names, most=6):
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

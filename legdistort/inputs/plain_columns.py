@@ -50,6 +50,5 @@ def restored(tree):
     """What `plain` took apart."""
     values = np.array(tree["values"])
     unit = u.Unit(tree["unit"], parse_strict="silent") if tree["unit"] else None
-    if "mask" in tree:
-        return MaskedColumn(values, mask=np.array(tree["mask"]), unit=unit)
-    return Column(values, unit=unit)
+    masked = "mask" in tree
+    return MaskedColumn(values, mask=np.array(tree["mask"]), unit=unit) if masked else Column(values, unit=unit)

@@ -108,8 +108,7 @@ class Reference:
         step = np.hstack([np.eye(2), np.zeros((2, 2))]) + years[:, None, None] * np.hstack(
             [np.zeros((2, 2)), np.eye(2)]
         )
-        full = np.where(np.isfinite(self.covariance), self.covariance, 0)
-        covariance = step @ full @ step.transpose(0, 2, 1)
+        covariance = step @ np.where(np.isfinite(self.covariance), self.covariance, 0) @ step.transpose(0, 2, 1)
         moved = replace(self, sky=_degrees(place), covariance=covariance, motion=None, epoch=np.full(len(self), epoch))
         return moved.subset(known | still)
 
@@ -119,7 +118,8 @@ class Reference:
         middle = directions(*np.radians([plane.lon, plane.lat]))
         far = place @ middle < 0.5  # beyond 60 degrees; the projection ends at 90
         step = 1e-6
-        xy, x_east, x_north = (_project(plane, place + step * shift) for shift in (0 * east, east, north))
+        near = (SkyCoord(*_degrees(place + step * shift).T * u.deg, frame="icrs") for shift in (0 * east, east, north))
+        xy, x_east, x_north = map(plane.from_sky, near)
         slope = np.stack([x_east - xy, x_north - xy], axis=-1) * _MAS / step
         xy[far] = np.nan
         return xy, slope @ self.covariance[:, :2, :2] @ slope.transpose(0, 2, 1)
@@ -134,10 +134,6 @@ def _axes(sky):
 def _degrees(place):
     lon, lat = np.degrees(angles(place))
     return np.stack([lon % 360, lat], axis=1)
-
-
-def _project(plane, place):
-    return plane.from_sky(SkyCoord(*_degrees(place).T * u.deg, frame="icrs"))
 
 
 def year(epoch):

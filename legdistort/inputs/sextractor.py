@@ -94,9 +94,7 @@ def understand(table, columns):
 
 def _numbers(table, *names):
     """Columns as float arrays; None if one is missing."""
-    if all(name in table.colnames for name in names):
-        return [values(table, name) for name in names]
-    return None
+    return [values(table, name) for name in names] if set(names) <= set(table.colnames) else None
 
 
 def _covariance(table, kind):

@@ -4,7 +4,6 @@ import numpy as np
 
 from ..exceptions import MatchError
 from ..geometry import similarity
-from ..geometry.similarity import robust_similarity
 
 
 def star_means(xy, star, n_stars):
@@ -42,8 +41,6 @@ def estimate_poses(exposure, star, xy, *, names=None):
     rows = [np.flatnonzero(exposure == i) for i in range(n_exposures)]
     first = int(np.argmax([len(r) for r in rows]))
     found = {first: similarity.identity()}
-    back = np.full_like(xy, np.nan)
-    back[rows[first]] = xy[rows[first]]
     sums, counts = np.zeros((n_stars, 2)), np.zeros(n_stars)
     np.add.at(sums, star[rows[first]], xy[rows[first]])
     np.add.at(counts, star[rows[first]], 1)
@@ -57,7 +54,7 @@ def estimate_poses(exposure, star, xy, *, names=None):
                 "and rotation need at least 2: give poses, or leave it out"
             )
         mean = sums[star[r]] / counts[star[r], None]
-        found[best] = robust_similarity(mean, xy[r])
+        found[best] = similarity.robust_similarity(mean, xy[r])
         off = np.hypot(*(similarity.apply(found[best], mean) - xy[r]).T)
         if np.median(off) > 0.05 * np.ptp(xy[r], axis=0).max():
             continue  # mismatched: it gets a pose, but has no say in those of the others
@@ -79,11 +76,11 @@ def _refine_poses(pose_list, rows, star, xy, n_sweeps=3):
         for pose, r in zip(pose_list, rows, strict=True):
             back[r] = similarity.apply(similarity.invert(pose), xy[r])
         mean = star_means(back, star, star.max() + 1)
-        refined = [robust_similarity(mean[star[r]], xy[r]) for r in rows]
+        refined = [similarity.robust_similarity(mean[star[r]], xy[r]) for r in rows]
         old, new = ([similarity.apply(similarity.invert(p), ends) for p in pair] for pair in (pose_list, refined))
         usual = np.abs(np.log(_scales(refined) / np.median(_scales(refined)))) < np.log(1.5)
         old, new = (np.concatenate([pair for pair, keep in zip(ends_of, usual, strict=True) if keep])
                     for ends_of in (old, new))  # fmt: skip
-        common = robust_similarity(old, new)
+        common = similarity.robust_similarity(old, new)
         pose_list = [similarity.compose(pose, common) for pose in refined]
     return pose_list

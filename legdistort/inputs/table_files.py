@@ -11,11 +11,8 @@ from astropy.io import fits
 from astropy.table import QTable, Table, vstack
 
 from ..exceptions import InputError
-from ..runtime.checks import first_line
-from ..runtime.outputs import replacing
-from ..runtime.provenance import checksums
-from . import column_contract, sextractor
-from .exposure_names import check_exposure_name, exposure_name
+from ..runtime import checks, outputs, provenance
+from . import column_contract, exposure_names, sextractor
 
 log = logging.getLogger(__name__)
 
@@ -61,13 +58,13 @@ def read_table(path, *, columns=None, origin=None):
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     if "exposure" not in table.colnames:
-        name = exposure_name(path.stem)
-        check_exposure_name(name, path)
+        name = exposure_names.exposure_name(path.stem)
+        exposure_names.check_exposure_name(name, path)
         table["exposure"] = np.full(len(table), name)
         if "shape" in table.meta:
             table.meta["shapes"] = {name: table.meta.pop("shape")}
     inputs = table.meta.get("inputs")
-    table.meta["inputs"] = (inputs if isinstance(inputs, dict) else {}) | checksums(path)
+    table.meta["inputs"] = (inputs if isinstance(inputs, dict) else {}) | provenance.checksums(path)
     return table
 
 
@@ -82,7 +79,7 @@ def stack(tables):
     try:
         return vstack(tables, metadata_conflicts="silent")
     except Exception as error:  # astropy raises what it likes
-        raise InputError(f"the tables do not go together: {first_line(error)}") from None
+        raise InputError(f"the tables do not go together: {checks.first_line(error)}") from None
 
 
 def _understood(table, columns, origin):
@@ -117,11 +114,11 @@ def _read(path):
                 with path.open("rb") as file:
                     return Table.read(file, format=kind)
             except Exception as error:  # readers raise what they like
-                errors.append(first_line(error))
+                errors.append(checks.first_line(error))
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"cannot be read as a table: {first_line(error)}") from None
+        raise InputError(f"cannot be read as a table: {checks.first_line(error)}") from None
     raise InputError(f"cannot be read as a table: {errors[-1]}")
 
 
@@ -149,7 +146,7 @@ def _read_fits(path):
         return found[0]
     shapes = {}
     for k, table in enumerate(found):
-        name = f"{exposure_name(path.stem)}_{k + 1}"
+        name = f"{exposure_names.exposure_name(path.stem)}_{k + 1}"
         table["exposure"] = np.full(len(table), name)
         if "shape" in table.meta:
             shapes[name] = table.meta.pop("shape")
@@ -206,7 +203,7 @@ def write_by_ending(table, path, *, overwrite=False):
 
 def write_table(table, path, *, kind="ascii.ecsv", overwrite=False):
     """Write a table to a file, in any format that astropy knows; as `legdistort.runtime.outputs.replacing`."""
-    with replacing(path, overwrite=overwrite) as file:
+    with outputs.replacing(path, overwrite=overwrite) as file:
         if kind.startswith("ascii"):
             text = io.TextIOWrapper(file, encoding="utf-8", newline="")
             table.write(text, format=kind)

@@ -8,7 +8,6 @@ from scipy.spatial import cKDTree
 
 from ..exceptions import InputError
 from ..geometry import similarity
-from ..geometry.similarity import robust_similarity
 from ..geometry.tangent_plane import TangentPlane, angles, directions
 from .registration import register
 from .similarity_candidates import scale_candidates
@@ -138,24 +137,20 @@ def _registered(source, target, source_flux, target_flux, near, *, guess):
     """Rows of source and target by `registration.register`; None if nothing stands out from chance."""
     if min(len(source), len(target)) < 5:
         return None
-    fluxes = (source_flux, None if target_flux is None else target_flux[near])
-    if any(f is None for f in fluxes):
-        fluxes = None, None
+    fluxes = (None, None) if source_flux is None or target_flux is None else (source_flux, target_flux[near])
     lists = []
     for xy, flux, shift in ((source, fluxes[0], 0.0), (target, fluxes[1], 10.0)):  # so that nothing stands still
         low, span = xy.min(axis=0) - shift, np.ptp(xy, axis=0) + shift
         lists.append((low, StarList(xy - low, np.zeros(len(xy)), tuple(np.ceil(span[::-1]).astype(int) + 1), flux)))
     (low, stars), (other, catalogue) = lists
-    pose = np.column_stack([np.eye(2), low - other]) if guess else None
-    found = register(stars, catalogue, guess=pose)
+    found = register(stars, catalogue, guess=np.column_stack([np.eye(2), low - other]) if guess else None)
     return None if found is None else (found.source, found.target)
 
 
 def _neighbours(positions, plane, span):
     """Mutual neighbours nearer than chance allows; for lists that are too short for a pattern."""
     limit = np.sqrt(_CHANCE * np.prod(np.maximum(span, 1)) / (np.pi * len(positions)))
-    stars = cKDTree(positions)
-    distance, row = stars.query(plane, distance_upper_bound=limit)
+    distance, row = cKDTree(positions).query(plane, distance_upper_bound=limit)
     back = cKDTree(plane).query(positions)[1]
     good = [k for k in np.flatnonzero(np.isfinite(distance)) if back[row[k]] == k]
     return row[good], np.array(good, dtype=int)
@@ -200,15 +195,14 @@ def _tangent_plane(reference, positions):
             "scale and parity: 3 are needed"
         )
     plane = _middle(reference.sky, 1.0)
-    matrix = robust_similarity(positions, reference.on_plane(plane)[0])
-    return TangentPlane(plane.lon, plane.lat, matrix)
+    return TangentPlane(plane.lon, plane.lat, similarity.robust_similarity(positions, reference.on_plane(plane)[0]))
 
 
 def _check_agreement(label, positions, xy, size):
     """Raise `InputError` if a similarity does not carry one to the other, roughly."""
     if len(positions) < 3:
         return
-    off = np.hypot(*(similarity.apply(robust_similarity(positions, xy), positions) - xy).T)
+    off = np.hypot(*(similarity.apply(similarity.robust_similarity(positions, xy), positions) - xy).T)
     if not np.median(off) < _AGREEMENT * size:
         raise InputError(
             f"the {len(positions)} stars that {label} shares with the exposures by name do not lie as they do there "

@@ -14,7 +14,6 @@ import numpy as np
 from tqdm import tqdm
 
 from ..geometry import similarity
-from ..geometry.similarity import robust_similarity
 from .registration import Registration, continue_from_pairs, continue_from_pose, outwards, register
 from .star_labels import label_stars
 from .star_lists import StarList, Warp, allowed_degree, fit_warp
@@ -85,7 +84,7 @@ def _gather(lists, hub, left, guess, tolerance):
                 i, j = sorted((base, other))
                 r = register(lists[i], lists[j], guess=guess(i, j), blind=blind, tolerance=tolerance)
                 if r is not None:
-                    step = robust_similarity(lists[i].xy[r.source], lists[j].xy[r.target])
+                    step = similarity.robust_similarity(lists[i].xy[r.source], lists[j].xy[r.target])
                     found[other] = similarity.compose(step if base == i else similarity.invert(step), found[base])
                     registrations[i, j] = r
                     left.remove(other)
@@ -155,8 +154,7 @@ def interlink(lists, group, *, tolerance=None, progress=False):
                 found = _register_again(lists[i], lists[j], rows, columns, step, tolerance)
                 if found is not None and (before is None or len(found.source) > len(before.source)):
                     known[i, j] = found
-    telling = [pair for pair in partners if overlaps[pair] >= TELLING]
-    return known, _misfits(known, telling)
+    return known, _misfits(known, [pair for pair in partners if overlaps[pair] >= TELLING])
 
 
 def _register_again(source, target, rows, columns, step, tolerance):
@@ -288,7 +286,7 @@ def _united(main, view, other, other_view, guess, tolerance):
     found = register(other_view.stars, view.stars, guess=start, tolerance=tolerance)
     if found is None:
         return None
-    step = robust_similarity(other_view.stars.xy[found.source], view.stars.xy[found.target])
+    step = similarity.robust_similarity(other_view.stars.xy[found.source], view.stars.xy[found.target])
     to_other = similarity.compose(
         similarity.invert(other_view.pose), similarity.compose(similarity.invert(step), view.pose)
     )

@@ -8,10 +8,11 @@ from astropy import units as u
 
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..inputs import column_contract
-from ..inputs.matches import Matches
+from ..inputs.matches import Matches, shapes_by_exposure
 from ..inputs.reference_catalogue import mean_epoch
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
+from ..priors.from_headers import describe_headers
 from .exposure_groups import interlink, link, standing, unite
 from .header_poses import HeaderPoses
 from .options import MatchOptions
@@ -111,8 +112,11 @@ def match(
         log.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
         star[~isolated] = -1
     table, star = _keep_common(table, star, min_exposures, left_out)
-    epoch = mean_epoch(e.header for e in named.values()) if named else None
-    return _finish(table, star, shapes, headers, left_out, epoch)
+    matches = _finish(table, star, shapes, headers, left_out)
+    if not named:
+        return matches
+    told = describe_headers([named[name] for name in matches.names])
+    return replace(matches, epoch=mean_epoch(e.header for e in named.values()), header_distortion=told)
 
 
 def _without_repetitions(table):
@@ -142,11 +146,6 @@ def _check_names(table, names, min_exposures):
 def _shapes(table, names, named, shape):
     if named is not None:
         return {name: named[name].shape for name in names}
-    if isinstance(shape, dict):
-        missing = [name for name in names if name not in shape]
-        if missing:
-            raise InputError(f"shape has no entry for exposure {missing[0]!r}; give (ny, nx) for every exposure")
-        return {name: tuple(shape[name]) for name in names}
     if shape is None:
         shape = tuple(int(np.ceil(table[c].to_value(u.pix).max() + 0.5)) for c in ("y", "x"))
         warn(
@@ -154,14 +153,13 @@ def _shapes(table, names, named, shape):
             "pass shape=(ny, nx) or exposures=",
             AssumptionWarning,
         )
-    return dict.fromkeys(names, tuple(shape))
+    return shapes_by_exposure(shape, names)
 
 
 def _star_list(table, shape):
     x, y, x_err, y_err = (table[c].to_value(u.pix) for c in ("x", "y", "x_err", "y_err"))
-    flux = None
-    if "flux" in table.colnames:
-        flux = np.nan_to_num(column_contract.values(table, "flux"), nan=-np.inf)
+    has_flux = "flux" in table.colnames
+    flux = np.nan_to_num(column_contract.values(table, "flux"), nan=-np.inf) if has_flux else None
     return StarList(np.column_stack([x, y]), np.hypot(x_err, y_err), shape, flux)
 
 
@@ -240,11 +238,11 @@ def _reasons(left_out):
     return "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
 
 
-def _finish(table, star, shapes, headers, left_out, epoch):
+def _finish(table, star, shapes, headers, left_out):
     table["star"] = _numbers(table, star)
     for name, reason in left_out.items():
         log.warning("%s is left out: %s", name, reason)
-    matches = Matches.from_table(table, shape=shapes, left_out=left_out, epoch=epoch)
+    matches = Matches.from_table(table, shape=shapes, left_out=left_out)
     poses, sky = headers.place(matches.poses)
     return replace(matches, poses=poses, sky=sky)
 

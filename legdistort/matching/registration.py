@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..geometry import similarity
-from ..geometry.similarity import robust_similarity
 from .similarity_candidates import offset_candidates, triangle_candidates
 from .star_lists import Warp, allowed_degree, fit_warp
 
@@ -55,8 +54,7 @@ class Registration:
     strength: float
 
     def __repr__(self):
-        n = len(self.source)
-        return f"<Registration: {n} pairs within {self.tolerance:.2f} pix, strength {self.strength:.0f}>"
+        return f"<Registration: {len(self.source)} pairs within {self.tolerance:.2f} pix, strength {self.strength:.0f}>"
 
 
 def register(source, target, *, guess=None, blind=True, tolerance=None):
@@ -110,7 +108,7 @@ def _spread(source, target, found, tolerance):
         ):
             return found
         order = None if source.ranking is not None else outwards(source, p.mean(axis=0))
-        pose = robust_similarity(p, target.xy[found.target])
+        pose = similarity.robust_similarity(p, target.xy[found.target])
         again = continue_from_pose(source, target, pose, order, tolerance=tolerance)
         if again is None or len(again.source) <= len(found.source):
             return found
@@ -378,8 +376,7 @@ def _mutual(warp, source, target, limit, most, lone=False):
     rows, backward = rows[mutual], backward[mutual]
     cols, distance = j[rows, 0], forward[rows, 0]
     spread = limit**2 * (1 + warp.leverage(source.xy[rows]))
-    allowed = np.minimum(np.sqrt(spread + 16 * (source.error[rows] ** 2 + target.error[cols] ** 2)), most)
-    good = distance <= allowed
+    good = distance <= np.minimum(np.sqrt(spread + 16 * (source.error[rows] ** 2 + target.error[cols] ** 2)), most)
     if lone:
         good &= (forward[rows, 1] > limit) & (backward[:, 1] > limit)
     return rows[good], cols[good], distance[good]

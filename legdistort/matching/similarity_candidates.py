@@ -145,8 +145,7 @@ def scale_candidates(source, target, *, n_best=3):
     expected = uniform_filter(votes, 31)
     contrast = (votes - expected) / np.sqrt(expected + 1)
     peaks = np.where(maximum_filter(contrast, 7) == contrast, contrast, -np.inf)
-    best = np.argsort(-peaks)[:n_best]
-    return [float(np.exp((bins[k] + bins[k + 1]) / 2)) for k in best]
+    return [float(np.exp((bins[k] + bins[k + 1]) / 2)) for k in np.argsort(-peaks)[:n_best]]
 
 
 def _triangles(xy, n_neighbours):

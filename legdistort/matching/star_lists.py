@@ -55,8 +55,7 @@ class StarList:
 
     def subset(self, keep):
         """The list with some of its rows (boolean mask)."""
-        flux = None if self.flux is None else self.flux[keep]
-        return StarList(self.xy[keep], self.error[keep], self.shape, flux)
+        return StarList(self.xy[keep], self.error[keep], self.shape, None if self.flux is None else self.flux[keep])
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +81,7 @@ class Warp:
         return np.einsum("ij,ij->i", design @ self.covariance, design)
 
     def _design(self, xy):
-        degree = basis.degree_of(len(self.coefficients))
-        return basis.values(degree, *basis.normalize(xy, self.shape)).T
+        return basis.values(basis.degree_of(len(self.coefficients)), *basis.normalize(xy, self.shape)).T
 
     @classmethod
     def from_pose(cls, pose, shape):
@@ -108,6 +106,5 @@ def fit_warp(p, q, shape, degree, *, weights, width, parity):
     design = basis.values(degree, *basis.normalize(p, shape))
     i, j = basis.orders(degree)
     ridge = np.where(i + j > 1, (width / (0.01 * max(shape))) ** 2, 1e-9)
-    normal = (design * weights) @ design.T + np.diag(ridge)
-    covariance = np.linalg.inv(normal)
+    covariance = np.linalg.inv((design * weights) @ design.T + np.diag(ridge))
     return Warp(covariance @ ((design * weights) @ q), shape, covariance)

@@ -67,8 +67,7 @@ def _background(data, mask, mesh, *, steep=False):
     """Sky and its standard deviation, smooth maps; of a steep sky no medians of meshes are taken."""
     box = tuple(min(mesh, n) for n in data.shape)
     clip = SigmaClip(sigma=3.0, maxiters=10)
-    with warnings.catch_warnings():  # of meshes without good pixels, which are interpolated
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):  # of meshes without good pixels, which are interpolated
         for exclude in (50.0, 100.0):
             try:
                 found = Background2D(
@@ -135,8 +134,7 @@ def detect(frame, fwhm, threshold):
     y, x = np.nonzero(ratio > threshold)
     peak = _is_highest(ratio, x, y, max(1, int(fwhm / 2)))
     x, y = x[peak], y[peak]
-    order = np.argsort(-ratio[y, x], kind="stable")
-    return np.column_stack([x, y])[order]
+    return np.column_stack([x, y])[np.argsort(-ratio[y, x], kind="stable")]
 
 
 def _blur(image, sigma):

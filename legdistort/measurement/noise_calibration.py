@@ -6,10 +6,9 @@ from functools import partial
 import numpy as np
 from astropy.table import vstack
 
-from ..exceptions import AssumptionWarning, InputError, warn
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs.exposure_files import listed
-from ..runtime.checks import options_from
-from ..runtime.parallel import map_items
+from ..runtime import checks, parallel
 from .injection import calibrate_frame
 from .noise_curves import NoiseCurves
 from .options import MeasureOptions
@@ -61,16 +60,15 @@ def calibrate_noise(
     """
     exposures = listed(exposures, "calibrate_noise")
     fluxes, widths = check_injection(fluxes, fwhm, n_positions, seed)
-    options = options_from(MeasureOptions, measuring, "measuring")
+    options = checks.options_from(MeasureOptions, measuring, "measuring")
     work = partial(_calibrate, options=options, fluxes=fluxes, widths=widths, n_positions=n_positions, seed=seed)
-    curves = list(map_items(work, exposures, workers=workers, progress=progress, description="noise"))
+    curves = list(parallel.map_items(work, exposures, workers=workers, progress=progress, description="noise"))
     photons = {exposure.name: photon for exposure, (_, photon) in zip(exposures, curves, strict=True)}
     gains = [f"{name} {1 / p:.3g}" if p else f"{name} none seen" for name, p in photons.items() if p is not None]
     if gains:
-        more = f" and {len(gains) - 3} more" if len(gains) > 3 else ""
         warn(
             "no gain known: the photon noise of injected stars is estimated from the stars of the frames (equivalent "
-            f"gain, e-/ADU: {', '.join(gains[:3])}{more}); give gain or the keyword GAIN to have it exact",
+            f"gain, e-/ADU: {some_of(gains, 3)}); give gain or the keyword GAIN to have it exact",
             AssumptionWarning,
         )
     tables = [of_frame.table for of_frame, _ in curves]

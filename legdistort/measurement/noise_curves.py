@@ -241,5 +241,4 @@ def _fit_law(levels, sigma):
 
     two, chi2 = fit([0, 1])
     three, chi2_floor = fit([0, 1, 2]) if len(flux) > 3 else (two, chi2)
-    best = three if chi2_floor < chi2 - 4 else np.append(two, 0.0)
-    return np.sqrt(best)
+    return np.sqrt(three if chi2_floor < chi2 - 4 else np.append(two, 0.0))

@@ -9,16 +9,15 @@ from astropy import units as u
 from astropy.table import QTable, vstack
 from scipy.spatial import cKDTree
 
-from ..exceptions import AssumptionWarning, warn
+from ..exceptions import AssumptionWarning, some_of, warn
 from ..inputs.exposure_files import listed
 from ..runtime.parallel import map_items
 from .crowding import crowding, is_deformed
 from .flags import UNUSABLE, Flag
 from .injection import calibrate_frame
 from .options import MeasureOptions
-from .profiles import moffat
+from .profiles import frame_fit, moffat
 from .profiles.cutouts import Stamps
-from .profiles.frame_fit import box_half, fit_stars, locate_stars
 
 log = logging.getLogger(__name__)
 
@@ -122,10 +121,9 @@ def _warn_of_gain(photons):
     if names:
         gains = [1 / photon for photon in photons.values() if photon]
         found = f"equivalent gain {min(gains):.3g} to {max(gains):.3g} e-/ADU" if gains else "none could be seen"
-        some = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
         warn(
-            f"no gain known for {some}: photon noise estimated from the residuals of the star fits ({found}); "
-            "give gain= or the keyword GAIN to have it exact",
+            f"no gain known for {some_of(names, 3)}: photon noise estimated from the residuals of the star fits "
+            f"({found}); give gain= or the keyword GAIN to have it exact",
             AssumptionWarning,
         )
 
@@ -160,15 +158,15 @@ def measure_exposure(exposure, options):
 def _measure_frame(exposure, options):
     """What `measure_exposure` gives, errors as the fits state them."""
     name, max_stars = exposure.name, options.max_stars
-    frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
+    frame, centres, shape = frame_fit.locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
     if len(centres) == 0:
         log.warning("%s: no star above %g times the noise", name, options.threshold)
         return _empty(), None
     if max_stars is not None:
         centres = centres[: 3 * max_stars]  # some will turn out to be hot pixels or saturated
     fwhm = float(moffat.fwhm(shape))
-    stamps = Stamps(frame, centres, options.box // 2 if options.box else box_half(fwhm))
-    fit, flags, snr, photon = fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
+    stamps = Stamps(frame, centres, options.box // 2 if options.box else frame_fit.box_half(fwhm))
+    fit, flags, snr, photon = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     shapes, covariance = fit.params[:, 3:7], fit.covariance[:, 3:7, 3:7]
     usable = ((flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
     deformed = is_deformed(shapes, covariance, snr=snr, usable=usable)
@@ -209,8 +207,7 @@ def _table(name, stamps, fit, *, flags, snr):
     flags = flags | np.where(lost, Flag.NOT_CONVERGED, 0) | np.where(to_edge < width, Flag.EDGE, 0)
     columns = (xy[:, 0], xy[:, 1], error[:, 0], error[:, 1], corr, flux, scale * flux_err, width, chi2)
     named = {key: v * u.pix if key in _PIXELS else v for key, v in zip(_COLUMNS, columns, strict=True)}
-    table = QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})
-    return table[np.argsort(-flux, kind="stable")]
+    return QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})[np.argsort(-flux, kind="stable")]
 
 
 def _distinct(table, fwhm):

@@ -44,15 +44,17 @@ def shorten(name, length=44):
     return name if len(name) <= length else f"{name[: length // 2]}…{name[1 - length // 2 :]}"
 
 
-def set_log_ticks(axis):
-    """Labels at 1, 2, 5 where a logarithmic axis is short, at powers of ten where it is long."""
+def set_log_grid(ax):
+    """Grid, and labels at 1, 2, 5 where a logarithmic axis is short, at powers of ten where it is long."""
     from matplotlib import ticker
 
-    low, high = axis.get_view_interval()
-    axis.set_minor_formatter(ticker.NullFormatter())
-    if high < 300 * low:
-        axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if high > 8 * low else (1, 1.5, 2, 3, 4, 5, 6, 8)))
-        axis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+    for axis in (ax.xaxis, ax.yaxis):
+        low, high = axis.get_view_interval()
+        axis.set_minor_formatter(ticker.NullFormatter())
+        if high < 300 * low:
+            axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if high > 8 * low else (1, 1.5, 2, 3, 4, 5, 6, 8)))
+            axis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+    ax.grid(linewidth=0.3)
 
 
 def peak(coefficients):
@@ -106,8 +108,7 @@ def draw_image(ax, image, *, sky, soft, low, high, extent):
 
 def running_median(x, y, per_bin=8):
     """Medians of x and y in bins of about equal number along x, by increasing x."""
-    order = np.argsort(x)
-    bins = np.array_split(order, int(np.clip(len(x) // per_bin, 1, 20)))
+    bins = np.array_split(np.argsort(x), int(np.clip(len(x) // per_bin, 1, 20)))
     if len(bins) == 1:
         return np.sort(x), np.full(len(x), np.median(y))
     return np.array([np.median(x[b]) for b in bins]), np.array([np.median(y[b]) for b in bins])

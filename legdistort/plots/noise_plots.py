@@ -50,9 +50,7 @@ def plot_noise(curves, *, exposure=None, ax=None):
     ax.plot(flux, b / np.sqrt(flux), ":", color=elements.GREY, linewidth=1.8, zorder=1, label="∝ 1 / √flux: photons")
     ax.set(xscale="log", yscale="log", xlabel="flux [units of the data]", ylabel="error of a position, per axis [px]")
     ax.set_ylim(0.6 * np.nanmin(ranges), 1.6 * np.nanmax(ranges))
-    elements.set_log_ticks(ax.xaxis)
-    elements.set_log_ticks(ax.yaxis)
-    ax.grid(linewidth=0.3)
+    elements.set_log_grid(ax)
     ax.legend(fontsize="small", frameon=False)
     elements.set_title(ax, f"{elements.shorten(name)}: stars put in and measured again")
     return ax

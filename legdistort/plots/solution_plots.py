@@ -10,7 +10,6 @@ from ..exceptions import InputError
 from ..geometry import basis
 from ..inputs import column_contract
 from . import elements
-from .elements import BLUE, GREY, ORANGE, RED, round_down
 
 #: Panels of one figure of small multiples.
 PANELS = 12
@@ -51,19 +50,19 @@ def plot_residuals(solution, name=None, *, scale=None, ax=None):
         raise InputError(f"nothing to draw: no position of {name or 'any exposure'} was used")
     shapes = list(solution.shapes.values()) if name is None else [solution.shapes[name]]
     ny, nx = np.max(shapes, axis=0)
-    scale = scale or round_down(0.08 * max(nx, ny) / (np.percentile(np.hypot(dx, dy)[rows], 90) or 1))
+    scale = scale or elements.round_down(0.08 * max(nx, ny) / (np.percentile(np.hypot(dx, dy)[rows], 90) or 1))
     if len(rows) > _MAX_ARROWS:
         rows = np.random.default_rng(0).choice(rows, _MAX_ARROWS, replace=False)
-    ax.plot(x[~used], y[~used], "x", color=RED, markersize=4, label="not used", linestyle="none")
+    ax.plot(x[~used], y[~used], "x", color=elements.RED, markersize=4, label="not used", linestyle="none")
     arrows = ax.quiver(
         *(a[rows] for a in (x, y, dx, dy)),
         angles="xy",
         scale_units="xy",
         scale=1 / scale,
         width=0.002,
-        color=BLUE,
+        color=elements.BLUE,
     )
-    key = round_down(0.1 * max(nx, ny) / scale)
+    key = elements.round_down(0.1 * max(nx, ny) / scale)
     ax.quiverkey(arrows, 0.87, 1.025, key, f"{key:g} px", labelpos="E", coordinates="axes")
     ax.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), xlabel="x [px]", ylabel="y [px]", aspect="equal")
     if not used.all():
@@ -99,10 +98,10 @@ def plot_distortion(solution, name, *, part="total", scale=50, ax=None):
     coefficients, prior = _parts(solution, name, part)
     shape = solution.shapes[name]
     scale = scale or distortion_scale(solution, [name], part=part)
-    elements.draw_grid(ax, shape, np.zeros_like(coefficients), color=GREY, linewidth=0.5)
+    elements.draw_grid(ax, shape, np.zeros_like(coefficients), color=elements.GREY, linewidth=0.5)
     if prior is not None:
-        elements.draw_grid(ax, shape, scale * prior, color=ORANGE, linewidth=2.4, alpha=0.7)
-    elements.draw_grid(ax, shape, scale * coefficients, color=BLUE, linewidth=0.9)
+        elements.draw_grid(ax, shape, scale * prior, color=elements.ORANGE, linewidth=2.4, alpha=0.7)
+    elements.draw_grid(ax, shape, scale * coefficients, color=elements.BLUE, linewidth=0.9)
     ax.margins(0.03)
     ax.autoscale_view()
     ax.set(xlabel="x [px]", ylabel="y [px]", aspect="equal")
@@ -154,7 +153,7 @@ def distortion_scale(solution, names, *, part="total"):
     """Round magnification that makes the largest displacement of some exposures about a tenth of the detector."""
     peak = max(elements.peak(_parts(solution, name, part)[0]) for name in names)
     size = max(max(solution.shapes[name]) for name in names)
-    return round_down(0.1 * size / peak) if peak > 0 else 1.0
+    return elements.round_down(0.1 * size / peak) if peak > 0 else 1.0
 
 
 def plot_coefficients(solution, name=None, *, fig=None):
@@ -186,9 +185,9 @@ def plot_coefficients(solution, name=None, *, fig=None):
         ax.axhline(0, color="black", linewidth=0.6)
         at = np.arange(n)
         if has_prior:
-            ax.bar(at - width / 2, prior[axis], width, color=ORANGE, label="prior")
+            ax.bar(at - width / 2, prior[axis], width, color=elements.ORANGE, label="prior")
             at = at + width / 2
-        bars = ax.bar(at, values[axis], width, yerr=scatter[axis], color=BLUE, error_kw={"elinewidth": 0.8})
+        bars = ax.bar(at, values[axis], width, yerr=scatter[axis], color=elements.BLUE, error_kw={"elinewidth": 0.8})
         bars.set_label(label)
         ax.set_ylabel(f"along {'xy'[axis]} [px]")
         ax.grid(axis="y", linewidth=0.3)
@@ -208,7 +207,7 @@ def plot_coefficients(solution, name=None, *, fig=None):
     return panels
 
 
-def plot_scatter(solution, *, label="scatter of one star", color=BLUE, ax=None):
+def plot_scatter(solution, *, label="scatter of one star", color=elements.BLUE, ax=None):
     """Residual scatter of every star against its flux, with the reported error (the paper's Figure "ercomp").
 
     The scatter is the rms residual per axis over the used positions of a star (two at least), the curve the
@@ -243,11 +242,9 @@ def plot_scatter(solution, *, label="scatter of one star", color=BLUE, ax=None):
         at = curve = np.sort(error[keep])
         abscissa, xlabel = error, "reported error per axis [px]"
     ax.loglog(abscissa[keep], scatter[keep], "o", color=color, markersize=4, alpha=0.7, mew=0, label=label)
-    ax.loglog(at, curve, color=RED, linewidth=2, label="reported error (median)")
+    ax.loglog(at, curve, color=elements.RED, linewidth=2, label="reported error (median)")
     ax.set(xlabel=xlabel, ylabel="rms residual per axis [px]")
-    ax.grid(linewidth=0.3)
-    elements.set_log_ticks(ax.xaxis)
-    elements.set_log_ticks(ax.yaxis)
+    elements.set_log_grid(ax)
     ax.legend(fontsize="small")
     elements.set_title(ax, "Residual scatter of the stars")
     return ax

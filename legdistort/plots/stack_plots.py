@@ -72,8 +72,7 @@ def plot_zooms(zooms, *, fig=None):
 
 
 def _draw_row(axes, zoom):
-    images = [image for image, _ in zoom.cuts.values()]
-    best = images[-1]
+    *_, (best, _) = zoom.cuts.values()
     sky, low = np.nanpercentile(best, [50, 16])
     soft = 3 * (sky - low) or 1.0
     # the core is saturated to show the wings and faint stars

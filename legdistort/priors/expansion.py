@@ -3,8 +3,7 @@
 import numpy as np
 
 from ..exceptions import InputError
-from ..geometry import basis, similarity
-from ..geometry.detector_modes import similarity_part
+from ..geometry import basis, detector_modes, similarity
 from ..geometry.distortion import Distortion
 from .source import check_folds
 
@@ -53,7 +52,7 @@ def expand(source, degree, parity=None):
             degree,
             max(NODES, degree + 6),
         )
-        shift = similarity_part(mean, shape)
+        shift = detector_modes.similarity_part(mean, shape)
         pose = similarity.compose(shift, pose)
         if np.abs(similarity.apply(shift, pixels) - pixels).max() < 1e-10:
             break

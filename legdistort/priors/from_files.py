@@ -75,8 +75,8 @@ def read_source(where, *, ext=None, frame=None):
             f"{path}: {'not a file' if path.exists() else 'no such file'}; give a file, gsaoi-1 ... gsaoi-4, or "
             "siaf:INSTRUMENT/APERTURE"
         )
-    with warnings.catch_warnings():  # files are often a little off the standard; what matters is checked here
-        warnings.simplefilter("ignore", AstropyWarning)
+    # files are often a little off the standard; what matters is checked here
+    with warnings.catch_warnings(action="ignore", category=AstropyWarning):
         return _read_file(path, ext, frame)
 
 
@@ -197,8 +197,7 @@ def _from_header(header, name, hdulist=None):
     except Exception as error:  # wcslib raises many kinds
         raise InputError(f"{name}: its WCS cannot be read ({' '.join(str(error).split())})") from None
     kind = "FITS header, " + str(header.get("CTYPE1", "WCS"))
-    shape = source.shape or _shape(header)
-    return replace(source, kind=kind, shape=shape)
+    return replace(source, kind=kind, shape=source.shape or _shape(header))
 
 
 def _shape(header):
@@ -295,8 +294,7 @@ def _aperture(text):
     except ImportError:
         raise InputError(f"{text}: SIAF apertures need pysiaf; pip install pysiaf") from None
     try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), contextlib.redirect_stdout(io.StringIO()):
             siaf = pysiaf.Siaf(instrument)
     except Exception as error:  # it knows its instruments by its own files
         raise InputError(f"{text}: pysiaf has no instrument {instrument!r} ({error})") from None

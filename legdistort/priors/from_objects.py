@@ -51,14 +51,11 @@ def of_model(model, name, **known):
     inputs, outputs = getattr(model, "n_inputs", 2), getattr(model, "n_outputs", 2)
     if (inputs, outputs) != (2, 2):
         raise InputError(f"{name} has {inputs} inputs and {outputs} outputs; a distortion has two of each")
-    kind = "astropy model" if isinstance(model, Model) else "function"
-    if isinstance(model, Model) and isinstance(_last(model), models.RotateNative2Celestial):
+    is_model = isinstance(model, Model)
+    if is_model and isinstance(model[-1] if model.n_submodels > 1 else model, models.RotateNative2Celestial):
         known = {"direction": DIRECTIONS[0], "sphere": 1.0} | known
+    kind = "astropy model" if is_model else "function"
     return Source(name, kind, _plain(model, known.get("sphere")), **known)
-
-
-def _last(model):
-    return model[-1] if getattr(model, "n_submodels", 1) > 1 else model
 
 
 def _plain(model, sphere=None):

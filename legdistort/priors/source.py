@@ -11,8 +11,7 @@ import numpy as np
 from scipy.interpolate import NdBSpline, make_interp_spline
 
 from ..exceptions import InputError
-from ..geometry import basis
-from ..geometry.tangent_plane import gnomonic
+from ..geometry import basis, tangent_plane
 from ..runtime.provenance import checksums
 
 DIRECTIONS = ("detector_to_reference", "reference_to_detector")
@@ -110,7 +109,7 @@ class Source:
             return self.function
         centre = (np.array([nx, ny]) - 1) / 2 + self.origin
         lon, lat = (float(a[0]) for a in self.function(*centre[:, None]))
-        return lambda x, y: gnomonic(*self.function(x, y), lon, lat, self.sphere)
+        return lambda x, y: tangent_plane.gnomonic(*self.function(x, y), lon, lat, self.sphere)
 
 
 def check_shape(shape):

@@ -47,9 +47,7 @@ def plot_comparison(solutions, *, noise=None, ax=None):
         curve = noise(at)
     ax.plot(at, curve, color="#E69F00", linewidth=2, label="error of one measured position")
     ax.set(xscale="log", yscale="log", xlabel=label, ylabel="scatter σ_j of corrected positions, per axis [px]")
-    ax.grid(linewidth=0.3)
-    elements.set_log_ticks(ax.xaxis)
-    elements.set_log_ticks(ax.yaxis)
+    elements.set_log_grid(ax)
     ax.legend(fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)  # clear of the marks
     return ax
 
@@ -81,10 +79,11 @@ def compared_corrections(comparison):
         "mean ": "px, both axes",
         "standard deviation ": "px, both axes",
     }
-    rows = []
-    for name, solution in comparison.items():
-        s = accuracy.scatter_summary(solution)
-        rows.append([name, str(s["n_stars"]), *(f"{s[key]:.4f}" for key in ("mean", "std", "mean_total", "std_total"))])
+    figures, shown = map(accuracy.scatter_summary, comparison.values()), ("mean", "std", "mean_total", "std_total")
+    rows = [
+        [name, str(s["n_stars"]), *(f"{s[key]:.4f}" for key in shown)]
+        for name, s in zip(comparison, figures, strict=True)
+    ]
     picture = figure(
         plot_comparison(comparison, ax=detached_figure(7.0, 5.0).subplots()),
         "Scatter of every star's corrected positions over the exposures, by correction, with the error of one "
@@ -112,10 +111,10 @@ def compared_stacks(made):
         "ellipticity": "",
         "positions": "px per axis",
     }
-    rows = []
-    for name, q in made.qualities.items():
-        ratios = (q.fwhm, q.fwhm_ratio, q.peak_ratio, q.ellipticity)
-        rows.append([name, *(f"{value:.3f}" for value in ratios), f"{q.position:.4f}"])
+    shown = "fwhm", "fwhm_ratio", "peak_ratio", "ellipticity"
+    rows = [
+        [name, *(f"{getattr(q, key):.3f}" for key in shown), f"{q.position:.4f}"] for name, q in made.qualities.items()
+    ]
     n = next(iter(made.qualities.values())).n_stars
     removed = "similarity" if made.removed == "similarity" else f"map of degree {made.removed}"
     picture = ""

@@ -79,11 +79,10 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
         raise InputError(f"{path} is not a readable ASDF file: not a file")
     try:
         # absolute, since asdf takes ~x for somebody's home
-        with io.BytesIO(content) if inside else Path(path).absolute().open("rb") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore", asdf.exceptions.AsdfWarning)  # of other versions; the schema has the say
+        quiet = warnings.catch_warnings(action="ignore", category=asdf.exceptions.AsdfWarning)  # the schema has the say
+        with io.BytesIO(content) if inside else Path(path).absolute().open("rb") as file, quiet:
             with nullcontext(content) if inside else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
-                end = _check_yaml(whole, tags, max_bytes)
-                _check_blocks(whole, end, max_bytes)
+                _check_blocks(whole, _check_yaml(whole, tags, max_bytes), max_bytes)
             _check_node(asdf.util.load_yaml(file, tagged=True), "", [max_bytes])
             file.seek(0)
             with asdf.open(file, memmap=False, lazy_load=False) as opened:

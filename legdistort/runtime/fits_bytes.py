@@ -59,8 +59,7 @@ def read_bytes(path):
 
 def open_bytes(raw, **options):
     """An HDUList of the content of a file, its oddities left alone."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AstropyWarning)
+    with warnings.catch_warnings(action="ignore", category=AstropyWarning):
         hdulist = fits.open(io.BytesIO(raw), memmap=False, **options)
         len(hdulist)  # astropy reads headers when they are asked for
     return hdulist
@@ -145,9 +144,7 @@ def _with_checksum(header, data):
 def _sum32(content):
     """Sum of 32-bit words in ones' complement (FITS standard 4.0, appendix J.1)."""
     total = int(np.frombuffer(content, ">u4").sum(dtype=np.uint64))
-    while total >> 32:
-        total = (total & 0xFFFFFFFF) + (total >> 32)
-    return total
+    return (total - 1) % 0xFFFFFFFF + 1  # carries come back at the low end; a header is never all 0
 
 
 def _encode(value):

@@ -110,11 +110,9 @@ def _executor(workers, threads, client):
     if client is not None:
         yield partial(client.submit, pure=False)
         return
-    pool = (
-        ThreadPoolExecutor(workers)
-        if threads
-        else ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin)
-    )
+    # a worker leaves Ctrl-C to the process that it works for, which then stops it
+    deaf = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+    pool = ThreadPoolExecutor(workers) if threads else ProcessPoolExecutor(workers, get_context("spawn"), **deaf)
     try:
         yield pool.submit
     except BrokenProcessPool:
@@ -126,19 +124,13 @@ def _executor(workers, threads, client):
         pool.shutdown(cancel_futures=True)
 
 
-def _begin():
-    """In a new worker: Ctrl-C is for the process that it works for, which then stops it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 def _attempt(function, item):
     """Result, error, warnings and log records of a process that nobody listens to."""
     records, result, raised = SimpleQueue(), None, None
     log = logging.getLogger("legdistort")
     log.handlers[:], log.propagate = [QueueHandler(records)], False
     log.setLevel(logging.INFO)
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as warned:
         try:
             result = function(item)
         except Exception as error:

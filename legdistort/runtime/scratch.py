@@ -19,13 +19,10 @@ class Stored:
 
     Attributes
     ----------
-    name : str
-        Of the exposure.
     paths : dict
         File of each plane, by its name.
     """
 
-    name: str
     paths: dict
 
     def piece(self, plane, part):
@@ -78,15 +75,13 @@ def scratch_folder(parent, need, what="the pixels"):
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def store(folder, name, planes):
+def store(folder, planes):
     """Store planes of an exposure.
 
     Parameters
     ----------
     folder : path
         From `scratch_folder`.
-    name : str
-        Of the exposure.
     planes : dict of ndarray or None
         By name; None is left out.
 
@@ -94,11 +89,11 @@ def store(folder, name, planes):
     -------
     Stored
     """
-    own = Path(tempfile.mkdtemp(dir=folder))  # not by its name, which is free text
+    own = Path(tempfile.mkdtemp(dir=folder))  # not named as the exposure, which is free text
     paths = {plane: own / f"{plane}.npy" for plane, values in planes.items() if values is not None}
     for plane, path in paths.items():
         np.save(path, planes[plane])
-    return Stored(name, paths)
+    return Stored(paths)
 
 
 class _Shared(mmap.mmap):

@@ -16,8 +16,7 @@ from ..exceptions import InputError
 from ..geometry import similarity
 from ..inputs.matches import Matches
 from ..inputs.table_files import write_table
-from ..runtime.checks import check_counts
-from ..runtime.outputs import replacing
+from ..runtime import checks, outputs
 from . import gsaoi_night, rendering
 from .truth import (
     Truth,
@@ -62,7 +61,7 @@ class SimulatedExposures:
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / f"{name}.fits" for name in self.hdus]
         for path, hdulist in zip(paths, self.hdus.values(), strict=True):
-            with replacing(path, overwrite=True) as file:
+            with outputs.replacing(path, overwrite=True) as file:
                 hdulist.writeto(file)
         write_table(self.truth.table(), folder / "truth.ecsv", overwrite=True)
         return paths
@@ -144,7 +143,7 @@ def simulate_matches(
     InputError
         For arguments out of range.
     """
-    check_counts(n_stars=n_stars, n_exposures=n_exposures)
+    checks.check_counts(n_stars=n_stars, n_exposures=n_exposures)
     if not (0 < seen <= 1 and -1 < corr < 1 and dither >= 0 and noise >= 0):
         raise InputError(
             "seen must be in (0, 1], corr in (-1, 1), dither and noise not negative, got "

@@ -13,8 +13,7 @@ from ..inputs import column_contract
 from ..priors.prior import Prior
 from ..runtime.checks import check_choice, check_counts
 from ..solving.gauge.constraints import KINDS
-from . import truth
-from .observations import matches_from, position_errors
+from . import observations, truth
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -109,7 +108,7 @@ class Layout:
         plan = truth.Truth(
             names, self.shape, self.positions, None, static, np.zeros((len(names), 1, 1)), self.poses, self.poses
         )
-        return matches_from(plan, self.observed, self.errors, np.random.default_rng(0), noise=0)
+        return observations.matches_from(plan, self.observed, self.errors, np.random.default_rng(0), noise=0)
 
     def axes(self, n):
         """Coordinates x, y of a grid of the field, n points along its longer side, as centres of cells."""
@@ -213,4 +212,4 @@ def _errors(plan, n):
         raise InputError(
             f"sigma must be positive and finite everywhere, got {sigma if sigma.ndim == 0 else sigma.min()}"
         )
-    return position_errors(sigma, plan.n_exposures, n)
+    return observations.position_errors(sigma, plan.n_exposures, n)

@@ -87,10 +87,10 @@ class Truth:
         if self.sky is not None:
             sky = self.sky.to_sky(self.positions)
             out["ra"], out["dec"] = sky.ra, sky.dec
-        out.meta["shape"] = list(self.shape)
-        out.meta["static"] = self.static.tolist()
-        for i, name in enumerate(self.names):
-            out.meta[name] = {"pose": self.poses[name].tolist(), "coefficients": self.coefficients[i].tolist()}
+        out.meta |= {"shape": list(self.shape), "static": self.static.tolist()} | {
+            name: {"pose": self.poses[name].tolist(), "coefficients": coefficients.tolist()}
+            for name, coefficients in zip(self.names, self.coefficients, strict=True)
+        }
         return out
 
     def _known(self, name):
@@ -113,7 +113,8 @@ def displacement(coefficients, q, shape):
     tensor = np.zeros((degree + 1, degree + 1, 2))
     for m, (i, j) in enumerate(mode_orders(degree)):
         tensor[i, j] = coefficients[:, m] * np.sqrt((2 * i + 1) / 2 * (2 * j + 1) / 2)
-    x, y = _unit_square(q, shape)
+    q = np.asarray(q, dtype=float)
+    x, y = (2 * q[..., 0] + 1) / shape[1] - 1, (2 * q[..., 1] + 1) / shape[0] - 1
     return np.moveaxis(legendre.legval2d(x, y, tensor), 0, -1)
 
 
@@ -207,8 +208,3 @@ def exposure_names(n):
 def shifted(pose, shift):
     """The pose with `shift` (2,) [pix] added on the detector."""
     return np.column_stack([pose[:, :2], pose[:, 2] + shift])
-
-
-def _unit_square(q, shape):
-    q = np.asarray(q, dtype=float)
-    return (2 * q[..., 0] + 1) / shape[1] - 1, (2 * q[..., 1] + 1) / shape[0] - 1

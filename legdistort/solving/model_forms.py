@@ -11,9 +11,8 @@ import numpy as np
 from astropy.modeling import CompoundModel, Model, models
 
 from ..exceptions import FoldError, InputError
-from ..geometry import basis, similarity
+from ..geometry import basis, fitter, similarity
 from ..geometry.distortion import Distortion
-from ..geometry.fitter import free_coefficients, legendre_coefficients, linear_parts, set_values
 from ..geometry.models import FastLegendre2D, leaves, rebuilt
 from ..priors.prior import Prior
 
@@ -73,7 +72,7 @@ class Form:
     """
 
     def __init__(self, model, shapes):
-        free_coefficients(model)  # refuses what is no map of the plane, ties and bounds
+        fitter.free_coefficients(model)  # refuses what is no map of the plane, ties and bounds
         own = _without_pose(model)
         self._shapes = {name: tuple(shape) for name, shape in shapes.items()}
         self._expansions = {shape: _expand(own, shape) for shape in set(self._shapes.values())}
@@ -92,7 +91,9 @@ class Form:
     def describe(self):
         """The form in plain numbers and strings, as files of solutions keep it."""
         model = next(iter(self._expansions.values())).model
-        fixed = {name: float(getattr(model, name).value) for name in legendre_coefficients(model) if model.fixed[name]}
+        fixed = {
+            name: float(getattr(model, name).value) for name in fitter.legendre_coefficients(model) if model.fixed[name]
+        }
         return {"parts": [type(part).__name__ for part in leaves(model)], "fixed": fixed, "n_free": self.n_free}
 
     def prior(self):
@@ -121,7 +122,7 @@ class Form:
         n = expansion.free.shape[1]
         departure = (distortion.coefficients[:, :n] - expansion.mean[:, :n])[expansion.free]
         out = expansion.model.copy()
-        set_values(out, expansion.names, expansion.start + np.linalg.solve(expansion.matrix.T, departure))
+        fitter.set_values(out, expansion.names, expansion.start + np.linalg.solve(expansion.matrix.T, departure))
         for part in leaves(out):
             if isinstance(part, FastLegendre2D):
                 part.valid = distortion.inverse.valid
@@ -148,7 +149,11 @@ def read(model, matches, *, degree, gauge):
 
 def _without_pose(model):
     """The model behind a leading similarity: every exposure has a pose of its own."""
-    if not isinstance(model, CompoundModel) or model.op != "|" or _has_series(model.left):
+    if (
+        not isinstance(model, CompoundModel)
+        or model.op != "|"
+        or any(isinstance(part, models.Legendre2D) for part in leaves(model.left))
+    ):
         return model
     if (model.left.n_inputs, model.left.n_outputs) != (2, 2):
         return model
@@ -163,19 +168,15 @@ def _without_pose(model):
     return model.right
 
 
-def _has_series(model):
-    return any(isinstance(part, models.Legendre2D) for part in leaves(model))
-
-
 def _expand(model, shape):
     """The `Expansion` of a caller's model on a detector."""
     own = _rebuilt(model, shape)
-    names = free_coefficients(own)
+    names = fitter.free_coefficients(own)
     start = np.array([getattr(own, name).value for name in names], dtype=float)
 
     def parts(u, v):
         q = basis.denormalize(u, v, shape).T
-        constant, columns = linear_parts(own, *q, names)
+        constant, columns = fitter.linear_parts(own, *q, names)
         return np.concatenate([[constant + np.tensordot(start, columns, 1) - q], columns])
 
     top = basis.MAX_DEGREE

@@ -6,8 +6,7 @@ from numbers import Real
 import numpy as np
 
 from ..exceptions import InputError
-from ..geometry import basis
-from ..geometry.fitter import free_coefficients
+from ..geometry import basis, fitter
 from ..inputs.reference_catalogue import read_reference, year
 from ..results.settings import Settings
 from ..runtime.checks import check_choice
@@ -71,7 +70,7 @@ class SolveOptions(Settings):
             raise InputError("a model says what is fitted in every exposure: leave degree='auto' and static out")
         if self.prior is not None:
             raise InputError("the static distortion is in the coefficients of model: leave prior out")
-        free_coefficients(self.model)  # refuses what is no map of the plane, ties and bounds
+        fitter.free_coefficients(self.model)  # refuses what is no map of the plane, ties and bounds
 
     def _check_static(self):
         check_choice(self.static, (None, "fit"), "static")

@@ -15,8 +15,7 @@ from astropy.io import fits
 from tqdm import tqdm
 
 from ..exceptions import ExportError, InputError
-from ..inputs.exposure_files import expand_paths, find_image
-from ..inputs.exposure_names import exposure_name
+from ..inputs import exposure_files, exposure_names
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, splice
 from ..runtime.outputs import replacing, replacing_folder
@@ -156,7 +155,7 @@ class _Plan:
 
 def _files(paths):
     """The files meant, each once."""
-    given = expand_paths(paths)
+    given = exposure_files.expand_paths(paths)
     other = next((path for path in given if not isinstance(path, (str, Path))), None)
     if other is not None:
         raise InputError(f"frames must be paths of FITS files, got {type(other).__name__}")
@@ -194,8 +193,7 @@ def _plan(solution, path, target, *, kind, max_error, ext, overwrite):
         if kind is not None:
             headers[name] = _header(solution, name, kind, max_error)
             start, data, stop, _ = spans[image]
-            renewed = exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)
-            edits.append((start, data, renewed))
+            edits.append((start, data, exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)))
     if images:
         edits += _asdf_edits(solution, images, spans, path=path, overwrite=overwrite)
     return _Plan(path, target, zlib.crc32(raw), headers, edits)
@@ -211,17 +209,17 @@ def _header(solution, name, kind, max_error):
 def _images(solution, raw, path, ext):
     """``{exposure: number of its HDU}`` of one file; empty if it was left out of the solution."""
     with open_bytes(raw) as hdulist:
-        candidates = {exposure_name(path, ext): ext}
+        candidates = {exposure_names.exposure_name(path, ext): ext}
         if ext is None:
             for i, hdu in enumerate(hdulist):
                 forms = (i, hdu.name, (hdu.name, hdu.ver)) if hdu.name else (i,)
-                candidates |= {exposure_name(path, form): form for form in forms}
+                candidates |= {exposure_names.exposure_name(path, form): form for form in forms}
         found = {name: form for name, form in candidates.items() if name in solution.names}
         if not found:
             return _nothing(solution, path, next(iter(candidates)))
         images = {}
         for name, form in found.items():
-            hdu = find_image(hdulist, form, str(path))
+            hdu = exposure_files.find_image(hdulist, form, str(path))
             if hdu.shape != tuple(solution.shapes[name]):
                 raise InputError(
                     f"{path}: the image has shape {hdu.shape}, exposure {name} of the solution "

@@ -5,8 +5,7 @@ from astropy import units as u
 from astropy.coordinates import ICRS
 from gwcs import coordinate_frames as cf
 
-from ..geometry import similarity
-from ..geometry.models import pose_model
+from ..geometry import models, similarity
 
 
 def exposure_wcs(name, pose, distortion, sky=None):
@@ -29,7 +28,7 @@ def exposure_wcs(name, pose, distortion, sky=None):
 
     steps = [
         (plane("detector"), distortion.correction_model()),
-        (plane("undistorted"), pose_model(similarity.invert(pose), "pose_inverse")),
+        (plane("undistorted"), models.pose_model(similarity.invert(pose), "pose_inverse")),
         (plane("reference"), None if sky is None else sky.model()),
     ]
     if sky is not None:

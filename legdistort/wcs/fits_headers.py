@@ -17,8 +17,7 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from numpy.polynomial.polynomial import polyval2d
 
 from ..exceptions import ExportError, InputError
-from ..geometry import basis, similarity
-from ..geometry.models import outside
+from ..geometry import basis, models, similarity
 from ..geometry.tangent_plane import TangentPlane
 from ..runtime.checks import check_choice
 
@@ -117,8 +116,7 @@ def header_error(header, pose, distortion, sky):
     """
     points = _detector_points(distortion.shape, np.linspace(-1, 1, _GRID))
     exact = _exact_sky(pose, distortion, sky, points)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FITSFixedWarning)
+    with warnings.catch_warnings(action="ignore", category=FITSFixedWarning):
         wcs = WCS(header)
     if not wcs.has_celestial:
         raise InputError(f"the header compared with exposure {distortion.name} has no celestial WCS")
@@ -163,7 +161,9 @@ def _reference_point(pose, distortion, sky):
     there = _exact_sky(pose, distortion, sky, centre[None])[0]
     tangent = similarity.apply(pose, similarity.invert(sky.matrix)[None, :, 2])
     pixel = distortion(tangent)[0]
-    near = not outside(distortion.inverse.valid, *tangent[0])  # elsewhere the series means nothing and may fold back
+    near = not models.outside(
+        distortion.inverse.valid, *tangent[0]
+    )  # elsewhere the series means nothing and may fold back
     if near and np.all(np.abs(pixel - centre) <= np.array([nx, ny]) / 2):
         return pixel, TangentPlane(sky.lon, sky.lat, similarity.identity())
     # far from the detector powers of the distance would lose digits
@@ -214,19 +214,16 @@ def _fit(points, target, degree):
 def _linear_header(kind, origin, tangent, cd):
     """The keywords of the linear part."""
     ends = {"sip": "TAN-SIP", "tpv": "TPV"}[kind]
-    header = fits.Header()
-    header["WCSAXES"] = (2, "number of WCS axes")
+    cards = [("WCSAXES", 2, "number of WCS axes")]
     for k, (axis, centre) in enumerate((("RA--", tangent.lon % 360), ("DEC-", tangent.lat)), start=1):
-        header[f"CTYPE{k}"] = f"{axis}-{ends}"
-        header[f"CUNIT{k}"] = "deg"
-        header[f"CRPIX{k}"] = (float(origin[k - 1]) + 1, "reference pixel, from 1")
-        header[f"CRVAL{k}"] = (float(centre), "[deg] at the reference pixel")
-    for a in (1, 2):
-        for b in (1, 2):
-            header[f"CD{a}_{b}"] = (float(cd[a - 1, b - 1]), "[deg/pix]")
-    header["LONPOLE"] = 180.0
-    header["RADESYS"] = "ICRS"
-    return header
+        cards += [
+            (f"CTYPE{k}", f"{axis}-{ends}"),
+            (f"CUNIT{k}", "deg"),
+            (f"CRPIX{k}", float(origin[k - 1]) + 1, "reference pixel, from 1"),
+            (f"CRVAL{k}", float(centre), "[deg] at the reference pixel"),
+        ]
+    cards += [(f"CD{a + 1}_{b + 1}", float(cd[a, b]), "[deg/pix]") for a, b in np.ndindex(2, 2)]
+    return fits.Header([*cards, ("LONPOLE", 180.0), ("RADESYS", "ICRS")])
 
 
 def _sip(polynomial, cd, offset, plane):
@@ -238,24 +235,21 @@ def _sip(polynomial, cd, offset, plane):
             break
     forward = np.tensordot(np.linalg.inv(cd), polynomial, axes=1)
     header = fits.Header()
-    for keys, tensors, lowest in ((("A", "B"), forward, 2), (("AP", "BP"), backward, 1)):
-        for key, tensor in zip(keys, tensors, strict=True):
-            degree = len(tensor) - 1
-            header[f"{key}_ORDER"] = degree
-            for i, j in np.transpose(basis.orders(degree)):
-                if i + j >= lowest:
-                    header[f"{key}_{i}_{j}"] = float(tensor[i, j])
+    for key, tensor, lowest in zip(("A", "B", "AP", "BP"), (*forward, *backward), (2, 2, 1, 1), strict=True):
+        degree = header[f"{key}_ORDER"] = len(tensor) - 1
+        terms = [(i, j) for i, j in np.transpose(basis.orders(degree)) if i + j >= lowest]
+        header.extend((f"{key}_{i}_{j}", float(tensor[i, j])) for i, j in terms)
     return header
 
 
 def _tpv(degree, cd, offset, plane):
     """TPV keywords: the same polynomial in degrees after the CD matrix; axis 2 has x and y exchanged in its terms."""
     polynomial, _ = _fit(offset @ cd.T, plane, degree)
-    header = fits.Header()
-    for axis, tensor in ((1, polynomial[0]), (2, polynomial[1].T)):
-        for i, j in np.transpose(basis.orders(degree))[1:]:
-            header[f"PV{axis}_{_TPV_FIRST[i + j] + j}"] = float(tensor[i, j])
-    return header
+    return fits.Header(
+        (f"PV{axis}_{_TPV_FIRST[i + j] + j}", float(tensor[i, j]))
+        for axis, tensor in ((1, polynomial[0]), (2, polynomial[1].T))
+        for i, j in np.transpose(basis.orders(degree))[1:]
+    )
 
 
 def _round_up(value):

@@ -263,9 +263,8 @@ def _drizzle(data, masks, variance, pixel_map, resampling):
     variances = np.broadcast_to(variance, (*np.shape(variance)[:-2], *data.shape))
     good = ~masks.get("bad", np.zeros(data.shape, dtype=bool))
     value, spread, coverage = drizzle(data, good, variances.reshape(-1, *data.shape), pixel_map, resampling)
-    full = None
-    if "full" in masks:
-        full = drizzle(masks["full"], good, [], pixel_map, resampling)[0] > _BAD_WEIGHT
+    has_full = "full" in masks
+    full = drizzle(masks["full"], good, [], pixel_map, resampling)[0] > _BAD_WEIGHT if has_full else None
     return Resampled(value, np.reshape(spread, (*variances.shape[:-2], *value.shape)), full, coverage)
 
 

@@ -12,8 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 
-from ...geometry import similarity
-from ...geometry.models import outside
+from ...geometry import models, similarity
 from ..grids import outline
 
 log = logging.getLogger(__name__)
@@ -199,16 +198,16 @@ class ExposureMap:
         centres = (-_TOLERANCE, nx - 1 + _TOLERANCE, -_TOLERANCE, ny - 1 + _TOLERANCE)
         # The map has an inverse where it is valid: what holds along the edge of a piece then holds within.
         edge = self.table.along_edge(rows, columns)
-        valid = edge is not None and not outside(self.valid, edge[2], edge[3]).any()
+        valid = edge is not None and not models.outside(self.valid, edge[2], edge[3]).any()
         widened = (slice(s.start - border, s.stop + border) for s in (rows, columns))
         everything = self.table(*widened, [0, 1, 4] if valid else [0, 1, 4, 2, 3])
         wider, planes = (everything[:2], everything[:, 1:-1, 1:-1]) if border else (None, everything)
-        if valid and not outside(centres, edge[0], edge[1]).any():
+        if valid and not models.outside(centres, edge[0], edge[1]).any():
             inside = np.ones(planes[0].shape, dtype=bool)
         else:
-            inside = ~outside(centres, planes[0], planes[1])
+            inside = ~models.outside(centres, planes[0], planes[1])
             if not valid:
-                inside &= ~outside(self.valid, planes[3], planes[4])
+                inside &= ~models.outside(self.valid, planes[3], planes[4])
             if not inside.any():
                 return None
         seen = edge[:2] if valid else planes[:2, inside]

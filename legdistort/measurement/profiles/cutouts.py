@@ -55,8 +55,7 @@ class Stamps:
             wide[params[rows, 2] <= 0] = 0
             core[rows] = wide[:, self.core]
             np.add.at(total, self.index_wide[rows][self.inside_wide[rows]], wide[self.inside_wide[rows]])
-        others = total[self.index] - core
-        return own, np.where(self.inside, others, 0)
+        return own, np.where(self.inside, total[self.index] - core, 0)
 
     def near(self, params, radius):
         """Pixels within a radius of the fitted centres, (n, npix)."""

@@ -92,8 +92,7 @@ def _folds(matches):
     if len(seen) < 2:
         raise InputError(f"degree={AUTO!r} needs stars that two exposures or more see; there are {len(seen)} of them")
     n = len(seen) if len(seen) <= FEW else N_FOLDS
-    parts = np.array_split(np.random.default_rng(0).permutation(seen), n)
-    return [np.isin(star, part) for part in parts]
+    return [np.isin(star, part) for part in np.array_split(np.random.default_rng(0).permutation(seen), n)]
 
 
 def _squares(solution, table):
@@ -155,7 +154,7 @@ def folding(solution, degree, higher):
     alone = np.mean([_fold(solution, name, low, high)[:, strongest] ** 2 for name in solution.names], axis=0)
     size = beyond * np.sqrt((folded**2).mean(axis=(0, 2)))  # per mode: rms over exposures and axes
     degrees = orders[:low].sum(axis=1)
-    found = _rms(departure)
+    found = float(np.sqrt((departure**2).mean(axis=(0, 1)).sum()) / 2)  # rms over the detector, exposures and axes
     return AliasedDegree(
         degree=int(higher),
         found=found,
@@ -186,15 +185,12 @@ def _fold(solution, name, low, high):
     return np.linalg.lstsq((b[:low] * weight).T, (b[high] * weight).T, rcond=None)[0]
 
 
-def _rms(coefficients):
-    """Rms over field, exposures and axes of (n_exposures, 2, n) coefficients, pixels."""
-    return float(np.sqrt((coefficients**2).mean(axis=(0, 1)).sum()) / 2)
-
-
 def _sentence(degree, degrees, scores, aliasing):
     """The choice and the alarm in words."""
-    words = f"{degree}, of {degrees[0]} to {degrees[-1]}: stars kept out scatter least with it, by "
-    words += f"{np.sqrt(scores[degrees.index(degree)]):.2f} of their errors"
+    words = (
+        f"{degree}, of {degrees[0]} to {degrees[-1]}: stars kept out scatter least with it, by "
+        f"{np.sqrt(scores[degrees.index(degree)]):.2f} of their errors"
+    )
     if degree == HIGHEST:
         words += "; it is the highest that was tried"
     elif degree == degrees[-1]:
@@ -211,5 +207,4 @@ def _in_words(a, degree):
 
 
 def _mode(orders):
-    factors = [f"{axis}^{n}" if n > 1 else axis for axis, n in zip("xy", orders, strict=True) if n]
-    return " ".join(factors) or "a shift"
+    return " ".join(f"{axis}^{n}" if n > 1 else axis for axis, n in zip("xy", orders, strict=True) if n) or "a shift"

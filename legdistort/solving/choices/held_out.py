@@ -129,6 +129,5 @@ def validation(solution, table, fraction):
 
 def _expected(solution, xy, sigma, seen):
     """Expected scatter of every star (n_stars,), NaN where fewer than two exposures see it."""
-    n = np.maximum(seen.sum(axis=0), 1)[:, None]
-    place = np.where(seen[..., None], xy, 0).sum(axis=0) / n
+    place = np.where(seen[..., None], xy, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]
     return accuracy.expected_scatter(solution, place, np.where(seen, sigma, 1), seen=seen)

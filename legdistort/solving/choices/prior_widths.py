@@ -16,8 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from ...exceptions import ConvergenceWarning, warn
-from ...geometry import basis
-from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
+from ...geometry import basis, detector_modes
 from ...priors.prior import Prior
 from ..equations import criterion, elimination
 from ..equations.problem import State, by_exposure
@@ -113,8 +112,7 @@ def find_widths(fit, prior, degree, unit, *, scale=False):
     widths = Widths(wanted, np.full((len(wanted), degree), unit))
 
     def fitted():
-        with warnings.catch_warnings(record=True) as caught:  # of the last fit they are told
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:  # of the last fit they are told
             return fit(widths.resolve(prior)), caught
 
     for _ in range(MAX_ROUNDS if degree else 0):
@@ -275,11 +273,11 @@ def evidence(problem, state, labels, motion):
     problem = replace(problem, prior_sigma=None if np.isinf(sigma).all() else sigma)
     blocks, unknowns = criterion.linearise(problem, state), problem.unknowns
     n = problem.n_modes
-    degree, departure = dynamic_degrees(n), state.coefficients - problem.prior_mean
+    degree, departure = detector_modes.dynamic_degrees(n), state.coefficients - problem.prior_mean
     sought = degree <= labels.shape[1]
     rows, label, origin = [], [], []
     for i in np.flatnonzero(wanted):
-        mine = dynamic_basis(problem.shapes[i], n)[sought]
+        mine = detector_modes.dynamic_basis(problem.shapes[i], n)[sought]
         place = np.zeros((problem.n_exposures, 2 * n, len(mine)))
         place[i] = mine.T
         rows.append(unknowns.gather(place).T)

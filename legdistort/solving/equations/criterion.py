@@ -16,8 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...geometry import basis
-from ...geometry.detector_modes import dynamic_basis
+from ...geometry import basis, detector_modes
 
 #: Weight on steps along directions that are fixed, relative to that of the data.
 _HOLD = 1e4
@@ -79,7 +78,7 @@ def prior_precision(problem, i):
     if not problem.has_widths(i):
         return out
     sigma = np.minimum(problem.prior_sigma[i].ravel(), 1e6)  # infinity stands for free
-    others = dynamic_basis(problem.shapes[i], problem.n_modes)
+    others = detector_modes.dynamic_basis(problem.shapes[i], problem.n_modes)
     others = others[np.any((others != 0) & (sigma > 0), axis=1)]
     return out + others.T @ np.linalg.solve(others * sigma**2 @ others.T, others)
 

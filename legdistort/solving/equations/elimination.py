@@ -80,6 +80,5 @@ def star_factors(problem, blocks, *, n_block=512):
             star, f, b = problem.star[lo:hi], blocks.coupling[:, :, lo:hi], blocks.values[:, lo:hi]
             column = [f[0] * l00[star] + f[1] * l10[star], f[1] * l11[star]]  # each (axis, n)
             for k in (0, 1):
-                rows = (column[k][:, None, :] * b).reshape(size, -1)
-                factor[i * size : (i + 1) * size, k, star - first] = rows
+                factor[i * size : (i + 1) * size, k, star - first] = (column[k][:, None, :] * b).reshape(size, -1)
         yield factor.reshape(len(factor), -1)

@@ -10,8 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...geometry import basis
-from ...geometry.detector_modes import dynamic_basis, similarity_basis
+from ...geometry import basis, detector_modes
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +58,10 @@ class Unknowns:
         n, own, common = self.n_modes, [], []
         for g in range(int(self.group.max()) + 1):
             shape = self.shapes[int(np.argmax(self.group == g))]
-            rows = dynamic_basis(shape, n)
+            rows = detector_modes.dynamic_basis(shape, n)
             degree = np.concatenate([[1, 1], np.tile(np.add(*basis.orders(self.degree))[3:], 2)])
             mine = degree <= self.own_degree
-            own.append(np.concatenate([similarity_basis(shape, n), rows[mine]]))
+            own.append(np.concatenate([detector_modes.similarity_basis(shape, n), rows[mine]]))
             common.append(rows[~mine])
         return np.stack(own), np.stack(common)
 
