@@ -249,7 +249,8 @@ def do_predict(a):
     plans = prediction.alternatives()
     rows = [dict(zip(plans.colnames, row, strict=True)) for row in plans.as_array().tolist()]
     own, *others = ({key: None if value != value else value for key, value in row.items()} for row in rows)  # no NaN
-    _say(a, f"{prediction}\n\n{show(plans)}", own | {"alternatives": others, "failed": plans.meta["failed"]})
+    own |= {"unknown": list(prediction.solution.gauge.unknown_names), "alternatives": others}
+    _say(a, f"{prediction}\n\n{show(plans)}", own | {"failed": plans.meta["failed"]})
 
 
 def do_simulate(a):

@@ -1,9 +1,9 @@
 """Errors of new positions, reported against true: ``python tests/benchmarks/new_positions_table.py``.
 
 Of the sets of ``calibration_table.py`` every second star is kept out of the solution, and its positions in every
-exposure are corrected with it. Relative: mean of (error / reported error)^2, once one cubic map of all new positions and
-the unknown directions are fitted and taken off. Absolute: mean square of the errors over that reported, once the similarity of the stars is taken
-off, or none with a reference. Both should be 1.
+exposure are corrected with it. Relative: mean of (error / reported error)^2, once one cubic map of all new positions
+and the unknown directions are fitted and taken off. Absolute: mean square of the errors over that reported, once the
+similarity of the stars is taken off, or none with a reference. Both should be 1.
 """
 
 import argparse
