@@ -163,7 +163,7 @@ def draw_first_mosaic(run):
     solution_plots.plot_sigma_map(*solution.sigma_map(first), ax=panels[0])
     offset = run.mosaic.offset
     xy = np.column_stack([solution.stars["x"].value, solution.stars["y"].value]) - offset
-    solution_plots.plot_mosaic(run.mosaic, stars=xy, ax=panels[1])
+    stack_plots.plot_mosaic(run.mosaic, stars=xy, ax=panels[1])
     save(fig, "mosaic.png", colours=256)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .geometry.gsaoi import gsaoi_static
-from .pipeline import check_folder, run, write_summary
+from .pipeline import check_results, run, write_summary
 from .priors.prior import Prior
 from .results import accuracy
 from .simulation.observations import simulate_exposures
@@ -34,10 +34,10 @@ def run_demo(*, out, small=False, seed=0, overwrite=False, progress=False):
     Returns
     -------
     Run
-        Its summary has the figures of `compare` added.
+        Its summary has the figures of `compare_with_truth` added.
     """
     out = Path(out)
-    check_folder(out, overwrite)
+    check_results(out, overwrite)
     night = simulate_exposures(small=small, seed=seed, progress=progress)
     shape = night.truth.shape
     out.mkdir(parents=True, exist_ok=True)
@@ -46,12 +46,12 @@ def run_demo(*, out, small=False, seed=0, overwrite=False, progress=False):
         gsaoi_static(2, size=shape[1]), shape=shape, direction="detector_to_reference", degree=PRIOR_DEGREE
     )
     result = run(paths, out=out, prior=prior, overwrite=overwrite, progress=progress)
-    result.summary.update(compare(result.solution, night.truth, seed=seed))
+    result.summary.update(compare_with_truth(result.solution, night.truth, seed=seed))
     write_summary(out / "summary.json", result.summary)
     return result
 
 
-def compare(solution, truth, *, seed=0):
+def compare_with_truth(solution, truth, *, seed=0):
     """How far a solution is from the truth, and how far its own errors say it should be.
 
     Returns

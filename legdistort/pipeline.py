@@ -11,20 +11,27 @@ import numpy as np
 
 from .assessment import baselines, stack_quality
 from .coaddition.mosaicking import coadd
+from .coaddition.options import CoaddOptions
 from .exceptions import InputError, MatchError
-from .inputs.exposure_files import open_exposures
-from .inputs.exposures import expand_paths
+from .inputs.exposure_files import file_checksums, open_exposures
 from .inputs.table_files import write_stars
 from .matching.matcher import match
+from .matching.options import MatchOptions
+from .measurement.options import MeasureOptions
 from .measurement.positions import measure
 from .reporting.page import write_report
 from .results import accuracy
 from .runtime import outputs, provenance
+from .runtime.checks import options_from
+from .runtime.parallel import check_workers
 from .solving.estimation import solve
 from .solving.options import SolveOptions, check_reference
-from .wcs.files import write_wcs
+from .wcs.storage import write_wcs
 
 log = logging.getLogger(__name__)
+
+#: What `run` and the command ``solve`` leave in their folder, and replace there.
+RESULTS = ("solution.asdf", "stars.ecsv", "wcs", "mosaic.fits", "report.html", "summary.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +99,8 @@ def run(
     reference, epoch, pixel_scale : optional
         Catalogue to tie the positions to, see `legdistort.solve`.
     measuring, matching, solving, coadding : dict, optional
-        Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`. The stack is ``"clipped"`` here:
-        hot pixels and cosmic rays do not get into it.
+        Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`, all of them checked before a frame is
+        read. The stack is ``"clipped"`` here: hot pixels and cosmic rays do not get into it.
     compare : bool
         Also correct by shifts, by the prior's static distortion and shifts, and by a relative polynomial
         (`legdistort.assessment.baselines`), and report the scatter and the sharpness of the stack that each of them
@@ -116,57 +123,68 @@ def run(
         With the file, exposure or argument at fault.
     """
     out = Path(out)
-    check_folder(out, overwrite)
-    SolveOptions(degree=degree, clip=clip, **(solving or {}))
-    method = (solving or {}).get("method", "joint")
-    reference, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
-    timings = {}
+    check_results(out, overwrite)
+    measuring = _step_options(MeasureOptions, measuring, "measuring")
+    matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures)
+    solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=prior, clip=clip)
+    coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
+    tying = {"epoch": epoch, "pixel_scale": pixel_scale}
+    reference, tying["epoch"] = check_reference(reference, **tying, method=solving.method)
+    check_workers(workers)
+    share, timings = {"workers": workers, "progress": progress}, {}
     with _timed(timings, "read"):
         exposures = open_exposures(paths, ext=ext, progress=progress)
-        _check_shapes(exposures)
-        if min_exposures > len(exposures):
-            raise InputError(
-                f"min_exposures is {min_exposures}, but there are {len(exposures)} exposures: "
-                f"give min_exposures={len(exposures)} (--min-exposures) or less"
-            )
+        _check_exposures(exposures, min_exposures)
     with _timed(timings, "measure"):
-        share = {"workers": workers, "progress": progress}
-        detections = measure(exposures, **share, **(measuring or {}))
+        detections = measure(exposures, **vars(measuring), **share)
     with _timed(timings, "match"):
-        matches = match(detections, exposures=exposures, min_exposures=min_exposures, **(matching or {}))
+        matches = match(detections, exposures=exposures, **vars(matching))
     with _timed(timings, "solve"):
-        tying = {"reference": reference, "epoch": epoch, "pixel_scale": pixel_scale}
-        solution = solve(matches, degree=degree, prior=prior, clip=clip, **tying, **(solving or {}))
-        solution = provenance.with_inputs(solution, provenance.checksums(expand_paths(paths)))
-    comparison = None
+        solution = solve(matches, **vars(solving), reference=reference, **tying)
+        solution = provenance.with_inputs(solution, file_checksums(exposures))
+    with _timed(timings, "coadd"):
+        kept = [exposure for exposure in exposures if exposure.name in solution.names]
+        mosaic = coadd(kept, solution, **vars(coadding), **share)
+    with _timed(timings, "assess"):
+        quality = _if_possible(stack_quality.assess, mosaic, solution, exposures=kept)
+    comparison = stacks = None
     if compare:
         with _timed(timings, "compare"):
             comparison = baselines.compare(matches, solution, prior=prior)
-    coadding = {"method": "clipped"} | (coadding or {})
-    with _timed(timings, "coadd"):
-        kept = [exposure for exposure in exposures if exposure.name in solution.names]
-        mosaic = coadd(kept, solution, **share, **coadding)
-    with _timed(timings, "assess"):
-        judged = _if_possible(stack_quality.assess, mosaic, solution, exposures=kept)
-    stacks = None
-    if comparison and judged:
-        with _timed(timings, "compare"):
-            stacks = _if_possible(stack_quality.compare_stacks, kept, comparison, mosaic=mosaic, **coadding)
+            if quality:
+                stacks = _if_possible(stack_quality.compare_stacks, kept, comparison, mosaic=mosaic, **vars(coadding))
     with outputs.replacing_folder(out) as target:
         with _timed(timings, "write"):
             write_results(solution, target)
             mosaic.write(target / "mosaic.fits")
-        summary = summarise(solution, timings=timings) | {"fwhm_ratio": judged and judged.fwhm_ratio}
-        if judged:
-            summary["quality"] = asdict(judged)
-        if comparison:
-            summary["comparison"] = {name: accuracy.scatter_summary(made) for name, made in comparison.items()}
-        if stacks:
-            summary["stacks"] = stacks.figures()
-        shown = {"mosaic": mosaic, "summary": summary, "comparison": comparison, "stacks": stacks}
-        write_report(target / "report.html", solution, **shown)
+        summary = summarise(solution, timings=timings) | _assessed(quality, comparison, stacks)
+        shown = {"mosaic": mosaic, "comparison": comparison, "stacks": stacks}
+        write_report(target / "report.html", solution, summary=summary, **shown)
         write_summary(target / "summary.json", summary)
     return Run(out, solution, mosaic, summary)
+
+
+def _step_options(kind, given, argument, *, defaults=None, **own):
+    """The frozen options of a step: from its dict, from what `run` takes itself, and from the defaults of `run`."""
+    kind(**own)  # whatever is wrong with these is said without the dict
+    given = {} if given is None else given
+    if isinstance(given, dict):
+        for name in own.keys() & given:
+            raise InputError(f"{argument} has the option {name!r}: give it as the argument {name} of run itself")
+        given = (defaults or {}) | own | given
+    return options_from(kind, given, argument)
+
+
+def _assessed(quality, comparison, stacks):
+    """What the summary says of the mosaic and of other corrections, as far as it is known."""
+    figures = {"fwhm_ratio": quality and quality.fwhm_ratio}
+    if quality:
+        figures["quality"] = asdict(quality)
+    if comparison:
+        figures["comparison"] = {name: accuracy.scatter_summary(made) for name, made in comparison.items()}
+    if stacks:
+        figures["stacks"] = stacks.figures()
+    return figures
 
 
 def write_results(solution, target):
@@ -219,10 +237,10 @@ def _if_possible(judge, *args, **kwargs):
         return None
 
 
-def check_folder(out, overwrite):
+def check_results(out, overwrite):
     """Raise `InputError` if `out` cannot be a folder, or holds results and `overwrite` is false."""
     outputs.check_folder(out)
-    there = [name for name in outputs.RESULTS if (Path(out) / name).exists()]
+    there = [name for name in RESULTS if (Path(out) / name).exists()]
     if there and not overwrite:
         raise InputError(
             f"{out} already holds {', '.join(there)}; give overwrite=True (--overwrite) to replace a run, or another "
@@ -230,8 +248,8 @@ def check_folder(out, overwrite):
         )
 
 
-def _check_shapes(exposures):
-    """All frames of a run show one detector; a run on a mixture would co-add nonsense."""
+def _check_exposures(exposures, min_exposures):
+    """There are enough, and all show one detector: a run on a mixture would co-add nonsense."""
     if len(exposures) < 2:
         raise MatchError(
             f"only one exposure ({exposures[0].name}): the distortion is found from the differences between "
@@ -244,6 +262,11 @@ def _check_shapes(exposures):
                 f"exposure {exposure.name} has shape {exposure.shape}, {first.name} has {first.shape} (ny, nx): "
                 "give frames of one detector, or solve their tables with a shape for each"
             )
+    if min_exposures > len(exposures):
+        raise InputError(
+            f"min_exposures is {min_exposures}, but there are {len(exposures)} exposures: "
+            f"give min_exposures={len(exposures)} (--min-exposures) or less"
+        )
 
 
 @contextmanager

@@ -14,8 +14,8 @@ from legdistort.exceptions import InputError, SolveError
 from legdistort.geometry import similarity
 from legdistort.inputs.matches import Matches
 from legdistort.priors.prior import Prior
-from legdistort.reporting import comparison_plots
 from legdistort.reporting import page as report
+from legdistort.reporting.comparison import plot_comparison
 from legdistort.results import accuracy
 from legdistort.results.solution import Solution
 from legdistort.simulation.observations import simulate_exposures, simulate_gsaoi_matches, simulate_matches
@@ -214,7 +214,7 @@ def test_comparison_is_drawn_with_its_figures(compared, with_flux, night):
         table.remove_column("flux")
         matches = Matches.from_table(table, shape=night.truth.shape, poses=night.matches.poses)
         compared = baselines.compare(matches, solve(matches, prior=Prior(night.truth.static)))
-    ax = comparison_plots.plot_comparison(compared, noise=None if with_flux else lambda e: 2 * e)
+    ax = plot_comparison(compared, noise=None if with_flux else lambda e: 2 * e)
     texts = [text.get_text() for text in ax.get_legend().get_texts()]
     assert len(texts) == len(compared) + 1
     figures = accuracy.scatter_summary(compared["shift"])

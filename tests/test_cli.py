@@ -4,8 +4,11 @@ import inspect
 import json
 import os
 import re
+import runpy
 import signal
+import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import asdf
@@ -15,12 +18,19 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from legdistort import Solution, coadd, open_exposures
-from legdistort.cli import commands
+import legdistort
+from legdistort import Prior, Solution, calibrate_noise, coadd, match, measure, open_exposures, predict, solve
+from legdistort.cli import options, parser
+from legdistort.cli.arguments import given
+from legdistort.cli.commands import COMMANDS
 from legdistort.cli.parser import main
-from legdistort.coaddition import mosaicking
+from legdistort.coaddition import mosaicking, preparation
+from legdistort.demo import run_demo
 from legdistort.exceptions import InputError
+from legdistort.measurement.noise_curves import SOURCES
+from legdistort.measurement.profiles.frame_fit import BLENDS, PROFILES
 from legdistort.simulation.observations import simulate_exposures
+from legdistort.wcs.attachment import attach
 
 RESULTS = {"solution.asdf", "stars.ecsv", "wcs", "mosaic.fits", "report.html", "summary.json"}
 
@@ -148,7 +158,7 @@ def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, numb
     """By Ctrl-C, or by a batch system."""
     (tmp_path / "scratch").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
-    monkeypatch.setattr(mosaicking, "survey", lambda *args, **options: os.kill(os.getpid(), number))
+    monkeypatch.setattr(preparation, "measure_background", lambda *args, **options: os.kill(os.getpid(), number))
     usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
     before = signal.signal(number, usual)
     try:
@@ -281,12 +291,58 @@ def test_wrong_usage_exits_with_2(capsys):
     capsys.readouterr()
 
 
+def test_the_package_runs_as_the_command(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["python -m legdistort", "--version"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module("legdistort", run_name="__main__")
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"legdistort {legdistort.__version__}\n"
+
+
 @pytest.mark.parametrize("command", ["demo", "run", "measure", "match", "solve", "coadd", "simulate", "show", "report"])
 def test_help_has_an_example(command, capsys):
     with pytest.raises(SystemExit) as end:
         main([command, "--help"])
     assert end.value.code == 0
     assert f"Example: legdistort {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("function", "groups"),
+    [
+        (run_demo, [options.NIGHT]),
+        (simulate_exposures, [options.NIGHT]),
+        (legdistort.run, [options.FRAMES, options.WORKERS, options.COMPARING]),
+        (measure, [options.MEASURING, options.WORKERS]),
+        (calibrate_noise, [options.INJECTING, options.WORKERS]),
+        (match, [options.MATCHING]),
+        (solve, [options.SOLVING]),
+        (coadd, [options.COADDING, options.WORKERS, options.GRID]),
+        (attach, [options.FRAMES, options.ATTACHING]),
+        (predict, [options.PREDICTING]),
+        (Prior.from_model, [options.EXPANDING]),
+        (Solution.read, [options.SOLUTION]),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_options_have_the_names_of_arguments(function, groups):
+    """And what is done with those that have not is said in the command."""
+    own = {"prior_sigma", "tpv", "asdf_only", "where", "ext", "frame", "solution"}
+    known = inspect.signature(function).parameters
+    assert {name for group in groups for name in group if name not in known} <= own
+
+
+def test_words_of_measuring():
+    choices = {name: option.settings.get("choices") for name, option in options.MEASURING.items()}
+    assert (choices["profile"], choices["blends"], choices["errors"]) == (PROFILES, BLENDS, SOURCES)
+
+
+def test_what_stands_for_none():
+    arguments = parser._parser().parse_args(["coadd", "a.fits", "--solution", "s", "--out", "m", "--scale", "none"])
+    assert given(arguments, options.COADDING) == {"method": "clipped", "match_background": True, "scale": None}
+    arguments = parser._parser().parse_args(["run", "a.fits", "--out", "o", "--clip", "0", "--errors", "floor"])
+    assert given(arguments, options.SOLVING) == {"degree": 3, "clip": None, "errors": "floor"}
+    assert given(arguments, options.MEASURING) == {}
 
 
 def _coadd(demo, out, *more):
@@ -408,7 +464,8 @@ FOLDERS = {
 def _ready(monkeypatch, line, *, read, out):
     """The words of a command whose work would be a failure."""
     words = [{"IN": str(read), "OUT": str(out)}.get(word, word) for word in line.split()]
-    monkeypatch.setattr(commands, f"do_{words[0]}", lambda a: pytest.fail("the work began"))
+    command = replace(COMMANDS[words[0]], function=lambda a: pytest.fail("the work began"))
+    monkeypatch.setitem(COMMANDS, words[0], command)
     return [*words, "--quiet"]
 
 

@@ -22,15 +22,16 @@ from scipy.optimize import least_squares
 from legdistort.coaddition.grids import reference_grid
 from legdistort.coaddition.mosaicking import coadd
 from legdistort.coaddition.options import CoaddOptions
-from legdistort.coaddition.resampling.engines import fill_bad
+from legdistort.coaddition.preparation import fill_bad
 from legdistort.coaddition.resampling.pixel_maps import tabulate, trace
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError
-from legdistort.geometry import similarity as poses
+from legdistort.geometry import similarity
 from legdistort.geometry.basis import from_tensor
 from legdistort.geometry.distortion import Distortion
 from legdistort.geometry.models import outside
 from legdistort.geometry.tangent_plane import TangentPlane
-from legdistort.inputs.exposures import Exposure, read_exposures
+from legdistort.inputs.exposure_files import read_exposures
+from legdistort.inputs.exposures import Exposure
 from legdistort.runtime.checks import options_from
 
 SHAPE = (300, 400)
@@ -66,16 +67,16 @@ class StandIn:
         return self.distortions[name]
 
     def distort(self, name, xy):
-        q = poses.apply(self.poses[name], xy)
+        q = similarity.apply(self.poses[name], xy)
         p = self.distortions[name](q)
         p[outside(self.distortions[name].inverse.valid, *q.T)] = np.nan
         return p
 
     def correct(self, name, xy):
-        return poses.apply(poses.invert(self.poses[name]), self.distortions[name].invert(xy))
+        return similarity.apply(similarity.invert(self.poses[name]), self.distortions[name].invert(xy))
 
     def wcs(self, name):
-        m = poses.invert(self.poses[name])
+        m = similarity.invert(self.poses[name])
         to_reference = models.AffineTransformation2D(m[:, :2], m[:, 2])
         pixels = cf.Frame2D(name="detector", unit=(u.pix, u.pix))
         forward = self.distortions[name].model()
@@ -193,9 +194,9 @@ class TestReferencePlane:
         solution = StandIn({"a": np.column_stack([m, [0, 0]])}, {"a": distortion})
         mosaic = coadd([Exposure("a", np.ones(SHAPE))], solution)
         y, x = np.nonzero(mosaic.footprint)
-        q = poses.apply(solution.poses["a"], np.stack([x, y], 1) + mosaic.offset)
+        q = similarity.apply(solution.poses["a"], np.stack([x, y], 1) + mosaic.offset)
         assert np.all((q > -5) & (q < np.array(SHAPE[::-1]) + 5))
-        corner = poses.apply(solution.poses["a"], np.array([mosaic.offset], dtype=float))
+        corner = similarity.apply(solution.poses["a"], np.array([mosaic.offset], dtype=float))
         assert np.all((distortion(corner) > 0) & (distortion(corner) < SHAPE[::-1]))  # here it would have been
 
     def test_footprint_counts_detectors(self):
@@ -215,14 +216,14 @@ class TestReferencePlane:
         seen = mosaic.footprint > 0
         for edge in (seen[:2], seen[-2:], seen[:, :2], seen[:, -2:]):
             assert edge.any()
-        identity = StandIn({"a": poses.identity()}, {"a": Distortion(np.zeros((2, 1)), SHAPE)})
+        identity = StandIn({"a": similarity.identity()}, {"a": Distortion(np.zeros((2, 1)), SHAPE)})
         grid = reference_grid(["a"], identity)
         assert grid.shape == SHAPE
         assert grid.offset == (0, 0)
 
     def test_identity_returns_the_image(self):
         image = np.random.default_rng(0).normal(size=SHAPE)
-        identity = StandIn({"a": poses.identity()}, {"a": Distortion(np.zeros((2, 3)), SHAPE)})
+        identity = StandIn({"a": similarity.identity()}, {"a": Distortion(np.zeros((2, 3)), SHAPE)})
         for order in (0, 1, 3):
             mosaic = coadd([Exposure("a", image)], identity, order=order)
             np.testing.assert_allclose(mosaic.data, image, atol=1e-6)
@@ -623,6 +624,15 @@ class TestBadInput:
             assert coadd(dead, solution, weights={f.name: 1 for f in dead}).exposures == ("frame0",)
         with pytest.raises(InputError, match="scale: no exposure of that name is co-added: frame9"):
             coadd(frames[:1], solution, scale={"frame0": 1, "frame9": 2})
+
+    def test_names_with_other_letters_go_into_the_file(self, tmp_path):
+        solution, *_, exposures, _ = plain()
+        strange = Exposure("né", np.ones(SHAPE))
+        with pytest.warns(AssumptionWarning, match="left out of the mosaic: né"):
+            mosaic = coadd([*exposures, strange], solution)
+        mosaic.write(tmp_path / "m.fits")
+        history = str(fits.getheader(tmp_path / "m.fits")["HISTORY"])
+        assert "left out n\\xe9: it is not in the solution" in history
 
     def test_a_coarse_grid_is_for_other_algorithms(self):
         solution, *_, exposures, mosaic = plain()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from legdistort.coaddition.combination import combine, confirmed, margin
-from legdistort.coaddition.resampling.engines import resample_exposure
+from legdistort.coaddition.resampling.engines import Resampling, resample_exposure
 from legdistort.coaddition.resampling.pixel_maps import PixelMap
 
 SHAPE = (300, 300)
@@ -48,7 +48,7 @@ def scene(fwhm, profile=gaussian, *, hits=None, order=3, seed=0):
         inside = np.all((where >= 0) & (where <= SHAPE[0] - 1), axis=0)
         window = (slice(0, SHAPE[0]), slice(0, SHAPE[1]))
         pixel_map = PixelMap(window, where, inside, np.ones(SHAPE))
-        found = resample_exposure(image, {}, NOISE**2, pixel_map, order=order)
+        found = resample_exposure(image, {}, NOISE**2, pixel_map, Resampling(order=order))
         data.append((found.data, np.broadcast_to(found.variance, SHAPE)))
     data, variance = np.array(data, dtype=np.float32).swapaxes(0, 1)
     return data, variance, xy, flux

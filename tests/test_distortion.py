@@ -4,6 +4,7 @@ import copy
 import pickle
 import threading
 import tracemalloc
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -87,6 +88,21 @@ def test_stated_error_is_what_a_denser_grid_shows():
     dense = d.round_trip_error(d.inverse.tensors, np.column_stack([x.ravel(), y.ravel()]))
     assert dense <= 2 * d.inverse.error
     assert d.round_trip_error(d.inverse.tensors) == d.inverse.error
+
+
+def test_a_certified_inverse_is_checked_and_taken():
+    d = make(3, 10.0, (300, 500))
+    again = Distortion(d.coefficients, d.shape, "exp7", d.inverse)
+    assert again.inverse is d.inverse
+    with pytest.raises(FrozenInstanceError):
+        again.certified = None
+    wrong = replace(d.inverse, error=d.inverse.error + 1e-8)
+    with pytest.raises(InputError, match=r"the inverse of the distortion of exposure exp7 misses by .* was certified"):
+        Distortion(d.coefficients, d.shape, "exp7", wrong)
+    with pytest.raises(InputError, match=r"misses by .* coefficients or inverse were changed since"):
+        replace(again, coefficients=1.01 * d.coefficients)
+    with pytest.raises(InputError, match="is said to be valid in"):
+        Distortion(d.coefficients, d.shape, certified=replace(d.inverse, valid=(0.0, 1.0, 0.0, 1.0)))
 
 
 @settings(max_examples=20, deadline=None)

@@ -8,7 +8,8 @@ from test_coaddition import SHAPE, StandIn, check_stars, covered, expose, fit_st
 
 from legdistort.coaddition import block_stack
 from legdistort.coaddition.mosaicking import coadd
-from legdistort.coaddition.resampling.drizzling import KERNELS, Drop
+from legdistort.coaddition.options import CoaddOptions
+from legdistort.coaddition.resampling.drizzling import KERNELS
 from legdistort.exceptions import InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.distortion import Distortion
@@ -128,4 +129,4 @@ def test_without_the_package(monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", absent)
     with pytest.raises(InputError, match=r"needs the package drizzle: pip install legdistort\[drizzle\]"):
-        Drop()
+        CoaddOptions(algorithm="drizzle")

@@ -297,6 +297,16 @@ def test_the_highest_likelihood_is_found(monkeypatch):
         assert evidence.cost(np.log(widths))[0] < min(costs) + 0.02
 
 
+def test_widths_up_to_a_degree_below_that_of_the_fit():
+    """Modes beyond are free; where they do not scatter at all, nothing is singular."""
+    sim = simulate_matches(n_stars=14, n_exposures=6, degree=2, seed=3)
+    prior = Prior(sim.truth.static, sigma=0.5)
+    solution, lower = (solve(sim.matches, degree=degree, prior=prior) for degree in (3, 2))
+    assert solution.chi2 / solution.dof == pytest.approx(1, abs=4 * np.sqrt(2 / solution.dof))
+    assert_allclose(solution.positions, lower.positions, atol=0.02)
+    assert_allclose(solution.stars["x_err"].value, lower.stars["x_err"].value, rtol=0.2)
+
+
 # --- the number of modes that the data determine -----------------------------------------------------------------
 
 

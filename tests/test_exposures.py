@@ -10,7 +10,8 @@ from astropy.nddata import CCDData, InverseVariance, StdDevUncertainty
 from astropy.wcs import WCS
 
 from legdistort.exceptions import InputError
-from legdistort.inputs.exposures import Exposure, believable_wcs, read_exposures
+from legdistort.inputs.exposure_files import read_exposures
+from legdistort.inputs.exposures import Exposure, believable_wcs
 
 SHAPE = (30, 40)
 

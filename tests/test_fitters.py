@@ -21,7 +21,8 @@ from numpy.polynomial.legendre import legval2d
 from numpy.testing import assert_allclose, assert_array_equal
 
 from legdistort.exceptions import InputError, SolveError
-from legdistort.geometry.fitter import LegendreDistortionFitter, leaves
+from legdistort.geometry.fitter import LegendreDistortionFitter
+from legdistort.geometry.models import leaves
 
 NX, NY = 1200, 700
 DOMAIN = {"x_domain": (-0.5, NX - 0.5), "y_domain": (-0.5, NY - 0.5)}

@@ -22,7 +22,7 @@ from legdistort.inputs.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 from legdistort.solving.estimation import solve
-from legdistort.wcs.files import write_wcs
+from legdistort.wcs.storage import write_wcs
 
 PACKAGE = Path(legdistort.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 import legdistort as ld
 from legdistort.exceptions import InputError
 from legdistort.inputs.exposures import Exposure
-from legdistort.measurement import crowding as isolation
+from legdistort.measurement.crowding import LIMIT, displacement, is_deformed, is_isolated
 from legdistort.measurement.flags import UNUSABLE, Flag
 from legdistort.simulation.rendering import Moffat, add_noise, render
 
@@ -33,7 +33,7 @@ def test_displacement_is_that_of_a_fit_that_knows_no_neighbour(distance, fwhm):
     slopes = [(star(xy + s) - star(xy - s)) / 2e-3 for s in step]
     design = np.column_stack([*slopes, star(xy), np.ones(n)])
     shift = np.linalg.lstsq(design, star(xy + away, ratio), rcond=None)[0][:2]
-    ours = isolation.displacement([xy, xy + away], [1.0, ratio], fwhm)
+    ours = displacement([xy, xy + away], [1.0, ratio], fwhm)
     rtol = 0.15 if distance < 3 else 0.35  # there the box ends: little pull is left, and it hangs on the corners
     np.testing.assert_allclose(ours[0], shift, atol=rtol * np.hypot(*shift))
     assert ours[0] @ away > 0  # towards the neighbour
@@ -41,19 +41,19 @@ def test_displacement_is_that_of_a_fit_that_knows_no_neighbour(distance, fwhm):
 
 def test_displacements_add_as_vectors():
     xy, flux = np.array([[50.0, 50], [58, 50], [42, 50], [50, 60]]), np.array([1.0, 2.0, 2.0, 0.5])
-    shift = isolation.displacement(xy, flux, 4.0)
+    shift = displacement(xy, flux, 4.0)
     assert shift[0, 0] == pytest.approx(0, abs=1e-12)  # two equal ones on either side
     assert shift[0, 1] > 0
-    one = isolation.displacement(xy[[0, 1]], flux[[0, 1]], 4.0)[0]
-    double = isolation.displacement(xy[[0, 1]], [1.0, 4.0], 4.0)[0]
+    one = displacement(xy[[0, 1]], flux[[0, 1]], 4.0)[0]
+    double = displacement(xy[[0, 1]], [1.0, 4.0], 4.0)[0]
     np.testing.assert_allclose(double, 2 * one)
-    turned = isolation.displacement(xy[:, ::-1], flux, 4.0)
+    turned = displacement(xy[:, ::-1], flux, 4.0)
     np.testing.assert_allclose(turned, shift[:, ::-1], atol=1e-12)
-    assert (isolation.displacement([[0, 0], [100, 0]], [1, 1], 4.0) == 0).all()
-    dark = isolation.displacement(xy, [1.0, -2.0, 2.0, 0.5], 4.0)
+    assert (displacement([[0, 0], [100, 0]], [1, 1], 4.0) == 0).all()
+    dark = displacement(xy, [1.0, -2.0, 2.0, 0.5], 4.0)
     assert np.isnan(dark[1]).all()
     assert dark[0, 0] < 0
-    without = isolation.displacement(xy, flux, 4.0, sources=np.array([True, False, True, True]))
+    without = displacement(xy, flux, 4.0, sources=np.array([True, False, True, True]))
     np.testing.assert_allclose(without[0], dark[0])
 
 
@@ -78,7 +78,7 @@ def crowded(seed, *, spacing=8.0, size=500):
 @pytest.fixture(scope="module")
 def crowd():
     tables, pulls = zip(*(crowded(seed) for seed in range(8)), strict=True)
-    isolated = np.concatenate([isolation.is_isolated(table) for table in tables])
+    isolated = np.concatenate([is_isolated(table) for table in tables])
     return isolated, np.concatenate(pulls), np.concatenate([table["crowding"] for table in tables])
 
 
@@ -95,7 +95,7 @@ def test_column_and_flag(crowd):
     _, _, crowding = crowd
     assert (crowding >= 0).all()
     assert (crowding == 0).any()
-    assert (crowding > isolation.LIMIT).any()
+    assert (crowding > LIMIT).any()
 
 
 def test_unresolved_pairs_are_deformed_and_single_stars_are_not():
@@ -112,7 +112,7 @@ def test_unresolved_pairs_are_deformed_and_single_stars_are_not():
     deformed = (table["flags"] & Flag.DEFORMED) != 0
     assert deformed[np.isin(star, pairs)].all()
     assert deformed[~np.isin(star, pairs)].mean() < 0.03
-    assert not isolation.is_isolated(table)[deformed].any()
+    assert not is_isolated(table)[deformed].any()
 
 
 def test_shapes_that_scatter_make_no_star_deformed():
@@ -121,21 +121,19 @@ def test_shapes_that_scatter_make_no_star_deformed():
     shapes = np.array([-1.2, -1.2, 0.0, 1.0]) + 0.1 * rng.standard_normal((200, 4))
     covariance = np.tile(np.diag(np.full(4, 1e-6)), (200, 1, 1))
     usable, snr = np.ones(200, dtype=bool), rng.uniform(10, 100, 200)
-    assert isolation.is_deformed(shapes, covariance, snr=snr, usable=usable).mean() < 0.05
-    assert not isolation.is_deformed(
-        shapes[:5], covariance[:5], snr=snr[:5], usable=usable[:5]
-    ).any()  # too few to tell
+    assert is_deformed(shapes, covariance, snr=snr, usable=usable).mean() < 0.05
+    assert not is_deformed(shapes[:5], covariance[:5], snr=snr[:5], usable=usable[:5]).any()  # too few to tell
 
 
 def test_limit():
     table = QTable({"crowding": [0.0, 2.0, 5.0, np.inf], "flags": [0, 256, 0, 0]})
-    np.testing.assert_array_equal(isolation.is_isolated(table), [True, False, False, False])
-    np.testing.assert_array_equal(isolation.is_isolated(table, 6.0), [True, False, True, False])
+    np.testing.assert_array_equal(is_isolated(table), [True, False, False, False])
+    np.testing.assert_array_equal(is_isolated(table, 6.0), [True, False, True, False])
     for everything in (None, np.inf):
-        assert isolation.is_isolated(table, everything).all()
-    assert isolation.is_isolated(table["flags",]).all()  # tables of other programs
+        assert is_isolated(table, everything).all()
+    assert is_isolated(table["flags",]).all()  # tables of other programs
     with pytest.raises(InputError, match="isolation must be a positive number of standard errors, or None, got 0"):
-        isolation.is_isolated(table, 0)
+        is_isolated(table, 0)
 
 
 def test_match_leaves_out_what_is_not_isolated():

@@ -13,8 +13,9 @@ from reproject import reproject_interp
 from scipy.spatial import Delaunay
 from test_coaddition import SHAPE, SIGMA, StandIn, check_stars, covered, expose, fit_star, plain, scene, star_image
 
+from legdistort.coaddition.background import measure_background
 from legdistort.coaddition.combination import PixelFlag
-from legdistort.coaddition.levels import flux_scales, sky_variance, survey
+from legdistort.coaddition.flux_scales import flux_scales
 from legdistort.coaddition.mosaicking import coadd
 from legdistort.coaddition.options import CoaddOptions
 from legdistort.coaddition.weights import make_weights, stellar_widths
@@ -180,9 +181,9 @@ class TestWeights:
         for e in truth:
             counts = rng.poisson(e.data + 100)
             exposures.append(Exposure(e.name, counts.astype(float), uncertainty=np.sqrt(np.maximum(counts, 1))))
-        seen = survey(exposures[0], bad=np.zeros(SHAPE, dtype=bool), filled=exposures[0].data)
+        seen = measure_background(exposures[0], bad=np.zeros(SHAPE, dtype=bool), filled=exposures[0].data)
         assert seen.photons == pytest.approx(1, rel=0.1)
-        variance = sky_variance(seen, exposures[0].data, exposures[0].uncertainty ** 2)
+        variance = seen.sky_variance(exposures[0].data, exposures[0].uncertainty ** 2)
         assert np.median(variance[truth[0].data > 500]) == pytest.approx(100, rel=0.2)
         mosaic, plainly = (coadd(exposures, solution, weights=w) for w in ("variance", "noise"))
         xy = stars - mosaic.offset

@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from legdistort.exceptions import InputError, MatchError
 from legdistort.geometry import similarity
-from legdistort.inputs import matches as module
 from legdistort.inputs.matches import Matches
 from legdistort.inputs.table_files import read_table
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
@@ -219,13 +218,6 @@ def test_an_exposure_of_one_common_star_has_no_pose(sim):
     ):
         Matches.from_table(given, shape=SHAPE)
     Matches.from_table(given, shape=SHAPE, poses=sim.matches.poses)
-
-
-def test_robust_similarity_keeps_given_weights(sim):
-    xy = np.random.default_rng(0).uniform(0, 1000, (30, 2))
-    target = xy + np.where(np.arange(30) < 20, 0.0, 8.0)[:, None]
-    pose = module.robust_similarity(xy, target, weights=(np.arange(30) >= 20).astype(float))
-    assert_allclose(similarity.apply(pose, xy), xy + 8, atol=1e-6)
 
 
 # --- in and out of files -----------------------------------------------------------------------------------------

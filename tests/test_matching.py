@@ -23,12 +23,12 @@ from star_fields import (
 
 from legdistort.exceptions import AssumptionWarning, InputError, MatchError
 from legdistort.geometry import similarity
-from legdistort.matching.linking import Group, interlink, label_stars, tie
+from legdistort.matching.exposure_groups import Group, interlink, link, unite
 from legdistort.matching.matcher import match
-from legdistort.matching.merging import unite
 from legdistort.matching.options import MatchOptions
 from legdistort.matching.registration import Registration, register
-from legdistort.matching.seeds import offset_candidates, triangle_candidates
+from legdistort.matching.similarity_candidates import offset_candidates, triangle_candidates
+from legdistort.matching.star_labels import label_stars
 from legdistort.matching.star_lists import StarList, Warp
 from legdistort.simulation.observations import simulate_matches
 
@@ -86,7 +86,7 @@ def test_exposures_that_fit_no_single_one_fit_the_stars_of_all():
         StarList(np.column_stack([t["x"], t["y"]]), np.full(len(t), 0.07), SHAPE, np.asarray(t["flux"]))
         for t in (table[table["exposure"] == name] for name in names)
     ]
-    groups = tie(lists, lambda i, j: None)
+    groups = link(lists, lambda i, j: None)
     assert len(groups) > 1
     (whole,) = unite(lists, groups, lambda i, j: None)
     assert sorted(whole.poses) == list(range(6))
@@ -355,6 +355,22 @@ def test_no_star_in_enough_exposures():
         match(table, shape=SHAPE)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"min_exposures": None}, "min_exposures must be an integer of at least 2, got None"),
+        ({"min_exposures": 2.5}, "min_exposures must be an integer of at least 2, got 2.5"),
+        ({"columns": "star"}, "columns must be a dict .*, got 'star'"),
+        ({"tolerance": "1"}, "tolerance must be a positive number of pixels, got '1'"),
+        ({"reject_flags": "hot"}, "reject_flags must be an integer, .* got 'hot'"),
+        ({"isolation": "much"}, "isolation must be a positive number of standard errors, or None, got 'much'"),
+    ],
+)
+def test_options_of_the_wrong_kind(options, message):
+    with pytest.raises(InputError, match=message):
+        MatchOptions(**options)
+
+
 def test_options_are_the_arguments():
     parameters = inspect.signature(match).parameters
     options = {option.name: option.default for option in fields(MatchOptions)}
@@ -396,7 +412,7 @@ def test_exposure_tied_by_mistake_is_found_out():
     rng = np.random.default_rng(0)
     positions = [np.column_stack([t["x"], t["y"]]) for t in table.group_by("exposure").groups]
     lists = [StarList(xy, np.full(len(xy), 0.1), SHAPE) for xy in [*positions, rng.uniform(0, 2047, (90, 2))]]
-    (group,) = tie(lists[:6], lambda i, j: None)
+    (group,) = link(lists[:6], lambda i, j: None)
     false = Registration(
         np.arange(30), np.arange(30), np.zeros(30), Warp.from_pose(similarity.identity(), SHAPE), 1.0, 99.0
     )

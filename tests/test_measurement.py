@@ -26,7 +26,8 @@ from star_images import (
 
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.column_contract import DETECTED, check
-from legdistort.inputs.exposures import Exposure, read_exposures
+from legdistort.inputs.exposure_files import read_exposures
+from legdistort.inputs.exposures import Exposure
 from legdistort.measurement.flags import Flag
 from legdistort.measurement.options import MeasureOptions
 from legdistort.measurement.positions import measure
@@ -444,6 +445,11 @@ def test_frames_are_independent_and_inputs_untouched():
         ({"threshold": 0}, "threshold must be at least 2"),
         ({"max_stars": 0}, "max_stars must be at least 1"),
         ({"box": 8}, "box must be an odd number of pixels, at least 5, got 8"),
+        ({"box": 9.0}, "box must be an odd number of pixels, at least 5, got 9.0"),
+        ({"fwhm": "4"}, "fwhm must lie between 0.5 and 200 pixels, got '4'"),
+        ({"threshold": None}, "threshold must be at least 2"),
+        ({"max_stars": 2.5}, "max_stars must be at least 1, and an integer, got 2.5"),
+        ({"read_noise": "5"}, "read_noise must be a positive number, got '5'"),
         ({"gain": -1.0}, "gain must be a positive number, got -1.0"),
         ({"saturation": np.inf}, "saturation must be a positive number"),
         ({"profile": "mine"}, "profile must be one of 'own', 'shared', 'linear', got 'mine'"),

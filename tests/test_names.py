@@ -29,7 +29,7 @@ from legdistort.runtime import asdf_files
 from legdistort.simulation.observations import SimulatedExposures, simulate_exposures, simulate_matches
 from legdistort.solving.estimation import solve
 from legdistort.wcs.attachment import attach
-from legdistort.wcs.files import read_wcs, write_wcs
+from legdistort.wcs.storage import read_wcs, write_wcs
 
 #: Parts of URLs, of patterns, of home folders, of options, of formulae.
 FOLDERS = ["A#1", "A?x=1", "A;b", "D%41", "a Ä", "-x", "new\nline", "~x", "~", "http:", "file:", "A[1]*", "$A&b"]

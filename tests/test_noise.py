@@ -236,6 +236,7 @@ def test_uncertainty_plane_tells_the_photon_noise():
         ({"n_positions": 3}, "n_positions must be an integer of at least 10, got 3"),
         ({"seed": -1}, "seed must be an integer, 0 or above, got -1"),
         ({"measuring": {"threshold": 0.1}}, "threshold must be at least 2"),
+        ({"measuring": {"treshold": 3}}, "measuring has no option 'treshold'; it takes fwhm, threshold, "),
     ],
 )
 def test_bad_arguments(options, message):

@@ -24,12 +24,13 @@ from astropy.nddata import CCDData
 from test_coaddition import SHAPE, expose, scene
 
 import legdistort as ld
-from legdistort.coaddition import block_stack, levels, mosaicking
+from legdistort.coaddition import block_stack, preparation
 from legdistort.coaddition.resampling import engines
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError, LegdistortError
-from legdistort.inputs.exposure_files import ExposureFile
+from legdistort.inputs.exposure_files import ExposureFile, file_checksums
 from legdistort.runtime import scratch
-from legdistort.runtime.parallel import each
+from legdistort.runtime.parallel import map_items
+from legdistort.runtime.provenance import checksums
 
 COMPILED = pytest.mark.parametrize("compiled_from", [0, 1 << 62], ids=["compiled", "plain"])
 WORK = {"serial": {"workers": 1}, "threads": {"workers": 2, "threads": True}, "processes": {"workers": 2}}
@@ -76,17 +77,17 @@ class TestEach:
     @pytest.mark.parametrize("how", WORK)
     def test_results_warnings_log_and_errors_come_as_from_a_loop(self, how, caplog):
         with pytest.warns(AssumptionWarning, match="three is assumed"):
-            assert list(each(work, range(10), **WORK[how])) == [i * i for i in range(10)]
+            assert list(map_items(work, range(10), **WORK[how])) == [i * i for i in range(10)]
         assert sorted(r.getMessage() for r in caplog.records) == [f"item {i}" for i in range(10)]
         with pytest.raises(InputError) as caught:
-            list(each(work, [1, 99, 2], **WORK[how]))
+            list(map_items(work, [1, 99, 2], **WORK[how]))
         assert str(caught.value) == "99 is not a number to work on"  # no traceback of a worker in it
 
     def test_the_client_of_the_caller_is_used(self, client):
-        assert set(each(_process, range(8))) == set(client.run(os.getpid).values())
-        assert set(each(_process, range(8), workers=1)) == {os.getpid()}
+        assert set(map_items(_process, range(8))) == set(client.run(os.getpid).values())
+        assert set(map_items(_process, range(8), workers=1)) == {os.getpid()}
         with pytest.raises(InputError, match=r"^99 is not a number to work on$"):
-            list(each(work, [99]))
+            list(map_items(work, [99]))
 
     def test_few_items_are_in_flight(self):
         drawn, most = 0, 0
@@ -97,13 +98,13 @@ class TestEach:
                 drawn += 1
                 yield i
 
-        for done, _ in enumerate(each(abs, items(), workers=2, threads=True)):
+        for done, _ in enumerate(map_items(abs, items(), workers=2, threads=True)):
             most = max(most, drawn - done)
         assert most <= 8
 
     def test_a_process_that_dies_is_explained(self):
         with pytest.raises(LegdistortError, match="a worker process died: it ran out of memory, or this is a script"):
-            list(each(die, [1], workers=2))
+            list(map_items(die, [1], workers=2))
 
     @pytest.mark.parametrize("how", ["threads", "processes"])
     @pytest.mark.usefixtures("interruptible")
@@ -113,14 +114,14 @@ class TestEach:
         timer.start()
         begin = time.monotonic()
         with pytest.raises(KeyboardInterrupt):
-            list(each(time.sleep, [0.3] * 300, **WORK[how]))
+            list(map_items(time.sleep, [0.3] * 300, **WORK[how]))
         assert time.monotonic() - begin < 30
         assert set(multiprocessing.active_children()) <= before
 
     @pytest.mark.parametrize("workers", [0, -1, 1.5, True])
     def test_bad_numbers_of_workers(self, workers):
         with pytest.raises(InputError, match="workers must be a positive integer, or None for one, got"):
-            list(each(abs, [1], workers=workers))
+            list(map_items(abs, [1], workers=workers))
 
 
 def _process(i):
@@ -165,6 +166,16 @@ class TestExposureFiles:
                     np.testing.assert_array_equal(getattr(read, name), getattr(exposure, name))
             assert exposure.read() is exposure
             assert repr(handle) == f"<ExposureFile {handle.name!r}: 150 x 120 px in {handle.path}>"
+
+    def test_what_is_small_is_worked_out_once(self, frames, monkeypatch):
+        handles = ld.open_exposures([*frames[:2], CCDData(np.ones((5, 5)), unit="adu")])
+        assert file_checksums(handles) == checksums(*frames[:2])
+        for name in ("believable_wcs", "known_from_header"):
+            monkeypatch.setattr(f"legdistort.inputs.exposure_files.{name}", lambda *_, **__: pytest.fail("once more"))
+        for handle in handles[:2]:
+            read = handle.read()
+            assert read.header is handle.header
+            assert read.wcs is handle.wcs
 
     def test_an_extension_is_remembered(self, frames):
         (handle,) = ld.open_exposures(frames[1], ext="ERR")
@@ -401,8 +412,8 @@ class TestMosaicInBlocks:
             with pytest.raises(DiskFullError, match=r"No space left on the disk of .* give another folder as scratch="):
                 ld.coadd(exposures, solution, scratch=tmp_path)
         assert not any(tmp_path.iterdir())
-        survey = levels.survey
-        monkeypatch.setattr(mosaicking, "survey", lambda *args, **kwargs: time.sleep(0.5) or survey(*args, **kwargs))
+        measure = preparation.measure_background
+        monkeypatch.setattr(preparation, "measure_background", lambda *a, **k: time.sleep(0.5) or measure(*a, **k))
         threading.Timer(1, _thread.interrupt_main).start()
         with pytest.raises(KeyboardInterrupt):
             [ld.coadd(exposures, solution, workers=2, scratch=tmp_path) for _ in range(20)]

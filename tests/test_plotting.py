@@ -12,7 +12,7 @@ from matplotlib.quiver import Quiver, QuiverKey
 
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
-from legdistort.plots import elements, solution_plots
+from legdistort.plots import elements, solution_plots, stack_plots
 from legdistort.results.diagnostics import Diagnostics
 from legdistort.results.settings import Settings
 from legdistort.results.solution import Solution
@@ -56,7 +56,7 @@ def make_solution(
         status="converged after 4 iterations",
         gauge=SimpleNamespace(sentence="minimal: by convention", warning=""),
         uncertainty=SimpleNamespace(coefficients=1e-4 * np.eye(coefficients.size)),
-        settings=Settings(degree, "joint"),
+        settings=Settings(degree),
         diagnostics=Diagnostics(),
         left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},
     )
@@ -268,7 +268,7 @@ def test_flux_unit_is_shown_and_unknown_fluxes_are_left_out():
 
 def test_mosaic_is_averaged_in_blocks_and_keeps_its_pixels():
     mosaic = make_mosaic(300)
-    ax = solution_plots.plot_mosaic(mosaic, max_size=100, stars=[[10, 20], [200, 250]])
+    ax = stack_plots.plot_mosaic(mosaic, max_size=100, stars=[[10, 20], [200, 250]])
     (image,) = ax.images
     assert image.get_array().shape == (100, 100)
     assert np.ma.getmaskarray(image.get_array())[:, :3].all()  # the strip of 10 pixels without data
@@ -290,7 +290,7 @@ def test_block_mean_ignores_what_is_not_finite():
 
 def test_mosaic_without_data_is_refused():
     with pytest.raises(InputError, match="no finite pixel"):
-        solution_plots.plot_mosaic(SimpleNamespace(data=np.full((5, 5), np.nan)))
+        stack_plots.plot_mosaic(SimpleNamespace(data=np.full((5, 5), np.nan)))
 
 
 def test_sigma_map_shows_the_rms_of_both_axes():
@@ -317,7 +317,7 @@ def test_axes_given_are_used_and_nothing_else_is_opened(solution):
 
     ax = Figure().subplots()
     assert solution_plots.plot_residuals(solution, ax=ax) is ax
-    assert solution_plots.plot_mosaic(make_mosaic(50), ax=Figure().subplots()).images
+    assert stack_plots.plot_mosaic(make_mosaic(50), ax=Figure().subplots()).images
     fig = Figure()
     assert solution_plots.plot_coefficients(solution, fig=fig)[0].figure is fig
     assert pyplot.get_fignums() == before

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from legdistort.exceptions import InputError
 from legdistort.geometry import similarity
-from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.geometry.tangent_plane import TangentPlane, angles, compass, directions, gnomonic
 
 
 @st.composite
@@ -91,6 +91,14 @@ def test_parity_can_be_held():
     assert similarity.describe(similarity.fit_similarity(XY, XY, parity=-1))["parity"] == -1
 
 
+def test_robust_fit_ignores_outliers_and_keeps_given_weights():
+    xy = np.random.default_rng(0).uniform(0, 1000, (30, 2))
+    target = xy + np.where(np.arange(30) < 20, 0.0, 8.0)[:, None]
+    assert_allclose(similarity.apply(similarity.robust_similarity(xy, target), xy), xy, atol=0.1)
+    pose = similarity.robust_similarity(xy, target, weights=(np.arange(30) >= 20).astype(float))
+    assert_allclose(similarity.apply(pose, xy), xy + 8, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("source", "weights", "message"),
     [
@@ -145,6 +153,27 @@ def test_tangent_plane_is_a_fits_tan(lon, lat):
 def test_tangent_plane_takes_any_frame():
     tp = plane()
     assert_allclose(tp.from_sky(tp.to_sky(XY).galactic), XY, atol=1e-5)
+
+
+@pytest.mark.parametrize(("lon", "lat"), [(201.3, -47.5), (0.0, 0.0), (359.9999, 60.0), (30.0, 89.999)])
+@pytest.mark.parametrize("degrees", [1.0, 1 / 3600])
+def test_gnomonic_projection_is_that_of_the_tangent_plane(lon, lat, degrees):
+    plane = TangentPlane(lon, lat, np.eye(2, 3))
+    offsets = np.random.default_rng(2).uniform(-2, 2, (30, 2))
+    sky = plane.to_sky(offsets)
+    ra = np.where(np.arange(30) % 2, sky.ra.deg, sky.ra.deg - 360)  # the same place
+    found = gnomonic(ra / degrees, sky.dec.deg / degrees, lon / degrees, lat / degrees, degrees)
+    assert_allclose(degrees * np.stack(found, axis=1), offsets, rtol=0, atol=1e-10)
+    assert np.isnan(gnomonic(lon + 180, -lat, lon, lat)).all()
+
+
+@given(st.floats(-3.1, 3.1), st.floats(-1.57, 1.57))
+def test_directions_and_compass_are_a_frame(lon, lat):
+    place = directions(lon, lat)
+    frame = np.stack([place, *compass(lon, lat)])
+    assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(frame) > 0
+    assert_allclose(angles(3 * place), (lon, lat), atol=1e-9)
 
 
 # --- errors on the sky ---------------------------------------------------------------------------------------------

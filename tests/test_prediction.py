@@ -1,6 +1,7 @@
 """Predictions against simulations, against a dense twin, and against the rules of thumb of the paper."""
 
 import json
+from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from legdistort.exceptions import AssumptionWarning, InputError, MatchError, Sol
 from legdistort.geometry import similarity
 from legdistort.inputs.matches import Matches
 from legdistort.priors.prior import Prior
-from legdistort.results import accuracy as performance
+from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
 from legdistort.simulation.prediction import predict
 from legdistort.simulation.truth import displacement
@@ -34,15 +35,15 @@ def outcomes(n_im, n_star, sigma, n, *, seed=0, n_grid=12):
     prior, rng = Prior(sim.truth.static), np.random.default_rng(seed + 1)
     prediction = predict(n_exposures=n_im, n_stars=n_star, sigma=sigma, prior=prior, seed=seed, n_grid=n_grid)
     grid = np.stack(np.meshgrid(prediction.x, prediction.y), axis=-1).reshape(-1, 2)
-    grid = grid[performance.in_contour(grid, prediction.contour)]
+    grid = grid[accuracy.in_contour(grid, prediction.contour)]
     squares = []
     for _ in range(n):
         table = sim.matches.table.copy()
         for axis in "xy":
             table[axis] += sigma * rng.normal(size=len(table)) * u.pix
         solution = solve(Matches.from_table(table, shape=SHAPE, poses=sim.matches.poses), prior=prior)
-        new = performance.new_scatter(solution, sim.truth.distort, grid, sigma, rng=rng)
-        squares.append((performance.bias(solution.positions, sim.truth.positions) ** 2, np.mean(new**2)))
+        new = accuracy.new_scatter(solution, sim.truth.distort, grid, sigma, rng=rng)
+        squares.append((accuracy.bias(solution.positions, sim.truth.positions) ** 2, np.mean(new**2)))
     mean, spread = np.mean(squares, axis=0), np.std(squares, axis=0)
     return prediction, np.sqrt(mean), spread / (2 * mean * np.sqrt(n))
 
@@ -94,10 +95,10 @@ def test_errors_are_those_that_solve_reports(settings):
             ratio = ours[name].value / reported[name].value
             assert np.median(ratio) == pytest.approx(1, abs=0.03)
             assert np.abs(ratio - 1).max() < 0.2
-        ratios.append((prediction.b_abs / performance.expected_bias(solution, absolute=True)) ** 2)
+        ratios.append((prediction.b_abs / accuracy.expected_bias(solution, absolute=True)) ** 2)
         xy = sim.truth.positions
         xy = xy[(np.abs(xy - 1023.5) < 500).all(axis=1)]  # on every detector
-        both = [performance.expected_scatter(s, xy, 0.14) for s in (prediction.solution, solution)]
+        both = [accuracy.expected_scatter(s, xy, 0.14) for s in (prediction.solution, solution)]
         assert_allclose(*both, rtol=0.01)
     assert np.mean(ratios) == pytest.approx(1, abs=0.3)  # the solution has its scatter from eight exposures
 
@@ -108,7 +109,7 @@ def test_aliasing_agrees_with_monte_carlo():
     spread = np.r_[np.zeros(10), np.full(5, 0.05), np.full(6, 0.03)]
     prediction = predict(n_exposures=6, n_stars=60, sigma=1.0, spectrum={4: 0.05, 5: 0.03}, n_grid=12)
     grid = np.stack(np.meshgrid(prediction.x, prediction.y), axis=-1).reshape(-1, 2)
-    grid = grid[performance.in_contour(grid, prediction.contour)]
+    grid = grid[accuracy.in_contour(grid, prediction.contour)]
     squares = []
     for seed in range(200):
         sim = simulate_matches(n_exposures=6, n_stars=60, sigma=1.0, noise=0, degree=5, static=0, dynamic=0, seed=0)
@@ -126,8 +127,8 @@ def test_aliasing_agrees_with_monte_carlo():
         def distort(name, xy, drawn=drawn):
             return xy + displacement(drawn[int(name[3:])], xy, SHAPE)
 
-        new = performance.new_scatter(solution, distort, grid, 0.0)
-        squares.append((performance.bias(solution.positions, sim.truth.positions) ** 2, np.mean(new**2)))
+        new = accuracy.new_scatter(solution, distort, grid, 0.0)
+        squares.append((accuracy.bias(solution.positions, sim.truth.positions) ** 2, np.mean(new**2)))
     measured = np.sqrt(np.mean(squares, axis=0))
     assert_allclose([prediction.b_alias, prediction.sigma_alias], measured, rtol=0.05)
 
@@ -425,6 +426,15 @@ def test_prints_a_table():
     assert "aliasing   together" in more
     with pytest.raises(AttributeError):
         p.b = 0
+
+
+def test_what_was_asked_for_stays_as_it_was():
+    settings = predict(**GOOD).settings
+    assert (settings.n_exposures, settings.n_stars, settings.sigma) == (GOOD["n_exposures"], None, GOOD["sigma"])
+    assert np.shape(settings.stars) == (GOOD["n_stars"], 2)  # those that were drawn
+    assert repr(settings) == f"<Plan: {GOOD['n_exposures']} exposures, degree 3, gauge minimal>"
+    with pytest.raises(FrozenInstanceError):
+        settings.degree = 2
 
 
 def test_alternatives():

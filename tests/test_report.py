@@ -2,6 +2,7 @@
 
 import base64
 import re
+from html import escape
 from html.parser import HTMLParser
 from io import BytesIO
 
@@ -15,6 +16,8 @@ from test_plotting import make_mosaic, make_solution
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
 from legdistort.reporting import page as report
+from legdistort.reporting.comparison import compared_corrections
+from legdistort.reporting.html import detached_figure, figure, wide_table
 from legdistort.simulation import observations
 from legdistort.solving.estimation import solve
 
@@ -103,6 +106,21 @@ def test_pictures_open_and_each_has_its_sentence(page, text):
         assert grey.max() == 255
         assert f"<figcaption>{attrs['alt']}</figcaption>" in text
         assert attrs["alt"].endswith(".")
+
+
+def test_captions_and_names_are_text_not_markup(solution):
+    """Whatever stands in a caption, the ``alt`` ends where it ends."""
+    caption = """Scatter of "a<b>&'c'" below 5" & more"""
+    made = figure(detached_figure(2, 2).subplots(), caption)
+    (attrs,) = Page(made).images
+    assert attrs["alt"] == caption
+    assert set(attrs) == {"src", "width", "alt"}
+    assert f"<figcaption>{escape(caption)}</figcaption>" in made
+    table = Page(f"<p>{wide_table({'name': '', 'a': 'px'}, [[name, name] for name in ODD])}</p>")
+    assert table.cells[2:] == [name for name in ODD for _ in range(2)]
+    section = Page(compared_corrections(dict.fromkeys(ODD[:3], solution)))
+    assert [row for row in section.cells if row in ODD] == ODD[:3]
+    assert {"b", "script"}.isdisjoint(table.tags + section.tags)
 
 
 def test_numbers_are_those_of_the_solution(page, solution):

@@ -155,7 +155,7 @@ def test_every_detector_has_its_own():
 @pytest.mark.parametrize("own", [0, 1])
 def test_says_what_dithers_alone_do_not_tell(own):
     sim = camera(rolls=None)
-    with pytest.warns(AssumptionWarning, match=r"(2 of 16|6 of 14) unknowns of the shared distortion are not told"):
+    with pytest.warns(AssumptionWarning, match=r"(4 of 16|6 of 14) unknowns of the shared distortion are not told"):
         solution = solve(sim.matches, static="fit", exposure_degree=own)
     assert len(solution.coefficients) == 12
 

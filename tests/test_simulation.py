@@ -12,7 +12,7 @@ from numpy.polynomial import legendre
 from legdistort.exceptions import FoldError, InputError
 from legdistort.geometry import basis, similarity
 from legdistort.geometry.gsaoi import GsaoiMap, gsaoi_polynomials, gsaoi_static
-from legdistort.inputs.exposures import read_exposures
+from legdistort.inputs.exposure_files import read_exposures
 from legdistort.priors.prior import Prior
 from legdistort.simulation.gsaoi_night import Night
 from legdistort.simulation.observations import simulate_exposures, simulate_gsaoi_matches, simulate_matches

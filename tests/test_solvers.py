@@ -1,5 +1,8 @@
 """Laws of the joint solution, and its agreement with the dense oracle and with the published scheme."""
 
+import dataclasses
+import inspect
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -12,11 +15,13 @@ from legdistort.geometry.detector_modes import similarity_part
 from legdistort.inputs.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
+from legdistort.runtime.checks import options_from
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving import start_values
 from legdistort.solving.equations import criterion, reduced_system
 from legdistort.solving.equations.problem import State, build_problem
 from legdistort.solving.estimation import solve
+from legdistort.solving.options import SolveOptions
 
 RNG = np.random.default_rng
 
@@ -269,6 +274,48 @@ def test_robust_losses_resist_outliers(loss):
 def test_bad_options_are_named(arguments, message):
     with pytest.raises(InputError, match=message):
         solve(simulate_matches().matches, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"order": 9}, r"^solving has no option 'order'; it takes degree, prior, model, .*max_iterations, validate$"),
+        ({"errors": "floor", "error_floor": 0.1}, "^solving: errors='floor' finds the error floor itself"),
+        ({"static": "fit", "exposure_degree": 3}, "^solving: static='fit' shares the modes above exposure_degree=3"),
+        ({"degree": "high"}, "^solving: degree must be an integer or 'auto', got 'high'"),
+        ({"prior": 3}, "^solving: prior must be a Prior or a dict of them, got int"),
+        ({"model": 3}, "^solving: model must be one astropy model .*, got 3"),
+        ({"validate": 0.7}, "^solving: validate must be a fraction"),
+        ({"max_iterations": 0}, "^solving: max_iterations must be a positive integer, got 0"),
+    ],
+)
+def test_options_are_judged_without_data(given, message):
+    with pytest.raises(InputError, match=message):
+        options_from(SolveOptions, given, "solving")
+
+
+def test_options_are_the_arguments_and_frozen():
+    """Those of `solve`, at the same defaults, but for what concerns the reference."""
+    arguments = inspect.signature(solve).parameters
+    for field in dataclasses.fields(SolveOptions):
+        assert arguments[field.name].default == field.default
+    assert set(arguments) - {f.name for f in dataclasses.fields(SolveOptions)} == {
+        "matches", "reference", "epoch", "pixel_scale",
+    }  # fmt: skip
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        SolveOptions().degree = 4
+
+
+def test_an_exposure_left_out_is_told_once(caplog):
+    """However many fits it takes: the widths are found in several."""
+    sim = simulate_matches(n_stars=40, n_exposures=6, degree=2, dynamic=0.5, seed=3)
+    table = table_of(sim)
+    astray = table["exposure"] == "exp02"
+    table["x"][astray] = np.random.default_rng(0).permutation(table["x"][astray].value) * u.pix
+    matches = Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses)
+    solution = solve(matches, degree=2, prior=Prior(sim.truth.static, sigma="evidence"), clip=5)
+    assert list(solution.left_out) == ["exp02"]
+    assert len([r for r in caplog.records if "exposure exp02 is left out: " in r.getMessage()]) == 1
 
 
 def test_undetermined_problem_names_the_exposure():

@@ -18,7 +18,7 @@ from gwcs import coordinate_frames as cf
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
@@ -457,6 +457,19 @@ def test_prior_of_another_field(tmp_path, capsys):
     assert "gsaoi-9: no such file; give a file, gsaoi-1 ..." in capsys.readouterr().err
 
 
+def test_a_model_in_several_places_is_one(tmp_path):
+    """Aliases of YAML, which the walk through the tree follows."""
+    model = gsaoi_static(1)
+    part = {"wcs": model}
+    asdf.AsdfFile({"first": part, "second": [part, model]}).write_to(tmp_path / "d.asdf")
+    assert b"*id" in (tmp_path / "d.asdf").read_bytes()
+    options = {"direction": FORWARD, "shape": (2048, 2048)}
+    found = Prior.from_file(tmp_path / "d.asdf", **options)
+    assert_array_equal(found.mean, Prior.from_model(model, **options).mean)
+    for ext in ("first.wcs", "second.0.wcs", "second.1"):
+        assert_array_equal(Prior.from_file(tmp_path / "d.asdf", ext=ext, **options).mean, found.mean)
+
+
 # --- refusals -------------------------------------------------------------------------------------------------------
 
 
@@ -488,7 +501,7 @@ def files(folder):
     trees = {
         "empty": {"a": 1},
         "bare": {"model": bare},
-        "two": {"a": bare, "b": {"c": bare}},
+        "two": {"a": bare, "b": {"c": bare.copy()}},
         "one": {"model": models.Shift(1)},
     }
     for name, tree in trees.items():

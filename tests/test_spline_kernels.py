@@ -27,8 +27,8 @@ def test_values_are_those_of_reproject(order, dtype, shape):
     xy[:, 0, :4] = [[0, nx - 1, nx - 0.5, -0.5], [0, ny - 1, ny - 0.5, -0.5]]
     xy[0, 5, 5] = np.nan
     pixel_map = PixelMap((slice(90), slice(70)), xy, np.ones((90, 70), dtype=bool), np.ones((90, 70)))
-    expected = engines.resample([image], pixel_map, order=order)
-    found = engines.resample([image], pixel_map, order=order, compiled=True)
+    expected = engines.resample([image], pixel_map, engines.Resampling(order=order))
+    found = engines.resample([image], pixel_map, engines.Resampling(order=order, compiled=True))
     assert np.isnan(expected).any()
     assert_allclose(found, expected, rtol=1e-12 if dtype is np.float64 else 1e-7)  # NaN where reproject has it
 

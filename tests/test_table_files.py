@@ -400,7 +400,7 @@ def test_from_lists_to_stars_in_the_shell(tmp_path, capsys):
     solving = ["solve", str(tmp_path / "m.ecsv"), "--degree", "1", "--out", str(tmp_path / "r"), "--quiet"]
     assert parser.main(solving) == 0
     solution = Solution.read(tmp_path / "r" / "solution.asdf")
-    assert solution.provenance["inputs"] == provenance.checksums([*paths, tmp_path / "m.ecsv"])
+    assert solution.provenance["inputs"] == provenance.checksums(*paths, tmp_path / "m.ecsv")
     first = solution.residuals[solution.residuals["exposure"] == sim.matches.names[0]]
     assert set(np.round(first["x"].value, 6)) <= set(
         np.round(sim.matches.table["x"][sim.matches.table["exposure"] == sim.matches.names[0]].value, 6)

@@ -25,7 +25,7 @@ from legdistort.inputs.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 from legdistort.solving.estimation import solve
-from legdistort.wcs.files import write_wcs
+from legdistort.wcs.storage import write_wcs
 
 
 @pytest.fixture(scope="module")
@@ -261,6 +261,20 @@ def test_derivatives_are_those_of_the_stock_model():
     x, y = np.random.default_rng(0).uniform(-1, 1, (2, 20))
     ours, stock = (cls(2, 3, **box) for cls in (FastLegendre2D, models.Legendre2D))
     assert_array_equal(ours.fit_deriv(x, y, *ours.parameters), stock.fit_deriv(x, y, *stock.parameters))
+
+
+@pytest.mark.parametrize("fitter", [fitting.LinearLSQFitter, fitting.TRFLSQFitter])
+@pytest.mark.parametrize("size", [8, 2048])
+@pytest.mark.parametrize("window", [(-1, 1), (0, 1)])
+def test_series_of_small_and_large_detectors_are_fitted(fitter, size, window):
+    """Stars may lie beyond the detector, and the series may have another window."""
+    x, y = np.random.default_rng(4).uniform(-0.3 * size, 1.3 * size, (2, 300))
+    box = {"x_domain": (-0.5, size - 0.5), "y_domain": (-0.5, size - 0.5), "x_window": window, "y_window": (-1, 1)}
+    truth = models.Legendre2D(2, 1, **box, c0_0=0.3, c1_0=-1.0, c2_1=0.7)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Model is linear")
+        fitted = fitter()(FastLegendre2D(2, 1, **box), x, y, truth(x, y))
+    assert_allclose(fitted.parameters, truth.parameters, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("fitter", [fitting.TRFLSQFitter, fitting.LevMarLSQFitter])

@@ -13,7 +13,7 @@ import numpy as np
 from legdistort.geometry import basis
 from legdistort.geometry.gsaoi import GsaoiMap
 from legdistort.plots import elements
-from legdistort.reporting import comparison_plots
+from legdistort.reporting.comparison import plot_comparison
 from legdistort.results import accuracy
 
 IMAGES = Path(__file__).parents[1] / "images" / "paper"
@@ -282,7 +282,7 @@ def used_stars(twin, name):
 def corrections(solutions, noise):
     """Figure "ercomp": the four corrections, and the error of one measured position."""
     fig, ax = new(size=(7.4, 5.4))
-    comparison_plots.plot_comparison(solutions, noise=noise, ax=ax)
+    plot_comparison(solutions, noise=noise, ax=ax)
     return fig
 
 
@@ -405,5 +405,5 @@ def real_lists(found):
         ax.set_ylim(0, None)
         ax.legend(fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
         ax.grid(linewidth=0.3)
-        comparison_plots.plot_comparison(figures["corrections"], ax=panels[row, 1])
+        plot_comparison(figures["corrections"], ax=panels[row, 1])
     return fig

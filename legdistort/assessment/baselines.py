@@ -281,7 +281,7 @@ def _solution(matches, problems, state, gauge, covariance=None):
         blocks,
         gauge,
         Uncertainty(problem, blocks, gauge, scale=scale, coefficients=coefficients),
-        settings=Settings(problem.degree, gauge.kind, errors="scale"),
+        settings=Settings(problem.degree, method=gauge.kind, errors="scale"),
         diagnostics=Diagnostics(error_scale=scale),
         status=f"{gauge.kind}: solved directly",
         dof=dof,

@@ -6,6 +6,7 @@ All figures come from the same fits (`legdistort.assessment.star_shapes`) on the
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from astropy.nddata import extract_array
 from scipy.spatial import KDTree
 
 from ..coaddition.mosaicking import coadd
@@ -138,11 +139,11 @@ def assess(mosaic, solution, *, exposures=(), fwhm=None, max_stars=500):
     InputError
         If the image has another grid, no width is known, or no star can be measured.
     """
-    bench = _Bench.of([solution], fwhm, max_stars)
-    single = bench.of_exposures(exposures, solution)
-    found = bench.of_mosaic(mosaic, solution)
+    sample = _Sample.of([solution], fwhm, max_stars)
+    single = sample.of_exposures(exposures, solution)
+    found = sample.of_mosaic(mosaic, solution)
     keep = _common([found], single, bool(len(exposures)))
-    return _summary(found[keep], single and single[0][keep], bench.positions(solution)[keep])
+    return _summary(found[keep], single and single[0][keep], sample.positions(solution)[keep])
 
 
 def compare_stacks(exposures, comparison, *, mosaic, fwhm=None, max_stars=500, **coadding):
@@ -174,27 +175,27 @@ def compare_stacks(exposures, comparison, *, mosaic, fwhm=None, max_stars=500, *
     if baselines.METHOD not in comparison:
         raise InputError(f"comparison must hold {baselines.METHOD!r}, got {', '.join(comparison) or 'nothing'}")
     method = comparison[baselines.METHOD]
-    bench = _Bench.of(list(comparison.values()), fwhm, max_stars)
-    single = bench.of_exposures(exposures, method)
+    sample = _Sample.of(list(comparison.values()), fwhm, max_stars)
+    single = sample.of_exposures(exposures, method)
     places, found, cuts = None, {}, {}
     for name, solution in sorted(comparison.items(), key=lambda item: item[0] != baselines.METHOD):  # the method first
         stack = mosaic if solution is method else coadd(exposures, solution, **coadding)
-        found[name] = bench.of_mosaic(stack, solution)
+        found[name] = sample.of_mosaic(stack, solution)
         if places is None:
-            places = bench.corners(stack, found[name])
-        cuts[name] = [bench.cut(stack, solution, place) for place in places]
+            places = sample.corners(stack, found[name])
+        cuts[name] = [sample.cut(stack, solution, place) for place in places]
         del stack
     found, cuts = ({name: made[name] for name in comparison} for made in (found, cuts))
     keep = _common(found.values(), single, True)
-    true = bench.positions(method)[keep]
+    true = sample.positions(method)[keep]
     removed = next((d for d in range(method.degree, 1, -1) if len(true) >= 3 * basis.n_modes(d)), "similarity")
     each = single[0][keep]
     qualities = {SINGLE: _summary(each, each, position=_robust(single[1][:, keep].reshape(-1, 2)))}
     qualities |= {name: _summary(values[keep], each, true, removed=removed) for name, values in found.items()}
     zooms = [
         Zoom(
-            star=bench.stars[place],
-            place=tuple(bench.positions(method)[place].tolist()),
+            star=sample.stars[place],
+            place=tuple(sample.positions(method)[place].tolist()),
             cuts={name: cut[k] for name, cut in cuts.items()},
             fwhm={name: float(values[place, 2]) for name, values in found.items()},
         )
@@ -204,7 +205,7 @@ def compare_stacks(exposures, comparison, *, mosaic, fwhm=None, max_stars=500, *
 
 
 @dataclass(frozen=True, eq=False)
-class _Bench:
+class _Sample:
     """The stars that are measured everywhere, and the size of their cut-outs."""
 
     stars: np.ndarray
@@ -215,7 +216,11 @@ class _Bench:
         """The brightest isolated stars that all solutions have; the last one knows fluxes and widths."""
         method = solutions[-1]
         if fwhm is None:
-            fwhm = _known_fwhm(method)
+            if "fwhm" not in method.observations.colnames:
+                raise InputError(
+                    "the positions came without a column fwhm: give fwhm=, the width of the stars in pixels"
+                )
+            fwhm = float(np.nanmedian(column_contract.values(method.observations, "fwhm", "pix")))
         if not (np.isfinite(fwhm) and 0.5 <= fwhm <= 200):
             raise InputError(f"fwhm must lie between 0.5 and 200 pixels, got {fwhm!r}")
         if max_stars < 1:
@@ -239,7 +244,8 @@ class _Bench:
 
     def of_mosaic(self, mosaic, solution):
         """`measure_shapes` of a mosaic, positions on the reference plane."""
-        _check_plane(mosaic)
+        if mosaic.offset is None:
+            raise InputError("the mosaic is not on the reference plane; make one with coadd(..., grid=None)")
         found = measure_shapes(mosaic.data, self.positions(solution) - mosaic.offset, fwhm=self.fwhm)
         found[:, :2] += mosaic.offset
         return found
@@ -266,7 +272,8 @@ class _Bench:
         if not shapes:
             return None
         with np.errstate(all="ignore"):
-            return _nanmedian(np.stack(shapes)), np.stack(offsets)
+            median = np.ma.median(np.ma.masked_invalid(np.stack(shapes)), axis=0)
+            return median.filled(np.nan), np.stack(offsets)
 
     @property
     def _zoom_half(self):
@@ -297,26 +304,10 @@ class _Bench:
         half = self._zoom_half
         xy = self.positions(solution)[place] - mosaic.offset
         x, y = np.round(xy).astype(int)
-        padded = np.full((2 * half + 1, 2 * half + 1), np.nan, dtype=np.float32)
-        ny, nx = mosaic.shape
-        low, high = np.maximum([x - half, y - half], 0), np.minimum([x + half + 1, y + half + 1], [nx, ny])
-        if (high > low).all():
-            at = low - [x - half, y - half]
-            rows, columns = (slice(at[k], at[k] + high[k] - low[k]) for k in (1, 0))
-            padded[rows, columns] = mosaic.data[low[1] : high[1], low[0] : high[0]]
+        side = 2 * half + 1
         west, south = np.array([x, y]) - half - 0.5 - xy
-        return padded, (west, west + 2 * half + 1, south, south + 2 * half + 1)
-
-
-def _known_fwhm(solution):
-    if "fwhm" not in solution.observations.colnames:
-        raise InputError("the positions came without a column fwhm: give fwhm=, the width of the stars in pixels")
-    return float(np.nanmedian(column_contract.values(solution.observations, "fwhm", "pix")))
-
-
-def _check_plane(mosaic):
-    if mosaic.offset is None:
-        raise InputError("the mosaic is not on the reference plane; make one with coadd(..., grid=None)")
+        image = extract_array(mosaic.data, (side, side), (y, x), mode="partial", fill_value=np.nan)
+        return image.copy(), (west, west + side, south, south + side)  # the mosaic itself is not kept
 
 
 def _common(found, single, compared):
@@ -348,8 +339,3 @@ def _summary(values, single, true=None, *, removed=None, position=None):
 def _robust(offsets):
     """Scatter per axis of offsets (n, 2) about zero, from the median distance."""
     return float(np.nanmedian(np.hypot(*offsets.T)) / _MEDIAN_DISTANCE)
-
-
-def _nanmedian(stack):
-    """Median over the first axis, NaN where there is nothing."""
-    return np.ma.median(np.ma.masked_invalid(stack), axis=0).filled(np.nan)

@@ -1,12 +1,11 @@
-"""The arguments of the command line: values from their text, and paths that are checked before any work."""
+"""What an option of the command line is: value from text, way to a function, paths checked before any work."""
 
 import argparse
 
-from ..inputs.exposures import expand_paths
+from ..inputs.exposure_files import expand_paths
 from ..runtime.outputs import check_file, check_folder, check_not_read
 
-#: Arguments that name what is read.
-_READ = ("frames", "tables", "table", "sources", "solution", "stars", "prior", "reference", "grid")
+# -- values from their text
 
 
 def columns(text):
@@ -42,17 +41,81 @@ def number_or_name(text):
     return int(text) if text.isdigit() else text
 
 
-def check_paths(arguments):
+def extension(text):
+    """The extension of a FITS file: number, name, or ``NAME,VERSION`` as a pair."""
+    name, comma, number = text.partition(",")
+    return (name, int(number)) if comma and number.isdigit() else number_or_name(text)
+
+
+# -- what an option is
+
+
+class Option:
+    """How the command line takes one argument of a function.
+
+    Parameters
+    ----------
+    help : str
+    flag : str, optional
+        The flag, or a word for a positional argument; by default the name of the argument as a flag.
+    none : object
+        What stands for None.
+    path : {"read", "file", "folder", "results"}, optional
+        It names what is read, and must not be replaced; or what is written: a file, a folder in which nothing is
+        replaced, or the folder of the results of a run.
+    one_of : str, optional
+        Options with the same word here exclude one another; one of them is needed if they are `required`.
+    **settings
+        As `argparse.ArgumentParser.add_argument` takes them.
+    """
+
+    def __init__(self, help, flag=None, *, none=None, path=None, one_of=None, **settings):
+        self.flag, self.none, self.path, self.one_of = flag, none, path, one_of
+        self.settings = settings | {"help": help}
+
+
+def _flagged(groups):
+    for group in groups:
+        for name, option in group.items():
+            flag = option.flag or f"--{name.replace('_', '-')}"
+            yield name, flag, flag.lstrip("-").replace("-", "_"), option
+
+
+def add_options(parser, groups):
+    """Give a parser the options of some groups."""
+    exclusive = {}
+    for _, flag, _, option in _flagged(groups):
+        place, settings = parser, dict(option.settings)
+        if option.one_of is not None:
+            required = settings.pop("required", False)
+            if option.one_of not in exclusive:
+                exclusive[option.one_of] = parser.add_mutually_exclusive_group(required=required)
+            place = exclusive[option.one_of]
+        place.add_argument(flag, **settings)
+
+
+def given(arguments, *groups):
+    """Those options of some groups that were given, or have a default here, as keyword arguments of a function."""
+    found = {name: (getattr(arguments, dest), option.none) for name, _, dest, option in _flagged(groups)}
+    return {name: None if value == none else value for name, (value, none) in found.items() if value is not None}
+
+
+def check_paths(arguments, groups):
     """Raise `InputError` if an output of a command cannot be written, or would replace what is read."""
-    given = {name: value for name, value in vars(arguments).items() if value is not None}
-    folder = given.get("out") if "leaves" in given else None
-    files = [given[name] for name in ("out", "plot") if name in given and given[name] != folder]
-    replaced = [path for path in files if not path.is_dir()]
-    replaced += [folder / name for name in given.get("leaves", ()) if folder]
-    inputs = [path for name in _READ if name in given for path in expand_paths(given[name])]
+    named = {"read": [], "file": [], "folder": [], "results": []}
+    for _, _, dest, option in _flagged(groups):
+        value = getattr(arguments, dest)
+        if option.path is not None and value is not None:
+            named[option.path].append(value)
+    inputs = [path for value in named["read"] for path in expand_paths(value)]
+    replaced = [path for path in named["file"] if not path.is_dir()]
+    for folder in named["results"]:
+        from ..pipeline import RESULTS
+
+        replaced += [folder / name for name in RESULTS]
     for path in replaced:
         check_not_read(path, inputs)
-    for path in files:
+    for path in named["file"]:
         check_file(path, overwrite=arguments.overwrite)
-    if folder:
+    for folder in named["folder"] + named["results"]:
         check_folder(folder)

@@ -1,14 +1,38 @@
-"""What the commands do: one function a command, its argument the parsed command line."""
+"""The commands: what each does, an example, its options, and the function that does it with the parsed command line."""
 
 import json
 import sys
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..exceptions import InputError
+from . import options
+from .arguments import given
 
-#: Arguments of `measure` by which it knows the detector.
-_DETECTOR = ("threshold", "gain", "read_noise", "saturation")
+
+@dataclass(frozen=True)
+class Command:
+    """A command: what it does, an example of its arguments, its groups of options, its function."""
+
+    what: str
+    example: str
+    groups: tuple
+    function: Callable
+
+
+#: The commands by name, in the order of the help.
+COMMANDS = {}
+
+
+def command(what, example, *groups):
+    """Make a function ``do_NAME`` the command NAME."""
+
+    def register(function):
+        COMMANDS[function.__name__.removeprefix("do_")] = Command(what, example, (options.COMMON, *groups), function)
+        return function
+
+    return register
 
 
 def wants_progress(a):
@@ -16,11 +40,17 @@ def wants_progress(a):
     return not a.quiet and sys.stderr.isatty()
 
 
+@command(
+    "simulate a night, solve it, compare with the truth",
+    "--out demo",
+    options.out("folder for frames and results", path="folder"),
+    options.NIGHT,
+)
 def do_demo(a):
     """``legdistort demo``."""
     from ..demo import run_demo
 
-    result = run_demo(out=a.out, small=a.small, seed=a.seed, overwrite=a.overwrite, progress=wants_progress(a))
+    result = run_demo(out=a.out, **given(a, options.NIGHT), overwrite=a.overwrite, progress=wants_progress(a))
     s = result.summary
     _report(a, result.solution, s)
     if not a.json:
@@ -35,27 +65,37 @@ def do_demo(a):
         )
 
 
+@command(
+    "frames to WCS, mosaic and report",
+    "frames/*.fits --out results --degree 3",
+    options.FRAMES,
+    options.out("folder for the results", path="results"),
+    options.MEASURING,
+    options.MATCHING,
+    options.SOLVING,
+    options.COADDING,
+    options.WORKERS,
+    options.COMPARING,
+)
 def do_run(a):
     """``legdistort run``."""
     from ..pipeline import run
 
+    matching, solving = given(a, options.MATCHING), _solving(a)
+    if a.method == "alternating":
+        solving.setdefault("clip", None)  # the published scheme has none
+    own = ("degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
     result = run(
-        a.frames,
+        **given(a, options.FRAMES),
         out=a.out,
-        ext=_extension(a.ext),
-        degree=a.degree,
-        prior=_prior_with_sigma(a),
-        min_exposures=a.min_exposures,
-        clip=_clip(a, 5.0),
-        **_tying(a),
-        measuring=_given(a, "fwhm", "profile", "blends", *_DETECTOR) | {"errors": a.position_errors},
-        matching=_given(a, "isolation"),
-        solving=_solving(a),
-        coadding=_coadding(a),
+        **{name: group.pop(name) for group in (matching, solving) for name in own if name in group},
+        measuring=given(a, options.MEASURING),
+        matching=matching,
+        solving=solving,
+        coadding=given(a, options.COADDING),
         compare=a.compare,
         overwrite=a.overwrite,
-        workers=a.workers,
-        progress=wants_progress(a),
+        **_share(a),
     )
     _report(a, result.solution, result.summary)
     if a.compare and not a.json:
@@ -66,86 +106,109 @@ def do_run(a):
         print(f"Results in {a.out}: open {Path(a.out) / 'report.html'}")
 
 
+@command(
+    "frames to a table of positions",
+    "frames/*.fits --out stars.ecsv",
+    options.FRAMES,
+    options.out("table (ECSV) of detections"),
+    options.MEASURING,
+    options.WORKERS,
+)
 def do_measure(a):
     """``legdistort measure``."""
-    from ..inputs.exposure_files import open_exposures
-    from ..inputs.exposures import expand_paths
+    from ..inputs.exposure_files import file_checksums
+    from ..inputs.table_files import write_table
+    from ..measurement.options import MeasureOptions
     from ..measurement.positions import measure
-    from ..runtime.provenance import checksums
 
-    exposures = open_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
-    given = _given(a, "fwhm", "profile", "blends", *_DETECTOR) | {"errors": a.position_errors}
-    table = measure(exposures, workers=a.workers, progress=wants_progress(a), **given)
+    measuring = given(a, options.MEASURING)
+    MeasureOptions(**measuring)  # which refuses them before a frame is read
+    exposures = _open(a)
+    table = measure(exposures, **measuring, **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
-    table.meta |= {"shapes": shapes, "inputs": checksums(expand_paths(a.frames))}
-    _write_table(table, a)
+    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures)}
+    write_table(table, a.out, overwrite=a.overwrite)
     _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
 
 
+@command(
+    "error of a position against flux, by injected stars",
+    "frames/a.fits --out noise.ecsv",
+    options.FRAMES,
+    options.out("table (ECSV) of errors against flux"),
+    options.INJECTING,
+    options.picture("picture of the curves"),
+    options.DETECTOR,
+    options.WORKERS,
+)
 def do_noise(a):
     """``legdistort noise``."""
-    from ..inputs.exposure_files import open_exposures
-    from ..measurement.noise_calibration import calibrate_noise
-    from ..runtime.outputs import replacing
+    from ..measurement.noise_calibration import calibrate_noise, check_injection
+    from ..measurement.options import MeasureOptions
 
-    curves = calibrate_noise(
-        open_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a)),
-        **_given(a, "fluxes", "fwhm", "n_positions", "seed"),
-        measuring=_given(a, *_DETECTOR),
-        workers=a.workers,
-        progress=wants_progress(a),
-    )
+    injecting, measuring = given(a, options.INJECTING), given(a, options.DETECTOR)
+    check_injection(**injecting)  # before a frame is read
+    MeasureOptions(**measuring)
+    curves = calibrate_noise(_open(a), **injecting, measuring=measuring, **_share(a))
     curves.write(a.out, overwrite=a.overwrite)
-    if a.plot is not None:
-        with replacing(a.plot, overwrite=a.overwrite) as file:
-            curves.plot().figure.savefig(file, format="png", dpi=120)
-    laws = [dict(zip(curves.laws.colnames, row, strict=True)) for row in curves.laws.as_array().tolist()]
-    laws = [{key: value if value == value else None for key, value in law.items()} for law in laws]  # no NaN in JSON
-    _say(a, curves, {"laws": laws, "out": str(a.out)})
+    _draw(curves, a)
+    _say(a, curves, {"laws": _records(curves.laws), "out": str(a.out)})
 
 
+@command(
+    "tables of positions to matched stars",
+    "A.lis B.lis C.lis --columns x_err=xe,y_err=ye --shape 1024 1024 --out matched.ecsv",
+    options.TABLES,
+    options.out("table (ECSV) of matched positions"),
+    options.TABLE,
+    options.MATCHING,
+)
 def do_match(a):
     """``legdistort match``."""
-    from ..inputs.table_files import stack
+    from ..inputs.table_files import stack, write_table
     from ..matching.matcher import match
 
     tables = [_read_table(path, a) for path in a.tables]
-    names = [name for table in tables for name in set(table["exposure"])]
+    names = [name for table in tables for name in dict.fromkeys(table["exposure"])]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
-    table = stack(tables)
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
-    matches = match(table, shape=tuple(a.shape) if a.shape else shapes or None, min_exposures=a.min_exposures,
-                    **_given(a, "isolation"))  # fmt: skip
+    matches = match(stack(tables), shape=tuple(a.shape) if a.shape else shapes or None, **given(a, options.MATCHING))
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
     matches = replace(matches, left_out=matches.left_out | empty)
-    out = matches.table.copy()
+    made = matches.table.copy()
     inputs = {name: checksum for each in tables for name, checksum in each.meta["inputs"].items()}
-    out.meta = matches.to_meta() | {"inputs": inputs}
-    _write_table(out, a)
-    figures = {"n_exposures": len(matches.names), "n_stars": len(matches.stars), "n_observations": len(out)}
+    made.meta = matches.to_meta() | {"inputs": inputs}
+    write_table(made, a.out, overwrite=a.overwrite)
+    figures = {"n_exposures": len(matches.names), "n_stars": len(matches.stars), "n_observations": len(made)}
     _say(a, repr(matches)[1:-1], figures | {"left_out": matches.left_out})
 
 
+@command(
+    "matched positions to distortions",
+    "matched.ecsv --degree 2 --out results",
+    options.MATCHED,
+    options.out("folder for the results", path="results"),
+    options.TABLE,
+    options.SOLVING | {"clip": options.clipping("no clipping")},
+)
 def do_solve(a):
     """``legdistort solve``."""
     from ..inputs.matches import Matches
-    from ..pipeline import check_folder, summarise, write_results, write_summary
+    from ..pipeline import check_results, summarise, write_results, write_summary
     from ..reporting.page import write_report
     from ..runtime.outputs import replacing_folder
     from ..runtime.provenance import with_inputs
     from ..solving.estimation import solve
 
-    check_folder(a.out, a.overwrite)
+    check_results(a.out, a.overwrite)
     table = _read_table(a.table, a)
     shape = tuple(a.shape) if a.shape else table.meta.get("shapes")
     if shape is None:
         raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
     matches = Matches.from_table(table, shape=shape, **Matches.read_meta(table.meta))
-    solution = solve(matches, degree=a.degree, prior=_prior_with_sigma(a, a.shape), clip=_clip(a, None),
-                     **_tying(a), **_solving(a))  # fmt: skip
-    solution = with_inputs(solution, table.meta["inputs"])
+    solution = with_inputs(solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
     summary = summarise(solution)
     with replacing_folder(a.out) as target:
         write_results(solution, target)
@@ -155,21 +218,17 @@ def do_solve(a):
     _report(a, solution, summary)
 
 
+@command(
+    "a known static distortion as a file for --prior",
+    "x.fits y.fits --out prior.asdf",
+    options.out("prior (ASDF)"),
+    options.EXPANDING,
+)
 def do_prior(a):
     """``legdistort prior``."""
     from ..priors.prior import Prior
 
-    prior = Prior.from_file(
-        a.sources,
-        ext=_extension(a.ext),
-        frame=a.frame,
-        shape=a.shape,
-        degree=a.degree,
-        direction=a.direction,
-        origin=a.origin,
-        sigma=a.sigma,
-        static_sigma=a.static_sigma,
-    )
+    prior = Prior.from_file(**given(a, options.EXPANDING))
     prior.write(a.out, overwrite=a.overwrite)
     rms_x, rms_y = map(float, prior.rms)
     figures = {"degree": prior.degree, "truncation_px": prior.truncation, "rms_px": [rms_x, rms_y]}
@@ -178,81 +237,84 @@ def do_prior(a):
     _say(a, f"{words}; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y; {a.out}", figures)
 
 
-def _coadding(a):
-    return _given(a, "order", "algorithm", "pixfrac", "kernel", "extrapolated", "conserve", "scratch") | {
-        "method": a.combine,
-        "match_background": not a.no_match_background,
-        "weights": None if a.weights == "equal" else a.weights,
-        "scale": None if a.scale == "none" else a.scale,
-    }
-
-
+@command(
+    "frames and a solution to a mosaic",
+    "frames/*.fits --solution results/solution.asdf --out mosaic.fits",
+    options.FRAMES,
+    options.SOLUTION | options.NAMED_SOLUTION,
+    options.out("mosaic (.fits, .fits.gz or .asdf)"),
+    options.GRID,
+    options.COADDING,
+    options.WORKERS,
+)
 def do_coadd(a):
     """``legdistort coadd``."""
     from ..coaddition.mosaic import check_ending
     from ..coaddition.mosaicking import coadd
-    from ..inputs.exposure_files import open_exposures
+    from ..coaddition.options import CoaddOptions
 
     check_ending(a.out)
     solution = _solution(a)
-    grid = _grid(a.grid, solution)
-    exposures = open_exposures(a.frames, ext=_extension(a.ext), progress=wants_progress(a))
-    share = {"workers": a.workers, "progress": wants_progress(a)}
-    mosaic = coadd(exposures, solution, grid=grid, **_coadding(a), **share)
+    coadding = given(a, options.COADDING) | {"grid": _grid(a.grid, solution)}
+    CoaddOptions(**coadding)  # which refuses them before a frame is read
+    mosaic = coadd(_open(a), solution, **coadding, **_share(a))
     mosaic.write(a.out, overwrite=a.overwrite)
     figures = {"shape": list(mosaic.shape), "n_exposures": len(mosaic.exposures), "left_out": mosaic.left_out}
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
 
 
+@command(
+    "the WCS of a solution into its frames",
+    "results/solution.asdf frames/*.fits --out calibrated",
+    options.SOLUTION,
+    options.FRAMES,
+    options.ATTACHING,
+)
 def do_attach(a):
     """``legdistort attach``."""
     from ..wcs.attachment import attach
 
-    done = attach(
-        _solution(a),
-        a.frames,
-        out=a.out,
-        in_place=a.in_place,
-        kind=None if a.asdf_only else "tpv" if a.tpv else "sip",
-        max_error=a.max_error,
-        ext=_extension(a.ext),
-        overwrite=a.overwrite,
-        progress=wants_progress(a),
-    )
+    keywords = given(a, options.FRAMES, options.ATTACHING)
+    tpv, asdf_only = keywords.pop("tpv"), keywords.pop("asdf_only")
+    kind = None if asdf_only else "tpv" if tpv else "sip"
+    done = attach(_solution(a), **keywords, kind=kind, progress=wants_progress(a))
     errors = {item.exposure: {"path": str(item.path)} | item.errors for item in done}
     _say(a, "\n".join(repr(item)[1:-1].partition(": ")[2] for item in done), errors)
 
 
+@command(
+    "expected errors of a planned set of exposures",
+    "--n-exposures 11 --n-stars 80 --sigma 0.02 --degree 3",
+    options.PREDICTING,
+    options.picture("map of the error over the field"),
+    options.REPLACING,
+    options.TABLE,
+)
 def do_predict(a):
     """``legdistort predict``."""
-    from ..runtime.outputs import replacing
-    from ..simulation.prediction import predict, show
+    from ..simulation.prediction import predict
+    from ..simulation.prediction_text import describe_plans
 
-    prediction = predict(
-        n_exposures=a.n_exposures,
-        stars=None if a.stars is None else _read_table(a.stars, a),
-        n_stars=a.n_stars,
-        density=a.density,
-        sigma=a.sigma,
-        degree=a.degree,
-        shape=tuple(a.shape or (2048, 2048)),
-        dithers=a.dither,
-        prior=_prior(a.prior, a.shape, a.static_sigma),
-        gauge=a.gauge,
-        dynamic=a.dynamic,
-        spectrum=a.spectrum,
-        seed=a.seed,
-    )
-    if a.plot is not None:
-        with replacing(a.plot, overwrite=a.overwrite) as file:
-            prediction.plot().figure.savefig(file, format="png", dpi=120)
+    keywords = given(a, options.PREDICTING) | {"prior": _prior(a.prior, a.shape, a.static_sigma)}
+    keywords.pop("static_sigma", None)
+    if a.stars is not None:
+        keywords["stars"] = _read_table(a.stars, a)
+    if a.shape is not None:
+        keywords["shape"] = tuple(a.shape)
+    prediction = predict(**keywords)
+    _draw(prediction, a)
     plans = prediction.alternatives()
-    rows = [dict(zip(plans.colnames, row, strict=True)) for row in plans.as_array().tolist()]
-    own, *others = ({key: None if value != value else value for key, value in row.items()} for row in rows)  # no NaN
+    own, *others = _records(plans)
     own |= {"unknown": list(prediction.solution.gauge.unknown_names), "alternatives": others}
-    _say(a, f"{prediction}\n\n{show(plans)}", own | {"failed": plans.meta["failed"]})
+    _say(a, f"{prediction}\n\n{describe_plans(plans)}", own | {"failed": plans.meta["failed"]})
 
 
+@command(
+    "frames of a simulated night with their truth",
+    "--out night --small",
+    options.out("folder for the frames", path="folder"),
+    options.NIGHT,
+)
 def do_simulate(a):
     """``legdistort simulate``."""
     from ..runtime.outputs import replacing_folder
@@ -260,12 +322,13 @@ def do_simulate(a):
 
     if Path(a.out, "truth.ecsv").exists() and not a.overwrite:
         raise InputError(f"{a.out} already holds a simulated night; give --overwrite or another folder")
-    night = simulate_exposures(small=a.small, seed=a.seed, progress=wants_progress(a))
+    night = simulate_exposures(**given(a, options.NIGHT), progress=wants_progress(a))
     with replacing_folder(a.out) as target:
         paths = night.write(target)
     _say(a, f"{len(paths)} frames and truth.ecsv in {a.out}", {"frames": [path.name for path in paths]})
 
 
+@command("print a solution", "results/solution.asdf", options.SOLUTION)
 def do_show(a):
     """``legdistort show``."""
     from ..pipeline import summarise
@@ -274,6 +337,12 @@ def do_show(a):
     _report(a, solution, summarise(solution))
 
 
+@command(
+    "the stars of a solution as a table",
+    "results/solution.asdf --out stars.fits",
+    options.SOLUTION,
+    options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
+)
 def do_stars(a):
     """``legdistort stars``."""
     from ..inputs.table_files import write_stars
@@ -283,6 +352,14 @@ def do_stars(a):
     _say(a, f"{len(solution.star_names)} stars in {a.out}", {"n_stars": len(solution.star_names), "out": str(a.out)})
 
 
+@command(
+    "positions measured elsewhere in its exposures to the reference plane and the sky, with errors",
+    "results/solution.asdf faint.ecsv --out corrected.ecsv",
+    options.SOLUTION,
+    options.POSITIONS,
+    options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
+    options.COLUMNS,
+)
 def do_correct(a):
     """``legdistort correct``."""
     from ..inputs.table_files import write_by_ending
@@ -292,6 +369,9 @@ def do_correct(a):
     _say(a, f"{len(table)} positions in {a.out}", {"n_positions": len(table), "out": str(a.out)})
 
 
+@command(
+    "HTML page of a solution", "results/solution.asdf --out report.html", options.SOLUTION, options.out("page (HTML)")
+)
 def do_report(a):
     """``legdistort report``."""
     from ..pipeline import summarise
@@ -313,49 +393,36 @@ def _say(a, sentence, figures):
     print(json.dumps(figures, indent=1) if a.json else sentence)
 
 
-def _given(a, *names):
-    """Those of the arguments that were given."""
-    return {name: value for name in names if (value := getattr(a, name)) is not None}
+def _records(table):
+    """The rows of a table for JSON, which knows no NaN."""
+    rows = [zip(table.colnames, row, strict=True) for row in table.as_array().tolist()]
+    return [{name: value if value == value else None for name, value in row} for row in rows]
 
 
-def _extension(text):
-    if text is None:
-        return None
-    name, comma, number = text.partition(",")
-    if comma and number.isdigit():
-        return name, int(number)
-    return int(text) if text.isdigit() else text
+def _share(a):
+    return {"workers": a.workers, "progress": wants_progress(a)}
 
 
-def _clip(a, default):
-    """The limit asked for, 0 for none; the published scheme has no clipping by default."""
-    if a.clip is None:
-        return None if a.method == "alternating" else default
-    return a.clip or None
+def _open(a):
+    from ..inputs.exposure_files import open_exposures
+    from ..runtime.parallel import check_workers
+
+    check_workers(a.workers)
+    return open_exposures(**given(a, options.FRAMES), progress=wants_progress(a))
 
 
-def _solving(a):
-    names = ("static", "exposure_degree", "gauge", "method", "loss", "error_floor", "errors", "validate")
-    return {name: getattr(a, name) for name in names}
-
-
-def _tying(a):
-    return {"reference": a.reference, "epoch": a.epoch, "pixel_scale": a.pixel_scale}
-
-
-def _prior_with_sigma(a, shape=None):
-    """The prior asked for, with the widths asked for at every degree fitted.
-
-    A scatter of exposures alone is one around no distortion.
-    """
+def _solving(a, shape=None):
+    """The arguments of `solve`; the prior read, no static distortion if there is none, with the widths asked for."""
     from ..priors.prior import EVIDENCE, Prior
     from ..solving.choices.degree_choice import AUTO, HIGHEST
 
-    prior = _prior(a.prior, shape, a.static_sigma)
-    if a.prior_sigma is None:
-        return prior
-    degree = 0 if a.prior_sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
-    return (prior or Prior([[0.0], [0.0]])).with_sigma(a.prior_sigma, degree=degree)
+    keywords, prior = given(a, options.SOLVING), _prior(a.prior, shape, a.static_sigma)
+    keywords.pop("static_sigma", None)
+    sigma = keywords.pop("prior_sigma", None)
+    if sigma is not None:
+        degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
+        prior = (prior or Prior([[0.0], [0.0]])).with_sigma(sigma, degree=degree)
+    return keywords | {"prior": prior}
 
 
 def _prior(text, shape, static_sigma):
@@ -393,7 +460,10 @@ def _grid(path, solution):
     return grid
 
 
-def _write_table(table, a):
-    from ..inputs.table_files import write_table
+def _draw(result, a):
+    """The picture of a result, if it is asked for."""
+    from ..runtime.outputs import replacing
 
-    write_table(table, a.out, overwrite=a.overwrite)
+    if a.plot is not None:
+        with replacing(a.plot, overwrite=a.overwrite) as file:
+            result.plot().figure.savefig(file, format="png", dpi=120)

@@ -7,18 +7,15 @@ from math import ceil
 import numpy as np
 
 from ..geometry.star_hull import supported
-from ..runtime.parallel import each
 from ..runtime.scratch import Stored, forget, spill
+from .background import Background
 from .combination import PixelFlag, combine, margin
-from .levels import Survey, sky_variance
-from .resampling.drizzling import Drop
-from .resampling.engines import resample_exposure
+from .resampling.engines import Resampling, resample_exposure
 from .resampling.pixel_maps import ExposureMap
 from .weights import Weight
 
 _SAMPLES = 1 << 23  # pixels of all exposures that are stacked at a time
 _SIDES = 64, 256  # of blocks, px
-_FORGETS = 2, 2, 12, 16, 20, 24  # pixels by which a spline of that order has forgotten, to 1e-8
 _BITS = 32  # exposures in a plane of the context
 
 
@@ -33,7 +30,7 @@ class Layer:
     stored : Stored
         Its planes: ``data``, with bad pixels filled; perhaps ``bad``, ``variance``.
     map : ExposureMap
-    survey : Survey
+    background : Background
     factor : float
         Flux scale.
     variance : float
@@ -54,7 +51,7 @@ class Layer:
     index: int
     stored: Stored
     map: ExposureMap
-    survey: Survey
+    background: Background
     factor: float
     variance: float
     sky: float | None
@@ -73,7 +70,8 @@ class Recipe:
     ----------
     shape : tuple
         Of the mosaic.
-    method, algorithm, order, conserve
+    resampling : Resampling
+    method, conserve : str
         See `legdistort.coadd`.
     level : float
         The common background level.
@@ -81,29 +79,15 @@ class Recipe:
         Whether extrapolated pixels are left out.
     widths : tuple or None
         The smallest and the largest FWHM of all exposures, if known.
-    drop : `~legdistort.coaddition.resampling.drizzling.Drop` or None
-        For drizzle.
-    compiled : bool
-        See `legdistort.coaddition.resampling.engines.is_compiled`.
     """
 
     shape: tuple
+    resampling: Resampling
     method: str
-    algorithm: str
-    order: int
     conserve: str
-    level: float = 0.0
-    mask: bool = False
-    widths: tuple | None = None
-    drop: Drop | None = None
-    compiled: bool = False
-
-    @property
-    def margin(self):
-        """Pixels of an exposure, around those that are wanted, on which their values depend."""
-        if self.algorithm == "interp":
-            return _FORGETS[self.order]
-        return 10
+    level: float
+    mask: bool
+    widths: tuple | None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -114,7 +98,7 @@ class Block:
     layers: list
 
 
-def assemble(layers, recipe, folder, **share):
+def assemble(layers, recipe, folder, share):
     """The planes of a mosaic.
 
     Parameters
@@ -123,22 +107,23 @@ def assemble(layers, recipe, folder, **share):
     recipe : Recipe
     folder : path
         The planes are arrays on the disk of this folder.
-    **share
-        How the work is shared, see `legdistort.runtime.parallel.each`.
+    share : callable
+        `legdistort.runtime.parallel.map_items`, told who shares the work.
 
     Returns
     -------
     list of ndarray
         Data, variance, weight, count, flags and context, as `stack` gives them for a block.
     """
-    context = n_planes(len(layers)), *recipe.shape
     planes = [spill(recipe.shape, np.float32, value, folder) for value in (np.nan, np.nan, 0)]
     planes += [spill(recipe.shape, dtype, 0, folder) for dtype in (np.int32, np.uint8)]
-    planes += [spill(context, np.uint32, 0, folder)]
+    planes += [spill((n_planes(len(layers)), *recipe.shape), np.uint32, 0, folder)]
     pieces = list(blocks(layers, recipe))
     work = partial(stack, recipe=recipe, n_exposures=len(layers))
-    stacked = each(work, pieces, description="co-adding", unit="block", **share)
+    stacked = share(work, pieces, description="co-adding", unit="block")
     for block, values in zip(pieces, stacked, strict=True):
+        if values is None:  # the planes have what stands for nothing
+            continue
         for plane, value in zip(planes, values, strict=True):
             plane[..., *block.window] = value
             forget(plane)
@@ -204,6 +189,8 @@ def stack(block, *, recipe, n_exposures):
         Bits of `legdistort.coaddition.combination.PixelFlag`.
     context : ndarray of uint32, shape (n_planes, ny, nx)
         Bit i % 32 of plane i // 32 is set where exposure i contributes.
+
+    It is None where no exposure meets the block.
     """
     outer = _widen(block.window, margin(recipe.method, recipe.widths), recipe.shape)
     shape = tuple(s.stop - s.start for s in outer)
@@ -214,13 +201,9 @@ def stack(block, *, recipe, n_exposures):
     for layer in block.layers:
         if _resample(layer, outer, recipe, [plane[len(met)] for plane in (data, variance, weight, doubt)]):
             met.append(layer)
-    inner = _inner(block.window, outer)
-    shape = tuple(s.stop - s.start for s in inner)
-    context = np.zeros((n_planes(n_exposures), *shape), dtype=np.uint32)
     if not met:
-        empty = np.full(shape, np.nan, dtype=np.float32)
-        nothing = (np.zeros(shape, dtype=dtype) for dtype in (np.float32, np.int32, np.uint8))
-        return empty, empty, *nothing, context
+        return None
+    inner = _inner(block.window, outer)
     n = len(met)
     photons = [layer.photons for layer in met]
     spare = doubt[:n] & PixelFlag.SATURATED > 0
@@ -240,6 +223,7 @@ def stack(block, *, recipe, n_exposures):
     if recipe.method == "clipped":
         rejected = np.isfinite(data[:n]) & ~spare & ~combined.keep
         flags |= rejected.any(axis=0) * np.uint8(PixelFlag.REJECTED)
+    context = np.zeros((n_planes(n_exposures), *keep.shape[1:]), dtype=np.uint32)
     for layer, used in zip(met, keep, strict=True):
         plane, bit = divmod(layer.index, _BITS)
         context[plane] |= used.astype(np.uint32) << np.uint32(bit)
@@ -250,8 +234,8 @@ def stack(block, *, recipe, n_exposures):
 def _resample(layer, window, recipe, planes):
     """Fill the place of one exposure in the stacks of a window; False if it does not meet it."""
     data, variance, weight, doubt = planes
-    edge = recipe.margin * ceil(layer.map.scale)
-    found = layer.map.piece(window, margin=edge, border=recipe.algorithm == "adaptive")
+    edge = recipe.resampling.margin * ceil(layer.map.scale)
+    found = layer.map.piece(window, margin=edge, border=recipe.resampling.algorithm == "adaptive")
     if found is None:
         return False
     pixel_map, part = found
@@ -260,26 +244,16 @@ def _resample(layer, window, recipe, planes):
     if spread is None:
         spread = layer.variance / layer.factor**2
     elif by_pixel:
-        spread = np.stack([spread, sky_variance(layer.survey, image, spread)])
+        spread = np.stack([spread, layer.background.sky_variance(image, spread)])
     masks = {plane: layer.stored.piece(plane, part) for plane in ("bad", "full", "rough")}
-    found = resample_exposure(
-        image,
-        masks,
-        spread,
-        pixel_map,
-        algorithm=recipe.algorithm,
-        order=recipe.order,
-        compiled=recipe.compiled,
-        gain=layer.gain,
-        drop=recipe.drop,
-    )
+    found = resample_exposure(image, masks, spread, pixel_map, recipe.resampling, gain=layer.gain)
     value, spread = found.data, found.variance
     place = _inner(pixel_map.window, window)
     xy = pixel_map.xy + np.array([part[1].start, part[0].start]).reshape(2, 1, 1)
     weight[place] = layer.weight.at(xy) * found.coverage
     if by_pixel:
         spread, sky = spread
-        weight[place] *= np.nan_to_num(layer.survey.noise**2 / sky)
+        weight[place] *= np.nan_to_num(layer.background.noise**2 / sky)
     if layer.support is not None:
         outside = ~supported(layer.support, xy)
         if recipe.mask:

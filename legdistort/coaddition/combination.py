@@ -1,4 +1,9 @@
-"""Combine resampled exposures: mean, median, clipped mean, each with its variance, weight and count."""
+"""Combine resampled exposures: mean, median, clipped mean, each with its variance, weight and count.
+
+reproject's combinations reject nothing, and sigma clipping as in ccdproc takes all exposures to be equally sharp: where
+the seeing varies it clips the cores of stars. Here what seeing and shifts can do is allowed for (`confirmed`), pixel by
+pixel with the errors that are known.
+"""
 
 from dataclasses import dataclass
 from enum import IntFlag

@@ -65,7 +65,7 @@ def outline(shape, n=65):
     return np.concatenate([np.stack(s, axis=1) for s in sides]) * [nx - 1, ny - 1]
 
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _FLAT = 1e6  # ratio of the sides of a pixel that is none
 
@@ -96,7 +96,7 @@ def reference_grid(names, solution):
         wcs.wcs.crpix = np.linalg.solve(matrix[:, :2], -matrix[:, 2]) - low + 1
         wcs.wcs.radesys = "ICRS"
     wcs.wcs.set()
-    logger.info("mosaic of %d x %d px on the reference plane", nx, ny)
+    log.info("mosaic of %d x %d px on the reference plane", nx, ny)
     return Grid((int(ny), int(nx)), wcs, (int(low[0]), int(low[1])), solution.sky)
 
 

@@ -1,6 +1,5 @@
 """Resample exposures with the solution's distortions and combine them."""
 
-from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -10,35 +9,22 @@ from astropy.io import fits
 
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry.star_hull import support
-from ..runtime.parallel import each
-from ..runtime.scratch import scratch_folder, store
+from ..runtime.parallel import map_items
+from ..runtime.scratch import scratch_folder
+from .background import match_backgrounds
 from .block_stack import Layer, Recipe, assemble, n_bytes
+from .flux_scales import flux_scales
 from .grids import given_grid, reference_grid
-from .levels import bad_pixels, flux_scales, match_backgrounds, saturated_pixels, survey
 from .mosaic import Mosaic
 from .options import CoaddOptions
-from .resampling.engines import (
-    fill_bad,
-    is_compiled,
-    noise_correlation,
-    rough_pixels,
-    white_gain,
-)
+from .preparation import prepare
+from .resampling.engines import white_gain
+from .resampling.noise_gain import noise_correlation
 from .resampling.pixel_maps import map_exposure
-from .weights import check_names, make_weights, stellar_widths
+from .weights import make_weights, stellar_widths
 
 _STORED = 5  # bytes a pixel in the scratch folder, about
 _COARSE = 1.5  # pixels of the grid in those of an exposure from which interpolation leaves out too much
-_MEANING = {
-    "COMBINE": "how exposures are combined",
-    "RESAMPLE": "how they are resampled, order or kernel",
-    "CONSERVE": "of stars, or of the sky",
-    "SKYLEVEL": "common level of the backgrounds",
-    "FLXSCALE": "where the flux scales come from",
-    "EXTRAPOL": "pixels outside the stars used",
-    "WEIGHTS": "of the exposures",
-    "NOISECOR": "noise of sums of many pixels over that by VAR",
-}
 _COPIED = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "BUNIT")
 
 
@@ -137,121 +123,89 @@ def coadd(
         kernel=kernel,
         scratch=scratch,
     )
-    return _coadd(exposures, solution, options, {"workers": workers, "threads": True, "progress": progress})
+    return _coadd(exposures, solution, options, partial(map_items, workers=workers, threads=True, progress=progress))
 
 
 def _coadd(exposures, solution, options, share):
-    """The mosaic; `share` tells `each` how the work is shared."""
+    """The mosaic; `share` is `map_items`, told who shares the work."""
     frames, left_out = _select(exposures, solution)
-    for argument in ("weights", "scale"):
-        check_names(argument, getattr(options, argument), [*(f.name for f in frames), *left_out])
-    grid, algorithm, order = options.grid, options.algorithm, options.order
-    output = reference_grid([f.name for f in frames], solution) if grid is None else given_grid(grid, solution)
-    maps = {f.name: map_exposure(f.name, solution, output, corners=algorithm in ("exact", "drizzle")) for f in frames}
+    options.check_names([*(f.name for f in frames), *left_out])
+    if options.grid is None:
+        output = reference_grid([f.name for f in frames], solution)
+    else:
+        output = given_grid(options.grid, solution)
+    corners = options.algorithm in ("exact", "drizzle")
+    maps = {f.name: map_exposure(f.name, solution, output, corners=corners) for f in frames}
     left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
     frames = [f for f in frames if maps[f.name] is not None]
     need = n_bytes(output.shape, len(frames)) + _STORED * sum(int(np.prod(f.shape)) for f in frames)
     ny, nx = output.shape
-    with scratch_folder(
-        options.scratch, need, f"a mosaic of {nx} x {ny} px and the pixels of {len(frames)} exposures"
-    ) as folder:
-        kept = each(partial(_keep, folder=folder), frames, description="reading", **share)
-        kept = dict(zip([f.name for f in frames], kept, strict=True))
-        empty = {name: found for name, found in kept.items() if isinstance(found, str)}
-        _warn(empty)
-        left_out |= empty
-        frames = [f for f in frames if f.name not in empty]
+    what = f"a mosaic of {nx} x {ny} px and the pixels of {len(frames)} exposures"
+    with scratch_folder(options.scratch, need, what) as folder:
+        found = list(share(partial(prepare, folder=folder), frames, description="reading"))
+        unfit = {f.name: reason for f, reason in zip(frames, found, strict=True) if isinstance(reason, str)}
+        _warn(unfit)
+        left_out |= unfit
+        prepared = {f.name: one for f, one in zip(frames, found, strict=True) if f.name not in unfit}
+        frames = [f for f in frames if f.name in prepared]
         if not frames:
             raise InputError(f"no exposure meets the output grid: {_reasons(left_out)}")
-        recipe = Recipe(
-            shape=output.shape,
-            method=options.method,
-            algorithm=algorithm,
-            order=order,
-            conserve=options.conserve,
-            mask=options.extrapolated == "mask",
-            drop=options.drop,
-            compiled=is_compiled(algorithm, order, sum(np.prod(f.shape) for f in frames)),
-        )
         factors, origin = flux_scales(frames, options.scale, solution)
-        sky = match_backgrounds([kept[f.name][1] for f in frames], solution, output, factors)
-        layers, recipe = _layers(frames, kept, maps, solution, recipe, options, factors=factors, sky=sky)
-        if options.extrapolated != "keep":
-            layers = [replace(each, support=support(each.survey.name, solution)) for each in layers]
-        planes = assemble(layers, recipe, folder.parent, **share)
-    _warn_of_misuse(frames, maps, algorithm)
-    settings = _settings(options, recipe.level, origin)
-    correlation = noise_correlation(maps[frames[0].name], layers[0].gain, algorithm=algorithm, order=order)
-    settings["NOISECOR"] = correlation if np.isfinite(correlation) else None
-    header = _header(frames, left_out, factors, settings)
+        layers, recipe = _layers(frames, prepared, maps, factors, solution, output, options)
+        planes = assemble(layers, recipe, folder.parent, share)
+    _warn_of_misuse(frames, maps, options.algorithm)
+    correlation = noise_correlation(layers[0].map, layers[0].gain, recipe.resampling)
+    header = _header(frames, left_out, factors, _settings(options, recipe, origin, correlation))
     names = tuple(f.name for f in frames)
     return Mosaic(*planes, wcs=output.wcs, exposures=names, left_out=left_out, offset=output.offset, header=header)
 
 
-def _settings(options, level, origin):
-    """Keywords of the file that tell how the mosaic was made."""
-    weights = options.weights
-    return {
-        "COMBINE": options.method,
-        "RESAMPLE": _in_words(options),
-        "CONSERVE": options.conserve,
-        "SKYLEVEL": level if options.match_background else None,
-        "FLXSCALE": origin,
-        "EXTRAPOL": options.extrapolated,
-        "WEIGHTS": weights if isinstance(weights, str) else "equal" if weights is None else "given",
-    }
-
-
-def _layers(frames, kept, maps, solution, recipe, options, *, factors, sky):
-    """The layers, and the recipe with the common background level and the widths of stars."""
-    noise = {f.name: factors[f.name] * kept[f.name][1].noise for f in frames}
-    weight = make_weights(options.weights, noise, solution, times={f.name: f.exposure_time for f in frames})
+def _layers(frames, prepared, maps, factors, solution, output, options):
+    """The layers, and how they become a mosaic."""
+    backgrounds = [prepared[f.name].background for f in frames]
+    sky = match_backgrounds(backgrounds, solution, output, factors)
+    noise = {b.name: factors[b.name] * b.noise for b in backgrounds}
+    weights = make_weights(options.weights, noise, solution, times={f.name: f.exposure_time for f in frames})
     fwhm = stellar_widths(solution, list(noise))
-    level = float(np.mean(list(sky.values())))
-    if recipe.conserve == "flux" and not options.match_background:  # the sky counts as flux as well
-        level *= float(np.mean([_area(maps[f.name]) for f in frames]))
+    flux = options.conserve == "flux"
+    area = {f.name: _area(maps[f.name]) if flux else 1.0 for f in frames}
+    resampling = options.resampling(sum(np.prod(f.shape) for f in frames))
     layers = [
         Layer(
             index=i,
-            stored=kept[f.name][0],
+            stored=prepared[f.name].stored,
             map=maps[f.name],
-            survey=kept[f.name][1],
+            background=prepared[f.name].background,
             factor=factors[f.name],
             variance=noise[f.name] ** 2,
             sky=sky[f.name] if options.match_background else None,
-            weight=weight[f.name],
+            weight=weights[f.name],
             fwhm=fwhm and fwhm[f.name],
-            gain=white_gain(maps[f.name], algorithm=recipe.algorithm, order=recipe.order, drop=recipe.drop),
+            gain=white_gain(maps[f.name], resampling),
+            photons=_photons(f, prepared[f.name], factors[f.name], noise[f.name] ** 2 * area[f.name]),
+            support=support(f.name, solution) if options.extrapolated != "keep" else None,
         )
         for i, f in enumerate(frames)
     ]
-    layers = [replace(each, photons=_photons(each, f.gain, recipe)) for each, f in zip(layers, frames, strict=True)]
-    return layers, replace(recipe, level=level, widths=_span(fwhm))
+    level = float(np.mean(list(sky.values())))
+    if not options.match_background:  # the sky counts as flux as well
+        level *= float(np.mean(list(area.values())))
+    widths = (min(fwhm.values()), max(fwhm.values())) if fwhm else None
+    mask = options.extrapolated == "mask"
+    return layers, Recipe(output.shape, resampling, options.method, options.conserve, level, mask, widths)
 
 
-def _photons(layer, gain, recipe):
+def _photons(frame, prepared, factor, variance):
     """Growth of the variance with the signal, by the gain where there is no uncertainty plane (see `Layer.photons`)."""
-    if not gain or "variance" in layer.stored.paths or layer.variance == 0:
+    if not frame.gain or "variance" in prepared.stored.paths or variance == 0:
         return 0.0
-    area = _area(layer.map) if recipe.conserve == "flux" else 1.0
-    return float(layer.factor / (layer.variance * area * gain))
+    return float(factor / (variance * frame.gain))
 
 
 def _area(exposure_map):
     """Detector pixels per output pixel in the middle of an exposure."""
     area = exposure_map.middle()[4].mean()
     return area if np.isfinite(area) else 1.0
-
-
-def _span(widths):
-    return (min(widths.values()), max(widths.values())) if widths else None
-
-
-def _in_words(options):
-    """Algorithm, and what it depends on."""
-    if options.algorithm == "interp":
-        return f"interp {options.order}"
-    return f"drizzle {options.kernel} {options.pixfrac:g}" if options.algorithm == "drizzle" else options.algorithm
 
 
 def _select(exposures, solution):
@@ -288,25 +242,6 @@ def _warn(left_out):
         warn(f"left out of the mosaic: {_reasons(left_out)}", AssumptionWarning)
 
 
-def _keep(frame, folder):
-    """The planes of an exposure, put aside, and its survey; or the reason why it cannot be used."""
-    exposure = frame.read()
-    bad = bad_pixels(exposure)
-    if bad.all():
-        return "every pixel is masked"
-    data, variance = fill_bad(exposure.data, bad), None
-    seen, full = survey(exposure, bad=bad, filled=data), saturated_pixels(exposure) & ~bad
-    if not data.any():
-        return "every pixel is 0"
-    rough = rough_pixels(data, bad, full, seen.noise)
-    if exposure.uncertainty is not None:
-        variance = np.square(exposure.uncertainty, dtype=np.float32)
-        variance[bad] = np.mean(variance, where=~bad)
-    masks = {"bad": bad, "full": full, "rough": rough}
-    planes = {"data": data, "variance": variance} | {name: mask for name, mask in masks.items() if mask.any()}
-    return store(folder, frame.name, planes), seen
-
-
 def _reasons(left_out):
     names = {reason: [n for n, other in left_out.items() if other == reason] for reason in left_out.values()}
     return "; ".join(f"{_few(same)}: {reason}" for reason, same in names.items())
@@ -334,6 +269,21 @@ def _warn_of_misuse(frames, maps, algorithm):
         )
 
 
+def _settings(options, recipe, origin, correlation):
+    """Cards that tell how the mosaic was made."""
+    weights = options.weights
+    return [
+        ("COMBINE", options.method, "how exposures are combined"),
+        ("RESAMPLE", str(recipe.resampling), "how they are resampled, order or kernel"),
+        ("CONSERVE", options.conserve, "of stars, or of the sky"),
+        ("SKYLEVEL", recipe.level if options.match_background else None, "common level of the backgrounds"),
+        ("FLXSCALE", origin, "where the flux scales come from"),
+        ("EXTRAPOL", options.extrapolated, "pixels outside the stars used"),
+        ("WEIGHTS", weights if isinstance(weights, str) else "given" if weights else "equal", "of the exposures"),
+        ("NOISECOR", correlation, "noise of sums of many pixels over that by VAR"),
+    ]
+
+
 def _header(frames, left_out, factors, settings):
     header = fits.Header()
     for key in _COPIED:
@@ -346,12 +296,17 @@ def _header(frames, left_out, factors, settings):
         header["EXPTIME"] = (round(mean, 9), "[s] exposure time that the values stand for")
         header["TEXPTIME"] = (sum(times), "[s] sum of the exposure times")
     header["NCOMBINE"] = (len(frames), "number of exposures combined")
-    for key, value in settings.items():
-        if value is not None:
-            header[key] = (value, _MEANING[key])
+    for key, value, meaning in settings:
+        if isinstance(value, str) or (value is not None and np.isfinite(value)):
+            header[key] = (value, meaning)
     header["CREATOR"] = f"legdistort {version('legdistort')}"
     for i, frame in enumerate(frames[:999], start=1):
-        header[f"IMCMB{i:03d}"] = frame.name.encode("ascii", "backslashreplace").decode()  # as FITS has it
+        header[f"IMCMB{i:03d}"] = _ascii(frame.name)
     for name, reason in left_out.items():
-        header.add_history(f"left out {name}: {reason}")
+        header.add_history(_ascii(f"left out {name}: {reason}"))
     return header
+
+
+def _ascii(text):
+    """As FITS has it; other letters by their numbers."""
+    return text.encode("ascii", "backslashreplace").decode()

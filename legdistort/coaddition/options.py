@@ -10,7 +10,8 @@ from astropy.wcs import WCS
 from ..exceptions import InputError
 from ..runtime.checks import check_choice
 from .grids import checked_wcs
-from .resampling.drizzling import Drop
+from .resampling.drizzling import KERNELS
+from .resampling.engines import Resampling, uses_compiled_splines
 
 METHODS = ("mean", "median", "clipped")
 ALGORITHMS = ("interp", "adaptive", "exact", "drizzle")
@@ -55,25 +56,41 @@ class CoaddOptions:
     scratch: object = None
 
     def __post_init__(self):
-        check_choice(self.method, METHODS, "method")
-        check_choice(self.algorithm, ALGORITHMS, "algorithm")
-        check_choice(self.conserve, CONSERVE, "conserve")
-        check_choice(self.extrapolated, EXTRAPOLATED, "extrapolated")
+        choices = {"method": METHODS, "algorithm": ALGORITHMS, "conserve": CONSERVE, "extrapolated": EXTRAPOLATED}
+        for name, allowed in choices.items():
+            check_choice(getattr(self, name), allowed, name)
         order = ORDERS.get(self.order, self.order) if isinstance(self.order, str) else self.order
         if isinstance(order, bool) or order not in range(6):
             raise InputError(f"order must be an integer from 0 to 5 or one of {', '.join(ORDERS)}, got {order!r}")
         object.__setattr__(self, "order", int(order))
-        object.__setattr__(self, "weights", _choice_or_numbers("weights", self.weights, WEIGHTS))
-        object.__setattr__(self, "scale", _choice_or_numbers("scale", self.scale, SCALES))
+        for name, allowed in (("weights", WEIGHTS), ("scale", SCALES)):
+            object.__setattr__(self, name, _choice_or_numbers(name, getattr(self, name), allowed))
         if self.grid is not None:
             checked_wcs(self.grid)
         if self.algorithm == "drizzle":
-            Drop(self.kernel, self.pixfrac)
+            self._check_drops()
 
-    @property
-    def drop(self):
-        """The `~legdistort.coaddition.resampling.drizzling.Drop` of drizzle, None for other algorithms."""
-        return Drop(self.kernel, self.pixfrac) if self.algorithm == "drizzle" else None
+    def _check_drops(self):
+        check_choice(self.kernel, KERNELS, "kernel")
+        is_number = isinstance(self.pixfrac, (int, float, np.number)) and not isinstance(self.pixfrac, bool)
+        if not (is_number and 0 < self.pixfrac <= 1):
+            raise InputError(f"pixfrac must be a number above 0 and up to 1, got {self.pixfrac!r}")
+        try:
+            import drizzle.resample  # noqa: F401
+        except ImportError:
+            raise InputError("algorithm='drizzle' needs the package drizzle: pip install legdistort[drizzle]") from None
+
+    def resampling(self, n_pixels):
+        """The `~legdistort.coaddition.resampling.engines.Resampling` of so many pixels of all exposures."""
+        compiled = uses_compiled_splines(self.algorithm, self.order, n_pixels)
+        return Resampling(self.algorithm, self.order, self.kernel, self.pixfrac, compiled)
+
+    def check_names(self, names):
+        """Raise `InputError` if weights or flux scales are given for other exposures than these."""
+        for argument, given in (("weights", self.weights), ("scale", self.scale)):
+            unknown = [str(name) for name in given if name not in names] if isinstance(given, Mapping) else []
+            if unknown:
+                raise InputError(f"{argument}: no exposure of that name is co-added: {', '.join(unknown)}")
 
 
 def _choice_or_numbers(argument, given, allowed):

@@ -32,13 +32,6 @@ def stellar_widths(solution, names):
     return {name: float(np.median(w)) for name, w in widths.items()} if all(len(w) for w in widths.values()) else None
 
 
-def check_names(argument, given, names):
-    """Raise `InputError` if a mapping by exposure has other names than these; what is no mapping passes."""
-    unknown = [str(name) for name in given if name not in names] if isinstance(given, Mapping) else []
-    if unknown:
-        raise InputError(f"{argument}: no exposure of that name is co-added: {', '.join(unknown)}")
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Weight:
     """Weight of one exposure, or of its pixels.
@@ -49,7 +42,7 @@ class Weight:
         Of the exposure.
     by_pixel : bool
         Whether it goes with the inverse variance of the sky in every pixel
-        (`legdistort.coaddition.levels.sky_variance`), relative to that of the background.
+        (`legdistort.coaddition.background.Background.sky_variance`), relative to that of the background.
     map : tuple or None
         ``(x, y, factor)``: a further factor on a coarse grid of the detector.
     """
@@ -57,9 +50,6 @@ class Weight:
     value: float
     by_pixel: bool = False
     map: tuple | None = None
-
-    def __repr__(self):
-        return f"<Weight {self.value:.4g}{' by pixel' * self.by_pixel}{' with map' * (self.map is not None)}>"
 
     def at(self, xy):
         """The weight (a number or an array) at detector pixels ``xy``, shape (2, ...), but for `by_pixel`."""

@@ -1,1 +1,1 @@
-"""The mathematics of one detector: basis, poses, distortion, sky. No files, no tables."""
+"""The geometry of a detector: Legendre basis, poses, distortions as functions and models, the plane on the sky."""

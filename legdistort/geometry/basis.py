@@ -215,13 +215,8 @@ def change_degree(coefficients, degree):
 
     The order of modes is by total degree, so this is a cut of the last axis.
     """
-    coefficients = np.asarray(coefficients, dtype=float)
-    n = n_modes(degree)
-    if coefficients.shape[-1] >= n:
-        return coefficients[..., :n].copy()
-    out = np.zeros((*coefficients.shape[:-1], n))
-    out[..., : coefficients.shape[-1]] = coefficients
-    return out
+    kept = np.asarray(coefficients, dtype=float)[..., : n_modes(degree)]
+    return np.pad(kept, [(0, 0)] * (kept.ndim - 1) + [(0, n_modes(degree) - kept.shape[-1])])
 
 
 @lru_cache

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..exceptions import FoldError, InputError
 from . import basis
-from .models import _CHUNK, displacement_model
+from .models import CHUNK, correction_model
 
 #: Largest round-trip error of a certified inverse, pixels.
 TOLERANCE = 1e-6
@@ -55,11 +55,20 @@ class Distortion:
         ``(ny, nx)`` of the detector.
     name : str
         For messages.
+    certified : Inverse, optional
+        One that was certified earlier. It is checked against its certificate again, and then is `inverse`.
+
+    Raises
+    ------
+    InputError
+        For coefficients of another shape or not finite; if the round-trip error of `certified` is not the one that it
+        states, or its region of validity not the image of the detector.
     """
 
     coefficients: np.ndarray
     shape: tuple
     name: str = ""
+    certified: Inverse | None = None
 
     def __post_init__(self):
         c = np.asarray(self.coefficients, dtype=float)
@@ -67,6 +76,8 @@ class Distortion:
             raise InputError(f"coefficients must be finite, of shape (2, n_modes), got shape {c.shape}")
         basis.degree_of(c.shape[1])
         object.__setattr__(self, "coefficients", c)
+        if self.certified is not None:
+            self._check_certificate(self.certified)
 
     @property
     def degree(self):
@@ -107,7 +118,7 @@ class Distortion:
             Naming the worst place, if some points do not converge.
         """
         p = np.asarray(p, dtype=float)
-        size = _CHUNK // 2
+        size = CHUNK // 2
         blocks = [self._newton(p[k : k + size], tolerance, max_iterations) for k in range(0, len(p), size)]
         q = np.concatenate(blocks) if blocks else p.copy()
         wrong = ~(np.abs(self(q) - p).max(axis=1) < max(1e-8, tolerance))
@@ -159,6 +170,8 @@ class Distortion:
         FoldError
             If the map folds, or no inverse of degree up to 30 reaches the tolerance.
         """
+        if self.certified is not None:
+            return self.certified
         self.check_fold()
         nodes, weights = np.polynomial.legendre.leggauss(_MAX_INVERSE_DEGREE + 12)
         u, v = np.meshgrid(nodes, nodes, indexing="ij")
@@ -192,14 +205,7 @@ class Distortion:
         u, v = basis.normalize(p, self.shape)
         return p + np.stack([np.polynomial.legendre.legval2d(u, v, t) for t in tensors], axis=-1)
 
-    def adopt(self, inverse):
-        """Take over an inverse that was certified earlier, after checking its certificate again.
-
-        Raises
-        ------
-        InputError
-            If the round-trip error is not the one certified, or the region of validity not the image of the detector.
-        """
+    def _check_certificate(self, inverse):
         p = _check_points(self.shape)
         q = self._corrected(inverse.tensors, p)
         error, box = np.abs(self(q) - p).max(), _valid_box(q, self.shape)
@@ -211,15 +217,16 @@ class Distortion:
             )
         if not np.allclose(box, inverse.valid, rtol=0, atol=1e-3):
             raise InputError(f"{whose} is said to be valid in {inverse.valid}, but the detector's image lies in {box}")
-        self.__dict__["inverse"] = inverse
+
+    def correction_model(self):
+        """Detector -> undistorted pixels as an astropy compound model, D attached as its inverse."""
+        return correction_model(basis.to_tensor(self.coefficients), self.inverse, self.shape)
 
     def model(self):
         """D as an astropy compound model (undistorted -> detector pixels) with the certified inverse attached."""
-        inverse = self.inverse
-        forward = displacement_model(
-            basis.to_tensor(self.coefficients), self.shape, valid=inverse.valid, name="distortion"
-        )
-        forward.inverse = displacement_model(inverse.tensors, self.shape, name="correction")
+        correction = self.correction_model()
+        forward, correction.inverse = correction.inverse, None  # no circle of inverses: files would never end
+        forward.inverse = correction
         return forward
 
 

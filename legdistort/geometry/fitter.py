@@ -7,11 +7,11 @@ Registered under the entry-point group ``astropy.modeling``, so that it is also 
 import numpy as np
 from astropy import units as u
 from astropy.modeling import models
-from astropy.modeling.core import CompoundModel, Model  # astropy.modeling itself is half imported when it looks in here
+from astropy.modeling.core import Model  # astropy.modeling itself is half imported when it looks in here
 from astropy.modeling.fitting import Covariance, Fitter, StandardDeviations
 
 from ..exceptions import InputError, SolveError
-from .models import to_pixels
+from .models import leaves, nodes, to_pixels
 
 #: Singular values below this fraction of the largest one count as zero.
 _RANK = 1e-11
@@ -117,12 +117,6 @@ class LegendreDistortionFitter(Fitter):
             covariance[where] = param_cov
             fitted.cov_matrix, fitted.stds = Covariance(covariance, names), StandardDeviations(param_cov, free)
         return fitted
-
-
-def leaves(model):
-    """The simple models that a model is made of, from left to right."""
-    nodes = model.traverse_postorder() if isinstance(model, CompoundModel) else [model]
-    return [node for node in nodes if isinstance(node, Model) and not isinstance(node, CompoundModel)]
 
 
 def legendre_coefficients(model):
@@ -248,6 +242,6 @@ def _least_squares(design, target, free, n):
 
 
 def _drop_inverses(model):
-    for node in model.traverse_postorder() if isinstance(model, CompoundModel) else [model]:
-        if isinstance(node, Model) and node.has_user_inverse:
+    for node in nodes(model):
+        if node.has_user_inverse:
             node.inverse = None

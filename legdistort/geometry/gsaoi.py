@@ -7,7 +7,7 @@ polynomials from the DRAGONS reduction package; source and licence stand in
 
 import json
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from importlib import resources
 
 import numpy as np
@@ -15,16 +15,10 @@ from astropy.modeling import models
 from numpy.polynomial import polynomial
 
 from ..exceptions import FoldError, InputError
-from . import similarity as poses
+from .similarity import apply, compose, describe, fit_similarity, invert
 
 #: Pixels along a side of a GSAOI detector.
 GSAOI_SIZE = 2048
-
-
-@lru_cache
-def _gsaoi_table():
-    text = resources.files("legdistort").joinpath("data/gsaoi_static_distortion.json").read_text(encoding="utf-8")
-    return json.loads(text)
 
 
 def gsaoi_polynomials(detector=2):
@@ -47,10 +41,12 @@ def gsaoi_polynomials(detector=2):
     """
     if detector not in (1, 2, 3, 4):
         raise InputError(f"detector must be 1, 2, 3 or 4, got {detector!r}")
+    published = resources.files("legdistort").joinpath("data/gsaoi_static_distortion.json")
+    table = json.loads(published.read_text(encoding="utf-8"))
     out = np.zeros((2, 4, 4))
     for part in ("linear", "nonlinear"):
         for axis, letter in enumerate("xy"):
-            for name, value in _gsaoi_table()[part][detector - 1][letter].items():
+            for name, value in table[part][detector - 1][letter].items():
                 i, j = map(int, name[1:].split("_"))
                 out[axis, i, j] += value
     return out
@@ -126,16 +122,16 @@ class GsaoiMap:
         grid = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2)
         grid = ((grid + 1) * self.size - 1) / 2
         weights = np.outer(weights, weights).ravel()
-        similarity = poses.fit_similarity(grid, self.to_arcsec(grid), weights=weights, parity=1)
+        pose = fit_similarity(grid, self.to_arcsec(grid), weights=weights, parity=1)
         for _ in range(6):  # each time 50 to 100 times nearer
-            rest = poses.fit_similarity(grid, self._invert(poses.apply(similarity, grid), grid), weights=weights)
-            similarity = poses.compose(similarity, poses.invert(rest))
-        return similarity
+            rest = fit_similarity(grid, self._invert(apply(pose, grid), grid), weights=weights)
+            pose = compose(pose, invert(rest))
+        return pose
 
     @property
     def pixel_scale(self):
         """Size of an undistorted pixel, arcsec."""
-        return poses.describe(self.similarity)["scale"]
+        return describe(self.similarity)["scale"]
 
     def to_arcsec(self, xy):
         """Detector pixels (..., 2), 0-based -> arcsec (..., 2): the published polynomials."""
@@ -144,7 +140,7 @@ class GsaoiMap:
 
     def undistort(self, xy):
         """Detector pixels (..., 2) -> undistorted pixels."""
-        return poses.apply(poses.invert(self.similarity), self.to_arcsec(xy))
+        return apply(invert(self.similarity), self.to_arcsec(xy))
 
     def distort(self, q):
         """Undistorted pixels (..., 2) -> detector pixels, inverse of `undistort`.
@@ -154,7 +150,7 @@ class GsaoiMap:
         FoldError
             If Newton's method does not get there, which happens only far off the detector.
         """
-        return self._invert(poses.apply(self.similarity, q), q)
+        return self._invert(apply(self.similarity, q), q)
 
     def _invert(self, arcsec, start):
         xy = np.array(start, dtype=float)

@@ -1,17 +1,15 @@
-"""Distortions and poses as astropy models."""
-
-import sys
+"""Distortions, poses and both together as astropy models."""
 
 import numpy as np
 from astropy import units as u
 from astropy.modeling import models
-from astropy.modeling.core import FittableModel  # astropy.modeling is half imported when it looks for our fitter
+from astropy.modeling.core import FittableModel, Model  # astropy.modeling is half imported when it looks for our fitter
 from astropy.modeling.parameters import Parameter
 
 from ..exceptions import InputError
 from . import basis, similarity
 
-_CHUNK = 8192  # points per block: the work arrays stay in the cache
+CHUNK = 8192  # points per block: the work arrays stay in the cache
 
 
 class FastLegendre2D(models.Legendre2D):
@@ -40,8 +38,8 @@ class FastLegendre2D(models.Legendre2D):
         x, y = np.broadcast_arrays(to_pixels(x), to_pixels(y))
         out = np.empty(x.shape)
         flat_x, flat_y, flat = x.reshape(-1), y.reshape(-1), out.reshape(-1)
-        for start in range(0, flat.size, _CHUNK):
-            part = slice(start, start + _CHUNK)
+        for start in range(0, flat.size, CHUNK):
+            part = slice(start, start + CHUNK)
             px = basis.legendre(self.x_degree, _to_window(flat_x[part], self.x_domain, self.x_window))
             py = basis.legendre(self.y_degree, _to_window(flat_y[part], self.y_domain, self.y_window))
             np.einsum("jn,jn->n", c @ px, py, out=flat[part])
@@ -52,27 +50,35 @@ class FastLegendre2D(models.Legendre2D):
     def fit_deriv(self, x, y, *params):
         """Derivatives with respect to the coefficients, shape (n, n_coefficients).
 
-        As for the stock model x and y are positions in the window. But only astropy's linear fitter hands over those;
-        its non-linear fitters and sums of models hand over plain positions, which are mapped here.
+        astropy's linear fitter hands over positions in the window, as the stock model takes them; its non-linear
+        fitters and sums of models hand over plain positions, which the stock model takes for those, too. Here they are
+        told by their size: what goes beyond twice the window, as pixels do unless a detector has but four, is mapped.
         """
-        if sys._getframe(1).f_code.co_name in ("_wrap_deriv", "_calc_compound_deriv"):
+        if not (_near(self.x_window, x) and _near(self.y_window, y)):
             x = _to_window(x, self.x_domain, self.x_window)
             y = _to_window(y, self.y_domain, self.y_window)
         return super().fit_deriv(x, y, *params)
 
     def stock(self):
         """The same function as a plain `~astropy.modeling.models.Legendre2D`."""
-        return models.Legendre2D(
-            self.x_degree,
-            self.y_degree,
-            x_domain=self.x_domain,
-            y_domain=self.y_domain,
-            x_window=self.x_window,
-            y_window=self.y_window,
-            name=self.name,
-            fixed=self.fixed,
-            **dict(zip(self.param_names, self.parameters, strict=True)),
-        )
+        return rebuilt(models.Legendre2D, self)
+
+
+def rebuilt(kind, series, **changed):
+    """A Legendre series as another class of model, all else the same but for the keywords given."""
+    known = {name: getattr(series, name) for name in ("x_domain", "y_domain", "x_window", "y_window", "name", "fixed")}
+    values = dict(zip(series.param_names, series.parameters, strict=True))
+    return kind(series.x_degree, series.y_degree, **known | values | changed)
+
+
+def nodes(model):
+    """All models that a model is made of, itself the last."""
+    return [n for n in model.traverse_postorder() if isinstance(n, Model)] if model.n_submodels > 1 else [model]
+
+
+def leaves(model):
+    """The simple models that a model is made of, from left to right."""
+    return [node for node in nodes(model) if node.n_submodels == 1]
 
 
 def to_pixels(x):
@@ -95,6 +101,11 @@ def _to_window(x, domain, window):
         return x
     (d0, d1), (w0, w1) = domain, window
     return w0 + (x - d0) * ((w1 - w0) / (d1 - d0))
+
+
+def _near(window, x):
+    """Whether all positions lie within twice a window: stars beyond the domain come out a little beyond it."""
+    return np.abs(x - np.mean(window)).max(initial=0) <= np.ptp(window)
 
 
 def outside(box, x, y):
@@ -140,6 +151,22 @@ def displacement_model(tensors, shape, *, valid=None, name=None):
     return model
 
 
+def correction_model(tensors, inverse, shape):
+    """Detector -> undistorted pixels: the certified inverse forwards, the exact distortion attached backwards.
+
+    Parameters
+    ----------
+    tensors : ndarray, shape (2, n, n)
+        Of the distortion, as for `displacement_model`.
+    inverse : Inverse
+    shape : tuple
+        ``(ny, nx)`` of the detector.
+    """
+    correction = displacement_model(inverse.tensors, shape, name="correction")
+    correction.inverse = displacement_model(tensors, shape, valid=inverse.valid, name="distortion")
+    return correction
+
+
 class Similarity2D(FittableModel):
     """A pose as a model: `~astropy.modeling.models.AffineTransformation2D` with one number a parameter.
 
@@ -174,3 +201,21 @@ class Similarity2D(FittableModel):
 def pose_model(pose, name=None):
     """A pose (2, 3) as a `Similarity2D`."""
     return Similarity2D(*np.ravel(pose), name=name)
+
+
+def exposure_model(pose, distortion, form=None):
+    """Reference plane -> detector pixels, ``T | D``, as an astropy compound model with its inverse attached.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (2, 3)
+    distortion : Distortion
+    form : Form, optional
+        What D looks like (``form.fill(distortion)`` is the model), if not
+        ``Identity(2) + (Mapping((0, 1, 0, 1)) | Legendre2D & Legendre2D)`` on the detector.
+    """
+    there, back = pose_model(pose, "pose"), pose_model(similarity.invert(pose), "pose_inverse")
+    model = there | (distortion.model() if form is None else form.fill(distortion))
+    model.inverse = distortion.correction_model() | back
+    model.name = "reference_to_detector"
+    return model

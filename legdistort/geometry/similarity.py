@@ -95,6 +95,23 @@ def fit_similarity(source, target, *, weights=None, parity=None):
     return similarity_of(mean_s, mean_t, cross, parity)
 
 
+def robust_similarity(source, target, *, weights=None, n_iterations=10):
+    """Similarity by iteratively reweighted least squares with Cauchy weights at the observed scale.
+
+    Parameters as for `fit_similarity`. The scale is the median residual.
+    """
+    base = np.ones(len(source)) if weights is None else weights
+    w = base
+    for _ in range(n_iterations):
+        pose = fit_similarity(source, target, weights=w)
+        r2 = ((apply(pose, source) - target) ** 2).sum(axis=1)
+        scale2 = np.median(r2)
+        if scale2 <= 1e-20 * np.ptp(target, axis=0).max() ** 2:
+            break
+        w = base / (1 + r2 / (2 * scale2))
+    return pose
+
+
 def similarity_of(mean_s, mean_t, cross, parity):
     """Least-squares similarities from the moments of their points.
 

@@ -1,4 +1,4 @@
-"""Where the reference plane lies on the sky."""
+"""Where the reference plane lies on the sky, and the trigonometry of the sphere that this takes."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,53 @@ from astropy.modeling import models
 from .similarity import apply
 
 
-def _compass(lon, lat):
+def directions(lon, lat):
+    """Unit vectors (..., 3) to places on the sphere, radians."""
+    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
+
+
+def angles(vectors):
+    """Longitude and latitude [rad] that vectors (..., 3) of any length point to; inverse of `directions`."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    return np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+
+
+def compass(lon, lat):
     """Unit vectors to the east and to the north at places on the sphere, radians, each (..., 3)."""
     east = np.stack([-np.sin(lon), np.cos(lon), np.zeros_like(lon)], axis=-1)
     north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], axis=-1)
     return east, north
+
+
+def gnomonic(lon, lat, lon0, lat0, degrees=1.0):
+    """Projection of places (lon, lat) on the plane that touches the sphere at (lon0, lat0).
+
+    Small offsets keep all their digits; the stock models of `TangentPlane.model` keep those of the angles, some 3e-14
+    degrees, and have values beyond 90 degrees too.
+
+    Parameters
+    ----------
+    lon, lat : array_like, shape (...)
+    lon0, lat0 : float
+        Tangent point.
+    degrees : float
+        Size of the unit of all angles, degrees; the plane has that unit too.
+
+    Returns
+    -------
+    xi, eta : ndarray, shape (...)
+        To the east and to the north; NaN at 90 degrees and beyond.
+    """
+    unit, turn = np.radians(degrees), 360 / degrees
+    sin0, cos0 = np.sin(unit * lat0), np.cos(unit * lat0)
+    dlon, dlat = np.asarray(lon) - lon0, unit * (np.asarray(lat) - lat0)
+    dlon = unit * (dlon - turn * np.round(dlon / turn))  # small angles are exact, across 360 degrees too
+    lat = unit * np.asarray(lat)
+    # sin(lat) cos0 - cos(lat) sin0 cos(dlon), without the difference of large numbers
+    up = np.sin(dlat) + 2 * np.cos(lat) * sin0 * np.sin(dlon / 2) ** 2
+    ahead = np.cos(dlat) - 2 * np.cos(lat) * cos0 * np.sin(dlon / 2) ** 2
+    ahead = np.where(ahead > 0, ahead, np.nan) * unit
+    return np.cos(lat) * np.sin(dlon) / ahead, up / ahead
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +104,9 @@ class TangentPlane:
         lon, lat = np.radians(self.lon), np.radians(self.lat)
         plane = np.radians(apply(self.matrix, xy))
         length = np.sqrt(1 + (plane**2).sum(axis=1))
-        axes = np.stack(_compass(lon, lat))  # e, n of the tangent point
-        towards = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
-        s = (towards + plane @ axes) / length[:, None]
-        lon, lat = np.arctan2(s[:, 1], s[:, 0]), np.arctan2(s[:, 2], np.hypot(s[:, 0], s[:, 1]))
-        return np.stack(_compass(lon, lat), axis=1) @ axes.T @ self.matrix[:, :2] / length[:, None, None]
+        axes = np.stack(compass(lon, lat))  # e, n of the tangent point
+        s = (directions(lon, lat) + plane @ axes) / length[:, None]
+        return np.stack(compass(*angles(s)), axis=1) @ axes.T @ self.matrix[:, :2] / length[:, None, None]
 
     def to_sky_errors(self, xy, variance):
         """Errors on the sky of positions (n, 2) with variances (3, n) ``xx, yy, xy`` [pix^2].

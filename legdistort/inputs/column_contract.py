@@ -134,10 +134,34 @@ def rename(table, columns):
     return out
 
 
-def _rows(bad, table, what):
-    first = int(np.flatnonzero(bad)[0])
-    where = ", ".join(f"{k} {table[k][first]}" for k in ("exposure", "star") if k in table.colnames)
-    return f"{what} in {np.count_nonzero(bad)} of {len(bad)} rows; the first is row {first} ({where})"
+def _is_positive(values):
+    return np.isfinite(values) & (values > 0)
+
+
+#: What values must be, and the words if they are not, by column.
+_RULES = (
+    (("x", "y"), np.isfinite, "not finite", ""),
+    (
+        ("x_err", "y_err"),
+        _is_positive,
+        "not a positive finite number",
+        "; errors are standard deviations in pixels, leave out rows without one",
+    ),
+    (("xy_corr",), lambda values: np.abs(values) < 1, "not inside (-1, 1)", ""),
+)
+
+
+def _check_values(table, what):
+    for names, allowed, fault, advice in _RULES:
+        for name in filter(table.colnames.__contains__, names):
+            bad = ~allowed(np.asarray(table[name]))
+            if bad.any():
+                row = int(np.argmax(bad))
+                where = ", ".join(f"{k} {table[k][row]}" for k in ("exposure", "star") if k in table.colnames)
+                raise InputError(
+                    f"{what}: {name} is {fault} in {np.count_nonzero(bad)} of {len(bad)} rows; the first is row {row} "
+                    f"({where}){advice}"
+                )
 
 
 def check(table, contract, what):
@@ -179,20 +203,5 @@ def check(table, contract, what):
             out.add_column(column, name=name, copy=False)  # `values` made a copy already
         else:
             out[name] = table[name]
-    for name in ("x", "y"):
-        bad = ~np.isfinite(out[name].value)
-        if bad.any():
-            raise InputError(f"{what}: " + _rows(bad, out, f"{name} is not finite"))
-    for name in ("x_err", "y_err"):
-        bad = ~(np.isfinite(out[name].value) & (out[name].value > 0))
-        if bad.any():
-            raise InputError(
-                f"{what}: "
-                + _rows(bad, out, f"{name} is not a positive finite number")
-                + "; errors are standard deviations in pixels, leave out rows without one"
-            )
-    if "xy_corr" in out.colnames:
-        bad = ~(np.abs(out["xy_corr"]) < 1)
-        if bad.any():
-            raise InputError(f"{what}: " + _rows(bad, out, "xy_corr is not inside (-1, 1)"))
+    _check_values(out, what)
     return out

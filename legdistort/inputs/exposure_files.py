@@ -1,13 +1,36 @@
-"""Exposures that stay in their files until their pixels are asked for."""
+"""Images from FITS files, HDU lists or CCDData: read at once, or when their pixels are needed."""
 
+import glob
+import logging
+import threading
+import warnings
+import zlib
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 from astropy.io import fits
+from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
+from tqdm import tqdm
 
 from ..exceptions import InputError
-from .exposures import Exposure, each_exposure, read_exposures
+from ..runtime.provenance import checksum
+from .exposure_names import exposure_name
+from .exposures import Exposure, believable_wcs, known_from_header
+
+log = logging.getLogger(__name__)
+
+#: Names of extensions that belong to an image, and how their values become standard deviations.
+UNCERTAINTY_NAMES = {"ERR": "StdDev", "UNCERT": "StdDev", "VAR": "Variance", "VARIANCE": "Variance"}
+MASK_NAMES = ("DQ", "MASK")
+
+_FILTERS = threading.Lock()  # warning filters belong to the process, not to the thread that changes them
+_DAMAGED = "truncated or damaged, its image cannot be read"
+_UNREADABLE = (OSError, EOFError, TypeError, ValueError, KeyError, IndexError, zlib.error, fits.VerifyError)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -20,6 +43,8 @@ class ExposureFile:
         As those of the `Exposure`.
     shape : tuple
         ``(ny, nx)``.
+    checksum : str
+        SHA-256 of the file, in hexadecimal digits.
     ext : int, str, (str, int) or None
         The extension asked for.
     """
@@ -33,24 +58,66 @@ class ExposureFile:
     read_noise: float | None
     exposure_time: float | None
     path: Path
+    checksum: str
     ext: object = None
 
     def read(self):
-        """The `Exposure` with its pixels.
+        """The `Exposure` with its pixels; what else is known is not worked out again.
 
         Raises
         ------
         InputError
             If the file is gone, or has become another one.
         """
-        (exposure,) = read_exposures(self.path, ext=self.ext)
-        if exposure.shape != self.shape:
-            raise InputError(f"{self.path} has changed: its image had shape {self.shape}, now {exposure.shape}")
-        return exposure
+        with _quiet(), _opened(self.path) as (_, hdulist), _told(f"{self.path}: {_DAMAGED}"):
+            hdu = find_image(hdulist, self.ext, self.path)
+            if hdu.shape != self.shape:
+                raise InputError(f"{self.path} has changed: its image had shape {self.shape}, now {hdu.shape}")
+            planes = _planes(hdulist, hdu)
+        known = {name: getattr(self, name) for name in _SHARED}
+        return Exposure(**known, **planes)
 
     def __repr__(self):
         ny, nx = self.shape
         return f"<ExposureFile {self.name!r}: {nx} x {ny} px in {self.path}>"
+
+
+#: What an `Exposure` and an `ExposureFile` both have.
+_SHARED = {field.name for field in fields(Exposure)} & {field.name for field in fields(ExposureFile)}
+
+
+def read_exposures(paths, *, ext=None, progress=False):
+    """Read images.
+
+    The name of an exposure is the base name of its file without ``.fits``, ``.fit``, ``.fts`` and
+    ``.gz``, ``.fz``, plus ``_EXT`` if `ext` was given. Images without a file are named after the
+    ``FILENAME`` in their header, or ``exposure_0``, ``exposure_1`` by their place in the list.
+
+    Extensions ``ERR``, ``UNCERT``, ``VAR`` or ``VARIANCE`` and ``DQ`` or ``MASK`` with the shape and the
+    ``EXTVER`` of the image are used as its uncertainty and mask (any non-zero value is bad; of JWST
+    and Roman data the bit DO_NOT_USE alone). Gain, read noise, saturation and exposure time come from
+    the header (`KEYWORDS`); for integer data without such a keyword, a piled-up maximum is taken for the saturation.
+
+    Parameters
+    ----------
+    paths : str, path, HDUList, CCDData, or a sequence of them
+        A string with ``*`` or ``?`` is expanded if no file has that very name.
+    ext : int, str or (str, int), optional
+        Extension to read from every file; by default ``SCI``, or else the first with a 2-D image.
+    progress : bool, optional
+        Show a progress bar.
+
+    Returns
+    -------
+    list of `Exposure`
+
+    Raises
+    ------
+    InputError
+        Naming the file: missing, not FITS, truncated, without a 2-D image or the extension wanted,
+        without a good pixel, with the name of another one, or with a name that ``wcs/NAME.asdf`` could not have.
+    """
+    return _read_each(paths, partial(_read, ext=ext), progress)
 
 
 def open_exposures(paths, *, ext=None, progress=False):
@@ -74,15 +141,29 @@ def open_exposures(paths, *, ext=None, progress=False):
     InputError
         As `legdistort.read_exposures` does.
     """
-    known = [field.name for field in fields(ExposureFile) if field.name != "ext"]
-    return [
-        ExposureFile(**{name: getattr(exposure, name) for name in known}, ext=ext) if _is_path(source) else exposure
-        for source, exposure in each_exposure(paths, ext, progress=progress)
-    ]
+    return _read_each(paths, partial(_open, ext=ext), progress)
 
 
-def _is_path(source):
-    return isinstance(source, (str, Path))
+def _read_each(paths, read, progress):
+    """What `read` makes of every source and its name in want of a better one; the names found are checked."""
+    origins, exposures = {}, []
+    for i, source in enumerate(tqdm(expand_paths(paths), desc="reading", unit="frame", disable=not progress)):
+        with _quiet():
+            exposure = read(source, f"exposure_{i}")
+        origin = exposure.path if exposure.path is not None else "in memory"
+        if exposure.name in origins:
+            raise InputError(
+                f"two exposures are named {exposure.name!r} ({origins[exposure.name]} and "
+                f"{origin}); rename a file, names tell exposures apart"
+            )
+        origins[exposure.name] = origin
+        exposures.append(exposure)
+    return exposures
+
+
+def file_checksums(exposures):
+    """``{base name: SHA-256}`` of the files of exposures that `open_exposures` gave; others have none."""
+    return {exposure.path.name: exposure.checksum for exposure in exposures if isinstance(exposure, ExposureFile)}
 
 
 def listed(exposures, function):
@@ -92,3 +173,157 @@ def listed(exposures, function):
         if not isinstance(exposure, (Exposure, ExposureFile)):
             raise InputError(f"{function} takes exposures as read_exposures gives them, got {type(exposure).__name__}")
     return exposures
+
+
+def expand_paths(paths):
+    """The argument of `read_exposures` as a flat list of sources, patterns expanded."""
+    if isinstance(paths, (str, Path, fits.HDUList, CCDData)):
+        paths = [paths]
+    sources = []
+    for source in paths:
+        if isinstance(source, str) and any(c in source for c in "*?") and not Path(source).exists():
+            found = sorted(glob.glob(source)) or sorted(glob.glob(source.replace("[", "[[]")))
+            if not found:
+                raise InputError(f"no file matches {source!r}")
+            sources += found
+        else:
+            sources.append(source)
+    if not sources:
+        raise InputError("no exposures to read: paths is empty")
+    return sources
+
+
+def _read(source, default, ext):
+    if isinstance(source, CCDData):
+        return _from_ccddata(source, default)
+    if isinstance(source, fits.HDUList):
+        filename = source.filename()
+        label = filename or str(source[0].header.get("FILENAME", default)) if len(source) else default
+        return _from_hdulist(source, ext, label, Path(filename) if filename else None)
+    if not isinstance(source, (str, Path)):
+        raise InputError(f"an exposure must be a path, an HDUList or a CCDData, got {type(source).__name__}")
+    path = Path(source)
+    with _opened(path) as (_, hdulist):
+        return _from_hdulist(hdulist, ext, str(path), path)
+
+
+def _open(source, default, ext):
+    if not isinstance(source, (str, Path)):
+        return _read(source, default, ext)
+    path = Path(source)
+    with _opened(path) as (file, hdulist):
+        exposure = _from_hdulist(hdulist, ext, str(path), path)
+        file.seek(0)
+        digits = checksum(file)
+    shared = {name: getattr(exposure, name) for name in _SHARED}
+    return ExposureFile(**shared, shape=exposure.shape, checksum=digits, ext=ext)
+
+
+@contextmanager
+def _quiet():
+    """Headers are often a little off the standard; what matters is checked."""
+    with _FILTERS, warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyWarning)
+        yield
+
+
+@contextmanager
+def _told(sentence):
+    """Whatever a damaged file provokes, as an `InputError` that begins with the sentence."""
+    try:
+        yield
+    except InputError:
+        raise
+    except _UNREADABLE as error:
+        raise InputError(f"{sentence} ({error})") from None
+
+
+@contextmanager
+def _opened(path):
+    """A FITS file, as it is and as an HDUList."""
+    if not path.is_file():
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    told = _told(f"{path}: cannot be read as FITS, damaged or something else")
+    with told, path.open("rb") as file, fits.open(file, memmap=False) as hdulist:
+        yield file, hdulist
+
+
+def _from_hdulist(hdulist, ext, label, path):
+    with _told(f"{label}: {_DAMAGED}"):
+        hdu = find_image(hdulist, ext, label)
+        header = hdulist[0].header.copy()
+        header.update(hdu.header)
+        integer = hdu.header.get("BITPIX", -32) > 0  # before the data are touched: scaling changes it
+        planes = _planes(hdulist, hdu)
+    name = exposure_name(label, ext)
+    try:
+        wcs = believable_wcs(WCS(header, fobj=hdulist), hdu.shape, name)
+    except Exception as error:  # wcslib raises many kinds; a header WCS is a hint, never a must
+        log.info("%s: WCS of the header not used: %s", name, error)
+        wcs = None
+    known = known_from_header(header, planes["data"], integer=integer)
+    return Exposure(name, **planes, header=header, wcs=wcs, path=path, **known)
+
+
+def _is_image(hdu):
+    return isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) and len(hdu.shape) > 0
+
+
+def find_image(hdulist, ext, label):
+    """The HDU to read (see `read_exposures`); `label` names the file in errors."""
+    if ext is not None:
+        try:
+            hdu = hdulist[ext]
+        except (KeyError, IndexError):
+            present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
+            raise InputError(f"{label}: no extension {ext!r}; the file has {present}") from None
+        candidates = [hdu] if _is_image(hdu) else []
+    else:
+        candidates = [hdu for hdu in hdulist if _is_image(hdu)]
+        candidates.sort(key=lambda hdu: hdu.name != "SCI")  # stable: SCI first, else the order of the file
+    for hdu in candidates:
+        if len(hdu.shape) == 2:
+            return hdu
+    where = "" if ext is None else f" in extension {ext!r}"
+    if candidates:
+        raise InputError(f"{label}: no 2-D image{where}, the data have shape {candidates[0].shape}; choose one plane")
+    raise InputError(f"{label}: no image{where}")
+
+
+def _planes(hdulist, hdu):
+    """Data of an image, and the mask and uncertainty that stand beside it in the same file."""
+    data = hdu.data
+    if data is None or data.shape != hdu.shape:
+        raise OSError("data incomplete")
+    telescope = hdu.header.get("TELESCOP", hdulist[0].header.get("TELESCOP", ""))
+    planes = {"data": data}
+    for other in hdulist:
+        alike = other is not hdu and _is_image(other) and other.shape == hdu.shape and other.ver == hdu.ver
+        if alike and other.name in MASK_NAMES:
+            flags = np.asarray(other.data)
+            do_not_use = telescope in ("JWST", "ROMAN") and flags.dtype.kind in "iu"
+            planes["mask"] = (flags & 1 if do_not_use else flags) != 0
+        elif alike and other.name in UNCERTAINTY_NAMES:
+            kind = str(other.header.get("UTYPE", UNCERTAINTY_NAMES[other.name]))  # CCDData writes its class as UTYPE
+            with np.errstate(invalid="ignore", divide="ignore"):
+                values = np.asarray(other.data, dtype=float)
+                if kind.startswith("Variance"):
+                    values = np.sqrt(values)
+                elif kind.startswith("InverseVariance"):
+                    values = 1 / np.sqrt(values)
+                planes["uncertainty"] = values
+    return planes
+
+
+def _from_ccddata(ccd, default):
+    header = fits.Header(ccd.header)
+    name = exposure_name(str(header.get("FILENAME", default)))
+    uncertainty = None
+    if ccd.uncertainty is not None:
+        uncertainty = ccd.uncertainty.represent_as(StdDevUncertainty).array
+    if ccd.unit is not None:
+        header["BUNIT"] = ccd.unit.to_string()
+    wcs = believable_wcs(ccd.wcs, np.shape(ccd.data), name) if isinstance(ccd.wcs, WCS) else None
+    integer = ccd.data.dtype.kind in "iu"
+    known = known_from_header(header, ccd.data, integer=integer)
+    return Exposure(name, ccd.data, ccd.mask, uncertainty, wcs, header, **known)

@@ -1,26 +1,19 @@
-"""Images and what is known about them: FITS files, HDU lists or CCDData become `Exposure`."""
+"""One image and what is known about it, from its header where that is to be believed."""
 
-import glob
 import logging
 import re
-import threading
-import warnings
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.nddata import CCDData, StdDevUncertainty
-from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
 from astropy.wcs.utils import proj_plane_pixel_scales
-from tqdm import tqdm
 
 from ..exceptions import InputError
-from .exposure_names import check_exposure_name, exposure_name
+from .exposure_names import check_exposure_name
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 #: Header keywords in order of preference. EGAIN comes first: cameras that write it use GAIN for a setting without unit.
 KEYWORDS = {
@@ -30,17 +23,10 @@ KEYWORDS = {
     "exposure_time": ("EXPTIME", "EXPOSURE", "XPOSURE", "ITIME"),
 }
 
-#: Names of extensions that belong to an image, and how their values become standard deviations.
-UNCERTAINTY_NAMES = {"ERR": "StdDev", "UNCERT": "StdDev", "VAR": "Variance", "VARIANCE": "Variance"}
-MASK_NAMES = ("DQ", "MASK")
-
 #: A header WCS is believed for pixel scales in this range [degrees]: 0.1 mas to 6 arcmin.
 PIXEL_SCALES = (0.0001 / 3600, 0.1)
 #: ... and a reference pixel not farther from the centre than this many frame sizes (mosaics need several).
 REFERENCE_DISTANCE = 20
-
-_FILTERS = threading.Lock()  # warning filters belong to the process, not to the thread that changes them
-_UNREADABLE = (OSError, EOFError, TypeError, ValueError, KeyError, IndexError, zlib.error, fits.VerifyError)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -132,182 +118,8 @@ class Exposure:
         return f"<Exposure {self.name!r}: {', '.join(words)}>"
 
 
-def read_exposures(paths, *, ext=None, progress=False):
-    """Read images.
-
-    The name of an exposure is the base name of its file without ``.fits``, ``.fit``, ``.fts`` and
-    ``.gz``, ``.fz``, plus ``_EXT`` if `ext` was given. Images without a file are named after the
-    ``FILENAME`` in their header, or ``exposure_0``, ``exposure_1`` by their place in the list.
-
-    Extensions ``ERR``, ``UNCERT``, ``VAR`` or ``VARIANCE`` and ``DQ`` or ``MASK`` with the shape and the
-    ``EXTVER`` of the image are used as its uncertainty and mask (any non-zero value is bad; of JWST
-    and Roman data the bit DO_NOT_USE alone). Gain, read noise, saturation and exposure time come from
-    the header (`KEYWORDS`); for integer data without such a keyword, a piled-up maximum is taken for the saturation.
-
-    Parameters
-    ----------
-    paths : str, path, HDUList, CCDData, or a sequence of them
-        A string with ``*`` or ``?`` is expanded if no file has that very name.
-    ext : int, str or (str, int), optional
-        Extension to read from every file; by default ``SCI``, or else the first with a 2-D image.
-    progress : bool, optional
-        Show a progress bar.
-
-    Returns
-    -------
-    list of `Exposure`
-
-    Raises
-    ------
-    InputError
-        Naming the file: missing, not FITS, truncated, without a 2-D image or the extension wanted,
-        without a good pixel, with the name of another one, or with a name that ``wcs/NAME.asdf`` could not have.
-    """
-    return [exposure for _, exposure in each_exposure(paths, ext, progress=progress)]
-
-
-def each_exposure(paths, ext, *, progress):
-    """Every source of `read_exposures` and its exposure, one after the other; names are checked."""
-    origins = {}
-    for i, source in enumerate(tqdm(expand_paths(paths), desc="reading", unit="frame", disable=not progress)):
-        with (
-            _FILTERS,
-            warnings.catch_warnings(),
-        ):  # headers are often a little off the standard; what matters is checked
-            warnings.simplefilter("ignore", AstropyWarning)
-            exposure = _read(source, ext, f"exposure_{i}")
-        origin = exposure.path if exposure.path is not None else "in memory"
-        if exposure.name in origins:
-            raise InputError(
-                f"two exposures are named {exposure.name!r} ({origins[exposure.name]} and "
-                f"{origin}); rename a file, names tell exposures apart"
-            )
-        origins[exposure.name] = origin
-        yield source, exposure
-
-
-def expand_paths(paths):
-    """The argument of `read_exposures` as a flat list of sources, patterns expanded."""
-    if isinstance(paths, (str, Path, fits.HDUList, CCDData)):
-        paths = [paths]
-    sources = []
-    for source in paths:
-        if isinstance(source, str) and any(c in source for c in "*?") and not Path(source).exists():
-            found = sorted(glob.glob(source)) or sorted(glob.glob(source.replace("[", "[[]")))
-            if not found:
-                raise InputError(f"no file matches {source!r}")
-            sources += found
-        else:
-            sources.append(source)
-    if not sources:
-        raise InputError("no exposures to read: paths is empty")
-    return sources
-
-
-def _read(source, ext, default):
-    if isinstance(source, CCDData):
-        return _from_ccddata(source, default)
-    if isinstance(source, fits.HDUList):
-        filename = source.filename()
-        label = filename or str(source[0].header.get("FILENAME", default)) if len(source) else default
-        return _from_hdulist(source, ext, label, Path(filename) if filename else None)
-    if not isinstance(source, (str, Path)):
-        raise InputError(f"an exposure must be a path, an HDUList or a CCDData, got {type(source).__name__}")
-    path = Path(source)
-    if not path.is_file():
-        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
-    try:
-        with path.open("rb") as file, fits.open(file, memmap=False) as hdulist:
-            return _from_hdulist(hdulist, ext, str(path), path)
-    except InputError:
-        raise
-    except _UNREADABLE as error:
-        raise InputError(f"{path}: cannot be read as FITS, damaged or something else ({error})") from None
-
-
-def _from_hdulist(hdulist, ext, label, path):
-    try:
-        hdu = find_image(hdulist, ext, label)
-        header = hdulist[0].header.copy()
-        header.update(hdu.header)
-        integer = hdu.header.get("BITPIX", -32) > 0  # before the data are touched: scaling changes it
-        data = hdu.data
-        if data is None or data.shape != hdu.shape:
-            raise OSError("data incomplete")
-        mask, uncertainty = _siblings(hdulist, hdu, header)
-    except InputError:
-        raise
-    except _UNREADABLE as error:
-        raise InputError(f"{label}: truncated or damaged, its image cannot be read ({error})") from None
-    name = exposure_name(label, ext)
-    try:
-        wcs = believable_wcs(WCS(header, fobj=hdulist), hdu.shape, name)
-    except Exception as error:  # wcslib raises many kinds; a header WCS is a hint, never a must
-        logger.info("%s: WCS of the header not used: %s", name, error)
-        wcs = None
-    return _assemble(name, data, header, integer, mask=mask, uncertainty=uncertainty, wcs=wcs, path=path)
-
-
-def _is_image(hdu):
-    return isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) and len(hdu.shape) > 0
-
-
-def find_image(hdulist, ext, label):
-    """The HDU to read (see `read_exposures`); `label` names the file in errors."""
-    if ext is not None:
-        try:
-            hdu = hdulist[ext]
-        except (KeyError, IndexError):
-            present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
-            raise InputError(f"{label}: no extension {ext!r}; the file has {present}") from None
-        candidates = [hdu] if _is_image(hdu) else []
-    else:
-        candidates = [hdu for hdu in hdulist if _is_image(hdu)]
-        candidates.sort(key=lambda hdu: hdu.name != "SCI")  # stable: SCI first, else the order of the file
-    for hdu in candidates:
-        if len(hdu.shape) == 2:
-            return hdu
-    where = "" if ext is None else f" in extension {ext!r}"
-    if candidates:
-        raise InputError(f"{label}: no 2-D image{where}, the data have shape {candidates[0].shape}; choose one plane")
-    raise InputError(f"{label}: no image{where}")
-
-
-def _siblings(hdulist, hdu, header):
-    """Mask and uncertainty that stand beside an image in the same file."""
-    mask = uncertainty = None
-    for other in hdulist:
-        alike = other is not hdu and _is_image(other) and other.shape == hdu.shape and other.ver == hdu.ver
-        if alike and other.name in MASK_NAMES:
-            flags = np.asarray(other.data)
-            do_not_use = header.get("TELESCOP", "") in ("JWST", "ROMAN") and flags.dtype.kind in "iu"
-            mask = (flags & 1 if do_not_use else flags) != 0
-        elif alike and other.name in UNCERTAINTY_NAMES:
-            kind = str(other.header.get("UTYPE", UNCERTAINTY_NAMES[other.name]))  # CCDData writes its class as UTYPE
-            with np.errstate(invalid="ignore", divide="ignore"):
-                values = np.asarray(other.data, dtype=float)
-                if kind.startswith("Variance"):
-                    values = np.sqrt(values)
-                elif kind.startswith("InverseVariance"):
-                    values = 1 / np.sqrt(values)
-                uncertainty = values
-    return mask, uncertainty
-
-
-def _from_ccddata(ccd, default):
-    header = fits.Header(ccd.header)
-    name = exposure_name(str(header.get("FILENAME", default)))
-    uncertainty = None
-    if ccd.uncertainty is not None:
-        uncertainty = ccd.uncertainty.represent_as(StdDevUncertainty).array
-    if ccd.unit is not None:
-        header["BUNIT"] = ccd.unit.to_string()
-    wcs = believable_wcs(ccd.wcs, np.shape(ccd.data), name) if isinstance(ccd.wcs, WCS) else None
-    integer = ccd.data.dtype.kind in "iu"
-    return _assemble(name, ccd.data, header, integer, mask=ccd.mask, uncertainty=uncertainty, wcs=wcs)
-
-
-def _assemble(name, data, header, integer, **planes):
+def known_from_header(header, data, *, integer):
+    """Saturation, gain, read noise and exposure time, as arguments of `Exposure`; `integer` data may tell the first."""
     known = {key: _number(header, keywords) for key, keywords in KEYWORDS.items()}
     # Detector readings are counts; calibrated data say in BUNIT that they are electrons, or electrons per second.
     unit = str(header.get("BUNIT", "")).lower().replace(" ", "")
@@ -317,7 +129,7 @@ def _assemble(name, data, header, integer, **planes):
         known["gain"] = known["exposure_time"]
     if known["saturation"] is None and integer:
         known["saturation"] = _piled_up(data)
-    return Exposure(name, data, header=header, **planes, **known)
+    return known
 
 
 def _number(header, keywords):
@@ -385,6 +197,6 @@ def believable_wcs(wcs, shape, name=""):
             if not np.all(np.abs(back - corners) < 0.01 * max(ny, nx)):
                 reason = "it does not map the corners to the sky and back"
     if reason:
-        logger.info("%s: WCS of the header not used: %s", name, reason)
+        log.info("%s: WCS of the header not used: %s", name, reason)
         return None
     return wcs

@@ -9,10 +9,11 @@ from astropy.table import QTable
 from scipy.sparse.csgraph import connected_components
 
 from ..exceptions import InputError, MatchError
-from ..geometry import similarity as poses
+from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
 from . import column_contract
 from .exposure_names import check_exposure_name
+from .start_poses import estimate_poses, star_means
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,18 +22,38 @@ class Observations:
 
     Attributes
     ----------
+    table : `~astropy.table.QTable`
+        What they come from.
+    names : tuple of str
+        Exposures, in the order in which they first appear.
+    stars : ndarray, shape (n_stars,)
+        Star identifiers, sorted.
     exposure, star : ndarray of int, shape (n,)
-        Indices into `Matches.names` and `Matches.stars`.
+        Indices into `names` and `stars`.
     xy : ndarray, shape (n, 2)
         Pixels.
     covariance : ndarray, shape (n, 3)
         ``var_x, var_y, cov_xy`` [pix^2].
     """
 
+    table: QTable
+    names: tuple
+    stars: np.ndarray
     exposure: np.ndarray
     star: np.ndarray
     xy: np.ndarray
     covariance: np.ndarray
+
+    @classmethod
+    def of(cls, table):
+        """Those of a table that keeps the contract of matched positions."""
+        names, exposure = _first_seen(table["exposure"])
+        stars, star = _ranked(table["star"])
+        x_err, y_err = table["x_err"].to_value(u.pix), table["y_err"].to_value(u.pix)
+        corr = np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else np.zeros(len(table))
+        xy = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
+        covariance = np.column_stack([x_err**2, y_err**2, corr * x_err * y_err])
+        return cls(table, names, stars, exposure, star, xy, covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +75,8 @@ class Matches:
         ``{exposure: reason}`` of exposures that could not be used.
     epoch : float or None
         Mean of the exposures, a Julian year, if their headers tell it.
+    observations : Observations
+        The table as plain arrays; need not be given.
     """
 
     table: QTable
@@ -62,21 +85,21 @@ class Matches:
     sky: TangentPlane | None = None
     left_out: dict = field(default_factory=dict)
     epoch: float | None = None
+    observations: Observations | None = None
 
-    @cached_property
+    def __post_init__(self):
+        if self.observations is None or self.observations.table is not self.table:
+            object.__setattr__(self, "observations", Observations.of(self.table))
+
+    @property
     def names(self):
         """Exposure names, in the order in which they first appear."""
-        return _first_seen(self.table["exposure"])[0]
+        return self.observations.names
 
-    @cached_property
+    @property
     def stars(self):
         """Star identifiers, sorted."""
-        return _ranked(self.table["star"])[0]
-
-    @cached_property
-    def observations(self):
-        """The table as plain arrays (`Observations`)."""
-        return _observations(self.table, _first_seen(self.table["exposure"])[1], _ranked(self.table["star"])[1])
+        return self.observations.stars
 
     @cached_property
     def positions(self):
@@ -85,8 +108,8 @@ class Matches:
         back = np.empty_like(obs.xy)
         for i, name in enumerate(self.names):
             rows = obs.exposure == i
-            back[rows] = poses.apply(poses.invert(self.poses[name]), obs.xy[rows])
-        return _star_means(back, obs.star, len(self.stars))
+            back[rows] = similarity.apply(similarity.invert(self.poses[name]), obs.xy[rows])
+        return star_means(back, obs.star, len(self.stars))
 
     def without(self, reasons):
         """The same matches without some exposures, ``{name: reason}``, which join `left_out`.
@@ -163,24 +186,19 @@ class Matches:
             table = column_contract.rename(table, columns)
         table = column_contract.check(table, column_contract.MATCHED, "the table of matched positions")
         table["exposure"] = table["exposure"].astype(str)
-        names, exposure_index = _first_seen(table["exposure"])
-        for name in names:
+        seen = Observations.of(table)
+        for name in seen.names:
             check_exposure_name(name)
-        shapes = _by_exposure(shape, names)
-        _check_inside(table, exposure_index, names, shapes)
-        stars, star_index = _ranked(table["star"])
-        _check_duplicates(table, exposure_index, star_index, len(stars))
-        _check_connected(exposure_index, star_index, names, len(stars))
+        shapes = _by_exposure(shape, seen.names)
+        _check_inside(seen, shapes)
+        _check_duplicates(seen)
+        _check_connected(seen)
         if poses is None:
-            xy = np.column_stack([table["x"].value, table["y"].value])
-            pose_list = estimate_poses(exposure_index, star_index, xy, names=names)
-            poses = dict(zip(names, pose_list, strict=True))
+            found = estimate_poses(seen.exposure, seen.star, seen.xy, names=seen.names)
+            poses = dict(zip(seen.names, found, strict=True))
         else:
-            poses = _check_poses(poses, names)
-        matches = cls(table, shapes, poses, sky, dict(left_out or {}), epoch)
-        matches.__dict__.update(names=names, stars=stars)  # known already
-        matches.__dict__["observations"] = _observations(table, exposure_index, star_index)
-        return matches
+            poses = _check_poses(poses, seen.names)
+        return cls(table, shapes, poses, sky, dict(left_out or {}), epoch, seen)
 
 
 def _by_exposure(shape, names):
@@ -205,7 +223,7 @@ def _check_poses(given, names):
     missing = [name for name in names if name not in given]
     if missing:
         raise InputError(f"poses has no entry for exposure {missing[0]!r}; give a (2, 3) array for every exposure")
-    return {name: poses.check(given[name], f"pose of exposure {name!r}") for name in names}
+    return {name: similarity.check(given[name], f"pose of exposure {name!r}") for name in names}
 
 
 def _first_seen(column):
@@ -226,19 +244,8 @@ def _ranked(column):
     return np.unique(column, return_inverse=True)
 
 
-def _observations(table, exposure, star):
-    x_err, y_err = table["x_err"].to_value(u.pix), table["y_err"].to_value(u.pix)
-    corr = np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else np.zeros(len(table))
-    return Observations(
-        exposure=exposure,
-        star=star,
-        xy=np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)]),
-        covariance=np.column_stack([x_err**2, y_err**2, corr * x_err * y_err]),
-    )
-
-
-def _check_duplicates(table, exposure, star, n_stars):
-    key = exposure.astype(np.int64) * n_stars + star
+def _check_duplicates(seen):
+    table, key = seen.table, seen.exposure.astype(np.int64) * len(seen.stars) + seen.star
     if np.all(key[1:] > key[:-1]):
         return
     order = np.argsort(key, kind="stable")
@@ -252,41 +259,39 @@ def _check_duplicates(table, exposure, star, n_stars):
         )
 
 
-def _check_inside(table, exposure, names, shapes):
+def _check_inside(seen, shapes):
     """Positions belong on their detector, give or take a tenth of its size."""
-    sizes = np.array([shapes[name][::-1] for name in names])
-    ends = np.array([[table[k].value.min(), table[k].value.max()] for k in ("x", "y")])
+    xy, sizes = seen.xy, np.array([shapes[name][::-1] for name in seen.names])
     smallest = sizes.min(axis=0)
-    if np.all(ends[:, 0] >= -0.1 * smallest) and np.all(ends[:, 1] <= 1.1 * smallest):
+    if np.all(xy.min(axis=0) >= -0.1 * smallest) and np.all(xy.max(axis=0) <= 1.1 * smallest):
         return
-    size = sizes[exposure]
-    xy = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
+    size = sizes[seen.exposure]
     out = ((xy < -0.1 * size) | (xy > 1.1 * size)).any(axis=1)
     if out.any():
         row = int(np.flatnonzero(out)[0])
-        name = names[exposure[row]]
+        name = seen.names[seen.exposure[row]]
         raise InputError(
             f"{np.count_nonzero(out)} positions lie outside their detector; the first is row {row}, star "
-            f"{table['star'][row]} of exposure {name} at ({xy[row, 0]:.0f}, {xy[row, 1]:.0f}) px, where the shape is "
-            f"{shapes[name]} (ny, nx): correct the shape or the position"
+            f"{seen.stars[seen.star[row]]} of exposure {name} at ({xy[row, 0]:.0f}, {xy[row, 1]:.0f}) px, where the "
+            f"shape is {shapes[name]} (ny, nx): correct the shape or the position"
         )
 
 
-def _check_connected(exposure, star, names, n_stars):
-    if len(names) < 2:
+def _check_connected(seen):
+    n = len(seen.names)
+    if n < 2:
         raise MatchError(
-            f"only one exposure ({names[0]}): the distortion is found from the differences between exposures, "
+            f"only one exposure ({seen.names[0]}): the distortion is found from the differences between exposures, "
             "give at least two of the same field"
         )
     # tie every exposure to the first one of each of its stars: the same groups as all pairs, in a small graph
-    n = len(names)
-    first = np.full(n_stars, n)
-    np.minimum.at(first, star, exposure)
+    first = np.full(len(seen.stars), n)
+    np.minimum.at(first, seen.star, seen.exposure)
     tied = np.zeros((n, n), dtype=bool)
-    tied[exposure, first[star]] = True
+    tied[seen.exposure, first[seen.star]] = True
     count, group = connected_components(tied, directed=False)
     if count > 1:
-        groups = [[name for name, g in zip(names, group, strict=True) if g == label] for label in range(count)]
+        groups = [[name for name, g in zip(seen.names, group, strict=True) if g == label] for label in range(count)]
         listed = "; ".join(_shorten(g) for g in groups)
         raise MatchError(
             f"the exposures form {len(groups)} groups with no star in common: {listed}; solve each group by itself"
@@ -295,102 +300,3 @@ def _check_connected(exposure, star, names, n_stars):
 
 def _shorten(names, most=6):
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-def _star_means(xy, star, n_stars, weights=None):
-    w = np.ones(len(star)) if weights is None else weights
-    total = np.bincount(star, w, n_stars)
-    sums = np.column_stack([np.bincount(star, w * xy[:, k], n_stars) for k in (0, 1)])
-    with np.errstate(invalid="ignore"):
-        return sums / total[:, None]
-
-
-def robust_similarity(source, target, *, weights=None, n_iterations=10):
-    """Similarity by iteratively reweighted least squares with Cauchy weights at the observed scale.
-
-    Parameters as for `legdistort.geometry.similarity.fit_similarity`. The scale is the median residual.
-    """
-    base = np.ones(len(source)) if weights is None else weights
-    w = base
-    for _ in range(n_iterations):
-        pose = poses.fit_similarity(source, target, weights=w)
-        r2 = ((poses.apply(pose, source) - target) ** 2).sum(axis=1)
-        scale2 = np.median(r2)
-        if scale2 <= 1e-20 * np.ptp(target, axis=0).max() ** 2:
-            break
-        w = base / (1 + r2 / (2 * scale2))
-    return pose
-
-
-def estimate_poses(exposure, star, xy, *, names=None):
-    """Poses of all exposures from matched positions alone.
-
-    The exposure with the most stars becomes the reference plane; the others are tied one after the
-    other, each to all that already stand, the best connected first, then all are refined together.
-
-    Parameters
-    ----------
-    exposure, star : ndarray of int, shape (n,)
-    xy : ndarray, shape (n, 2)
-    names : sequence of str, optional
-        For messages.
-
-    Returns
-    -------
-    list of ndarray, each (2, 3)
-
-    Raises
-    ------
-    MatchError
-        Naming an exposure that shares fewer than two stars with all the others.
-    """
-    n_exposures, n_stars = exposure.max() + 1, star.max() + 1
-    names = range(n_exposures) if names is None else names
-    rows = [np.flatnonzero(exposure == i) for i in range(n_exposures)]
-    first = int(np.argmax([len(r) for r in rows]))
-    found = {first: poses.identity()}
-    back = np.full_like(xy, np.nan)
-    back[rows[first]] = xy[rows[first]]
-    sums, counts = np.zeros((n_stars, 2)), np.zeros(n_stars)
-    np.add.at(sums, star[rows[first]], xy[rows[first]])
-    np.add.at(counts, star[rows[first]], 1)
-    while len(found) < n_exposures:
-        shared = {i: rows[i][counts[star[rows[i]]] > 0] for i in range(n_exposures) if i not in found}
-        best = max(shared, key=lambda i: len(shared[i]))
-        r = shared[best]
-        if len(r) < 2 or np.all(np.ptp(xy[r], axis=0) == 0):
-            raise MatchError(
-                f"exposure {names[best]} shares {len(r)} star{'s' * (len(r) != 1)} with the other exposures; its shift "
-                "and rotation need at least 2: give poses, or leave it out"
-            )
-        mean = sums[star[r]] / counts[star[r], None]
-        found[best] = robust_similarity(mean, xy[r])
-        off = np.hypot(*(poses.apply(found[best], mean) - xy[r]).T)
-        if np.median(off) > 0.05 * np.ptp(xy[r], axis=0).max():
-            continue  # mismatched: it gets a pose, but has no say in those of the others
-        back = poses.apply(poses.invert(found[best]), xy[rows[best]])
-        np.add.at(sums, star[rows[best]], back)
-        np.add.at(counts, star[rows[best]], 1)
-    return _refine_poses([found[i] for i in range(n_exposures)], rows, star, xy)
-
-
-def _scales(pose_list):
-    return np.sqrt(np.abs(np.linalg.det(np.stack(pose_list)[:, :, :2])))
-
-
-def _refine_poses(pose_list, rows, star, xy, n_sweeps=3):
-    """Refit every pose to the mean of all, the first one's plane held by the mean of the poses."""
-    ends = np.array([xy.min(axis=0), xy.max(axis=0)])
-    for _ in range(n_sweeps):
-        back = np.empty_like(xy)
-        for pose, r in zip(pose_list, rows, strict=True):
-            back[r] = poses.apply(poses.invert(pose), xy[r])
-        mean = _star_means(back, star, star.max() + 1)
-        refined = [robust_similarity(mean[star[r]], xy[r]) for r in rows]
-        old, new = ([poses.apply(poses.invert(p), ends) for p in pair] for pair in (pose_list, refined))
-        usual = np.abs(np.log(_scales(refined) / np.median(_scales(refined)))) < np.log(1.5)
-        old, new = (np.concatenate([pair for pair, keep in zip(ends_of, usual, strict=True) if keep])
-                    for ends_of in (old, new))  # fmt: skip
-        common = robust_similarity(old, new)
-        pose_list = [poses.compose(pose, common) for pose in refined]
-    return pose_list

@@ -15,6 +15,7 @@ from astropy.table import Table
 from astropy.time import Time
 
 from ..exceptions import InputError
+from ..geometry.tangent_plane import angles, compass, directions
 from . import column_contract
 from .table_files import read_table
 
@@ -115,7 +116,7 @@ class Reference:
     def on_plane(self, plane):
         """Positions (n, 2) and covariances (n, 2, 2) in pixels of a tangent plane; NaN far off its tangent point."""
         place, east, north = _axes(self.sky)
-        middle = directions(np.array([[plane.lon, plane.lat]]))[0]
+        middle = directions(*np.radians([plane.lon, plane.lat]))
         far = place @ middle < 0.5  # beyond 60 degrees; the projection ends at 90
         step = 1e-6
         xy, x_east, x_north = (_project(plane, place + step * shift) for shift in (0 * east, east, north))
@@ -124,22 +125,15 @@ class Reference:
         return xy, slope @ self.covariance[:, :2, :2] @ slope.transpose(0, 2, 1)
 
 
-def directions(sky):
-    """Unit vectors (n, 3) to positions (n, 2) on the sky, degrees."""
-    lon, lat = np.radians(sky).T
-    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
-
-
 def _axes(sky):
     """Unit vectors (n, 3) to positions (n, 2) in degrees, and those to the east and to the north there."""
-    place, lon = directions(sky), np.radians(sky[:, 0])
-    east = np.stack([-np.sin(lon), np.cos(lon), np.zeros(len(lon))], axis=1)
-    return place, east, np.cross(place, east)
+    lon, lat = np.radians(sky).T
+    return directions(lon, lat), *compass(lon, lat)
 
 
 def _degrees(place):
-    lon = np.degrees(np.arctan2(place[:, 1], place[:, 0])) % 360
-    return np.stack([lon, np.degrees(np.arctan2(place[:, 2], np.hypot(place[:, 0], place[:, 1])))], axis=1)
+    lon, lat = np.degrees(angles(place))
+    return np.stack([lon % 360, lat], axis=1)
 
 
 def _project(plane, place):

@@ -11,8 +11,9 @@ import numpy as np
 from astropy.table import Table
 
 from ..exceptions import InputError
+from .column_contract import values
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 #: Kinds of positions, the most precise first.
 KINDS = ("PSF", "WIN", "")
@@ -86,22 +87,16 @@ def understand(table, columns):
             out[name] = column
     if not np.all(good):
         bad = np.count_nonzero(~good)
-        logger.warning("%d of %d detections have no usable error of position and are left out", bad, len(table))
+        log.warning("%d of %d detections have no usable error of position and are left out", bad, len(table))
         out = out[good]
     return out, None if "x" in taken else f"X{kind}_IMAGE"
 
 
 def _numbers(table, *names):
     """Columns as float arrays; None if one is missing."""
-    if not all(name in table.colnames for name in names):
-        return None
-    several = [name for name in names if table[name].ndim != 1]
-    if several:
-        raise InputError(f"column {several[0]!r} must hold one number a row, it has shape {table[several[0]].shape}")
-    try:
-        return [np.ma.filled(np.ma.asarray(table[name]).astype(float), np.nan) for name in names]
-    except (TypeError, ValueError):
-        raise InputError(f"the columns {', '.join(names)} must hold numbers") from None
+    if all(name in table.colnames for name in names):
+        return [values(table, name) for name in names]
+    return None
 
 
 def _covariance(table, kind):

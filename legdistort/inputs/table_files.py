@@ -11,12 +11,13 @@ from astropy.io import fits
 from astropy.table import QTable, Table, vstack
 
 from ..exceptions import InputError
+from ..runtime.checks import first_line
 from ..runtime.outputs import replacing
 from ..runtime.provenance import checksums
 from . import column_contract, sextractor
 from .exposure_names import check_exposure_name, exposure_name
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 #: Formats that are written, by suffix.
 WRITTEN = {".ecsv": "ascii.ecsv", ".fits": "fits", ".csv": "ascii.csv", ".vot": "votable", ".xml": "votable"}
@@ -81,7 +82,7 @@ def stack(tables):
     try:
         return vstack(tables, metadata_conflicts="silent")
     except Exception as error:  # astropy raises what it likes
-        raise InputError(f"the tables do not go together: {_line(error)}") from None
+        raise InputError(f"the tables do not go together: {first_line(error)}") from None
 
 
 def _understood(table, columns, origin):
@@ -95,7 +96,7 @@ def _understood(table, columns, origin):
     if origin is None:
         origin = 1 if source is not None and sextractor.is_pixel(source) else 0
     if origin:
-        logger.info("pixels of the table count from 1; 1 is taken off")
+        log.info("pixels of the table count from 1; 1 is taken off")
         for name in ("x", "y"):
             if name in table.colnames:
                 table[name] = column_contract.values(table, name, u.pix) - origin
@@ -116,11 +117,11 @@ def _read(path):
                 with path.open("rb") as file:
                     return Table.read(file, format=kind)
             except Exception as error:  # readers raise what they like
-                errors.append(_line(error))
+                errors.append(first_line(error))
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"cannot be read as a table: {_line(error)}") from None
+        raise InputError(f"cannot be read as a table: {first_line(error)}") from None
     raise InputError(f"cannot be read as a table: {errors[-1]}")
 
 
@@ -134,10 +135,6 @@ def _text_formats(head, suffix):
     if re.match(rb"#\s+1\s+[A-Z]\w+", head):
         return ["ascii.sextractor"]
     return ["ascii.commented_header", "ascii"]
-
-
-def _line(error):
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def _read_fits(path):

@@ -8,11 +8,10 @@ from scipy.spatial import cKDTree
 
 from ..exceptions import InputError
 from ..geometry import similarity
-from ..geometry.tangent_plane import TangentPlane
-from ..inputs.matches import robust_similarity
-from ..inputs.reference_catalogue import directions
+from ..geometry.similarity import robust_similarity
+from ..geometry.tangent_plane import TangentPlane, angles, directions
 from .registration import register
-from .seeds import scale_candidates
+from .similarity_candidates import scale_candidates
 from .star_lists import StarList
 
 log = logging.getLogger(__name__)
@@ -85,15 +84,13 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
     rows = np.flatnonzero(solved)
     flux = None if flux is None else flux[rows]
     if reference.star is not None:
-        found = _by_name(reference, names, rows)
+        mine, theirs = _by_name(reference, names[rows])
     elif reference.xy is None and sky is None:
-        found = _by_pattern(reference, positions[rows], flux, pixel_scale)
-        found = rows[found[0]], found[1]
+        mine, theirs = _by_pattern(reference, positions[rows], flux, pixel_scale)
     else:
         plane = reference.xy if reference.xy is not None else reference.on_plane(sky)[0]
-        found = _on_plane(reference, plane, positions[rows], flux)
-        found = rows[found[0]], found[1]
-    rows, reference = found[0], reference.subset(found[1])
+        mine, theirs = _on_plane(reference, plane, positions[rows], flux)
+    rows, reference = rows[mine], reference.subset(theirs)
     if reference.xy is not None:
         xy, covariance = reference.xy, reference.covariance
     else:
@@ -104,9 +101,9 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
     return Identified(rows, xy, covariance, sky)
 
 
-def _by_name(reference, names, rows):
-    """Stars of the same name; a number is the same as its digits."""
-    known = {str(names[row]): row for row in rows}
+def _by_name(reference, names):
+    """Rows of the names and of the reference that are the same; a number is the same as its digits."""
+    known = {str(name): row for row, name in enumerate(names)}
     pairs = [(known[str(name)], k) for k, name in enumerate(reference.star) if str(name) in known]
     if not pairs:
         raise InputError(
@@ -191,8 +188,7 @@ def _by_pattern(reference, positions, flux, pixel_scale):
 
 def _middle(sky, scale):
     """The plane that touches the sky in the middle of positions (n, 2), in pixels of `scale` degrees."""
-    place = np.mean(directions(sky), axis=0)
-    lon, lat = np.degrees([np.arctan2(place[1], place[0]), np.arctan2(place[2], np.hypot(place[0], place[1]))])
+    lon, lat = np.degrees(angles(np.mean(directions(*np.radians(sky).T), axis=0)))
     return TangentPlane(float(lon) % 360, float(lat), scale * similarity.identity())
 
 

@@ -1,31 +1,27 @@
 """Detections of all exposures -> matches: the same star gets the same number, every exposure its nominal pose."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 from astropy import units as u
-from astropy.coordinates import SkyCoord
-from astropy.wcs.utils import wcs_to_celestial_frame
 
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
-from ..geometry import similarity
-from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
-from ..inputs.matches import Matches, estimate_poses
+from ..inputs.matches import Matches
 from ..inputs.reference_catalogue import mean_epoch
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
-from .linking import interlink, label_stars, standing, tie
-from .merging import unite
+from .exposure_groups import interlink, link, standing, unite
+from .header_poses import HeaderPoses
 from .options import MatchOptions
+from .star_labels import label_stars
 from .star_lists import StarList
 
 log = logging.getLogger(__name__)
 
 #: Fewest detections with which an exposure can take part.
 FEWEST = 5
-#: Headers that disagree with the others by more than this part of the field do not say where the field lies.
-HEADER_TOLERANCE = 0.1
 
 
 def match(
@@ -100,7 +96,7 @@ def match(
     if "flags" in table.colnames:
         table = table[(np.asarray(table["flags"]).astype(int) & int(reject_flags)) == 0]
     table = _without_repetitions(table)
-    headers = _Headers({n: e.wcs for n, e in (named or {}).items() if e.wcs is not None}, shapes)
+    headers = HeaderPoses.from_wcs({n: e.wcs for n, e in (named or {}).items() if e.wcs is not None}, shapes)
 
     rows = {name: np.flatnonzero(table["exposure"] == name) for name in names}
     left_out = {n: f"only {len(r)} usable detections of at least {FEWEST}" for n, r in rows.items() if len(r) < FEWEST}
@@ -179,12 +175,15 @@ def _associate(lists, names, headers, left_out, options):
     def guess(i, j):
         return headers.step(names[i], names[j])
 
-    groups = unite(lists, tie(lists, guess, tolerance=tolerance, progress=progress), guess, tolerance=tolerance)
+    def grouped(lists):
+        return unite(lists, link(lists, guess, tolerance=tolerance, progress=progress), guess, tolerance=tolerance)
+
+    groups = grouped(lists)
     hot = standing(lists, groups[0])
     if any(h.any() for h in hot):
         log.info("%d detections stand still while the sky moves: hot pixels, not used", sum(h.sum() for h in hot))
         lists = [stars.subset(~h) for stars, h in zip(lists, hot, strict=True)]
-        groups = unite(lists, tie(lists, guess, tolerance=tolerance, progress=progress), guess, tolerance=tolerance)
+        groups = grouped(lists)
     _check_groups(groups, lists, names, left_out)
     registrations, misfits = interlink(lists, groups[0], tolerance=tolerance, progress=progress)
     left_out.update({names[i]: reason for i, reason in misfits.items()})
@@ -242,97 +241,24 @@ def _reasons(left_out):
 
 
 def _finish(table, star, shapes, headers, left_out, epoch):
-    names = tuple(dict.fromkeys(table["exposure"].tolist()))
-    _, index = np.unique(star, return_inverse=True)
-    exposure = np.array([names.index(name) for name in table["exposure"]])
-    xy = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
-    table["star"] = _number(table, index, xy)
-    shapes = {name: shapes[name] for name in names}
-    try:
-        found = dict(zip(names, estimate_poses(exposure, index, xy, names=names), strict=True))
-    except MatchError:
-        found = None  # from_table says which groups are apart
-    sky = None
-    if found is not None:
-        found, sky = headers.place(found)
+    table["star"] = _numbers(table, star)
     for name, reason in left_out.items():
         log.warning("%s is left out: %s", name, reason)
-    return Matches.from_table(table, shape=shapes, poses=found, sky=sky, left_out=left_out, epoch=epoch)
+    matches = Matches.from_table(table, shape=shapes, left_out=left_out, epoch=epoch)
+    poses, sky = headers.place(matches.poses)
+    return replace(matches, poses=poses, sky=sky)
 
 
-def _number(table, index, xy):
-    """Serial numbers: by falling median flux, or else by position from left to right."""
-    n = index.max() + 1
+def _numbers(table, star):
+    """Serial numbers for labels: by falling median flux, or else by position from left to right."""
+    _, index, count = np.unique(star, return_inverse=True, return_counts=True)
     if "flux" in table.colnames:
-        order = np.lexsort([column_contract.values(table, "flux"), index])
-        middle = np.searchsorted(index[order], np.arange(n)) + np.bincount(index, minlength=n) // 2
-        value = -np.nan_to_num(column_contract.values(table, "flux")[order][middle], nan=-np.inf)
+        flux = column_contract.values(table, "flux")
+        order = np.lexsort([flux, index])
+        middle = np.searchsorted(index[order], np.arange(len(count))) + count // 2
+        value = -np.nan_to_num(flux[order][middle], nan=-np.inf)
     else:
-        value = np.bincount(index, xy[:, 0], n) / np.bincount(index, minlength=n)
-    serial = np.empty(n, int)
-    serial[np.argsort(value, kind="stable")] = np.arange(n)
+        value = np.bincount(index, table["x"].to_value(u.pix)) / count
+    serial = np.empty(len(count), int)
+    serial[np.argsort(value, kind="stable")] = np.arange(len(count))
     return serial[index]
-
-
-class _Headers:
-    """Nominal poses from the header WCSs (linear part), and the tangent plane they share."""
-
-    def __init__(self, wcss, shapes):
-        self.shapes, self.poses, self.sky = shapes, {}, None
-        if not wcss:
-            return
-        centres = np.array([_to_sky(w, _grid(shapes[n], 1)).cartesian.xyz.value[:, 0] for n, w in wcss.items()])
-        # the median, not the mean: one header may point anywhere
-        middle = SkyCoord(*np.median(centres, axis=0), representation_type="cartesian").spherical
-        on_sky = TangentPlane(middle.lon.deg, middle.lat.deg, similarity.identity())
-        planes = {}
-        for name, w in wcss.items():
-            grid = _grid(shapes[name], 5)
-            plane = on_sky.from_sky(_to_sky(w, grid))
-            if np.all(np.isfinite(plane)):
-                planes[name] = similarity.fit_similarity(grid, plane)
-        if not planes:
-            return
-        first, matrix = next(iter(planes.items()))
-        matrix = np.column_stack([matrix[:, :2], -matrix[:, :2] @ _grid(shapes[first], 1)[0]])
-        self.sky = TangentPlane(on_sky.lon, on_sky.lat, matrix)
-        self.poses = {name: similarity.compose(similarity.invert(plane), matrix) for name, plane in planes.items()}
-
-    def step(self, source, target):
-        """Nominal pose from one exposure's pixels to another's, or None."""
-        if source in self.poses and target in self.poses:
-            return similarity.compose(self.poses[target], similarity.invert(self.poses[source]))
-        return None
-
-    def place(self, found):
-        """Poses in any plane -> poses in the headers' plane, by the mean of the headers that agree; and its tie."""
-        names = [name for name in found if name in self.poses]
-        if not names:
-            return found, None
-        # every header says where the plane of the poses lies in the plane of the sky
-        steps = np.array([similarity.compose(similarity.invert(found[n]), self.poses[n]) for n in names])
-        size = max(max(self.shapes[n]) for n in names)
-        corners = np.array([similarity.apply(step, _grid(self.shapes[names[0]], 2)) for step in steps])
-        apart = np.linalg.norm(corners - np.median(corners, axis=0), axis=2).max(axis=1)
-        good = apart < HEADER_TOLERANCE * size
-        if 2 * np.count_nonzero(good) <= len(names):
-            warn(
-                "the header WCSs contradict the stars and one another; they are ignored, and the sky stays unknown",
-                AssumptionWarning,
-            )
-            return found, None
-        mean = steps[good].mean(axis=0)
-        return {name: similarity.compose(pose, mean) for name, pose in found.items()}, self.sky
-
-
-def _grid(shape, n):
-    """Pixels of an n x n grid from edge to edge (the centre for n = 1), shape (n*n, 2)."""
-    x, y = (np.linspace(0, size - 1, n) if n > 1 else np.array([(size - 1) / 2]) for size in shape[::-1])
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-
-
-def _to_sky(wcs, xy):
-    """Sky positions by the linear part of a WCS (no SIP or table), as the poses lead to undistorted pixels."""
-    wcs = wcs.celestial
-    lon, lat = wcs.wcs_pix2world(xy, 0).T
-    return SkyCoord(lon * u.deg, lat * u.deg, frame=wcs_to_celestial_frame(wcs)).icrs

@@ -1,6 +1,7 @@
 """Options of `legdistort.match`, checked before there are detections."""
 
 from dataclasses import dataclass
+from numbers import Integral, Real
 
 import numpy as np
 
@@ -27,8 +28,13 @@ class MatchOptions:
     progress: bool = False
 
     def __post_init__(self):
-        if int(self.min_exposures) != self.min_exposures or self.min_exposures < 2:
-            raise InputError(f"min_exposures must be an integer of at least 2, got {self.min_exposures!r}")
-        if self.tolerance is not None and not 0 < self.tolerance < np.inf:
+        least = self.min_exposures
+        if not (isinstance(least, Real) and least >= 2 and least % 1 == 0):
+            raise InputError(f"min_exposures must be an integer of at least 2, got {least!r}")
+        if not isinstance(self.columns, dict | None):
+            raise InputError(f"columns must be a dict {{name expected: name in the table}}, got {self.columns!r}")
+        if self.tolerance is not None and not (isinstance(self.tolerance, Real) and 0 < self.tolerance < np.inf):
             raise InputError(f"tolerance must be a positive number of pixels, got {self.tolerance!r}")
+        if not isinstance(self.reject_flags, Integral):
+            raise InputError(f"reject_flags must be an integer, whose bits are flags, got {self.reject_flags!r}")
         check_isolation(self.isolation)

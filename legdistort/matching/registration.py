@@ -1,6 +1,6 @@
 """Two star lists of the same sky laid on one another: seeds, growth, and a test against chance.
 
-A candidate similarity (from a header or `legdistort.matching.seeds`) grows to a
+A candidate similarity (from a header or `legdistort.matching.similarity_candidates`) grows to a
 polynomial map while the tolerance shrinks: all neighbours within reach count
 with a Gaussian weight, so that a few wrong ones do not lead astray. The growth
 starts with bright stars, or without fluxes with one corner of the field, where
@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..geometry import similarity
-from ..inputs.matches import robust_similarity
-from . import seeds as asterisms
+from ..geometry.similarity import robust_similarity
+from .similarity_candidates import offset_candidates, triangle_candidates
 from .star_lists import Warp, allowed_degree, fit_warp
 
 #: How far above chance the number of pairs must be, ``k ln(k/expected) - k + expected`` (natural units,
@@ -96,9 +96,8 @@ def _first(source, target, seeds, tolerance):
     """The first seed that grows to something significant."""
     if min(len(source), len(target)) < 5:
         return None
-    grown = (grow(source, target, pose, order) for pose, order in seeds)
-    settled = (settle(source, target, *g, tolerance=tolerance) for g in grown if g is not None)
-    found = next((s for s in settled if s is not None), None)
+    grown = (continue_from_pose(source, target, pose, order, tolerance=tolerance) for pose, order in seeds)
+    found = next((g for g in grown if g is not None), None)
     return None if found is None else _spread(source, target, found, tolerance)
 
 
@@ -107,12 +106,12 @@ def _spread(source, target, found, tolerance):
     while True:
         p = source.xy[found.source]
         if len(p) > MOST / 2 and np.all(
-            p.std(axis=0) > 0.95 * source.xy[_inside(source, target, found.warp)].std(axis=0)
+            p.std(axis=0) > 0.95 * source.xy[target.on_detector(found.warp(source.xy))].std(axis=0)
         ):
             return found
         order = None if source.ranking is not None else outwards(source, p.mean(axis=0))
-        grown = grow(source, target, robust_similarity(p, target.xy[found.target]), order)
-        again = None if grown is None else settle(source, target, *grown, tolerance=tolerance)
+        pose = robust_similarity(p, target.xy[found.target])
+        again = continue_from_pose(source, target, pose, order, tolerance=tolerance)
         if again is None or len(again.source) <= len(found.source):
             return found
         enough = len(again.source) < 1.05 * len(found.source)
@@ -121,7 +120,27 @@ def _spread(source, target, found, tolerance):
             return found
 
 
-def continue_from(source, target, rows, columns, *, tolerance=None):
+def continue_from_pose(source, target, pose, order=None, *, tolerance=None):
+    """Registration of two lists of which a rough pose is known.
+
+    Parameters
+    ----------
+    source, target : StarList
+    pose : ndarray, shape (2, 3)
+    order : ndarray of int, optional
+        As in `grow`.
+    tolerance : float, optional
+        As in `register`.
+
+    Returns
+    -------
+    Registration or None
+    """
+    grown = grow(source, target, pose, order)
+    return None if grown is None else settle(source, target, *grown, tolerance=tolerance)
+
+
+def continue_from_pairs(source, target, rows, columns, *, tolerance=None):
     """Registration of two lists of which some pairs are known.
 
     Parameters
@@ -189,7 +208,7 @@ def _blind_seeds(source, target, guess):
         rows, others, order = selection
         if order is not None:
             yield from _shifts(source, target, guess, selection)
-        for pose in asterisms.triangle_candidates(source.xy[rows], target.xy[others]):
+        for pose in triangle_candidates(source.xy[rows], target.xy[others]):
             yield pose, order
 
 
@@ -200,7 +219,7 @@ def _shifts(source, target, guess, selection):
         orientations.pop()
     for m in orientations:
         turned = source.xy[rows] @ m.T
-        for shift in asterisms.offset_candidates(turned, target.xy[others], size=max(np.ptp(turned, axis=0))):
+        for shift in offset_candidates(turned, target.xy[others], size=max(np.ptp(turned, axis=0))):
             yield np.column_stack([m, shift]), order
 
 
@@ -230,7 +249,7 @@ def grow(source, target, pose, order=None):
     order = source.ranking if ranked else np.arange(len(source)) if order is None else order
     parity = np.sign(np.linalg.det(pose[:, :2]))
     warp = Warp.from_pose(pose, source.shape)
-    total, n, width = len(source), min(FIRST, len(source)), REACH * source.field
+    total, n, width = len(source), min(FIRST, len(source)), REACH * max(source.shape)
     best, best_strength = None, 0.0
     for stage in range(100):
         chosen = order[:n][:: -(-n // MOST)]
@@ -338,16 +357,10 @@ def _settle(source, target, warp, limit, tolerance, degree):
     predicted = warp(source.xy)
     i, j, distance = _mutual(warp, source, target, limit, max(most, limit), lone=True)
     strength = _strength(predicted, target.tree, limit, len(warp.coefficients))
-    possible = np.mean(_inside(source, target, warp)) * min(len(source), len(target))
+    possible = np.mean(target.on_detector(predicted)) * min(len(source), len(target))
     if strength < MIN_STRENGTH or len(i) < max(5, MIN_SHARE * possible):
         return None
     return Registration(i, j, distance, warp, float(limit), float(strength))
-
-
-def _inside(source, target, warp):
-    """Which stars of the source a map puts on the target's detector."""
-    predicted = warp(source.xy)
-    return np.all((predicted > -0.5) & (predicted < np.array(target.shape[::-1]) - 0.5), axis=1)
 
 
 def _mutual(warp, source, target, limit, most, lone=False):

@@ -45,14 +45,13 @@ class StarList:
         return None if self.flux is None else np.argsort(-self.flux, kind="stable")
 
     @property
-    def field(self):
-        """Longer side of the detector, pixels."""
-        return float(max(self.shape))
-
-    @property
     def area(self):
         """Area of the detector, pixels squared."""
         return float(self.shape[0] * self.shape[1])
+
+    def on_detector(self, xy):
+        """Which positions (n, 2) lie on the detector."""
+        return np.all((xy > -0.5) & (xy < np.array(self.shape[::-1]) - 0.5), axis=1)
 
     def subset(self, keep):
         """The list with some of its rows (boolean mask)."""

@@ -7,6 +7,7 @@ subtracted, in standard errors of the position (`crowding`)? Subtraction leaves 
 """
 
 from functools import lru_cache
+from numbers import Real
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -28,7 +29,7 @@ _FEWEST = 20  # stars that tell what shape is usual
 
 def check_isolation(limit):
     """Raise `InputError` if a limit of `is_isolated` is neither positive nor None."""
-    if limit is not None and not limit > 0:
+    if limit is not None and not (isinstance(limit, Real) and limit > 0):
         raise InputError(f"isolation must be a positive number of standard errors, or None, got {limit!r}")
 
 

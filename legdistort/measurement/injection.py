@@ -73,7 +73,6 @@ def calibrate_frame(exposure, remeasure, *, threshold=5.0, widths=None, fluxes=N
     for width in widths or [own]:
         profile = scaled(shape, width)
         levels = np.sort(fluxes if fluxes is not None else default_fluxes(exposure, frame, centres, profile, threshold))
-
         again = remeasure if width == own else partial(remeasure, fwhm=width)
         each = np.repeat(levels[::-1], n_positions)  # stars of about the same flux come into one frame
         off = _offsets(exposure, centres, each, profile, photon=photon, again=again, rng=rng)
@@ -98,7 +97,7 @@ def _photon_noise(frame, exposure, centres, shape):
 
 def default_fluxes(exposure, frame, centres, shape, threshold):
     """Fluxes from the detection limit to bright stars, evenly spaced in their logarithm; see `calibrate_frame`."""
-    params = np.array([[0, 0, 1.0, *shape, 0]])
+    params = moffat.parameters(np.ones(1), shape)
     unit = moffat.evaluate(params, box_half(moffat.fwhm(shape)), moffat.CENTRES)[0] / moffat.flux(params)
     variance = np.median(frame.variance[frame.good])
     lowest = _FAINTEST * threshold * np.sqrt(variance / (unit**2).sum())
@@ -144,9 +143,7 @@ def _statistics(off):
     out = {"n": len(off), "found": len(found) / len(off)}
     for k, axis in enumerate("xy"):
         d, err = found[:, k], found[:, 2 + k]
-        enough = len(found) > 2
-        sigma = biweight_scale(d, M=np.zeros(1)) if enough else np.nan
-        pull = biweight_scale(d / err, M=np.zeros(1)) if enough else np.nan
+        sigma, pull = (biweight_scale(v, M=np.zeros(1)) if len(d) > 2 else np.nan for v in (d, d / err))
         figures = {
             "rms": np.sqrt(np.mean(d**2)) if len(d) else np.nan,
             "sigma": sigma,
@@ -197,11 +194,10 @@ def free_positions(exposure, taken, fwhm, *, n, rng):
         xy = xy[cKDTree(taken).query(xy)[0] > AWAY * fwhm]
     if not len(xy):
         return xy
-    tree, keep = cKDTree(xy), np.ones(len(xy), dtype=bool)
-    for i in range(len(xy)):
+    keep = np.ones(len(xy), dtype=bool)
+    for i, j in sorted(cKDTree(xy).query_pairs(APART * fwhm)):  # i < j: who came first stays
         if keep[i]:
-            near = np.array(tree.query_ball_point(xy[i], APART * fwhm))
-            keep[near[near > i]] = False
+            keep[j] = False
     return xy[keep][:n]
 
 
@@ -247,8 +243,7 @@ def _light(image_shape, xy, flux, shape):
     for k in range(0, len(xy), 100):
         part = slice(k, k + 100)
         pixel = np.round(xy[part]).astype(int)
-        params = np.zeros((len(pixel), 8))
-        params[:, :2], params[:, 2], params[:, 3:7] = xy[part] - pixel, 1.0, shape
+        params = moffat.parameters(np.ones(len(pixel)), shape, xy[part] - pixel)
         params[:, 2] = flux[part] / moffat.flux(params)
         stamp = moffat.evaluate(params, wide, moffat.CENTRES)
         stamp[:, core] = moffat.evaluate(params, half, nodes)

@@ -9,7 +9,7 @@ from astropy.table import vstack
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..inputs.exposure_files import listed
 from ..runtime.checks import options_from
-from ..runtime.parallel import each
+from ..runtime.parallel import map_items
 from .injection import calibrate_frame
 from .noise_curves import NoiseCurves
 from .options import MeasureOptions
@@ -60,20 +60,20 @@ def calibrate_noise(
         If exposures lack a gain: the photon noise put in is estimated from their stars.
     """
     exposures = listed(exposures, "calibrate_noise")
-    fluxes, widths = _check_arguments(fluxes, fwhm, n_positions, seed)
+    fluxes, widths = check_injection(fluxes, fwhm, n_positions, seed)
     options = options_from(MeasureOptions, measuring, "measuring")
     work = partial(_calibrate, options=options, fluxes=fluxes, widths=widths, n_positions=n_positions, seed=seed)
-    results = list(each(work, exposures, workers=workers, progress=progress, description="noise"))
-    assumed = {name: photon for _, photons in results for name, photon in photons.items()}
-    if assumed:
-        gains = [f"{name} {1 / photon:.3g}" if photon else f"{name} none seen" for name, photon in assumed.items()]
+    curves = list(map_items(work, exposures, workers=workers, progress=progress, description="noise"))
+    photons = {exposure.name: photon for exposure, (_, photon) in zip(exposures, curves, strict=True)}
+    gains = [f"{name} {1 / p:.3g}" if p else f"{name} none seen" for name, p in photons.items() if p is not None]
+    if gains:
         more = f" and {len(gains) - 3} more" if len(gains) > 3 else ""
         warn(
             "no gain known: the photon noise of injected stars is estimated from the stars of the frames (equivalent "
             f"gain, e-/ADU: {', '.join(gains[:3])}{more}); give gain or the keyword GAIN to have it exact",
             AssumptionWarning,
         )
-    tables = [curves.table for curves, _ in results]
+    tables = [of_frame.table for of_frame, _ in curves]
     table = vstack(tables, metadata_conflicts="silent")
     table.meta = {key: {k: v for each_ in tables for k, v in each_.meta[key].items()} for key in ("fwhm", "photon")}
     table.meta["seed"] = seed
@@ -81,18 +81,18 @@ def calibrate_noise(
 
 
 def _calibrate(exposure, *, options, **stars):
-    """Curves of one exposure, and its photon noise by name if that is an estimate; `stars` put in."""
+    """Curves of one exposure, and its photon noise if that is an estimate; `stars` put in."""
     exposure = options.with_detector(exposure.read())
 
     def remeasure(image, *, fwhm=options.fwhm):
         return measure_exposure(image, replace(options, fwhm=fwhm))[0]
 
     curves = calibrate_frame(exposure, remeasure, threshold=options.threshold, **stars)
-    return curves, {} if exposure.gain else curves.table.meta["photon"]
+    return curves, None if exposure.gain else curves.table.meta["photon"][exposure.name]
 
 
-def _check_arguments(fluxes, fwhm, n_positions, seed):
-    """Fluxes and widths as lists, or None."""
+def check_injection(fluxes=None, fwhm=None, n_positions=100, seed=0):
+    """The stars asked for, checked: fluxes and widths as lists, or None."""
     if fluxes is not None:
         fluxes = np.unique(np.asarray(fluxes, dtype=float))
         if not fluxes.size or not (np.isfinite(fluxes) & (fluxes > 0)).all():

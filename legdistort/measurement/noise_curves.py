@@ -134,14 +134,18 @@ class NoiseCurves:
             raise InputError(f"{exposure}: too few injected stars were found for a noise curve; raise fluxes")
         widths = laws["fwhm"].value
         if fwhm is None:
-            own = self.table.meta.get("fwhm", {}).get(exposure) or np.median(widths)
-            fwhm = widths[np.argmin(np.abs(widths - own))]
+            fwhm = self._own_width(exposure, widths)
         if not widths[0] <= fwhm <= widths[-1]:
             raise InputError(
                 f"fwhm {fwhm!r} lies outside the widths calibrated for {exposure}, {widths[0]:.4g} to {widths[-1]:.4g} "
                 "pixels; give calibrate_noise the widths wanted"
             )
         return [np.interp(fwhm, widths, laws[f"{axis}_{key}"]) for key in ("a", "b", "floor")]
+
+    def _own_width(self, exposure, widths):
+        """The one of some widths that is nearest to that of the exposure's own stars."""
+        own = self.table.meta.get("fwhm", {}).get(exposure) or np.median(widths)
+        return widths[np.argmin(np.abs(widths - own))]
 
     def apply(self, table, source):
         """A table of detections with its errors replaced.
@@ -176,9 +180,8 @@ class NoiseCurves:
     def _stated(self, exposure, flux, axis):
         """What fits of that flux state; beyond the fluxes calibrated in proportion to the law."""
         levels = self.table[self.table["exposure"] == exposure]
-        own = self.table.meta.get("fwhm", {}).get(exposure) or np.median(levels["fwhm"].value)
-        nearest = np.abs(levels["fwhm"].value - own)
-        levels = levels[(nearest == nearest.min()) & _enough(levels)]
+        widths = levels["fwhm"].value
+        levels = levels[(widths == self._own_width(exposure, widths)) & _enough(levels)]
         ratio = levels[f"{axis}_err"].value / self.sigma(levels["flux"], exposure=exposure, axis=axis)
         order = np.argsort(levels["flux"])
         return self.sigma(flux, exposure=exposure, axis=axis) * np.interp(

@@ -1,6 +1,7 @@
 """Options of `legdistort.measure`, checked before a frame is read."""
 
 from dataclasses import dataclass, replace
+from numbers import Integral, Real
 
 import numpy as np
 
@@ -34,20 +35,20 @@ class MeasureOptions:
     errors: str = "fit"
 
     def __post_init__(self):
-        if self.fwhm is not None and not 0.5 <= self.fwhm <= 200:
+        if self.fwhm is not None and not (isinstance(self.fwhm, Real) and 0.5 <= self.fwhm <= 200):
             raise InputError(f"fwhm must lie between 0.5 and 200 pixels, got {self.fwhm!r}")
-        if not self.threshold >= 2:
+        if not (isinstance(self.threshold, Real) and self.threshold >= 2):
             raise InputError(f"threshold must be at least 2 (signal-to-noise ratio), got {self.threshold!r}")
-        if self.max_stars is not None and self.max_stars < 1:
-            raise InputError(f"max_stars must be at least 1, got {self.max_stars!r}")
-        if self.box is not None and not (self.box >= 5 and self.box % 2 == 1):
+        if self.max_stars is not None and not (isinstance(self.max_stars, Integral) and self.max_stars >= 1):
+            raise InputError(f"max_stars must be at least 1, and an integer, got {self.max_stars!r}")
+        if self.box is not None and not (isinstance(self.box, Integral) and self.box >= 5 and self.box % 2 == 1):
             raise InputError(f"box must be an odd number of pixels, at least 5, got {self.box!r}")
         check_choice(self.errors, SOURCES, "errors")
         check_choice(self.profile, PROFILES, "profile")
         check_choice(self.blends, BLENDS, "blends")
         for key in _DETECTOR:
             value = getattr(self, key)
-            if value is not None and not (np.isfinite(value) and value > 0):
+            if value is not None and not (isinstance(value, Real) and 0 < value < np.inf):
                 raise InputError(f"{key} must be a positive number, got {value!r}")
 
     def with_detector(self, exposure):

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, warn
 from ..inputs.exposure_files import listed
-from ..runtime.parallel import each
+from ..runtime.parallel import map_items
 from .crowding import crowding, is_deformed
 from .flags import UNUSABLE, Flag
 from .injection import calibrate_frame
@@ -110,28 +110,24 @@ def measure(
         read_noise=read_noise, saturation=saturation, errors=errors,
     )  # fmt: skip
     work = partial(measure_exposure, options=options)
-    measured = each(work, exposures, workers=workers, progress=progress, description="measuring")
-    tables, assumed = [], {}
-    for exposure, (table, photon, assuming) in zip(exposures, measured, strict=True):
-        if assuming:
-            assumed[exposure.name] = photon
-        tables.append(table)
-    if assumed:
-        _warn_gain(assumed)
-    filled = [table for table in tables if len(table)]
+    measured = list(map_items(work, exposures, workers=workers, progress=progress, description="measuring"))
+    _warn_of_gain({exposure.name: photon for exposure, (_, photon) in zip(exposures, measured, strict=True)})
+    filled = [table for table, _ in measured if len(table)]
     return vstack(filled) if filled else _empty()
 
 
-def _warn_gain(assumed):
-    names = list(assumed)
-    values = [1 / p for p in assumed.values() if p]
-    found = f"equivalent gain {min(values):.3g} to {max(values):.3g} e-/ADU" if values else "none could be seen"
-    listed = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-    warn(
-        f"no gain known for {listed}: photon noise estimated from the residuals of the star fits ({found}); "
-        "give gain= or the keyword GAIN to have it exact",
-        AssumptionWarning,
-    )
+def _warn_of_gain(photons):
+    """Warn of exposures whose photon noise was estimated: ``{name: variance per unit of light, None if known}``."""
+    names = [name for name, photon in photons.items() if photon is not None]
+    if names:
+        gains = [1 / photon for photon in photons.values() if photon]
+        found = f"equivalent gain {min(gains):.3g} to {max(gains):.3g} e-/ADU" if gains else "none could be seen"
+        some = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        warn(
+            f"no gain known for {some}: photon noise estimated from the residuals of the star fits ({found}); "
+            "give gain= or the keyword GAIN to have it exact",
+            AssumptionWarning,
+        )
 
 
 def measure_exposure(exposure, options):
@@ -147,20 +143,18 @@ def measure_exposure(exposure, options):
     -------
     table : `~astropy.table.QTable`
         As from `measure`.
-    photon : float
-        Variance per unit of star light that was used.
-    assumed : bool
-        Whether that is an estimate, for want of a gain.
+    photon : float or None
+        Variance per unit of star light if it had to be estimated, for want of a gain.
     """
     exposure = options.with_detector(exposure.read())
-    table, photon, assumed = _measure_frame(exposure, options)
+    table, photon = _measure_frame(exposure, options)
     if options.errors != "fit" and np.any((table["flags"] & UNUSABLE) == 0):
 
         def remeasure(image, *, fwhm=options.fwhm):
             return _measure_frame(image, replace(options, max_stars=None, fwhm=fwhm))[0]
 
         table = calibrate_frame(exposure, remeasure, threshold=options.threshold).apply(table, options.errors)
-    return table, photon, assumed
+    return table, photon
 
 
 def _measure_frame(exposure, options):
@@ -169,7 +163,7 @@ def _measure_frame(exposure, options):
     frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
     if len(centres) == 0:
         log.warning("%s: no star above %g times the noise", name, options.threshold)
-        return _empty(), frame.photon, False
+        return _empty(), None
     if max_stars is not None:
         centres = centres[: 3 * max_stars]  # some will turn out to be hot pixels or saturated
     fwhm = float(moffat.fwhm(shape))
@@ -184,16 +178,14 @@ def _measure_frame(exposure, options):
     if max_stars is not None:
         table = table[(table["flags"] & UNUSABLE) == 0][:max_stars]
     log.info("%s: %d detections, FWHM %.2f px", name, len(table), fwhm)
-    assumed = len(table) > 0 and not exposure.gain and exposure.uncertainty is None
-    return table, photon, assumed
+    known = exposure.gain or exposure.uncertainty is not None or not len(table)
+    return table, None if known else photon
 
 
 def _empty():
-    table = QTable({"exposure": np.zeros(0, dtype="U1")})
-    for name in _COLUMNS:
-        table[name] = np.zeros(0) * (u.pix if name in _PIXELS else 1)
-    table["flags"], table["crowding"] = np.zeros(0, dtype=int), np.zeros(0)
-    return table
+    columns = {name: np.zeros(0) * (u.pix if name in _PIXELS else 1) for name in _COLUMNS}
+    kinds = {"flags": np.zeros(0, dtype=int), "crowding": np.zeros(0)}
+    return QTable({"exposure": np.zeros(0, dtype="U1"), **columns, **kinds})
 
 
 def _table(name, stamps, fit, *, flags, snr):
@@ -215,11 +207,9 @@ def _table(name, stamps, fit, *, flags, snr):
     width = moffat.fwhm(fit.params)
     to_edge = np.minimum(xy + 0.5, np.array([nx, ny]) - 0.5 - xy).min(axis=1)
     flags = flags | np.where(lost, Flag.NOT_CONVERGED, 0) | np.where(to_edge < width, Flag.EDGE, 0)
-    table = QTable({"exposure": np.full(len(xy), name)})
     columns = (xy[:, 0], xy[:, 1], error[:, 0], error[:, 1], corr, flux, scale * flux_err, width, chi2)
-    for column, values in zip(_COLUMNS, columns, strict=True):
-        table[column] = values * u.pix if column in _PIXELS else values
-    table["flags"] = flags
+    named = {key: v * u.pix if key in _PIXELS else v for key, v in zip(_COLUMNS, columns, strict=True)}
+    table = QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})
     return table[np.argsort(-flux, kind="stable")]
 
 

@@ -21,9 +21,7 @@ def round_down(value):
 
 def new_axes(ax, size):
     """The axes given, or the only ones of a new figure of this size in inches."""
-    if ax is None:
-        ax = new_figure(None, size).subplots()
-    return ax
+    return new_figure(None, size).subplots() if ax is None else ax
 
 
 def new_figure(fig, size):
@@ -77,6 +75,33 @@ def draw_grid(ax, shape, coefficients, **style):
         shift = np.tensordot(coefficients, basis.values(degree, first, second), 1)
         paths.extend(basis.denormalize(first, second, shape) + np.moveaxis(shift, 0, -1))
     ax.add_collection(LineCollection(paths, **style))
+
+
+def draw_image(ax, image, *, sky, soft, low, high, extent):
+    """An image in asinh stretch, dark on light; pixels without data are pale blue.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+    image : ndarray, shape (ny, nx)
+        NaN where there are no data.
+    sky, soft : float
+        The value in the middle of the stretch and that above it where it turns from linear to logarithmic.
+    low, high : float
+        Where it ends, in stretched values.
+    extent : tuple
+        As matplotlib takes it.
+    """
+    from matplotlib import colormaps
+
+    ax.imshow(
+        np.ma.masked_invalid(np.arcsinh((image - sky) / soft)),
+        vmin=low,
+        vmax=high,
+        cmap=colormaps["gray_r"].with_extremes(bad="#cfe0f1"),
+        origin="lower",
+        extent=extent,
+    )
 
 
 def running_median(x, y, per_bin=8):

@@ -1,4 +1,4 @@
-"""Pictures of finished objects: residuals, distortions, coefficients, error maps, mosaics.
+"""Pictures of a solution: residuals, distortions, coefficients, scatter, error maps.
 
 Every function draws on the axes ``ax`` that it is given, or on new ones, and returns them; those that need
 several take a figure ``fig``, set its size and return a list of axes. Nothing is shown or saved.
@@ -15,6 +15,7 @@ from .elements import BLUE, GREY, ORANGE, RED, round_down
 #: Panels of one figure of small multiples.
 PANELS = 12
 _MAX_ARROWS = 3000
+_PARTS = {"total": "distortion", "nonlinear": "distortion of degree 2 and more", "dynamic": "dynamic distortion"}
 
 
 def plot_residuals(solution, name=None, *, scale=None, ax=None):
@@ -48,7 +49,8 @@ def plot_residuals(solution, name=None, *, scale=None, ax=None):
     rows = np.flatnonzero(used)
     if not len(rows):
         raise InputError(f"nothing to draw: no position of {name or 'any exposure'} was used")
-    ny, nx = _largest_shape(solution, name)
+    shapes = list(solution.shapes.values()) if name is None else [solution.shapes[name]]
+    ny, nx = np.max(shapes, axis=0)
     scale = scale or round_down(0.08 * max(nx, ny) / (np.percentile(np.hypot(dx, dy)[rows], 90) or 1))
     if len(rows) > _MAX_ARROWS:
         rows = np.random.default_rng(0).choice(rows, _MAX_ARROWS, replace=False)
@@ -131,7 +133,7 @@ def plot_distortions(solution, *, names=None, page=0, part="total", scale=50, fi
     columns = min(4, len(shown))
     rows = -(-len(shown) // columns)
     fig = elements.new_figure(fig, (2.3 * columns + 0.5, 2.3 * rows + 0.6))
-    panels = list(fig.subplots(rows, columns, squeeze=False).flat)
+    panels = list(fig.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)
     scale = scale or distortion_scale(solution, shown, part=part)
     for i, (ax, name) in enumerate(zip(panels, shown, strict=False)):
         plot_distortion(solution, name, part=part, scale=scale, ax=ax)
@@ -141,16 +143,11 @@ def plot_distortions(solution, *, names=None, page=0, part="total", scale=50, fi
         ax.locator_params(nbins=3)
     for ax in panels[len(shown) :]:
         ax.remove()
-    panels = panels[: len(shown)]
-    (x_min, y_min), (x_max, y_max) = type(panels[0].dataLim).union([ax.dataLim for ax in panels]).get_points()
-    pad = 0.03 * max(x_max - x_min, y_max - y_min)
-    for ax in panels:
-        ax.set(xlim=(x_min - pad, x_max + pad), ylim=(y_min - pad, y_max + pad))
     fig.supxlabel("x [px]", fontsize="medium")
     fig.supylabel("y [px]", fontsize="medium")
     heading = _heading(part, scale, part != "dynamic" and np.any(solution.prior_mean))
     fig.suptitle(heading.capitalize(), fontsize="medium")
-    return panels
+    return panels[: len(shown)]
 
 
 def distortion_scale(solution, names, *, part="total"):
@@ -256,47 +253,6 @@ def plot_scatter(solution, *, label="scatter of one star", color=BLUE, ax=None):
     return ax
 
 
-def plot_mosaic(mosaic, *, stars=None, max_size=900, ax=None):
-    """Co-added image, asinh stretch, dark stars on light sky; pixels without data are pale blue.
-
-    Parameters
-    ----------
-    mosaic : `~legdistort.coaddition.mosaicking.Mosaic`
-        Only its ``data``, shape (ny, nx), are looked at.
-    stars : array_like, shape (n, 2), optional
-        Positions to be circled, mosaic pixels.
-    max_size : int
-        Larger images are averaged in blocks for display; the axes stay in mosaic pixels.
-    ax : `~matplotlib.axes.Axes`, optional
-        Where to draw.
-    """
-    from matplotlib import colormaps
-
-    ax = elements.new_axes(ax, (7.0, 7.0))
-    data = np.asarray(mosaic.data, dtype=float)
-    image = elements.block_mean(data, block := max(1, -(-max(data.shape) // max_size)))
-    good = image[np.isfinite(image)]
-    if not good.size:
-        raise InputError(f"the mosaic of shape {data.shape} has no finite pixel to show")
-    sky, high = np.percentile(good, [50, 99.9])
-    soft = 2 * (sky - np.percentile(good, 16)) or 1.0  # twice the noise of the sky
-    height, width = (block * n for n in image.shape)
-    ax.imshow(
-        np.ma.masked_invalid(np.arcsinh((image - sky) / soft)),
-        vmin=np.arcsinh(-1.2),
-        vmax=max(np.arcsinh((high - sky) / soft), 4.0),
-        cmap=colormaps["gray_r"].with_extremes(bad="#cfe0f1"),
-        origin="lower",
-        extent=(-0.5, width - 0.5, -0.5, height - 0.5),
-    )
-    if stars is not None:
-        ax.plot(*np.asarray(stars, dtype=float).T, "o", mfc="none", color=RED, markersize=9, mew=0.9)
-    ny, nx = data.shape
-    ax.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), xlabel="x [px]", ylabel="y [px]")
-    elements.set_title(ax, "Mosaic (asinh stretch)")
-    return ax
-
-
 def plot_sigma_map(x, y, sigma, *, stars=None, ax=None):
     """Map of the error of a corrected position (the paper's Figure "ergrid").
 
@@ -346,25 +302,17 @@ def plot_sigma_map(x, y, sigma, *, stars=None, ax=None):
 
 
 def _heading(part, scale, has_prior):
-    what = {"total": "distortion", "nonlinear": "distortion of degree 2 and more", "dynamic": "dynamic distortion"}[
-        part
-    ]
-    return f"{what} × {scale:g}{' (blue) over the prior (orange)' if has_prior else ''}"
+    return f"{_PARTS[part]} × {scale:g}{' (blue) over the prior (orange)' if has_prior else ''}"
 
 
 def _parts(solution, name, part):
     """Coefficients to draw and those of the prior behind them (None without one)."""
     i = solution.index(name)
+    if part not in _PARTS:
+        raise InputError(f"part must be 'total', 'nonlinear' or 'dynamic', got {part!r}")
     if part == "dynamic":
         return solution.coefficients[i] - solution.prior_mean[i], None
-    if part not in ("total", "nonlinear"):
-        raise InputError(f"part must be 'total', 'nonlinear' or 'dynamic', got {part!r}")
     coefficients, prior = solution.coefficients[i].copy(), solution.prior_mean[i].copy()
     if part == "nonlinear":
         coefficients[:, :3] = prior[:, :3] = 0
     return coefficients, prior if np.any(prior) else None
-
-
-def _largest_shape(solution, name):
-    shapes = [solution.shapes[name]] if name is not None else list(solution.shapes.values())
-    return tuple(max(sizes) for sizes in zip(*shapes, strict=True))

@@ -1,1 +1,1 @@
-"""A static distortion that is known beforehand, from anything."""
+"""What is known of a static distortion beforehand: maps from objects and files, as Legendre series with widths."""

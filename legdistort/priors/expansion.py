@@ -81,11 +81,12 @@ class _Plane:
 
     def __init__(self, source):
         self._function, self._origin, self._name = source.on_plane(), source.origin, source.name
-        self._inverse, self._affine = source.direction == "reference_to_detector", None
-        self._reached = None
+        self._inverse, self._reached = source.direction == "reference_to_detector", None
         t = np.linspace(-1, 1, CHECK_GRID)
         self.pixels = basis.denormalize(*np.meshgrid(t, t), source.shape)
-        self.dense = self.of_pixels(self.pixels.reshape(-1, 2)).reshape(self.pixels.shape)
+        flat = self.pixels.reshape(-1, 2)
+        self._affine = self._approach(flat.mean(axis=0), np.ptp(flat, axis=0)) if self._inverse else None
+        self.dense = self.of_pixels(flat).reshape(self.pixels.shape)
         if not np.all(np.isfinite(self.dense)):
             row, column = np.argwhere(~np.isfinite(self.dense))[0, :2]
             raise InputError(
@@ -97,8 +98,6 @@ class _Plane:
         """Plane coordinates of detector pixels (n, 2)."""
         if not self._inverse:
             return self._call(pixels + self._origin)
-        if self._affine is None:
-            self._affine = self._approach(pixels.mean(axis=0), np.ptp(pixels, axis=0))
         matrix, shift, size = self._affine
         return self._newton(lambda w: self._call(w) - self._origin, pixels, (pixels - shift) @ matrix, size)[0]
 

@@ -5,6 +5,7 @@ import difflib
 import io
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import gwcs
@@ -17,10 +18,10 @@ from astropy.wcs import WCS
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis
 from ..geometry.gsaoi import GSAOI_SIZE, gsaoi_static
-from ..inputs.exposures import read_exposures
+from ..inputs.exposure_files import read_exposures
 from ..runtime.asdf_files import WITH_WCS, read_tree
-from . import source as sources
-from .from_objects import describe, of_model
+from .from_objects import as_source, of_model
+from .source import DIRECTIONS, of_maps, of_powers
 
 #: Tags of ASDF files that hold a WCS: those of gwcs, and what the archives of JWST and Roman put around it.
 TAGS = (*WITH_WCS, "tag:stsci.edu:jwst_pipeline/", "tag:stsci.edu:jwst_datamodel/", "asdf://stsci.edu/datamodels/")
@@ -45,7 +46,7 @@ def read_source(where, *, ext=None, frame=None):
         Extension of FITS files, place among several headers of a text, or path in the tree of an ASDF file
         (``"roman.meta.wcs"``), where it is not clear.
     frame : str, optional
-        As for `legdistort.priors.from_objects.describe`.
+        As for `legdistort.priors.from_objects.as_source`.
 
     Returns
     -------
@@ -64,10 +65,10 @@ def read_source(where, *, ext=None, frame=None):
         where = where[0]
     text = str(where)
     if re.fullmatch(r"gsaoi-[1-4]", text):
-        known = {"direction": sources.DIRECTIONS[0], "origin": 0, "shape": (GSAOI_SIZE, GSAOI_SIZE)}
+        known = {"direction": DIRECTIONS[0], "origin": 0, "shape": (GSAOI_SIZE, GSAOI_SIZE)}
         return _refuse(of_model(gsaoi_static(int(text[-1])), text, **known), ext=ext, frame=frame)
     if text.startswith("siaf:"):
-        return _refuse(describe(_aperture(text), frame=frame, name=text), ext=ext)
+        return _refuse(as_source(_aperture(text), frame=frame, name=text), ext=ext)
     path = Path(where)
     if not path.is_file():
         raise InputError(
@@ -98,7 +99,7 @@ def _read_file(path, ext, frame):
         source = _refuse(_read_text(path, ext), frame=frame)
     else:
         raise InputError(f"{path} is neither FITS, ASDF, the text of a FITS header nor a file of Drizzle coefficients")
-    return sources.dataclasses.replace(source, files=(path,))
+    return replace(source, files=(path,))
 
 
 # -- ASDF
@@ -114,25 +115,22 @@ def _from_tree(tree, ext, frame, name):
     candidates = whole or found
     if not candidates:
         raise InputError(f"{name} holds neither a gwcs nor a distortion model that can be read here")
-    if len(candidates) > 1:
+    model, *others = candidates.values()
+    if any(other is not model for other in others):  # one may stand in several places
         raise InputError(f"{name} holds several distortions: {', '.join(candidates)}; choose one with ext (--ext)")
-    (model,) = candidates.values()
     if whole:
-        return describe(model, frame=frame, name=name)
+        return as_source(model, frame=frame, name=name)
     return _refuse(_reference_model(model, tree, name), frame=frame)
 
 
-def _models(tree):
-    """Path and value of every gwcs and model in a tree of dicts and lists."""
-    waiting, seen = [("", tree)], set()
-    while waiting:
-        path, node = waiting.pop()
-        if isinstance(node, (gwcs.WCS, Model)):
-            yield path.lstrip("."), node
-        elif isinstance(node, (dict, list)) and id(node) not in seen:
-            seen.add(id(node))
-            items = node.items() if isinstance(node, dict) else enumerate(node)
-            waiting += [(f"{path}.{key}", value) for key, value in items if key not in ("asdf_library", "history")]
+def _models(tree, path=""):
+    """Path and value of every gwcs and model in a tree of dicts and lists; `read_tree` took none that holds itself."""
+    if isinstance(tree, (gwcs.WCS, Model)):
+        yield path, tree
+    elif isinstance(tree, (dict, list)):
+        for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
+            if key not in ("asdf_library", "history"):
+                yield from _models(value, f"{path}.{key}".lstrip("."))
 
 
 def _reference_model(model, tree, name):
@@ -141,7 +139,7 @@ def _reference_model(model, tree, name):
     meta = roman.get("meta") if isinstance(roman, dict) else tree.get("meta")
     if not isinstance(meta, dict) or str(meta.get("reftype")).lower() != "distortion":
         return of_model(model, name)
-    known = {"direction": sources.DIRECTIONS[0], "origin": 0, "sphere": 1 / 3600, "details": {"frame": "v2v3"}}
+    known = {"direction": DIRECTIONS[0], "origin": 0, "sphere": 1 / 3600, "details": {"frame": "v2v3"}}
     return of_model(model, name, **known)
 
 
@@ -172,7 +170,8 @@ def _from_hdulist(hdulist, ext, name):
         try:
             return _from_header(hdulist[ext].header, f"{name}[{ext}]", hdulist)
         except (KeyError, IndexError):
-            raise InputError(f"{name}: no extension {ext!r}; it has {_contents(hdulist)}") from None
+            contents = ", ".join(f"{i} {hdu.name}".strip() for i, hdu in enumerate(hdulist))
+            raise InputError(f"{name}: no extension {ext!r}; it has {contents}") from None
     refusals = []
     for i, hdu in sorted(enumerate(hdulist), key=lambda pair: pair[1].name != "SCI"):
         try:
@@ -180,10 +179,6 @@ def _from_hdulist(hdulist, ext, name):
         except InputError as error:
             refusals.append(str(error))
     raise InputError(next((r for r in refusals if "no celestial" not in r), refusals[0]))
-
-
-def _contents(hdulist):
-    return ", ".join(f"{i} {hdu.name}".strip() for i, hdu in enumerate(hdulist))
 
 
 def _from_header(header, name, hdulist=None):
@@ -196,14 +191,14 @@ def _from_header(header, name, hdulist=None):
     if hdulist is None:
         _leave_out_tables(header, name)
     try:
-        source = describe(WCS(header, fobj=hdulist), name=name)
+        source = as_source(WCS(header, fobj=hdulist), name=name)
     except InputError:
         raise
     except Exception as error:  # wcslib raises many kinds
         raise InputError(f"{name}: its WCS cannot be read ({' '.join(str(error).split())})") from None
     kind = "FITS header, " + str(header.get("CTYPE1", "WCS"))
     shape = source.shape or _shape(header)
-    return sources.dataclasses.replace(source, kind=kind, shape=shape)
+    return replace(source, kind=kind, shape=shape)
 
 
 def _shape(header):
@@ -235,7 +230,7 @@ def _read_maps(paths, ext):
     name = f"{x}, {y}"
     maps = [read_exposures(path, ext=ext)[0] for path in paths]
     shifts = [np.where(image.mask, np.nan, image.data) for image in maps]
-    return sources.dataclasses.replace(sources.of_maps(*shifts, name=name), files=tuple(map(Path, paths)))
+    return replace(of_maps(*shifts, name=name), files=tuple(map(Path, paths)))
 
 
 # -- text
@@ -283,7 +278,7 @@ def _read_powers(text, name):
             f"{name}: not a file of Drizzle coefficients, which is 'poly N' or 'cubic', (N+1)(N+2)/2 numbers for x "
             f"and as many for y ({error})"
         ) from None
-    return sources.of_powers(coefficients, name, centre=centre)
+    return of_powers(coefficients, name, centre=centre)
 
 
 # -- SIAF

@@ -1,6 +1,6 @@
 """Models, WCSs and SIAF apertures as sources of a static distortion."""
 
-import dataclasses
+from dataclasses import replace
 
 import gwcs
 import numpy as np
@@ -10,7 +10,8 @@ from astropy.modeling import Model, models
 from gwcs import coordinate_frames as cf
 
 from ..exceptions import InputError
-from .source import DIRECTIONS, Source, check_shape, tangent
+from ..geometry.tangent_plane import gnomonic
+from .source import DIRECTIONS, Source, check_shape
 
 #: Frames of a gwcs where the distortion ends and pointing has not begun, in order of preference.
 PLANES = ("undistorted", "v2v3")
@@ -18,7 +19,7 @@ PLANES = ("undistorted", "v2v3")
 NOTHING = 1e-6
 
 
-def describe(model, *, frame=None, name="the model"):
+def as_source(model, *, frame=None, name="the model"):
     """What is known of a model, WCS, aperture or function, as a `Source`.
 
     Parameters
@@ -100,7 +101,7 @@ def _of_gwcs(wcs, frame, name):
         known["sphere"] = float(end.unit[0].to(u.deg)) if hasattr(end, "unit") else 1.0
         if getattr(end, "axes_order", None) == (1, 0):
             transform = transform | models.Mapping((1, 0))
-    return dataclasses.replace(of_model(transform, name, **known), kind="gwcs")
+    return replace(of_model(transform, name, **known), kind="gwcs")
 
 
 def _shape_of(wcs):
@@ -127,11 +128,10 @@ def _of_fits_wcs(wcs, name):
         return sky[wcs.wcs.lng], sky[wcs.wcs.lat]
 
     crval, centre = wcs.wcs.crval, wcs.wcs.crpix - 1
-    plane = tangent(function, crval[wcs.wcs.lng], crval[wcs.wcs.lat])
     grid = (np.stack(np.meshgrid(*[np.linspace(-500, 500, 5)] * 2), axis=-1).reshape(-1, 2)) + centre
     linear = np.column_stack([grid, np.ones(len(grid))])
     with np.errstate(all="ignore"):
-        sky = np.column_stack(plane(*grid.T))
+        sky = np.column_stack(gnomonic(*function(*grid.T), crval[wcs.wcs.lng], crval[wcs.wcs.lat]))
         matrix = np.linalg.lstsq(linear, np.nan_to_num(sky), rcond=None)[0]
         left = np.abs(linear @ matrix - sky).max() / np.sqrt(abs(np.linalg.det(matrix[:2])))
     if left < NOTHING:  # not if it is NaN

@@ -1,6 +1,6 @@
 """What is known of the distortion beforehand."""
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from numbers import Real
 
 import numpy as np
@@ -13,12 +13,10 @@ EVIDENCE = "evidence"
 
 
 def _per_mode(value, n, name):
-    """A width given as a number, per mode or per axis and mode -> (2, n_modes), non-negative."""
-    if value is None:
-        return None
+    """A width given as a number, per mode or per axis and mode -> (2, n_modes), non-negative; None as None."""
+    if value is None or (isinstance(value, str) and name == "sigma" and value == EVIDENCE):
+        return value
     if isinstance(value, str):
-        if name == "sigma" and value == EVIDENCE:
-            return EVIDENCE
         words = "widths in pixels" + (f", or {EVIDENCE!r}: found from the exposures" if name == "sigma" else "")
         raise InputError(f"{name} must be {words}, got {value!r}")
     out = np.asarray(value, dtype=float)
@@ -46,7 +44,7 @@ def _declared(sigma, static_sigma):
     return float(static_sigma)
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False)
 class Prior:
     """Static distortion known beforehand, and how far to trust it.
 
@@ -85,31 +83,27 @@ class Prior:
     """
 
     mean: np.ndarray | None
-    sigma: np.ndarray | str | None
-    static_sigma: np.ndarray | float | None
-    shape: tuple | None
-    truncation: float
-    plane: np.ndarray | None
-    source: str | dict | None
+    _: KW_ONLY
+    sigma: np.ndarray | str | None = None
+    static_sigma: np.ndarray | float | None = None
+    shape: tuple | None = None
+    truncation: float = 0.0
+    plane: np.ndarray | None = None
+    source: str | dict | None = None
 
-    def __init__(self, mean, *, sigma=None, static_sigma=None, shape=None, truncation=0.0, plane=None, source=None):
-        if mean is None:
-            static_sigma = _declared(sigma, static_sigma)
-        else:
-            mean = np.array(mean, dtype=float)
-            if mean.ndim != 2 or mean.shape[0] != 2:
-                raise InputError(f"mean must have shape (2, n_modes), x then y, got {mean.shape}")
-            if not np.all(np.isfinite(mean)):
-                raise InputError("mean has values that are not finite")
-            basis.degree_of(mean.shape[1])
-            sigma = _per_mode(sigma, mean.shape[1], "sigma")
-            static_sigma = _per_mode(static_sigma, mean.shape[1], "static_sigma")
-        for name, value in zip(
-            ("mean", "sigma", "static_sigma", "shape", "truncation", "plane", "source"),
-            (mean, sigma, static_sigma, shape, truncation, plane, source),
-            strict=True,
-        ):
-            object.__setattr__(self, name, value)
+    def __post_init__(self):
+        if self.mean is None:
+            object.__setattr__(self, "static_sigma", _declared(self.sigma, self.static_sigma))
+            return
+        mean = np.array(self.mean, dtype=float)
+        if mean.ndim != 2 or mean.shape[0] != 2:
+            raise InputError(f"mean must have shape (2, n_modes), x then y, got {mean.shape}")
+        if not np.all(np.isfinite(mean)):
+            raise InputError("mean has values that are not finite")
+        basis.degree_of(mean.shape[1])
+        object.__setattr__(self, "mean", mean)
+        for name in ("sigma", "static_sigma"):
+            object.__setattr__(self, name, _per_mode(getattr(self, name), mean.shape[1], name))
 
     @property
     def degree(self):
@@ -155,11 +149,10 @@ class Prior:
             given = np.asarray(sigma, dtype=float)
             sigma = np.full((*given.shape[:-1], basis.n_modes(degree)), np.inf)
             sigma[..., : given.shape[-1]] = given[..., : sigma.shape[-1]]
-        known = {name: getattr(self, name) for name in ("shape", "truncation", "plane", "source")}
         if self.mean is None:
-            return Prior(None, sigma=sigma, static_sigma=self.static_sigma, **known)
+            return replace(self, sigma=sigma)
         static = None if self.static_sigma is None else basis.change_degree(self.static_sigma, degree)
-        return Prior(basis.change_degree(self.mean, degree), sigma=sigma, static_sigma=static, **known)
+        return replace(self, mean=basis.change_degree(self.mean, degree), sigma=sigma, static_sigma=static)
 
     def __repr__(self):
         if self.mean is None:
@@ -221,9 +214,9 @@ class Prior:
             For a wrong direction or origin, or a model that cannot be followed over the detector.
         """
         from .expansion import expand
-        from .from_objects import describe
+        from .from_objects import as_source
 
-        source = describe(model, frame=frame).stated(shape=shape, direction=direction, origin=origin)
+        source = as_source(model, frame=frame).stated(shape=shape, direction=direction, origin=origin)
         mean, plane, truncation = expand(source, basis.check_degree(degree), parity)
         known = {"shape": source.shape, "truncation": truncation, "plane": plane, "source": source.record()}
         return cls(mean, sigma=sigma, static_sigma=static_sigma, **known)

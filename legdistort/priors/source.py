@@ -5,14 +5,14 @@ V2 and V3) are projected from the centre of the sphere on the plane that touches
 since angles themselves are no plane.
 """
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.interpolate import NdBSpline, make_interp_spline
 
 from ..exceptions import InputError
 from ..geometry import basis
+from ..geometry.tangent_plane import gnomonic
 from ..runtime.provenance import checksums
 
 DIRECTIONS = ("detector_to_reference", "reference_to_detector")
@@ -60,7 +60,7 @@ class Source:
     usual: str | None = None
     from_middle: bool = False
     files: tuple = ()
-    details: dict = dataclasses.field(default_factory=dict)
+    details: dict = field(default_factory=dict)
 
     def __repr__(self):
         return f"<Source {self.name}: {self.kind}>"
@@ -94,12 +94,12 @@ class Source:
             raise InputError(
                 f"{self.name} ({self.kind}) does not tell the size of the detector: give shape=(ny, nx) (--shape NY NX)"
             )
-        return dataclasses.replace(self, **given)
+        return replace(self, **given)
 
     def record(self):
         """Where it comes from as plain numbers and strings; files with their SHA-256."""
         known = {"kind": self.kind, "name": self.name, "direction": self.direction, "origin": self.origin}
-        return known | self.details | ({"files": checksums(self.files)} if self.files else {})
+        return known | self.details | ({"files": checksums(*self.files)} if self.files else {})
 
     def on_plane(self):
         """The function with its outputs on a plane; of a complete source only."""
@@ -110,7 +110,7 @@ class Source:
             return self.function
         centre = (np.array([nx, ny]) - 1) / 2 + self.origin
         lon, lat = (float(a[0]) for a in self.function(*centre[:, None]))
-        return tangent(self.function, lon, lat, self.sphere)
+        return lambda x, y: gnomonic(*self.function(x, y), lon, lat, self.sphere)
 
 
 def check_shape(shape):
@@ -120,34 +120,6 @@ def check_shape(shape):
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"shape must be (ny, nx) in pixels, at least 2 each, got {shape!r}") from None
     return ny, nx
-
-
-def tangent(function, lon0, lat0, degrees=1.0):
-    """A function that ends in (lon, lat), followed by the gnomonic projection about (lon0, lat0).
-
-    Parameters
-    ----------
-    function : callable
-    lon0, lat0 : float
-        Tangent point.
-    degrees : float
-        Size of the unit of all angles, degrees; the plane has that unit too. NaN beyond 90 degrees.
-    """
-    unit, turn = np.radians(degrees), 360 / degrees
-    sin0, cos0 = np.sin(unit * lat0), np.cos(unit * lat0)
-
-    def on_plane(x, y):
-        lon, lat = function(x, y)
-        dlon, dlat = np.asarray(lon) - lon0, unit * (np.asarray(lat) - lat0)
-        dlon = unit * (dlon - turn * np.round(dlon / turn))  # small angles are exact, across 360 degrees too
-        lat = unit * np.asarray(lat)
-        # sin(lat) cos0 - cos(lat) sin0 cos(dlon), without the difference of large numbers
-        up = np.sin(dlat) + 2 * np.cos(lat) * sin0 * np.sin(dlon / 2) ** 2
-        ahead = np.cos(dlat) - 2 * np.cos(lat) * cos0 * np.sin(dlon / 2) ** 2
-        ahead = np.where(ahead > 0, ahead, np.nan) * unit
-        return np.cos(lat) * np.sin(dlon) / ahead, up / ahead
-
-    return on_plane
 
 
 def check_folds(plane, pixels, name):

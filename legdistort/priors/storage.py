@@ -14,8 +14,8 @@ from ..results.solution import Solution
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, check_tree, read_tree
 from ..runtime.outputs import replacing
-from . import source as sources
 from .from_files import read_source
+from .source import check_shape
 
 #: Version of the layout under ``legdistort_prior``.
 LAYOUT = 1
@@ -54,8 +54,8 @@ def read_prior(path, kind):
         raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
     check_tree({"legdistort_prior": tree}, "prior-1.schema.yaml", path)
     try:
-        arrays = {key: tree[key] for key in ("coefficients", "sigma", "static_sigma", "plane")}
-        arrays = {key: np.array(value) if hasattr(value, "shape") else value for key, value in arrays.items()}
+        given = ((key, tree[key]) for key in ("coefficients", "sigma", "static_sigma", "plane"))
+        arrays = {key: np.array(value) if hasattr(value, "shape") else value for key, value in given}
         if arrays["plane"] is not None:
             similarity.check(arrays["plane"], "plane")
         prior = kind(
@@ -81,11 +81,10 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
     if ready is not None:
         given = options | {key: value for key, value in (("ext", ext), ("frame", frame)) if value is not None}
         if "shape" in given and ready.shape in (None, tuple(given["shape"])):
-            widths["shape"] = sources.check_shape(given.pop("shape"))
+            widths["shape"] = check_shape(given.pop("shape"))
         if given:
             raise InputError(f"{where} is a prior already: {', '.join(given)} cannot be chosen any more; leave it out")
-        known = {field.name: getattr(ready, field.name) for field in dataclasses.fields(ready)}
-        return kind(**known | widths)
+        return dataclasses.replace(ready, **widths)
     source = read_source(where, ext=ext, frame=frame)
     try:
         return kind.from_model(source, **options, **widths)

@@ -1,4 +1,8 @@
-"""Pieces of an HTML page that is complete in itself: style, tables of figures, pictures."""
+"""Pieces of an HTML page that is complete in itself: style, tables of figures, pictures.
+
+They are written without a template engine: one page of two tables and some pictures is not worth a dependency and a
+second language. Texts are escaped here, where they become markup.
+"""
 
 import base64
 import io
@@ -31,13 +35,13 @@ footer { margin-top: 2.5rem; font-size: .8rem; color: #51606d; }
 
 
 def wide_table(head, rows):
-    """Table of figures: columns with their units, rows of a name and cells (ready-made or plain)."""
+    """Table of figures: columns with their units, rows of a name and cells (ready-made ``<td>``, or plain text)."""
     header = "".join(
         f'<th scope="col">{h}{f"<br><small>{unit}</small>" if unit else ""}</th>' for h, unit in head.items()
     )
     body = ""
     for name, *cells in rows:
-        cells = "".join(c if c.startswith("<td") else f"<td>{c}</td>" for c in cells)
+        cells = "".join(c if c.startswith("<td") else f"<td>{escape(c)}</td>" for c in cells)
         body += f"<tr><td>{escape(name)}</td>{cells}</tr>\n"
     return (
         f'<div class="wide"><table class="exposures">\n<thead><tr>{header}</tr></thead>\n'
@@ -45,8 +49,8 @@ def wide_table(head, rows):
     )
 
 
-def new_figure(*size):
-    """An empty figure, of a size in inches or of whatever size a plot will give it."""
+def detached_figure(*size):
+    """An empty figure that pyplot knows nothing of, of a size in inches or of whatever size a plot will give it."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=size or None, layout="constrained")
@@ -56,6 +60,7 @@ def figure(ax, caption):
     """A picture with its sentence, the PNG inside the page."""
     from PIL import Image
 
+    caption = escape(caption)
     file, small = io.BytesIO(), io.BytesIO()
     ax.figure.savefig(file, format="png", dpi=120)
     # A palette takes a third of the room; "maximum coverage" keeps rare colours, such as the black of stars.

@@ -10,10 +10,10 @@ import numpy as np
 from ..exceptions import FoldError
 from ..geometry import similarity
 from ..inputs import column_contract
-from ..plots import solution_plots
+from ..plots import solution_plots, stack_plots
 from ..runtime.outputs import replacing
-from . import comparison as comparison_report
-from .html import STYLE, count, figure, new_figure, wide_table
+from .comparison import compared_corrections, compared_stacks, sharpness
+from .html import STYLE, count, detached_figure, figure, wide_table
 
 #: An exposure whose residuals exceed the median by this factor is marked.
 _MARK = 2.0
@@ -28,7 +28,7 @@ def write_report(path, solution, *, mosaic=None, summary=None, comparison=None, 
         Of the page.
     solution : `~legdistort.results.solution.Solution`
         What is reported.
-    mosaic : `~legdistort.coaddition.mosaicking.Mosaic`, optional
+    mosaic : `~legdistort.coaddition.mosaic.Mosaic`, optional
         The co-added image.
     summary : dict, optional
         Results of the run that replace or complete what follows from the solution: ``n_exposures``, ``n_stars``,
@@ -60,25 +60,29 @@ def write_report(path, solution, *, mosaic=None, summary=None, comparison=None, 
 
 def render(solution, *, mosaic=None, summary=None, comparison=None, stacks=None):
     """The page of `write_report` as a string."""
+    from matplotlib import style
+
     facts = _facts(solution, summary or {})
     title = f"Distortion of {count(facts['n_exposures'], 'exposure')}"
     lead = (
         f"{count(facts['n_stars'], 'star')}, {count(facts['n_observations'], 'position')}, "
         f"Legendre polynomials of degree {solution.degree}"
     )
-    body = [
-        f'<h1>{title}</h1><p class="lead">{lead}</p>',
-        _warning(solution.gauge),
-        _facts_table(solution, facts),
-        "<h2>Exposures</h2>",
-        _exposures_table(solution),
-        comparison_report.corrections(comparison) if comparison else "",
-        comparison_report.stacks(stacks) if stacks else "",
-        "<h2>Pictures</h2>",
-        _pictures(solution, mosaic),
-        f"<footer>Written by legdistort {version('legdistort')}. Pixels count from 0 at the centre of the first; "
-        "x is the column. Residuals are measured minus predicted positions on the detector.</footer>",
-    ]
+    with style.context("default"), warnings.catch_warnings():  # not the user's style
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # a name in a script that the font lacks
+        body = [
+            f'<h1>{title}</h1><p class="lead">{lead}</p>',
+            _warning(solution.gauge),
+            _facts_table(solution, facts),
+            "<h2>Exposures</h2>",
+            _exposures_table(solution),
+            compared_corrections(comparison) if comparison else "",
+            compared_stacks(stacks) if stacks else "",
+            "<h2>Pictures</h2>",
+            _pictures(solution, mosaic),
+            f"<footer>Written by legdistort {version('legdistort')}. Pixels count from 0 at the centre of the first; "
+            "x is the column. Residuals are measured minus predicted positions on the detector.</footer>",
+        ]
     return (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -123,7 +127,7 @@ def _facts_table(solution, facts):
     if facts.get("sigma_px") is not None:
         rows["Scatter of corrected positions"] = _per_axis(facts["sigma_px"])
     if facts.get("quality"):
-        rows["Stars in the mosaic"] = comparison_report.sharpness(facts["quality"])
+        rows["Stars in the mosaic"] = sharpness(facts["quality"])
     error = facts["max_inverse_error_px"]
     rows["Largest error of an inverse"] = escape(error) if isinstance(error, str) else f"{error:.1e} px"
     rows["Minimisation"] = escape(str(solution.status))
@@ -203,37 +207,31 @@ def _sizes(solution):
 
 
 def _pictures(solution, mosaic):
-    from matplotlib import style
-
-    with style.context("default"), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing")  # a name in a script that the font lacks
-        residuals = figure(
-            solution_plots.plot_residuals(solution, ax=new_figure(6.4, 6.4).subplots()),
-            "Residuals of all exposures at their places on the detector, magnified: arrows that point the same way "
-            "over a region would mean a distortion that the polynomials do not follow.",
-        )
-        scatter = figure(
-            solution_plots.plot_scatter(solution, ax=new_figure(6.4, 5.6).subplots()),
-            "Residual scatter of each star against its flux, with the reported errors; a little below the curve is "
-            "right, because the fit absorbs some noise, while stars far above it would mean errors stated too small.",
-        )
-        figures = [f'<div class="pair">{residuals}{scatter}</div>', *_distortion_figures(solution)]
+    residuals = figure(
+        solution_plots.plot_residuals(solution, ax=detached_figure(6.4, 6.4).subplots()),
+        "Residuals of all exposures at their places on the detector, magnified: arrows that point the same way "
+        "over a region would mean a distortion that the polynomials do not follow.",
+    )
+    scatter = figure(
+        solution_plots.plot_scatter(solution, ax=detached_figure(6.4, 5.6).subplots()),
+        "Residual scatter of each star against its flux, with the reported errors; a little below the curve is "
+        "right, because the fit absorbs some noise, while stars far above it would mean errors stated too small.",
+    )
+    coefficients = figure(
+        solution_plots.plot_coefficients(solution, fig=detached_figure())[0],
+        "Coefficients of the Legendre modes, mean of the exposures with their scatter, beside the prior if "
+        "there is one: large values in the highest orders would mean a degree too low or too few stars.",
+    )
+    figures = [f'<div class="pair">{residuals}{scatter}</div>', *_distortion_figures(solution), coefficients]
+    figures += _error_figure(solution)
+    if mosaic is not None:
         figures.append(
             figure(
-                solution_plots.plot_coefficients(solution, fig=new_figure())[0],
-                "Coefficients of the Legendre modes, mean of the exposures with their scatter, beside the prior if "
-                "there is one: large values in the highest orders would mean a degree too low or too few stars.",
+                stack_plots.plot_mosaic(mosaic, ax=detached_figure(7.5, 7.5).subplots()),
+                "The co-added image, pale blue where no exposure contributes: double or elongated stars, more so "
+                "towards one edge, would mean that the exposures are not aligned there.",
             )
         )
-        figures += _error_figure(solution)
-        if mosaic is not None:
-            figures.append(
-                figure(
-                    solution_plots.plot_mosaic(mosaic, ax=new_figure(7.5, 7.5).subplots()),
-                    "The co-added image, pale blue where no exposure contributes: double or elongated stars, more so "
-                    "towards one edge, would mean that the exposures are not aligned there.",
-                )
-            )
     return "\n".join(figures)
 
 
@@ -249,7 +247,7 @@ def _error_figure(solution):
         "of a new position, once a common map of the fitted degree is taken off. White is outside the stars, where the "
         "correction is extrapolated. Absolute errors are those of the row Gauge above."
     )
-    yield figure(solution_plots.plot_sigma_map(*drawn, ax=new_figure(6.4, 5.4).subplots()), text)
+    yield figure(solution_plots.plot_sigma_map(*drawn, ax=detached_figure(6.4, 5.4).subplots()), text)
 
 
 def _distortion_figures(solution):
@@ -266,14 +264,16 @@ def _distortion_figures(solution):
         "edge, would be worrying."
     )
     yield figure(
-        solution_plots.plot_distortions(solution, names=names, part=part, scale=scale, fig=new_figure())[0], text
+        solution_plots.plot_distortions(solution, names=names, part=part, scale=scale, fig=detached_figure())[0], text
     )
     if np.any(solution.prior_mean):
         text = (
             "What is left when the static distortion is taken off, on a scale of its own: the same pattern in all "
             "panels would mean that the static distortion is not that of this instrument any more."
         )
-        panels = solution_plots.plot_distortions(solution, names=names, part="dynamic", scale=None, fig=new_figure())
+        panels = solution_plots.plot_distortions(
+            solution, names=names, part="dynamic", scale=None, fig=detached_figure()
+        )
         yield figure(panels[0], text)
 
 

@@ -32,7 +32,7 @@ def relative_variance(gauge, uncertainty, xy):
     That in the gauge, and the part of the common map that is of second order.
     """
     good = np.isfinite(xy[:, 0]) & np.isfinite(uncertainty.stars[0])
-    out = np.array(uncertainty.stars)
+    out = np.where(np.isfinite(xy[:, 0]), uncertainty.stars, np.nan)
     if gauge.plane is not None or not np.count_nonzero(good):
         return out
     directions = _directions(gauge, xy)[good]
@@ -50,7 +50,9 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
     """
     if gauge.plane is not None:
         return np.full_like(uncertainty.stars, np.nan)
-    out = uncertainty.stars + _spread(_directions(gauge, xy), gauge.absolute_covariance)
+    out = np.where(np.isfinite(xy[:, 0]), uncertainty.stars, np.nan) + _spread(
+        _directions(gauge, xy), gauge.absolute_covariance
+    )
     if gauge.tie is not None:
         out = out + gauge.tie.shared
     if not without_unknown:

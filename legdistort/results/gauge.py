@@ -1,15 +1,16 @@
 """What positions alone do not determine, what else determines it, and the convention that holds the rest.
 
 Any map G of the reference plane leaves J (nearly) as it is when every D_i takes it back: the six affine directions
-exactly, all 2 n_modes polynomial directions to a part in a million. Left free they are noise. They are fixed by as many
-linear constraints on the coefficients, ``sum_i R_i (A_i - A_0) = 0``. Where exposures differ in place or orientation, or
-a prior is given, the constraints are those under which star positions and coefficients are the posterior mean of a model
-in which exposures scatter around a static distortion (`legdistort.solving.gauge.hierarchy`). What that does not determine
-either is *unknown*, and held by the convention: the smallest dynamic part, ``R_i = N_i' W_i`` (gauge ``"minimal"``), or
-``sum_i (A_i - A_0) = 0`` (gauge ``"mean"``), which the paper's starting point implies for undithered exposures.
+exactly, all 2 n_modes polynomial directions to a part in a million. Left free they are noise. They are fixed by as
+many linear constraints on the coefficients, ``sum_i R_i (A_i - A_0) = 0``. Where exposures differ in place or
+orientation, or a prior is given, the constraints are those under which star positions and coefficients are the
+posterior mean of a model in which exposures scatter around a static distortion
+(`legdistort.solving.gauge.hierarchy`). What that does not determine either is *unknown*, and held by the convention:
+the smallest dynamic part, ``R_i = N_i' W_i`` (gauge ``"minimal"``), or ``sum_i (A_i - A_0) = 0`` (gauge ``"mean"``),
+which the paper's starting point implies for undithered exposures.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -123,7 +124,7 @@ class Gauge:
     values: np.ndarray | None = None
     released: np.ndarray | None = None
     tie: object = None
-    responses: object = None
+    responses: object = field(default=None, repr=False, compare=False)
     plane: str | None = None
 
     @property

@@ -11,30 +11,31 @@ class Settings:
     ----------
     degree : int
         Total degree of the fit; with ``degree="auto"`` the one that was chosen.
-    method : str
-        "joint", "alternating"; or the name of a simpler correction (`legdistort.assessment.baselines`).
-    gauge, static, loss, errors : str or None
+    prior, model : dict or None
+        What they were: see `Prior.describe` (by detector or exposure, if they were given so), and ``parts``,
+        ``fixed``, ``n_free`` of the model.
+    static : str or None
     exposure_degree : int or None
         With ``static="fit"``: up to which exposures have modes of their own.
+    gauge, loss, errors : str
+    method : str
+        "joint", "alternating"; or the name of a simpler correction (`legdistort.assessment.baselines`).
     clip, validate : float or None
     error_floor : float
         As it was stated; for the one in force see `legdistort.results.diagnostics.Diagnostics`.
     max_iterations : int or None
-    prior, model : dict or None
-        What they were: see `Prior.describe` (by detector or exposure, if they were given so), and ``parts``,
-        ``fixed``, ``n_free`` of the model.
     """
 
-    degree: int
-    method: str
-    gauge: str | None = None
+    degree: int | str = 3
+    prior: object = None
+    model: object = None
     static: str | None = None
     exposure_degree: int | None = None
-    loss: str | None = None
+    gauge: str = "minimal"
+    method: str = "joint"
+    loss: str = "linear"
     clip: float | None = None
-    errors: str | None = None
     error_floor: float = 0.0
+    errors: str = "stated"
     max_iterations: int | None = None
     validate: float | None = None
-    prior: dict | None = None
-    model: dict | None = None

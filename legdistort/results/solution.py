@@ -1,7 +1,7 @@
 """The result of `solve`: positions, distortions, their errors, and everything made from them."""
 
 import textwrap
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -12,12 +12,13 @@ from astropy.wcs import WCS
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
-from ..geometry.models import like, outside, to_pixels
+from ..geometry.models import exposure_model, like, outside, to_pixels
 from ..geometry.star_hull import support, supported
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from . import absolute_errors, new_positions
 from .diagnostics import Diagnostics
+from .gauge import Gauge
 from .settings import Settings
 
 
@@ -72,6 +73,12 @@ class Solution:
         ``created``, ``versions`` of packages and, if files went in, ``inputs`` ``{base name: SHA-256}``.
     form : `legdistort.solving.model_forms.Form` or None
         The model that was given to `solve`. Files do not keep it: `model` then has the usual form, the same function.
+
+    Parameters
+    ----------
+    inverses : dict, optional
+        ``{exposure: Inverse}`` that were certified for these coefficients earlier; checked again where they are used.
+        What `dataclasses.replace` makes finds its own.
     """
 
     names: tuple
@@ -86,7 +93,7 @@ class Solution:
     chi2: float
     dof: int
     status: str
-    gauge: object
+    gauge: Gauge
     uncertainty: object
     settings: Settings
     diagnostics: Diagnostics
@@ -94,6 +101,10 @@ class Solution:
     left_out: dict = field(default_factory=dict)
     provenance: dict = field(default_factory=dict)
     form: object = None
+    inverses: InitVar[dict | None] = None
+
+    def __post_init__(self, inverses):
+        object.__setattr__(self, "_inverses", inverses or {})
 
     # -- tables
 
@@ -174,7 +185,10 @@ class Solution:
 
     @cached_property
     def _distortions(self):
-        return [Distortion(a, self.shapes[name], name) for name, a in zip(self.names, self.coefficients, strict=True)]
+        return [
+            Distortion(a, self.shapes[name], name, self._inverses.get(name))
+            for name, a in zip(self.names, self.coefficients, strict=True)
+        ]
 
     def distortion(self, name):
         """The `Distortion` of an exposure: undistorted -> detector pixels, without the pose."""
@@ -251,8 +265,6 @@ class Solution:
 
     def model(self, name):
         """Reference plane -> detector pixels as an astropy compound model with inverse."""
-        from ..wcs.exposure_wcs import exposure_model
-
         distortion = self.distortion(name)
         return exposure_model(self.poses[name], distortion, self.form)
 
@@ -267,7 +279,8 @@ class Solution:
         """FITS header of an exposure, TAN-SIP or TPV, with its error in it (`legdistort.wcs.fits_headers`)."""
         from ..wcs.fits_headers import make_header
 
-        return make_header(self, name, kind=kind, max_error=max_error)
+        distortion = self.distortion(name)
+        return make_header(self.poses[name], distortion, self.sky, kind=kind, max_error=max_error)
 
     def fits_wcs(self, name, *, max_error=1e-3):
         """The nearest `astropy.wcs.WCS` of an exposure, TAN-SIP, for what takes no other (`CCDData`, `Cutout2D`).
@@ -285,9 +298,7 @@ class Solution:
         InputError
             If the sky is not known.
         """
-        from ..wcs.fits_headers import make_header
-
-        wcs = WCS(make_header(self, name, max_error=max_error))
+        wcs = WCS(self.header(name, max_error=max_error))
         wcs.array_shape = self.shapes[name]
         return wcs
 

@@ -58,11 +58,9 @@ def write_solution(solution, path, *, overwrite=False):
         "columns": table.colnames,  # their order: that of a mapping is lost in files
         "observations": {name: plain(table[name]) for name in table.colnames},
         "covariance": {key: getattr(solution.uncertainty, key) for key in ("coefficients", "stars", "directions")}
-        | {"weak": [_fields(each) for each in solution.uncertainty.weak]},
+        | {"weak": [dataclasses.asdict(each) for each in solution.uncertainty.weak]},
         "gauge": _gauge_tree(solution.gauge),
-        "sky": None
-        if solution.sky is None
-        else {"lon": solution.sky.lon, "lat": solution.sky.lat, "matrix": solution.sky.matrix},
+        "sky": solution.sky and dataclasses.asdict(solution.sky),
         "left_out": solution.left_out,
     }
     content = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
@@ -74,9 +72,12 @@ def write_solution(solution, path, *, overwrite=False):
 
 
 def _gauge_tree(gauge):
-    tree = _fields(gauge) | {"tie": _fields(gauge.tie), "unknown_maps": [_fields(each) for each in gauge.unknown_maps]}
-    del tree["responses"]  # they stand with the covariances
-    return tree
+    fields = dataclasses.fields(gauge)  # the responses stand with the covariances
+    tree = {field.name: getattr(gauge, field.name) for field in fields if field.name != "responses"}
+    return tree | {
+        "tie": gauge.tie and dataclasses.asdict(gauge.tie),
+        "unknown_maps": [dataclasses.asdict(each) for each in gauge.unknown_maps],
+    }
 
 
 def _exposure_tree(solution, name):
@@ -111,49 +112,42 @@ def read_solution(path, kind, *, max_bytes=None):
     return understood(path, partial(_from_tree, kind), tree)
 
 
-def _fields(thing):
-    """The fields of a dataclass by name; None for None."""
-    return None if thing is None else {field.name: getattr(thing, field.name) for field in dataclasses.fields(thing)}
-
-
-def _made(kind, tree):
-    """A dataclass from its fields by name, those that are absent at their defaults; None for None."""
+def _made(kind, tree, **inner):
+    """A dataclass from its fields by name, with dataclasses in some of them, ``field=kind``; None for None."""
     if tree is None:
         return None
-    known = {field.name: tree[field.name] for field in dataclasses.fields(kind) if field.name in tree}
-    return kind(**{key: np.array(value) if hasattr(value, "shape") else value for key, value in known.items()})
+    made = {name: _made(each, tree[name]) for name, each in inner.items()}
+    return kind(**{name: _own(value) for name, value in tree.items()} | made)
 
 
-def _diagnostics(tree):
-    """`Diagnostics` from their fields by name, sequences as tuples."""
-    kinds = {"reference": UsedReference, "selection": DegreeChoice, "validation": Validation}
-    found = {key: kind(**tree[key]) for key, kind in kinds.items() if tree[key] is not None}
-    if chosen := found.get("selection"):
-        degrees = tuple(AliasedDegree(**each) for each in chosen.aliasing)
-        found["selection"] = dataclasses.replace(chosen, aliasing=degrees)
-    return Diagnostics(**tree | found)
-
-
-def _tuples(value):
-    """A tree with tuples for lists, as frozen objects have them."""
+def _own(value):
+    """Arrays of our own for those of a file, tuples for lists, as frozen objects have them."""
     if isinstance(value, dict):
-        return {key: _tuples(each) for key, each in value.items()}
-    return tuple(_tuples(each) for each in value) if isinstance(value, list) else value
+        return {key: _own(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return tuple(_own(each) for each in value)
+    return np.array(value) if hasattr(value, "shape") else value
+
+
+def _diagnostics(tree, names):
+    """`Diagnostics`; with exposures in their order, which mappings in files do not keep."""
+    found = _made(Diagnostics, tree, reference=UsedReference, selection=DegreeChoice, validation=Validation)
+    if (chosen := found.selection) is not None:
+        degrees = tuple(AliasedDegree(**each) for each in chosen.aliasing)
+        found = dataclasses.replace(found, selection=dataclasses.replace(chosen, aliasing=degrees))
+    effective = found.effective_modes
+    return dataclasses.replace(found, effective_modes=effective and {name: effective[name] for name in names})
 
 
 def _from_tree(kind, tree):
-    exposures, covariance, gauge = tree["exposures"], tree["covariance"], tree["gauge"]
-    uncertainty = StoredUncertainty(
-        *(np.array(covariance[key]) for key in ("coefficients", "stars", "directions")),
-        tuple(_made(UnknownDirection, each) for each in covariance["weak"]),
-    )
-    gauge = gauge | {
-        "tie": _made(Tie, gauge.get("tie")),
-        "unknown_maps": tuple(_made(UnknownMap, each) for each in gauge["unknown_maps"]),
-        "responses": uncertainty,
-    }
+    exposures = tree["exposures"]
+    uncertainty = _made(StoredUncertainty, tree["covariance"])
+    weak = tuple(UnknownDirection(**each) for each in uncertainty.weak)
+    uncertainty = dataclasses.replace(uncertainty, weak=weak)
+    gauge = _made(Gauge, tree["gauge"], tie=Tie)
+    maps = tuple(UnknownMap(**each) for each in gauge.unknown_maps)
+    gauge = dataclasses.replace(gauge, unknown_maps=maps, responses=uncertainty)
     table = QTable({name: restored(tree["observations"][name]) for name in tree["columns"]})
-    sky = tree["sky"]
     solution = kind(
         names=tuple(e["name"] for e in exposures),
         degree=tree["degree"],
@@ -167,21 +161,22 @@ def _from_tree(kind, tree):
         chi2=tree["chi2"],
         dof=tree["dof"],
         status=tree["status"],
-        gauge=_made(Gauge, gauge),
+        gauge=gauge,
         uncertainty=uncertainty,
         settings=Settings(**tree["settings"]),
-        diagnostics=_diagnostics(_tuples(tree["diagnostics"])),
-        sky=None if sky is None else TangentPlane(sky["lon"], sky["lat"], np.array(sky["matrix"])),
+        diagnostics=_diagnostics(tree["diagnostics"], [e["name"] for e in exposures]),
+        sky=_made(TangentPlane, tree["sky"]),
         left_out=dict(tree["left_out"]),
         provenance=dict(tree["provenance"]),
+        inverses={e["name"]: _inverse(e["inverse"]) for e in exposures if e["inverse"] is not None},
     )
     _check_consistent(solution)
-    for exposure in exposures:
-        if exposure["inverse"] is not None:
-            kept = exposure["inverse"]
-            inverse = Inverse(np.array(kept["tensors"]), kept["error_px"], tuple(kept["valid_undistorted_px"]))
-            solution.distortion(exposure["name"]).adopt(inverse)
+    solution.distortion(solution.names[0])  # checks the certificates of all
     return solution
+
+
+def _inverse(tree):
+    return Inverse(np.array(tree["tensors"]), tree["error_px"], tuple(tree["valid_undistorted_px"]))
 
 
 def _check_consistent(solution):

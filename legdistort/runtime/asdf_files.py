@@ -3,6 +3,10 @@
 A file is looked at three times: its blocks (what they declare to hold), its YAML as a stream of events (length,
 nesting, repetition by aliases, tags), and its tree before any object is made of it (references, sizes of arrays).
 Only then does asdf open it.
+
+It guards those who read a solution, a prior or a WCS that somebody sent them or that lies on a server: against files
+that fill the memory (a few kilobytes can unpack to any size), name files elsewhere, or call whatever converters are
+installed; and against those that were cut off or damaged on the way, for which asdf alone has no words.
 """
 
 import hashlib
@@ -23,6 +27,7 @@ import yaml
 from asdf.tags.core.ndarray import asdf_datatype_to_numpy_dtype
 
 from ..exceptions import InputError
+from .checks import first_line
 
 #: Version of the ASDF standard that is written.
 ASDF_STANDARD = "1.5.0"
@@ -89,7 +94,7 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
             "with max_bytes= (--max-bytes)"
         ) from None
     except Exception as error:  # whatever a broken file provokes
-        raise InputError(f"{path} is not a readable ASDF file: {_first_line(error)}") from None
+        raise InputError(f"{path} is not a readable ASDF file: {first_line(error)}") from None
 
 
 def check_tree(tree, schema, path):
@@ -117,20 +122,15 @@ def check_tree(tree, schema, path):
         entry = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in error.absolute_path).lstrip(".")
         meaning = "" if error.validator == "required" else error.schema.get("description", "")
         raise InputError(
-            f"{path} is damaged: entry {entry or 'tree'}: {_first_line(error)[:200]}"
+            f"{path} is damaged: entry {entry or 'tree'}: {first_line(error)[:200]}"
             + (f"; it should be {meaning}" if meaning else "")
         ) from None
     except Exception as error:  # a tree that asdf cannot take
-        raise InputError(f"{path} is damaged: {_first_line(error)}") from None
+        raise InputError(f"{path} is damaged: {first_line(error)}") from None
 
 
 class _TooLargeError(Exception):
     """A size beyond the limit; the sentence without the limit."""
-
-
-def _first_line(error):
-    text = getattr(error, "message", None) or str(error) or type(error).__name__
-    return f"{text}".strip().splitlines()[0]
 
 
 def _check_yaml(content, tags, max_bytes):

@@ -20,6 +20,12 @@ def check_counts(**counts):
             raise InputError(f"{name} must be a positive integer, got {value!r}")
 
 
+def first_line(error):
+    """What an error of a library says, in one line."""
+    text = getattr(error, "message", None) or str(error).strip() or type(error).__name__
+    return text.strip().splitlines()[0]
+
+
 def options_from(kind, given, argument):
     """Frozen options of class `kind` from a dict of keywords, as they come through another function.
 

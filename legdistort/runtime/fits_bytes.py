@@ -126,7 +126,11 @@ def exchange_cards(header, data, new, obsolete):
 
 
 def _with_checksum(header, data):
-    """The header with the value of its ``CHECKSUM`` card, if any, made true."""
+    """The header with the value of its ``CHECKSUM`` card, if any, made true.
+
+    By hand: ``add_checksum`` of astropy sums the header as astropy would write it, cards that it mends and the new date
+    in the comment included, and not the bytes that stand here.
+    """
     found = re.match(rb"(?:.{80})*?(?=CHECKSUM=)", header, re.DOTALL)
     if found is None:
         return header

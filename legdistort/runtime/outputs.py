@@ -14,9 +14,6 @@ from pathlib import Path
 
 from ..exceptions import DiskFullError, InputError
 
-#: What `run` and `solve` leave in their folder, and replace there.
-RESULTS = ("solution.asdf", "stars.ecsv", "wcs", "mosaic.fits", "report.html", "summary.json")
-
 
 def is_full(error):
     """Whether an `OSError` is that of a full disk; writers do not always hand the number of it on."""

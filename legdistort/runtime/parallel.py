@@ -1,14 +1,17 @@
-"""One door for work that falls into independent items: in this process, on its cores, or on a cluster, all by dask."""
+"""One door for work that falls into independent items: in this process, on its cores, or on a cluster of dask."""
 
 import logging
 import signal
 import sys
 import warnings
+from collections import deque
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
-from itertools import islice
+from logging.handlers import QueueHandler
+from multiprocessing import get_context
+from queue import SimpleQueue
 
 from tqdm import tqdm
 
@@ -17,7 +20,7 @@ from ..exceptions import InputError, LegdistortError, warn
 _AHEAD = 4  # items in flight for every worker
 
 
-def each(function, items, *, workers=None, threads=False, progress=False, description=None, unit="frame"):
+def map_items(function, items, *, workers=None, threads=False, progress=False, description=None, unit="frame"):
     """Results of a function for every item, in the order of the items, whoever works on them.
 
     Parameters
@@ -57,7 +60,7 @@ def each(function, items, *, workers=None, threads=False, progress=False, descri
         if client is None and workers == 1:
             results = map(function, items)
         else:
-            results = _dask(function, iter(items), workers=workers, threads=threads, client=client)
+            results = _shared(function, items, workers=workers, threads=threads, client=client)
         for result in results:
             bar.update()
             yield result
@@ -82,49 +85,38 @@ def _client():
     return None if client is None or client.asynchronous else client
 
 
-def _dask(function, items, *, workers, threads, client):
-    """Results by dask, a few items at a time, so that neither items nor results pile up."""
-    import dask  # takes a third of a second
-
+def _shared(function, items, *, workers, threads, client):
+    """Results of other threads or processes, in the order of the items, of which few are in flight."""
     if client is not None:
         workers = max(1, sum(client.nthreads().values()))
-    call = partial(_attempt if threads or client is not None else _attempt_quietly, function)
-    with _scheduler(workers, threads, client) as scheduler:
-        while batch := list(islice(items, _AHEAD * workers)):
-            tasks = [dask.delayed(partial(call, item), pure=False, traverse=False)() for item in batch]
+    quiet = not threads and client is None
+    work = partial(_attempt, function) if quiet else function
+    finish = _finish if quiet else lambda result: result
+    with _executor(workers, threads, client) as submit:
+        waiting = deque()
+        for item in items:
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "Sending large graph")  # images that the caller has in memory
-                done = dask.compute(*tasks, optimize_graph=False, traverse=False, **scheduler)
-            for result, error, warned, logged in done:
-                for message in warned:
-                    warn(message, type(message))
-                for record in logged:
-                    logger = logging.getLogger(record.name)
-                    if logger.isEnabledFor(record.levelno):
-                        logger.handle(record)
-                if error is not None:
-                    raise error
-                yield result
+                waiting.append(submit(partial(work, item)))
+            if len(waiting) == _AHEAD * workers:
+                yield finish(waiting.popleft().result())
+        while waiting:
+            yield finish(waiting.popleft().result())
 
 
 @contextmanager
-def _scheduler(workers, threads, client):
-    """What tells dask where to work; local workers stand as long as the block."""
+def _executor(workers, threads, client):
+    """The function that hands work on and returns a future; local workers stand as long as the block."""
     if client is not None:
-        yield {"scheduler": client}
+        yield partial(client.submit, pure=False)
         return
-    from dask.multiprocessing import get_context
-
-    if threads:
-        pool = ThreadPoolExecutor(workers)
-    else:
-        pool = ProcessPoolExecutor(workers, mp_context=get_context(), initializer=_begin)
+    pool = (
+        ThreadPoolExecutor(workers)
+        if threads
+        else ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin)
+    )
     try:
-        yield (
-            {"scheduler": "threads", "pool": pool}
-            if threads
-            else {"scheduler": "processes", "pool": pool, "chunksize": 1}
-        )
+        yield pool.submit
     except BrokenProcessPool:
         raise LegdistortError(
             "a worker process died: it ran out of memory, or this is a script whose work does not stand under "
@@ -137,36 +129,32 @@ def _scheduler(workers, threads, client):
 def _begin():
     """In a new worker: Ctrl-C is for the process that it works for, which then stops it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # forked workers would have the handler of the command line
 
 
 def _attempt(function, item):
-    """Result, error, warnings and log records; dask would glue the traceback of a worker to the message of an error."""
-    try:
-        return function(item), None, [], []
-    except Exception as error:
-        return None, error, [], []
-
-
-def _attempt_quietly(function, item):
-    """The same in a process that nobody listens to: warnings and log records are handed over."""
-    logged = _Records()
+    """Result, error, warnings and log records of a process that nobody listens to."""
+    records, result, raised = SimpleQueue(), None, None
     log = logging.getLogger("legdistort")
-    log.handlers[:], log.propagate = [logged], False
+    log.handlers[:], log.propagate = [QueueHandler(records)], False
     log.setLevel(logging.INFO)
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        result, error, *_ = _attempt(function, item)
-    return result, error, [w.message for w in warned], logged.records
+        try:
+            result = function(item)
+        except Exception as error:
+            raised = error
+    return result, raised, [w.message for w in warned], [records.get() for _ in range(records.qsize())]
 
 
-class _Records(logging.Handler):
-    """Log records that can be pickled."""
-
-    def __init__(self):
-        super().__init__()
-        self.records = []
-
-    def emit(self, record):
-        record.msg, record.args, record.exc_info = record.getMessage(), None, None
-        self.records.append(record)
+def _finish(attempt):
+    """The result of an `_attempt`; what was warned of, logged and raised there is so here."""
+    result, error, warned, logged = attempt
+    for message in warned:
+        warn(message, type(message))
+    for record in logged:
+        log = logging.getLogger(record.name)
+        if log.isEnabledFor(record.levelno):
+            log.handle(record)
+    if error is not None:
+        raise error
+    return result

@@ -23,19 +23,18 @@ def _versions():
     return {name: version(name) for name in PACKAGES}
 
 
-def checksums(inputs):
-    """``{base name: SHA-256}`` of the files among `inputs`; what is no path (an HDUList, a CCDData) has none.
-
-    Parameters
-    ----------
-    inputs : str, path, or a list of anything
-    """
+def checksums(*paths):
+    """``{base name: SHA-256}`` of files."""
     out = {}
-    for path in inputs if isinstance(inputs, (list, tuple)) else [inputs]:
-        if isinstance(path, (str, Path)):
-            with open(path, "rb") as file:
-                out[Path(path).name] = hashlib.file_digest(file, "sha256").hexdigest()
+    for path in paths:
+        with open(path, "rb") as file:
+            out[Path(path).name] = checksum(file)
     return out
+
+
+def checksum(file):
+    """SHA-256 of an open file from where it stands, in hexadecimal digits."""
+    return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def with_inputs(solution, files):

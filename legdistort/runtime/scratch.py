@@ -102,7 +102,11 @@ def store(folder, name, planes):
 
 
 class _Shared(mmap.mmap):
-    """Memory that is the same as a file, so that it may be dropped and read again."""
+    """Memory that is the same as a file, so that it may be dropped and read again.
+
+    A type of its own, since `forget` must know its own: dropped from ``np.memmap(mode="c")`` of a caller, changes would
+    be lost. And an array over it is a plain one.
+    """
 
 
 def spill(shape, dtype, value, folder):

@@ -12,7 +12,6 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis
-from ..priors.prior import Prior
 from ..solving.equations import criterion, elimination
 from ..solving.equations.covariances import Uncertainty
 from ..solving.equations.problem import State
@@ -42,8 +41,8 @@ def spectrum_of(given, degree, name="spectrum"):
         For a wrong shape, degree or value.
     """
     n_fit = basis.n_modes(degree)
-    if given is None:
-        out = np.full((2, n_fit), np.nan)
+    if given is None or isinstance(given, Real):
+        out = np.full((2, n_fit), np.nan if given is None else float(given))
     elif isinstance(given, dict):
         degrees = [basis.check_degree(key, f"a degree in {name}") for key in given]
         out = np.zeros((2, basis.n_modes(max([degree, *degrees]))))
@@ -51,8 +50,6 @@ def spectrum_of(given, degree, name="spectrum"):
             out[:, :n_fit] = np.nan
         for d, value in zip(degrees, given.values(), strict=True):
             out[:, d * (d + 1) // 2 : basis.n_modes(d)] = value
-    elif isinstance(given, Real):
-        out = np.full((2, n_fit), float(given))
     else:
         values = np.asarray(given, dtype=float)
         if values.ndim not in (1, 2) or values.shape[:-1] not in ((), (2,)):
@@ -65,29 +62,27 @@ def spectrum_of(given, degree, name="spectrum"):
     return out
 
 
-def assumed_spectra(degree, prior, dynamic, spectrum, static_spectrum):
-    """Spectra (2, n_modes) of the independent and the common distortions, NaN where unknown."""
-    if not isinstance(prior, Prior | None):
-        raise InputError(f"prior must be a Prior, got {type(prior).__name__}")
+def assumed_spectra(plan):
+    """Spectra (2, n_modes) of the independent and the common distortions of a `Plan`, NaN where unknown."""
+    degree = plan.degree
     n_fit = basis.n_modes(degree)
-    independent = spectrum_of(spectrum, degree)
+    independent = spectrum_of(plan.spectrum, degree)
     stated = np.isfinite(independent[:, 1:n_fit]).any()
-    if dynamic is not None:
-        fitted = spectrum_of(dynamic, degree, "dynamic")
+    if plan.dynamic is not None:
+        fitted = spectrum_of(plan.dynamic, degree, "dynamic")
         if stated or fitted.shape[1] != n_fit:
             raise InputError(
                 f"dynamic states the scatter of the {n_fit} modes that are fitted and spectrum, beside it, that of "
                 f"degree {degree + 1} and more: leave one out, or cut it there"
             )
         independent, stated = np.concatenate([fitted, independent[:, n_fit:]], axis=1), True
-    if stated and prior is not None and prior.sigma is not None:
+    if stated and plan.prior is not None and plan.prior.sigma is not None:
         raise InputError(
             "the widths of the prior state the scatter of the modes that are fitted: leave dynamic out, and let "
             f"spectrum begin at degree {degree + 1}"
         )
-    if static_spectrum is None:
-        return independent, np.zeros_like(independent)
-    return independent, spectrum_of(static_spectrum, degree, "static_spectrum")
+    common = 0.0 if plan.static_spectrum is None else plan.static_spectrum
+    return independent, spectrum_of(common, degree, "static_spectrum")
 
 
 @dataclass(frozen=True, eq=False)

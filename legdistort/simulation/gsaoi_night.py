@@ -110,29 +110,29 @@ class Night:
 SMALL_NIGHT = Night(n_exposures=6, n_stars=70, size=512, dither=60.0)
 
 
-def draw_night(small, seed, settings):
-    """Settings, truth, and the generator for what is left to draw (profiles and noise).
+def make_night(small, **settings):
+    """`SMALL_NIGHT` or the default `Night` with some attributes changed; `InputError` for what is none of them."""
+    known = [field.name for field in fields(Night)]
+    unknown = sorted(settings.keys() - known)
+    if unknown:
+        raise InputError(f"unknown setting {unknown[0]!r}; a night has {', '.join(known)}")
+    return replace(SMALL_NIGHT if small else Night(), **settings)
+
+
+def draw_night(night, seed):
+    """The truth of a night, and the generator for what is left to draw (profiles and noise).
 
     Parameters
     ----------
-    small : bool
-        Start from `SMALL_NIGHT` instead of the defaults of `Night`.
+    night : Night
     seed : int
         Seed of everything.
-    settings : dict
-        Attributes of `Night` to change.
 
     Returns
     -------
-    night : Night
     truth : `~legdistort.simulation.truth.Truth`
     rng : `~numpy.random.Generator`
     """
-    unknown = set(settings) - {field.name for field in fields(Night)}
-    if unknown:
-        known = ", ".join(field.name for field in fields(Night))
-        raise InputError(f"unknown setting {min(unknown)!r}; a night has {known}")
-    night = replace(SMALL_NIGHT if small else Night(), **settings)
     star_rng, map_rng, pose_rng, noise_rng = np.random.default_rng(seed).spawn(4)
     instrument = GsaoiMap(night.detector, night.size)
     shape, names = (night.size, night.size), exposure_names(night.n_exposures)
@@ -158,7 +158,7 @@ def draw_night(small, seed, settings):
         1,
         separation=10 * night.fwhm,
     )
-    return night, replace(truth, positions=positions), noise_rng
+    return replace(truth, positions=positions), noise_rng
 
 
 def _draw_dynamic(rng, night):

@@ -199,7 +199,8 @@ def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **set
     InputError
         For an unknown setting or one out of range.
     """
-    night, truth, rng = gsaoi_night.draw_night(small, seed, settings)
+    night = gsaoi_night.make_night(small, **settings)
+    truth, rng = gsaoi_night.draw_night(night, seed)
     hdus = {}
     for i, name in enumerate(tqdm(truth.names, desc="simulate", disable=not progress)):
         psf = replace(
@@ -233,7 +234,8 @@ def simulate_gsaoi_matches(*, small=False, seed=0, **settings):
     -------
     Simulation
     """
-    night, truth, rng = gsaoi_night.draw_night(small, seed, settings)
+    night = gsaoi_night.make_night(small, **settings)
+    truth, rng = gsaoi_night.draw_night(night, seed)
     observed = gsaoi_night.stars_inside(truth, night, truth.positions)
     observed &= np.count_nonzero(observed, axis=0) >= min(4, night.n_exposures)
     sigma = np.broadcast_to(night.position_error(truth.flux)[None, :, None], (*observed.shape, 2))
@@ -261,11 +263,9 @@ def matches_from(truth, observed, sigma, rng, *, noise=1.0, corr=0.0, sky=None):
     drawn[..., 1] = corr * drawn[..., 0] + np.sqrt(1 - corr**2) * drawn[..., 1]
     xy = np.stack([truth.distort(name, truth.positions) for name in truth.names]) + noise * sigma * drawn
     exposure, star = np.nonzero(observed)
-    table = QTable({"exposure": np.array(truth.names)[exposure], "star": star})
-    for k, axis in enumerate("xy"):
-        table[axis] = xy[exposure, star, k] * u.pix
-    for k, axis in enumerate("xy"):
-        table[f"{axis}_err"] = sigma[exposure, star, k] * u.pix
+    (x, y), (x_err, y_err) = (values[exposure, star].T * u.pix for values in (xy, sigma))
+    names = np.array(truth.names)[exposure]
+    table = QTable({"exposure": names, "star": star, "x": x, "y": y, "x_err": x_err, "y_err": y_err})
     if corr:
         table["xy_corr"] = np.full(len(star), float(corr))
     if truth.flux is not None:

@@ -4,8 +4,7 @@ Positions without noise, the normal equations there, the gauge and the covarianc
 no simulation (Bernard et al. 2017, section 4, measures the same by Monte Carlo).
 """
 
-import textwrap
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from astropy.table import Table
@@ -14,12 +13,11 @@ from ..exceptions import LegdistortError
 from ..geometry import basis
 from ..results import accuracy
 from ..results.solution import Solution
-from ..runtime.checks import check_choice, check_counts
 from ..solving.equations.problem import build_problem
-from ..solving.gauge.constraints import KINDS
 from .aliasing import alias, assumed_spectra
-from .noiseless import noiseless_solution
-from .planned_layout import lay_out
+from .noiseless_solution import noiseless_solution
+from .plan import Plan, lay_out
+from .prediction_text import decimals, describe, finite_rms
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +56,8 @@ class Prediction:
         Rms error of the fitted coefficients from aliasing: where the energy of the modes left out goes.
     spectrum : ndarray, shape (2, n_modes)
         Scatter of the distortion from exposure to exposure that was assumed, NaN where it is unknown.
-    settings : dict
-        How `predict` was called.
+    settings : Plan
+        What was asked for, the stars that were drawn in it.
     """
 
     solution: Solution
@@ -77,7 +75,7 @@ class Prediction:
     contour: np.ndarray
     folded: np.ndarray
     spectrum: np.ndarray
-    settings: dict = field(default_factory=dict)
+    settings: Plan
 
     @property
     def degree(self):
@@ -132,11 +130,10 @@ class Prediction:
 
     def summary(self):
         """All figures as a dict of numbers."""
-        out = {"n_exposures": self.n_exposures, "n_stars": self.n_stars, "degree": self.degree}
-        out |= {f.name: getattr(self, f.name) for f in fields(self) if f.type is float}
-        thumb_b, thumb_sigma = self.thumb
-        out |= {name: getattr(self, name) for name in ("b_total", "sigma_total", "s_b", "s_sigma")}
-        return out | {"thumb_b": thumb_b, "thumb_sigma": thumb_sigma}
+        counts = {"n_exposures": self.n_exposures, "n_stars": self.n_stars, "degree": self.degree}
+        names = [f.name for f in fields(self) if f.type is float] + ["b_total", "sigma_total", "s_b", "s_sigma"]
+        thumb = dict(zip(("thumb_b", "thumb_sigma"), self.thumb, strict=True))
+        return counts | {name: getattr(self, name) for name in names} | thumb
 
     def plot(self, *, ax=None):
         """Map of the expected scatter of new positions, aliasing included, with stars and contour; returns the axes.
@@ -168,15 +165,14 @@ class Prediction:
         """
         n, settings = self.n_exposures, self.settings
         changes = [{"degree": d} for d in (self.degree - 1, self.degree + 1) if 0 <= d <= basis.MAX_DEGREE]
-        single = settings["poses"] is None and np.ndim(settings["dithers"]) == 0 and np.ndim(settings["sigma"]) < 2
-        if single:
-            least = (settings["min_exposures"] or min(4, n)) / n  # the same part of them, for the same stars
+        if settings.poses is None and np.ndim(settings.dithers) == 0 and np.ndim(settings.sigma) < 2:
+            least = settings.least / n  # the same part of them, for the same stars
             some = [m for m in (n // 2, 2 * n) if m > 1]
             changes += [{"n_exposures": m, "min_exposures": max(min(2, m), round(least * m))} for m in some]
         rows, failed = [self.summary()], {}
         for change in changes:
             try:
-                rows.append(predict(**settings | change).summary())
+                rows.append(_predict(replace(settings, **change)).summary())
             except LegdistortError as error:
                 failed["{} {}".format(*next(iter(change.items())))] = str(error)
         table = Table(rows)
@@ -184,24 +180,8 @@ class Prediction:
         for name in table.colnames:
             if table[name].dtype.kind == "f":
                 slope = name.startswith(("s_", "thumb_"))
-                table[name].info.format = ".3f" if slope else f".{self._decimals}f"
+                table[name].info.format = ".3f" if slope else f".{decimals(self)}f"
         return table
-
-    def _absolute(self, row):
-        unknown = ", ".join(self.solution.gauge.unknown_names)
-        if unknown and np.isfinite(self.b_abs):
-            return [row(f"b, absolute, after {unknown}", self.b_abs)]
-        return [row("b, absolute (mean dynamic distortion too)", self.b_abs)]
-
-    @property
-    def _relative(self):
-        words = f"what is left once a common map of degree {self.degree} is taken off"
-        return "; ".join(filter(None, [words, self.solution.gauge.warning]))
-
-    @property
-    def _decimals(self):
-        """Decimal places that show three digits of errors like these."""
-        return max(4, 3 - int(np.floor(np.log10(self.sigma_meas))))
 
     def __repr__(self):
         return (
@@ -210,36 +190,7 @@ class Prediction:
         )
 
     def __str__(self):
-        ny, nx = self.solution.shapes[self.solution.names[0]]
-        low, high = self.stars_per_exposure.min(), self.stars_per_exposure.max()
-        thumb_b, thumb_sigma = self.thumb
-        aliased = np.any(self.folded != 0)  # NaN included
-
-        def row(label, noise, aliasing=None, *slopes):
-            values = [
-                noise,
-                *([] if not aliased else [None, None] if aliasing is None else [aliasing, np.hypot(noise, aliasing)]),
-            ]
-            cells = ["" if v is None else "not known" if np.isnan(v) else f"{v:.{self._decimals}f}" for v in values]
-            cells += [f"{slope:.3f}" for slope in slopes]
-            return (f"{label:44s}" + "".join(f"{cell:>11s}" for cell in cells)).rstrip()
-
-        head = ["noise", *(["aliasing", "together"] if aliased else []), "/ sigma", "thumb"]
-        return "\n".join(
-            [
-                f"Prediction: {self.n_exposures} exposures of {ny} x {nx} px, {self.n_stars} stars "
-                f"({low if low == high else f'{low} to {high}'} on each), degree {self.degree}, "
-                f"errors of {self.sigma_meas:.4g} px",
-                f"{'expected, rms per axis [px]':44s}" + "".join(f"{cell:>11s}" for cell in head),
-                row("b, star positions, relative", self.b, self.b_alias, self.s_b, thumb_b),
-                *self._absolute(row),
-                row("sigma, new positions inside the contour", self.sigma, self.sigma_alias, self.s_sigma, thumb_sigma),
-                row("sigma, new positions over the whole field", self.sigma_field, _rms(self.alias_map)),
-                *textwrap.wrap(f"All but b, absolute, are relative: {self._relative}", 110),
-                f"gauge {self.solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), "
-                "s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
-            ]
-        )
+        return describe(self)
 
 
 def predict(
@@ -323,24 +274,26 @@ def predict(
     Up to 8000 coefficients (400 exposures at degree 3) their full covariance is used; beyond, an `AssumptionWarning`
     says that it is approximated by one block an exposure.
     """
-    settings = dict(locals())  # the arguments as given
-    check_counts(n_grid=n_grid)
-    degree = basis.check_degree(degree)
-    check_choice(gauge, KINDS, "gauge")
-    independent, common = assumed_spectra(degree, prior, dynamic, spectrum, static_spectrum)
-    layout = lay_out(
-        n_exposures=n_exposures, stars=stars, n_stars=n_stars, density=density, sigma=sigma, shape=shape,
-        dithers=dithers, poses=poses, min_exposures=min_exposures, seed=seed,
+    plan = Plan(
+        n_exposures=n_exposures, stars=stars, n_stars=n_stars, density=density, sigma=sigma, degree=degree,
+        shape=shape, dithers=dithers, poses=poses, prior=prior, gauge=gauge, dynamic=dynamic, spectrum=spectrum,
+        static_spectrum=static_spectrum, min_exposures=min_exposures, n_grid=n_grid, seed=seed,
     )  # fmt: skip
-    sigma_meas = layout.sigma
-    matches = layout.matches(np.zeros((2, 1)) if prior is None or prior.mean is None else prior.mean)
-    problem = build_problem(matches, degree, prior=prior)
+    return _predict(plan)
+
+
+def _predict(plan):
+    """The `Prediction` of a `Plan`."""
+    independent, common = assumed_spectra(plan)
+    layout = lay_out(plan)
+    matches = layout.matches(np.zeros((2, 1)) if plan.prior is None or plan.prior.mean is None else plan.prior.mean)
+    problem = build_problem(matches, plan.degree, prior=plan.prior)
     fitted = independent[:, : problem.n_modes]
     known = bool(np.isfinite(fitted).all())
-    solution, state = noiseless_solution(matches, problem, layout, gauge, fitted if known else None)
-    x, y = layout.axes(n_grid)
+    solution, state = noiseless_solution(matches, problem, layout, plan.gauge, fitted if known else None)
+    x, y = layout.axes(plan.n_grid)
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    noise = accuracy.expected_scatter(solution, grid, sigma_meas)
+    noise = accuracy.expected_scatter(solution, grid, layout.sigma)
     aliased, folded, b_alias = np.where(np.isfinite(noise), 0.0, np.nan), np.zeros_like(fitted), 0.0
     if max(independent.shape[1], common.shape[1]) > problem.n_modes:
         aliasing = alias(
@@ -350,16 +303,16 @@ def predict(
         folded, b_alias = aliasing.folded, float(np.sqrt(np.mean(aliasing.stars)))
     square = accuracy.contour(solution.positions)
     inside = accuracy.in_contour(grid, square)
-    drawn = {} if stars is not None else {"stars": layout.positions, "n_stars": None, "density": None}
+    drawn = {"stars": layout.positions, "n_stars": None, "density": None} if plan.stars is None else {}
     return Prediction(
         solution=solution,
-        sigma_meas=sigma_meas,
+        sigma_meas=layout.sigma,
         b=accuracy.expected_bias(solution),
         b_abs=accuracy.expected_bias(solution, absolute=True) if known or solution.gauge.prior else np.nan,
-        sigma=_rms(noise[inside]),
-        sigma_field=_rms(noise),
+        sigma=finite_rms(noise[inside]),
+        sigma_field=finite_rms(noise),
         b_alias=b_alias,
-        sigma_alias=_rms(aliased[inside]),
+        sigma_alias=finite_rms(aliased[inside]),
         x=x,
         y=y,
         error_map=noise.reshape(len(y), len(x)),
@@ -367,19 +320,5 @@ def predict(
         contour=square,
         folded=folded,
         spectrum=independent,
-        settings=settings | drawn | {"spectrum": independent, "dynamic": None},
+        settings=replace(plan, **drawn, spectrum=independent, dynamic=None),
     )
-
-
-def show(plans):
-    """The table of `Prediction.alternatives` as text: criteria (aliasing if any is known), slopes, rules of thumb."""
-    criteria = [c for c in ("b", "b_alias", "b_abs", "sigma", "sigma_alias") if np.nansum(plans[c]) > 0]
-    columns = ["n_exposures", "degree", "n_stars", *criteria, "s_b", "thumb_b", "s_sigma", "thumb_sigma"]
-    lines = plans[columns].pformat(max_lines=-1, max_width=-1)
-    return "\n".join(lines + [f"{change}: {reason}" for change, reason in plans.meta["failed"].items()])
-
-
-def _rms(values):
-    """Rms of those that are finite; NaN if none is."""
-    values = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan

@@ -1,4 +1,8 @@
-"""Images of simulated stars: Moffat profiles integrated over pixels, sky, photon and read noise."""
+"""Images of simulated stars: Moffat profiles integrated over pixels, sky, photon and read noise.
+
+The profile is written apart from `legdistort.measurement.profiles.moffat`, so that an error in the one that is fitted
+cannot hide in its own tests.
+"""
 
 from dataclasses import dataclass
 

@@ -13,7 +13,7 @@ from astropy.table import QTable
 from numpy.polynomial import legendre
 
 from ..exceptions import InputError
-from ..geometry import similarity as poses
+from ..geometry import similarity
 from ..geometry.gsaoi import GsaoiMap
 from ..geometry.tangent_plane import TangentPlane
 
@@ -63,7 +63,7 @@ class Truth:
 
     def distort(self, name, xy):
         """True pixels of reference-plane positions (..., 2) in one exposure, noise-free."""
-        q = poses.apply(self.poses[self._known(name)], xy)
+        q = similarity.apply(self.poses[self._known(name)], xy)
         i = self.names.index(name)
         if self.instrument is None:
             return q + displacement(self.coefficients[i], q, self.shape)
@@ -76,12 +76,12 @@ class Truth:
         """
         u_, v = np.meshgrid(*[(np.arange(n) + 0.5) / n] * 2)
         q = np.stack([u_.ravel() * self.shape[1] - 0.5, v.ravel() * self.shape[0] - 0.5], axis=-1)
-        return poses.apply(poses.invert(self.poses[self._known(name)]), q)
+        return similarity.apply(similarity.invert(self.poses[self._known(name)]), q)
 
     def table(self):
         """Stars as a QTable (``star``, ``x``, ``y``, ``flux``, and ``ra``, ``dec`` if known); the rest in its meta."""
-        out = QTable({"star": np.arange(len(self.positions)), "x": self.positions[:, 0] * u.pix})
-        out["y"] = self.positions[:, 1] * u.pix
+        x, y = self.positions.T * u.pix
+        out = QTable({"star": np.arange(len(x)), "x": x, "y": y})
         if self.flux is not None:
             out["flux"] = self.flux
         if self.sky is not None:
@@ -189,7 +189,7 @@ def footprint(pose_list, shape):
     """Lower and upper corner, (2,) each, of the box in the reference plane that holds all the detectors."""
     ny, nx = shape
     corners = np.array([(-0.5, -0.5), (nx - 0.5, -0.5), (-0.5, ny - 0.5), (nx - 0.5, ny - 0.5)])
-    back = np.concatenate([poses.apply(poses.invert(pose), corners) for pose in pose_list])
+    back = np.concatenate([similarity.apply(similarity.invert(pose), corners) for pose in pose_list])
     return back.min(axis=0), back.max(axis=0)
 
 

@@ -62,7 +62,7 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
         settings=settings,
         diagnostics=Diagnostics() if diagnostics is None else diagnostics,
         sky=matches.sky,
-        left_out=dict(matches.left_out),
+        left_out=dict(sorted(matches.left_out.items())),
         provenance=provenance.stamp(),
         form=form,
     )

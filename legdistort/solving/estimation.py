@@ -152,7 +152,9 @@ def _choose_degree(matches, options):
 
     def fit(part, degree):
         trial = single_fit.estimate(part, replace(options, degree=degree))
-        return _solution(trial, 1.0, Settings(degree, options.method), Diagnostics(error_floor=options.error_floor))
+        return _solution(
+            trial, 1.0, Settings(degree, method=options.method), Diagnostics(error_floor=options.error_floor)
+        )
 
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", LegdistortWarning)  # of fits that are thrown away

@@ -41,8 +41,8 @@ class Result:
     converged : bool
     status : str
         What happened, in a sentence.
-    history : list of dict
-        J, the largest changes of positions and coefficients [pix], one entry an iteration.
+    n_iterations : int
+        Steps of the joint solver, sweeps of the alternating one.
     robust : ndarray, shape (n,)
         Factors on the weights from the loss (ones for a linear one).
     n_weak : int
@@ -54,7 +54,7 @@ class Result:
     gauge: Gauge
     converged: bool
     status: str
-    history: list
+    n_iterations: int
     robust: np.ndarray
     n_weak: int = 0
 
@@ -110,14 +110,16 @@ def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", 
             break
         run = freer
     convention = run.convention if run.released is None else run.declared()
-    status = f"converged after {len(run.history)} iterations"
+    status = f"converged after {len(run.steps)} iterations"
     if not run.converged:
         status = (
-            f"not converged after {max_iterations} iterations: the last step was {run.history[-1]['step']:.2g} "
+            f"not converged after {max_iterations} iterations: the last step was {run.steps[-1]:.2g} "
             "standard errors; look for mismatched stars (loss='cauchy'), or lower the degree"
         )
         warn(status, ConvergenceWarning)
-    return Result(run.state, run.blocks, convention, run.converged, status, run.history, run.factors, run.system.n_weak)
+    return Result(
+        run.state, run.blocks, convention, run.converged, status, len(run.steps), run.factors, run.system.n_weak
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +134,9 @@ class _Rules:
 class _Descent:
     """Gauss-Newton iterations under one set of constraints."""
 
-    def __init__(self, problem, state, rules, *, released=None, history=()):
+    def __init__(self, problem, state, rules, *, released=None, steps=()):
         self.problem, self.state, self.rules = problem, state, rules
-        self.released, self.history, self.converged = released, list(history), False
+        self.released, self.steps, self.converged = released, list(steps), False
         self._reweight(criterion.residuals(problem, state) if rules.loss != "linear" else None)
         self.blocks = criterion.linearise(self.weighted, state)
         self._prepare()
@@ -160,14 +162,7 @@ class _Descent:
             target = -self.convention.violation(_departure(self.problem, self.state))
             d_star, d_exposure = self.system.step(target, accuracy)
             size, last = _step_size(self.blocks, d_star, d_exposure), size
-            self.history.append(
-                {
-                    "cost": self.blocks.cost,
-                    "d_positions": float(np.abs(d_star).max()),
-                    "d_coefficients": float(np.abs(d_exposure).max()),
-                    "step": size,
-                }
-            )
+            self.steps.append(size)
             log.debug("J = %.8g, step %.2g standard errors", self.blocks.cost, size)
             if size < tolerance:
                 self.converged = True
@@ -190,7 +185,7 @@ class _Descent:
             return None
         log.debug("residuals determine %d maps that nothing else does", more.shape[1])
         released = more if self.released is None else np.hstack([self.released, more])
-        return _Descent(self.problem, self.state, self.rules, released=released, history=self.history)
+        return _Descent(self.problem, self.state, self.rules, released=released, steps=self.steps)
 
     def declared(self):
         """The gauge with all maps held where they are, so that errors relative to it stay relative.
@@ -265,9 +260,9 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
     Result
     """
     max_iterations = MAX_SWEEPS if max_iterations is None else max_iterations
-    n_modes, history, converged = problem.n_modes, [], False
+    n_modes = problem.n_modes
     blocks = criterion.linearise(problem, state)
-    for _sweep in range(1, max_iterations + 1):
+    for sweep in range(1, max_iterations + 1):
         before = state
         for _ in range(3):  # stars given A: a few Newton steps, each star by itself
             step = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
@@ -282,11 +277,9 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
         blocks = criterion.linearise(problem, state)
         c_a = _relative_change(before.coefficients, state.coefficients)
         c_x = _relative_change(before.positions, state.positions)
-        history.append({"cost": blocks.cost, "c_a": c_a, "c_x": c_x})
-        if c_a <= tolerance and c_x <= tolerance:
-            converged = True
+        status = f"converged after {sweep} sweeps (|dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e})"
+        if converged := c_a <= tolerance and c_x <= tolerance:
             break
-    status = f"converged after {len(history)} sweeps (|dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e})"
     if not converged:
         status = (
             f"stopped after {max_iterations} sweeps with |dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e}: the coefficients "
@@ -296,7 +289,7 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
     state, _ = constraints.absorb_similarities(problem, state)
     blocks = criterion.linearise(problem, state)
     convention = constraints.make(gauge, problem, state, blocks)
-    return Result(state, blocks, convention, converged, status, history, np.ones(problem.xy.shape[1]))
+    return Result(state, blocks, convention, converged, status, sweep, np.ones(problem.xy.shape[1]))
 
 
 def _relative_change(old, new):

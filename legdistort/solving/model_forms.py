@@ -13,8 +13,8 @@ from astropy.modeling import CompoundModel, Model, models
 from ..exceptions import FoldError, InputError
 from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
-from ..geometry.fitter import free_coefficients, leaves, legendre_coefficients, linear_parts, set_values
-from ..geometry.models import FastLegendre2D
+from ..geometry.fitter import free_coefficients, legendre_coefficients, linear_parts, set_values
+from ..geometry.models import FastLegendre2D, leaves, rebuilt
 from ..priors.prior import Prior
 
 #: A form must be a polynomial to this, pixels.
@@ -242,13 +242,4 @@ def _rebuilt(model, shape):
                     f"for, as {axis}_domain=(-0.5, {n - 0.5}) for the whole detector"
                 )
             domains[f"{axis}_domain"] = (-0.5, n - 0.5)
-    return FastLegendre2D(
-        model.x_degree,
-        model.y_degree,
-        **domains,
-        x_window=model.x_window,
-        y_window=model.y_window,
-        name=model.name,
-        fixed=model.fixed,
-        **dict(zip(model.param_names, model.parameters, strict=True)),
-    )
+    return rebuilt(FastLegendre2D, model, **domains)

@@ -7,11 +7,12 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis
+from ..geometry.fitter import free_coefficients
 from ..inputs.reference_catalogue import read_reference, year
-from ..priors.prior import Prior
+from ..results.settings import Settings
 from ..runtime.checks import check_choice
 from .choices.degree_choice import AUTO
-from .equations.problem import check_error_floor
+from .equations.problem import check_error_floor, check_prior
 from .gauge.constraints import KINDS
 from .minimisers import LOSSES
 
@@ -19,9 +20,9 @@ METHODS = ("joint", "alternating")
 ERRORS = ("stated", "scale", "floor")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SolveOptions:
-    """Those arguments of `legdistort.solve` that can be judged without data; see there.
+@dataclass(frozen=True, eq=False)
+class SolveOptions(Settings):
+    """Those arguments of `legdistort.solve` that can be judged without data, with the prior and the model themselves.
 
     Raises
     ------
@@ -29,22 +30,8 @@ class SolveOptions:
         For options that are out of range or contradict one another.
     """
 
-    degree: int | str = 3
-    prior: Prior | dict | None = None
-    model: object = None
-    static: str | None = None
-    exposure_degree: int | None = None
-    gauge: str = "minimal"
-    method: str = "joint"
-    loss: str = "linear"
-    clip: float | None = None
-    error_floor: float = 0.0
-    errors: str = "stated"
-    max_iterations: int | None = None
-    validate: float | None = None
-
     def __post_init__(self):
-        self._check_model_of_distortion()
+        self._check_distortion()
         check_choice(self.gauge, KINDS, "gauge")
         check_error_floor(self.error_floor)
         check_choice(self.method, METHODS, "method")
@@ -63,8 +50,8 @@ class SolveOptions:
         if self.clip is not None and not (isinstance(self.clip, Real) and self.clip > 1):
             raise InputError(f"clip must be a number of standard errors above 1, got {self.clip!r}")
 
-    def _check_model_of_distortion(self):
-        """The degree, what is shared, what is kept out, and a model that says it all."""
+    def _check_distortion(self):
+        """The degree, what is shared, what is known, what is kept out, and a model that says it all."""
         if not isinstance(self.degree, str):
             basis.check_degree(self.degree)
         elif not self.chooses_degree:
@@ -75,10 +62,16 @@ class SolveOptions:
         if self.chooses_degree and self.static is not None:
             raise InputError("static='fit' needs a degree in numbers, not 'auto'")
         self._check_static()
-        if self.model is not None and (self.chooses_degree or self.static is not None):
+        check_prior(self.prior)
+        if self.model is not None:
+            self._check_model()
+
+    def _check_model(self):
+        if self.chooses_degree or self.static is not None:
             raise InputError("a model says what is fitted in every exposure: leave degree='auto' and static out")
-        if self.model is not None and self.prior is not None:
+        if self.prior is not None:
             raise InputError("the static distortion is in the coefficients of model: leave prior out")
+        free_coefficients(self.model)  # refuses what is no map of the plane, ties and bounds
 
     def _check_static(self):
         check_choice(self.static, (None, "fit"), "static")

@@ -6,14 +6,15 @@ modes of a common map becomes the value at which the constraints of the gauge ar
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ..exceptions import AssumptionWarning, warn
 from ..geometry import similarity
 from ..geometry.detector_modes import similarity_basis
+from ..geometry.similarity import robust_similarity
 from ..inputs import column_contract
-from ..inputs.matches import robust_similarity
 from ..matching.cross_identification import identify
 from ..results.absolute_errors import plain_directions
 from ..results.diagnostics import UsedReference
@@ -33,7 +34,7 @@ _LARGE = 2.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Anchor:
+class ReferenceTie:
     """What is needed to tie a solution.
 
     Attributes
@@ -44,17 +45,15 @@ class Anchor:
     names : ndarray, shape (n_stars,)
     scale : float
         Factor on the stated errors of the exposures.
-    options : SolveOptions
+    solve : callable
+        ``solve(problem, state, common=None)``: `legdistort.solving.minimisers.solve_joint` with the options of the fit.
     """
 
     identified: object
     label: str
     names: np.ndarray
     scale: float
-    options: object
-
-    def __repr__(self):
-        return f"<Anchor: {self.identified!r} of {self.label}>"
+    solve: object
 
     def tie(self, problem, result):
         """The `Result` with the plane where the reference puts it, and the `Tie` in its gauge.
@@ -73,15 +72,15 @@ class Anchor:
         """
         status, first = result.status, self._rough(result.state)
         if first is not None:
-            result = self._solved(problem, _moved(result.state, first))
+            result = self.solve(problem, _moved(result.state, first))
         prior = None
         for count in range(_ROUNDS):
             if count < 2:  # afterwards the plane moves too little for another
                 errors = self._errors(problem, result)
                 directions = self._directions(result.gauge, errors, result.state.positions.T)
                 prior = self._prior(result.gauge, directions) if prior is None else prior
-            offered = self._offered(result, directions, errors, prior)
-            step, made = catalogue_map.estimate(offered, catalogue_map.accepted(offered, self.label), self.names)
+            equations = self._equations(result, directions, errors, prior)
+            step, made = catalogue_map.estimate(equations, catalogue_map.accepted(equations, self.label), self.names)
             if count and self._is_settled(directions, step, made):
                 break
             similar = similarity_basis(prior.size, prior.n_modes)
@@ -93,20 +92,15 @@ class Anchor:
             if common is None:
                 result = replace(result, state=state, blocks=criterion.linearise(problem.scaled(result.robust), state))
             else:
-                result = self._solved(problem, state, common=common)
+                result = self.solve(problem, state, common=common)
         else:
             log.warning("the tie to %s is not settled after %d rounds", self.label, _ROUNDS)
-        unknown = hierarchy.named(offered.determined(made.used)[2], result.gauge, result.state.positions.T)
+        unknown = hierarchy.named(equations.determined(made.used)[2], result.gauge, result.state.positions.T)
         self._warn(made)
         log.info("%s", made.sentence)
         if result.converged:
             result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds")
         return replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown))
-
-    def _solved(self, problem, state, *, common=None):
-        of = self.options
-        how = {"gauge": of.gauge, "loss": of.loss, "max_iterations": of.max_iterations}
-        return minimisers.solve_joint(problem, state, common=common, **how)
 
     def _warn(self, made):
         """Tell what makes the absolute errors too small."""
@@ -151,7 +145,7 @@ class Anchor:
         maps = np.array([each.map for each in gauge.unknown_maps]).reshape(-1, 2 * n).T
         return catalogue_map.map_prior(covariance.reshape(2 * k, -1), maps, directions, tuple(2 * gauge.box[1, ::-1]))
 
-    def _offered(self, result, directions, errors, prior):
+    def _equations(self, result, directions, errors, prior):
         positions = result.state.positions.T
         offsets = catalogue_map.Offsets(
             self.identified.rows,
@@ -159,7 +153,7 @@ class Anchor:
             self.identified.covariance,
         )
         relative = errors.star_matrix if len(positions) <= catalogue_map.DENSE else errors.stars
-        return catalogue_map.Offered(offsets, directions, relative, prior)
+        return catalogue_map.MapEquations(offsets, directions, relative, prior)
 
     def _is_settled(self, directions, step, made):
         move = np.mean((directions @ step) ** 2)
@@ -228,14 +222,15 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         pixel_scale=pixel_scale,
     )
     log.info("%d of the %d stars of %s are in the exposures", len(identified.rows), len(reference), reference.label)
-    anchor = Anchor(
+    of = fit.options
+    tying = ReferenceTie(
         identified,
         reference.label,
         matches.stars,
         scale=scale,
-        options=fit.options,
+        solve=partial(minimisers.solve_joint, gauge=of.gauge, loss=of.loss, max_iterations=of.max_iterations),
     )
-    result = anchor.tie(fit.problem.scaled(fit.used.astype(float)), result)
+    result = tying.tie(fit.problem.scaled(fit.used.astype(float)), result)
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
 
 

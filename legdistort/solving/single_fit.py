@@ -2,7 +2,7 @@
 
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.optimize import brentq
@@ -92,7 +92,7 @@ class Fit:
 def estimate(matches, options):
     """The fit (`Fit`) with some `SolveOptions`; where the prior asks for it, with the widths that the exposures say."""
     prior = options.prior
-    if not prior_widths.is_wanted(prior):
+    if not prior_widths.sought(prior):
         return minimise(matches, options)
     unit = np.hypot(np.sqrt(np.median(matches.observations.covariance[:, :2])), options.error_floor)
     fit, widths = prior_widths.find_widths(
@@ -138,11 +138,10 @@ def estimate_with_floor(matches, fit, options):
     if fit.dof <= 0 or fit.chi2 <= fit.dof:
         return fit
     residual = np.sqrt(np.mean(fit.result.blocks.residual[:, fit.used] ** 2))
-    tried = {}
 
+    @cache
     def with_floor(log_floor):
-        tried[log_floor] = estimate(matches, replace(options, errors="stated", error_floor=np.exp(log_floor)))
-        return tried[log_floor]
+        return estimate(matches, replace(options, errors="stated", error_floor=np.exp(log_floor)))
 
     def excess(log_floor):
         fitted = with_floor(log_floor)
@@ -151,4 +150,4 @@ def estimate_with_floor(matches, fit, options):
     high = np.log(4 * residual)
     low = high - 12  # a floor of 1e-5 of the residuals is none
     best = brentq(excess, low, high, xtol=1e-3, maxiter=40) if excess(low) > 0 > excess(high) else high
-    return tried[best] if best in tried else with_floor(best)
+    return with_floor(best)

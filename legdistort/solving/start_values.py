@@ -8,14 +8,13 @@ from ..geometry.distortion import Distortion
 from .equations.problem import State
 
 
-def start(problem, nominal, *, n_sweeps=1, robust=False):
+def start(problem, nominal, *, robust=False):
     """Start values: coefficients at the prior mean, poses refined to one another, positions their weighted mean.
 
     Parameters
     ----------
     problem : Problem
     nominal : ndarray, shape (n_exposures, 2, 3)
-    n_sweeps : int
     robust : bool
         Give deviant observations less weight, so that mismatched exposures do not drag the others along.
 
@@ -34,7 +33,7 @@ def start(problem, nominal, *, n_sweeps=1, robust=False):
     q = undistorted(problem)
     full = problem.weight[:2].sum(axis=0) / 2
     current, weight = np.array(nominal, dtype=float), full
-    n_sweeps *= 12 if robust else 1
+    n_sweeps = 12 if robust else 1
     for sweep in range(n_sweeps + 1):
         positions = mean_positions(problem, current, q, weight)
         if sweep == n_sweeps:
@@ -52,14 +51,12 @@ def start(problem, nominal, *, n_sweeps=1, robust=False):
 
 def _check_prior(problem):
     """Raise `SolveError` if the map of a prior folds."""
-    checked = set()
+    distinct = {}
     for shape, mean, name in zip(problem.shapes, problem.prior_mean, problem.names, strict=True):
-        key = (shape, mean.tobytes())
-        if key in checked or not np.any(mean):
-            continue
-        checked.add(key)
+        distinct.setdefault((shape, mean.tobytes()), Distortion(mean, shape, name))
+    for distortion in distinct.values():
         try:
-            Distortion(mean, shape, name).check_fold()
+            distortion.check_fold()
         except FoldError as error:
             raise SolveError(f"the prior is not usable: {error}") from None
 
@@ -68,10 +65,6 @@ def undistorted(problem):
     """Positions (2, n) with the prior distortion taken out to second order, which is enough for a start."""
     if not np.any(problem.prior_mean):
         return problem.xy
-    if problem.uses_compiled_loops:
-        from .equations import compiled
-
-        return compiled.undistorted(problem)
     q = problem.xy.copy()
     for i, (shape, mean) in enumerate(zip(problem.shapes, problem.prior_mean, strict=True)):
         distortion, x = Distortion(mean, shape), problem.xy[:, problem.part(i)].T
@@ -140,16 +133,10 @@ def distances(problem, pose_list, q, positions):
 
 def mean_positions(problem, pose_list, q, weight):
     """Weighted mean (2, n_stars) of undistorted positions carried back to the reference plane."""
-    inverse = np.stack([similarity.invert(pose) for pose in pose_list])
-    if problem.uses_compiled_loops:
-        from .equations import compiled
-
-        sums, total = compiled.mean_sums(problem, inverse, q, weight)
-    else:
-        back = np.empty_like(q)
-        for i, pose in enumerate(inverse):
-            part = problem.part(i)
-            back[:, part] = pose[:, :2] @ q[:, part] + pose[:, 2:]
-        total = np.bincount(problem.star, weight, problem.n_stars)
-        sums = np.stack([np.bincount(problem.star, weight * axis, problem.n_stars) for axis in back])
+    back = np.empty_like(q)
+    for i, pose in enumerate(pose_list):
+        part, inverse = problem.part(i), similarity.invert(pose)
+        back[:, part] = inverse[:, :2] @ q[:, part] + inverse[:, 2:]
+    total = np.bincount(problem.star, weight, problem.n_stars)
+    sums = np.stack([np.bincount(problem.star, weight * axis, problem.n_stars) for axis in back])
     return np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)

@@ -1,1 +1,1 @@
-"""The WCS of an exposure: gwcs, ASDF file, FITS headers, attached to frames."""
+"""The WCS of an exposure: gwcs, its ASDF file, FITS headers with SIP or TPV, and frames that both go into."""

@@ -15,15 +15,14 @@ from astropy.io import fits
 from tqdm import tqdm
 
 from ..exceptions import ExportError, InputError
+from ..inputs.exposure_files import expand_paths, find_image
 from ..inputs.exposure_names import exposure_name
-from ..inputs.exposures import expand_paths, find_image
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, splice
 from ..runtime.outputs import replacing, replacing_folder
-from .files import wcs_tree
-from .fits_headers import make_header
+from .storage import wcs_tree
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 #: Keywords of the primary WCS and its distortion, all of which give way; those of alternative WCSs end in a letter.
 WCS_KEYWORDS = re.compile(
@@ -204,7 +203,7 @@ def _plan(solution, path, target, *, kind, max_error, ext, overwrite):
 
 def _header(solution, name, kind, max_error):
     try:
-        return make_header(solution, name, kind=kind, max_error=max_error)
+        return solution.header(name, kind=kind, max_error=max_error)
     except (ExportError, InputError) as error:
         raise type(error)(f"{error}; kind=None (--asdf-only) attaches the exact WCS alone") from None
 
@@ -240,7 +239,7 @@ def _nothing(solution, path, name):
             solution.index(name)
         except InputError as error:
             raise InputError(f"{path}: {error}; frames are told by their names") from None
-    logger.warning("%s: skipped, it was left out of the solution (%s)", path, solution.left_out[name])
+    log.warning("%s: skipped, it was left out of the solution (%s)", path, solution.left_out[name])
     return {}
 
 

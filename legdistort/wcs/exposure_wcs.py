@@ -1,39 +1,12 @@
-"""Solution -> astropy models and gwcs objects made of stock parts."""
+"""The gwcs of an exposure, made of stock parts."""
 
 import gwcs
 from astropy import units as u
 from astropy.coordinates import ICRS
 from gwcs import coordinate_frames as cf
 
-from ..geometry import similarity as poses
+from ..geometry import similarity
 from ..geometry.models import pose_model
-
-
-def exposure_model(pose, distortion, form=None):
-    """Reference plane -> detector pixels, ``T | D``, as an astropy compound model with its inverse attached.
-
-    Parameters
-    ----------
-    pose : ndarray, shape (2, 3)
-    distortion : Distortion
-    form : `legdistort.solving.model_forms.Form`, optional
-        What D looks like, if not ``Identity(2) + (Mapping((0, 1, 0, 1)) | Legendre2D & Legendre2D)`` on the detector.
-    """
-    similarity = pose_model(pose, "pose")
-    forward = similarity | (distortion.model() if form is None else form.fill(distortion))
-    forward.inverse = correction_model(distortion) | pose_model(poses.invert(pose), "pose_inverse")
-    forward.name = "reference_to_detector"
-    return forward
-
-
-def correction_model(distortion):
-    """Detector -> undistorted pixels: the certified inverse forwards, the exact distortion attached backwards."""
-    exact = distortion.model()
-    correction = exact.inverse
-    plain = exact.copy()
-    plain.inverse = None  # no circle of inverses: files would never end
-    correction.inverse = plain
-    return correction
 
 
 def exposure_wcs(name, pose, distortion, sky=None):
@@ -55,8 +28,8 @@ def exposure_wcs(name, pose, distortion, sky=None):
         return cf.Frame2D(name=frame, axes_order=(0, 1), unit=(u.pix, u.pix))
 
     steps = [
-        (plane("detector"), correction_model(distortion)),
-        (plane("undistorted"), pose_model(poses.invert(pose), "pose_inverse")),
+        (plane("detector"), distortion.correction_model()),
+        (plane("undistorted"), pose_model(similarity.invert(pose), "pose_inverse")),
         (plane("reference"), None if sky is None else sky.model()),
     ]
     if sky is not None:

@@ -1,4 +1,4 @@
-"""Solution -> FITS headers with distortion (TAN-SIP, TPV), and how far a header is from the exact chain.
+"""FITS headers with distortion (TAN-SIP, TPV), and how far a header is from the exact chain.
 
 SIP is what DS9, astropy and Aladin read, TPV what SWarp and SCAMP read. Both are polynomials from pixels to the sky,
 the direction in which a distortion has no closed form: they are fitted, their degree is raised until the error asked
@@ -18,6 +18,7 @@ from numpy.polynomial.polynomial import polyval2d
 
 from ..exceptions import ExportError, InputError
 from ..geometry import basis, similarity
+from ..geometry.models import outside
 from ..geometry.tangent_plane import TangentPlane
 from ..runtime.checks import check_choice
 
@@ -33,17 +34,18 @@ _GRID = 65
 _LAWSON = 12
 
 
-def make_header(solution, name, *, kind="sip", max_error=1e-3):
+def make_header(pose, distortion, sky, *, kind="sip", max_error=1e-3):
     """FITS header of one exposure: WCS keywords only, of the lowest degree that meets an error.
 
-    The reference point is the tangent point of the solution if it falls on the detector, and the middle of the
-    detector otherwise.
+    The reference point is the tangent point of the sky if it falls on the detector, and the middle of the detector
+    otherwise.
 
     Parameters
     ----------
-    solution : Solution
-    name : str
-        Exposure.
+    pose : ndarray, shape (2, 3)
+        Reference plane -> undistorted pixels.
+    distortion : Distortion
+    sky : TangentPlane or None
     kind : {"sip", "tpv"}
         Convention: TAN with SIP polynomials, or TPV.
     max_error : float
@@ -60,15 +62,15 @@ def make_header(solution, name, *, kind="sip", max_error=1e-3):
     ExportError
         If no degree meets `max_error`, naming the best.
     InputError
-        If the solution is not tied to the sky.
+        If the sky is not known.
     """
     check_choice(kind, tuple(MAX_DEGREE), "kind")
     if not max_error > 0:
         raise InputError(f"max_error must be a positive number of pixels, got {max_error!r}")
-    origin, tangent = _reference_point(solution, name)
-    nodes = _detector_points(solution.shapes[name], np.cos(np.pi * np.arange(_NODES) / (_NODES - 1)))
+    origin, tangent = _reference_point(pose, distortion, sky)
+    nodes = _detector_points(distortion.shape, np.cos(np.pi * np.arange(_NODES) / (_NODES - 1)))
     offset = nodes - origin
-    plane = tangent.from_sky(_exact_sky(solution, name, nodes))
+    plane = tangent.from_sky(_exact_sky(pose, distortion, sky, nodes))
     top = MAX_DEGREE[kind]
     for degree in range(2, top + 1):
         polynomial, missed = _fit(offset, plane, degree)
@@ -77,19 +79,19 @@ def make_header(solution, name, *, kind="sip", max_error=1e-3):
             continue
         header = _linear_header(kind, origin, tangent, cd)
         header.update(_sip(polynomial, cd, offset, plane) if kind == "sip" else _tpv(degree, cd, offset, plane))
-        errors = [_round_up(error) for error in header_error(header, solution, name)]
+        errors = [_round_up(error) for error in header_error(header, pose, distortion, sky)]
         if max(errors) <= max_error:
             for key, error, direction in zip(("MXERR", "IVERR"), errors, ("pixel to sky", "sky to pixel"), strict=True):
                 header[kind.upper() + key] = (error, f"[pix] largest error over detector, {direction}")
             return header
     raise ExportError(
-        f"{name}: no {kind.upper()} header meets max_error = {max_error:g} px; the best, of degree {top}, has "
-        f"{max(errors):.2g} px: allow that (--max-error), or hand on the ASDF form, which is exact"
+        f"{distortion.name}: no {kind.upper()} header meets max_error = {max_error:g} px; the best, of degree {top}, "
+        f"has {max(errors):.2g} px: allow that (--max-error), or hand on the ASDF form, which is exact"
     )
 
 
-def header_error(header, solution, name):
-    """Largest errors [pix] of a FITS header against the exact chain of a solution, as `astropy.wcs` reads it.
+def header_error(header, pose, distortion, sky):
+    """Largest errors [pix] of a FITS header against the exact chain of an exposure, as `astropy.wcs` reads it.
 
     Over a grid of the whole detector with its edges and corners; errors are distances in detector pixels.
 
@@ -97,9 +99,8 @@ def header_error(header, solution, name):
     ----------
     header : `~astropy.io.fits.Header`
         Any celestial WCS: of `make_header`, or of another program.
-    solution : Solution
-    name : str
-        Exposure.
+    pose, distortion, sky
+        As for `make_header`.
 
     Returns
     -------
@@ -112,25 +113,24 @@ def header_error(header, solution, name):
     Raises
     ------
     InputError
-        If the header has no celestial WCS, or the solution is not tied to the sky.
+        If the header has no celestial WCS, or the sky is not known.
     """
-    points = _detector_points(solution.distortion(name).shape, np.linspace(-1, 1, _GRID))
-    exact = _exact_sky(solution, name, points)
+    points = _detector_points(distortion.shape, np.linspace(-1, 1, _GRID))
+    exact = _exact_sky(pose, distortion, sky, points)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)
         wcs = WCS(header)
     if not wcs.has_celestial:
-        raise InputError(f"the header compared with exposure {name} has no celestial WCS")
+        raise InputError(f"the header compared with exposure {distortion.name} has no celestial WCS")
     frame = wcs_to_celestial_frame(wcs)
-    sky = SkyCoord(*wcs.all_pix2world(points, 0).T, unit="deg", frame=frame)
-    undistorted = similarity.apply(solution.poses[name], solution.sky.from_sky(sky))
-    forward = solution.distortion(name)(undistorted)
+    said = SkyCoord(*wcs.all_pix2world(points, 0).T, unit="deg", frame=frame)
+    forward = distortion(similarity.apply(pose, sky.from_sky(said)))
     there = exact.transform_to(frame).spherical
-    inverse = _to_pixels(wcs, np.column_stack([there.lon.deg, there.lat.deg]))
+    inverse = _pixels(wcs, np.column_stack([there.lon.deg, there.lat.deg]))
     return tuple(_largest(found - points) for found in (forward, inverse))
 
 
-def _to_pixels(wcs, sky):
+def _pixels(wcs, sky):
     """Sky [deg] -> pixels (n, 2), from 0, by the inverse polynomials where there are some."""
     if wcs.sip is None:
         return wcs.wcs_world2pix(sky, 0)
@@ -145,27 +145,29 @@ def _largest(difference):
     return float(distance.max()) if np.all(np.isfinite(distance)) else np.inf
 
 
-def _exact_sky(solution, name, points):
+def _exact_sky(pose, distortion, sky, points):
     """Sky (SkyCoord) of detector pixels (n, 2)."""
-    if solution.sky is None:
+    if sky is None:
         raise InputError(
-            f"the solution does not know the sky, so exposure {name} can have no FITS header: solve exposures whose "
-            "headers have a WCS, or give solve() a reference catalogue with ra and dec"
+            f"the solution does not know the sky, so exposure {distortion.name} can have no FITS header: solve "
+            "exposures whose headers have a WCS, or give solve() a reference catalogue with ra and dec"
         )
-    return solution.sky.to_sky(solution.correct(name, points))
+    distortion.check_fold()
+    return sky.to_sky(similarity.apply(similarity.invert(pose), distortion.invert(points)))
 
 
-def _reference_point(solution, name):
+def _reference_point(pose, distortion, sky):
     """Pixel (2,) of the reference point of a header, and the `TangentPlane` there, in degrees."""
-    ny, nx = solution.distortion(name).shape
+    ny, nx = distortion.shape
     centre = np.array([nx - 1, ny - 1]) / 2
-    sky = _exact_sky(solution, name, centre[None])[0]
-    tangent = similarity.invert(solution.sky.matrix)[:, 2]
-    pixel = solution.distort(name, tangent)[0]
-    if np.all(np.abs(pixel - centre) <= np.array([nx, ny]) / 2):  # false for NaN: not on the detector
-        return pixel, TangentPlane(solution.sky.lon, solution.sky.lat, similarity.identity())
-    # far from the detector a distortion means nothing, and powers of the distance lose digits
-    return centre, TangentPlane(sky.ra.deg, sky.dec.deg, similarity.identity())
+    there = _exact_sky(pose, distortion, sky, centre[None])[0]
+    tangent = similarity.apply(pose, similarity.invert(sky.matrix)[None, :, 2])
+    pixel = distortion(tangent)[0]
+    near = not outside(distortion.inverse.valid, *tangent[0])  # elsewhere the series means nothing and may fold back
+    if near and np.all(np.abs(pixel - centre) <= np.array([nx, ny]) / 2):
+        return pixel, TangentPlane(sky.lon, sky.lat, similarity.identity())
+    # far from the detector powers of the distance would lose digits
+    return centre, TangentPlane(there.ra.deg, there.dec.deg, similarity.identity())
 
 
 def _detector_points(shape, t):

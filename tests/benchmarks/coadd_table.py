@@ -157,7 +157,7 @@ def single_reproject(folder, out, *, stock):
     from reproject import reproject_interp
 
     from legdistort.coaddition.grids import reference_grid
-    from legdistort.wcs.files import write_wcs
+    from legdistort.wcs.storage import write_wcs
 
     solution, _, _ = inputs(folder)
     path = frames(folder)[0]

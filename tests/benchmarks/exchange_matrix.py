@@ -29,7 +29,6 @@ from legdistort.priors.from_files import read_source
 from legdistort.priors.prior import Prior
 from legdistort.wcs.attachment import attach
 from legdistort.wcs.exposure_wcs import exposure_wcs
-from legdistort.wcs.fits_headers import make_header
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import test_headers
@@ -289,7 +288,7 @@ def exported(reader, read):
             solution = make(degree, peak)
             for allowed in (1e-3, 1e-2, 1e-1):  # strong distortions are beyond SIP and TPV
                 with contextlib.suppress(ExportError):
-                    header = make_header(solution, "a", kind=kind, max_error=allowed)
+                    header = solution.header("a", kind=kind, max_error=allowed)
                     break
             p, _, _ = test_headers.detector(solution, "a")
             back = test_headers.pixels_of(solution, "a", *read(header, p))

@@ -45,7 +45,7 @@ def measure(name, solver, n_exposures, n_stars):
                 state, chi2 = rivals.solve_scipy(problem, start)
             else:
                 result = minimisers.solve_alternating(problem, start, max_iterations=300)
-                state, chi2, sweeps = result.state, result.blocks.chi2, len(result.history)
+                state, chi2, sweeps = result.state, result.blocks.chi2, result.n_iterations
             positions = state.positions.T
         times.append(time.perf_counter() - begin)
     memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024

@@ -1,49 +1,12 @@
 """One detector image -> the output grid by drizzle (Fruchter & Hook 2002), with the package of STScI as the engine."""
 
-from dataclasses import dataclass
-
 import numpy as np
-
-from ...exceptions import InputError
 
 KERNELS = ("square", "turbo", "point")  # those that conserve flux
 _EMPTY = 1e-3  # share of a drop with which an output pixel counts as empty: its value would be noise
 
 
-@dataclass(frozen=True)
-class Drop:
-    """What a detector pixel becomes before it falls on the output grid.
-
-    Attributes
-    ----------
-    kernel : {'square', 'turbo', 'point'}
-        Shape: a square that turns and shears with the distortion, one along the axes of the output, or a point.
-    pixfrac : float
-        Side, as a fraction of the pixel's, above 0 up to 1.
-
-    Raises
-    ------
-    InputError
-        If they are none of these, or the package is missing.
-    """
-
-    kernel: str = "square"
-    pixfrac: float = 1.0
-
-    def __post_init__(self):
-        if self.kernel not in KERNELS:
-            raise InputError(f"kernel must be one of {', '.join(map(repr, KERNELS))}, got {self.kernel!r}")
-        if isinstance(self.pixfrac, bool) or not (
-            isinstance(self.pixfrac, (int, float, np.number)) and 0 < self.pixfrac <= 1
-        ):
-            raise InputError(f"pixfrac must be a number above 0 and up to 1, got {self.pixfrac!r}")
-        try:
-            import drizzle.resample  # noqa: F401
-        except ImportError:
-            raise InputError("algorithm='drizzle' needs the package drizzle: pip install legdistort[drizzle]") from None
-
-
-def drizzle(data, good, variances, pixel_map, drop):
+def drizzle(data, good, variances, pixel_map, resampling):
     """Drizzle an image, surface brightness conserved.
 
     Parameters
@@ -55,7 +18,8 @@ def drizzle(data, good, variances, pixel_map, drop):
         Of independent pixels.
     pixel_map : `~legdistort.coaddition.resampling.pixel_maps.PixelMap`
         With corners.
-    drop : Drop
+    resampling : `~legdistort.coaddition.resampling.engines.Resampling`
+        Its ``kernel`` and ``pixfrac`` tell what a pixel becomes before it falls.
 
     Returns
     -------
@@ -75,18 +39,18 @@ def drizzle(data, good, variances, pixel_map, drop):
     low = np.minimum(np.floor(np.nanmin(c, axis=(1, 2))), 0).astype(int) - 2
     high = np.maximum(np.ceil(np.nanmax(c, axis=(1, 2))), (nx, ny)).astype(int) + 2
     shape = tuple(int(n) for n in (high - low)[::-1])
-    onto = Drizzle(kernel=drop.kernel, out_shape=shape, fillval=np.nan, disable_ctx=True)
+    onto = Drizzle(kernel=resampling.kernel, out_shape=shape, fillval=np.nan, disable_ctx=True)
     onto.add_image(
         np.ascontiguousarray(data, dtype=np.float32),
         exptime=1.0,
         pixmap=np.ascontiguousarray(np.moveaxis(centres, 0, -1)) - low,
         data2=[np.ascontiguousarray(v, dtype=np.float32) for v in variances] or None,
         weight_map=good.astype(np.float32),
-        pixfrac=drop.pixfrac,
+        pixfrac=resampling.pixfrac,
         in_units="cps",
     )
     within = slice(-low[1], ny - low[1]), slice(-low[0], nx - low[0])
     coverage = onto.out_wht[within]
-    empty = ~(np.abs(coverage) > _EMPTY * drop.pixfrac**2) | ~pixel_map.inside
+    empty = ~(np.abs(coverage) > _EMPTY * resampling.pixfrac**2) | ~pixel_map.inside
     out = [np.where(empty, np.nan, plane[within]).astype(float) for plane in (onto.out_img, *(onto.out_img2 or ()))]
     return out[0], out[1:], np.where(empty, 0, coverage)

@@ -1,31 +1,65 @@
 """Pieces of detector images -> pieces of the output grid, with reproject as the engine.
 
 It is handed tiny WCS objects whose world *is* the output grid, and a pixel map
-(`legdistort.coaddition.resampling.pixel_maps`). For many pixels, compiled twins of its splines take over
-(`legdistort.coaddition.resampling.compiled_splines`).
+(`legdistort.coaddition.resampling.pixel_maps`), since coordinates through the sky would take most of its time. For many
+pixels, compiled twins of its splines take over (`legdistort.coaddition.resampling.compiled_splines`).
 """
 
-from dataclasses import dataclass
-from functools import lru_cache
-from math import ceil
+from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.wcs.wcsapi import BaseLowLevelWCS
-from numpy.polynomial.polynomial import polyfit, polyval
-from scipy.ndimage import binary_dilation, map_coordinates
+from scipy.ndimage import map_coordinates
 
 from ...runtime.optional import has_fast
 from .drizzling import drizzle
+from .noise_gain import mean_spline_gain, spline_gain
 
 _BAD_WEIGHT = 0.05  # an output pixel with a larger share of bad pixels is left empty
+_FORGETS = 2, 2, 12, 16, 20, 24  # pixels by which a spline of that order has forgotten, to 1e-8
 #: Pixels of all exposures from which compiled splines are used, if numba is installed.
 COMPILED_FROM = 1 << 22
 
 
-def is_compiled(algorithm, order, n_pixels):
-    """Whether the compiled splines of `legdistort.coaddition.resampling.compiled_splines` serve so many pixels."""
+@dataclass(frozen=True)
+class Resampling:
+    """How exposures are resampled.
+
+    Attributes
+    ----------
+    algorithm : {'interp', 'adaptive', 'exact', 'drizzle'}
+        Which of reproject's, or that of STScI.
+    order : int
+        Of the spline, for 'interp'.
+    kernel : {'square', 'turbo', 'point'}
+        Of drizzle's drops: a square that turns and shears with the distortion, one along the axes of the output, or a
+        point.
+    pixfrac : float
+        Side of a drop, as a fraction of the pixel's, above 0 up to 1.
+    compiled : bool
+        Splines by compiled loops, see `uses_compiled_splines`.
+    """
+
+    algorithm: str = "interp"
+    order: int = 3
+    kernel: str = "square"
+    pixfrac: float = 1.0
+    compiled: bool = False
+
+    def __str__(self):
+        kind = {"interp": f" {self.order}", "drizzle": f" {self.kernel} {self.pixfrac:g}"}
+        return self.algorithm + kind.get(self.algorithm, "")
+
+    @property
+    def margin(self):
+        """Pixels of an exposure, around those that are wanted, on which their values depend."""
+        return _FORGETS[self.order] if self.algorithm == "interp" else 10
+
+
+def uses_compiled_splines(algorithm, order, n_pixels):
+    """Whether the splines of `legdistort.coaddition.resampling.compiled_splines` serve so many pixels."""
     return algorithm == "interp" and order in (1, 3) and n_pixels >= COMPILED_FROM and has_fast()
 
 
@@ -91,7 +125,7 @@ def _look_up(table, x, y, margin=0):
     return tuple(plane[index] for plane in planes)
 
 
-def resample(planes, pixel_map, *, algorithm="interp", order=1, compiled=False):
+def resample(planes, pixel_map, resampling):
     """Images of one detector on the output grid, surface brightness conserved.
 
     Parameters
@@ -100,43 +134,40 @@ def resample(planes, pixel_map, *, algorithm="interp", order=1, compiled=False):
         The images.
     pixel_map : `~legdistort.coaddition.resampling.pixel_maps.PixelMap`
         With what the algorithm asks for.
-    algorithm : {'interp', 'adaptive', 'exact'}
-        One of reproject's.
-    order : int
-        Of the spline, for 'interp'.
-    compiled : bool
-        By compiled loops, see `is_compiled`.
+    resampling : Resampling
+        By any algorithm but drizzle.
 
     Returns
     -------
     ndarray, shape (k, my, mx)
         NaN outside the detector.
     """
-    if compiled:
+    if resampling.compiled:
         from . import compiled_splines
 
         out = np.empty((len(planes), *pixel_map.area.shape))
         for plane, values in zip(planes, out, strict=True):
-            compiled_splines.interpolate(plane, pixel_map.xy, order, values)
+            compiled_splines.interpolate(plane, pixel_map.xy, resampling.order, values)
     else:
-        out = _reproject(planes, pixel_map, algorithm, order)
+        out = _reproject(planes, pixel_map, resampling)
     if not pixel_map.inside.all():
         out[:, ~pixel_map.inside] = np.nan
     return out
 
 
-def _reproject(planes, pixel_map, algorithm, order):
+def _reproject(planes, pixel_map, resampling):
     import reproject  # brings dask along, which takes a third of a second
 
     planes = np.asarray(planes)
     options = {"shape_out": (len(planes), *pixel_map.area.shape), "return_footprint": False}
-    if algorithm == "exact":
+    if resampling.algorithm == "exact":
         scale = 1 / max(pixel_map.area.shape)
         wcs_in, wcs_out = _TableWCS(to_world=pixel_map.corners, scale=scale), _TableWCS(scale=scale)
         return reproject.reproject_exact((planes, wcs_in), wcs_out, **options)
     options["roundtrip_coords"] = False
-    if algorithm == "interp":
-        return reproject.reproject_interp((planes, _TableWCS(pixel_map.xy)), _TableWCS(), order=order, **options)
+    if resampling.algorithm == "interp":
+        options["order"] = resampling.order
+        return reproject.reproject_interp((planes, _TableWCS(pixel_map.xy)), _TableWCS(), **options)
     # asks one pixel beyond the grid
     return reproject.reproject_adaptive((planes, _TableWCS(pixel_map.wider, margin=1)), _TableWCS(), **options)
 
@@ -163,58 +194,55 @@ class Resampled:
     coverage: object = 1.0
 
 
-def resample_exposure(
-    data, masks, variance, pixel_map, *, algorithm="interp", order=3, compiled=False, gain=None, drop=None
-):
+def resample_exposure(data, masks, variance, pixel_map, resampling, *, gain=None):
     """A piece of an exposure on the output grid.
 
     Parameters
     ----------
     data : ndarray, shape (ny, nx)
-        The image, bad pixels replaced (`fill_bad`), so that they do not ring through the spline.
+        The image, bad pixels replaced, so that they do not ring through the spline.
     masks : dict of ndarray of bool, shape (ny, nx), or None
         ``bad``: output pixels where their share is above 5 % are NaN (of drizzle, they do not fall). ``full``:
-        saturated ones. ``rough``: where a spline would ring (`rough_pixels`), which are interpolated linearly.
+        saturated ones. ``rough``: where a spline would ring (`legdistort.coaddition.preparation.rough_pixels`), which
+        are interpolated linearly.
     variance : ndarray, shape (ny, nx) or (k, ny, nx), or float
         Of independent pixels.
     pixel_map : `~legdistort.coaddition.resampling.pixel_maps.PixelMap`
         Of its exposure.
-    algorithm, order, compiled
-        See `resample`; or 'drizzle'.
+    resampling : `~legdistort.coaddition.resampling.engines.Resampling`
     gain : float, optional
-        What the algorithm leaves of the variance of white noise (`white_gain`); not for 'interp', where it is known.
-    drop : `~legdistort.coaddition.resampling.drizzling.Drop`, optional
-        For drizzle.
+        What the algorithm leaves of the variance of white noise
+        (`white_gain`); not for 'interp', where it is known.
 
     Returns
     -------
     Resampled
     """
     masks = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
-    if algorithm == "drizzle":
-        return _drizzle(data, masks, variance, pixel_map, drop)
+    if resampling.algorithm == "drizzle":
+        return _drizzle(data, masks, variance, pixel_map, resampling)
+    spline = resampling.algorithm == "interp"
     spoilt = [name for name in ("bad", "full") if name in masks]
     extra = list(np.reshape(variance, (-1, *data.shape)) if np.ndim(variance) else [])
-    if algorithm == "interp" and order > 0:
+    if spline and resampling.order > 0:
         hits = [_hits(masks[name], pixel_map) for name in spoilt]
-        out = [*resample(data[None], pixel_map, order=order, compiled=compiled)]
-        out += [*resample(extra, pixel_map, order=1, compiled=compiled)] if extra else []
-        value = out.pop(0)
+        value = resample(data[None], pixel_map, resampling)[0]
+        out = resample(extra, pixel_map, replace(resampling, order=1)) if extra else []
     else:
         shares = [masks[name].astype(np.float32) for name in spoilt]
-        value, *out = resample(np.array([data, *shares, *extra]), pixel_map, algorithm=algorithm, order=order)
+        value, *out = resample(np.array([data, *shares, *extra]), pixel_map, resampling)
         hits = [~(out.pop(0) <= _BAD_WEIGHT) for _ in spoilt]
     hits = dict(zip(spoilt, hits, strict=True))
-    if algorithm == "interp":
-        gain = _spline_gain(order, pixel_map.xy, compiled)
-    if "rough" in masks and algorithm == "interp" and order > 1:
+    if spline:
+        gain = spline_gain(resampling.order, pixel_map.xy, resampling.compiled)
+    if "rough" in masks and spline and resampling.order > 1:
         place = [np.clip(np.rint(p), 0, n - 1) for p, n in zip(pixel_map.xy[::-1], data.shape, strict=True)]
         near = masks["rough"][tuple(np.array(place, dtype=np.intp))] & pixel_map.inside
         value[near] = map_coordinates(data, pixel_map.xy[::-1, near], order=1, mode="nearest")
-        gain = np.where(near, _spline_gain(1, pixel_map.xy, compiled), gain)
+        gain = np.where(near, spline_gain(1, pixel_map.xy, resampling.compiled), gain)
     if "bad" in masks:
         value[hits["bad"]] = np.nan
-    spread = np.reshape(out, (*np.shape(variance)[:-2], *value.shape)) if out else variance
+    spread = np.reshape(out, (*np.shape(variance)[:-2], *value.shape)) if extra else variance
     return Resampled(value, gain * spread, hits.get("full"))
 
 
@@ -231,17 +259,17 @@ def _hits(mask, pixel_map):
     return hits
 
 
-def _drizzle(data, masks, variance, pixel_map, drop):
+def _drizzle(data, masks, variance, pixel_map, resampling):
     variances = np.broadcast_to(variance, (*np.shape(variance)[:-2], *data.shape))
     good = ~masks.get("bad", np.zeros(data.shape, dtype=bool))
-    value, spread, coverage = drizzle(data, good, variances.reshape(-1, *data.shape), pixel_map, drop)
+    value, spread, coverage = drizzle(data, good, variances.reshape(-1, *data.shape), pixel_map, resampling)
     full = None
     if "full" in masks:
-        full = drizzle(masks["full"], good, [], pixel_map, drop)[0] > _BAD_WEIGHT
+        full = drizzle(masks["full"], good, [], pixel_map, resampling)[0] > _BAD_WEIGHT
     return Resampled(value, np.reshape(spread, (*variances.shape[:-2], *value.shape)), full, coverage)
 
 
-def white_gain(exposure_map, *, algorithm, order=None, drop=None):
+def white_gain(exposure_map, resampling):
     """What an algorithm leaves of the variance of white noise; found in the middle of an exposure, but for splines.
 
     The sum over many pixels keeps its variance: it is the inverse of this times the sum of the variances of single
@@ -250,142 +278,25 @@ def white_gain(exposure_map, *, algorithm, order=None, drop=None):
     Parameters
     ----------
     exposure_map : `~legdistort.coaddition.resampling.pixel_maps.ExposureMap`
-    algorithm, order, drop
-        As for `resample_exposure`.
+    resampling : `~legdistort.coaddition.resampling.engines.Resampling`
 
     Returns
     -------
     float
         The mean over 128 x 128 px of the output.
     """
-    if algorithm == "interp":
-        fraction = (np.arange(100) + 0.5) / 100
-        return float(polyval(fraction * (1 - fraction), _gain_series(order)).mean() ** 2)
+    if resampling.algorithm == "interp":
+        return mean_spline_gain(resampling.order)
     middle = tuple(
         slice(max(s.start, (s.start + s.stop) // 2 - 64), (s.start + s.stop) // 2 + 64) for s in exposure_map.window
     )
     for window in (middle, exposure_map.window):  # an exposure may meet the grid with a corner only
-        found = exposure_map.piece(window, margin=24, border=algorithm == "adaptive")
+        found = exposure_map.piece(window, margin=24, border=resampling.algorithm == "adaptive")
         if found is not None:
             noise = np.random.default_rng(1).standard_normal([s.stop - s.start for s in found[1]])
-            if algorithm == "drizzle":
-                return float(np.nanvar(drizzle(noise, np.ones(noise.shape, dtype=bool), [], found[0], drop)[0]))
-            return float(np.nanvar(resample(noise[None], found[0], algorithm=algorithm)))
+            if resampling.algorithm == "drizzle":
+                out = drizzle(noise, np.ones(noise.shape, dtype=bool), [], found[0], resampling)[0]
+            else:
+                out = resample(noise[None], found[0], resampling)
+            return float(np.nanvar(out))
     return 1.0
-
-
-def noise_correlation(exposure_map, gain, *, algorithm, order=None):
-    """Noise of the sum of many pixels over that by the sum of their variances, in the middle of an exposure.
-
-    Parameters
-    ----------
-    exposure_map : `~legdistort.coaddition.resampling.pixel_maps.ExposureMap`
-    gain : float
-        From `white_gain`.
-    algorithm, order
-        As for `resample_exposure`.
-
-    Returns
-    -------
-    float
-    """
-    x, y, _, _, area = exposure_map.middle()
-    if algorithm != "interp":  # these lose no light: the sum has the noise of the pixels of the detector
-        return float((gain * area.mean()) ** -0.5)
-    along_x, along_y = (np.array([np.diff(p, axis=axis).mean() for p in (x, y)]) for axis in (1, 0))
-    reach = min(200, ceil(20 / min(np.hypot(*along_x), np.hypot(*along_y))))
-    i, k = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    step, correlation = _spline_correlation(order)
-    lag = along_x[:, None, None] * k + along_y[:, None, None] * i
-    both = [np.interp(np.abs(p), step * np.arange(len(correlation)), correlation, right=0) for p in lag]
-    return float(np.sqrt((both[0] * both[1]).sum()))
-
-
-@lru_cache
-def _spline_correlation(order, n=32, reach=20):
-    """Correlation of white noise after interpolation, at lags of so many n-th pixels: the step, and values."""
-    impulse = np.zeros(4 * reach + 1)
-    impulse[2 * reach] = 1
-    kernel = map_coordinates(impulse, [np.arange(reach, 3 * reach, 1 / n)], order=order)
-    values = np.correlate(kernel, kernel, "full")[len(kernel) - 1 :]
-    return 1 / n, values / values[0]
-
-
-def rough_pixels(data, bad, full, noise):
-    """Pixels within five of a saturated one, or of a hole in the slope of a star: splines ring there.
-
-    Parameters
-    ----------
-    data : ndarray, shape (ny, nx)
-        Bad pixels replaced.
-    bad, full : ndarray of bool, shape (ny, nx)
-        Bad pixels and saturated ones.
-    noise : float
-        Of the background: a slope is where data within two pixels differ by more than ten times this; a hole is where
-        most of these pixels are bad. Single bad pixels are replaced well enough.
-
-    Returns
-    -------
-    ndarray of bool, shape (ny, nx)
-    """
-    rough = full.copy()
-    y, x = np.nonzero(bad)
-    if len(y):
-        around = [_around(plane, y, x) for plane in (data, bad)]
-        rough[y, x] = (np.ptp(around[0], axis=0) > 10 * noise) & (around[1].mean(axis=0) > 0.5)
-    return binary_dilation(rough, np.ones((11, 11), dtype=bool)) if rough.any() else rough
-
-
-def _around(plane, y, x):
-    padded = np.pad(plane, 2, mode="edge")
-    return np.stack([padded[y + i, x + k] for i, k in np.ndindex(5, 5)])
-
-
-def fill_bad(data, bad, radius=2):
-    """Replace bad pixels by a weighted mean of the good ones near by, or the median of all good ones."""
-    if not bad.any():
-        return data
-    (y, x), (ny, nx) = np.nonzero(bad), bad.shape
-    total, norm = np.zeros(len(x)), np.zeros(len(x))
-    for dy, dx in np.ndindex(2 * radius + 1, 2 * radius + 1):
-        near = np.clip(y + dy - radius, 0, ny - 1), np.clip(x + dx - radius, 0, nx - 1)
-        weight = np.exp(-((dy - radius) ** 2 + (dx - radius) ** 2) / 2) * ~bad[near]
-        total += weight * np.where(weight > 0, data[near], 0)
-        norm += weight
-    lonely = norm == 0
-    out = data.copy()
-    out[y, x] = total / np.where(lonely, 1, norm)
-    if lonely.any():
-        out[y[lonely], x[lonely]] = np.median(data[~bad])
-    return out
-
-
-def _spline_gain(order, xy, compiled):
-    """Variance of an interpolated pixel for unit white noise, from the fractions of its coordinates."""
-    if compiled:
-        from . import compiled_splines
-
-        return compiled_splines.product(_gain_series(order), xy)
-    fraction = xy.astype(np.float32)  # small numbers, since they count from the piece of the detector
-    fraction -= np.floor(fraction)
-    fraction *= 1 - fraction
-    *rest, last = _gain_series(order)
-    gain = np.full_like(fraction, last)
-    for c in reversed(rest):  # in place: three times faster than polyval
-        gain *= fraction
-        gain += np.float32(c)
-    return gain[0] * gain[1]
-
-
-@lru_cache
-def _gain_series(order, n=256, reach=20):
-    """Sum of the squared weights of a spline at the fraction f of a pixel, as a polynomial in f (1 - f).
-
-    It is one of that very degree for odd orders; even ones are met to 0.001.
-    """
-    impulse = np.zeros(2 * reach + 1)
-    impulse[reach] = 1
-    fraction = np.linspace(0, 1, n + 1)
-    coordinates = reach + np.arange(-reach + 1, reach)[:, None] - fraction
-    gain = (map_coordinates(impulse, [coordinates], order=order) ** 2).sum(axis=0)
-    return polyfit(fraction * (1 - fraction), gain, order if order % 2 else 5)

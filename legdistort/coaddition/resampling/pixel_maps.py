@@ -16,7 +16,7 @@ from ...geometry import similarity
 from ...geometry.models import outside
 from ..grids import outline
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _NODES = 24
 _TOLERANCE = 1e-6  # largest error of a tabulated map, px (and relative, for the determinant)
@@ -136,7 +136,7 @@ def tabulate(function, corner, shape):
     wx, wy = (chebvander((i + 0.5) * 2 / n - 1, m - 1) for i, n, m in ((x, nx, mx), (y, ny, my)))
     if np.all(np.abs(np.einsum("na,kab,nb->kn", wy, table.coefficients, wx) - exact) <= _TOLERANCE):
         return table
-    logger.info("the pixel map is not smooth enough for %d nodes, every pixel is evaluated", _NODES)
+    log.info("the pixel map is not smooth enough for %d nodes, every pixel is evaluated", _NODES)
     return Table(tuple(corner), tuple(shape), None, function)
 
 

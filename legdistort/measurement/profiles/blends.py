@@ -6,7 +6,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from . import moffat
-from .levenberg_marquardt import fit
 
 _LARGEST = 6  # stars fitted together; the work grows with the square
 
@@ -62,7 +61,7 @@ def partner_models(stamps, labels, params, nodes):
     return np.where(stamps.inside, out, 0)
 
 
-def fit_groups(found, labels, pixels, start, *, stamps, centre, **options):
+def fit_groups(found, labels, pixels, start, *, stamps, centre, fitting):
     """The fit with all groups fitted anew, the stars of one together: with one shape and one background.
 
     Parameters
@@ -77,8 +76,8 @@ def fit_groups(found, labels, pixels, start, *, stamps, centre, **options):
     stamps : `~legdistort.measurement.profiles.cutouts.Stamps`
     centre : ndarray, shape (4,) or (n, 4)
         Of the prior of the shapes.
-    **options
-        Of `legdistort.measurement.profiles.levenberg_marquardt.fit`.
+    fitting : callable
+        `legdistort.measurement.profiles.levenberg_marquardt.fit`, how to fit being settled.
 
     Returns
     -------
@@ -91,13 +90,13 @@ def fit_groups(found, labels, pixels, start, *, stamps, centre, **options):
         m, g = stars.shape
         if g == 1:
             rows = stars[:, 0]
-            part = fit(data[rows], weights[rows], start[rows], centre=centre[rows], **options)
+            part = fitting(data[rows], weights[rows], start[rows], centre=centre[rows])
         else:
             once = _once(weights[stars].reshape(m, -1), stamps.index[stars].reshape(m, -1))
             leader = stars[np.arange(m), np.argmax(start[stars, 2], axis=1)]
             first = np.hstack([start[stars, :3].reshape(m, -1), centre[leader], start[leader, 7:]])
             offsets = stamps.centres[stars]
-            part = fit(data[stars].reshape(m, -1), once, first, centre=centre[leader], offsets=offsets, **options)
+            part = fitting(data[stars].reshape(m, -1), once, first, centre=centre[leader], offsets=offsets)
         found = found.updated(stars.ravel(), part.by_star())
     return found
 

@@ -1,5 +1,7 @@
 """All stars of a frame fitted: neighbours subtracted, noise from the model, hot pixels told from stars."""
 
+from functools import partial
+
 import numpy as np
 
 from ..detection import MESH, detect, prepare
@@ -7,7 +9,7 @@ from ..flags import Flag
 from . import moffat
 from .blends import fit_groups, group_stars, partner_models
 from .cutouts import Stamps
-from .levenberg_marquardt import HELD, SHAPE_SIGMA, fit
+from .levenberg_marquardt import HELD, SHAPE_SIGMA, Limits, fit
 from .pixel_noise import NEIGHBOUR, pixel_noise
 from .shape_field import shape_field
 
@@ -18,7 +20,7 @@ _FIRST_FWHM = 3.0
 _OUTLIER = 6.0  # standard deviations ...
 _OUTLIER_MODEL = 0.2  # ... plus this fraction of the star itself, which no real profile follows exactly
 #: Limits of the passes: what the first leaves tells the noise, the second prepares the last.
-_FIRST, _MIDDLE, _LAST = {"max_iterations": 20}, {"max_iterations": 20, "tolerance": 1e-2}, {"max_iterations": 40}
+_FIRST, _MIDDLE, _LAST = Limits(20, 1e-4), Limits(20, 1e-2), Limits(40, 1e-4)
 _SHAPELY = 20  # signal-to-noise ratio of stars that tell the shape of all
 _GAP = 1 / 3  # part of the pixels within one FWHM that may be missing
 _POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no star, however sharp, has so little
@@ -26,10 +28,7 @@ _POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no
 
 def _start(stamps, shape):
     middle = stamps.data.shape[1] // 2
-    start = np.zeros((len(stamps.centres), 8))
-    start[:, 3:7] = shape
-    start[:, 2] = np.maximum(stamps.data[:, middle], np.sqrt(stamps.variance[:, middle]))
-    return start
+    return moffat.parameters(np.maximum(stamps.data[:, middle], np.sqrt(stamps.variance[:, middle])), shape)
 
 
 def _weights(good, variance):
@@ -117,7 +116,7 @@ def _fit_once(stamps, shape, nodes):
     start = _start(stamps, shape)
     _, others = stamps.models(start, nodes)
     data, weights = stamps.data - others, _weights(stamps.good, stamps.variance + (NEIGHBOUR * others) ** 2)
-    return fit(data, weights, start, nodes=nodes, centre=shape, **_FIRST), _point_chi2(data, weights)
+    return fit(data, weights, start, nodes=nodes, centre=shape, limits=_FIRST), _point_chi2(data, weights)
 
 
 def _point_chi2(data, weights):
@@ -127,14 +126,15 @@ def _point_chi2(data, weights):
     middle = np.zeros((size, size), dtype=bool)
     middle[size // 2 - 1 : size // 2 + 2, size // 2 - 1 : size // 2 + 2] = True
     peak = np.argmax(np.where(middle.ravel() & (weights > 0), data, -np.inf), axis=1)
-    out = []
-    for drop in (True, False):
-        w = weights.copy()
-        if drop:
-            w[np.arange(n), peak] = 0
-        mean = (w * data).sum(axis=1) / np.maximum(w.sum(axis=1), np.finfo(w.dtype).tiny)
-        out.append((w * (data - mean[:, None]) ** 2).sum(axis=1))
-    return np.column_stack(out)
+    rest = weights.copy()
+    rest[np.arange(n), peak] = 0
+    return np.column_stack([_flat_chi2(data, rest), _flat_chi2(data, weights)])
+
+
+def _flat_chi2(data, weights):
+    """Chi2 of a flat background, (n,)."""
+    mean = (weights * data).sum(axis=1) / np.maximum(weights.sum(axis=1), np.finfo(weights.dtype).tiny)
+    return (weights * (data - mean[:, None]) ** 2).sum(axis=1)
 
 
 def fit_stars(stamps, shape, *, profile="own", blends="together"):
@@ -182,13 +182,13 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
         labels = _touching(stamps, found, hot, done, radius)
         pixels = _, weights = _separate(stamps, found, models, labels, noise, nodes)
         start = np.where(_is_wild(found, width)[:, None], _start(stamps, shape), found.params)
-        options = {"nodes": nodes, "sigma": sigma, **(_LAST if last else _MIDDLE)}
-        found = fit_groups(found, labels, pixels, start, stamps=stamps, centre=centre, **options)
+        fitting = partial(fit, nodes=nodes, sigma=sigma, limits=_LAST if last else _MIDDLE)
+        found = fit_groups(found, labels, pixels, start, stamps=stamps, centre=centre, fitting=fitting)
         models = stamps.models(found.params, nodes)
         done = _is_hot(stamps, found, models, weights > 0)
         hot = done | (hot if sigma is HELD else moffat.fwhm(found.params) < 0.6 * width)
-    wild = np.flatnonzero(_is_wild(found, width) & ~done)
-    if len(wild):
+    wild = _is_wild(found, width) & ~done
+    if wild.any():
         known = np.broadcast_to(centre, (len(hot), 4))[wild]
         found = _share_shape(stamps.data - models[1], weights, found, wild, shape=known, nodes=nodes)
         models[0][wild] = moffat.evaluate(found.params[wild], stamps.half, nodes)
@@ -204,17 +204,18 @@ def _ratio(models, weights):
 
 def _flags(stamps, found, good, troubles, width):
     wild, hot, snr = troubles
-    flags = np.zeros(len(good), dtype=int)
-    flags[wild] |= Flag.SHARED_SHAPE
-    flags[hot] |= Flag.HOT
-    flags[_is_wild(found, width)] |= Flag.NOT_CONVERGED
-    flags[snr < 3] |= Flag.INSIGNIFICANT
     near = stamps.near(found.params, width)
-    flags[(near & stamps.inside & ~good & ~stamps.saturated).any(axis=1)] |= Flag.MASKED
-    flags[(near & stamps.saturated).any(axis=1)] |= Flag.SATURATED
     seen = stamps.inside & stamps.cut(stamps.frame.good)
-    flags[(near & ~seen).sum(axis=1) > _GAP * near.sum(axis=1)] |= Flag.EDGE
-    return flags
+    raised = {
+        Flag.SHARED_SHAPE: wild,
+        Flag.HOT: hot,
+        Flag.NOT_CONVERGED: _is_wild(found, width),
+        Flag.INSIGNIFICANT: snr < 3,
+        Flag.MASKED: (near & stamps.inside & ~good & ~stamps.saturated).any(axis=1),
+        Flag.SATURATED: (near & stamps.saturated).any(axis=1),
+        Flag.EDGE: (near & ~seen).sum(axis=1) > _GAP * near.sum(axis=1),
+    }
+    return sum(np.where(stars, flag, 0) for flag, stars in raised.items())
 
 
 def _touching(stamps, found, hot, done, radius):
@@ -253,7 +254,5 @@ def _is_wild(fit, width):
 def _share_shape(data, weights, found, rows, *, shape, nodes):
     """The fit with some stars fitted anew and alone, their shape held at that of the frame."""
     data = data[rows]
-    start = np.zeros((len(rows), 8))
-    start[:, 2] = np.maximum(found.params[rows, 2], 1e-3 * np.abs(data).max(axis=1))
-    start[:, 3:7] = shape
+    start = moffat.parameters(np.maximum(found.params[rows, 2], 1e-3 * np.abs(data).max(axis=1)), shape)
     return found.updated(rows, fit(data, weights[rows], start, nodes=nodes, centre=shape, sigma=HELD))

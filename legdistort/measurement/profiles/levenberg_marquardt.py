@@ -1,6 +1,7 @@
 """Moffat profiles fitted to stars by Levenberg-Marquardt, all at once: alone, or some that touch together."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,17 @@ _SMALLEST = 0.3  # smallest full width at half maximum [pix]: anything narrower 
 #: Bounds of the shape, and of the background, which has none.
 _LOW = np.array([-np.inf, -np.inf, -0.95, moffat.LOG_BETA[0], -np.inf])
 _HIGH = np.array([2 * np.log(2 / _SMALLEST)] * 2 + [0.95, moffat.LOG_BETA[1], np.inf])
+
+
+class Limits(NamedTuple):
+    """When iterations end: after so many, or when a step would lower chi2 by less than the gain."""
+
+    iterations: int
+    gain: float
+
+
+#: Of a fit that is final.
+FULL = Limits(60, 1e-4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +72,7 @@ class Fit:
         return Fit(**merged)
 
 
-def fit(stamps, weights, start, *, nodes, centre, sigma=SHAPE_SIGMA, max_iterations=60, tolerance=1e-4, offsets=None):
+def fit(stamps, weights, start, *, nodes, centre, sigma=SHAPE_SIGMA, limits=FULL, offsets=None):
     """Fit profiles by Levenberg-Marquardt, all groups of stars at once, each with its own damping.
 
     The shape carries a weak Gaussian prior: it decides nothing that the pixels can tell (above a
@@ -81,10 +93,8 @@ def fit(stamps, weights, start, *, nodes, centre, sigma=SHAPE_SIGMA, max_iterati
         Centre of the prior: log_a, log_b, rho, log_beta.
     sigma : ndarray, shape (4,)
         Its standard deviation; a narrow one holds the shape (`HELD`).
-    max_iterations : int
-        A pass that only prepares the next one can do with few.
-    tolerance : float
-        Gain in chi2 at which a fit ends.
+    limits : Limits
+        A pass that only prepares the next one can do with less.
     offsets : ndarray of int, shape (n, g, 2), optional
         Central pixels (x, y) of the stamps; needed for g > 1.
 
@@ -97,15 +107,12 @@ def fit(stamps, weights, start, *, nodes, centre, sigma=SHAPE_SIGMA, max_iterati
     size = max(1, _CHUNK // (stamps.shape[1] * g))
     centre = np.broadcast_to(centre, (n, 4))
     offsets = np.zeros((n, 1, 2)) if offsets is None else offsets
-    limits = max_iterations, tolerance
     parts = [
         _fit(_Pixels(stamps[i:j], weights[i:j], offsets[i:j], nodes), start[i:j], (centre[i:j], sigma), limits)
-        for i, j in ((i, i + size) for i in range(0, n, size))
+        for i, j in ((i, i + size) for i in range(0, max(n, 1), size))
     ]
     held = np.count_nonzero(np.asarray(sigma) <= HELD)
     dof = np.count_nonzero(weights, axis=1) - (width - held)
-    if not parts:
-        return Fit(start, np.zeros((0, width, width)), np.zeros(0), dof, np.zeros(0, dtype=bool))
     params, covariance, chi2, converged = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Fit(params, covariance, chi2, dof, converged)
 
@@ -151,7 +158,6 @@ class _Pixels:
 
 
 def _fit(pixels, start, prior, limits):
-    max_iterations, tolerance = limits
     mean, precision = np.zeros_like(start), np.zeros(start.shape[1])
     mean[:, -5:-1], precision[-5:-1] = prior[0], 1 / np.asarray(prior[1]) ** 2
 
@@ -165,7 +171,7 @@ def _fit(pixels, start, prior, limits):
     chi2, cost, gradient, hessian = linearise(params, np.arange(len(start)))
     damping = np.full(len(start), 1e-2)
     converged = np.zeros(len(start), dtype=bool)
-    for _ in range(max_iterations):
+    for _ in range(limits.iterations):
         active = np.flatnonzero(~converged & (damping < 1e10))
         if len(active) == 0:
             break
@@ -183,7 +189,7 @@ def _fit(pixels, start, prior, limits):
             kept[good] = value[better]
         # A step that would lower chi2 by 1e-4 moves a position by a hundredth of its error, which is larger where the
         # fit is bad. The damping must be small for the foreseen gain to mean that.
-        small = gain < tolerance * np.maximum(1, chi2[rows] / pixels.dof[rows])
+        small = gain < limits.gain * np.maximum(1, chi2[rows] / pixels.dof[rows])
         converged[rows] = small & ((damping[rows] <= 1) | ~better)
         damping[good] /= 5
         damping[rows[~better]] *= 8

@@ -49,6 +49,13 @@ def shape(fwhm, beta=3.0):
     return np.array([np.log(4 / fwhm**2), np.log(4 / fwhm**2), 0.0, np.log(beta)])
 
 
+def parameters(peak, shape, xy=0.0):
+    """Parameters (n, 8) of profiles without background: peaks (n,), shapes (4,) or (n, 4), positions (n, 2)."""
+    out = np.zeros((len(peak), 8))
+    out[:, :2], out[:, 2], out[:, 3:7] = xy, peak, shape
+    return out
+
+
 def fwhm(params):
     """Full width at half maximum [pix], geometric mean of the axes, of parameters (..., 8) or shapes (..., 4)."""
     log_a, log_b, rho = np.moveaxis(params[..., -5:-2] if params.shape[-1] == 8 else params[..., :3], -1, 0)

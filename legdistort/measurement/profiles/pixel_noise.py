@@ -26,12 +26,11 @@ def pixel_noise(stamps, fit, models, nodes):
     sky : ndarray, shape (n, npix)
     photon : float
     """
-    frame, sky, photon = stamps.frame, stamps.variance, stamps.frame.photon
-    if frame.noise_given and photon is not None:
+    sky, photon = stamps.variance, stamps.frame.photon
+    if stamps.frame.noise_given:
         return sky, photon
     remains = _residuals(stamps, fit, models, nodes)
-    if not frame.noise_given:
-        sky = sky * sky.dtype.type(_sky_factor(stamps, fit, remains))
+    sky = sky * sky.dtype.type(_sky_factor(stamps, fit, remains))
     return sky, _photon_noise(stamps, sky, fit, remains) if photon is None else photon
 
 

@@ -73,18 +73,13 @@ class Widths:
         They are in units of errors that were stated `scale` times too small.
         """
         if isinstance(prior, dict):
-            return {str(key): self.describe(each, scale) for key, each in prior.items()}
+            return {str(key): self.describe(prior[key], scale) for key in sorted(prior, key=str)}
         k = self.number(prior)
         return None if k < 0 else tuple((scale * self.values[k]).tolist())
 
 
-def is_wanted(prior):
-    """Whether a prior, or one of a dict of them, leaves its widths to be found."""
-    return bool(_sought(prior))
-
-
-def _sought(prior):
-    """The priors whose widths are to be found, each object once."""
+def sought(prior):
+    """Those of a prior, or of a dict of them, whose widths are to be found, each object once."""
     priors = list(prior.values()) if isinstance(prior, dict) else [prior]
     first = [p for k, p in enumerate(priors) if not any(p is earlier for earlier in priors[:k])]
     return tuple(p for p in first if isinstance(p, Prior) and isinstance(p.sigma, str))
@@ -114,7 +109,7 @@ def find_widths(fit, prior, degree, unit, *, scale=False):
     Widths
         0 where one was held at the smallest.
     """
-    wanted, bounds = _sought(prior), unit * np.array(RANGE)
+    wanted, bounds = sought(prior), unit * np.array(RANGE)
     widths = Widths(wanted, np.full((len(wanted), degree), unit))
 
     def fitted():

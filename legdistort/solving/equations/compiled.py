@@ -216,42 +216,6 @@ def _to_exposures(n_chunks, start, star, values, coupling, stars):
 
 
 @njit(cache=True, parallel=True, fastmath=_FAST)
-def _undistorted(n_chunks, start, xy, coefficients, sizes, orders):
-    out = np.empty_like(xy)
-    bounds, top, n_all = _bounds(start, n_chunks), orders.max() + 1, orders.shape[1]
-    for c in prange(n_chunks):
-        x_, legendre_ = np.empty((2, _BATCH)), np.empty((4, top, _BATCH))
-        b_, g_ = np.empty((n_all, _BATCH)), np.empty((4, _BATCH))
-        for i in range(bounds[c], bounds[c + 1]):
-            for first in range(start[i], start[i + 1], _BATCH):
-                last = min(first + _BATCH, start[i + 1])
-                size = last - first
-                x, guess, given = x_[:, :size], out[:, first:last], xy[:, first:last]
-                work = (legendre_[0], legendre_[1], legendre_[2], legendre_[3], b_[:, :size], g_[:, :size])
-                guess[:] = given
-                for _sweep in range(2):
-                    x[:] = guess
-                    _model(coefficients[i], orders, sizes[i], x, work)
-                    guess += given - x
-    return out
-
-
-@njit(cache=True, parallel=True, fastmath=_FAST)
-def _mean_sums(n_chunks, start, star, q, weight, back, n_stars):
-    sums = np.zeros((n_chunks, n_stars, 3))
-    bounds = _bounds(start, n_chunks)
-    for c in prange(n_chunks):
-        for i in range(bounds[c], bounds[c + 1]):
-            pose = back[i]
-            for k in range(start[i], start[i + 1]):
-                w, row = weight[k], sums[c, star[k]]
-                row[0] += w * (pose[0, 0] * q[0, k] + pose[0, 1] * q[1, k] + pose[0, 2])
-                row[1] += w * (pose[1, 0] * q[0, k] + pose[1, 1] * q[1, k] + pose[1, 2])
-                row[2] += w
-    return sums
-
-
-@njit(cache=True, parallel=True, fastmath=_FAST)
 def _distances(start, star, q, poses, positions):
     out = np.empty(q.shape[1])
     for i in prange(len(start) - 1):
@@ -303,7 +267,7 @@ def linearise(problem, state):
         np.ascontiguousarray(state.positions),
         state.coefficients,
         state.poses,
-        _sizes(problem),
+        np.array(problem.shapes, dtype=float),
         orders,
         problem.n_modes,
     )
@@ -327,19 +291,6 @@ def to_exposures(problem, blocks, y):
     return out.reshape(len(out), -1)
 
 
-def undistorted(problem):
-    """Twin of `legdistort.solving.start_values.undistorted`, without its checks."""
-    orders = np.stack(basis.orders(basis.degree_of(problem.prior_mean.shape[2])))
-    return _undistorted(get_num_threads(), problem.start, problem.xy, problem.prior_mean, _sizes(problem), orders)
-
-
-def mean_sums(problem, back, q, weight):
-    """Weighted sums (2, n_stars) of positions q carried back by the poses `back`, and of the weights (n_stars,)."""
-    sums = _mean_sums(get_num_threads(), problem.start, problem.star, q, weight, back, problem.n_stars)
-    x, y, total = sums.sum(axis=0).T
-    return np.stack([x, y]), total
-
-
 def distances(problem, pose_list, q, positions):
     """Twin of `legdistort.solving.start_values.distances`."""
     return _distances(problem.start, problem.star, q, pose_list, np.ascontiguousarray(positions))
@@ -357,7 +308,3 @@ def moments(problem, q, weight, positions):
     out = _moments(problem.start, problem.star, q, weight, np.ascontiguousarray(positions))
     with np.errstate(divide="ignore", invalid="ignore"):
         return out[:, :2], out[:, 2:4], (out[:, 4:8] / out[:, 8:]).reshape(-1, 2, 2)
-
-
-def _sizes(problem):
-    return np.array(problem.shapes, dtype=float)

@@ -58,10 +58,7 @@ class Uncertainty:
         """Covariance xx, yy, xy of every star's position in the gauge, shape (3, n_stars), px^2."""
         problem, blocks = self._problem, self._blocks
         inverse = elimination.inverse_star_blocks(blocks.v)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            l00 = np.sqrt(inverse[0])
-            l10 = np.where(l00 > 0, inverse[2] / l00, 0)
-            l11 = np.sqrt(np.maximum(inverse[1] - l10**2, 0))
+        l00, l10, l11 = elimination.star_roots(inverse)
         inner = np.concatenate(
             [_block_diagonal(factor, self.coefficients) for factor in elimination.star_factors(problem, blocks)], axis=1
         )

@@ -60,14 +60,18 @@ def reduced_matrix(problem, blocks):
     return out
 
 
-def star_factors(problem, blocks, *, n_block=512):
-    """Yield ``E' L`` for blocks of stars, with ``L L' = V^-1``: arrays (n_unknowns, 2 n_block)."""
-    size = 2 * problem.n_modes
-    inverse = inverse_star_blocks(blocks.v)
+def star_roots(inverse):
+    """L of ``L L' = V^-1``, lower triangles: l00, l10, l11, each (n_stars,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         l00 = np.sqrt(inverse[0])
         l10 = np.where(l00 > 0, inverse[2] / l00, 0)
-        l11 = np.sqrt(np.maximum(inverse[1] - l10**2, 0))
+        return l00, l10, np.sqrt(np.maximum(inverse[1] - l10**2, 0))
+
+
+def star_factors(problem, blocks, *, n_block=512):
+    """Yield ``E' L`` for blocks of stars, with ``L L' = V^-1``: arrays (n_unknowns, 2 n_block)."""
+    size = 2 * problem.n_modes
+    l00, l10, l11 = star_roots(inverse_star_blocks(blocks.v))
     for first in range(0, problem.n_stars, n_block):
         last = min(first + n_block, problem.n_stars)
         factor = np.zeros((problem.n_exposures * size, 2, last - first))

@@ -146,6 +146,12 @@ def check_error_floor(error_floor):
         raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
 
 
+def check_prior(prior):
+    """Raise `InputError` for what is neither a `Prior`, a dict, nor None."""
+    if not isinstance(prior, Prior | dict | None):
+        raise InputError(f"prior must be a Prior or a dict of them, got {type(prior).__name__}")
+
+
 def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=None):
     """The problem posed by `legdistort.inputs.matches.Matches`.
 
@@ -264,8 +270,7 @@ def by_exposure(matches, prior):
     """One prior (or None) per exposure."""
     if prior is None or isinstance(prior, Prior):
         return [prior] * len(matches.names)
-    if not isinstance(prior, dict):
-        raise InputError(f"prior must be a Prior or a dict of them, got {type(prior).__name__}")
+    check_prior(prior)
     detectors = _detectors(matches)
     out = []
     for name in matches.names:

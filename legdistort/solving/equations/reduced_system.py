@@ -213,6 +213,8 @@ def _singular_message(problem, s):
 class Iterative(_Reduced):
     """Matrix-free solution of the reduced system on the constraints, preconditioned by the exposure blocks.
 
+    For problems in which exposures share nothing.
+
     Projected conjugate gradients with the constraint preconditioner of Gould, Hribar & Nocedal (2001): every
     iterate satisfies the constraints. The coupling E d of the iterate is carried along, so that neither the
     right-hand side nor the stars need a pass of their own.
@@ -220,16 +222,11 @@ class Iterative(_Reduced):
 
     def __init__(self, problem, blocks, gauge):
         super().__init__(problem, blocks, gauge)
-        self._block_inverses = [np.linalg.inv(block) for block in self.unknowns.blocks(blocks.u)]
+        self._block_inverses = np.linalg.inv(blocks.u)
         self.scale = np.einsum("iaa->", blocks.u) / self.unknowns.size
 
     def _block_solve(self, r):
-        done, out = 0, []
-        for inverse in self._block_inverses:
-            part = r[done : done + inverse.shape[0] * inverse.shape[1]]
-            out.append(np.einsum("iab,ib->ia", inverse, part.reshape(inverse.shape[:2])).ravel())
-            done += len(part)
-        return np.concatenate(out)
+        return np.einsum("iab,ib->ia", self._block_inverses, r.reshape(self.blocks.g_exposure.shape)).ravel()
 
     @cached_property
     def moves(self):

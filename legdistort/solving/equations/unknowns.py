@@ -120,16 +120,6 @@ class Unknowns:
             out[theirs, theirs] += common @ block @ common.T
         return out
 
-    def blocks(self, blocks):
-        """Diagonal blocks of that matrix: of the exposures, and of the groups if there is something in common."""
-        if not self.shared:
-            return [blocks]
-        own, common = self._rows
-        total = np.zeros((len(common), *blocks.shape[1:]))
-        np.add.at(total, self.group, blocks)
-        mine = own[self.group]
-        return [mine @ blocks @ mine.transpose(0, 2, 1), common @ total @ common.transpose(0, 2, 1)]
-
     def keep_common(self, before, after):
         """Coefficients (n_exposures, 2 n_modes) with what is own of `after` and what is common of `before`."""
         if not self.shared:

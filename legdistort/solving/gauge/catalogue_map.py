@@ -1,9 +1,9 @@
 """What a reference catalogue determines of a common map: an estimate of it, with its errors.
 
 A common map g of the reference plane, X -> X + D g, is all that a reference is asked for. Its stars lie
-``r_j = X_cat,j - X_j`` off the relative solution, ``r = D g`` but for the errors of both. What the exposures and a prior
-determine of g (`legdistort.solving.gauge.hierarchy`) counts with its information, that is, of shift, rotation and scale
-nothing. What neither determines to `LIMIT` stays where the convention has it.
+``r_j = X_cat,j - X_j`` off the relative solution, ``r = D g`` but for the errors of both. What the exposures and a
+prior determine of g (`legdistort.solving.gauge.hierarchy`) counts with its information, that is, of shift, rotation and
+scale nothing. What neither determines to `LIMIT` stays where the convention has it.
 """
 
 from dataclasses import dataclass
@@ -42,9 +42,6 @@ class Offsets:
     rows: np.ndarray
     values: np.ndarray
     covariance: np.ndarray
-
-    def __repr__(self):
-        return f"<Offsets: {len(self.rows)} reference stars>"
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +87,7 @@ def _metric(directions):
     return out + 1e-9 * np.trace(out) / len(out) * np.eye(len(out))
 
 
-class Offered:
+class MapEquations:
     """The equations that the offsets of a reference give for the common map.
 
     Parameters
@@ -183,7 +180,7 @@ def _own(relative, star, n, dense):
     return np.array([[xx, xy], [xy, yy]])
 
 
-def accepted(offered, label):
+def accepted(equations, label):
     """Which offsets are no mismatches: those that deviate are taken away, round by round, and never come back.
 
     Raises
@@ -191,19 +188,19 @@ def accepted(offered, label):
     InputError
         If most of them deviate.
     """
-    n = len(offered.offsets.rows)
+    n = len(equations.offsets.rows)
     used, weights = np.ones(n, dtype=bool), np.ones(n)
     if n < 3:
         return used
     for _ in range(_ROUNDS):  # a robust start, which a few gross errors hardly move
-        pull = offered.pulls(used, weights)
+        pull = equations.pulls(used, weights)
         scale = max(1.0, np.median(pull) / _SQRT)
         weights, before = 1 / (1 + (pull / (2.385 * scale)) ** 2), weights
         if np.abs(weights - before).max() < 0.01:
             break
     for count in range(_ROUNDS):
         if count:
-            pull = offered.pulls(used)
+            pull = equations.pulls(used)
         fresh = used & (pull > CLIP * max(1.0, np.median(pull[used]) / _SQRT))
         if count and not fresh.any():
             break
@@ -216,12 +213,12 @@ def accepted(offered, label):
     return used
 
 
-def estimate(offered, used, names):
+def estimate(equations, used, names):
     """The map that the used offsets tell, and the tie.
 
     Parameters
     ----------
-    offered : Offered
+    equations : MapEquations
     used : ndarray of bool, shape (n,)
     names : ndarray, shape (n_stars,)
         Of all stars.
@@ -232,42 +229,42 @@ def estimate(offered, used, names):
     Tie
         With offsets as if that map were taken out already.
     """
-    value, covariance, gain = offered.solve(used)
-    left = offered.offsets.values - offered.design @ value
-    offered_matrix = offered.matrix(used) if offered.dense else None
-    information = offered.gain(used)[0]
+    value, covariance, gain = equations.solve(used)
+    left = equations.offsets.values - equations.design @ value
+    offered_matrix = equations.matrix(used) if equations.dense else None
+    information = equations.gain(used)[0]
     share = covariance @ information
-    measured = [
-        np.trace(part.T @ share @ part) / part.shape[1] for part in map_parts(offered.prior.size, offered.prior.n_modes)
-    ]
+    parts = map_parts(equations.prior.size, equations.prior.n_modes)[1:]
+    pointing = 1.0 if np.count_nonzero(used) > 1 else 0.5  # a single star determines the shift alone
+    measured = [pointing, *(np.trace(part.T @ share @ part) / part.shape[1] for part in parts)]
     whitened = left[used].ravel()
     if offered_matrix is None:
-        chi2 = np.einsum("na,nab,nb->", left[used], np.linalg.inv(offered.blocks[used]), left[used])
+        chi2 = np.einsum("na,nab,nb->", left[used], np.linalg.inv(equations.blocks[used]), left[used])
     else:
         chi2 = whitened @ np.linalg.solve(offered_matrix, whitened)
     dof = len(whitened) - np.trace(share)
     return value, Tie(
         covariance=covariance,
-        shared=_shared(offered, used, gain),
+        shared=_shared(equations, used, gain),
         measured=np.clip(measured, 0, 1),
-        stars=np.asarray(names)[offered.offsets.rows],
+        stars=np.asarray(names)[equations.offsets.rows],
         offsets=left,
         used=used,
         ratio=float(chi2 / dof) if dof > 2 else np.nan,
     )
 
 
-def _shared(offered, used, gain):
+def _shared(equations, used, gain):
     """See `Tie.shared`: minus the covariance of each star's relative error with the map at it, both ways."""
-    n, rows = len(offered.directions), offered.offsets.rows[used]
+    n, rows = len(equations.directions), equations.offsets.rows[used]
     out = np.zeros((3, n))
-    if offered.dense:
+    if equations.dense:
         index = (rows[:, None] + [0, n]).ravel()
-        drawn = gain @ offered.relative[index]
-        both = np.stack([np.einsum("nk,kn->n", offered.directions[:, a], drawn[:, b * n : (b + 1) * n])
+        drawn = gain @ equations.relative[index]
+        both = np.stack([np.einsum("nk,kn->n", equations.directions[:, a], drawn[:, b * n : (b + 1) * n])
                          for a, b in ((0, 0), (1, 1), (0, 1), (1, 0))])  # fmt: skip
         out[:] = -2 * both[0], -2 * both[1], -both[2] - both[3]
     else:
-        at = np.einsum("jak,kjb,jbc->acj", offered.design[used], gain.reshape(len(gain), -1, 2), offered.own[used])
+        at = np.einsum("jak,kjb,jbc->acj", equations.design[used], gain.reshape(len(gain), -1, 2), equations.own[used])
         out[:, rows] = -2 * at[0, 0], -2 * at[1, 1], -at[0, 1] - at[1, 0]
     return out

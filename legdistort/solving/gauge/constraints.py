@@ -126,9 +126,9 @@ def _in_a_word(static, shared):
 
 def _pose_rows(kind, motion, error, similar, box):
     """Rows (4, n_exposures, 2 n) that hold the plane by the poses, mean over the exposures."""
-    common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
     if kind == "mean":
-        return np.broadcast_to(common[:, None], (len(common), *motion.shape[:2]))
+        return similar.transpose(1, 0, 2)
+    common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
     weight = influence(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
     return (common @ motion.transpose(0, 2, 1) @ weight).transpose(1, 0, 2)
 

@@ -5,9 +5,9 @@ never tell it. What tells it is that single exposures depart from one static dis
 
     A_i = A_0 + N_i g + d_i,      d_i ~ N(0, Lambda_i + C_i)
 
-A_i are the coefficients as they come out with the plane bent by g, N_i says how a bend changes those of exposure i,
-Lambda is the scatter of single exposures and C_i the error of A_i. A_0, one for each detector, has the caller's prior:
-nothing (flat), a mean with its uncertainty, or a mean that is exact. With A_0 integrated out, g has a Gaussian posterior
+A_i are the coefficients as they come out with the plane bent by g, N_i is how a bend changes those of exposure i,
+Lambda is the scatter of single exposures and C_i the error of A_i. A_0, one for each detector, has the caller's
+prior: nothing (flat), a mean with its uncertainty, or a mean that is exact. With A_0 integrated out, g has a Gaussian posterior
 whose mean is linear in the A_i: it is where ``R (A - A_0) = 0`` with the rows ``R = M' (D + 1 S 1')^-1``, M the N_i one
 upon another, D the block diagonal of Lambda_i + C_i and S the variance of A_0. These rows are the constraints of the
 gauge, so that the positions and coefficients published are the posterior mean, and the variance of g under them is the
@@ -97,7 +97,7 @@ class Hierarchy:
     def convention(self, kind):
         """Rows (m, n_exposures, 2 n) of a convention by itself: A_0 at the prior mean."""
         if kind == "mean":
-            return np.broadcast_to(self.maps[:, None], (len(self.maps), *self.motion.shape[:2]))
+            return np.einsum("bc,ikc,ika->bia", self.maps, self.others, self.others, optimize=True)
         return self.rows(np.zeros_like(self.static))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Where planned exposures and stars lie, and which star will be measured where and how well."""
+"""Observations that are planned, as asked for, and where their stars will be measured, and how well."""
 
 from dataclasses import dataclass
 from numbers import Real
@@ -8,11 +8,70 @@ from astropy import units as u
 from astropy.table import Table
 
 from ..exceptions import InputError
-from ..geometry import similarity
+from ..geometry import basis, similarity
 from ..inputs import column_contract
-from ..runtime.checks import check_counts
+from ..priors.prior import Prior
+from ..runtime.checks import check_choice, check_counts
+from ..solving.gauge.constraints import KINDS
 from . import truth
 from .observations import matches_from, position_errors
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Plan:
+    """What is planned: the arguments of `legdistort.predict`, which explains them.
+
+    Raises
+    ------
+    InputError
+        For a value out of range.
+    """
+
+    n_exposures: int
+    stars: object
+    n_stars: int | None
+    density: float | None
+    sigma: object
+    degree: int
+    shape: tuple
+    dithers: object
+    poses: dict | None
+    prior: Prior | None
+    gauge: str
+    dynamic: object
+    spectrum: object
+    static_spectrum: object
+    min_exposures: int | None
+    n_grid: int
+    seed: int
+
+    def __post_init__(self):
+        check_counts(n_grid=self.n_grid, n_exposures=self.n_exposures)
+        object.__setattr__(self, "degree", basis.check_degree(self.degree))
+        check_choice(self.gauge, KINDS, "gauge")
+        if not isinstance(self.prior, Prior | None):
+            raise InputError(f"prior must be a Prior, got {type(self.prior).__name__}")
+        if np.shape(self.shape) != (2,):
+            raise InputError(f"shape must be (ny, nx) of the detector, got {self.shape!r}")
+        check_counts(**dict(zip(("ny in shape", "nx in shape"), self.shape, strict=True)))
+        if self.least not in range(1, self.n_exposures + 1):
+            raise InputError(
+                f"min_exposures must be from 1 to the {self.n_exposures} exposures, got {self.min_exposures!r}"
+            )
+        if sum(value is not None for value in (self.stars, self.n_stars, self.density)) != 1:
+            raise InputError("one of stars (positions), n_stars (how many) and density (how many a detector) is needed")
+        if self.n_stars is not None:
+            check_counts(n_stars=self.n_stars)
+        if self.density is not None and not (isinstance(self.density, Real) and 0 < self.density < np.inf):
+            raise InputError(f"density must be a positive number of stars a detector, got {self.density!r}")
+
+    @property
+    def least(self):
+        """Exposures that a star must be on: four, or all if there are fewer, unless it is said."""
+        return min(4, self.n_exposures) if self.min_exposures is None else self.min_exposures
+
+    def __repr__(self):
+        return f"<Plan: {self.n_exposures} exposures, degree {self.degree}, gauge {self.gauge}>"
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,69 +118,57 @@ class Layout:
         return tuple(a + (b - a) * (np.arange(m) + 0.5) / m for a, b, m in zip(low, high, n_xy, strict=True))
 
 
-def lay_out(*, n_exposures, stars, n_stars, density, sigma, shape, dithers, poses, min_exposures, seed):
-    """A `Layout` from the arguments of `legdistort.predict`, which explains them.
+def lay_out(plan):
+    """The `Layout` of a `Plan`.
 
     Raises
     ------
     InputError
-        For arguments out of range or in contradiction.
+        If its stars, dithers, poses or errors have a wrong shape or value, or no star is on enough exposures.
     """
-    check_counts(n_exposures=n_exposures)
-    if np.shape(shape) != (2,):
-        raise InputError(f"shape must be (ny, nx) of the detector, got {shape!r}")
-    shape = tuple(shape)
-    check_counts(**dict(zip(("ny in shape", "nx in shape"), shape, strict=True)))
-    if min_exposures is None:
-        min_exposures = min(4, n_exposures)
-    if min_exposures not in range(1, n_exposures + 1):
-        raise InputError(f"min_exposures must be from 1 to the {n_exposures} exposures, got {min_exposures!r}")
-    star_rng, _, pose_rng, _ = np.random.default_rng(seed).spawn(4)  # as in simulate_matches
-    pose_list = _poses(n_exposures, shape, dithers, poses, pose_rng)
+    star_rng, _, pose_rng, _ = np.random.default_rng(plan.seed).spawn(4)  # as in simulate_matches
+    shape = tuple(plan.shape)
+    pose_list = _poses(plan, pose_rng)
 
     def inside(xy):
         return np.array([truth.within(similarity.apply(pose, xy), shape) for pose in pose_list.values()])
 
-    if sum(value is not None for value in (stars, n_stars, density)) != 1:
-        raise InputError("one of stars (positions), n_stars (how many) and density (how many a detector) is needed")
     region = truth.footprint(pose_list.values(), shape)
-    if stars is not None:
-        positions = _positions(stars)
-    elif n_stars is not None:
-        check_counts(n_stars=n_stars)
-        positions = truth.draw_stars(star_rng, n_stars, region, inside, min_exposures)
+    if plan.stars is not None:
+        positions = _positions(plan.stars)
+    elif plan.n_stars is not None:
+        positions = truth.draw_stars(star_rng, plan.n_stars, region, inside, plan.least)
     else:
-        if not (isinstance(density, Real) and 0 < density < np.inf):
-            raise InputError(f"density must be a positive number of stars a detector, got {density!r}")
-        count = round(density * np.prod(region[1] - region[0]) / np.prod(shape))
+        count = round(plan.density * np.prod(region[1] - region[0]) / np.prod(shape))
         positions = star_rng.uniform(*region, size=(count, 2))
     observed = inside(positions)
-    observed &= np.count_nonzero(observed, axis=0) >= min_exposures
+    observed &= np.count_nonzero(observed, axis=0) >= plan.least
     if not observed.any():
         raise InputError(
-            f"none of {len(positions)} stars lies on {min_exposures} or more of the detectors; positions are pixels of "
+            f"none of {len(positions)} stars lies on {plan.least} or more of the detectors; positions are pixels of "
             f"the reference plane, here from {region[0].round()} to {region[1].round()} (x, y)"
         )
-    return Layout(positions, pose_list, shape, observed, _errors(sigma, stars, n_exposures, len(positions)))
+    return Layout(positions, pose_list, shape, observed, _errors(plan, len(positions)))
 
 
-def _poses(n_exposures, shape, dithers, given, rng):
+def _poses(plan, rng):
     """``{exposure: (2, 3)}``, given or made of dithers."""
-    if given is not None:
-        if np.any(dithers):
+    n_exposures = plan.n_exposures
+    if plan.poses is not None:
+        if np.any(plan.dithers):
             raise InputError("poses and dithers both say where the exposures lie: leave one out")
-        if len(given) != n_exposures:
-            raise InputError(f"poses has {len(given)} exposures, n_exposures is {n_exposures}")
-        return {str(name): similarity.check(pose, f"pose of exposure {name!r}") for name, pose in given.items()}
-    shifts = np.asarray(dithers, dtype=float)
+        if len(plan.poses) != n_exposures:
+            raise InputError(f"poses has {len(plan.poses)} exposures, n_exposures is {n_exposures}")
+        return {str(name): similarity.check(pose, f"pose of exposure {name!r}") for name, pose in plan.poses.items()}
+    shifts = np.asarray(plan.dithers, dtype=float)
     if shifts.shape not in ((), (n_exposures, 2)) or not np.isfinite(shifts).all() or (shifts.ndim == 0 and shifts < 0):
         raise InputError(
             f"dithers must be an rms length in pixels, or one shift for each exposure, shape ({n_exposures}, 2), got "
-            f"{dithers if shifts.ndim == 0 else f'shape {shifts.shape}'}"
+            f"{plan.dithers if shifts.ndim == 0 else f'shape {shifts.shape}'}"
         )
     names = truth.exposure_names(n_exposures)
     if shifts.ndim == 0:
-        return truth.draw_poses(rng, names, shape, float(shifts))
+        return truth.draw_poses(rng, names, tuple(plan.shape), float(shifts))
     return {name: np.column_stack([np.eye(2), shift]) for name, shift in zip(names, shifts, strict=True)}
 
 
@@ -142,8 +189,9 @@ def _positions(stars):
     return xy
 
 
-def _errors(sigma, stars, n_exposures, n):
-    """Errors (n_exposures, n, 2) from `sigma` or from the columns of the table of stars."""
+def _errors(plan, n):
+    """Errors (n_exposures, n, 2) of n stars, stated or from the columns of the table of stars."""
+    sigma, stars = plan.sigma, plan.stars
     columns = stars.colnames if isinstance(stars, Table) else ()
     if sigma is None:
         if "x_err" not in columns or "y_err" not in columns:
@@ -165,4 +213,4 @@ def _errors(sigma, stars, n_exposures, n):
         raise InputError(
             f"sigma must be positive and finite everywhere, got {sigma if sigma.ndim == 0 else sigma.min()}"
         )
-    return position_errors(sigma, n_exposures, n)
+    return position_errors(sigma, plan.n_exposures, n)

@@ -50,7 +50,7 @@ def noiseless_solution(matches, problem, layout, kind, scatter):
         exact,
         gauge,
         Uncertainty(problem, blocks, gauge),
-        settings=Settings(problem.degree, "predicted", gauge=kind),
+        settings=Settings(problem.degree, method="predicted", gauge=kind),
         status="predicted: nothing was measured",
         dof=0,
     )

@@ -5,12 +5,12 @@ from pathlib import Path
 import asdf
 import gwcs
 import numpy as np
-from astropy.modeling import CompoundModel, models
+from astropy.modeling import models
 
 from ..exceptions import InputError
 from ..geometry import basis
 from ..geometry.distortion import Distortion, Inverse
-from ..geometry.models import displacement_model
+from ..geometry.models import correction_model, displacement_model, leaves
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, WITH_WCS, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
@@ -84,18 +84,15 @@ def _checked_wcs(meta):
     for model, tensor in zip((correction.inverse, correction), tensors, strict=True):
         _check_same(model, displacement_model(tensor, shape), shape)
     inverse = Inverse(tensors[1], meta["inverse_error_px"], tuple(meta["valid_undistorted_px"]))
-    Distortion(basis.from_tensor(tensors[0]), shape, meta["exposure"]).adopt(inverse)
-    restored_correction = displacement_model(tensors[1], shape, name="correction")
-    restored_correction.inverse = displacement_model(tensors[0], shape, valid=inverse.valid, name="distortion")
-    wcs.set_transform("detector", "undistorted", restored_correction)
+    Distortion(basis.from_tensor(tensors[0]), shape, meta["exposure"], inverse)  # checks the certificate
+    wcs.set_transform("detector", "undistorted", correction_model(tensors[0], inverse, shape))
     wcs.bounding_box = box
     return wcs
 
 
 def _series(model):
     """The two Legendre series, x and y, of a displacement model."""
-    parts = model.traverse_postorder() if isinstance(model, CompoundModel) else [model]
-    parts = [part for part in parts if isinstance(part, models.Legendre2D)]
+    parts = [part for part in leaves(model) if isinstance(part, models.Legendre2D)]
     if len(parts) != 2:
         raise ValueError(f"the distortion should be made of two Legendre2D, got {len(parts)}")
     return parts

@@ -1,0 +1,187 @@
+"""The options of the commands, each stated once, under the name of the argument of the function that takes it."""
+
+from pathlib import Path
+
+from ..coaddition.options import ALGORITHMS, CONSERVE, EXTRAPOLATED, ORDERS, SCALES, WEIGHTS
+from ..coaddition.options import METHODS as COMBINATIONS
+from ..coaddition.resampling.drizzling import KERNELS
+from ..priors.source import DIRECTIONS
+from ..solving.gauge.constraints import KINDS
+from ..solving.minimisers import LOSSES
+from ..solving.options import ERRORS, METHODS
+from .arguments import Option, columns, extension, number_or_name, spectrum, word_or
+
+# -- options that several commands have
+
+COMMON = {
+    "json": Option("print figures as JSON", action="store_true"),
+    "quiet": Option("no progress, only warnings", action="store_true"),
+    "debug": Option("full log and traceback", action="store_true"),
+}
+FRAMES = {
+    "paths": Option("FITS files, plain or compressed", "frames", nargs="+", metavar="FRAME", path="read"),
+    "ext": Option("extension: number, name, or NAME,VERSION", type=extension),
+}
+NAMED_SOLUTION = {"solution": Option("solution.asdf", required=True, path="read")}
+SOLUTION = {
+    "solution": Option("solution.asdf", "solution", path="read"),
+    "max_bytes": Option("accept arrays of so many bytes, unpacked (default 2147483648)", type=int),
+}
+COLUMNS = {
+    "columns": Option("names of columns", type=columns, default=[], metavar="OURS=THEIRS,..."),
+    "origin": Option("of pixels in the table (default 0; SExtractor 1)", type=int, choices=(0, 1)),
+}
+TABLE = {
+    **COLUMNS,
+    "shape": Option("of the detector, pixels", type=int, nargs=2, metavar=("NY", "NX")),
+}
+TABLES = {
+    "tables": Option(
+        "positions; without a column exposure, one exposure", "tables", nargs="+", metavar="TABLE", path="read"
+    )
+}
+POSITIONS = {"table": Option("exposure, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
+MATCHED = {"table": Option("exposure, star, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
+WORKERS = {"workers": Option("cores to use (default 1)", type=int, metavar="N")}
+
+
+def out(what, *, path="file"):
+    """The output of a command."""
+    return {
+        "out": Option(what, required=True, type=Path, path=path),
+        "overwrite": Option("replace what an earlier call left", action="store_true"),
+    }
+
+
+def picture(what):
+    """A picture that is made if it is asked for."""
+    return {"plot": Option(what, type=Path, metavar="FILE.png", path="file")}
+
+
+REPLACING = {"overwrite": Option("replace a picture that exists", action="store_true")}
+
+KNOWN_STATIC = {
+    "prior": Option("known static distortion: see the command prior", path="read"),
+    "static_sigma": Option(
+        "uncertainty of a coefficient of it; without --prior its size, nothing else being known",
+        type=float,
+        metavar="PIXELS",
+    ),
+}
+
+# -- options of the functions
+
+NIGHT = {
+    "small": Option("six frames of 512 x 512 instead of eleven of 2048 x 2048", action="store_true"),
+    "seed": Option("of the random numbers (default 0)", type=int),
+}
+DETECTOR = {
+    "threshold": Option("detection limit, signal-to-noise ratio (default 5)", type=float),
+    "gain": Option("electrons per ADU (default: header)", type=float),
+    "read_noise": Option("electrons (default: header)", type=float),
+    "saturation": Option("ADU (default: header, or a piled-up maximum)", type=float),
+}
+#: Words are repeated here: the modules that know them load photutils and scipy.optimize, which take 0.3 s.
+MEASURING = {
+    "fwhm": Option("of the stars, pixels (default: found)", type=float),
+    **DETECTOR,
+    "profile": Option("shape: of a star, or the whole frame", choices=("own", "shared", "linear")),
+    "blends": Option("how stars that touch are fitted (default together)", choices=("together", "alone")),
+    "errors": Option(
+        "of the fit, or by stars of known position put into the frame (default fit)",
+        "--position-errors",
+        choices=("fit", "injected", "scaled"),
+    ),
+}
+INJECTING = {
+    "fwhm": Option("of the stars put in, pixels (default: that of the frame's)", type=float, nargs="+"),
+    "fluxes": Option("in units of the data (default: chosen by the frame)", type=float, nargs="+"),
+    "n_positions": Option("stars for every flux and width (default 100)", type=int),
+    "seed": Option("of the random numbers (default 0)", type=int),
+}
+MATCHING = {
+    "min_exposures": Option("keep stars seen in so many exposures (default 4)", type=int),
+    "isolation": Option("largest crowding of a star; inf keeps all (default 3)", type=float),
+}
+
+
+def clipping(default):
+    """The limit of the clipping, where `default` stands in the help."""
+    return Option(f"leave out what deviates by more sigma; 0: nothing (default {default})", type=float, none=0)
+
+
+SOLVING = {
+    "degree": Option("total degree, or auto (default 3)", type=word_or(int, "auto"), default=3),
+    **KNOWN_STATIC,
+    "prior_sigma": Option(
+        "scatter of exposures around it; evidence: found from them", type=word_or(float, "evidence"), metavar="PIXELS"
+    ),
+    "validate": Option("of the stars, kept out to test the errors", type=float, metavar="FRACTION"),
+    "static": Option("fit one static distortion for all exposures of a detector", choices=("fit",)),
+    "exposure_degree": Option("with --static fit: what every exposure adds (default 1)", type=int),
+    "gauge": Option("see the docs (default minimal)", choices=KINDS),
+    "method": Option("(default joint)", choices=METHODS),
+    "loss": Option("(default linear)", choices=LOSSES),
+    "clip": clipping("5"),
+    "errors": Option("(default stated)", choices=ERRORS),
+    "error_floor": Option("pixels, added in quadrature to every error", type=float),
+    "reference": Option("catalogue to tie the positions to, such as one of Gaia", metavar="TABLE", path="read"),
+    "epoch": Option("of the exposures, for proper motions (default: header)", type=float, metavar="YEAR"),
+    "pixel_scale": Option("helps to find the stars without a header WCS", type=float, metavar="ARCSEC"),
+}
+COADDING = {
+    "method": Option("(default clipped)", "--combine", choices=COMBINATIONS, default="clipped"),
+    "order": Option("of the spline (default 3)", type=number_or_name, choices=(*range(6), *ORDERS)),
+    "algorithm": Option("of resampling (default interp)", choices=ALGORITHMS),
+    "pixfrac": Option("with drizzle: side of the drops (default 1)", type=float),
+    "kernel": Option("with drizzle: shape of the drops (default square)", choices=KERNELS),
+    "conserve": Option("when pixels change size (default flux)", choices=CONSERVE),
+    "match_background": Option(
+        "leave the levels of the sky as they are", "--no-match-background", action="store_false"
+    ),
+    "weights": Option("of exposures (default noise)", choices=(*WEIGHTS, "equal"), none="equal"),
+    "scale": Option("of fluxes (default auto)", choices=(*SCALES, "none"), none="none"),
+    "extrapolated": Option("pixels outside the stars used (default flag)", choices=EXTRAPOLATED),
+    "scratch": Option("for pixels while work goes on (default: system's)", type=Path, metavar="FOLDER"),
+}
+GRID = {"grid": Option("image or header text whose grid is taken", type=Path, metavar="FILE", path="read")}
+COMPARING = {"compare": Option("also by shifts, static map and relative polynomial", action="store_true")}
+EXPANDING = {
+    "where": Option(
+        "a file or name, or the two maps of shifts in x and y", "sources", nargs="+", metavar="SOURCE", path="read"
+    ),
+    "shape": Option("of the detector, where it is not told", type=int, nargs=2, metavar=("NY", "NX")),
+    "degree": Option("total degree of the Legendre series (default 5)", type=int),
+    "direction": Option("what the source does, where it is not told", choices=DIRECTIONS),
+    "origin": Option("coordinate of the first pixel (default 0)", type=int, choices=(0, 1)),
+    "ext": Option("extension of FITS files, header of a text, or place in an ASDF tree", type=extension),
+    "frame": Option("where to end: frame of a gwcs, or idl or tel of an aperture"),
+    "sigma": Option(
+        "scatter of single exposures around it, pixels, or the word evidence", type=word_or(float, "evidence")
+    ),
+    "static_sigma": Option("uncertainty of it, pixels", type=float),
+}
+ATTACHING = {
+    "out": Option("folder for copies", type=Path, path="folder", one_of="where", required=True),
+    "in_place": Option("change the frames themselves", action="store_true", one_of="where", required=True),
+    "tpv": Option("header for SWarp and SCAMP (default: SIP)", action="store_true", one_of="header"),
+    "asdf_only": Option("leave the header alone, add the exact WCS", action="store_true", one_of="header"),
+    "max_error": Option("of the header, pixels (default 0.001)", type=float),
+    "overwrite": Option("replace copies and ASDF extensions that exist", action="store_true"),
+}
+PREDICTING = {
+    "n_exposures": Option("how many", type=int, required=True),
+    "n_stars": Option("so many, drawn evenly over the field", type=int, one_of="stars", required=True),
+    "density": Option("the same, as stars a detector", type=float, one_of="stars", required=True),
+    "stars": Option(
+        "x, y in the reference plane, perhaps x_err, y_err", metavar="TABLE", path="read", one_of="stars", required=True
+    ),
+    "sigma": Option("error of one measured position, pixels (default: x_err, y_err)", type=float),
+    "degree": Option("total degree to be fitted (default 3)", type=int),
+    "dithers": Option("rms length of the shifts, pixels (default 0)", "--dither", type=float, metavar="RMS"),
+    **KNOWN_STATIC,
+    "dynamic": Option("rms of a coefficient from exposure to exposure, pixels", type=float),
+    "spectrum": Option("the same by degree, beyond the fit too", type=spectrum, metavar="DEGREE=RMS,..."),
+    "gauge": Option("see the docs (default minimal)", choices=KINDS),
+    "seed": Option("of stars and shifts that are drawn (default 0)", type=int),
+}

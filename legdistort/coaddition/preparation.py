@@ -1,0 +1,109 @@
+"""Exposures prepared for resampling: bad pixels replaced, their noise and background known, their pixels put aside."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from ..runtime.scratch import Stored, store
+from .background import Background, measure_background
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Prepared:
+    """What co-adding keeps of an exposure.
+
+    Attributes
+    ----------
+    stored : Stored
+        Its planes: ``data``, with bad pixels filled; perhaps ``variance``, and the masks ``bad``, ``full`` (saturated)
+        and ``rough`` (`rough_pixels`), where they hold any pixel.
+    background : Background
+    """
+
+    stored: Stored
+    background: Background
+
+
+def prepare(frame, folder):
+    """Prepare an exposure.
+
+    Parameters
+    ----------
+    frame : Exposure or ExposureFile
+    folder : path
+        For its planes.
+
+    Returns
+    -------
+    Prepared or str
+        The reason why it cannot be used.
+    """
+    exposure = frame.read()
+    bad, full = ~np.isfinite(exposure.data), np.zeros(exposure.shape, dtype=bool)
+    if exposure.mask is not None:
+        bad |= exposure.mask
+    if bad.all():
+        return "every pixel is masked"
+    data, variance = fill_bad(exposure.data, bad), None
+    if not data.any():
+        return "every pixel is 0"
+    if exposure.saturation is not None:
+        full = ~bad & (data >= exposure.saturation)
+    background = measure_background(exposure, bad=bad, filled=data)
+    rough = rough_pixels(data, bad, full, background.noise)
+    if exposure.uncertainty is not None:
+        variance = np.square(exposure.uncertainty, dtype=np.float32)
+        variance[bad] = np.mean(variance, where=~bad)
+    masks = {"bad": bad, "full": full, "rough": rough}
+    planes = {"data": data, "variance": variance} | {name: mask for name, mask in masks.items() if mask.any()}
+    return Prepared(store(folder, frame.name, planes), background)
+
+
+def rough_pixels(data, bad, full, noise):
+    """Pixels within five of a saturated one, or of a hole in the slope of a star: splines ring there.
+
+    Parameters
+    ----------
+    data : ndarray, shape (ny, nx)
+        Bad pixels replaced.
+    bad, full : ndarray of bool, shape (ny, nx)
+        Bad pixels and saturated ones.
+    noise : float
+        Of the background: a slope is where data within two pixels differ by more than ten times this; a hole is where
+        most of these pixels are bad. Single bad pixels are replaced well enough.
+
+    Returns
+    -------
+    ndarray of bool, shape (ny, nx)
+    """
+    rough = full.copy()
+    y, x = np.nonzero(bad)
+    if len(y):
+        around = [_around(plane, y, x) for plane in (data, bad)]
+        rough[y, x] = (np.ptp(around[0], axis=0) > 10 * noise) & (around[1].mean(axis=0) > 0.5)
+    return binary_dilation(rough, np.ones((11, 11), dtype=bool)) if rough.any() else rough
+
+
+def _around(plane, y, x):
+    padded = np.pad(plane, 2, mode="edge")
+    return np.stack([padded[y + i, x + k] for i, k in np.ndindex(5, 5)])
+
+
+def fill_bad(data, bad, radius=2):
+    """Replace bad pixels by a weighted mean of the good ones near by, or the median of all good ones."""
+    if not bad.any():
+        return data
+    (y, x), (ny, nx) = np.nonzero(bad), bad.shape
+    total, norm = np.zeros(len(x)), np.zeros(len(x))
+    for dy, dx in np.ndindex(2 * radius + 1, 2 * radius + 1):
+        near = np.clip(y + dy - radius, 0, ny - 1), np.clip(x + dx - radius, 0, nx - 1)
+        weight = np.exp(-((dy - radius) ** 2 + (dx - radius) ** 2) / 2) * ~bad[near]
+        total += weight * np.where(weight > 0, data[near], 0)
+        norm += weight
+    lonely = norm == 0
+    out = data.copy()
+    out[y, x] = total / np.where(lonely, 1, norm)
+    if lonely.any():
+        out[y[lonely], x[lonely]] = np.median(data[~bad])
+    return out

@@ -1,0 +1,114 @@
+"""What the WCSs in the headers say of where exposures lie: tried first in matching, and never trusted."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.wcs.utils import wcs_to_celestial_frame
+
+from ..exceptions import AssumptionWarning, warn
+from ..geometry import similarity
+from ..geometry.tangent_plane import TangentPlane
+
+#: Headers that disagree with the others by more than this part of the field do not say where the field lies.
+TOLERANCE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class HeaderPoses:
+    """Nominal poses by the header WCSs.
+
+    Attributes
+    ----------
+    poses : dict
+        ``{exposure: (2, 3)}``, plane -> pixels, of the exposures that have a WCS.
+    shapes : dict
+        ``{exposure: (ny, nx)}``.
+    sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
+        Where the plane of these poses lies.
+    """
+
+    poses: dict
+    shapes: dict
+    sky: TangentPlane | None
+
+    @classmethod
+    def from_wcs(cls, wcss, shapes):
+        """From the linear parts of WCSs: on the tangent plane at their median pointing, in pixels of the first one.
+
+        Parameters
+        ----------
+        wcss : dict
+            ``{exposure: WCS}``; it may be empty.
+        shapes : dict
+            ``{exposure: (ny, nx)}``.
+        """
+        planes = {}
+        if wcss:
+            centres = [_to_sky(w, _grid(shapes[name], 1)).cartesian.xyz.value[:, 0] for name, w in wcss.items()]
+            # the median, not the mean: one header may point anywhere
+            middle = SkyCoord(*np.median(centres, axis=0), representation_type="cartesian").spherical
+            on_sky = TangentPlane(middle.lon.deg, middle.lat.deg, similarity.identity())
+        for name, w in wcss.items():
+            grid = _grid(shapes[name], 5)
+            plane = on_sky.from_sky(_to_sky(w, grid))
+            if np.all(np.isfinite(plane)):
+                planes[name] = similarity.fit_similarity(grid, plane)
+        if not planes:
+            return cls({}, shapes, None)
+        first, matrix = next(iter(planes.items()))
+        matrix = np.column_stack([matrix[:, :2], -matrix[:, :2] @ _grid(shapes[first], 1)[0]])
+        poses = {name: similarity.compose(similarity.invert(plane), matrix) for name, plane in planes.items()}
+        return cls(poses, shapes, TangentPlane(on_sky.lon, on_sky.lat, matrix))
+
+    def step(self, source, target):
+        """Nominal pose from one exposure's pixels to another's, or None."""
+        if not {source, target} <= self.poses.keys():
+            return None
+        return similarity.compose(self.poses[target], similarity.invert(self.poses[source]))
+
+    def place(self, found):
+        """Poses in any plane carried to the headers' plane, by the mean of the headers that agree.
+
+        Parameters
+        ----------
+        found : dict
+            ``{exposure: (2, 3)}``.
+
+        Returns
+        -------
+        poses : dict
+        sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
+            Where their plane lies; None, with the poses as they were, if the headers do not say.
+        """
+        names = [name for name in found if name in self.poses]
+        if not names:
+            return found, None
+        # every header says where the plane of the poses lies in the plane of the sky
+        steps = np.array([similarity.compose(similarity.invert(found[n]), self.poses[n]) for n in names])
+        size = max(max(self.shapes[n]) for n in names)
+        corners = np.array([similarity.apply(step, _grid(self.shapes[names[0]], 2)) for step in steps])
+        apart = np.linalg.norm(corners - np.median(corners, axis=0), axis=2).max(axis=1)
+        good = apart < TOLERANCE * size
+        if 2 * np.count_nonzero(good) <= len(names):
+            warn(
+                "the header WCSs contradict the stars and one another; they are ignored, and the sky stays unknown",
+                AssumptionWarning,
+            )
+            return found, None
+        mean = steps[good].mean(axis=0)
+        return {name: similarity.compose(pose, mean) for name, pose in found.items()}, self.sky
+
+
+def _grid(shape, n):
+    """Pixels of an n x n grid from edge to edge (the centre for n = 1), shape (n*n, 2)."""
+    x, y = (np.linspace(0, size - 1, n) if n > 1 else np.array([(size - 1) / 2]) for size in shape[::-1])
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def _to_sky(wcs, xy):
+    """Sky positions by the linear part of a WCS (no SIP or table), as the poses lead to undistorted pixels."""
+    wcs = wcs.celestial
+    lon, lat = wcs.wcs_pix2world(xy, 0).T
+    return SkyCoord(lon * u.deg, lat * u.deg, frame=wcs_to_celestial_frame(wcs)).icrs

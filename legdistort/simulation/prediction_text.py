@@ -1,0 +1,75 @@
+"""Predictions as text."""
+
+import textwrap
+
+import numpy as np
+
+
+def decimals(prediction):
+    """Decimal places that show three digits of errors like those of a `Prediction`."""
+    return max(4, 3 - int(np.floor(np.log10(prediction.sigma_meas))))
+
+
+def finite_rms(values):
+    """Rms of those values that are finite; NaN if none is."""
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
+
+
+def describe(prediction):
+    """A `Prediction` as ``print`` shows it: both criteria, aliasing where any is assumed, slopes and rules of thumb."""
+    solution = prediction.solution
+    ny, nx = solution.shapes[solution.names[0]]
+    low, high = prediction.stars_per_exposure.min(), prediction.stars_per_exposure.max()
+    thumb_b, thumb_sigma = prediction.thumb
+    aliased = np.any(prediction.folded != 0)  # NaN included
+    places = decimals(prediction)
+
+    def row(label, noise, aliasing=None, *slopes):
+        values = [noise]
+        if aliased:
+            values += [None, None] if aliasing is None else [aliasing, np.hypot(noise, aliasing)]
+        cells = ["" if v is None else "not known" if np.isnan(v) else f"{v:.{places}f}" for v in values]
+        return columns(label, cells + [f"{slope:.3f}" for slope in slopes]).rstrip()
+
+    def columns(label, cells):
+        return f"{label:44s}" + "".join(f"{cell:>11s}" for cell in cells)
+
+    b, sigma = (prediction.b, prediction.b_alias), (prediction.sigma, prediction.sigma_alias)
+    return "\n".join(
+        [
+            f"Prediction: {prediction.n_exposures} exposures of {ny} x {nx} px, {prediction.n_stars} stars "
+            f"({low if low == high else f'{low} to {high}'} on each), degree {prediction.degree}, "
+            f"errors of {prediction.sigma_meas:.4g} px",
+            columns(
+                "expected, rms per axis [px]",
+                ["noise", *(["aliasing", "together"] if aliased else []), "/ sigma", "thumb"],
+            ),
+            row("b, star positions, relative", *b, prediction.s_b, thumb_b),
+            row(_absolute(prediction), prediction.b_abs),
+            row("sigma, new positions inside the contour", *sigma, prediction.s_sigma, thumb_sigma),
+            row("sigma, new positions over the whole field", prediction.sigma_field, finite_rms(prediction.alias_map)),
+            *textwrap.wrap(f"All but b, absolute, are relative: {_relative(prediction)}", 110),
+            f"gauge {solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
+        ]
+    )
+
+
+def _absolute(prediction):
+    unknown = ", ".join(prediction.solution.gauge.unknown_names)
+    if unknown and np.isfinite(prediction.b_abs):
+        return f"b, absolute, after {unknown}"
+    return "b, absolute (mean dynamic distortion too)"
+
+
+def _relative(prediction):
+    words = f"what is left once a common map of degree {prediction.degree} is taken off"
+    return "; ".join(filter(None, [words, prediction.solution.gauge.warning]))
+
+
+def describe_plans(plans):
+    """The table of `Prediction.alternatives` as text: criteria (aliasing if any is known), slopes, rules of thumb."""
+    criteria = [c for c in ("b", "b_alias", "b_abs", "sigma", "sigma_alias") if np.nansum(plans[c]) > 0]
+    columns = ["n_exposures", "degree", "n_stars", *criteria, "s_b", "thumb_b", "s_sigma", "thumb_sigma"]
+    lines = plans[columns].pformat(max_lines=-1, max_width=-1)
+    return "\n".join(lines + [f"{change}: {reason}" for change, reason in plans.meta["failed"].items()])

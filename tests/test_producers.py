@@ -1,0 +1,215 @@
+"""What every `Solution` keeps, whoever made it: it comes back from its file equal, and says the same."""
+
+import dataclasses
+import warnings
+from dataclasses import FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.modeling import models
+from astropy.table import QTable, Table
+
+from legdistort import Matches, Prior, Solution, solve
+from legdistort.assessment import baselines
+from legdistort.exceptions import LegdistortWarning
+from legdistort.results.diagnostics import DegreeChoice, Diagnostics, UsedReference, Validation
+from legdistort.results.settings import Settings
+from legdistort.runtime.provenance import with_inputs
+from legdistort.simulation import prediction
+from legdistort.simulation.noiseless_solution import noiseless_solution
+from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
+
+FEW = simulate_matches(n_stars=14, n_exposures=6, degree=2, seed=3)
+NIGHT = simulate_gsaoi_matches(small=True, seed=1)  # knows its sky
+
+
+def mismatched(sim):
+    """The same with some gross errors, an exposure that fits none of the others, and one left out beforehand."""
+    table = sim.matches.table.copy()
+    table["x"][::37] += 20 * u.pix
+    astray = table["exposure"] == sim.matches.names[2]
+    table["y"][astray] = np.random.default_rng(0).permutation(table["y"][astray].value) * u.pix
+    known = {"shape": sim.matches.shapes, "poses": sim.matches.poses, "left_out": {"dark": "no star in it"}}
+    return Matches.from_table(table, **known)
+
+
+def catalogue(sim):
+    positions = solve(sim.matches, degree=1).positions
+    errors = {"x_err": np.full(len(positions), 0.02), "y_err": np.full(len(positions), 0.02)}
+    return Table({"star": sim.matches.stars, "x": positions[:, 0] + 3, "y": positions[:, 1], **errors})
+
+
+def detectors(sim):
+    table = sim.matches.table.copy()
+    table["detector"] = ["even" if int(name[3:]) % 2 == 0 else "odd" for name in table["exposure"]]
+    return Matches.from_table(table, shape=sim.matches.shapes, poses=sim.matches.poses)
+
+
+def predicted(**options):
+    """The solution of `predict`, which its figures are made of."""
+    made = []
+
+    def keep(*args, **kwargs):
+        made.append(noiseless_solution(*args, **kwargs))
+        return made[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prediction, "noiseless_solution", keep)
+        prediction.predict(n_exposures=5, n_stars=40, sigma=0.05, seed=2, **options)
+    return made[0][0]
+
+
+def model():
+    sides = {"x_domain": (-0.5, 2047.5), "y_domain": (-0.5, 2047.5)}
+    series = models.Legendre2D(2, 2, **sides) & models.Legendre2D(2, 2, c2_2=0.3, fixed={"c2_2": True}, **sides)
+    return models.Identity(2) + (models.Mapping((0, 1, 0, 1)) | series)
+
+
+PRODUCERS = {
+    "plain": lambda: solve(FEW.matches, degree=2),
+    "prior with its error": lambda: solve(FEW.matches, degree=2, prior=Prior(FEW.truth.static, static_sigma=0.02)),
+    "prior with widths": lambda: solve(FEW.matches, degree=2, prior=Prior(FEW.truth.static, sigma=0.5)),
+    "widths found": lambda: solve(FEW.matches, prior=Prior(FEW.truth.static, sigma="evidence")),
+    "widths found at degree 1": lambda: solve(FEW.matches, degree=1, prior=Prior(FEW.truth.static, sigma="evidence")),
+    "widths found at degree 0": lambda: solve(FEW.matches, degree=0, prior=Prior(FEW.truth.static, sigma="evidence")),
+    "widths by detector": lambda: solve(
+        detectors(FEW),
+        degree=2,
+        prior={"odd": Prior(FEW.truth.static, sigma="evidence"), "even": Prior(FEW.truth.static, sigma=0.3)},
+    ),
+    "static fitted": lambda: solve(NIGHT.matches, static="fit"),
+    "tied to a reference": lambda: solve(FEW.matches, degree=2, reference=catalogue(FEW)),
+    "tied to one star": lambda: solve(FEW.matches, degree=2, reference=catalogue(FEW)[:1]),
+    "degree chosen": lambda: solve(FEW.matches, degree="auto", prior=Prior(FEW.truth.static)),
+    "model": lambda: solve(simulate_matches(n_stars=40, n_exposures=5, seed=5).matches, model=model()),
+    "validated": lambda: solve(NIGHT.matches, degree=2, validate=0.2, clip=5),
+    "alternating": lambda: solve(FEW.matches, degree=1, method="alternating"),
+    "floor found": lambda: solve(NIGHT.matches, degree=1, errors="floor"),
+    "errors scaled": lambda: solve(NIGHT.matches, degree=1, errors="scale"),
+    "clipped": lambda: solve(mismatched(simulate_matches(n_stars=60, n_exposures=6, seed=4)), degree=2, clip=5),
+    "robust": lambda: solve(mismatched(simulate_matches(n_stars=60, n_exposures=6, seed=4)), degree=2, loss="cauchy"),
+    "mean gauge": lambda: solve(FEW.matches, degree=2, gauge="mean", error_floor=0.01, max_iterations=30),
+    "shifts": lambda: baselines.solve_shifts(FEW.matches),
+    "static and shifts": lambda: baselines.solve_shifts(NIGHT.matches, prior=Prior(NIGHT.truth.static), weighted=True),
+    "relative to one exposure": lambda: baselines.solve_relative(FEW.matches, degree=2),
+    "relative to the mean": lambda: baselines.solve_relative(FEW.matches, degree=2, reference="mean", weighted=False),
+    "predicted": lambda: predicted(dynamic=0.3),
+    "predicted without scatter": lambda: predicted(),
+    "predicted with widths": lambda: predicted(prior=Prior(np.zeros((2, 10)), sigma=0.5)),
+    "with its inputs": lambda: with_inputs(solve(FEW.matches, degree=1), {"a b#1.fits": "0" * 64}),
+}
+
+
+@pytest.fixture(scope="module", params=PRODUCERS)
+def produced(request):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LegdistortWarning)  # some of the sets tell little
+        return PRODUCERS[request.param]()
+
+
+def assert_same(a, b, where):
+    """Equal to the last bit, dtype and type: numbers, text, arrays, tables, dicts, sequences and dataclasses."""
+    if isinstance(a, QTable):
+        assert a.colnames == b.colnames, where
+        for name in a.colnames:
+            assert getattr(a[name], "unit", None) == getattr(b[name], "unit", None), (where, name)
+            assert_same(np.asarray(a[name]), np.asarray(b[name]), f"{where}.{name}")
+    elif isinstance(a, np.ndarray):
+        assert a.dtype.kind == b.dtype.kind, where
+        assert np.array_equal(a, b, equal_nan=a.dtype.kind == "f"), where
+    elif dataclasses.is_dataclass(a):
+        assert type(a) is type(b), where
+        for field in (each for each in dataclasses.fields(a) if each.compare):
+            assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
+    elif isinstance(a, dict):
+        assert set(a) == set(b), where
+        for key in a:
+            assert_same(a[key], b[key], f"{where}[{key!r}]")
+    elif isinstance(a, (list, tuple)):
+        assert type(a) is type(b), where
+        assert len(a) == len(b), where
+        for k, (one, other) in enumerate(zip(a, b, strict=True)):
+            assert_same(one, other, f"{where}[{k}]")
+    else:
+        assert a == b or (a != a and b != b), (where, a, b)
+
+
+class TestEveryProducer:
+    def test_file_and_words(self, produced, tmp_path):
+        back = Solution.read(produced.write(tmp_path / "s.asdf"))
+        for field in dataclasses.fields(Solution):
+            if field.name not in ("uncertainty", "form"):
+                assert_same(getattr(produced, field.name), getattr(back, field.name), field.name)
+        for name in ("coefficients", "stars"):
+            assert_same(getattr(produced.uncertainty, name), getattr(back.uncertainty, name), name)
+        assert_same(produced.stars, back.stars, "stars")
+        assert_same(produced.absolute_covariance(), back.absolute_covariance(), "absolute")
+        for one, other in zip(produced.gauge.unknown, back.gauge.unknown, strict=True):
+            assert_same(one, other, one.name)
+        for words in (str, repr):
+            assert words(back) == words(produced)
+            assert words(back.gauge) == words(produced.gauge)
+            assert words(back.diagnostics) == words(produced.diagnostics)
+        assert back.sky_sentence == produced.sky_sentence
+        assert back.diagnostics.summary() == produced.diagnostics.summary()
+        again = back.write(tmp_path / "again.asdf")
+        assert str(Solution.read(again)) == str(produced)
+
+    def test_frozen(self, produced):
+        for part, name in ((produced, "settings"), (produced.settings, "clip"), (produced.diagnostics, "validation")):
+            with pytest.raises(FrozenInstanceError):
+                setattr(part, name, None)
+        assert isinstance(produced.settings, Settings)
+        assert isinstance(produced.diagnostics, Diagnostics)
+        assert set(produced.provenance) >= {"created", "versions"}
+
+    def test_words_end_well(self, produced):
+        for words in (*produced.diagnostics.in_words().values(), produced.gauge.sentence, produced.sky_sentence):
+            assert words == words.strip()
+            assert words[-1] not in ",;:"
+
+
+def test_absolute_errors_of_a_simpler_correction_stay_unknown(tmp_path):
+    shifts = baselines.solve_shifts(FEW.matches)
+    back = Solution.read(shifts.write(tmp_path / "s.asdf"))
+    for solution in (shifts, back):
+        words = "shift: the plane is the mean of all exposures; absolute errors are not available"
+        assert solution.gauge.sentence == words
+        assert str(solution.gauge) == words
+        assert np.isnan(solution.stars["x_err_abs"]).all()
+
+
+@pytest.mark.parametrize(
+    ("widths", "words"),
+    [
+        ((), None),
+        ((0.5,), "0.5 px at degree 1"),
+        ((0.5, 0.25), "0.5, 0.25 px at degree 1, 2"),
+        ((0.5, 0.25, 0.1), "0.5, 0.25, 0.1 px at degree 1, 2, ..."),
+        ((0.5, 0.25, 0.1, 0.0), "0.5, 0.25, 0.1, 0 px at degree 1, 2, ..."),
+        ({"a": (0.5,), "b": None, "c": (0.1, 0.2)}, "a 0.5 px at degree 1; c 0.1, 0.2 px at degree 1, 2"),
+        ({"a": ()}, None),
+    ],
+)
+def test_widths_in_words(widths, words):
+    told = Diagnostics(widths=widths).in_words()
+    assert told == ({} if words is None else {"widths": f"scatter of a coefficient, found from the exposures: {words}"})
+
+
+def test_summary_is_plain():
+    """Of what was not asked for nothing; of the rest what JSON takes."""
+    assert Diagnostics().summary() == {}
+    found = Diagnostics(
+        error_scale=2.0,
+        reference=UsedReference("gaia", 2020.0, 3, 0.1),
+        widths=(0.1, 0.2),
+        departure_ratio=1.5,
+        selection=DegreeChoice(1, (0, 1), (2.0, 1.0), 10, (), False, "1, of 0 to 1"),
+        validation=Validation(0.1, 3, 30, 0, 0.05, 0.05, 1.0),
+    )
+    summary = found.summary()
+    assert list(summary) == ["widths", "departure_ratio", "selection", "validation"]
+    assert summary["selection"]["degree"] == 1
+    assert summary["validation"]["n_stars"] == 3
+    assert replace(found, widths=None).summary().keys() == {"departure_ratio", "selection", "validation"}
