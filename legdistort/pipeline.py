@@ -241,6 +241,7 @@ def summarise(solution, *, timings=None):
         "rms_px": float(np.sqrt(np.mean(solution.rms**2))),
         "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
         "gauge": solution.gauge.sentence,
+        "unknown": list(solution.gauge.unknown_names),
         "sky": solution.sky_sentence,
         "reference": found.reference and asdict(found.reference),
         "max_inverse_error_px": float(solution.max_inverse_error),

@@ -84,7 +84,7 @@ def test_errors_are_calibrated_for_distortions_of_that_size():
         good = np.isfinite(solution.positions[:, 0])
         true.append(accuracy.bias(solution.positions[good], sim.truth.positions[good], removed="similarity") ** 2)
         reported.append(accuracy.expected_bias(solution, removed="similarity", absolute=True) ** 2)
-    assert np.mean(true) / np.mean(reported) == pytest.approx(1, abs=0.25)  # 12 unknown amplitudes a set
+    assert np.mean(true) / np.mean(reported) == pytest.approx(1, abs=0.2)  # standard error 0.06
 
 
 def _size(static):
@@ -134,6 +134,15 @@ def test_it_is_no_static_map_to_correct_with(sim, declared):
     assert "static + shift" not in made
 
 
+@pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")  # these fit this set badly
+@pytest.mark.parametrize("options", [{"static": "fit"}, {"degree": "auto"}, {"gauge": "mean"}], ids=str)
+def test_with_other_options(sim, options):
+    solution = ld.solve(sim.matches, prior=ld.Prior(None, static_sigma=2.0), **options)
+    assert solution.gauge.unknown == ()
+    assert np.isfinite(solution.stars["x_err_abs"]).all()
+    assert np.isfinite(solution.coefficient_errors(solution.names[0])).all()
+
+
 def test_by_detector(sim):
     priors = {name: ld.Prior(None, static_sigma=2.0) for name in sim.matches.names}
     assert ld.solve(sim.matches, prior=priors).gauge.unknown == ()
@@ -171,6 +180,8 @@ def test_solve_command(sim, tmp_path, capsys):
     out, error = capsys.readouterr()
     assert "not known" not in error
     assert "absolute to" in json.loads(out)["gauge"]
+    assert json.loads(out)["unknown"] == []
+    assert {"shear", "z^2"} <= set(json.loads((tmp_path / "free" / "summary.json").read_text())["unknown"])
     assert ld.Solution.read(tmp_path / "declared" / "solution.asdf").settings.prior["static_sigma"] == 2.0
     assert main([*command, str(tmp_path / "bad"), "--static-sigma", "0"]) == 1
     assert "static_sigma must be a positive number" in capsys.readouterr().err
@@ -212,5 +223,6 @@ def test_predict_command(capsys):
     command = ["predict", "--n-exposures", "8", "--n-stars", "50", "--sigma", "0.02", "--dynamic", "0.3", "--json"]
     assert main([*command, "--quiet"]) == 0
     free = json.loads(capsys.readouterr().out)
+    assert "shear" in free["unknown"]
     assert main([*command, "--quiet", "--static-sigma", "2"]) == 0
     assert json.loads(capsys.readouterr().out)["b_abs"] > 10 * free["b_abs"]

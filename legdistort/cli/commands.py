@@ -315,7 +315,8 @@ def do_predict(a):
     _draw(prediction, a)
     plans = prediction.alternatives()
     own, *others = _records(plans)
-    _say(a, f"{prediction}\n\n{describe_plans(plans)}", own | {"alternatives": others, "failed": plans.meta["failed"]})
+    own |= {"unknown": list(prediction.solution.gauge.unknown_names), "alternatives": others}
+    _say(a, f"{prediction}\n\n{describe_plans(plans)}", own | {"failed": plans.meta["failed"]})
 
 
 @command(

@@ -54,7 +54,8 @@ def solve(
         Total degree of the Legendre series, 0 to 30; or the one up to 6 whose distortions serve stars best that are
         left out of the fit (`legdistort.solving.choices.degree_choice`).
     prior : Prior or dict, optional
-        Static distortion; one, or by ``detector`` or exposure name. None starts from no distortion.
+        Static distortion; one, or by ``detector`` or exposure name. None: nothing is known of it, so that some of the
+        absolute positions may not be known either (``gauge.unknown``), which is then logged as a warning.
     model : `~astropy.modeling.Model`, optional
         Form of the distortion of every exposure, undistorted -> detector pixels, instead of `degree` and `prior`:
         ``Identity(2) + (Mapping((0, 1, 0, 1)) | Legendre2D & Legendre2D)``, with a static part added if there is one.
