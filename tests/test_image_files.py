@@ -15,7 +15,7 @@ from legdistort import pipeline
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
-from legdistort.priors.from_headers import SAME, SMALL, describe, header_distortions
+from legdistort.priors.from_headers import describe, header_distortions
 from legdistort.priors.prior import HeaderPrior
 from legdistort.wcs.attachment import attach
 
@@ -250,7 +250,8 @@ def test_the_prior_of_headers_is_that_of_the_file(tmp_path):
     exposures = [exposure(k) for k in range(3)]
     prior = ld.Prior.from_headers(exposures, degree=3, sigma=0.1, static_sigma=0.2)
     assert isinstance(prior, ld.Prior)  # the same SIP in all of them: one static distortion
-    assert prior.truncation < SAME
+    assert prior.truncation < 1e-3
+    assert ld.Prior.from_model(exposures[0].wcs, shape=SHAPE, degree=prior.degree - 1).truncation > 1e-3
     assert prior.degree > 3
     assert (prior.sigma == 0.1).all()
     assert (prior.static_sigma == 0.2).all()
@@ -263,14 +264,22 @@ def test_the_prior_of_headers_is_that_of_the_file(tmp_path):
 
 def test_headers_that_differ_give_each_its_own():
     small = {key: value if key.endswith("ORDER") else 0.9 * value for key, value in SIP.items()}
-    hardly = SIP | {"A_2_0": SIP["A_2_0"] * (1 + 1e-6)}
-    assert isinstance(ld.Prior.from_headers([exposure(0), exposure(1, sip=hardly)]), ld.Prior)
+    for change, one in ((1e-4, True), (1e-3, False)):  # of 4 pixels, so 0.0004 and 0.004
+        hardly = SIP | {"A_2_0": SIP["A_2_0"] * (1 + change)}
+        assert isinstance(ld.Prior.from_headers([exposure(0), exposure(1, sip=hardly)]), ld.Prior) == one
     priors = ld.Prior.from_headers([exposure(0), exposure(1, sip=small)])
     assert list(priors) == ["e0", "e1"]
     ratio = priors["e1"].rms / priors["e0"].rms
     np.testing.assert_allclose(ratio, 0.9, rtol=0.02)
     with pytest.raises(InputError, match="the headers of e2 have no distortion, and those of the others differ"):
         ld.Prior.from_headers([exposure(0), exposure(1, sip=small), exposure(2, sip=None)])
+
+
+def test_series_end_at_the_highest_degree_of_sip():
+    steep = {"A_ORDER": 9, "B_ORDER": 9, "A_9_0": 5e-18, "B_0_9": 5e-18}
+    prior = ld.Prior.from_headers([exposure(0, sip=steep)])
+    assert prior.degree == 9
+    assert prior.truncation > 1e-3
 
 
 def test_headers_without_a_distortion():
@@ -310,7 +319,7 @@ def test_the_size_is_that_over_the_detector():
     assert words.startswith("SIP, up to ")
     assert float(words.split()[3]) == pytest.approx(size, rel=0.1)
     for factor, told in ((0.5, False), (2, True)):
-        tiny = {key: v if key.endswith("ORDER") else v * factor * SMALL / size for key, v in SIP.items()}
+        tiny = {key: v if key.endswith("ORDER") else v * factor * 0.01 / size for key, v in SIP.items()}
         assert (told_of([exposure(0, sip=tiny)]) is not None) == told
 
 
