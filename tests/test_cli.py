@@ -192,7 +192,7 @@ def _truncated(path, night):
 
 
 def _other_shape(path, night):
-    fits.PrimaryHDU(np.zeros((300, 512), dtype="float32")).writeto(path)
+    fits.PrimaryHDU(np.eye(300, 512, dtype="float32")).writeto(path)
     return [*night[1:], path]
 
 
@@ -206,7 +206,7 @@ def _other_shape(path, night):
 )
 def test_bad_frames_are_named_and_nothing_is_left(night, tmp_path, capsys, make, words):
     frames = make(tmp_path / "bad.fits", night)
-    failed(capsys, run(frames, tmp_path / "out"), *words)
+    failed(capsys, run(frames, tmp_path / "out", "--stop-at-bad"), *words)
     assert [item.name for item in tmp_path.iterdir()] == ["bad.fits"]
 
 

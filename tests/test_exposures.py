@@ -104,8 +104,8 @@ def multi_extension(data):
 def test_extensions_and_their_companions(tmp_path, data):
     path = tmp_path / "mef.fits"
     multi_extension(data).writeto(path)
-    exposure = read_one(path)
-    assert exposure.name == "mef"
+    exposure = read_one(path, ext=("SCI", 1))
+    assert exposure.name == "mef_SCI1"
     assert (exposure.gain, exposure.exposure_time) == (4.0, 30.0)
     np.testing.assert_array_equal(exposure.data, data + 1)
     np.testing.assert_array_equal(exposure.uncertainty, 3.0)
@@ -128,7 +128,7 @@ def test_extensions_and_their_companions(tmp_path, data):
 def test_do_not_use_bit(data):
     hdus = multi_extension(data)
     hdus[0].header["TELESCOP"] = "JWST"
-    np.testing.assert_array_equal(np.argwhere(read_one(hdus).mask), [[1, 3]])
+    np.testing.assert_array_equal(np.argwhere(read_one(hdus, ext="SCI").mask), [[1, 3]])
 
 
 def test_variance_extension(data):

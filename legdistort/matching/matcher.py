@@ -10,9 +10,10 @@ from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..inputs import column_contract
 from ..inputs.matches import Matches, shapes_by_exposure
 from ..inputs.reference_catalogue import mean_epoch
+from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
-from ..priors.from_headers import describe_headers
+from ..priors.from_headers import describe, header_distortions
 from .exposure_groups import interlink, link, standing, unite
 from .header_poses import HeaderPoses
 from .options import MatchOptions
@@ -112,11 +113,9 @@ def match(
         log.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
         star[~isolated] = -1
     table, star = _keep_common(table, star, min_exposures, left_out)
-    matches = _finish(table, star, shapes, headers, left_out)
-    if not named:
-        return matches
-    told = describe_headers([named[name] for name in matches.names])
-    return replace(matches, epoch=mean_epoch(e.header for e in named.values()), header_distortion=told)
+    epoch = mean_epoch(e.header for e in named.values()) if named else None
+    distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
+    return _finish(table, star, shapes, headers, left_out, epoch, distortions)
 
 
 def _without_repetitions(table):
@@ -238,13 +237,26 @@ def _reasons(left_out):
     return "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
 
 
-def _finish(table, star, shapes, headers, left_out):
+def _finish(table, star, shapes, headers, left_out, epoch, distortions):
     table["star"] = _numbers(table, star)
     for name, reason in left_out.items():
         log.warning("%s is left out: %s", name, reason)
-    matches = Matches.from_table(table, shape=shapes, left_out=left_out)
-    poses, sky = headers.place(matches.poses)
-    return replace(matches, poses=poses, sky=sky)
+    matches = Matches.from_table(table, shape=shapes, left_out=left_out, epoch=epoch)
+    poses, sky = headers.place(_undistorted_poses(matches, distortions))
+    return replace(matches, poses=poses, sky=sky, header_distortion=describe(distortions))
+
+
+def _undistorted_poses(matches, distortions):
+    """Poses by positions without what the headers know of distortion: so the sky is that which they mean."""
+    if not distortions:
+        return matches.poses
+    obs = matches.observations
+    xy = obs.xy.copy()
+    for i, name in enumerate(matches.names):
+        if name in distortions:
+            rows = obs.exposure == i
+            xy[rows] = distortions[name].undistort(xy[rows])
+    return dict(zip(matches.names, estimate_poses(obs.exposure, obs.star, xy, names=matches.names), strict=True))
 
 
 def _numbers(table, star):

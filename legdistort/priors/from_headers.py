@@ -5,7 +5,8 @@ similarity, which belongs to the pose, and a static distortion without one. So a
 right whether or not the distortion is used, as far as a similarity can be.
 """
 
-from dataclasses import replace
+import contextlib
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,13 +16,15 @@ from ..geometry.tangent_plane import TangentPlane
 from .expansion import POSE_GRID, expand
 from .from_files import read_source
 from .from_objects import as_source
+from .source import Source
 
 #: Headers tell one distortion if their series differ by less than this [pix] all over the detector; the degree of a
-#: series is raised until it leaves less out. A tenth of the error of the best stars that are measured.
+#: series is raised until it leaves less out. It is what `legdistort attach` allows a header by default.
 SAME = 1e-3
 #: Highest degree: that of SIP as the convention allows it.
 HIGHEST = 9
-#: Distortions up to this size [pix] are not worth a warning: that of the best stars that are measured.
+#: Distortions up to this size [pix] are not worth a warning: half the error of a star of the paper (0.02 px). A linear
+#: header departs by 1e-6 px (`legdistort.priors.from_objects.NOTHING`) at most, so that it never gives a false alarm.
 SMALL = 0.01
 
 
@@ -102,17 +105,46 @@ def _kind(wcs):
     return " and ".join(kinds) or wcs.wcs.ctype[0][-3:]
 
 
-def describe_headers(exposures):
-    """The largest distortion in the headers in words, or None: ``SIP, up to 24.9 px over the detector``."""
-    sizes = {}
+@dataclass(frozen=True, eq=False)
+class HeaderDistortion:
+    """A distortion by its header, with the pose from its plane to undistorted pixels.
+
+    `size` is the largest distance [pix] of undistorted pixels to those of the detector.
+    """
+
+    source: Source
+    pose: np.ndarray
+    size: float
+
+    @classmethod
+    def of(cls, source):
+        """That of a complete source."""
+        _, pose, _ = expand(source, 1)
+        bare = cls(source, pose, 0.0)
+        pixels = _pixels(source.shape, POSE_GRID)
+        return replace(bare, size=float(np.hypot(*(bare.undistort(pixels) - pixels).T).max()))
+
+    def undistort(self, xy):
+        """Undistorted pixels of detector pixels (n, 2)."""
+        plane = self.source.on_plane()(*(xy + self.source.origin).T)
+        return similarity.apply(self.pose, np.stack(plane, axis=1))
+
+
+def header_distortions(exposures):
+    """``{name: HeaderDistortion}`` of the exposures that have one of more than `SMALL` pixels."""
+    found = {}
     for exposure in exposures:
-        try:
-            source = header_source(exposure)
-            sizes[exposure.name] = _placed(source)[1], source.kind
-        except InputError:
-            continue
-    size, kind = max(sizes.values(), default=(0, ""))
-    return f"{kind}, up to {size:.3g} px over the detector" if size > SMALL else None
+        with contextlib.suppress(InputError):
+            found[exposure.name] = HeaderDistortion.of(header_source(exposure))
+    return {name: distortion for name, distortion in found.items() if distortion.size > SMALL}
+
+
+def describe(distortions):
+    """The largest of `header_distortions` in words, or None: ``SIP, up to 24.9 px over the detector``."""
+    if not distortions:
+        return None
+    largest = max(distortions.values(), key=lambda distortion: distortion.size)
+    return f"{largest.source.kind}, up to {largest.size:.3g} px over the detector"
 
 
 def undistorted_plane(wcs, shape):
@@ -125,19 +157,11 @@ def undistorted_plane(wcs, shape):
     """
     try:
         source = wcs_source(wcs, shape)
-        pose, _ = _placed(source)
+        pose = HeaderDistortion.of(source).pose
     except InputError:
         return None
     lon, lat = (float(a[0]) for a in source.function(*_pixels(shape, 1).T))
     return TangentPlane(lon, lat, similarity.invert(pose))
-
-
-def _placed(source):
-    """Pose from the plane of a source to undistorted pixels; largest distance [pix] of these to the detector's."""
-    _, pose, _ = expand(source, 1)
-    pixels = _pixels(source.shape, POSE_GRID)
-    plane = np.stack(source.on_plane()(*(pixels + source.origin).T), axis=1)
-    return pose, float(np.hypot(*(similarity.apply(pose, plane) - pixels).T).max())
 
 
 def _pixels(shape, n):
