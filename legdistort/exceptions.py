@@ -20,6 +20,10 @@ class InputError(LegdistortError, ValueError):
     """An argument, file or table is not what was asked for; correct it and call again."""
 
 
+class DamagedError(InputError):
+    """An image file is blank, truncated, damaged or without the image wanted; leave it out, or mend it."""
+
+
 class MatchError(LegdistortError, ValueError):
     """Exposures cannot be tied together; check overlap, the number of stars or the nominal poses."""
 

@@ -4,7 +4,7 @@ import json
 import logging
 import time
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from .matching.matcher import match
 from .matching.options import MatchOptions
 from .measurement.options import MeasureOptions
 from .measurement.positions import measure
+from .priors.prior import HEADER, HeaderPrior
 from .reporting.page import write_report
 from .results import accuracy
 from .runtime import checks, outputs, parallel, provenance
@@ -71,6 +72,7 @@ def run(
     solving=None,
     coadding=None,
     compare=False,
+    stop_at_bad=False,
     overwrite=False,
     workers=None,
     progress=False,
@@ -87,8 +89,8 @@ def run(
         Extension to read from every file.
     degree : int
         Total degree of the distortion.
-    prior : Prior, optional
-        Static distortion.
+    prior : Prior, dict, "header" or HeaderPrior, optional
+        Static distortion. "header": that of the headers, see `legdistort.Prior.from_headers`.
     min_exposures : int
         Stars seen in fewer exposures are not used.
     clip : float or None
@@ -102,6 +104,9 @@ def run(
         Also correct by shifts, by the prior's static distortion and shifts, and by a relative polynomial
         (`legdistort.assessment.baselines`), and report the scatter and the sharpness of the stack that each of them
         leaves.
+    stop_at_bad : bool
+        Raise `InputError` for blank, truncated or damaged frames, naming all of them; else they are left out with a
+        warning.
     overwrite : bool
         Replace the results of an earlier run.
     workers : int, optional
@@ -123,19 +128,19 @@ def run(
     check_results(out, overwrite)
     measuring = _step_options(MeasureOptions, measuring, "measuring")
     matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures)
-    solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=prior, clip=clip)
+    solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
     tying = {"epoch": epoch, "pixel_scale": pixel_scale}
     reference, tying["epoch"] = check_reference(reference, **tying, method=solving.method)
     parallel.check_workers(workers)
     share, timings = {"workers": workers, "progress": progress}, {}
     with _timed(timings, "read"):
-        exposures = exposure_files.open_exposures(paths, ext=ext, progress=progress)
-        _check_exposures(exposures, min_exposures)
+        exposures, bad = _open_frames(paths, min_exposures, ext=ext, stop_at_bad=stop_at_bad, progress=progress)
+        solving = replace(solving, prior=_known_prior(prior, exposures, degree))
     with _timed(timings, "measure"):
         detections = measure(exposures, **vars(measuring), **share)
     with _timed(timings, "match"):
-        matches = match(detections, exposures=exposures, **vars(matching))
+        matches = _also_left_out(match(detections, exposures=exposures, **vars(matching)), bad)
     with _timed(timings, "solve"):
         solution = solve(matches, **vars(solving), reference=reference, **tying)
         solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
@@ -147,7 +152,7 @@ def run(
     comparison = stacks = None
     if compare:
         with _timed(timings, "compare"):
-            comparison = baselines.compare(matches, solution, prior=prior)
+            comparison = baselines.compare(matches, solution, prior=solving.prior)
             if quality:
                 stacks = _if_possible(stack_quality.compare_stacks, kept, comparison, mosaic=mosaic, **vars(coadding))
     with outputs.replacing_folder(out) as target:
@@ -159,6 +164,27 @@ def run(
         write_report(target / "report.html", solution, summary=summary, **shown)
         write_summary(target / "summary.json", summary)
     return Run(out, solution, mosaic, summary)
+
+
+def _open_frames(paths, min_exposures, **options):
+    """Exposures that can be solved together, and the bad ones as ``{name: reason}``."""
+    bad = {}
+    exposures = exposure_files.open_exposures(paths, left_out=bad, **options)
+    _check_exposures(exposures, min_exposures, bad)
+    return exposures, bad
+
+
+def _known_prior(prior, exposures=None, degree=3):
+    """The prior; that of the headers is read from the exposures, or has a stand-in for checks before there are any."""
+    if isinstance(prior, str) and prior == HEADER:
+        prior = HeaderPrior()
+    if not isinstance(prior, HeaderPrior):
+        return prior
+    return prior.stand_in if exposures is None else prior.read(exposures, degree)
+
+
+def _also_left_out(matches, bad):
+    return replace(matches, left_out=bad | matches.left_out)
 
 
 def _step_options(kind, given, argument, *, defaults=None, **own):
@@ -244,7 +270,7 @@ def check_results(out, overwrite):
         )
 
 
-def _check_exposures(exposures, min_exposures):
+def _check_exposures(exposures, min_exposures, bad):
     """There are enough, and all show one detector: a run on a mixture would co-add nonsense."""
     if len(exposures) < 2:
         raise MatchError(
@@ -259,8 +285,9 @@ def _check_exposures(exposures, min_exposures):
                 "give frames of one detector, or solve their tables with a shape for each"
             )
     if min_exposures > len(exposures):
+        good = "usable exposures" if bad else "exposures"
         raise InputError(
-            f"min_exposures is {min_exposures}, but there are {len(exposures)} exposures: "
+            f"min_exposures is {min_exposures}, but there are {len(exposures)} {good}: "
             f"give min_exposures={len(exposures)} (--min-exposures) or less"
         )
 

@@ -17,7 +17,7 @@ from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
 from ..inputs.exposure_files import file_checksums
 from ..inputs.table_files import read_table, stack, write_stars, write_table
-from ..priors.prior import EVIDENCE
+from ..priors.prior import EVIDENCE, HEADER, HeaderPrior
 from ..runtime import outputs, parallel, provenance
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from . import options
@@ -82,6 +82,7 @@ def do_demo(a):
     "frames to WCS, mosaic and report",
     "frames/*.fits --out results --degree 3",
     options.FRAMES,
+    options.STOPPING,
     options.out("folder for the results", path="results"),
     options.MEASURING,
     options.MATCHING,
@@ -92,12 +93,12 @@ def do_demo(a):
 )
 def do_run(a):
     """``legdistort run``."""
-    matching, solving = given(a, options.MATCHING), _solving(a)
+    matching, solving = given(a, options.MATCHING), _solving(a, with_headers=True)
     if a.method == "alternating":
         solving.setdefault("clip", None)  # the published scheme has none
     own = ("degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
     result = legdistort.run(
-        **given(a, options.FRAMES),
+        **given(a, options.FRAMES, options.STOPPING),
         out=a.out,
         **{name: group.pop(name) for group in (matching, solving) for name in own if name in group},
         measuring=given(a, options.MEASURING),
@@ -121,6 +122,7 @@ def do_run(a):
     "frames to a table of positions",
     "frames/*.fits --out stars.ecsv",
     options.FRAMES,
+    options.STOPPING,
     options.out("table (ECSV) of detections"),
     options.MEASURING,
     options.WORKERS,
@@ -131,12 +133,17 @@ def do_measure(a):
 
     measuring = given(a, options.MEASURING)
     MeasureOptions(**measuring)  # which refuses them before a frame is read
-    exposures = _open(a)
+    bad = {}
+    exposures = _open(a, left_out=bad, stop_at_bad=a.stop_at_bad)
     table = legdistort.measure(exposures, **measuring, **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
-    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures)}
+    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures), "left_out": bad}
     write_table(table, a.out, overwrite=a.overwrite)
-    _say(a, f"{len(table)} detections in {len(exposures)} exposures", {"n_detections": len(table), "shapes": shapes})
+    _say(
+        a,
+        f"{len(table)} detections in {len(exposures)} exposures",
+        {"n_detections": len(table), "shapes": shapes, "left_out": bad},
+    )
 
 
 @command(
@@ -183,7 +190,9 @@ def do_match(a):
         stack(tables), shape=tuple(a.shape) if a.shape else shapes or None, **given(a, options.MATCHING)
     )
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
-    matches = replace(matches, left_out=matches.left_out | empty)
+    bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
+    bad = {name: reason for name, reason in bad.items() if name not in names}
+    matches = replace(matches, left_out=bad | matches.left_out | empty)
     made = matches.table.copy()
     inputs = {name: checksum for each in tables for name, checksum in each.meta["inputs"].items()}
     made.meta = matches.to_meta() | {"inputs": inputs}
@@ -380,16 +389,18 @@ def _share(a):
     return {"workers": a.workers, "progress": wants_progress(a)}
 
 
-def _open(a):
-
+def _open(a, **reading):
     parallel.check_workers(a.workers)
-    return legdistort.open_exposures(**given(a, options.FRAMES), progress=wants_progress(a))
+    return legdistort.open_exposures(**given(a, options.FRAMES), **reading, progress=wants_progress(a))
 
 
-def _solving(a, shape=None):
+def _solving(a, shape=None, *, with_headers=False):
     """The arguments of `solve`; the prior read, no static distortion if there is none, with the widths asked for."""
-    keywords, prior = given(a, options.SOLVING), _prior(a.prior, shape)
+    keywords = given(a, options.SOLVING)
     sigma = keywords.pop("prior_sigma", None)
+    if with_headers and a.prior == HEADER:
+        return keywords | {"prior": HeaderPrior(sigma)}
+    prior = _prior(a.prior, shape)
     if sigma is not None:
         degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
         prior = (prior or legdistort.Prior([[0.0], [0.0]])).with_sigma(sigma, degree=degree)
@@ -398,6 +409,8 @@ def _solving(a, shape=None):
 
 def _prior(text, shape=None):
     """Whatever `legdistort.Prior.from_file` recognises."""
+    if text == HEADER and not Path(text).exists():
+        raise InputError("--prior header takes the distortion from the headers of frames, which only run reads")
     return None if text is None else legdistort.Prior.from_file(text, shape=shape)
 
 

@@ -22,6 +22,7 @@ FRAMES = {
     "paths": Option("FITS files, plain or compressed", "frames", nargs="+", metavar="FRAME", path="read"),
     "ext": Option("extension: number, name, or NAME,VERSION", type=extension),
 }
+STOPPING = {"stop_at_bad": Option("refuse blank and damaged frames, do not leave them out", action="store_true")}
 NAMED_SOLUTION = {"solution": Option("solution.asdf", required=True, path="read")}
 SOLUTION = {
     "solution": Option("solution.asdf", "solution", path="read"),
@@ -99,7 +100,9 @@ def clipping(default):
 
 SOLVING = {
     "degree": Option("total degree, or auto (default 3)", type=word_or(int, "auto"), default=3),
-    "prior": Option("known static distortion: see the command prior", path="read"),
+    "prior": Option(
+        "known static distortion: see the command prior; of run also header: that of the frames", path="read"
+    ),
     "prior_sigma": Option(
         "scatter of exposures around it; evidence: found from them", type=word_or(float, "evidence"), metavar="PIXELS"
     ),

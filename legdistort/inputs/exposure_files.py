@@ -2,6 +2,7 @@
 
 import glob
 import logging
+import re
 import threading
 import warnings
 import zlib
@@ -17,16 +18,26 @@ from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
 from tqdm import tqdm
 
-from ..exceptions import InputError
+from ..exceptions import AssumptionWarning, DamagedError, InputError, warn
 from ..runtime.provenance import checksum
 from .exposure_names import exposure_name
-from .exposures import Exposure, believable_wcs, known_from_header
+from .exposures import LEAVE_OUT, Exposure, believable_wcs, known_from_header
 
 log = logging.getLogger(__name__)
 
 #: Names of extensions that belong to an image, and how their values become standard deviations.
 UNCERTAINTY_NAMES = {"ERR": "StdDev", "UNCERT": "StdDev", "VAR": "Variance", "VARIANCE": "Variance"}
 MASK_NAMES = ("DQ", "MASK")
+#: Words in the names of extensions that are no images of the sky but stand beside one: errors, masks, weights, times,
+#: backgrounds, and the look-up tables of a WCS, as the archives of HST, JWST, ESO, NOIRLab and Astropy name them.
+_BESIDE = {
+    "ERR", "ERROR", "ERRORS", "UNCERT", "UNCERTAINTY", "VAR", "VARIANCE", "IVAR", "INVVAR", "STAT", "STDDEV",
+    "SIGMA", "RMS", "NOISE", "DQ", "PIXELDQ", "GROUPDQ", "MASK", "BPM", "FLAG", "FLAGS", "QUAL", "QUALITY", "WHT",
+    "WEIGHT", "WEIGHTS", "CON", "CTX", "CONTEXT", "CONFIDENCE", "COVERAGE", "FOOTPRINT", "EXP", "EXPTIME", "EXPMAP",
+    "TIME", "SAMP", "AREA", "BKG", "BACKGROUND", "SKY", "PSF", "PSFIMAGE", "WCSDVARR", "D2IMARR",
+}  # fmt: skip
+#: Images of a file that a message names.
+_MOST_NAMED = 8
 
 _FILTERS = threading.Lock()  # warning filters belong to the process, not to the thread that changes them
 _DAMAGED = "truncated or damaged, its image cannot be read"
@@ -40,7 +51,7 @@ class ExposureFile:
     Attributes
     ----------
     name, wcs, header, saturation, gain, read_noise, exposure_time, path
-        As those of the `Exposure`.
+        As those of the `Exposure`; so is `has_gwcs`.
     shape : tuple
         ``(ny, nx)``.
     checksum : str
@@ -60,6 +71,7 @@ class ExposureFile:
     path: Path
     checksum: str
     ext: object = None
+    has_gwcs: bool = False
 
     def read(self):
         """The `Exposure` with its pixels; what else is known is not worked out again.
@@ -101,7 +113,8 @@ def read_exposures(paths, *, ext=None, progress=False):
     paths : str, path, HDUList, CCDData, or a sequence of them
         A string with ``*`` or ``?`` is expanded if no file has that very name.
     ext : int, str or (str, int), optional
-        Extension to read from every file; by default ``SCI``, or else the first with a 2-D image.
+        Extension to read from every file; by default the image, ``SCI`` if one is named so. Planes beside it (``DQ``,
+        ``WHT`` and the like) do not count.
     progress : bool, optional
         Show a progress bar.
 
@@ -112,13 +125,14 @@ def read_exposures(paths, *, ext=None, progress=False):
     Raises
     ------
     InputError
-        Naming the file: missing, not FITS, truncated, without a 2-D image or the extension wanted,
-        without a good pixel, with the name of another one, or with a name that ``wcs/NAME.asdf`` could not have.
+        Naming the file: missing, not FITS, truncated, without a 2-D image or the extension wanted, with several
+        images and no `ext`, without a good pixel, with the name of another one, or with a name that ``wcs/NAME.asdf``
+        could not have.
     """
-    return _read_each(paths, partial(_read, ext=ext), progress)
+    return _read_each(paths, _read, ext, progress)
 
 
-def open_exposures(paths, *, ext=None, progress=False):
+def open_exposures(paths, *, ext=None, left_out=None, stop_at_bad=False, progress=False):
     """Exposures for work on more images than the memory holds.
 
     Every file is read once, so that it is known to be sound, and read again when its pixels are needed; what is in
@@ -129,6 +143,11 @@ def open_exposures(paths, *, ext=None, progress=False):
     ----------
     paths, ext, progress
         As for `legdistort.read_exposures`; the names are the same.
+    left_out : dict, optional
+        If given, what is blank (all pixels alike, hidden or NaN), truncated, damaged or without the image wanted is
+        left out with one warning, and added here, ``{name: reason}``.
+    stop_at_bad : bool
+        Refuse such files instead, naming all of them.
 
     Returns
     -------
@@ -137,17 +156,50 @@ def open_exposures(paths, *, ext=None, progress=False):
     Raises
     ------
     InputError
-        As `legdistort.read_exposures` does.
+        As `legdistort.read_exposures` does; with `left_out` also if fewer than two good ones remain.
     """
-    return _read_each(paths, partial(_open, ext=ext), progress)
+    if left_out is None and not stop_at_bad:
+        return _read_each(paths, _open, ext, progress)
+    bad = {}
+    exposures = _read_each(paths, partial(_open, even_blank=False), ext, progress, bad)
+    if bad:
+        _tell_bad(bad, len(exposures), stop_at_bad)
+        left_out.update({name: reason for name, (reason, _) in bad.items()})
+    return exposures
 
 
-def _read_each(paths, read, progress):
-    """What `read` makes of every source and its name in want of a better one; the names found are checked."""
+def _tell_bad(bad, n_good, stop_at_bad):
+    """Warn of bad files, or raise `InputError` for all of them."""
+    if n_good + len(bad) == 1:
+        ((_, error),) = bad.values()
+        raise error
+    same = {reason: [name for name, (other, _) in bad.items() if other == reason] for reason, _ in bad.values()}
+    named = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in same.items())
+    told = f"{len(bad)} of {n_good + len(bad)} frames cannot be used: {named}"
+    if stop_at_bad:
+        raise InputError(f"{told}; mend them, or leave them out")
+    if n_good < 2:
+        raise InputError(f"{told}; {'one good frame is' if n_good else 'no good frame is'} left, give at least two")
+    warn(f"{told}; they are left out (--stop-at-bad, stop_at_bad=True, refuses them)", AssumptionWarning)
+
+
+def _read_each(paths, read, ext, progress, bad=None):
+    """What `read` makes of every source and its name in want of a better one; the names found are checked.
+
+    What cannot be used is an error, or goes into the dict `bad`: ``{name: (reason, error)}``.
+    """
     origins, exposures = {}, []
     for i, source in enumerate(tqdm(expand_paths(paths), desc="reading", unit="frame", disable=not progress)):
-        with _quiet():
-            exposure = read(source, f"exposure_{i}")
+        try:
+            with _quiet():
+                exposure = read(source, f"exposure_{i}", ext)
+        except DamagedError as error:
+            if bad is None:
+                raise
+            name = exposure_name(source, ext) if isinstance(source, (str, Path)) else f"exposure_{i}"
+            reason = str(error).removeprefix(f"{source}: ").removeprefix(f"{name}: ").removesuffix(LEAVE_OUT)
+            bad[name] = reason, error
+            continue
         origin = exposure.path if exposure.path is not None else "in memory"
         if exposure.name in origins:
             raise InputError(
@@ -205,16 +257,25 @@ def _read(source, default, ext):
         return _from_hdulist(hdulist, ext, str(path), path)
 
 
-def _open(source, default, ext):
+def _open(source, default, ext, even_blank=True):
     if not isinstance(source, (str, Path)):
-        return _read(source, default, ext)
+        exposure = _read(source, default, ext)
+        return exposure if even_blank else _not_blank(exposure)
     path = Path(source)
     with _opened(path) as (file, hdulist):
         exposure = _from_hdulist(hdulist, ext, str(path), path)
+        exposure = exposure if even_blank else _not_blank(exposure)
         file.seek(0)
         digits = checksum(file)
     shared = {name: getattr(exposure, name) for name in _SHARED}
     return ExposureFile(**shared, shape=exposure.shape, checksum=digits, ext=ext)
+
+
+def _not_blank(exposure):
+    good = exposure.data[~exposure.mask]
+    if good.min() == good.max():
+        raise DamagedError(f"{exposure.name}: every pixel has the same value{LEAVE_OUT}")
+    return exposure
 
 
 @contextmanager
@@ -226,13 +287,13 @@ def _quiet():
 
 @contextmanager
 def _told(sentence):
-    """Whatever a damaged file provokes, as an `InputError` that begins with the sentence."""
+    """Whatever a damaged file provokes, as a `DamagedError` that begins with the sentence."""
     try:
         yield
     except InputError:
         raise
     except _UNREADABLE as error:
-        raise InputError(f"{sentence} ({error})") from None
+        raise DamagedError(f"{sentence} ({error})") from None
 
 
 @contextmanager
@@ -259,6 +320,9 @@ def _from_hdulist(hdulist, ext, label, path):
         log.info("%s: WCS of the header not used: %s", name, error)
         wcs = None
     known = known_from_header(header, planes["data"], integer=integer)
+    number = next(i for i, other in enumerate(hdulist) if other is hdu)
+    tables = [other.header.get("IMAGEHDU", number) for other in hdulist if other.name == "ASDF"]
+    known["has_gwcs"] = path is not None and tables == [number]
     return Exposure(name, **planes, header=header, wcs=wcs, path=path, **known)
 
 
@@ -268,20 +332,48 @@ def _is_image(hdu):
 
 def find_image(hdulist, ext, label):
     """The HDU to read (see `read_exposures`); `label` names the file in errors."""
-    try:
-        chosen = hdulist if ext is None else [hdulist[ext]]
-    except (KeyError, IndexError):
-        present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
-        raise InputError(f"{label}: no extension {ext!r}; the file has {present}") from None
-    # stable: SCI first, else the order of the file
-    candidates = sorted(filter(_is_image, chosen), key=lambda hdu: hdu.name != "SCI")
-    for hdu in candidates:
-        if len(hdu.shape) == 2:
-            return hdu
     where = "" if ext is None else f" in extension {ext!r}"
-    if candidates:
-        raise InputError(f"{label}: no 2-D image{where}, the data have shape {candidates[0].shape}; choose one plane")
-    raise InputError(f"{label}: no image{where}")
+    if ext is not None:
+        try:
+            candidates = [hdulist[ext]]
+        except (KeyError, IndexError):
+            present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
+            raise DamagedError(f"{label}: no extension {ext!r}; the file has {present}") from None
+        candidates = [hdu for hdu in candidates if _is_image(hdu)]
+    else:
+        every = [hdu for hdu in hdulist if _is_image(hdu)]
+        science = [hdu for hdu in every if hdu.name == "SCI"]
+        candidates = science or [hdu for hdu in every if not _stands_beside(hdu.name)] or every
+    if not candidates:
+        raise DamagedError(f"{label}: no image{where}")
+    images = [hdu for hdu in candidates if len(hdu.shape) > 1]
+    if len(images) > 1:
+        raise InputError(f"{label} holds {_listed_images(hdulist, images)}")
+    if not images or len(images[0].shape) > 2:
+        shape = (images or candidates)[0].shape
+        words = "choose one plane, and give it as a file of its own"
+        raise InputError(f"{label}: no 2-D image{where}, the data have shape {shape}; {words}")
+    return images[0]
+
+
+def _stands_beside(name):
+    """Whether an extension is by its name (``ERR``, ``VAR_POISSON``, ``CHIP1.DQ``, ``WHT2``) no image of the sky."""
+    words = re.split(r"[^A-Z0-9]+", name.upper())
+    return any(word in _BESIDE or word.rstrip("0123456789") in _BESIDE for word in words)
+
+
+def _listed_images(hdulist, images):
+    """How many images there are, which, and how to choose one."""
+    numbers = [str(i) for i, hdu in enumerate(hdulist) if any(hdu is image for image in images)]
+    forms = [f"{hdu.name},{hdu.ver}" if hdu.name else i for i, hdu in zip(numbers, images, strict=True)]
+    if len(set(forms)) < len(forms):
+        forms = numbers
+    named = [f"{form} {hdu.shape}" for form, hdu in zip(forms, images, strict=True)][:_MOST_NAMED]
+    more = f" and {len(images) - _MOST_NAMED} more" * (len(images) > _MOST_NAMED)
+    name, comma, version = forms[0].partition(",")
+    python = f"({name!r}, {version})" if comma else name
+    listed_so = f"{len(images)} images, {', '.join(named)}{more} (ny, nx)"
+    return f"{listed_so}: choose one with ext, as in ext={python} (--ext {forms[0]})"
 
 
 def _planes(hdulist, hdu):

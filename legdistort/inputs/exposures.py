@@ -10,7 +10,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from astropy.wcs.utils import proj_plane_pixel_scales
 
-from ..exceptions import InputError
+from ..exceptions import DamagedError, InputError
 from .exposure_names import check_exposure_name
 
 log = logging.getLogger(__name__)
@@ -27,6 +27,10 @@ KEYWORDS = {
 PIXEL_SCALES = (0.0001 / 3600, 0.1)
 #: ... and a reference pixel not farther from the centre than this many frame sizes (mosaics need several).
 REFERENCE_DISTANCE = 20
+
+
+#: What to do about an exposure that has nothing to offer.
+LEAVE_OUT = "; leave this exposure out or mend it"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,6 +58,8 @@ class Exposure:
     exposure_time : float or None
         Seconds.
     path : `~pathlib.Path` or None
+    has_gwcs : bool
+        Whether its file has an extension ``ASDF`` beside it, which may hold a gwcs.
 
     Raises
     ------
@@ -73,6 +79,7 @@ class Exposure:
     read_noise: float | None = None
     exposure_time: float | None = None
     path: Path | None = None
+    has_gwcs: bool = False
 
     def __post_init__(self):
         check_exposure_name(self.name, self.path)
@@ -89,7 +96,7 @@ class Exposure:
             cause = (
                 "is NaN or blank" if not np.isfinite(data).any() else "is hidden by the mask or the uncertainty plane"
             )
-            raise InputError(f"{self.name}: every pixel {cause}; leave this exposure out or mend it")
+            raise DamagedError(f"{self.name}: every pixel {cause}{LEAVE_OUT}")
         for key, value in {"data": data, "mask": mask, "uncertainty": uncertainty}.items():
             object.__setattr__(self, key, value)
 

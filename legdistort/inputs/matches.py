@@ -73,6 +73,8 @@ class Matches:
         ``{exposure: reason}`` of exposures that could not be used.
     epoch : float or None
         Mean of the exposures, a Julian year, if their headers tell it.
+    header_distortion : str or None
+        The largest distortion of the headers, in words, if they have one; it is not in the poses.
     observations : Observations
         The table as plain arrays; need not be given.
     """
@@ -83,6 +85,7 @@ class Matches:
     sky: TangentPlane | None = None
     left_out: dict = field(default_factory=dict)
     epoch: float | None = None
+    header_distortion: str | None = None
     observations: Observations | None = None
 
     def __post_init__(self):
@@ -196,7 +199,7 @@ class Matches:
             poses = dict(zip(seen.names, found, strict=True))
         else:
             poses = _check_poses(poses, seen.names)
-        return cls(table, shapes, poses, sky, dict(left_out or {}), epoch, seen)
+        return cls(table, shapes, poses, sky, dict(left_out or {}), epoch, observations=seen)
 
 
 def shapes_by_exposure(shape, names):

@@ -10,6 +10,7 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from ..exceptions import AssumptionWarning, warn
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
+from ..priors.from_headers import undistorted_plane
 
 #: Headers that disagree with the others by more than this part of the field do not say where the field lies.
 TOLERANCE = 0.1
@@ -35,7 +36,7 @@ class HeaderPoses:
 
     @classmethod
     def from_wcs(cls, wcss, shapes):
-        """From the linear parts of WCSs: on the tangent plane at their median pointing, in pixels of the first one.
+        """From WCSs less their distortions: on the tangent plane at their median pointing, in pixels of the first one.
 
         Parameters
         ----------
@@ -46,13 +47,14 @@ class HeaderPoses:
         """
         planes = {}
         if wcss:
-            centres = [_to_sky(w, _grid(shapes[name], 1)).cartesian.xyz.value[:, 0] for name, w in wcss.items()]
+            to_sky = {name: _undistorted(w, shapes[name]) for name, w in wcss.items()}
+            centres = [to_sky[name](_grid(shapes[name], 1)).cartesian.xyz.value[:, 0] for name in wcss]
             # the median, not the mean: one header may point anywhere
             middle = SkyCoord(*np.median(centres, axis=0), representation_type="cartesian").spherical
             on_sky = TangentPlane(middle.lon.deg, middle.lat.deg, similarity.identity())
-        for name, w in wcss.items():
+        for name in wcss:
             grid = _grid(shapes[name], 5)
-            plane = on_sky.from_sky(_to_sky(w, grid))
+            plane = on_sky.from_sky(to_sky[name](grid))
             if np.all(np.isfinite(plane)):
                 planes[name] = similarity.fit_similarity(grid, plane)
         if not planes:
@@ -107,8 +109,16 @@ def _grid(shape, n):
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def _to_sky(wcs, xy):
-    """Sky positions by the linear part of a WCS (no SIP or table), as the poses lead to undistorted pixels."""
-    wcs = wcs.celestial
-    lon, lat = wcs.wcs_pix2world(xy, 0).T
-    return SkyCoord(lon * u.deg, lat * u.deg, frame=wcs_to_celestial_frame(wcs)).icrs
+def _undistorted(wcs, shape):
+    """The function from undistorted pixels (n, 2) to the sky, as the poses lead to these.
+
+    A distortion has a similarity in it (the linear part of a header holds at its reference pixel alone): the pixels are
+    those that a static distortion without one leads to, as in a prior.
+    """
+    wcs, plane = wcs.celestial, undistorted_plane(wcs.celestial, shape)
+
+    def to_sky(xy):
+        lon, lat = wcs.wcs_pix2world(xy, 0).T if plane is None else plane.model()(*xy.T)
+        return SkyCoord(lon * u.deg, lat * u.deg, frame=wcs_to_celestial_frame(wcs)).icrs
+
+    return to_sky

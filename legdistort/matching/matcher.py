@@ -12,6 +12,7 @@ from ..inputs.matches import Matches, shapes_by_exposure
 from ..inputs.reference_catalogue import mean_epoch
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
+from ..priors.from_headers import describe_headers
 from .exposure_groups import interlink, link, standing, unite
 from .header_poses import HeaderPoses
 from .options import MatchOptions
@@ -111,8 +112,11 @@ def match(
         log.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
         star[~isolated] = -1
     table, star = _keep_common(table, star, min_exposures, left_out)
-    epoch = mean_epoch(e.header for e in named.values()) if named else None
-    return _finish(table, star, shapes, headers, left_out, epoch)
+    matches = _finish(table, star, shapes, headers, left_out)
+    if not named:
+        return matches
+    told = describe_headers([named[name] for name in matches.names])
+    return replace(matches, epoch=mean_epoch(e.header for e in named.values()), header_distortion=told)
 
 
 def _without_repetitions(table):
@@ -234,11 +238,11 @@ def _reasons(left_out):
     return "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
 
 
-def _finish(table, star, shapes, headers, left_out, epoch):
+def _finish(table, star, shapes, headers, left_out):
     table["star"] = _numbers(table, star)
     for name, reason in left_out.items():
         log.warning("%s is left out: %s", name, reason)
-    matches = Matches.from_table(table, shape=shapes, left_out=left_out, epoch=epoch)
+    matches = Matches.from_table(table, shape=shapes, left_out=left_out)
     poses, sky = headers.place(matches.poses)
     return replace(matches, poses=poses, sky=sky)
 

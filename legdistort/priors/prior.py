@@ -9,6 +9,8 @@ from ..geometry import basis
 
 #: As `sigma` of a `Prior`: to be found from the exposures.
 EVIDENCE = "evidence"
+#: As `prior` of `legdistort.run`: that of the headers of the frames.
+HEADER = "header"
 
 
 def _per_mode(value, n, name):
@@ -216,6 +218,40 @@ class Prior:
 
         return open_prior(where, cls, ext=ext, frame=frame, **options)
 
+    @classmethod
+    def from_headers(cls, exposures, *, degree=3, sigma=None, static_sigma=None):
+        """Prior from the distortions that the headers of exposures have, as `legdistort.solve` takes it.
+
+        Read are SIP, TPV, look-up tables and what else astropy reads; a gwcs in an extension ``ASDF`` goes before them.
+
+        Parameters
+        ----------
+        exposures : list of Exposure
+            From `legdistort.read_exposures` or `legdistort.open_exposures`.
+        degree : int
+            Total degree of the series at least; it is raised, up to 9, until less than 0.001 pixels are left out.
+        sigma, static_sigma
+            As for `Prior`.
+
+        Returns
+        -------
+        Prior or dict
+            One, if all headers tell the same (to 0.001 pixels); else ``{exposure: Prior}``.
+
+        Raises
+        ------
+        InputError
+            If no header has a distortion, or some have none and the others differ.
+
+        Warns
+        -----
+        AssumptionWarning
+            For headers without a distortion where all others tell the same, which is then taken for these too.
+        """
+        from .from_headers import from_headers
+
+        return from_headers(exposures, cls, degree=degree, sigma=sigma, static_sigma=static_sigma)
+
     def write(self, path, *, overwrite=False):
         """Write everything to an ASDF file (`legdistort.priors.storage`)."""
         from .storage import write_prior
@@ -228,6 +264,29 @@ class Prior:
         from .storage import read_prior
 
         return read_prior(path, cls)
+
+
+@dataclass(frozen=True, eq=False)
+class HeaderPrior:
+    """As `prior` of `legdistort.run`: that of the headers, with widths as of a `Prior`; ``"header"`` is one without."""
+
+    sigma: np.ndarray | str | None = None
+    static_sigma: np.ndarray | None = None
+
+    @property
+    def stand_in(self):
+        """A prior with the same widths, for checks before a header is read."""
+        return Prior([[0.0], [0.0]], **vars(self))
+
+    def read(self, exposures, degree):
+        """The prior, or dict of priors; `degree` may be a word."""
+        return Prior.from_headers(exposures, degree=3 if isinstance(degree, str) else degree, **vars(self))
+
+
+def tells(prior):
+    """Whether a prior, or any of a dict of them, tells of a distortion: its mean is not zero."""
+    each = prior.values() if isinstance(prior, dict) else [prior]
+    return any(p is not None and np.any(p.mean) for p in each)
 
 
 def means(prior):

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, warn
 from ..inputs.matches import Matches
+from ..priors.prior import tells
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
 from . import model_forms, reference_tie, single_fit
@@ -118,6 +119,12 @@ def solve(
     if not isinstance(matches, Matches):
         raise InputError(
             f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
+        )
+    if matches.header_distortion and model is None and not tells(prior):
+        warn(
+            f"the headers have a distortion ({matches.header_distortion}) that is not used; --prior header takes it as "
+            "the static distortion (in Python: Prior.from_headers(exposures))",
+            AssumptionWarning,
         )
     options, form, selection = asked, None, None
     if model is not None:
