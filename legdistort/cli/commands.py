@@ -428,7 +428,7 @@ def _solving(a, shape=None, *, with_headers=False):
 
 
 def _prior(text, shape, static_sigma):
-    """Whatever `legdistort.Prior.from_file` recognises; without a text, a distortion of which the size alone is known."""
+    """Whatever `legdistort.Prior.from_file` recognises; without a text, a distortion of which only the size is known."""
     if text == HEADER and not Path(text).exists():
         raise InputError("--prior header takes the distortion from the headers of frames, which only run reads")
     if text is None:

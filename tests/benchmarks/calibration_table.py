@@ -1,10 +1,10 @@
 """Reported absolute errors against true ones, over many simulated sets.
 
 ``python tests/benchmarks/calibration_table.py``. The truth is made of Chebyshev polynomials in pixels
-(``numpy.polynomial.chebyshev``), none of it by the package. Every set has a static distortion of its own, drawn with the
-width that the prior states, or 3 px rms where there is none, and exposures that depart from it independently. Errors are
-those of the star positions once a similarity of the plane and the unknown directions that the solution names are taken
-off.
+(``numpy.polynomial.chebyshev``), none of it by the package. Every set has a static distortion of its own, drawn with
+the width that the prior states, or 3 px rms where there is none, and exposures that depart from it independently.
+Errors are those of the star positions once a similarity of the plane and the unknown directions that the solution
+names are taken off.
 """
 
 import argparse

@@ -7,11 +7,11 @@ never tell it. What tells it is that single exposures depart from one static dis
 
 A_i are the coefficients as they come out with the plane bent by g, N_i is how a bend changes those of exposure i,
 Lambda is the scatter of single exposures and C_i the error of A_i. A_0, one for each detector, has the caller's
-prior: nothing (flat), a mean with its uncertainty, or a mean that is exact. With A_0 integrated out, g has a Gaussian posterior
-whose mean is linear in the A_i: it is where ``R (A - A_0) = 0`` with the rows ``R = M' (D + 1 S 1')^-1``, M the N_i one
-upon another, D the block diagonal of Lambda_i + C_i and S the variance of A_0. These rows are the constraints of the
-gauge, so that the positions and coefficients published are the posterior mean, and the variance of g under them is the
-absolute error.
+prior: nothing (flat), a mean with its uncertainty, or a mean that is exact. With A_0 integrated out, g has a Gaussian
+posterior whose mean is linear in the A_i: it is where ``R (A - A_0) = 0`` with the rows ``R = M' (D + 1 S 1')^-1``, M
+the N_i one upon another, D the block diagonal of Lambda_i + C_i and S the variance of A_0. These rows are the
+constraints of the gauge, so that the positions and coefficients published are the posterior mean, and the variance of
+g under them is the absolute error.
 
 Without a prior the rows see only that in which the N_i differ, which dithers and rolls bring about. What they do not
 tell to `LIMIT` pixels, rms over the stars, is *unknown*: there a convention holds the plane (the smallest dynamic part,
