@@ -166,16 +166,18 @@ def open_exposures(paths, *, ext=None, left_out=None, stop_at_bad=False, progres
     exposures = _read_each(paths, partial(_open, even_blank=False), ext, progress, bad)
     if bad:
         _tell_bad(bad, len(exposures), stop_at_bad)
-        left_out.update({name: reason for name, (reason, _) in bad.items()})
+        left_out.update({name: reason for name, (_, reason, _) in bad.items()})
     return exposures
 
 
 def _tell_bad(bad, n_good, stop_at_bad):
     """Warn of bad files, or raise `InputError` for all of them."""
     if n_good + len(bad) == 1:
-        ((_, error),) = bad.values()
+        ((_, _, error),) = bad.values()
         raise error
-    same = {reason: [name for name, (other, _) in bad.items() if other == reason] for reason, _ in bad.values()}
+    same = {}
+    for label, reason, _ in bad.values():
+        same.setdefault(reason, []).append(label)
     named = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in same.items())
     told = f"{len(bad)} of {n_good + len(bad)} frames cannot be used: {named}"
     if stop_at_bad:
@@ -188,7 +190,7 @@ def _tell_bad(bad, n_good, stop_at_bad):
 def _read_each(paths, read, ext, progress, bad=None):
     """What `read` makes of every source and its name in want of a better one; the names found are checked.
 
-    What cannot be used is an error, or goes into the dict `bad`: ``{name: (reason, error)}``.
+    What cannot be used is an error, or goes into the dict `bad`: ``{name: (file, reason, error)}``.
     """
     origins, exposures = {}, []
     for i, source in enumerate(tqdm(expand_paths(paths), desc="reading", unit="frame", disable=not progress)):
@@ -198,9 +200,10 @@ def _read_each(paths, read, ext, progress, bad=None):
         except DamagedError as error:
             if bad is None:
                 raise
-            name = exposure_name(source, ext) if isinstance(source, (str, Path)) else f"exposure_{i}"
+            file = Path(source).name if isinstance(source, (str, Path)) else f"exposure_{i}"
+            name = exposure_name(file, ext)
             reason = str(error).removeprefix(f"{source}: ").removeprefix(f"{name}: ").removesuffix(LEAVE_OUT)
-            bad[name] = reason, error
+            bad[name] = file, reason, error
             continue
         origin = exposure.path if exposure.path is not None else "in memory"
         if exposure.name in origins:
