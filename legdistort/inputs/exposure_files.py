@@ -336,8 +336,8 @@ def _is_image(hdu):
     return isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) and len(hdu.shape) > 0
 
 
-def find_image(hdulist, ext, label):
-    """The HDU to read (see `read_exposures`); `label` names the file in errors."""
+def find_image(hdulist, ext, label, *, of_several=False):
+    """The HDU to read (see `read_exposures`), `of_several` images the first; `label` names the file in errors."""
     where = "" if ext is None else f" in extension {ext!r}"
     if ext is not None:
         try:
@@ -353,7 +353,9 @@ def find_image(hdulist, ext, label):
     if not candidates:
         raise DamagedError(f"{label}: no image{where}")
     images = [hdu for hdu in candidates if len(hdu.shape) > 1]
-    if len(images) > 1:
+    if len(images) > 1 and of_several:
+        images.sort(key=lambda hdu: len(hdu.shape))  # stable: 2-D before cubes, else the order of the file
+    elif len(images) > 1:
         raise InputError(f"{label} holds {_listed_images(hdulist, images)}")
     if not images or len(images[0].shape) > 2:
         shape = (images or candidates)[0].shape

@@ -221,7 +221,7 @@ def _images(solution, raw, path, ext):
             return _nothing(solution, path, next(iter(candidates)))
         images = {}
         for name, form in found.items():
-            hdu = find_image(hdulist, form, str(path))
+            hdu = find_image(hdulist, form, str(path), of_several=True)  # whose name is that of the file alone
             if hdu.shape != tuple(solution.shapes[name]):
                 raise InputError(
                     f"{path}: the image has shape {hdu.shape}, exposure {name} of the solution "
