@@ -183,7 +183,7 @@ def test_bad_files_are_left_out_together(tmp_path, night):
     assert left_out.keys() == reasons.keys()
     for name, reason in reasons.items():
         assert left_out[name].startswith(reason)
-        assert f"{name}: {left_out[name]}" in warning
+        assert f"{name}.fits: {left_out[name]}" in warning
     assert warning.startswith("4 of 6 frames cannot be used")
 
 
@@ -195,7 +195,7 @@ def test_bad_files_are_refused_together(tmp_path, night):
         ld.open_exposures([*bad, night[0]], left_out={})
     for name, reason in reasons.items():
         for message in (str(error.value), str(lonely.value)):
-            assert f"{name}: {reason}" in message
+            assert f"{name}.fits: {reason}" in message
     with pytest.raises(InputError, match="no good frame is left"):
         ld.open_exposures(bad, left_out={})
     for path, reason in zip(bad, reasons.values(), strict=True):
@@ -223,7 +223,7 @@ def test_measure_and_match_leave_bad_files_out(tmp_path, night, capsys):
     line = ["measure", *map(str, [*night[:4], *bad]), "--out", str(out), "--quiet"]
     assert main([*line, "--stop-at-bad"]) == 1
     error = capsys.readouterr().err
-    assert all(f"{name}: {reason}" in error for name, reason in reasons.items())
+    assert all(f"{name}.fits: {reason}" in error for name, reason in reasons.items())
     assert not out.exists()
     assert main([*line, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["left_out"].keys() == reasons.keys()

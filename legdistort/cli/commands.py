@@ -17,7 +17,7 @@ from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
 from ..inputs.exposure_files import file_checksums
 from ..inputs.table_files import read_table, stack, write_stars, write_table
-from ..priors.prior import EVIDENCE, HEADER, HeaderPrior
+from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
 from ..runtime import outputs, parallel, provenance
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from . import options
@@ -423,12 +423,12 @@ def _solving(a, shape=None, *, with_headers=False):
     prior = _prior(a.prior, shape, static_sigma)
     if sigma is not None:
         degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
-        prior = (prior or legdistort.Prior([[0.0], [0.0]])).with_sigma(sigma, degree=degree)
+        prior = (prior or legdistort.Prior([[0.0], [0.0]], source=UNSTATED)).with_sigma(sigma, degree=degree)
     return keywords | {"prior": prior}
 
 
 def _prior(text, shape, static_sigma):
-    """Whatever `legdistort.Prior.from_file` recognises; without a text, a distortion of which only the size is known."""
+    """Whatever `Prior.from_file` recognises; without a text, a distortion of which only the size is known."""
     if text == HEADER and not Path(text).exists():
         raise InputError("--prior header takes the distortion from the headers of frames, which only run reads")
     if text is None:

@@ -164,16 +164,18 @@ def open_exposures(paths, *, ext=None, left_out=None, stop_at_bad=False, progres
     exposures = _read_each(paths, partial(_open, even_blank=False), ext, progress, bad)
     if bad:
         _tell_bad(bad, len(exposures), stop_at_bad)
-        left_out.update({name: reason for name, (reason, _) in bad.items()})
+        left_out.update({name: reason for name, (_, reason, _) in bad.items()})
     return exposures
 
 
 def _tell_bad(bad, n_good, stop_at_bad):
     """Warn of bad files, or raise `InputError` for all of them."""
     if n_good + len(bad) == 1:
-        ((_, error),) = bad.values()
+        ((_, _, error),) = bad.values()
         raise error
-    same = {reason: [name for name, (other, _) in bad.items() if other == reason] for reason, _ in bad.values()}
+    same = {}
+    for label, reason, _ in bad.values():
+        same.setdefault(reason, []).append(label)
     named = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in same.items())
     told = f"{len(bad)} of {n_good + len(bad)} frames cannot be used: {named}"
     if stop_at_bad:
@@ -186,7 +188,7 @@ def _tell_bad(bad, n_good, stop_at_bad):
 def _read_each(paths, read, ext, progress, bad=None):
     """What `read` makes of every source and its name in want of a better one; the names found are checked.
 
-    What cannot be used is an error, or goes into the dict `bad`: ``{name: (reason, error)}``.
+    What cannot be used is an error, or goes into the dict `bad`: ``{name: (file, reason, error)}``.
     """
     origins, exposures = {}, []
     for i, source in enumerate(tqdm(expand_paths(paths), desc="reading", unit="frame", disable=not progress)):
@@ -196,9 +198,10 @@ def _read_each(paths, read, ext, progress, bad=None):
         except DamagedError as error:
             if bad is None:
                 raise
-            name = exposure_name(source, ext) if isinstance(source, (str, Path)) else f"exposure_{i}"
+            file = Path(source).name if isinstance(source, (str, Path)) else f"exposure_{i}"
+            name = exposure_name(file, ext)
             reason = str(error).removeprefix(f"{source}: ").removeprefix(f"{name}: ").removesuffix(LEAVE_OUT)
-            bad[name] = reason, error
+            bad[name] = file, reason, error
             continue
         origin = exposure.path if exposure.path is not None else "in memory"
         if exposure.name in origins:
@@ -330,8 +333,8 @@ def _is_image(hdu):
     return isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) and len(hdu.shape) > 0
 
 
-def find_image(hdulist, ext, label):
-    """The HDU to read (see `read_exposures`); `label` names the file in errors."""
+def find_image(hdulist, ext, label, *, of_several=False):
+    """The HDU to read (see `read_exposures`), `of_several` images the first; `label` names the file in errors."""
     where = "" if ext is None else f" in extension {ext!r}"
     if ext is not None:
         try:
@@ -347,7 +350,9 @@ def find_image(hdulist, ext, label):
     if not candidates:
         raise DamagedError(f"{label}: no image{where}")
     images = [hdu for hdu in candidates if len(hdu.shape) > 1]
-    if len(images) > 1:
+    if len(images) > 1 and of_several:
+        images.sort(key=lambda hdu: len(hdu.shape))  # stable: 2-D before cubes, else the order of the file
+    elif len(images) > 1:
         raise InputError(f"{label} holds {_listed_images(hdulist, images)}")
     if not images or len(images[0].shape) > 2:
         shape = (images or candidates)[0].shape

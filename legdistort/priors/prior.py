@@ -12,6 +12,8 @@ from ..geometry import basis
 EVIDENCE = "evidence"
 #: As `prior` of `legdistort.run`: that of the headers of the frames.
 HEADER = "header"
+#: Source of a mean that nobody has stated.
+UNSTATED = "unstated"
 
 
 def _per_mode(value, n, name):
@@ -113,9 +115,14 @@ class Prior:
         return 0 if self.mean is None else basis.degree_of(self.mean.shape[1])
 
     def static_widths(self, degree):
-        """Uncertainty (2, n_modes) of the static distortion to a total degree, pixels; zero where it is exact."""
+        """Uncertainty (2, n_modes) of the static distortion to a total degree, pixels; zero where it is exact.
+
+        Infinite where nothing is stated.
+        """
         if self.mean is None:
             return np.full((2, basis.n_modes(degree)), self.static_sigma)
+        if self.source == UNSTATED:
+            return np.full((2, basis.n_modes(degree)), np.inf)
         return basis.change_degree(np.zeros((2, 1)) if self.static_sigma is None else self.static_sigma, degree)
 
     def describe(self):

@@ -121,12 +121,8 @@ def solve(
         raise InputError(
             f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
         )
-    if matches.header_distortion and model is None and not tells(prior):
-        warn(
-            f"the headers have a distortion ({matches.header_distortion}) that is not used; --prior header takes it as "
-            "the static distortion (in Python: Prior.from_headers(exposures))",
-            AssumptionWarning,
-        )
+    if model is None:
+        _warn_of_header(matches, prior)
     options, form, selection = asked, None, None
     if model is not None:
         form = model_forms.read(model, matches, degree=degree, gauge=gauge)
@@ -152,6 +148,16 @@ def solve(
     if kept_out is None:
         return solution
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
+
+
+def _warn_of_header(matches, prior):
+    """Warn of a distortion in the headers that is not used."""
+    if matches.header_distortion and not tells(prior):
+        warn(
+            f"the headers have a distortion ({matches.header_distortion}) that is not used; --prior header takes it as "
+            "the static distortion (in Python: Prior.from_headers(exposures))",
+            AssumptionWarning,
+        )
 
 
 def _choose_degree(matches, options):

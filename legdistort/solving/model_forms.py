@@ -14,7 +14,7 @@ from ..exceptions import FoldError, InputError
 from ..geometry import basis, fitter, similarity
 from ..geometry.distortion import Distortion
 from ..geometry.models import FastLegendre2D, leaves, rebuilt
-from ..priors.prior import Prior
+from ..priors.prior import UNSTATED, Prior
 
 #: A form must be a polynomial to this, pixels.
 _EXACT = 1e-8
@@ -104,7 +104,8 @@ class Form:
             sigma = np.full(mean.shape, np.inf)
             sigma[:, : expansion.free.shape[1]][~expansion.free] = 0
             sigma[:, 0] = np.inf  # a constant is a shift, which the pose carries
-            made[shape] = Prior(mean, sigma=sigma, shape=shape)
+            # coefficients that are all zero state no static distortion
+            made[shape] = Prior(mean, sigma=sigma, shape=shape, source=None if mean.any() else UNSTATED)
         return {name: made[shape] for name, shape in self._shapes.items()}
 
     def hold(self, names, coefficients):

@@ -219,7 +219,8 @@ def _images(solution, raw, path, ext):
             return _nothing(solution, path, next(iter(candidates)))
         images = {}
         for name, form in found.items():
-            hdu = exposure_files.find_image(hdulist, form, str(path))
+            # of several images the first, if the solution knows the file by its name alone
+            hdu = exposure_files.find_image(hdulist, form, str(path), of_several=True)
             if hdu.shape != tuple(solution.shapes[name]):
                 raise InputError(
                     f"{path}: the image has shape {hdu.shape}, exposure {name} of the solution "
