@@ -340,7 +340,7 @@ def test_bad_arguments():
         match(table, exposures=[exposure(f"e{k:02d}", None) for k in range(5)])
     with pytest.raises(InputError, match="no entry for exposure 'e05'"):
         match(table, shape={f"e{k:02d}": SHAPE for k in range(5)})
-    with pytest.raises(InputError, match="shape of exposure 'e00' must be .* got 5"):
+    with pytest.raises(InputError, match=r"shape of exposure 'e00' must be .* got 5"):
         match(table, shape=5)
     with pytest.raises(InputError, match="lacks the column"):
         match(table["exposure", "x", "y"], shape=SHAPE)
