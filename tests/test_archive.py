@@ -17,6 +17,7 @@ from astropy.modeling import models
 from astropy.table import MaskedColumn, QTable
 from astropy.time import Time
 from astropy.utils.masked import Masked
+from caller_warnings import warns_here
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -150,7 +151,7 @@ def test_columns_of_objects_are_left_out_loudly(tmp_path):
         when=lambda n: Time(np.arange(n) + 51544, format="mjd"),
         what=lambda n: np.array([{}] * n, dtype=object),
     )
-    with pytest.warns(AssumptionWarning, match=r"columns place, when, what of the observations: .* left out of the fi"):
+    with warns_here(AssumptionWarning, match=r"columns place, when, what of the observations: .* left out of the fi"):
         path = given.write(tmp_path / "s.asdf")
     kept = [c for c in given.residuals.colnames if c not in ("place", "when", "what")]
     assert Solution.read(path).residuals.colnames == kept

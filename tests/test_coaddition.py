@@ -16,6 +16,7 @@ from astropy.io import fits
 from astropy.modeling import models
 from astropy.table import QTable
 from astropy.wcs import WCS
+from caller_warnings import warns_here
 from gwcs import WCS as GWCS
 from scipy.optimize import least_squares
 
@@ -425,7 +426,7 @@ class TestCombination:
         assert mosaic.header["EXPTIME"] == 20
         assert mosaic.header["TEXPTIME"] == 40
         check_stars(mosaic, stars - mosaic.offset, 20 * flux)
-        with pytest.warns(AssumptionWarning, match="no exposure time known for frame1"):
+        with warns_here(AssumptionWarning, match="no exposure time known for frame1"):
             coadd([two[0], long], solution)
 
     def test_bad_pixels_leave_no_trace(self):
@@ -585,7 +586,7 @@ class TestBadInput:
     def test_exposures(self):
         solution, _, _, exposures, mosaic = plain()
         stranger = Exposure("stranger", np.ones(SHAPE))
-        with pytest.warns(AssumptionWarning, match="left out of the mosaic: stranger: it is not in the solution"):
+        with warns_here(AssumptionWarning, match="left out of the mosaic: stranger: it is not in the solution"):
             with_stranger = coadd([*exposures, stranger], solution)
         np.testing.assert_array_equal(with_stranger.data, mosaic.data)
         assert list(with_stranger.left_out) == ["stranger"]
@@ -616,11 +617,11 @@ class TestBadInput:
         solution, stars, flux = scene(7, rolls=[0] * 7)
         frames = expose(solution, stars, flux, header=fits.Header({"BUNIT": "adu"}))
         frames[1] = replace(frames[1], header=fits.Header({"BUNIT": "adu/s"}))
-        with pytest.warns(AssumptionWarning, match=r"the units \(BUNIT\) of the exposures differ: adu, adu/s"):
+        with warns_here(AssumptionWarning, match=r"the units \(BUNIT\) of the exposures differ: adu, adu/s"):
             coadd(frames, solution)
         dead = [frames[0]] + [replace(f, data=np.zeros(SHAPE), header=fits.Header()) for f in frames[1:]]
         names = "frame1, frame2, frame3, frame4, frame5 and 1 more"
-        with pytest.warns(AssumptionWarning, match=f"left out of the mosaic: {names}: every pixel is 0"):
+        with warns_here(AssumptionWarning, match=f"left out of the mosaic: {names}: every pixel is 0"):
             assert coadd(dead, solution, weights={f.name: 1 for f in dead}).exposures == ("frame0",)
         with pytest.raises(InputError, match="scale: no exposure of that name is co-added: frame9"):
             coadd(frames[:1], solution, scale={"frame0": 1, "frame9": 2})
@@ -628,7 +629,7 @@ class TestBadInput:
     def test_names_with_other_letters_go_into_the_file(self, tmp_path):
         solution, *_, exposures, _ = plain()
         strange = Exposure("né", np.ones(SHAPE))
-        with pytest.warns(AssumptionWarning, match="left out of the mosaic: né"):
+        with warns_here(AssumptionWarning, match="left out of the mosaic: né"):
             mosaic = coadd([*exposures, strange], solution)
         mosaic.write(tmp_path / "m.fits")
         history = str(fits.getheader(tmp_path / "m.fits")["HISTORY"])
@@ -639,7 +640,7 @@ class TestBadInput:
         grid = mosaic.wcs.deepcopy()
         grid.wcs.cd, grid.wcs.crpix = 3 * grid.wcs.cd, grid.wcs.crpix / 3
         grid.array_shape = tuple(n // 3 for n in mosaic.shape)
-        with pytest.warns(AssumptionWarning, match=r"pixels of the grid are 3\.\d times .* take algorithm='adaptive'"):
+        with warns_here(AssumptionWarning, match=r"pixels of the grid are 3\.\d times .* take algorithm='adaptive'"):
             coadd(exposures, solution, grid=grid)
         coadd(exposures, solution, grid=grid, algorithm="adaptive")
 

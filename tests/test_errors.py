@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 
 from legdistort.exceptions import AssumptionWarning
@@ -179,7 +180,7 @@ def test_what_residuals_hardly_determine_stays_with_the_convention(monkeypatch, 
 def test_real_frames_of_one_telescope_have_one_scale(shared_data):
     """Similarities between these frames leave 0.1 to 0.2 px, and their scales agree to 0.0005."""
     exposures = read_exposures(sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fits.gz")))
-    with pytest.warns(AssumptionWarning, match="no gain known"):
+    with warns_here(AssumptionWarning, match="no gain known"):
         detections = measure(exposures)
     matches = match(detections, exposures=exposures, min_exposures=4)
     for degree in (2, 3, 4, 5):

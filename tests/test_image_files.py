@@ -9,6 +9,7 @@ from astropy.io import fits
 from astropy.nddata import CCDData
 from astropy.table import Table, vstack
 from astropy.wcs import WCS
+from caller_warnings import warns_here
 
 import legdistort as ld
 from legdistort import pipeline
@@ -233,7 +234,7 @@ def test_measure_and_match_leave_bad_files_out(tmp_path, night, capsys):
 
 def test_run_leaves_bad_files_out(tmp_path, night):
     bad, reasons = bad_files(tmp_path)
-    with pytest.warns(AssumptionWarning, match="4 of 10 frames cannot be used"):
+    with warns_here(AssumptionWarning, match="4 of 10 frames cannot be used"):
         made = ld.run([*night, *bad], out=tmp_path / "out", degree=1)
     assert made.solution.left_out.keys() == reasons.keys() == made.summary["left_out"].keys()
     with pytest.raises(InputError, match="4 of 10 frames cannot be used"):
@@ -286,7 +287,7 @@ def test_headers_without_a_distortion():
     for wcs in (WCS(header(0, sip=None)), None):
         with pytest.raises(InputError, match="no header has a distortion that could be the prior"):
             ld.Prior.from_headers([Exposure("a", pixels(), wcs=wcs)])
-    with pytest.warns(AssumptionWarning, match="the headers of e1 have no distortion; they are given that"):
+    with warns_here(AssumptionWarning, match="the headers of e1 have no distortion; they are given that"):
         prior = ld.Prior.from_headers([exposure(0), exposure(1, sip=None)])
     assert isinstance(prior, ld.Prior)
 
@@ -328,9 +329,9 @@ def test_a_distortion_that_is_not_used_is_said():
     exposures = [exposure(k) for k in range(6)]
     matches = ld.match(table, exposures=exposures)
     words = r"the headers have a distortion \(SIP, up to [\d.]+ px over the detector\) that is not used; --prior "
-    with pytest.warns(AssumptionWarning, match=f"^{words}header takes it as the static distortion"):
+    with warns_here(AssumptionWarning, match=f"^{words}header takes it as the static distortion"):
         ld.solve(matches, degree=3)
-    with pytest.warns(AssumptionWarning, match=words):
+    with warns_here(AssumptionWarning, match=words):
         ld.solve(matches, degree=3, prior=ld.Prior([[0.0], [0.0]], sigma=5.0))
     with warnings.catch_warnings():
         warnings.simplefilter("error", AssumptionWarning)

@@ -9,6 +9,7 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 from astropy.wcs import WCS
+from caller_warnings import warns_here
 from reproject import reproject_interp
 from scipy.spatial import Delaunay
 from test_coaddition import SHAPE, SIGMA, StandIn, check_stars, covered, expose, fit_star, plain, scene, star_image
@@ -92,7 +93,7 @@ class TestFluxScale:
             factors, origin = flux_scales(frames, "auto", solution)
         assert origin == "stars"
         assert factors["frame0"] / factors["frame1"] == pytest.approx(3, rel=0.03)
-        with pytest.warns(AssumptionWarning, match="no exposure time known for frame1"):
+        with warns_here(AssumptionWarning, match="no exposure time known for frame1"):
             assert flux_scales(frames, "exptime", solution)[0]["frame0"] == 1
 
     def test_exposures_are_joined_through_others(self):

@@ -6,6 +6,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 from astropy.table import QTable, Table, vstack
+from caller_warnings import warns_here
 from star_fields import (
     CELLS,
     FLIPS,
@@ -264,7 +265,7 @@ def test_one_wrong_header_does_no_harm():
 
 def test_headers_all_wrong_are_ignored_with_a_warning():
     table, exposures, _ = header_case(np.zeros((6, 2)), wrong=range(6))
-    with pytest.warns(AssumptionWarning, match="header WCSs contradict"):
+    with warns_here(AssumptionWarning, match="header WCSs contradict"):
         matches = match(table, exposures=exposures)
     assert_good(table, matches)
     assert matches.sky is None
@@ -344,7 +345,7 @@ def test_bad_arguments():
         match(table, shape=5)
     with pytest.raises(InputError, match="lacks the column"):
         match(table["exposure", "x", "y"], shape=SHAPE)
-    with pytest.warns(AssumptionWarning, match="no shape given: every exposure is taken as 20[0-9]+ x 20"):
+    with warns_here(AssumptionWarning, match="no shape given: every exposure is taken as 20[0-9]+ x 20"):
         match(table)
 
 

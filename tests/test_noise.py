@@ -8,6 +8,7 @@ import pytest
 from astropy.io import fits
 from astropy.stats import biweight_scale
 from astropy.table import QTable
+from caller_warnings import warns_here
 
 import legdistort as ld
 from legdistort.cli import parser
@@ -208,7 +209,7 @@ def test_measure_takes_its_errors_from_the_curve(tmp_path):
 
 def test_missing_gain_is_estimated_and_said():
     exposure = replace(field(4, n=80), gain=None)
-    with pytest.warns(AssumptionWarning, match=r"photon noise of injected stars is estimated .* field4 [12]\.") as said:
+    with warns_here(AssumptionWarning, match=r"photon noise of injected stars is estimated .* field4 [12]\.") as said:
         curves = ld.calibrate_noise(exposure, fluxes=[1e5, 3e5], n_positions=40)
     assert len(said) == 1
     assert curves.table.meta["photon"]["field4"] == pytest.approx(1 / GAIN, rel=0.3)
@@ -220,7 +221,7 @@ def test_uncertainty_plane_tells_the_photon_noise():
     exposure = field(5)
     clean = np.maximum(exposure.data, 0)
     with_plane = replace(exposure, gain=None, uncertainty=np.sqrt(clean / GAIN + (READ_NOISE / GAIN) ** 2))
-    with pytest.warns(AssumptionWarning, match="photon noise of injected stars"):
+    with warns_here(AssumptionWarning, match="photon noise of injected stars"):
         curves = ld.calibrate_noise(with_plane, fluxes=[1e5, 3e5], n_positions=30)
     assert curves.table.meta["photon"]["field5"] == pytest.approx(1 / GAIN, rel=0.1)
 

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData
+from caller_warnings import warns_here
 from test_coaddition import SHAPE, expose, scene
 
 import legdistort as ld
@@ -76,7 +77,7 @@ def interruptible():
 class TestEach:
     @pytest.mark.parametrize("how", WORK)
     def test_results_warnings_log_and_errors_come_as_from_a_loop(self, how, caplog):
-        with pytest.warns(AssumptionWarning, match="three is assumed"):
+        with warns_here(AssumptionWarning, match="three is assumed"):
             assert list(map_items(work, range(10), **WORK[how])) == [i * i for i in range(10)]
         assert sorted(r.getMessage() for r in caplog.records) == [f"item {i}" for i in range(10)]
         with pytest.raises(InputError) as caught:
@@ -440,11 +441,11 @@ class TestMosaicInBlocks:
         empty = SimpleNamespace(name="frame1", shape=SHAPE, header=fits.Header(), exposure_time=None)
         empty.data, empty.mask, empty.uncertainty = np.ones(SHAPE), np.ones(SHAPE, dtype=bool), None
         empty.read = lambda: empty
-        with pytest.warns(AssumptionWarning, match="left out of the mosaic: frame1: every pixel is masked"):
+        with warns_here(AssumptionWarning, match="left out of the mosaic: frame1: every pixel is masked"):
             mosaic = ld.coadd([exposures[0], empty], solution)
         assert (mosaic.exposures, mosaic.left_out) == (("frame0",), {"frame1": "every pixel is masked"})
         with (
-            pytest.warns(AssumptionWarning, match="every pixel is masked"),
+            warns_here(AssumptionWarning, match="every pixel is masked"),
             pytest.raises(InputError, match="no exposure meets the output grid: frame1: every pixel is masked"),
         ):
             ld.coadd([empty], solution)

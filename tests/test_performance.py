@@ -122,8 +122,8 @@ def test_absolute_bias_is_the_one_expected(make, slack):
 def test_absolute_bias_adds_the_static_uncertainty():
     """The set shares the static distortion: its error does not average down."""
     sim = paper(0, n_stars=200)
-    sharp = solve(sim.matches, prior=Prior(sim.truth.static, sigma=1e-3))
-    vague = solve(sim.matches, prior=Prior(sim.truth.static, sigma=1e-3, static_sigma=0.5))
+    sharp = solve(sim.matches, prior=Prior(sim.truth.static, sigma=0.1))
+    vague = solve(sim.matches, prior=Prior(sim.truth.static, sigma=0.1, static_sigma=0.5))
     left, right = (accuracy.expected_bias(s, removed=1, absolute=True) for s in (sharp, vague))
     # 7 modes of degree 2 and 3 per axis, each 0.5 px: rms over the detector 0.5 sqrt(7) / 2 px
     assert np.sqrt(right**2 - left**2) == pytest.approx(0.5 * np.sqrt(7) / 2, rel=0.15)

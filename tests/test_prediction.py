@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.table import Table
+from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 from oracle import modes
 from oracle import predict as model
@@ -345,7 +346,7 @@ def test_a_distorting_prior_and_the_mean_gauge():
 
 def test_many_coefficients_are_approximated_and_it_is_said(monkeypatch):
     monkeypatch.setattr(covariances, "DENSE_LIMIT", 50)
-    with pytest.warns(AssumptionWarning, match="80 coefficients: their covariance is approximated"):
+    with warns_here(AssumptionWarning, match="80 coefficients: their covariance is approximated"):
         p = predict(n_exposures=4, n_stars=200, sigma=0.1)
     assert p.sigma == pytest.approx(0.1 * p.thumb[1], rel=0.05)
 

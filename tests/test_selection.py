@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from astropy import units as u
+from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 
 from legdistort import Matches, Solution, run, solve
@@ -280,7 +281,7 @@ def test_noise_is_no_energy():
 def test_alarm_is_raised():
     """Sixteen stars, precise, with more distortion than they can be fitted with at degree 3."""
     sim = simulate(16, 0.5, 0.5, 0.5, 0.3, 0.3, sigma=0.01, seed=2)
-    with pytest.warns(AssumptionWarning, match=r"degree \d, of 0 to .*Degree \d is there as well, .* px rms beyond"):
+    with warns_here(AssumptionWarning, match=r"degree \d, of 0 to .*Degree \d is there as well, .* px rms beyond"):
         solution = solved(sim, degree="auto")
     chosen = solution.diagnostics.selection
     assert chosen.alarm

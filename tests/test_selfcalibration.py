@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.table import vstack
+from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
@@ -155,7 +156,7 @@ def test_every_detector_has_its_own():
 @pytest.mark.parametrize("own", [0, 1])
 def test_says_what_dithers_alone_do_not_tell(own):
     sim = camera(rolls=None)
-    with pytest.warns(AssumptionWarning, match=r"(4 of 16|6 of 14) unknowns of the shared distortion are not told"):
+    with warns_here(AssumptionWarning, match=r"(4 of 16|6 of 14) unknowns of the shared distortion are not told"):
         solution = solve(sim.matches, static="fit", exposure_degree=own)
     assert len(solution.coefficients) == 12
 

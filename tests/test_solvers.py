@@ -6,6 +6,7 @@ import inspect
 import numpy as np
 import pytest
 from astropy import units as u
+from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 from oracle import DenseOracle, predict
 
@@ -113,7 +114,7 @@ def test_alternating_reaches_the_same_minimum():
     sim = simulate_matches(seed=3)
     prior = Prior(sim.truth.static)
     joint = solve(sim.matches, prior=prior)
-    with pytest.warns(ConvergenceWarning, match="drift along directions that the data do not tell"):
+    with warns_here(ConvergenceWarning, match="drift along directions that the data do not tell"):
         published = solve(sim.matches, prior=prior, method="alternating", max_iterations=60)
     assert_allclose(published.chi2, joint.chi2, rtol=2e-4)
     assert accuracy.bias(published.positions, joint.positions, removed=3) < 5e-4
@@ -124,8 +125,9 @@ def test_conjugate_gradients_give_the_direct_answer(monkeypatch):
     direct = solve(sim.matches, degree=2, prior=Prior(sim.truth.static))
     monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: False)
     iterative = solve(sim.matches, degree=2, prior=Prior(sim.truth.static))
-    assert_allclose(iterative.positions, direct.positions, atol=1e-6)
-    assert_allclose(iterative.coefficients, direct.coefficients, atol=1e-6)
+    # the scatter of exposures, which weighs in the gauge, is found by iterations of its own
+    assert_allclose(iterative.positions, direct.positions, atol=1e-5)
+    assert_allclose(iterative.coefficients, direct.coefficients, atol=1e-5)
 
 
 def test_poses_carry_the_similarities():
@@ -198,7 +200,7 @@ def test_halved_errors_quarter_the_covariance():
     # the gauge weighs the scatter against the errors, so only what is free of it scales to the letter
     full = accuracy.expected_bias(whole, removed=2)
     assert_allclose(accuracy.expected_bias(half, removed=2), full / 2, rtol=1e-3)
-    assert_allclose(half.chi2, 4 * whole.chi2, rtol=1e-4)
+    assert_allclose(half.chi2, 4 * whole.chi2, rtol=1e-3)
 
 
 def test_an_exposure_of_infinite_error_changes_nothing():

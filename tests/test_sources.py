@@ -14,6 +14,7 @@ from astropy.coordinates import ICRS
 from astropy.io import fits
 from astropy.modeling import models
 from astropy.wcs import WCS
+from caller_warnings import warns_here
 from gwcs import coordinate_frames as cf
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -189,7 +190,7 @@ def test_fits_headers(tmp_path, ctype, by_hand, place):
 def test_hst_header(shared_data):
     path = shared_data / "gwcs_interop" / "acs_wfc.hdr"
     header = fits.Header.fromtextfile(path)
-    with pytest.warns(AssumptionWarning, match=r"look-up tables .*CPDIS1.*CPERR1 = 0\.083.* give the FITS file"):
+    with warns_here(AssumptionWarning, match=r"look-up tables .*CPDIS1.*CPERR1 = 0\.083.* give the FITS file"):
         source = read_source(path).stated(shape=(2048, 4096))
     tables = [card for card in header.cards if card.keyword.startswith(("CPDIS", "D2IMDIS", "DP", "D2IM1"))]
     for keyword in {card.keyword for card in tables}:

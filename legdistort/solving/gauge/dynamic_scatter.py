@@ -53,7 +53,7 @@ def dynamic_covariance(problem, state, error, moved, others, group, static):
         weight = counts / (variance + scatter2 + 1e-300)
         left, leverage = _fitted(design, weight, own, stated)
         dof = np.maximum(counts.sum(axis=0) - leverage, 0.0)
-        new = _pooled(_excess(left, variance, counts, dof), dof)
+        new = _pooled(_excess(left, variance, counts, dof), dof, np.mean(own**2))
         change, scatter2 = np.abs(new - scatter2).max(initial=0), new
         if change < 1e-3 * new.max(initial=0):
             break
@@ -83,17 +83,20 @@ def _fitted(design, weight, own, stated):
     return left, np.einsum("ika,ab,ikb,ik->k", design, inverse, design, weight, optimize=True)
 
 
-def _pooled(variance, dof):
+def _pooled(variance, dof, largest):
     """Variance per mode, shears first, drawn towards the mean of its degree by the weight of `_SHARED` exposures.
 
     A handful of exposures determines the scatter of a single mode badly, and weights that follow its noise make
     positions worse and reported errors too small. A degree of which nothing is determined (shears, in four exposures
     without rolls) is taken to scatter with twice the variance of the degree that scatters most: distortions fall with
-    the degree. `dof` (K,) are the degrees of freedom that a fit leaves to every mode.
+    the degree. Where nothing is determined of any degree, exposures may scatter by as much as they depart from the
+    prior mean, the mean square of which is `largest`. `dof` (K,) are the degrees of freedom that a fit leaves to every
+    mode.
     """
     degree = dynamic_degrees(len(variance) // 2 + 2)
     number, total = np.bincount(degree, dof), np.bincount(degree, dof * variance)
-    most = 2 * (total / np.maximum(number, 1e-300))[number > 1].max(initial=0)
+    seen = (total / np.maximum(number, 1e-300))[number > 1]
+    most = 2 * seen.max() if seen.size else largest
     usual = ((total + _BORROWED * most) / (number + _BORROWED))[degree]
     return (dof * variance + _SHARED * usual) / (dof + _SHARED)
 
