@@ -6,13 +6,14 @@ import re
 import numpy as np
 import oracle
 import pytest
+from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 from scipy.spatial import Delaunay
 
 from legdistort import Matches, Solution, solve
 from legdistort.assessment import baselines
 from legdistort.cli import parser
-from legdistort.exceptions import InputError, LegdistortError, SolveError
+from legdistort.exceptions import ConvergenceWarning, InputError, LegdistortError, SolveError
 from legdistort.geometry.detector_modes import dynamic_basis, dynamic_degrees
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
@@ -483,3 +484,9 @@ def test_wrong_priors_are_told():
     assert ratio[3] > 2.5
     assert chi2[3] > chi2[0] + 0.4
     assert b[3] > 1.1 * b[0]
+
+
+def test_widths_that_do_not_settle_are_warned_of(monkeypatch):
+    monkeypatch.setattr(prior_widths, "MAX_ROUNDS", 1)
+    with warns_here(ConvergenceWarning, match="the widths of the prior have not settled after 1 fits"):
+        found(simulate(40))

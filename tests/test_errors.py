@@ -187,7 +187,8 @@ def test_real_frames_of_one_telescope_have_one_scale(shared_data):
         solution = solve(matches, degree=degree, clip=5.0)
         scales = [np.sqrt(np.linalg.det(pose[:, :2])) for pose in solution.poses.values()]
         assert_allclose(scales, 1, rtol=0, atol=0.001)
-        assert rms_distortion(solution) < 0.5
+        # at degree 2 the small turns between the frames determine z^2, to less than the 1 px that counts as unknown
+        assert rms_distortion(solution) < 1.0
 
 
 @pytest.mark.slow

@@ -142,8 +142,12 @@ class ReferenceTie:
         n, k = gauge.n_modes, directions.shape[2] // 2
         covariance = np.zeros((2, k, 2, k))
         covariance[:, :n, :, :n] = gauge.covariance.reshape(2, n, 2, n)
-        maps = np.array([each.map for each in gauge.unknown_maps]).reshape(-1, 2 * n).T
-        return catalogue_map.map_prior(covariance.reshape(2 * k, -1), maps, directions, tuple(2 * gauge.box[1, ::-1]))
+        maps = np.zeros((2, k, len(gauge.unknown_maps)))
+        for j, each in enumerate(gauge.unknown_maps):
+            maps[:, :n, j] = each.map.reshape(2, n)
+        return catalogue_map.map_prior(
+            covariance.reshape(2 * k, -1), maps.reshape(2 * k, -1), directions, tuple(2 * gauge.box[1, ::-1])
+        )
 
     def _equations(self, result, directions, errors, prior):
         positions = result.state.positions.T
