@@ -61,12 +61,6 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
     return out
 
 
-def map_covariance(gauge, xy):
-    """Covariance xx, yy, xy (3, n) of the common map at any reference positions (n, 2); NaN where it is unknown."""
-    covariance = gauge.absolute_covariance
-    return _spread(plain_directions(gauge, xy, len(covariance) // 2), covariance)
-
-
 def coefficient_variance(gauge, block, i):
     """Variance (2, n_modes) of the coefficients of exposure i from their covariance `block` in the gauge.
 

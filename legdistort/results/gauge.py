@@ -190,15 +190,12 @@ class Gauge:
 
         Posterior standard deviation above 1 px, rms over the stars, where no size of the static distortion is stated.
         """
-        return self._mapped + self.responses.weak
-
-    @property
-    def _mapped(self):
         shape = (len(self.motion), 2, self.n_modes)
-        return tuple(
+        mapped = tuple(
             UnknownDirection(each.name, self.directions @ each.map, -(self.motion @ each.map).reshape(shape))
             for each in self.unknown_maps
         )
+        return mapped + self.responses.weak
 
     @property
     def absolute_covariance(self):
@@ -230,11 +227,8 @@ class Gauge:
     @property
     def unknown_names(self):
         """Names of what is unknown, each once."""
-        return tuple(dict.fromkeys([each.name for each in self.unknown_maps] + [w.name for w in self._weak]))
-
-    @property
-    def _weak(self):
-        return () if self.responses is None else self.responses.weak
+        weak = () if self.responses is None else self.responses.weak
+        return tuple(dict.fromkeys(each.name for each in (*self.unknown_maps, *weak)))
 
     @property
     def warning(self):

@@ -168,7 +168,6 @@ def one(seed, simulating, solving):
 def row(name, n_sets, **changed):
     """The figures of a setting over many sets."""
     simulating, solving = settings()[name]
-    results = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LegdistortWarning)
         results = [one(seed, simulating | changed, solving) for seed in range(n_sets)]
@@ -177,13 +176,18 @@ def row(name, n_sets, **changed):
     return true, reported, max(set(named), key=named.count)
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def command_line(description):
+    """What was asked for; the package keeps silent."""
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("--sets", type=int, default=100)
     parser.add_argument("--exposures", type=int, nargs="+", default=[11, 6, 4])
     parser.add_argument("--only", default="", help="settings whose names contain this")
-    arguments = parser.parse_args()
     logging.getLogger("legdistort").setLevel(logging.ERROR)
+    return parser.parse_args()
+
+
+def main():
+    arguments = command_line(__doc__)
     print(f"{'setting':32s} {'exposures':>9s} {'true rms':>9s} {'reported':>9s} {'ratio^2':>8s}  unknown")
     for name in settings():
         for n in arguments.exposures if arguments.only in name else []:

@@ -6,8 +6,6 @@ and the unknown directions are fitted and taken off. Absolute: mean square of th
 similarity of the stars is taken off, or none with a reference. Both should be 1.
 """
 
-import argparse
-import logging
 import warnings
 
 import calibration_table as sets
@@ -95,12 +93,7 @@ def row(name, n_sets, **changed):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sets", type=int, default=100)
-    parser.add_argument("--exposures", type=int, nargs="+", default=[11, 6, 4])
-    parser.add_argument("--only", default="", help="settings whose names contain this")
-    arguments = parser.parse_args()
-    logging.getLogger("legdistort").setLevel(logging.ERROR)
+    arguments = sets.command_line(__doc__)
     print(f"{'setting':36s} {'exposures':>9s} {'relative':>9s} {'absolute':>9s}")
     for name in SETTINGS:
         for n in arguments.exposures if arguments.only in name else []:
