@@ -15,6 +15,7 @@ __version__ = version("legdistort")
 # Loaded when first asked for: astropy.modeling looks into this package for a fitter while it is itself half imported,
 # and a program that only fits models should not wait for the rest.
 _PLACES = {
+    "EffectivePSF": "measurement.effective.model",
     "Exposure": "inputs.exposures",
     "LegdistortError": "exceptions",
     "LegdistortWarning": "exceptions",
@@ -24,12 +25,14 @@ _PLACES = {
     "Solution": "results.solution",
     "calibrate_noise": "measurement.noise_calibration",
     "coadd": "coaddition.mosaicking",
+    "effective_psf": "measurement.positions",
     "match": "matching.matcher",
     "measure": "measurement.positions",
     "open_exposures": "inputs.exposure_files",
     "predict": "simulation.prediction",
     "read_exposures": "inputs.exposure_files",
     "read_wcs": "wcs.storage",
+    "refine": "wcs.refinement",
     "run": "pipeline",
     "simulate_exposures": "simulation.observations",
     "simulate_matches": "simulation.observations",

@@ -11,6 +11,8 @@ import os
 import warnings
 from pathlib import Path
 
+from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
+
 
 class LegdistortError(Exception):
     """Base of every error that the package raises on purpose."""
@@ -44,7 +46,7 @@ class ExportError(LegdistortError, ValueError):
     """A result does not fit the form asked for; allow a larger error, or choose a form that is exact."""
 
 
-class LegdistortWarning(UserWarning):
+class LegdistortWarning(AstropyUserWarning):
     """Base of every warning of the package."""
 
 
@@ -54,6 +56,15 @@ class ConvergenceWarning(LegdistortWarning):
 
 class AssumptionWarning(LegdistortWarning):
     """Something was missing from the input and a stated value was assumed."""
+
+
+@contextlib.contextmanager
+def without_astropy_warnings():
+    """Ignore the warnings of astropy, of files a little off the standard; ours, a kind of them, stay as they were."""
+    ours = [each[0] for each in warnings.filters if issubclass(LegdistortWarning, each[2]) and not (each[1] or each[3])]
+    with warnings.catch_warnings(action="ignore", category=AstropyWarning):
+        warnings.simplefilter(next(iter(ours), "default"), LegdistortWarning)
+        yield
 
 
 def some_of(names, most):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .assessment import baselines, stack_quality
+from .assessment import baselines, run_checks, stack_quality
 from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
 from .exceptions import InputError, MatchError
@@ -17,19 +17,20 @@ from .inputs import exposure_files, table_files
 from .matching.matcher import match
 from .matching.options import MatchOptions
 from .measurement.options import MeasureOptions
-from .measurement.positions import measure
+from .measurement.positions import measure_with_psfs, write_psfs
 from .priors.prior import HEADER, HeaderPrior
 from .reporting.page import write_report
 from .results import accuracy
+from .results.check import Check
 from .runtime import checks, outputs, parallel, provenance
 from .solving.estimation import solve
-from .solving.options import SolveOptions, check_reference
+from .solving.options import CLIP, SolveOptions, check_reference
 from .wcs.storage import write_wcs
 
 log = logging.getLogger(__name__)
 
 #: What `run` and the command ``solve`` leave in their folder, and replace there.
-RESULTS = ("solution.asdf", "stars.ecsv", "wcs", "mosaic.fits", "report.html", "summary.json")
+RESULTS = ("solution.asdf", "stars.ecsv", "wcs", "psf", "mosaic.fits", "report.html", "summary.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,11 @@ class Run:
     mosaic: object
     summary: dict
 
+    @property
+    def checks(self):
+        """The checks of the solution, and those of images and stack: a tuple of `~legdistort.results.check.Check`."""
+        return tuple(Check(**each) for each in self.summary["checks"])
+
     def __repr__(self):
         return f"<Run: {self.solution!r} in {self.out}>"
 
@@ -60,10 +66,12 @@ def run(
     *,
     out,
     ext=None,
+    dq_good=None,
     degree=3,
     prior=None,
     min_exposures=4,
-    clip=5.0,
+    clip=CLIP,
+    psf="auto",
     reference=None,
     epoch=None,
     pixel_scale=None,
@@ -81,12 +89,14 @@ def run(
 
     Parameters
     ----------
-    paths : str, path, HDUList, CCDData or a sequence of them
+    paths : str, path, HDUList, NDData or a sequence of them
         See `legdistort.read_exposures`.
     out : str or path
         Folder for the results; made if it does not exist. Nothing is left there if the run fails.
     ext : int, str or (str, int), optional
         Extension to read from every file.
+    dq_good : int, str or sequence of int, optional
+        Flags that are no reason to leave a pixel out.
     degree : int
         Total degree of the distortion.
     prior : Prior, dict, "header" or HeaderPrior, optional
@@ -94,7 +104,9 @@ def run(
     min_exposures : int
         Stars seen in fewer exposures are not used.
     clip : float or None
-        Leave out observations beyond this many standard errors.
+        Leave out observations beyond this many standard errors, see `legdistort.solve`.
+    psf : str, EffectivePSF, path, photutils model or dict of those
+        What the stars are fitted with, see `legdistort.measure`.
     reference, epoch, pixel_scale : optional
         Catalogue to tie the positions to, see `legdistort.solve`.
     measuring, matching, solving, coadding : dict, optional
@@ -126,7 +138,7 @@ def run(
     """
     out = Path(out)
     check_results(out, overwrite)
-    measuring = _step_options(MeasureOptions, measuring, "measuring")
+    measuring = _step_options(MeasureOptions, measuring, "measuring", psf=psf)
     matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures)
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
@@ -135,10 +147,10 @@ def run(
     parallel.check_workers(workers)
     share, timings = {"workers": workers, "progress": progress}, {}
     with _timed(timings, "read"):
-        exposures, bad = _open_frames(paths, min_exposures, ext=ext, stop_at_bad=stop_at_bad, progress=progress)
+        exposures, bad = _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress)
         solving = replace(solving, prior=_known_prior(prior, exposures, degree))
     with _timed(timings, "measure"):
-        detections = measure(exposures, **vars(measuring), **share)
+        detections, psfs = measure_with_psfs(exposures, measuring, **share)
     with _timed(timings, "match"):
         matches = _also_left_out(match(detections, exposures=exposures, **vars(matching)), bad)
     with _timed(timings, "solve"):
@@ -157,18 +169,19 @@ def run(
                 stacks = _if_possible(stack_quality.compare_stacks, kept, comparison, mosaic=mosaic, **vars(coadding))
     with outputs.replacing_folder(out) as target:
         with _timed(timings, "write"):
-            write_results(solution, target)
+            write_results(solution, target, psfs=psfs)
             mosaic.write(target / "mosaic.fits")
-        summary = summarise(solution, timings=timings) | _assessed(quality, comparison, stacks)
-        shown = {"mosaic": mosaic, "comparison": comparison, "stacks": stacks}
+        summary = summarise(solution, timings=timings) | _assessed(solution, quality, comparison, stacks)
+        shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks}
         write_report(target / "report.html", solution, summary=summary, **shown)
         write_summary(target / "summary.json", summary)
     return Run(out, solution, mosaic, summary)
 
 
-def _open_frames(paths, min_exposures, **options):
+def _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress):
     """Exposures that can be solved together, and the bad ones as ``{name: reason}``."""
     bad = {}
+    options = {"ext": ext, "dq_good": dq_good, "stop_at_bad": stop_at_bad, "progress": progress}
     exposures = exposure_files.open_exposures(paths, left_out=bad, **options)
     _check_exposures(exposures, min_exposures, bad)
     return exposures, bad
@@ -198,9 +211,10 @@ def _step_options(kind, given, argument, *, defaults=None, **own):
     return checks.options_from(kind, given, argument)
 
 
-def _assessed(quality, comparison, stacks):
-    """What the summary says of the mosaic and of other corrections, as far as it is known."""
-    figures = {"fwhm_ratio": quality and quality.fwhm_ratio}
+def _assessed(solution, quality, comparison, stacks):
+    """What the summary says of images, mosaic and other corrections, as far as it is known; all checks among it."""
+    checked = solution.checks + run_checks.check_run(solution, quality)
+    figures = {"checks": [asdict(check) for check in checked], "fwhm_ratio": quality and quality.fwhm_ratio}
     if quality:
         figures["quality"] = asdict(quality)
     if comparison:
@@ -210,13 +224,14 @@ def _assessed(quality, comparison, stacks):
     return figures
 
 
-def write_results(solution, target):
-    """Write ``solution.asdf``, ``stars.ecsv`` and ``wcs/NAME.asdf`` of a solution into an existing folder."""
+def write_results(solution, target, *, psfs=None):
+    """Write ``solution.asdf``, ``stars.ecsv``, ``wcs/NAME.asdf`` and ``psf/NAME.fits`` into an existing folder."""
     solution.write(target / "solution.asdf")
     table_files.write_stars(solution, target / "stars.ecsv")
     (target / "wcs").mkdir()
     for name in solution.names:
         write_wcs(solution, name, target / "wcs" / f"{name}.asdf")
+    write_psfs(psfs or {}, target / "psf")
 
 
 def write_summary(path, summary):
@@ -240,6 +255,7 @@ def summarise(solution, *, timings=None):
         "dof": int(solution.dof),
         "rms_px": float(np.sqrt(np.mean(solution.rms**2))),
         "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
+        "checks": [asdict(check) for check in solution.checks],
         "gauge": solution.gauge.sentence,
         "unknown": list(solution.gauge.unknown_names),
         "sky": solution.sky_sentence,

@@ -2,10 +2,16 @@
 
 import bz2
 import dataclasses
+import datetime
 import gzip
+import hashlib
 import io
 import json
 import os
+import re
+import shutil
+import subprocess
+import time
 import warnings
 from pathlib import Path
 
@@ -17,10 +23,12 @@ from astropy.wcs import WCS
 from numpy.testing import assert_allclose, assert_array_equal
 from test_headers import detector, geometry  # noqa: F401  (a fixture)
 
+import legdistort
 from legdistort.cli.parser import main
 from legdistort.exceptions import ExportError, InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.results.solution import Solution
 from legdistort.runtime.fits_bytes import locate
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve
@@ -189,7 +197,9 @@ def test_every_other_byte_stays(one, frame, tmp_path, kind):
     ]
     assert rest[0] == rest[1]
     if kind is not None:
-        assert sum(c.startswith("HISTORY") for c in rest[1]) == 1
+        told, kept = (c.rstrip() for c in cards(after, new[0]) if c.startswith("HISTORY"))
+        assert re.fullmatch(r"HISTORY legdistort \S+ wrote the WCS of this image, \d{4}-\d\d-\d\d", told)
+        assert kept == "HISTORY reduced"
         assert sum(c.startswith("CONTINUE") for c in cards(after, new[0])) == 2  # of LONGTEXT, not of WCSNAME
         assert new[0].header["LONGTEXT"] == old[0].header["LONGTEXT"]
         header = new[0].header
@@ -241,7 +251,7 @@ def test_compressed_images_are_not_packed_again(geometry, tmp_path):  # noqa: F8
     with fits.open(frame) as hdus:
         assert_array_equal(hdus["PACKED"].data, pixels(1).astype("int16"))
         assert hdus["PACKED"].header["A_ORDER"] == done.header["A_ORDER"]
-        assert hdus["ASDF"].header["IMAGEHDU"] == 1
+        assert hdus["ASDF"].header["EXPNAME"] == "frame_PACKED"
 
 
 @pytest.mark.parametrize(("suffix", "module"), [(".gz", gzip), (".bz2", bz2)])
@@ -266,8 +276,93 @@ def test_attaching_again_replaces(one, frame):
     header = fits.getheader(frame)
     assert header["CRVAL1"] == 50.0
     assert sum(key.startswith("PV") for key in header) == 1  # PVX
+    assert len(header["HISTORY"]) == 2  # the frame's own, and ours once
     assert_array_equal(wcs_in(frame)(3.0, 4.0), turned.wcs("frame")(3.0, 4.0))
     check_sums(frame)
+
+
+def moved(path, layout):
+    """The file with its image elsewhere, as fpack and funpack, and others that leave the primary HDU empty, make it."""
+    with fits.open(path) as hdus:
+        image = next(hdu for hdu in hdus if hdu.is_image and hdu.shape == SHAPE)
+        rest = [hdu.copy() for hdu in hdus if not hdu.is_image]
+        if layout == "packed":
+            image = fits.CompImageHDU(image.data, image.header, name="COMPRESSED_IMAGE")
+        elif layout == "extension":
+            image = fits.ImageHDU(image.data, image.header)
+        else:
+            image = fits.PrimaryHDU(image.data, image.header)
+        first = [] if layout == "primary" else [fits.PrimaryHDU()]
+        fits.HDUList([*first, image, *rest]).writeto(path, overwrite=True)
+
+
+@pytest.mark.parametrize(("start", "then"), [("primary", "packed"), ("packed", "primary"), ("extension", "packed")])
+def test_its_own_extension_is_known_wherever_it_stands(one, tmp_path, start, then):
+    frame = tmp_path / "frame.fits"
+    table = fits.BinTableHDU.from_columns([fits.Column("a", "D", array=[1.0])], name="LOG")
+    fits.HDUList([fits.PrimaryHDU(pixels().astype("int16")), table]).writeto(frame)
+    moved(frame, start)
+    attach(one, frame, in_place=True)
+    moved(frame, then)
+    turned = dataclasses.replace(one, sky=TangentPlane(50.0, 5.0, one.sky.matrix))
+    attach(turned, frame, in_place=True)
+    assert [name for name in names_in(frame) if name in ("ASDF", "LOG")] == ["LOG", "ASDF"]
+    assert_array_equal(wcs_in(frame)(3.0, 4.0), turned.wcs("frame")(3.0, 4.0))
+    (exposure,) = legdistort.read_exposures(frame)
+    assert exposure.has_gwcs
+
+
+@pytest.mark.skipif(shutil.which("fpack") is None, reason="fpack is not installed")
+def test_fpack_and_back(one, tmp_path):
+    frame = tmp_path / "frame.fits"
+    fits.PrimaryHDU(pixels().astype("int16")).writeto(frame)
+    attach(one, frame, in_place=True)
+    subprocess.run(["fpack", "-D", "-Y", frame], check=True)
+    turned = dataclasses.replace(one, sky=TangentPlane(50.0, 5.0, one.sky.matrix))
+    (done,) = attach(turned, f"{frame}.fz", in_place=True)
+    assert names_in(done.path).count("ASDF") == 1
+    assert_array_equal(wcs_in(done.path)(3.0, 4.0), turned.wcs("frame")(3.0, 4.0))
+    subprocess.run(["funpack", "-D", f"{frame}.fz"], check=True)
+    attach(one, frame, in_place=True)
+    assert names_in(frame) == ["PRIMARY", "ASDF"]
+    assert_array_equal(wcs_in(frame)(3.0, 4.0), one.wcs("frame")(3.0, 4.0))
+    check_sums(frame)
+
+
+def test_a_frame_under_another_name(one, frame, tmp_path):
+    """What was attached under the old name would be stale beside what the new one gets."""
+    attach(one, frame, in_place=True)
+    os.rename(frame, tmp_path / "other.fits")
+    attach(one, tmp_path / "other.fits", in_place=True)
+    assert names_in(tmp_path / "other.fits").count("ASDF") == 1
+    assert_array_equal(wcs_in(tmp_path / "other.fits")(3.0, 4.0), one.wcs("other")(3.0, 4.0))
+
+
+def test_names_beyond_ascii(geometry, tmp_path):  # noqa: F811
+    name = "nuit_é_星" + 70 * "x"
+    solution, path = geometry(1, 2.0, shape=SHAPE, names=(name,)), tmp_path / f"{name}.fits"
+    fits.writeto(path, pixels().astype("int16"))
+    for _ in range(2):
+        attach(solution, path, in_place=True)
+    assert names_in(path) == ["PRIMARY", "ASDF"]
+    check_sums(path)
+
+
+# --- where it comes from -----------------------------------------------------------------------------------------
+
+
+def test_provenance(one, frame, stored):
+    attach(Solution.read(stored), frame.with_name("exp00.fits"), in_place=True)
+    image, table = (fits.getheader(frame.with_name("exp00.fits"), ext) for ext in (0, "ASDF"))
+    digest = hashlib.sha256(Path(stored).read_bytes()).hexdigest()
+    assert image["SOLSHA"] == table["SOLSHA"] == digest
+    assert table["EXPNAME"] == "exp00"
+    assert table["CREATOR"] == f"legdistort {legdistort.__version__}"
+    assert abs(datetime.datetime.fromisoformat(table["DATE"] + "+00:00").timestamp() - time.time()) < 60
+    assert f"legdistort {legdistort.__version__}, numpy" in " ".join(table["HISTORY"])
+    attach(one, frame, in_place=True)  # in memory, or changed since it was read
+    assert "SOLSHA" not in fits.getheader(frame)
+    assert dataclasses.replace(Solution.read(stored), degree=1).checksum is None
 
 
 # --- several detectors -------------------------------------------------------------------------------------------
@@ -289,18 +384,51 @@ def test_all_detectors_of_a_file_at_once(geometry, mosaic):  # noqa: F811
         header = fits.getheader(mosaic, ("SCI", number))
         assert holds(header, item.header)
         assert_array_equal(wcs_in(mosaic, number)(3.0, 4.0), solution.wcs(item.exposure)(3.0, 4.0))
-        assert fits.getheader(mosaic, ("ASDF", number))["IMAGEHDU"] == number
+        assert fits.getheader(mosaic, ("ASDF", number))["EXPNAME"] == f"night_SCI{number}"
 
 
 def test_detectors_one_by_one(geometry, mosaic):  # noqa: F811
     solution = geometry(3, 2.0, shape=SHAPE, names=("night_SCI1", "night_2"))
     attach(solution, mosaic, in_place=True, kind=None, ext=2)
     attach(solution, mosaic, in_place=True, kind=None, ext=("SCI", 1))
-    assert fits.getheader(mosaic, ("ASDF", 1))["IMAGEHDU"] == 2
-    assert fits.getheader(mosaic, ("ASDF", 2))["IMAGEHDU"] == 1
+    assert fits.getheader(mosaic, ("ASDF", 1))["EXPNAME"] == "night_2"
+    assert fits.getheader(mosaic, ("ASDF", 2))["EXPNAME"] == "night_SCI1"
     assert_array_equal(wcs_in(mosaic, 1)(3.0, 4.0), solution.wcs("night_2")(3.0, 4.0))
     attach(solution, mosaic, in_place=True, kind=None)
     assert names_in(mosaic) == ["PRIMARY", "SCI", "SCI", "ASDF", "ASDF"]
+
+
+def test_errors_and_flags_get_the_wcs_of_their_image(geometry, tmp_path):  # noqa: F811
+    """Of two detectors, each to its own by EXTVER; not what has another shape or is another image."""
+    solution = geometry(1, 2.0, shape=SHAPE, names=("night_SCI1", "night_SCI2"))
+    path, zeros = tmp_path / "night.fits", np.zeros(SHAPE, "uint8")
+    beside = [fits.ImageHDU(zeros, header_of(OLD), name=name, ver=k) for k in (1, 2) for name in ("SCI", "ERR", "DQ")]
+    others = [fits.ImageHDU(zeros[:9], name="ERR", ver=3), fits.ImageHDU(zeros, name="SCI", ver=4)]
+    fits.HDUList([fits.PrimaryHDU(), *beside, *others]).writeto(path)
+    before = path.read_bytes()
+    attach(solution, path, in_place=True, ext=("SCI", 2))
+    first, *_ = locate(before, path)[4:5]
+    assert path.read_bytes()[: first.start] == before[: first.start]  # nothing of the other detector
+    done = {item.exposure[-1]: item.header for item in attach(solution, path, in_place=True, kind="tpv")}
+    for k, header in done.items():
+        for name in ("SCI", "ERR", "DQ"):
+            assert holds(fits.getheader(path, (name, int(k))), header)
+    assert done["1"]["CRVAL1"] == fits.getheader(path, ("DQ", 1))["CRVAL1"]
+    assert "CTYPE1" not in fits.getheader(path, ("ERR", 3))
+    assert "CTYPE1" not in fits.getheader(path, ("SCI", 4))
+    before = path.read_bytes()
+    attach(solution, path, out=tmp_path / "out", kind=None)
+    last = locate(before, path)[8]
+    assert (tmp_path / "out" / "night.fits").read_bytes()[: last.stop] == before[: last.stop]
+
+
+def test_flags_of_two_images_are_left_alone(geometry, tmp_path):  # noqa: F811
+    solution = geometry(1, 2.0, shape=SHAPE, names=("night_A", "night_B"))
+    hdus = [fits.ImageHDU(np.zeros(SHAPE, "uint8"), name=name) for name in ("A", "B", "DQ")]
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(tmp_path / "night.fits")
+    attach(solution, tmp_path / "night.fits", in_place=True)
+    assert "CTYPE1" in fits.getheader(tmp_path / "night.fits", "B")
+    assert "CTYPE1" not in fits.getheader(tmp_path / "night.fits", "DQ")
 
 
 def test_one_image_under_two_names(geometry, mosaic):  # noqa: F811
@@ -468,7 +596,9 @@ def test_foreign_asdf_is_replaced_when_asked(one, frame):
 
 def test_no_sky(one, frame):
     blind = dataclasses.replace(one, sky=None)
-    with pytest.raises(InputError, match=r"does not know the sky.*reference catalogue.*kind=None \(--asdf-only\)"):
+    with pytest.raises(
+        InputError, match=r"does not know the sky.*\(reference=, --reference\); kind=None \(--asdf-only\)"
+    ):
         attach(blind, frame, in_place=True)
     (done,) = attach(blind, frame, in_place=True, kind=None)
     assert repr(done) == f"<Attachment: frame in {frame}: ASDF>"

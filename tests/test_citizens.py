@@ -1,6 +1,7 @@
 """The WCS of an exposure in other people's hands: one test with each real library."""
 
 import warnings
+from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -15,6 +16,7 @@ from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.aperture import CircularAperture, EllipticalAperture, SkyCircularAperture, aperture_photometry
 from reproject.mosaicking import find_optimal_celestial_wcs, reproject_and_coadd
+from test_headers import detector, geometries, pixels_of, sky_of
 
 from legdistort.exceptions import ExportError, InputError
 from legdistort.geometry.tangent_plane import TangentPlane
@@ -123,6 +125,71 @@ def test_reproject_finds_the_frame(solution, image, target):
     mosaic, footprint = reproject_and_coadd(both, wcs, shape_out=shape, reproject_function=reproject.reproject_interp)
     assert mosaic.shape == shape
     assert footprint.max() == 2
+
+
+#: Right ascension and declination of the middle of a detector: on a pole, across RA = 0, and elsewhere.
+PLACES = {"pole": (0.0, 90.0), "RA 0": (0.0, -30.0), "plain": (140.0, 60.0)}
+
+
+@pytest.fixture(scope="module", params=PLACES)
+def bent(request):
+    """A detector with 25 px of distortion, its middle at one of the `PLACES`."""
+    lon, lat = PLACES[request.param]
+    made = geometries()(5, 25.0, lon=lon, lat=lat, turn=0.0, shape=(400, 560))
+    sky = TangentPlane(lon, lat, 50 * made.sky.matrix)  # 1 arcsec a pixel: reproject_exact was once too coarse for less
+    return replace(made, coefficients=-made.coefficients, sky=sky)  # with edges that bend outwards
+
+
+def test_no_position_on_the_detector_is_lost(bent):
+    wcs = bent.wcs("a")
+    p, ra, dec = (a[404:] for a in detector(bent, "a"))  # the first ones are on the edge, to all digits
+    for sky in ((ra, dec), (ra - 360, dec), (ra * u.deg, dec * u.deg)):
+        back = np.column_stack([u.Quantity(a, u.pix).value for a in wcs.invert(*sky)])
+        assert np.hypot(*(back - p).T).max() < 2e-6
+    assert np.hypot(*(np.column_stack(wcs.world_to_pixel(SkyCoord(ra, dec, unit="deg"))) - p).T).max() < 2e-6
+    corners, places = wcs.footprint(), np.column_stack([ra, dec])
+    for sky in (corners, places):
+        sky[:, 0] = (sky[:, 0] - bent.sky.lon + 180) % 360
+    # a box around the corners would lose some
+    assert np.any((places < corners.min(axis=0)) | (places > corners.max(axis=0)))
+
+
+def test_positions_beyond_the_detector_are_nan(bent):
+    """The opposite half of the sky as well, which a gnomonic projection could send to the same pixels."""
+    wcs = bent.wcs("a")
+    ny, nx = bent.shapes["a"]
+    middle = np.array([nx - 1, ny - 1]) / 2
+    ring = [[np.cos(t), np.sin(t)] for t in np.linspace(0, 2 * np.pi, 40)]
+    far = np.concatenate([middle + np.hypot(nx, ny) * s * np.array(ring) for s in (0.6, 1, 3, 30)])
+    ra, dec = sky_of(bent, "a", far)
+    assert np.isnan(wcs.world_to_pixel_values(ra, dec)).all()
+    assert_array_equal(wcs.in_image(ra, dec), False)
+    ra, dec = sky_of(bent, "a", middle + np.zeros((1, 2)))
+    assert np.isfinite(wcs.world_to_pixel_values(ra, dec)).all()
+    assert np.isnan(wcs.world_to_pixel_values((ra + 180) % 360, -dec)).all()
+    assert wcs.footprint().shape == (4, 2)
+    assert wcs.pixel_bounds == ((-0.5, nx - 0.5), (-0.5, ny - 0.5))
+
+
+@pytest.mark.parametrize("method", ["interp", "adaptive", "exact"])
+def test_reproject_fills_the_whole_image(bent, method):
+    """An image that rises by one a column and three a row, on a plain grid: every pixel holds where it comes from."""
+    ny, nx = bent.shapes["a"]
+    y, x = np.mgrid[:ny, :nx].astype(float)
+    shape = ny // 2 + 60, nx // 2 + 60
+    grid = WCS(naxis=2)
+    grid.wcs.ctype, grid.wcs.crval = ["RA---TAN", "DEC--TAN"], [bent.sky.lon, bent.sky.lat]
+    grid.wcs.crpix = (shape[1] + 1) / 2, (shape[0] + 1) / 2
+    grid.wcs.cdelt = np.array([-2.0, 2.0]) * bent.sky.pixel_scale / 3600
+    out, _ = getattr(reproject, f"reproject_{method}")((x + 3 * y, bent.wcs("a")), grid, shape_out=shape)
+    to = np.indices(shape)[::-1].reshape(2, -1).T
+    p = pixels_of(bent, "a", *grid.all_pix2world(to, 0).T).reshape(*shape, 2)
+    inside = np.minimum(np.minimum(p[..., 0], nx - 1 - p[..., 0]), np.minimum(p[..., 1], ny - 1 - p[..., 1]))
+    well = inside > 6
+    assert 0.4 < well.mean() < 0.9
+    assert np.isfinite(out[well]).all()
+    assert np.abs(out - p @ [1, 3])[well].max() < (1e-4 if method == "interp" else 0.25)
+    assert np.isnan(out[inside < -6]).all()
 
 
 def test_photutils(solution, image):

@@ -14,13 +14,16 @@ from astropy import units as u
 from astropy.coordinates import ICRS, SkyCoord
 from astropy.io import fits
 from astropy.modeling import models
+from astropy.nddata import CCDData, VarianceUncertainty
 from astropy.table import QTable
+from astropy.time import Time
+from astropy.utils.exceptions import AstropyUserWarning
 from astropy.wcs import WCS
 from caller_warnings import warns_here
 from gwcs import WCS as GWCS
 from scipy.optimize import least_squares
 
-from legdistort.coaddition.grids import reference_grid
+from legdistort.coaddition.grids import read_grid, reference_grid
 from legdistort.coaddition.mosaicking import coadd
 from legdistort.coaddition.options import CoaddOptions
 from legdistort.coaddition.preparation import fill_bad
@@ -467,7 +470,17 @@ class TestFile:
         mosaic.write(tmp_path / "m.fits")
         assert [p.name for p in tmp_path.iterdir()] == ["m.fits"]
         with fits.open(tmp_path / "m.fits") as hdulist:
-            assert [h.name for h in hdulist] == ["SCI", "VAR", "WEIGHT", "FOOTPRINT", "FLAGS", "CONTEXT"]
+            assert [h.name for h in hdulist] == [
+                "SCI",
+                "UNCERT",
+                "MASK",
+                "WEIGHT",
+                "FOOTPRINT",
+                "FLAGS",
+                "EXTRAPOLATED",
+                "REJECTED",
+                "CONTEXT",
+            ]
             header = hdulist[0].header
             assert header["BUNIT"] == "adu"
             assert header["NCOMBINE"] == 4
@@ -483,12 +496,92 @@ class TestFile:
 
     def test_the_file_is_that_of_the_hdulist(self, tmp_path):
         *_, mosaic = plain()
-        mosaic.to_hdulist().writeto(tmp_path / "whole.fits")
+        mosaic.to_hdulist().writeto(tmp_path / "whole.fits", checksum=True)
         for name in ("rows.fits", "packed.fits.gz"):
             mosaic.write(tmp_path / name)
-        whole = (tmp_path / "whole.fits").read_bytes()
-        assert (tmp_path / "rows.fits").read_bytes() == whole
-        assert gzip.decompress((tmp_path / "packed.fits.gz").read_bytes()) == whole
+        rows = (tmp_path / "rows.fits").read_bytes()
+        assert gzip.decompress((tmp_path / "packed.fits.gz").read_bytes()) == rows
+        with fits.open(tmp_path / "whole.fits") as whole, fits.open(tmp_path / "rows.fits", checksum=True) as mine:
+            assert len(whole) == len(mine)  # a checksum that is not true would be warned of
+            assert not fits.FITSDiff(whole, mine, ignore_keywords=["CHECKSUM"], ignore_comments=["DATASUM"]).diff_hdus
+
+    def test_wrong_checksums_are_noticed(self, tmp_path):
+        plain()[-1].write(tmp_path / "m.fits")
+        raw = bytearray((tmp_path / "m.fits").read_bytes())
+        raw[-2880 * 3] ^= 1
+        (tmp_path / "m.fits").write_bytes(raw)
+        with pytest.warns(AstropyUserWarning, match=r"(Data|Check)sum verification failed for HDU"):
+            fits.open(tmp_path / "m.fits", checksum=True).close()
+
+    def test_ccddata_finds_unit_variance_mask_and_wcs(self, tmp_path):
+        solution, stars, _, exposures, _ = plain()
+        mosaic = coadd(exposures, solution)
+        mosaic.write(tmp_path / "m.fits")
+        direct = mosaic.to_ccddata()
+        assert np.shares_memory(direct.data, mosaic.data)
+        for ccd in (CCDData.read(tmp_path / "m.fits"), direct):
+            assert ccd.unit == u.adu
+            np.testing.assert_array_equal(ccd.data, mosaic.data)
+            assert type(ccd.uncertainty) is VarianceUncertainty
+            np.testing.assert_array_equal(ccd.uncertainty.array, mosaic.variance)
+            np.testing.assert_array_equal(ccd.mask, np.isnan(mosaic.data))
+            assert ccd.mask.dtype == bool
+            sky = ccd.wcs.pixel_to_world(*(stars - mosaic.offset).T)
+            assert solution.sky.to_sky(stars).separation(sky).max() < 1e-9 * u.deg
+            assert ccd.header["NCOMBINE"] == 4
+
+    def test_files_of_earlier_versions_are_read(self, tmp_path):
+        """They had VAR and no mask."""
+        solution, *_, exposures, _ = plain()
+        noisy = [Exposure(e.name, e.data, uncertainty=np.full(SHAPE, 2.0), header=e.header) for e in exposures]
+        mosaic = coadd(noisy, solution)
+        hdus = mosaic.to_hdulist()
+        hdus["UNCERT"].header.remove("UTYPE")
+        hdus["UNCERT"].name = "VAR"
+        for name in ("MASK", "EXTRAPOLATED", "REJECTED"):
+            del hdus[name]
+        hdus.writeto(tmp_path / "old.fits")
+        (old,) = read_exposures(tmp_path / "old.fits")
+        np.testing.assert_allclose(old.uncertainty**2, mosaic.variance, rtol=1e-5)
+        assert read_grid(tmp_path / "old.fits").array_shape == mosaic.shape
+
+    @pytest.mark.parametrize("unit", ["no unit", ""])
+    def test_a_mosaic_without_a_unit_is_dimensionless(self, unit):
+        *_, mosaic = plain()
+        header = mosaic.header.copy()
+        header["BUNIT"] = unit
+        assert replace(mosaic, header=header).to_ccddata().unit == u.dimensionless_unscaled
+
+    def test_times_of_the_exposures(self, tmp_path):
+        solution, *_, exposures, _ = plain()
+        clocks = [("DATE-OBS", "2024-03-01"), ("TIME-OBS", "22:00:00.5")], [("MJD-OBS", 60371.0)]
+        clocks += [("DATE-BEG", "2024-03-02T00:10:00")], [("DATE-OBS", "2024-03-02T00:20:00"), ("TIME-OBS", "9")]
+        timed = []
+        for exposure, cards in zip(exposures, clocks, strict=True):
+            header = fits.Header(cards)
+            timed.append(Exposure(exposure.name, exposure.data, header=header, exposure_time=60.0))
+        header = coadd(timed, solution).header
+        assert header["DATE-BEG"] == header["DATE-OBS"] == "2024-03-01T22:00:00.500"
+        assert header["DATE-END"] == "2024-03-02T00:21:00.000"
+        starts = Time(["2024-03-01T22:00:00.5", "2024-03-02T00:00:00", "2024-03-02T00:10:00", "2024-03-02T00:20:00"])
+        assert header["MJD-AVG"] == pytest.approx(np.mean(starts.mjd) + 30 / 86400, abs=1e-9)
+        timed[0] = Exposure(timed[0].name, timed[0].data, header=fits.Header([("DATE-OBS", "?")]), exposure_time=60.0)
+        assert "DATE-BEG" not in coadd(timed, solution).header  # of all or not at all
+
+    def test_shares(self):
+        """Of four exposures one is rejected at a hot pixel, where the flag says only that there is one."""
+        solution, *_, exposures, _ = plain()
+        spoilt = exposures[0].data.copy()
+        spoilt[100:103, 100:103] += 1e5
+        mosaic = coadd([Exposure(exposures[0].name, spoilt, header=exposures[0].header), *exposures[1:]], solution,
+                       method="clipped")  # fmt: skip
+        hit = (mosaic.flags & 4 > 0) & (mosaic.footprint == 3)
+        assert hit.any()
+        assert set(mosaic.rejected[hit].tolist()) == {25}
+        assert not mosaic.rejected[mosaic.flags & 4 == 0].any()
+        assert not mosaic.extrapolated[mosaic.flags & 1 == 0].any()
+        assert mosaic.extrapolated[mosaic.flags & 1 > 0].all()
+        assert mosaic.extrapolated.max() <= 100
 
     def test_asdf(self, tmp_path):
         solution, stars, _, exposures, _ = plain()

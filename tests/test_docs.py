@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 import legdistort
 from legdistort.cli import parser
@@ -81,6 +82,23 @@ def test_the_check_script_takes_its_commands_from_the_readme():
     for ending in endings:
         assert sum(line.startswith("pip install ") and line.endswith(ending) for line in lines) == 1
     assert script.count('bash -c "$') == 2
+
+
+def test_the_workflow_only_calls_the_check_script():
+    (job,) = yaml.safe_load((ROOT / ".github" / "workflows" / "check.yml").read_text(encoding="utf-8"))["jobs"].values()
+    (command,) = (step["run"] for step in job["steps"] if "run" in step)
+    assert command == ".ci/run ${{ matrix.what }}"
+    known = (
+        re.search(r"case \$what in (.*?)\)", (ROOT / ".ci" / "run").read_text(encoding="utf-8")).group(1).split(" | ")
+    )
+    assert {each["what"] for each in job["strategy"]["matrix"]["include"]} == set(known) - {"all"}
+
+
+def test_every_minimum_can_be_pinned():
+    """``.ci/run oldest`` takes the minima from here; what it does not understand it would leave at the newest."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for requirement in sum(project["optional-dependencies"].values(), project["dependencies"]):
+        assert re.fullmatch(r"[\w-]+>=[\d.]+|legdistort\[[\w,]+\]", requirement)
 
 
 def test_versions_agree():

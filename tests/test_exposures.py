@@ -11,7 +11,8 @@ from astropy.wcs import WCS
 
 from legdistort.exceptions import InputError
 from legdistort.inputs.exposure_files import read_exposures
-from legdistort.inputs.exposures import Exposure, believable_wcs
+from legdistort.inputs.exposures import Exposure
+from legdistort.inputs.sky_wcs import believable_wcs
 
 SHAPE = (30, 40)
 
@@ -264,7 +265,7 @@ def test_not_fits(tmp_path):
         read_exposures(tmp_path / "nowhere.fits")
     with pytest.raises(InputError, match="is not a file"):
         read_exposures(tmp_path)
-    with pytest.raises(InputError, match="must be a path, an HDUList or a CCDData, got int"):
+    with pytest.raises(InputError, match="must be a path, an HDUList or an NDData, got int"):
         read_exposures([3])
 
 

@@ -183,7 +183,7 @@ def test_packed_fits_files(mosaic, tmp_path, name, unpack):
     assert names(tmp_path) == [name]
     with fits.open(BytesIO(unpack.decompress((tmp_path / name).read_bytes()))) as hdulist:
         np.testing.assert_array_equal(hdulist["SCI"].data, mosaic.data)
-        assert len(hdulist) == 6
+        assert len(hdulist) == 7
 
 
 @pytest.mark.parametrize("name", ["m.asdf", "M.ASDF"])

@@ -267,3 +267,40 @@ def test_what_is_not_determined_is_named(data):
     assert LegendreDistortionFitter()(
         displacement(0, fixed=(("c0_0",), ("c0_0",))), x, y, x_data, y_data
     ).parameters.tolist() == [0, 0]
+
+
+# --- outliers ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_clip_leaves_out_what_deviates(weighted):
+    """The fit is the one without the gross errors, which an oracle leaves out by hand."""
+    rng = np.random.default_rng(8)
+    x, y = rng.uniform(0, 2000, (2, 200))
+    found = np.stack([x + 0.5 + 1e-3 * y, y - 2e-7 * x * y]) + rng.normal(0, 0.02, (2, 200))
+    found[:, :9] += rng.uniform(0.5, 30, (2, 9)) * rng.choice([-1, 1], (2, 9))
+    fit, weights = LegendreDistortionFitter(), np.full(200, 1 / 0.02) if weighted else None
+    clipped = fit(displacement(), x, y, *found, weights=weights, clip=5)
+    assert np.flatnonzero(~fit.fit_info["used"]).tolist() == list(range(9))
+    dof = fit.fit_info["dof"]
+    by_hand = fit(displacement(), x[9:], y[9:], *found[:, 9:], weights=weights if weights is None else weights[9:])
+    assert dof == fit.fit_info["dof"]
+    assert_allclose(clipped.parameters, by_hand.parameters, rtol=0, atol=1e-10)
+    assert fit.fit_info["used"].all()
+
+
+def test_exact_positions_are_not_clipped():
+    x, y = np.random.default_rng(9).uniform(0, 2000, (2, 50))
+    fit = LegendreDistortionFitter()
+    fit(displacement(), x, y, x + 0.1, y, clip=3)
+    assert fit.fit_info["used"].all()
+    with pytest.raises(InputError, match="clip must be a number of standard errors above 1, got 0"):
+        fit(displacement(), x, y, x, y, clip=0)
+
+
+def test_astropys_outlier_removal_fits_one_output_alone():
+    """Which is why there is `clip`: when this changes, it can go."""
+    x, y = np.random.default_rng(9).uniform(0, 2000, (2, 50))
+    removal = fitting.FittingWithOutlierRemoval(LegendreDistortionFitter(), lambda values: np.ma.masked_array(values))
+    with pytest.raises(TypeError):
+        removal(displacement(), x, y, x, y)

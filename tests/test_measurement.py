@@ -1,13 +1,16 @@
 """Detection and profile fits against images rendered by code of their own."""
 
 import inspect
+import re
 import warnings
 from dataclasses import fields
 
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.io import fits
 from caller_warnings import warns_here
+from numpy.testing import assert_allclose
 from photutils.psf import SourceGrouper
 from scipy.spatial import cKDTree
 from star_images import (
@@ -29,6 +32,7 @@ from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.column_contract import DETECTED, check
 from legdistort.inputs.exposure_files import read_exposures
 from legdistort.inputs.exposures import Exposure
+from legdistort.measurement import camera_gain
 from legdistort.measurement.flags import Flag
 from legdistort.measurement.options import MeasureOptions
 from legdistort.measurement.positions import measure
@@ -232,6 +236,47 @@ def test_gain_is_found_when_it_is_missing():
     assert np.std(z) == pytest.approx(1, abs=0.08)
 
 
+def test_one_gain_for_all_frames_of_a_camera():
+    """Twelve stars a frame: alone each frame says something else, together they say what is nearly true."""
+    rng = np.random.default_rng(31)
+    frames = []
+    for k in range(8):
+        xy, flux = scattered(rng, 12, 160), 10 ** rng.uniform(3.5, 4.5, 12)
+        frame = observe(image((160, 160), xy, flux, 3.5), rng)
+        frames.append(Exposure(f"f{k}", frame, header=fits.Header([("INSTRUME", "CAM")])))
+    singly = []
+    for frame in frames[:4]:
+        with pytest.warns(AssumptionWarning, match=f"no gain known for {frame.name}: ") as told:
+            measure([frame])
+        singly += map(float, re.findall(r"gain ([\d.e+]+) to", str(told[0].message)))
+    with pytest.warns(AssumptionWarning, match="no gain known for f0, f1, f2 and 5 more: .*equivalent gain") as told:
+        together = measure(frames)
+    low, high = map(float, re.search(r"gain ([\d.]+) to ([\d.]+) e-", str(told[0].message)).groups())
+    assert low == high == pytest.approx(GAIN, rel=0.35)
+    assert len(singly) < 4 or max(singly) > 1.2 * min(singly)
+    given = measure(frames, gain=low)
+    assert_allclose(together["x_err"].value, given["x_err"].value, rtol=2e-3)  # the message has three digits
+
+
+def test_cameras_are_told_apart():
+    data = np.arange(400.0).reshape(20, 20)
+
+    def exposure(name, gain=None, time=None, **cards):
+        return Exposure(name, data, header=fits.Header(list(cards.items())), gain=gain, exposure_time=time)
+
+    one, two = exposure("a", DETECTOR="A"), exposure("b", DETECTOR="B")
+    others = [exposure("c", DETECTOR="A"), exposure("d", gain=2.0, DETECTOR="A")]
+    assert list(camera_gain.pilots([one, two, *others]).values()) == [[one, others[0]]]  # nothing for one alone
+    many = [exposure(f"e{k}") for k in range(130)]
+    (chosen,) = camera_gain.pilots(many).values()
+    assert (len(chosen), chosen[0], chosen[-1]) == (camera_gain.PILOTS, many[0], many[-1])
+    rates = [exposure(f"r{k}", time=t, BUNIT="adu/s") for k, t in enumerate((1.0, 2.0, 2.0))]
+    assert list(camera_gain.pilots(rates).values()) == [rates[1:]]
+    assert camera_gain.pooled([0.5, 0.1, 0.25]) == 4
+    assert camera_gain.pooled([0.0, 0.0, 1.0]) is None
+    assert camera_gain.pooled([0.5, None]) is None
+
+
 def test_uncertainty_plane_is_used():
     rng = np.random.default_rng(4)
     xy, flux = scattered(rng, 225, 600), 10 ** rng.uniform(3, 5, 225)
@@ -306,7 +351,7 @@ def test_trouble_does_not_move_the_stars(troubled):
 
 def test_table_keeps_the_contract(troubled):
     table = troubled[0]
-    assert set(DETECTED) | {"chi2"} == set(table.colnames)
+    assert set(DETECTED) - {"mag"} | {"chi2", "psf"} == set(table.colnames)
     assert table["x"].unit == table["x_err"].unit == table["fwhm"].unit == u.pix
     check(table, DETECTED, "detections")
     assert np.all(np.diff(table["flux"]) <= 0)
@@ -411,7 +456,7 @@ def test_noise_alone_gives_almost_nothing():
 def test_empty_frames_give_no_rows(data, caplog):
     table = measure([Exposure("nothing", data, mask=np.eye(*data.shape) > 2, gain=1.0)])
     assert len(table) == 0
-    assert set(table.colnames) >= set(DETECTED)
+    assert set(table.colnames) >= set(DETECTED) - {"mag"}  # of lists of other programs
     assert "nothing: no star above 5 times the noise" in caplog.text
 
 
@@ -466,7 +511,7 @@ def test_options_are_the_arguments():
     parameters = inspect.signature(measure).parameters
     options = {option.name: option.default for option in fields(MeasureOptions)}
     assert options == {name: parameters[name].default for name in options}
-    assert parameters.keys() - options == {"exposures", "workers", "progress"}
+    assert parameters.keys() - options == {"exposures", "workers", "progress", "write_psf"}
 
 
 def test_exposures_only():

@@ -272,10 +272,10 @@ def test_patterns_in_folders_with_brackets(tmp_path):
 
 def test_the_package_itself_in_such_a_folder(tmp_path, monkeypatch):
     """Schemas are found wherever the package is installed."""
-    folder = tmp_path / "A#1" / "legdistort" / "data"
+    folder = tmp_path / "A#1" / "legdistort" / "data" / "schemas"
     folder.mkdir(parents=True)
-    (folder / "moved.schema.yaml").write_text("%YAML 1.1\n---\ntype: object\nrequired: [a]\n")
+    (folder / "moved-1.0.0.yaml").write_text("%YAML 1.1\n---\ntype: object\nrequired: [a]\n")
     monkeypatch.setattr(asdf_files.resources, "files", lambda package: tmp_path / "A#1" / package)
-    asdf_files.check_tree({"a": 1}, "moved.schema.yaml", "f.asdf")
+    asdf_files.check_tree({"a": 1}, "moved-1.0.0", "f.asdf")
     with pytest.raises(InputError, match="'a' is a required property"):
-        asdf_files.check_tree({"b": 1}, "moved.schema.yaml", "f.asdf")
+        asdf_files.check_tree({"b": 1}, "moved-1.0.0", "f.asdf")

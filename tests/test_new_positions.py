@@ -17,6 +17,9 @@ from legdistort.exceptions import InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.results import absolute_errors, new_positions
+from legdistort.solving.equations import criterion
+from legdistort.solving.equations.covariances import Uncertainty
+from legdistort.solving.equations.problem import State, build_problem
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 import new_positions_table
@@ -119,6 +122,41 @@ def test_sigma_map_is_relative_unless_asked(solution, free):
     expected = np.einsum("nkk->nk", solution.correct(solution.names[0], grid, errors=0.0).absolute)
     assert_allclose(absolute.reshape(-1, 2) ** 2, expected)
     assert np.isnan(free.sigma_map(free.names[0], n=6, support=False, absolute=True)[2]).any()
+
+
+def test_relative_errors_are_those_under_the_convention_alone():
+    """Without a prior dithers determine the common map, worse than the positions: that is no relative error."""
+    sim = ld.simulate_matches(
+        n_exposures=4, n_stars=40, sigma=0.02, static=3.0, dynamic=0.3, dither=150.0, zero_mean=False, seed=3
+    )
+    solution = ld.solve(sim.matches)
+    gauge = replace(solution.gauge, covariance=np.zeros_like(solution.gauge.covariance))  # nothing of second order
+    problem = build_problem(sim.matches, 3)
+    poses = np.stack([solution.poses[name] for name in solution.names])
+    blocks = criterion.linearise(problem, State(solution.positions.T, solution.coefficients, poses))
+    alone = Uncertainty(problem, blocks, replace(gauge, constraint=gauge.convention, convention=None))
+    variance = absolute_errors.relative_variance(gauge, solution.uncertainty, solution.positions)
+    assert_allclose(variance[:2], alone.stars[:2], rtol=0.03)
+    assert np.mean(solution.uncertainty.stars[:2] / variance[:2]) > 1.2
+    for i, name in enumerate(solution.names):
+        block = alone.coefficients[20 * i : 20 * i + 20, 20 * i : 20 * i + 20]
+        relative = solution.coefficient_covariance(name, relative=True)
+        assert_allclose(relative, block, atol=0.03 * np.abs(block).max())
+        assert_allclose(solution.coefficient_errors(name, relative=True).ravel() ** 2, np.diag(relative))
+
+
+def test_where_the_convention_holds_relative_errors_are_those_of_the_gauge(solution):
+    assert solution.gauge.convention is None
+    assert solution.uncertainty.bends is None
+    covariance = solution.coefficient_covariance("exp01")
+    assert_array_equal(solution.coefficient_covariance("exp01", relative=True), covariance)
+
+
+@pytest.mark.parametrize("n", [4, 6])
+def test_relative_errors_without_a_prior_hold_for_few_exposures(n):
+    """Truth of Chebyshev polynomials; 0.72 and 0.86 in the gauge of what dithers determine."""
+    relative, _ = new_positions_table.row("no prior, 0.02 px", 8, n_exposures=n)
+    assert relative == pytest.approx(1, abs=0.1)
 
 
 # -- limits

@@ -51,7 +51,10 @@ def test_what_run_takes_itself_does_not_stand_in_a_dict(argument, name, tmp_path
         ({"clip": 0.5}, "^clip must be"),
         ({"workers": 0}, "^workers must be"),
         ({"epoch": "soon"}, "epoch"),
-        ({"solving": {"method": "alternating"}}, "^solving: method='alternating' .* takes neither loss nor clip"),
+        (
+            {"clip": 5.0, "solving": {"method": "alternating"}},
+            "^solving: method='alternating' .* takes neither loss nor clip",
+        ),
         ({"solving": {"static": "fit"}, "degree": 1}, "^solving: static='fit' shares the modes"),
     ],
 )

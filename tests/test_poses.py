@@ -207,3 +207,20 @@ def test_sky_errors_are_those_of_a_cloud_of_points():
     assert_allclose(ra_error.to_value(u.mas), east.std(), rtol=5e-3)
     assert_allclose(dec_error.to_value(u.mas), north.std(), rtol=5e-3)
     assert_allclose(corr, np.corrcoef(east, north)[0, 1], atol=5e-3)
+
+
+@pytest.mark.parametrize(("lon", "lat", "flip"), [(10.0, -40.0, 1), (359.9999, 89.2, -1), (200.0, 0.0, -1)])
+def test_position_angle_and_scale_are_those_of_the_sky(lon, lat, flip):
+    """Of a rotated exposure off the tangent point, by the separations and angles of astropy."""
+    turn, scale, pose_turn = np.radians(33.0), 0.02 / 3600, np.radians(-50.0)
+    matrix = scale * np.array([[-flip * np.cos(turn), np.sin(turn)], [flip * np.sin(turn), np.cos(turn)]])
+    plane = TangentPlane(lon, lat, np.column_stack([matrix, [0.0, 0.0]]))
+    c, s = 1.1 * np.cos(pose_turn), 1.1 * np.sin(pose_turn)
+    pose = np.array([[c, -s, 4000.0], [s, c, -9000.0]])
+    centre = np.array([511.5, 1023.5])
+    ends = similarity.apply(similarity.invert(pose), [centre, centre + [0, 1], centre + [1, 0]])
+    middle, up, along = plane.to_sky(ends)
+    angle, size = plane.orientation(pose, (2048, 1024))
+    assert angle == pytest.approx((middle.position_angle(up).deg + 180) % 360 - 180, abs=1e-4)
+    assert size == pytest.approx(np.sqrt(middle.separation(up).arcsec * middle.separation(along).arcsec), rel=1e-5)
+    assert size == pytest.approx(0.02 / 1.1, rel=1e-3)

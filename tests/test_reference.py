@@ -1,6 +1,7 @@
 """A reference catalogue ties what the exposures do not tell, with calibrated errors, and blurs nothing."""
 
 import json
+import logging
 import warnings
 from dataclasses import replace
 
@@ -23,6 +24,7 @@ from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.results.solution import Solution
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
+from legdistort.solving import reference_tie
 from legdistort.solving.estimation import solve
 
 RNG = np.random.default_rng
@@ -185,6 +187,21 @@ def test_mismatched_stars_are_rejected_by_name(sim):
     assert_allclose(tie.offsets[~tie.used, 0], [3.0, -50.0, 1.0, 200.0], atol=0.2)
     assert "4 rejected as mismatched" in str(solution.gauge)
     assert np.mean(pulls(sim, solution) ** 2) == pytest.approx(1, abs=0.4)
+
+
+@pytest.mark.parametrize(("rounds", "words"), [(3, "may be off by as much"), (4, "too little to matter"), (10, None)])
+def test_a_tie_that_does_not_settle_says_how_far_it_is(monkeypatch, caplog, rounds, words):
+    """A static distortion of 12 px, unknown: the plane moves by 9, 0.8, 0.08 and 0.004 px; its error is 0.03 px."""
+    sim = simulate(static=12.0)
+    monkeypatch.setattr(reference_tie, "_ROUNDS", rounds)
+    with caplog.at_level(logging.WARNING, logger="legdistort"):
+        solution = solve(sim.matches, reference=planar(sim, 40, 0.02))
+    assert solution.status.endswith("not settled") == (words is not None)
+    if words is None:
+        assert not caplog.messages
+    else:
+        assert f"not settled after {rounds} rounds: the last of them moved the plane by" in caplog.text
+        assert words in caplog.text
 
 
 def test_permuted_reference_is_the_same(sim):
@@ -518,7 +535,7 @@ def change(**columns):
         (lambda t: change(star=None)(change(x=t["x"] + 1e5)(t)), "none of the 40 stars of the reference lies where"),
         (lambda t: t[:0], "has no row"),
         (lambda t: "nowhere.ecsv", "nowhere.ecsv: no such file"),
-        (lambda t: 3, "reference must be a table or the path of one, got int"),
+        (lambda t: 3, "reference must be a table, the path of one, or a SkyCoord, got int"),
         (lambda t: change(ra=1.0, dec=95.0, ra_error=1.0, dec_error=1.0)(t), "dec must lie in -90 ... 90 degrees"),
         (lambda t: change(ra=1.0, dec=5.0)(t), "lacks ra_error and dec_error, errors of its positions"),
         (change(ra=1.0, dec=5.0, ra_error=1.0, dec_error=1.0, pmra=1.0), "one of pmra, pmdec is missing"),
@@ -580,7 +597,10 @@ def test_no_sky_and_no_way_to_it(night):
         solve(matches, prior=prior, reference=reference[:4], epoch=2021)
     other = reference.copy()
     other["ra"], other["dec"] = RNG(0).uniform([[84.9], [-69.77]], [[84.93], [-69.76]], (2, len(other)))
-    with pytest.raises(InputError, match=r"the pattern of their .* stars is not that of the"):
+    with pytest.raises(
+        InputError,
+        match=r"the pattern of their .* stars is not that of .*\(pixel_scale=, --pixel-scale\).* The brightest stars",
+    ):
         solve(matches, prior=prior, reference=other, epoch=2021)
     with pytest.raises(InputError, match=r"at 0\.5 arcsec a pixel: another field"):
         solve(matches, prior=prior, reference=reference, epoch=2021, pixel_scale=0.5)

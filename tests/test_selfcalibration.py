@@ -109,6 +109,30 @@ def test_against_a_general_least_squares_code(own):
     assert 2 * found.cost - 1e-3 < solution.chi2 < 2 * found.cost + (10 if own else 0.01)
 
 
+@pytest.mark.parametrize("own", [0, 1])
+def test_is_a_minimum_in_every_pose(own):
+    """A pose carries the points that the common distortion is evaluated at: its slope there counts."""
+    sim = camera(2, n_stars=60, n_exposures=5, rolls=60.0)
+    solution = solve(sim.matches, static="fit", exposure_degree=own)
+    table = solution.observations
+    for i, name in enumerate(solution.names):
+        mine = table[table["exposure"] == name]
+        stars = solution.positions[np.searchsorted(solution.star_names, mine["star"])]
+        q0 = stars @ solution.poses[name][:, :2].T + solution.poses[name][:, 2]
+        measured = np.column_stack([mine["x"].value, mine["y"].value])
+
+        def squares(move, q0=q0, measured=measured, a=solution.coefficients[i], sigma=mine["x_err"].value[:, None]):
+            x, y = (q0 - 1023.5).T / 1000
+            q = q0 + np.column_stack([move[0] + move[2] * x - move[3] * y, move[1] + move[3] * x + move[2] * y])
+            values = basis.values(3, *basis.normalize(q, SHAPE))
+            return np.sum(((measured - q - (a @ values).T) / sigma) ** 2)
+
+        for step in 0.002 * np.eye(4):
+            low, middle, high = squares(-step), squares(0 * step), squares(step)
+            offset = (high - low) / 2 / (high + low - 2 * middle) * 0.002  # of the minimum, pixels
+            assert abs(offset) < 1e-5
+
+
 def test_recovers_a_static_distortion():
     sim = camera()
     solution = solve(sim.matches, static="fit")

@@ -10,7 +10,7 @@ from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 from oracle import DenseOracle, predict
 
-from legdistort.exceptions import ConvergenceWarning, InputError, SolveError
+from legdistort.exceptions import AssumptionWarning, ConvergenceWarning, InputError, SolveError
 from legdistort.geometry import similarity
 from legdistort.geometry.detector_modes import similarity_part
 from legdistort.inputs.matches import Matches
@@ -255,8 +255,8 @@ def test_robust_losses_resist_outliers(loss):
     matches = Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses)
     true = sim.truth.positions
     prior = Prior(sim.truth.static)
-    assert accuracy.bias(solve(matches, prior=prior, loss=loss).positions, true) < 0.12
-    assert accuracy.bias(solve(matches, prior=prior).positions, true) > 0.3
+    assert accuracy.bias(solve(matches, prior=prior, loss=loss, clip=None).positions, true) < 0.12
+    assert accuracy.bias(solve(matches, prior=prior, clip=None).positions, true) > 0.3
 
 
 @pytest.mark.parametrize(
@@ -308,16 +308,17 @@ def test_options_are_the_arguments_and_frozen():
         SolveOptions().degree = 4
 
 
-def test_an_exposure_left_out_is_told_once(caplog):
+def test_an_exposure_left_out_is_told_once():
     """However many fits it takes: the widths are found in several."""
     sim = simulate_matches(n_stars=40, n_exposures=6, degree=2, dynamic=0.5, seed=3)
     table = table_of(sim)
     astray = table["exposure"] == "exp02"
     table["x"][astray] = np.random.default_rng(0).permutation(table["x"][astray].value) * u.pix
     matches = Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses)
-    solution = solve(matches, degree=2, prior=Prior(sim.truth.static, sigma="evidence"), clip=5)
+    with warns_here(AssumptionWarning, match="exposure exp02 is left out: ") as caught:
+        solution = solve(matches, degree=2, prior=Prior(sim.truth.static, sigma="evidence"), clip=5)
     assert list(solution.left_out) == ["exp02"]
-    assert len([r for r in caplog.records if "exposure exp02 is left out: " in r.getMessage()]) == 1
+    assert len(caught) == 1
 
 
 def test_undetermined_problem_names_the_exposure():
@@ -330,6 +331,6 @@ def test_undetermined_problem_names_the_exposure():
     for i in range(1, 10):
         on = table["exposure"] == f"exp{i:02d}"
         table["x"][on], table["y"][on] = table["x"][first], table["y"][first]
-    matches = Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses)
+    matches = Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses, allow_copies=True)
     with pytest.raises(SolveError, match="do not determine the distortion of degree 2"):
         solve(matches, degree=2)

@@ -29,6 +29,7 @@ from legdistort.geometry.gsaoi import GsaoiMap, gsaoi_polynomials, gsaoi_static
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.priors.from_files import read_source
 from legdistort.priors.prior import Prior
+from legdistort.priors.source import Source
 from legdistort.results.solution import Solution
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve
@@ -236,6 +237,84 @@ def test_drizzle_coefficients_agree_with_the_maps(shared_data, nirc2):
     assert_allclose(maps.rms, [0.26, 0.34], atol=0.01)
     left = np.sqrt(((inner.mean - maps.mean) ** 2).sum(axis=1)) / 2
     assert_allclose(left, [0.056, 0.046], atol=0.005)
+
+
+def _cubic(x, y):
+    """Undistorted to detector pixels of a detector of 1024 pixels: a polynomial of degree 3."""
+    u, v = (x - 500.0) / 500, (y - 520.0) / 500
+    return x + 0.8 * u**2 - 0.3 * u * v**2 + 0.2 * v**3, y + 0.5 * u * v - 0.4 * v**2 + 0.1 * u**3
+
+
+@pytest.mark.parametrize(
+    ("offset", "part", "shape"), [((256, 128), (512, 640), (1024, 1024)), ((-256, -100), (1024, 1024), (600, 512))]
+)
+def test_a_part_is_placed_in_the_detector(offset, part, shape):
+    """A polynomial known on a part of the detector, or on more than it, is the same polynomial on all of it."""
+    known = {"direction": "reference_to_detector", "origin": 0, "degree": 3}
+    x0, y0 = offset
+
+    def of_part(x, y):
+        return tuple(
+            value - o for value, o in zip(_cubic(x + max(x0, 0), y + max(y0, 0)), np.maximum(offset, 0), strict=True)
+        )
+
+    def of_whole(x, y):  # the detector's own pixels are those of the cubic, or lie inside them
+        return tuple(
+            value + o for value, o in zip(_cubic(x - min(x0, 0), y - min(y0, 0)), np.minimum(offset, 0), strict=True)
+        )
+
+    source = Source("part", "function", of_part, shape=part)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        placed = Prior.from_model(source, shape=shape, offset=offset, **known)
+    whole = Prior.from_model(of_whole, shape=shape, **known)
+    assert_allclose(placed.mean, whole.mean, rtol=0, atol=1e-7)
+    assert_allclose(placed.plane[:, :2], whole.plane[:, :2], rtol=0, atol=1e-9)
+    assert placed.truncation < 1e-7
+    assert placed.shape == shape
+    told = [str(w.message) for w in caught]
+    assert [("31 % of the detector; elsewhere its polynomial of degree 3" in t) for t in told] == [True] * (x0 > 0)
+
+
+def test_the_maps_of_nirc2_in_the_whole_detector(shared_data, nirc2, tmp_path, capsys):
+    """Against the polynomial of the same observatory for the whole detector, on the inner quarter."""
+    polynomial_ = read_source(shared_data / "static_distortion" / "nirc2_kai" / "nirc2_narrow_ACS.coeffs.txt")
+    whole = Prior.from_model(polynomial_, shape=(1024, 1024))
+    out = tmp_path / "prior.asdf"
+    command = ["prior", *map(str, nirc2), "--offset", "256", "256", "--shape", "1024", "1024", "--degree", "5"]
+    assert main([*command, "--out", str(out)]) == 0
+    assert "covers 25 % of the detector" in capsys.readouterr().err
+    placed, alone = Prior.read(out), Prior.from_file(nirc2, degree=5)
+    assert placed.source["offset"] == [256, 256]
+    assert placed.truncation == alone.truncation
+    x, y = np.stack(grid((512, 512), 40))
+    q = np.column_stack([x, y]) + 256
+    mine, theirs = (Distortion(p.mean, (1024, 1024))(q) - q for p in (placed, whole))
+    design = np.column_stack([np.ones(len(q)), q])
+    left = [d - design @ np.linalg.lstsq(design, d, rcond=None)[0] for d in (mine, theirs)]
+    assert np.std(left[0]) > 0.2
+    assert np.std(left[0] - left[1]) < 0.06  # as on the quarter alone
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"offset": (2000, 0)}, r"lies beside the detector of shape \(1024, 1024\): offset \(--offset X Y\) is where"),
+        ({"offset": (1, 2, 3)}, r"offset must be x, y in pixels of the detector, got \(1, 2, 3\)"),
+        (
+            {"offset": (256, 256), "degree": 9},
+            r"75 % of the detector that it does not cover, at degree 9: .*lower the deg",
+        ),
+    ],
+)
+def test_bad_offsets(nirc2, options, message):
+    with pytest.raises(InputError, match=message):
+        Prior.from_file(nirc2, shape=(1024, 1024), **options)
+
+
+def test_an_offset_needs_a_size():
+    with pytest.raises(InputError, match=r"has no size of its own: leave offset \(--offset\) out"):
+        Prior.from_model(_cubic, shape=(1024, 1024), direction="reference_to_detector", offset=(1, 1))
 
 
 def test_refpix(tmp_path):

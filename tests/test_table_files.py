@@ -9,15 +9,20 @@ from astropy.io import fits
 from astropy.io.votable import parse_single_table
 from astropy.io.votable.ucd import check_ucd
 from astropy.table import QTable, Table
+from astropy.utils.exceptions import AstropyUserWarning
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
 
+import legdistort
 from legdistort.cli import parser
-from legdistort.exceptions import InputError, LegdistortError
-from legdistort.inputs import column_contract, sextractor
-from legdistort.inputs.table_files import read_table, stack, write_stars
+from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
+from legdistort.inputs import column_contract
+from legdistort.inputs.matches import Matches
+from legdistort.inputs.star_lists import sextractor
+from legdistort.inputs.star_lists.formats import stack
+from legdistort.inputs.table_files import read_table, write_stars
 from legdistort.measurement.positions import Flag
 from legdistort.priors.prior import Prior
 from legdistort.results.solution import Solution
@@ -263,8 +268,8 @@ SKY = ["ra", "dec", "ra_error", "dec_error", "ra_dec_corr", "ra_error_abs", "dec
 
 def test_stars_follow_the_virtual_observatory(solution):
     stars = solution.stars
-    assert set(stars.colnames) == set(column_contract.STARS)
-    for name in stars.colnames:
+    assert set(stars.colnames) == {*column_contract.STARS, "sky"}
+    for name in column_contract.STARS:
         assert check_ucd(stars[name].info.meta["ucd"], check_controlled_vocabulary=True), name
         assert len(stars[name].info.description) > 10
     assert stars["ra"].unit == stars["dec"].unit == u.deg
@@ -283,7 +288,7 @@ def test_errors_on_the_sky_are_those_in_pixels_times_the_scale(solution):
 @pytest.mark.parametrize("ending", [".ecsv", ".fits", ".vot", ".xml", ".csv"])
 def test_stars_come_back_from_every_format(solution, tmp_path, ending):
     path = write_stars(solution, tmp_path / f"stars{ending}")
-    stars = solution.stars
+    stars = solution.stars[[name for name in solution.stars.colnames if name != "sky"]]
     if ending in (".vot", ".xml"):
         resource = parse_single_table(path)
         assert {f.name: f.ucd for f in resource.fields} == {
@@ -413,3 +418,39 @@ def test_from_lists_to_stars_in_the_shell(tmp_path, capsys):
     assert "s.fits exists already" in capsys.readouterr().err
     assert parser.main([*stars, "--overwrite", "--max-bytes", "1000"]) == 1
     assert "is refused" in capsys.readouterr().err
+
+
+# --- what a table of stars says of itself --------------------------------------------------------------------------
+
+
+def test_stars_say_what_they_are(tmp_path):
+    sim = simulate_gsaoi_matches(small=True, seed=3)
+    table = sim.matches.table.copy()
+    table["epoch"] = 2015.25
+    matches = Matches.from_table(table, shape=sim.matches.shapes, poses=sim.matches.poses, sky=sim.matches.sky)
+    solution = solve(matches, prior=Prior(sim.truth.static, source="a mask"), degree=3)
+    stars = solution.stars
+    meta = {"frame": "ICRS", "epoch": 2015.25, "gauge": "minimal", "degree": 3, "prior": "a mask"}
+    assert stars.meta == meta | {"version": f"legdistort {legdistort.__version__}"}
+    assert stars["sky"].obstime.jyear == 2015.25
+    assert_array_equal(stars["sky"].ra, stars["ra"])
+    again = Solution.read(solution.write(tmp_path / "s.asdf"))
+    assert again.stars.meta == stars.meta
+    for ending in ("ecsv", "fits", "vot", "csv"):
+        write_stars(solution, tmp_path / f"t.{ending}")
+        assert "sky" not in read_table(tmp_path / f"t.{ending}").colnames
+    assert QTable.read(tmp_path / "t.ecsv", format="ascii.ecsv").meta["gauge"] == "minimal"
+    assert fits.getheader(tmp_path / "t.fits", 1)["EPOCH"] == 2015.25
+    planar = solve(Matches.from_table(table, shape=sim.matches.shapes), degree=1, clip=None).stars
+    assert planar.meta["frame"] == "reference plane"
+    assert {"sky", "prior"}.isdisjoint([*planar.colnames, *planar.meta])
+
+
+def test_warnings_are_those_of_astropy():
+    assert issubclass(AssumptionWarning, AstropyUserWarning)
+
+
+def test_celestial_axes_have_names():
+    sim = simulate_gsaoi_matches(small=True, seed=3)
+    wcs = solve(sim.matches, degree=1, clip=None).wcs(sim.matches.names[0])
+    assert tuple(wcs.world_axis_names) == ("ra", "dec")

@@ -9,6 +9,7 @@ degree 3 cannot follow, both scaled so that the four corrections can leave about
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import brentq
 
 import legdistort as ld
 from legdistort.assessment import baselines
@@ -17,12 +18,14 @@ from legdistort.geometry.gsaoi import gsaoi_static
 from legdistort.results import accuracy
 from legdistort.simulation import rendering
 from legdistort.simulation.gsaoi_night import Night
+from legdistort.simulation.pupil import PupilPSF
 from legdistort.simulation.truth import Truth
 
 #: Rms over the detector, both axes together, pixels.
 DYNAMIC, RESIDUE = 0.62, 0.31
-#: Part of the light in the halo: what a Strehl ratio of 14 % leaves outside the core is of this order.
-HALO = 0.4
+#: Gemini (7.9 m) in Ks at 20 mas a pixel: Strehl ratio 14 %, 75 % of the light in a halo of 0.5 arcsec, a core widened
+#: by image motion.
+PSF = PupilPSF(strehl=0.14, resolution=2.8, halo_fwhm=25.0, jitter=1.15, elongation=1.0)
 N_STARS = 110
 #: "It ranges between 0.002 pixels and 0.14 pixels": fainter stars are not used.
 FAINTEST = 0.14
@@ -42,7 +45,7 @@ class Twin:
 
 def observe(folder, *, residue=True, small=False, seed=SEED):
     """Render the exposures into a folder, read them back, measure and match them."""
-    settings = {"dynamic_rms": DYNAMIC, "residue_rms": RESIDUE if residue else 0.0, "halo": HALO, "n_stars": N_STARS}
+    settings = {"dynamic_rms": DYNAMIC, "residue_rms": RESIDUE if residue else 0.0, "psf": PSF, "n_stars": N_STARS}
     if small:
         settings |= {"size": 768, "n_exposures": 6, "dither": 94.0, "n_stars": 70}
     night = replace(Night(), **settings)
@@ -68,8 +71,17 @@ def absolute_error(twin, solution, *, removed):
     return accuracy.bias(solution.positions, true, removed=removed)
 
 
+def psf_of_width(fwhm):
+    """The mean PSF of the twin, its core widened by more or less motion to this FWHM [pix], with the same halo."""
+
+    def moved(jitter):
+        return replace(PSF, strehl=None, jitter=jitter, elongation=0.0).with_core(PSF.coherent)
+
+    return moved(brentq(lambda jitter: moved(jitter).over((1, 1), nodes=1).fwhm - fwhm, 0.0, fwhm, xtol=0.01))
+
+
 def noise_curve(exposure, night, fwhm, fluxes, *, n=100, size=1024, seed=0):
-    """Measured error of positions against flux: Moffat profiles put into a real background and measured again.
+    """Measured error of positions against flux: stars of known position put into a real background, measured again.
 
     As in section 5.2.2 of the paper: n positions per flux, photon noise added, fitted by the same program.
 
@@ -82,10 +94,9 @@ def noise_curve(exposure, night, fwhm, fluxes, *, n=100, size=1024, seed=0):
     rng = np.random.default_rng(seed)
     image = np.asarray(exposure.data[:size, :size], dtype=float)
     places = _empty_places(image, n, rng)
-    out = np.full(len(fluxes), np.nan)
+    psf, out = rendering.as_psf(psf_of_width(fwhm), image.shape), np.full(len(fluxes), np.nan)
     for k, flux in enumerate(fluxes):
         xy = places + rng.uniform(-0.5, 0.5, places.shape)
-        psf = rendering.Moffat(fwhm, night.beta)
         light = rendering.render(image.shape, xy, np.full(n, flux), psf=psf)
         noisy = image + rng.poisson(light * night.gain) / night.gain
         frame = ld.Exposure(name="injected", data=noisy, gain=night.gain, read_noise=night.read_noise)

@@ -25,7 +25,7 @@ FRACTION_INSIDE = 0.9
 def simulation_1(seed=0, *, n_grid=N_GRID):
     """One data set and the map of its error: simulation, solution, grid (n, 2), sigma_j' (n,), contour."""
     sim = ld.simulate_matches(seed=seed)
-    solution = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static), gauge=GAUGE)
+    solution = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static), gauge=GAUGE, clip=None)
     grid = sim.truth.grid(sim.truth.names[0], n_grid)
     sigma = accuracy.new_scatter(solution, sim.truth.distort, grid, 0.14, rng=np.random.default_rng(seed))
     return sim, solution, grid, sigma, accuracy.contour(sim.truth.positions, fraction=FRACTION_INSIDE)
@@ -54,7 +54,9 @@ class Outcome:
             seed=self.seed,
         )
         truth = sim.truth
-        solution = ld.solve(sim.matches, prior=ld.Prior(truth.static) if self.static_known else None, gauge=GAUGE)
+        solution = ld.solve(
+            sim.matches, prior=ld.Prior(truth.static) if self.static_known else None, gauge=GAUGE, clip=None
+        )
         b = [accuracy.bias(solution.positions, truth.positions, removed=removed) for removed in (None, 3)]
         if not self.n_grid:
             return (*b, np.nan, np.nan)
@@ -136,7 +138,7 @@ def simulation_5(kind, *, amplitude=1.0, n_stars=1000, n_exposures=10, seed=0):
     observed = np.ones((n_exposures, n_stars), dtype=bool)
     errors = np.full((n_exposures, n_stars, 2), 0.14)
     matches = matches_from(truth, observed, errors, np.random.default_rng(0), noise=0)
-    solution = ld.solve(matches, prior=ld.Prior(sim.truth.static), gauge=GAUGE)
+    solution = ld.solve(matches, prior=ld.Prior(sim.truth.static), gauge=GAUGE, clip=None)
     found = np.stack([whole_coefficients(solution, name) for name in solution.names])
     return found - sim.truth.coefficients, accuracy.bias(solution.positions, truth.positions)
 

@@ -3,7 +3,7 @@
 All figures come from the same fits (`legdistort.assessment.star_shapes`) on the same stars.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from astropy.nddata import extract_array
@@ -45,6 +45,8 @@ class Quality:
     fwhm_ratio, peak_ratio : float
         `fwhm` and `peak` over those in single exposures, star by star (NaN without exposures). The second is a
         Strehl ratio with single exposures in place of the diffraction limit.
+    exposures : dict
+        ``{name: (FWHM [pix], ellipticity)}``, medians over the stars of single exposures; empty without exposures.
     """
 
     n_stars: int
@@ -54,6 +56,7 @@ class Quality:
     position: float
     fwhm_ratio: float = np.nan
     peak_ratio: float = np.nan
+    exposures: dict = field(default_factory=dict)
 
     def __str__(self):
         return (
@@ -143,7 +146,8 @@ def assess(mosaic, solution, *, exposures=(), fwhm=None, max_stars=500):
     single = sample.of_exposures(exposures, solution)
     found = sample.of_mosaic(mosaic, solution)
     keep = _common([found], single, bool(len(exposures)))
-    return _summary(found[keep], single and single[0][keep], sample.positions(solution)[keep])
+    quality = _summary(found[keep], single and single[0][keep], sample.positions(solution)[keep])
+    return replace(quality, exposures=single[2]) if single else quality
 
 
 def compare_stacks(exposures, comparison, *, mosaic, fwhm=None, max_stars=500, **coadding):
@@ -253,11 +257,12 @@ class _Sample:
         return found
 
     def of_exposures(self, exposures, solution):
-        """Medians of `measure_shapes` over the exposures (n, 5), and offsets of corrected positions (n_exp, n, 2).
+        """Medians of `measure_shapes` over the exposures (n, 5), offsets of corrected positions (n_exp, n, 2), and
+        ``{exposure: (FWHM, ellipticity)}``, medians over the stars.
 
         A star that is saturated, or cannot be measured for another reason, in every exposure is NaN.
         """
-        table, shapes, offsets = solution.observations, [], []
+        table, shapes, offsets, medians = solution.observations, [], [], {}
         for handle in exposures:
             if handle.name not in solution.poses:
                 continue
@@ -270,12 +275,14 @@ class _Sample:
             offset = np.full_like(xy, np.nan)
             offset[seen] = solution.correct(exposure.name, found[seen, :2]) - self.positions(solution)[seen]
             shapes.append(found)
+            if seen.any():
+                medians[exposure.name] = tuple(np.median(found[seen, 2:4], axis=0).tolist())
             offsets.append(offset)
         if not shapes:
             return None
         with np.errstate(all="ignore"):
             median = np.ma.median(np.ma.masked_invalid(np.stack(shapes)), axis=0)
-            return median.filled(np.nan), np.stack(offsets)
+            return median.filled(np.nan), np.stack(offsets), medians
 
     @property
     def _zoom_half(self):

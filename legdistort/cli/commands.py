@@ -16,8 +16,10 @@ from ..coaddition.mosaic import check_ending
 from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
 from ..inputs.exposure_files import file_checksums
-from ..inputs.table_files import read_table, stack, write_stars, write_table
+from ..inputs.star_lists.formats import stack
+from ..inputs.table_files import read_table, write_stars, write_table
 from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
+from ..results.check import Check, worst
 from ..runtime import outputs, parallel, provenance
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from . import options
@@ -82,7 +84,9 @@ def do_demo(a):
     "frames to WCS, mosaic and report",
     "frames/*.fits --out results --degree 3",
     options.FRAMES,
+    options.FLAGGED,
     options.STOPPING,
+    options.STRICT,
     options.out("folder for the results", path="results"),
     options.MEASURING,
     options.MATCHING,
@@ -93,15 +97,17 @@ def do_demo(a):
 )
 def do_run(a):
     """``legdistort run``."""
-    matching, solving = given(a, options.MATCHING), _solving(a, with_headers=True)
-    if a.method == "alternating":
-        solving.setdefault("clip", None)  # the published scheme has none
-    own = ("degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
+    measuring, matching, solving = (
+        given(a, options.MEASURING),
+        given(a, options.MATCHING),
+        _solving(a, with_headers=True),
+    )
+    own = ("psf", "degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
     result = legdistort.run(
-        **given(a, options.FRAMES, options.STOPPING),
+        **given(a, options.FRAMES, options.FLAGGED, options.STOPPING),
         out=a.out,
-        **{name: group.pop(name) for group in (matching, solving) for name in own if name in group},
-        measuring=given(a, options.MEASURING),
+        **{name: group.pop(name) for group in (measuring, matching, solving) for name in own if name in group},
+        measuring=measuring,
         matching=matching,
         solving=solving,
         coadding=given(a, options.COADDING),
@@ -116,15 +122,18 @@ def do_run(a):
             print(f"  {name:24s} {s['mean']:8.4f} {s['std']:8.4f}")
     if not a.json:
         print(f"Results in {a.out}: open {Path(a.out) / 'report.html'}")
+    return _status(a, result.summary)
 
 
 @command(
     "frames to a table of positions",
     "frames/*.fits --out stars.ecsv",
     options.FRAMES,
+    options.FLAGGED,
     options.STOPPING,
     options.out("table (ECSV) of detections"),
     options.MEASURING,
+    options.PSF_FILES,
     options.WORKERS,
 )
 def do_measure(a):
@@ -135,7 +144,7 @@ def do_measure(a):
     MeasureOptions(**measuring)  # which refuses them before a frame is read
     bad = {}
     exposures = _open(a, left_out=bad, stop_at_bad=a.stop_at_bad)
-    table = legdistort.measure(exposures, **measuring, **_share(a))
+    table = legdistort.measure(exposures, **measuring, **given(a, options.PSF_FILES), **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
     table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures), "left_out": bad}
     write_table(table, a.out, overwrite=a.overwrite)
@@ -150,6 +159,7 @@ def do_measure(a):
     "error of a position against flux, by injected stars",
     "frames/a.fits --out noise.ecsv",
     options.FRAMES,
+    options.FLAGGED,
     options.out("table (ECSV) of errors against flux"),
     options.INJECTING,
     options.picture("picture of the curves"),
@@ -205,9 +215,10 @@ def do_match(a):
     "matched positions to distortions",
     "matched.ecsv --degree 2 --out results",
     options.MATCHED,
+    options.STRICT,
     options.out("folder for the results", path="results"),
     options.TABLE,
-    options.SOLVING | {"clip": options.clipping("no clipping")},
+    options.SOLVING,
 )
 def do_solve(a):
     """``legdistort solve``."""
@@ -228,6 +239,7 @@ def do_solve(a):
         write_summary(target / "summary.json", summary)
     (a.out / "mosaic.fits").unlink(missing_ok=True)  # of an earlier run: it does not belong to this solution
     _report(a, solution, summary)
+    return _status(a, summary)
 
 
 @command(
@@ -256,6 +268,7 @@ def do_prior(a):
     "frames and a solution to a mosaic",
     "frames/*.fits --solution results/solution.asdf --out mosaic.fits",
     options.FRAMES,
+    options.FLAGGED,
     options.SOLUTION | options.NAMED_SOLUTION,
     options.out("mosaic (.fits, .fits.gz or .asdf)"),
     options.GRID,
@@ -324,24 +337,30 @@ def do_predict(a):
     "--out night --small",
     options.out("folder for the frames", path="folder"),
     options.NIGHT,
+    options.OPTICS,
 )
 def do_simulate(a):
     """``legdistort simulate``."""
+    from ..simulation.pupil import PupilPSF
+
     if Path(a.out, "truth.ecsv").exists() and not a.overwrite:
         raise InputError(f"{a.out} already holds a simulated night; give --overwrite or another folder")
-    night = legdistort.simulate_exposures(**given(a, options.NIGHT), progress=wants_progress(a))
+    optics = {"psf": PupilPSF(**optics)} if (optics := given(a, options.OPTICS)) else {}
+    night = legdistort.simulate_exposures(**given(a, options.NIGHT), **optics, progress=wants_progress(a))
     with outputs.replacing_folder(a.out) as target:
         paths = night.write(target)
     _say(a, f"{len(paths)} frames and truth.ecsv in {a.out}", {"frames": [path.name for path in paths]})
 
 
-@command("print a solution", "results/solution.asdf", options.SOLUTION)
+@command("print a solution", "results/solution.asdf", options.SOLUTION, options.STRICT)
 def do_show(a):
     """``legdistort show``."""
     from ..pipeline import summarise
 
     solution = _solution(a)
-    _report(a, solution, summarise(solution))
+    summary = summarise(solution)
+    _report(a, solution, summary)
+    return _status(a, summary)
 
 
 @command(
@@ -391,7 +410,19 @@ def do_report(a):
 
 
 def _report(a, solution, summary):
-    print(json.dumps(summary, indent=1) if a.json else solution)
+    """Print a solution with its checks, those of a run included."""
+    if a.json:
+        print(json.dumps(summary, indent=1))
+        for check in summary["checks"]:
+            if check["state"] in ("warn", "fail"):
+                print(Check(**check), file=sys.stderr)
+    else:
+        print(replace(solution, checked=tuple(Check(**check) for check in summary["checks"])))
+
+
+def _status(a, summary):
+    """Exit status 3 where a check fails and `--strict` asks for it."""
+    return 3 if a.strict and worst(Check(**check) for check in summary["checks"]) == "fail" else 0
 
 
 def _say(a, sentence, figures):
@@ -410,7 +441,7 @@ def _share(a):
 
 def _open(a, **reading):
     parallel.check_workers(a.workers)
-    return legdistort.open_exposures(**given(a, options.FRAMES), **reading, progress=wants_progress(a))
+    return legdistort.open_exposures(**given(a, options.FRAMES, options.FLAGGED), **reading, progress=wants_progress(a))
 
 
 def _solving(a, shape=None, *, with_headers=False):
@@ -437,12 +468,10 @@ def _prior(text, shape, static_sigma):
 
 
 def _read_table(path, a):
-
-    return read_table(path, columns=dict(a.columns), origin=a.origin)
+    return read_table(path, columns=dict(a.columns), origin=a.origin, error=a.error)
 
 
 def _solution(a):
-
     return legdistort.Solution.read(a.solution, max_bytes=a.max_bytes)
 
 

@@ -19,10 +19,14 @@ COMMON = {
     "debug": Option("full log and traceback", action="store_true"),
 }
 FRAMES = {
-    "paths": Option("FITS files, plain or compressed", "frames", nargs="+", metavar="FRAME", path="read"),
+    "paths": Option(
+        "FITS files, plain or compressed; ASDF files of Roman", "frames", nargs="+", metavar="FRAME", path="read"
+    ),
     "ext": Option("extension: number, name, or NAME,VERSION", type=extension),
 }
+FLAGGED = {"dq_good": Option("flags that leave a pixel good: a sum, or 64,32", metavar="BITS")}
 STOPPING = {"stop_at_bad": Option("refuse blank and damaged frames, do not leave them out", action="store_true")}
+STRICT = {"strict": Option("exit status 3 if a check of the result fails", action="store_true")}
 NAMED_SOLUTION = {"solution": Option("solution.asdf", required=True, path="read")}
 SOLUTION = {
     "solution": Option("solution.asdf", "solution", path="read"),
@@ -30,7 +34,8 @@ SOLUTION = {
 }
 COLUMNS = {
     "columns": Option("names of columns", type=columns, default=[], metavar="OURS=THEIRS,..."),
-    "origin": Option("of pixels in the table (default 0; SExtractor 1)", type=int, choices=(0, 1)),
+    "origin": Option("of pixels in the table (default: the program's, else 0)", type=int, choices=(0, 1)),
+    "error": Option("of positions that come without one", type=float, metavar="PIXELS"),
 }
 TABLE = {
     **COLUMNS,
@@ -78,6 +83,9 @@ NIGHT = {
     "small": Option("six frames of 512 x 512 instead of eleven of 2048 x 2048", action="store_true"),
     "seed": Option("of the random numbers (default 0)", type=int),
 }
+OPTICS = {
+    "strehl": Option("adaptive optics: Strehl ratio of a core in a seeing halo (default: Moffat profiles)", type=float),
+}
 DETECTOR = {
     "threshold": Option("detection limit, signal-to-noise ratio (default 5)", type=float),
     "gain": Option("electrons per ADU (default: header)", type=float),
@@ -89,6 +97,7 @@ MEASURING = {
     "fwhm": Option("of the stars, pixels (default: found)", type=float),
     **DETECTOR,
     "profile": Option("shape: of a star, or the whole frame", choices=("own", "shared", "linear")),
+    "psf": Option("auto (default), moffat, effective, or a file or folder with PSFs", path="read"),
     "blends": Option("how stars that touch are fitted (default together)", choices=("together", "alone")),
     "errors": Option(
         "of the fit, or by stars of known position put into the frame (default fit)",
@@ -96,6 +105,7 @@ MEASURING = {
         choices=("fit", "injected", "scaled"),
     ),
 }
+PSF_FILES = {"write_psf": Option("folder for the effective PSF of every exposure", type=Path, path="folder")}
 INJECTING = {
     "fwhm": Option("of the stars put in, pixels (default: that of the frame's)", type=float, nargs="+"),
     "fluxes": Option("in units of the data (default: chosen by the frame)", type=float, nargs="+"),
@@ -106,11 +116,6 @@ MATCHING = {
     "min_exposures": Option("keep stars seen in so many exposures (default 4)", type=int),
     "isolation": Option("largest crowding of a star; inf keeps all (default 3)", type=float),
 }
-
-
-def clipping(default):
-    """The limit of the clipping, where `default` stands in the help."""
-    return Option(f"leave out what deviates by more sigma; 0: nothing (default {default})", type=float, none=0)
 
 
 SOLVING = {
@@ -125,7 +130,7 @@ SOLVING = {
     "gauge": Option("see the docs (default minimal)", choices=KINDS),
     "method": Option("(default joint)", choices=METHODS),
     "loss": Option("(default linear)", choices=LOSSES),
-    "clip": clipping("5"),
+    "clip": Option("leave out what deviates by more sigma; 0: nothing (default 5)", type=float, none=0),
     "errors": Option("(default stated)", choices=ERRORS),
     "error_floor": Option("pixels, added in quadrature to every error", type=float),
     "reference": Option("catalogue to tie the positions to, such as one of Gaia", metavar="TABLE", path="read"),
@@ -159,6 +164,9 @@ EXPANDING = {
     "origin": Option("coordinate of the first pixel (default 0)", type=int, choices=(0, 1)),
     "ext": Option("extension of FITS files, header of a text, or place in an ASDF tree", type=extension),
     "frame": Option("where to end: frame of a gwcs, or idl or tel of an aperture"),
+    "offset": Option(
+        "detector pixel (from 0) of the first pixel of a smaller source", type=float, nargs=2, metavar=("X", "Y")
+    ),
     "sigma": Option(
         "scatter of single exposures around it, pixels, or the word evidence", type=word_or(float, "evidence")
     ),

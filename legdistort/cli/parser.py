@@ -19,7 +19,10 @@ log = logging.getLogger("legdistort")
 
 
 def main(argv=None):
-    """Run the command line; returns the exit status: 0, 1 for a failed run, 2 for wrong usage."""
+    """Run the command line; returns the exit status.
+
+    0; 1 for a failed run, 2 for wrong usage, 3 where `--strict` is given and a check fails.
+    """
     arguments = _parser().parse_args(argv)
     try:
         with _stopping(), _logging(arguments), warnings.catch_warnings():
@@ -28,7 +31,7 @@ def main(argv=None):
             warnings.showwarning = lambda message, *_, **__: log.warning("%s", message)
             with logging_redirect_tqdm([log]) if wants_progress(arguments) else nullcontext():  # bars stay whole
                 check_paths(arguments, arguments.command.groups)
-                arguments.command.function(arguments)
+                status = arguments.command.function(arguments)
     except LegdistortError as error:
         if arguments.debug:
             raise
@@ -45,7 +48,7 @@ def main(argv=None):
     except KeyboardInterrupt:
         print("legdistort: interrupted; nothing was left half-written", file=sys.stderr)
         return 1
-    return 0
+    return status or 0
 
 
 @contextmanager

@@ -113,11 +113,12 @@ def assemble(layers, recipe, folder, share):
     Returns
     -------
     list of ndarray
-        Data, variance, weight, count, flags and context, as `stack` gives them for a block.
+        Data, variance, weight, count, flags, context and shares, as `stack` gives them for a block.
     """
     planes = [spill(recipe.shape, np.float32, value, folder) for value in (np.nan, np.nan, 0)]
     planes += [spill(recipe.shape, dtype, 0, folder) for dtype in (np.int32, np.uint8)]
     planes += [spill((n_planes(len(layers)), *recipe.shape), np.uint32, 0, folder)]
+    planes += [spill(recipe.shape, np.uint8, 0, folder) for _ in range(2)]
     pieces = list(blocks(layers, recipe))
     work = partial(stack, recipe=recipe, n_exposures=len(layers))
     for block, values in zip(pieces, share(work, pieces, description="co-adding", unit="block"), strict=True):
@@ -131,7 +132,7 @@ def assemble(layers, recipe, folder, share):
 
 def n_bytes(shape, n_exposures):
     """Of the planes of a mosaic."""
-    return int(np.prod(shape)) * (4 * 4 + 1 + 4 * n_planes(n_exposures))
+    return int(np.prod(shape)) * (4 * 4 + 3 + 4 * n_planes(n_exposures))
 
 
 def side(n_exposures):
@@ -188,6 +189,8 @@ def stack(block, *, recipe, n_exposures):
         Bits of `legdistort.coaddition.combination.PixelFlag`.
     context : ndarray of uint32, shape (n_planes, ny, nx)
         Bit i % 32 of plane i // 32 is set where exposure i contributes.
+    extrapolated, rejected : ndarray of uint8, shape (ny, nx)
+        Per cent of the exposures that contribute, and of those that are there, rounded up.
 
     It is None where no exposure meets the block.
     """
@@ -218,16 +221,25 @@ def stack(block, *, recipe, n_exposures):
         widths=recipe.widths,
     )
     keep = combined.keep[:, *inner]
-    flags = np.bitwise_or.reduce(doubt[:n] * combined.keep, axis=0)
+    doubt = doubt[:n] * combined.keep
+    flags = np.bitwise_or.reduce(doubt, axis=0)
+    rejected = np.zeros(shape, dtype=int)
     if recipe.method == "clipped":
-        rejected = np.isfinite(data[:n]) & ~spare & ~combined.keep
-        flags |= rejected.any(axis=0) * np.uint8(PixelFlag.REJECTED)
+        rejected = np.count_nonzero(np.isfinite(data[:n]) & ~spare & ~combined.keep, axis=0)
+        flags |= (rejected > 0) * np.uint8(PixelFlag.REJECTED)
+    extrapolated = np.count_nonzero(doubt & PixelFlag.EXTRAPOLATED, axis=0)
+    shares = _per_cent(extrapolated, combined.count), _per_cent(rejected, combined.count + rejected)
     context = np.zeros((n_planes(n_exposures), *keep.shape[1:]), dtype=np.uint32)
     for layer, used in zip(met, keep, strict=True):
         plane, bit = divmod(layer.index, _BITS)
         context[plane] |= used.astype(np.uint32) << np.uint32(bit)
     planes = combined.data, combined.variance, combined.weight, combined.count, flags
-    return *(p[inner] for p in planes), context
+    return *(p[inner] for p in planes), context, *(share[inner] for share in shares)
+
+
+def _per_cent(part, whole):
+    """Rounded up, so that none is none; 0 of nothing."""
+    return np.ceil(100 * part / np.maximum(whole, 1)).astype(np.uint8)
 
 
 def _resample(layer, window, recipe, planes):

@@ -2,16 +2,14 @@
 
 import logging
 import re
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
 
-from ..exceptions import InputError
+from ..exceptions import InputError, without_astropy_warnings
 from ..geometry.tangent_plane import TangentPlane
 
 
@@ -166,7 +164,7 @@ def read_grid(path):
         raise InputError(f"{path}: neither a FITS file nor the text of a FITS header")
     is_image = packed or re.match(rb"SIMPLE  =[^\n]*\Z", start)
     try:
-        with warnings.catch_warnings(action="ignore", category=AstropyWarning):  # of headers that astropy repairs
+        with without_astropy_warnings():  # of headers that astropy repairs
             wcs = _of_image(path) if is_image else _of_text(path)
             wcs.wcs.set()
     except Exception as error:  # whatever a broken file provokes, in wcslib too

@@ -8,13 +8,16 @@ from pathlib import Path
 
 import asdf
 import numpy as np
+from astropy import units as u
 from astropy.io import fits
+from astropy.nddata import CCDData, VarianceUncertainty
 from astropy.wcs import WCS
 
 from ..exceptions import InputError
-from ..runtime.fits_bytes import BLOCK
+from ..runtime.fits_bytes import BLOCK, sum32, with_checksum
 from ..runtime.outputs import replacing
 from ..runtime.scratch import forget
+from .combination import PixelFlag
 
 _ENDING = re.compile(r"\.(?:(?P<asdf>asdf)|(?:fits|fit|fts)(?P<packed>\.gz|\.bz2)?)$", re.IGNORECASE)
 _PACKERS = {".gz": gzip.open, ".bz2": bz2.open}
@@ -55,7 +58,10 @@ class Mosaic:
         ``(ox, oy)``: the centre of pixel (x, y) is the point (x + ox, y + oy) of the reference plane. None = the
         mosaic has another grid.
     header : `~astropy.io.fits.Header`
-        Unit, exposure time, method and what else goes into the file besides the WCS.
+        Unit, exposure times, method and what else goes into the file besides the WCS.
+    extrapolated, rejected : ndarray of uint8, shape (ny, nx), or None
+        Of how many exposures the flags 1 and 4 tell: per cent of those that contribute, and of those that are there,
+        rounded up.
     """
 
     data: np.ndarray
@@ -69,6 +75,34 @@ class Mosaic:
     left_out: dict = field(default_factory=dict)
     offset: tuple | None = None
     header: fits.Header = field(default_factory=fits.Header)
+    extrapolated: np.ndarray | None = None
+    rejected: np.ndarray | None = None
+
+    @property
+    def mask(self):
+        """Where there is no value, or only saturated ones: ndarray of bool, True = bad, as astropy has it."""
+        found = np.empty(self.shape, dtype=bool)
+        for start in range(0, len(found), _ROWS):  # the planes may be larger than the memory
+            rows = slice(start, start + _ROWS)
+            found[rows] = ~np.isfinite(self.data[rows]) | ((self.flags[rows] & PixelFlag.SATURATED) > 0)
+            forget(self.data)
+            forget(self.flags)
+        return found
+
+    def to_ccddata(self):
+        """The mosaic as a `~astropy.nddata.CCDData`: unit, variance, `mask`, WCS, header.
+
+        Its arrays are those of the mosaic, not copies. Without a unit (``BUNIT``) that astropy understands it is
+        dimensionless.
+        """
+        try:
+            unit = u.Unit(self.header.get("BUNIT", ""))
+        except ValueError:
+            unit = u.dimensionless_unscaled
+        uncertainty = VarianceUncertainty(self.variance, copy=False)
+        return CCDData(
+            self.data, unit=unit, uncertainty=uncertainty, mask=self.mask, wcs=self.wcs, meta=self.header.copy()
+        )
 
     @property
     def shape(self):
@@ -97,10 +131,11 @@ class Mosaic:
         return tuple(name for i, name in enumerate(self.exposures) if planes[i // 32] >> np.uint32(i % 32) & 1)
 
     def to_hdulist(self):
-        """The FITS file: image (primary HDU, ``SCI``), ``VAR``, ``WEIGHT``, ``FOOTPRINT``, ``FLAGS``, ``CONTEXT``.
+        """The FITS file: image (primary HDU, ``SCI``), ``UNCERT``, ``MASK``, ``WEIGHT``, ``FOOTPRINT`` and the others.
 
-        Each has the WCS. ``CONTEXT`` has a third axis where there are more than 32 exposures; a bit counts them in the
-        order of the keywords ``IMCMB001``, ``IMCMB002``, ...
+        These are ``FLAGS``, ``EXTRAPOLATED``, ``REJECTED`` and ``CONTEXT``. ``CCDData.read`` finds the variances
+        (``UTYPE`` of ``UNCERT``) and the mask. Each has the WCS. ``CONTEXT`` has a third axis where there are more than
+        32 exposures; a bit counts them in the order of the keywords ``IMCMB001``, ``IMCMB002``, ...
         """
         header = self.header.copy()
         header.update(self.wcs.to_header(relax=True))
@@ -111,27 +146,37 @@ class Mosaic:
         context = self.context.view(np.int32)  # the sign is the last bit, as drizzled images have it
         planes = {
             "SCI": self.data,
-            "VAR": self.variance,
+            "UNCERT": self.variance,
+            "MASK": self.mask.view(np.uint8),
             "WEIGHT": self.weight,
             "FOOTPRINT": self.footprint,
             "FLAGS": self.flags,
+            "EXTRAPOLATED": self.extrapolated,
+            "REJECTED": self.rejected,
             "CONTEXT": context[0] if len(context) == 1 else context,
         }
         hdulist = fits.HDUList()
         for name, plane in planes.items():
+            if plane is None:
+                continue
             hdu = (fits.ImageHDU if hdulist else fits.PrimaryHDU)(plane, header)
             hdu.name = name
             hdulist.append(hdu)
         unit = header.get("BUNIT")
         if unit:
-            hdulist["VAR"].header["BUNIT"] = f"({unit})**2"
+            hdulist["UNCERT"].header["BUNIT"] = f"({unit})**2"
+        hdulist["UNCERT"].header["UTYPE"] = ("VarianceUncertainty", "class of astropy.nddata")
         for name, meaning in (
+            ("MASK", "1: no value, or saturated"),
             ("WEIGHT", "sum of weights"),
             ("FOOTPRINT", "number of exposures"),
             ("FLAGS", "bits: 1 extrapolated, 2 saturated, 4 rejected"),
+            ("EXTRAPOLATED", "per cent of exposures that contribute"),
+            ("REJECTED", "per cent of exposures"),
             ("CONTEXT", "bits: exposures IMCMBnnn"),
         ):
-            hdulist[name].header["BUNIT"] = ("", meaning)
+            if name in hdulist:
+                hdulist[name].header["BUNIT"] = ("", meaning)
         return hdulist
 
     def write(self, path, *, overwrite=False):
@@ -159,10 +204,13 @@ class Mosaic:
                 asdf.AsdfFile({"mosaic": self._tree()}).write_to(file)
             elif ending["packed"]:
                 with _PACKERS[ending["packed"].lower()](file, "wb") as packer:
-                    self.to_hdulist().writeto(packer)
+                    self._append_to(packer)
             else:
-                for hdu in self.to_hdulist():
-                    _append(file, hdu)
+                self._append_to(file)
+
+    def _append_to(self, file):
+        for hdu in self.to_hdulist():
+            _append(file, hdu)
 
     def _tree(self):
         tree = {each.name: getattr(self, each.name) for each in fields(self)}
@@ -193,13 +241,23 @@ def check_ending(path):
 
 
 def _append(file, hdu):
-    """Add an HDU to a FITS file, a few rows at a time: astropy would turn the bytes of all of it in memory.
+    """Add an HDU with its checksums to a FITS file, a few rows at a time: astropy would turn all of it in memory.
 
     ``StreamingHDU``, which would not, closes the file after each.
     """
-    file.write(hdu.header.tostring().encode("ascii"))
-    rows = hdu.data.reshape(-1, hdu.data.shape[-1])
+    header, size, datasum = hdu.header.copy(), 0, 0
+    for content in _pieces(hdu.data):
+        size, datasum = size + len(content), sum32(content + bytes(-len(content) % 4), datasum)
+    header["CHECKSUM"], header["DATASUM"] = ("0" * 16, "of the HDU"), (str(datasum), "of its data")
+    file.write(with_checksum(header.tostring().encode("ascii"), datasum))
+    for content in _pieces(hdu.data):
+        file.write(content)
+    file.write(bytes(-size % BLOCK))
+
+
+def _pieces(plane):
+    """The bytes of a plane as FITS has them, a few rows at a time; but for the last of them whole words of 32 bits."""
+    rows = plane.reshape(-1, plane.shape[-1])
     for start in range(0, len(rows), _ROWS):
-        file.write(rows[start : start + _ROWS].astype(rows.dtype.newbyteorder(">")))
+        yield rows[start : start + _ROWS].astype(rows.dtype.newbyteorder(">")).tobytes()
         forget(rows)
-    file.write(bytes(-file.tell() % BLOCK))

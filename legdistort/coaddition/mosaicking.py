@@ -1,11 +1,9 @@
 """Resample exposures with the solution's distortions and combine them."""
 
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.star_hull import support
@@ -16,6 +14,7 @@ from .block_stack import Layer, Recipe, assemble, n_bytes
 from .flux_scales import flux_scales
 from .grids import given_grid, reference_grid
 from .mosaic import Mosaic
+from .mosaic_header import mosaic_header
 from .options import CoaddOptions
 from .preparation import prepare
 from .resampling import engines, noise_gain, pixel_maps
@@ -23,7 +22,6 @@ from .weights import make_weights, stellar_widths
 
 _STORED = 5  # bytes a pixel in the scratch folder, about
 _COARSE = 1.5  # pixels of the grid in those of an exposure from which interpolation leaves out too much
-_COPIED = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "BUNIT")
 
 
 def coadd(
@@ -153,9 +151,11 @@ def _coadd(exposures, solution, options, share):
         planes = assemble(layers, recipe, folder.parent, share)
     _warn_of_misuse(frames, maps, options.algorithm)
     correlation = noise_gain.noise_correlation(layers[0].map, layers[0].gain, recipe.resampling)
-    header = _header(frames, left_out, factors, _settings(options, recipe, origin, correlation))
+    header = mosaic_header(frames, left_out, factors, _settings(options, recipe, origin, correlation))
     names = tuple(f.name for f in frames)
-    return Mosaic(*planes, wcs=output.wcs, exposures=names, left_out=left_out, offset=output.offset, header=header)
+    *planes, extrapolated, rejected = planes
+    made = {"exposures": names, "left_out": left_out, "offset": output.offset, "header": header}
+    return Mosaic(*planes, wcs=output.wcs, **made, extrapolated=extrapolated, rejected=rejected)
 
 
 def _layers(frames, prepared, maps, factors, solution, output, options):
@@ -273,32 +273,5 @@ def _settings(options, recipe, origin, correlation):
         ("FLXSCALE", origin, "where the flux scales come from"),
         ("EXTRAPOL", options.extrapolated, "pixels outside the stars used"),
         ("WEIGHTS", weights if isinstance(weights, str) else "given" if weights else "equal", "of the exposures"),
-        ("NOISECOR", correlation, "noise of sums of many pixels over that by VAR"),
+        ("NOISECOR", correlation, "noise of sums of pixels over that by UNCERT"),
     ]
-
-
-def _header(frames, left_out, factors, settings):
-    header = fits.Header()
-    for key in _COPIED:
-        values = {str(f.header.get(key, "")) for f in frames}
-        if len(values) == 1 and values != {""}:
-            header[key] = values.pop()
-    times = [f.exposure_time or None for f in frames]
-    if None not in times:
-        mean = float(np.mean([time * factors[f.name] for f, time in zip(frames, times, strict=True)]))
-        header["EXPTIME"] = (round(mean, 9), "[s] exposure time that the values stand for")
-        header["TEXPTIME"] = (sum(times), "[s] sum of the exposure times")
-    header["NCOMBINE"] = (len(frames), "number of exposures combined")
-    for key, value, meaning in settings:
-        if isinstance(value, str) or (value is not None and np.isfinite(value)):
-            header[key] = (value, meaning)
-    header["CREATOR"] = f"legdistort {version('legdistort')}"
-    header.extend((f"IMCMB{i:03d}", _ascii(frame.name)) for i, frame in enumerate(frames[:999], start=1))
-    for name, reason in left_out.items():
-        header.add_history(_ascii(f"left out {name}: {reason}"))
-    return header
-
-
-def _ascii(text):
-    """As FITS has it; other letters by their numbers."""
-    return text.encode("ascii", "backslashreplace").decode()

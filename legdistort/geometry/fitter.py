@@ -4,6 +4,9 @@ Registered under the entry-point group ``astropy.modeling``, so that it is also 
 ``astropy.modeling.fitting.LegendreDistortionFitter``.
 """
 
+from functools import partial
+from numbers import Real
+
 import numpy as np
 from astropy import units as u
 from astropy.modeling import models
@@ -13,6 +16,10 @@ from astropy.modeling.fitting import Covariance, Fitter, StandardDeviations
 from ..exceptions import InputError, SolveError
 from .models import leaves, nodes, to_pixels
 
+#: Residuals [pix] up to this come from rounding.
+_EXACT = 1e-9
+#: Fits of a robust start, and at most so many until the positions used stay the same.
+_ROUNDS = 10
 #: Singular values below this fraction of the largest one count as zero.
 _RANK = 1e-11
 
@@ -35,7 +42,8 @@ class LegendreDistortionFitter(Fitter):
     fit_info : dict
         Of the last fit: ``param_names`` (fitted, in the order of the covariances), ``cov_x`` (at the weights given),
         ``param_cov`` (the same; without weights times chi2/dof, as astropy does), ``chi2``, ``dof``, ``rank``,
-        ``condition`` (of the design with columns of unit length), ``residuals`` (2, n) [pix], data minus model.
+        ``condition`` (of the design with columns of unit length), ``residuals`` (2, n) [pix], data minus model,
+        ``used`` (n,), whether a position took part.
 
     Examples
     --------
@@ -56,7 +64,7 @@ class LegendreDistortionFitter(Fitter):
         self.fit_info = {}
         self._calc_uncertainties = calc_uncertainties
 
-    def __call__(self, model, x, y, x_data, y_data, *, weights=None, inplace=False):
+    def __call__(self, model, x, y, x_data, y_data, *, weights=None, clip=None, inplace=False):
         """Fit a map of the plane to matched positions.
 
         Parameters
@@ -70,6 +78,11 @@ class LegendreDistortionFitter(Fitter):
         weights : array_like or Quantity, or pair of them, optional
             1/sigma, as everywhere in astropy (*not* 1/sigma^2), [1/pix]; a pair gives x and y their own. Zero leaves
             a position out. None weighs all alike.
+        clip : float, optional
+            Leave out positions that deviate by more standard errors, at the observed scale (from the median) where that
+            is larger than the weights say, from a fit of the others. ``fit_info["used"]`` says which are left.
+            (`~astropy.modeling.fitting.FittingWithOutlierRemoval` fits one output alone, and a map of the plane has
+            two: it cannot take its place.)
         inplace : bool
             Change the model itself instead of a copy.
 
@@ -86,13 +99,16 @@ class LegendreDistortionFitter(Fitter):
         SolveError
             Naming the coefficients that the positions do not determine.
         """
+        if clip is not None and not (isinstance(clip, Real) and clip > 1):
+            raise InputError(f"clip must be a number of standard errors above 1, got {clip!r}")
         free = free_coefficients(model)
         x, y, data, weight = _check_arrays(x, y, (x_data, y_data), weights)
         constant, columns = linear_parts(model, x, y, free)
-        design = (columns * weight).reshape(len(free), weight.size).T
-        target = ((data - constant) * weight).ravel()
-        values, cov_x, condition = _least_squares(design, target, free, x.size)
-        residuals = data - constant - np.tensordot(values, columns, 1)
+        values, cov_x, condition, residuals, weight = _fitted(data - constant, columns, weight, free)
+        if clip is not None:
+            least = _EXACT if weights is None else 1.0
+            again = partial(_fitted, data - constant, columns, free=free)
+            values, cov_x, condition, residuals, weight = _clipped(again, weight, residuals, clip * least, clip)
         chi2 = float(((residuals * weight) ** 2).sum())
         dof = int(np.count_nonzero(weight)) - len(free)
         param_cov = cov_x if weights is not None else cov_x * (chi2 / dof if dof > 0 else np.nan)
@@ -105,6 +121,7 @@ class LegendreDistortionFitter(Fitter):
             "rank": len(free),
             "condition": condition,
             "residuals": residuals,
+            "used": (weight > 0).any(axis=0),
         }
         fitted = model if inplace else model.copy()
         _drop_inverses(fitted)
@@ -117,6 +134,39 @@ class LegendreDistortionFitter(Fitter):
             covariance[where] = param_cov
             fitted.cov_matrix, fitted.stds = Covariance(covariance, names), StandardDeviations(param_cov, free)
         return fitted
+
+
+def _fitted(data, columns, weight, free):
+    """Values, their covariance, condition, residuals (2, n) and weights (2, n) of a linear problem."""
+    design = (columns * weight).reshape(len(free), weight.size).T
+    values, cov_x, condition = _least_squares(design, (data * weight).ravel(), free, weight.shape[1])
+    return values, cov_x, condition, data - np.tensordot(values, columns, 1), weight
+
+
+def _clipped(fit, weight, residuals, least, clip):
+    """The fit without the positions that deviate from it, after a start that gross errors hardly move (Cauchy weights).
+
+    `fit` takes weights and gives what `_fitted` does; the limit is `clip` times the observed scale, or `least`.
+    """
+    for _ in range(_ROUNDS):
+        radius = np.hypot(*(residuals * weight))
+        scale = max(_typical(radius), _EXACT)
+        residuals = fit(weight=weight / np.sqrt(1 + (radius / (2 * scale)) ** 2))[3]
+    used = None
+    for _ in range(_ROUNDS):
+        radius = np.hypot(*(residuals * weight))
+        kept = radius <= max(least, clip * _typical(radius))
+        if used is not None and np.array_equal(kept, used):
+            break
+        used = kept
+        found = fit(weight=np.where(used, weight, 0.0))
+        residuals = found[3]
+    return found
+
+
+def _typical(radius):
+    """Standard deviation per axis by the median of residuals in two axes; those of no weight do not count."""
+    return np.median(radius[radius > 0]) / np.sqrt(2 * np.log(2)) if radius.any() else 0.0
 
 
 def legendre_coefficients(model):

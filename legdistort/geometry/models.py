@@ -17,7 +17,8 @@ class FastLegendre2D(models.Legendre2D):
 
     The stock model stores its recurrence in attributes: two threads that evaluate one instance corrupt each
     other, and full-size arrays stay behind. Its derivatives forget the domain, so that astropy's non-linear fitters
-    end at wrong coefficients; here they are right. Positions may be quantities in pixels, and so is then the value.
+    end at wrong coefficients; here they are right. (docs/upstream.md shows all three faults.) Positions may be
+    quantities in pixels, and so is then the value.
     Parameters and serialisation are those of `Legendre2D`, and ASDF files hold the stock model.
 
     Attributes

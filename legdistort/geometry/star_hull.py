@@ -28,6 +28,16 @@ def support(name, solution):
         return np.array([[0.0, 0.0, 1.0]])
 
 
+def enclosed_area(xy):
+    """Area of the convex hull of positions (n, 2), square pixels; 0 where they span none."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return float(ConvexHull(xy).volume)  # which is what the area of a plane figure is called there
+    except (QhullError, ValueError):
+        return 0.0
+
+
 def supported(planes, xy):
     """Whether detector pixels ``(2, ...)`` lie within the half-planes of `support`."""
     x, y = xy

@@ -7,7 +7,7 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.modeling import models
 
-from .similarity import apply
+from .similarity import apply, invert
 
 
 def directions(lon, lat):
@@ -107,6 +107,29 @@ class TangentPlane:
         axes = np.stack(compass(lon, lat))  # e, n of the tangent point
         s = (directions(lon, lat) + plane @ axes) / length[:, None]
         return np.stack(compass(*angles(s)), axis=1) @ axes.T @ self.matrix[:, :2] / length[:, None, None]
+
+    def orientation(self, pose, shape):
+        """How a detector lies on the sky, at its centre, its distortion aside.
+
+        Parameters
+        ----------
+        pose : ndarray, shape (2, 3)
+            Reference plane -> undistorted pixels.
+        shape : tuple
+            ``(ny, nx)``.
+
+        Returns
+        -------
+        position_angle : float
+            Of the y axis of the detector, from north through east, degrees in [-180, 180).
+        pixel_scale : float
+            Arcsec.
+        """
+        back = invert(pose)
+        centre = apply(back, [[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
+        east, north = slope = self.jacobian(centre)[0] @ back[:, :2]
+        angle = np.degrees(np.arctan2(east[1], north[1]))
+        return float((angle + 180) % 360 - 180), float(3600 * np.sqrt(abs(np.linalg.det(slope))))
 
     def to_sky_errors(self, xy, variance):
         """Errors on the sky of positions (n, 2) with variances (3, n) ``xx, yy, xy`` [pix^2].

@@ -17,6 +17,7 @@ MATCHED = {
     "xy_corr": (None, False),
     "detector": (None, False),
     "flux": (None, False),
+    "mag": (None, False),
 }
 
 #: Columns of a table of detections.
@@ -29,10 +30,14 @@ DETECTED = {
     "xy_corr": (None, False),
     "flux": (None, False),
     "flux_err": (None, False),
+    "mag": (None, False),
     "fwhm": (u.pix, False),
     "flags": (None, False),
     "crowding": (None, False),
 }
+
+#: Beyond these, either way, a magnitude stands for none.
+_NO_MAGNITUDE = 90
 
 #: Columns of a table of stars: name -> (UCD of the Virtual Observatory, meaning). Names of sky columns are Gaia's.
 STARS = {
@@ -141,9 +146,15 @@ _RULES = (
         ("x_err", "y_err"),
         lambda values: np.isfinite(values) & (values > 0),
         "not a positive finite number",
-        "; errors are standard deviations in pixels, leave out rows without one",
+        "; errors are standard deviations in pixels: leave out rows without one, or give them one (--error PIXELS)",
     ),
     (("xy_corr",), lambda values: np.abs(values) < 1, "not inside (-1, 1)", ""),
+)
+
+
+_NO_ERRORS = (
+    "; where a list has no errors, give one for all: read_table(error=...), --error PIXELS, and let solve find them "
+    "with errors='by-brightness')"
 )
 
 
@@ -163,8 +174,8 @@ def _check_values(table, what):
 def check(table, contract, what):
     """Check a table against a column contract and return it as a `~astropy.table.QTable`.
 
-    Columns beyond the contract are kept. Positions must be finite, errors positive
-    and finite, correlations inside (-1, 1).
+    Columns beyond the contract are kept; of magnitudes fluxes are made where there are none. Positions must be finite,
+    errors positive and finite, correlations inside (-1, 1).
 
     Parameters
     ----------
@@ -184,7 +195,8 @@ def check(table, contract, what):
     if missing:
         raise InputError(
             f"{what} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}; it has "
-            f"{', '.join(table.colnames)} (map names: columns={{'{missing[0]}': ...}} or --columns {missing[0]}=...)"
+            f"{', '.join(table.colnames)} (map names: columns={{'{missing[0]}': ...}} or --columns {missing[0]}=..."
+            + (_NO_ERRORS if {"x_err", "y_err"} & set(missing) else ")")
         )
     if len(table) == 0:
         raise InputError(f"{what} is empty")
@@ -199,5 +211,14 @@ def check(table, contract, what):
             out.add_column(column, name=name, copy=False)  # `values` made a copy already
         else:
             out[name] = table[name]
+    if "mag" in contract and "mag" in out.colnames and "flux" not in out.colnames:
+        out["flux"] = flux_of(out["mag"])
     _check_values(out, what)
     return out
+
+
+def flux_of(magnitudes):
+    """Fluxes on an arbitrary scale; NaN for what is no magnitude (NaN, or the 99.999 and -99.999 of many programs)."""
+    magnitudes = np.asarray(magnitudes, dtype=float)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.where(np.abs(magnitudes) < _NO_MAGNITUDE, 10 ** (-0.4 * magnitudes), np.nan)

@@ -1,27 +1,30 @@
-"""Images from FITS files, HDU lists or CCDData: read at once, or when their pixels are needed."""
+"""Images from FITS files, HDU lists, NDData and others: read at once, or when their pixels are needed."""
 
+import contextlib
 import glob
+import hashlib
 import logging
 import re
 import threading
-import warnings
 import zlib
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.nddata import CCDData, StdDevUncertainty
-from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
 from tqdm import tqdm
 
-from ..exceptions import AssumptionWarning, DamagedError, InputError, warn
+from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, without_astropy_warnings
+from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.provenance import checksum
-from .exposure_names import exposure_name
-from .exposures import LEAVE_OUT, Exposure, believable_wcs, known_from_header
+from . import repetitions
+from .exposure_names import exposure_name, in_header
+from .exposures import LEAVE_OUT, Exposure, known_from_header
+from .foreign_images import from_nddata, is_nddata, read_roman
+from .pixel_flags import bad_pixels, good_bits
+from .sky_wcs import believable_wcs
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +37,8 @@ _BESIDE = {
     "ERR", "ERROR", "ERRORS", "UNCERT", "UNCERTAINTY", "VAR", "VARIANCE", "IVAR", "INVVAR", "STAT", "STDDEV",
     "SIGMA", "RMS", "NOISE", "DQ", "PIXELDQ", "GROUPDQ", "MASK", "BPM", "FLAG", "FLAGS", "QUAL", "QUALITY", "WHT",
     "WEIGHT", "WEIGHTS", "CON", "CTX", "CONTEXT", "CONFIDENCE", "COVERAGE", "FOOTPRINT", "EXP", "EXPTIME", "EXPMAP",
-    "TIME", "SAMP", "AREA", "BKG", "BACKGROUND", "SKY", "PSF", "PSFIMAGE", "WCSDVARR", "D2IMARR",
+    "TIME", "SAMP", "EXTRAPOLATED", "REJECTED", "AREA", "BKG", "BACKGROUND", "SKY", "PSF", "PSFIMAGE", "WCSDVARR",
+    "D2IMARR",
 }  # fmt: skip
 #: Images of a file that a message names.
 _MOST_NAMED = 8
@@ -54,15 +58,17 @@ class ExposureFile:
         As those of the `Exposure`; so is `has_gwcs`.
     shape : tuple
         ``(ny, nx)``.
-    checksum : str
-        SHA-256 of the file, in hexadecimal digits.
+    checksum, pixels : str
+        SHA-256 of the file and of its image alone, in hexadecimal digits.
     ext : int, str, (str, int) or None
         The extension asked for.
+    dq_good : int or None
+        Flags that are no reason to leave a pixel out.
     """
 
     name: str
     shape: tuple
-    wcs: WCS | None
+    wcs: object
     header: fits.Header
     saturation: float | None
     gain: float | None
@@ -70,8 +76,10 @@ class ExposureFile:
     exposure_time: float | None
     path: Path
     checksum: str
+    pixels: str
     ext: object = None
     has_gwcs: bool = False
+    dq_good: int | None = None
 
     def read(self):
         """The `Exposure` with its pixels; what else is known is not worked out again.
@@ -81,11 +89,16 @@ class ExposureFile:
         InputError
             If the file is gone, or has become another one.
         """
-        with _quiet(), _opened(self.path) as (_, hdulist), _told(f"{self.path}: {_DAMAGED}"):
-            hdu = find_image(hdulist, self.ext, self.path)
-            if hdu.shape != self.shape:
-                raise InputError(f"{self.path} has changed: its image had shape {self.shape}, now {hdu.shape}")
-            planes = _planes(hdulist, hdu)
+        if _is_asdf(self.path):
+            with _quiet(), _file(self.path) as file:
+                found = read_roman(file, str(self.path), self.path, self.dq_good)
+            planes = {name: getattr(found, name) for name in ("data", "mask", "uncertainty")}
+        else:
+            with _quiet(), _opened(self.path) as (_, hdulist), _told(f"{self.path}: {_DAMAGED}"):
+                planes = _planes(hdulist, find_image(hdulist, self.ext, self.path), self.dq_good)
+        shape = planes["data"].shape
+        if shape != self.shape:
+            raise InputError(f"{self.path} has changed: its image had shape {self.shape}, now {shape}")
         return Exposure(**{name: getattr(self, name) for name in _SHARED}, **planes)
 
     def __repr__(self):
@@ -96,7 +109,7 @@ class ExposureFile:
 _SHARED = {field.name for field in fields(Exposure)} & {field.name for field in fields(ExposureFile)}
 
 
-def read_exposures(paths, *, ext=None, progress=False):
+def read_exposures(paths, *, ext=None, dq_good=None, progress=False):
     """Read images.
 
     The name of an exposure is the base name of its file without ``.fits``, ``.fit``, ``.fts`` and
@@ -105,16 +118,20 @@ def read_exposures(paths, *, ext=None, progress=False):
 
     Extensions ``ERR``, ``UNCERT``, ``VAR`` or ``VARIANCE`` and ``DQ`` or ``MASK`` with the shape and the
     ``EXTVER`` of the image are used as its uncertainty and mask (any non-zero value is bad; of JWST
-    and Roman data the bit DO_NOT_USE alone). Gain, read noise, saturation and exposure time come from
-    the header (`KEYWORDS`); for integer data without such a keyword, a piled-up maximum is taken for the saturation.
+    and Roman data the bit DO_NOT_USE alone; see `dq_good`). Of JWST files the gwcs at ``meta.wcs`` is the WCS,
+    where they have one. Files ending in ``.asdf`` are images of Roman, with their ``dq``, ``err`` and ``meta.wcs``.
+    Gain, read noise, saturation and exposure time come from the header (`KEYWORDS`); for integer data without such a
+    keyword, a piled-up maximum is taken for the saturation.
 
     Parameters
     ----------
-    paths : str, path, HDUList, CCDData, or a sequence of them
+    paths : str, path, HDUList, NDData (as CCDData), or a sequence of them
         A string with ``*`` or ``?`` is expanded if no file has that very name.
     ext : int, str or (str, int), optional
         Extension to read from every file; by default the image, ``SCI`` if one is named so. Planes beside it (``DQ``,
         ``WHT`` and the like) do not count.
+    dq_good : int, str or sequence of int, optional
+        Flags of the DQ plane that are no reason to leave a pixel out, a sum of bits or ``"64,32"``; all others are.
     progress : bool, optional
         Show a progress bar.
 
@@ -129,23 +146,24 @@ def read_exposures(paths, *, ext=None, progress=False):
         images and no `ext`, without a good pixel, with the name of another one, or with a name that ``wcs/NAME.asdf``
         could not have.
     """
-    return _read_each(paths, _read, ext, progress)
+    return _read_each(paths, partial(_read, good=good_bits(dq_good)), ext, progress)
 
 
-def open_exposures(paths, *, ext=None, left_out=None, stop_at_bad=False, progress=False):
+def open_exposures(paths, *, ext=None, dq_good=None, left_out=None, stop_at_bad=False, progress=False):
     """Exposures for work on more images than the memory holds.
 
     Every file is read once, so that it is known to be sound, and read again when its pixels are needed; what is in
-    memory already (HDULists, CCDData) becomes an ordinary exposure. `legdistort.measure`, `match` and `coadd` take
+    memory already (HDULists, NDData) becomes an ordinary exposure. `legdistort.measure`, `match` and `coadd` take
     both.
 
     Parameters
     ----------
-    paths, ext, progress
+    paths, ext, dq_good, progress
         As for `legdistort.read_exposures`; the names are the same.
     left_out : dict, optional
         If given, what is blank (all pixels alike, hidden or NaN), truncated, damaged or without the image wanted is
-        left out with one warning, and added here, ``{name: reason}``.
+        left out with one warning, and added here, ``{name: reason}``; so is, with another, an image that is there
+        already under another name.
     stop_at_bad : bool
         Refuse such files instead, naming all of them.
 
@@ -158,13 +176,17 @@ def open_exposures(paths, *, ext=None, left_out=None, stop_at_bad=False, progres
     InputError
         As `legdistort.read_exposures` does; with `left_out` also if fewer than two good ones remain.
     """
+    good = good_bits(dq_good)
     if left_out is None and not stop_at_bad:
-        return _read_each(paths, _open, ext, progress)
-    bad = {}
-    exposures = _read_each(paths, partial(_open, even_blank=False), ext, progress, bad)
+        return _read_each(paths, partial(_open, good=good), ext, progress)
+    bad, copies = {}, {}
+    exposures = _read_each(paths, partial(_open, good=good, even_blank=False), ext, progress, bad, copies)
+    kept, reasons = {exposure.name for exposure in exposures}, repetitions.told(copies)
     if bad:
         _tell_bad(bad, len(exposures), stop_at_bad)
-        left_out.update({name: reason for name, (_, reason, _) in bad.items()})
+        reasons |= {name: reason for name, (_, reason, _) in bad.items()}
+    if left_out is not None:  # a copy may have the name of the original
+        left_out.update({name: reason for name, reason in reasons.items() if name not in kept})
     return exposures
 
 
@@ -185,12 +207,13 @@ def _tell_bad(bad, n_good, stop_at_bad):
     warn(f"{told}; they are left out (--stop-at-bad, stop_at_bad=True, refuses them)", AssumptionWarning)
 
 
-def _read_each(paths, read, ext, progress, bad=None):
+def _read_each(paths, read, ext, progress, bad=None, copies=None):
     """What `read` makes of every source and its name in want of a better one; the names found are checked.
 
-    What cannot be used is an error, or goes into the dict `bad`: ``{name: (file, reason, error)}``.
+    What cannot be used is an error, or goes into the dict `bad`: ``{name: (file, reason, error)}``. An image that is
+    there already goes into the dict `copies`, if there is one: ``{name: reason}``.
     """
-    origins, exposures = {}, []
+    origins, exposures, images = {}, [], {}
     for i, source in enumerate(tqdm(expand_paths(paths), desc="reading", unit="frame", disable=not progress)):
         try:
             with _quiet():
@@ -204,6 +227,12 @@ def _read_each(paths, read, ext, progress, bad=None):
             bad[name] = file, reason, error
             continue
         origin = exposure.path if exposure.path is not None else "in memory"
+        if copies is not None:
+            first = images.setdefault(_pixels(exposure), exposure)
+            if first is not exposure:
+                where = f" ({origins[first.name]} and {origin})" * (first.name == exposure.name)
+                copies[exposure.name] = f"its pixels are those of {first.name}{where}"
+                continue
         if exposure.name in origins:
             raise InputError(
                 f"two exposures are named {exposure.name!r} ({origins[exposure.name]} and "
@@ -230,7 +259,7 @@ def listed(exposures, function):
 
 def expand_paths(paths):
     """The argument of `read_exposures` as a flat list of sources, patterns expanded."""
-    if isinstance(paths, (str, Path, fits.HDUList, CCDData)):
+    if isinstance(paths, (str, Path, fits.HDUList)) or is_nddata(paths):
         paths = [paths]
     sources = []
     for source in paths:
@@ -246,32 +275,60 @@ def expand_paths(paths):
     return sources
 
 
-def _read(source, default, ext):
-    if isinstance(source, CCDData):
-        return _from_ccddata(source, default)
+def _read(source, default, ext, good=None):
+    if is_nddata(source):
+        return from_nddata(source, default, good)
     if isinstance(source, fits.HDUList):
         filename = source.filename()
         label = filename or str(source[0].header.get("FILENAME", default)) if len(source) else default
-        return _from_hdulist(source, ext, label, Path(filename) if filename else None)
+        return _from_hdulist(source, ext, label, Path(filename) if filename else None, good)
     if not isinstance(source, (str, Path)):
-        raise InputError(f"an exposure must be a path, an HDUList or a CCDData, got {type(source).__name__}")
+        raise InputError(f"an exposure must be a path, an HDUList or an NDData, got {type(source).__name__}")
     path = Path(source)
+    if _is_asdf(path):
+        with _file(path) as file:
+            _check_no_extension(path, ext)
+            return read_roman(file, str(path), path, good)
     with _opened(path) as (_, hdulist):
-        return _from_hdulist(hdulist, ext, str(path), path)
+        return _from_hdulist(hdulist, ext, str(path), path, good)
 
 
-def _open(source, default, ext, even_blank=True):
+def _open(source, default, ext, good=None, even_blank=True):
+    exposure = _read(source, default, ext, good)
+    exposure = exposure if even_blank else _not_blank(exposure)
     if not isinstance(source, (str, Path)):
-        exposure = _read(source, default, ext)
-        return exposure if even_blank else _not_blank(exposure)
+        return exposure
     path = Path(source)
-    with _opened(path) as (file, hdulist):
-        exposure = _from_hdulist(hdulist, ext, str(path), path)
-        exposure = exposure if even_blank else _not_blank(exposure)
-        file.seek(0)
+    with _file(path) as file:
         digits = checksum(file)
     shared = {name: getattr(exposure, name) for name in _SHARED}
-    return ExposureFile(**shared, shape=exposure.shape, checksum=digits, ext=ext)
+    made = {"shape": exposure.shape, "checksum": digits, "pixels": _pixels(exposure), "ext": ext, "dq_good": good}
+    return ExposureFile(**shared, **made)
+
+
+def _pixels(exposure):
+    """SHA-256 of the pixels, in hexadecimal digits: the same for the same image in another file."""
+    if isinstance(exposure, ExposureFile):
+        return exposure.pixels
+    digest = hashlib.sha256(f"{exposure.shape} {exposure.data.dtype}".encode())
+    digest.update(np.ascontiguousarray(exposure.data))
+    return digest.hexdigest()
+
+
+def _is_asdf(path):
+    return path.suffix.lower() == ".asdf"
+
+
+def _check_no_extension(path, ext):
+    if ext is not None:
+        raise InputError(f"{path}: an ASDF file has no extensions; leave ext (--ext) out")
+
+
+def _file(path):
+    """A file, open; `InputError` if there is none."""
+    if not path.is_file():
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    return path.open("rb")
 
 
 def _not_blank(exposure):
@@ -281,14 +338,14 @@ def _not_blank(exposure):
     return exposure
 
 
-@contextmanager
+@contextlib.contextmanager
 def _quiet():
     """Headers are often a little off the standard; what matters is checked."""
-    with _FILTERS, warnings.catch_warnings(action="ignore", category=AstropyWarning):
+    with _FILTERS, without_astropy_warnings():
         yield
 
 
-@contextmanager
+@contextlib.contextmanager
 def _told(sentence):
     """Whatever a damaged file provokes, as a `DamagedError` that begins with the sentence."""
     try:
@@ -299,23 +356,21 @@ def _told(sentence):
         raise DamagedError(f"{sentence} ({error})") from None
 
 
-@contextmanager
+@contextlib.contextmanager
 def _opened(path):
     """A FITS file, as it is and as an HDUList."""
-    if not path.is_file():
-        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
     told = _told(f"{path}: cannot be read as FITS, damaged or something else")
-    with told, path.open("rb") as file, fits.open(file, memmap=False) as hdulist:
+    with _file(path) as file, told, fits.open(file, memmap=False) as hdulist:
         yield file, hdulist
 
 
-def _from_hdulist(hdulist, ext, label, path):
+def _from_hdulist(hdulist, ext, label, path, good=None):
     with _told(f"{label}: {_DAMAGED}"):
         hdu = find_image(hdulist, ext, label)
         header = hdulist[0].header.copy()
         header.update(hdu.header)
         integer = hdu.header.get("BITPIX", -32) > 0  # before the data are touched: scaling changes it
-        planes = _planes(hdulist, hdu)
+        planes = _planes(hdulist, hdu, good)
     name = exposure_name(label, ext)
     try:
         wcs = believable_wcs(WCS(header, fobj=hdulist), hdu.shape, name)
@@ -323,10 +378,55 @@ def _from_hdulist(hdulist, ext, label, path):
         log.info("%s: WCS of the header not used: %s", name, error)
         wcs = None
     known = known_from_header(header, planes["data"], integer=integer)
-    number = next(i for i, other in enumerate(hdulist) if other is hdu)
-    tables = [other.header.get("IMAGEHDU", number) for other in hdulist if other.name == "ASDF"]
-    known["has_gwcs"] = path is not None and tables == [number]
+    tables = [other for other in hdulist if other.name == "ASDF"]
+    if len(tables) == 1:
+        owner = tables[0].header.get("EXPNAME")
+        if path is not None:
+            known["has_gwcs"] = owner is None or named_images(hdulist, path).get(owner) is hdu
+        if owner is None and header.get("TELESCOP") == "JWST":
+            wcs = _gwcs_of(tables[0], name, hdu.shape) or wcs
     return Exposure(name, **planes, header=header, wcs=wcs, path=path, **known)
+
+
+def _gwcs_of(table, name, shape):
+    """The gwcs at ``meta.wcs`` of the table in which JWST keeps the data model of a file, if that can be read."""
+    try:
+        content = np.asarray(table.data["ASDF_METADATA"]).tobytes()
+        tree = read_tree(f"{name}[ASDF]", content=content, tags=ARCHIVES)
+    except (InputError, *_UNREADABLE) as error:
+        log.warning("the gwcs of %s cannot be read, the WCS of its header is taken: %s", name, error)
+        return None
+    wcs = (tree.get("meta") or {}).get("wcs")
+    if not hasattr(wcs, "pixel_to_world"):  # none in _rate files; a mapping where a package is missing
+        if wcs is not None:
+            log.warning("the gwcs of %s needs a package that is not there (stdatamodels); its header is taken", name)
+        return None
+    return believable_wcs(wcs, shape, name)
+
+
+def extension_names(hdulist, path):
+    """``{name of an exposure: extension}`` for every way to name an extension of a file, and for none."""
+    names = {exposure_name(path): None}
+    for i, hdu in enumerate(hdulist):
+        forms = (i, hdu.name, (hdu.name, hdu.ver)) if hdu.name else (i,)
+        names |= {exposure_name(path, form): form for form in forms}
+    return names
+
+
+def named_images(hdulist, path):
+    """``{name of an exposure, as headers hold it: HDU}`` for every name that an image of a file can have."""
+    found = {}
+    for name, ext in extension_names(hdulist, path).items():
+        with contextlib.suppress(InputError):
+            found[in_header(name)] = find_image(hdulist, ext, str(path), of_several=True)
+    return found
+
+
+def planes_beside(hdulist, image):
+    """HDUs of errors, flags, weights beside an image: of its shape and ``EXTVER``, and of no other image."""
+    alike = [hdu for hdu in hdulist if _is_image(hdu) and hdu.shape == image.shape and hdu.ver == image.ver]
+    planes = [hdu for hdu in alike if hdu is not image and _stands_beside(hdu.name)]
+    return planes if len(planes) == len(alike) - 1 else []
 
 
 def _is_image(hdu):
@@ -381,7 +481,7 @@ def _listed_images(hdulist, images):
     return f"{listed_so}: choose one with ext, as in ext={python} (--ext {forms[0]})"
 
 
-def _planes(hdulist, hdu):
+def _planes(hdulist, hdu, good=None):
     """Data of an image, and the mask and uncertainty that stand beside it in the same file."""
     data = hdu.data
     if data is None or data.shape != hdu.shape:
@@ -391,9 +491,7 @@ def _planes(hdulist, hdu):
     for other in hdulist:
         alike = other is not hdu and _is_image(other) and other.shape == hdu.shape and other.ver == hdu.ver
         if alike and other.name in MASK_NAMES:
-            flags = np.asarray(other.data)
-            do_not_use = telescope in ("JWST", "ROMAN") and flags.dtype.kind in "iu"
-            planes["mask"] = (flags & 1 if do_not_use else flags) != 0
+            planes["mask"] = bad_pixels(other.data, good, do_not_use=telescope in ("JWST", "ROMAN"))
         elif alike and other.name in UNCERTAINTY_NAMES:
             kind = str(other.header.get("UTYPE", UNCERTAINTY_NAMES[other.name]))  # CCDData writes its class as UTYPE
             with np.errstate(invalid="ignore", divide="ignore"):
@@ -404,14 +502,3 @@ def _planes(hdulist, hdu):
                     values = 1 / np.sqrt(values)
                 planes["uncertainty"] = values
     return planes
-
-
-def _from_ccddata(ccd, default):
-    header = fits.Header(ccd.header)
-    name = exposure_name(str(header.get("FILENAME", default)))
-    uncertainty = None if ccd.uncertainty is None else ccd.uncertainty.represent_as(StdDevUncertainty).array
-    if ccd.unit is not None:
-        header["BUNIT"] = ccd.unit.to_string()
-    wcs = believable_wcs(ccd.wcs, np.shape(ccd.data), name) if isinstance(ccd.wcs, WCS) else None
-    known = known_from_header(header, ccd.data, integer=ccd.data.dtype.kind in "iu")
-    return Exposure(name, ccd.data, ccd.mask, uncertainty, wcs, header, **known)

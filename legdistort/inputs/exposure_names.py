@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..exceptions import InputError
 
-_SUFFIX = re.compile(r"\.(fits|fit|fts|ldac)(\.(gz|fz|bz2|zip))?$", re.IGNORECASE)
+_SUFFIX = re.compile(r"\.(fits|fit|fts|ldac|asdf)(\.(gz|fz|bz2|zip))?$", re.IGNORECASE)
 #: What no name has: slashes, control characters and line breaks, bytes of a file name that are no UTF-8.
 _UNFIT = re.compile("[/\\\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _LONGEST = 250  # bytes; with the ending .asdf the 255 that file systems allow
@@ -16,6 +16,11 @@ def exposure_name(path, ext=None):
     name = _SUFFIX.sub("", Path(path).name)
     parts = ext if isinstance(ext, tuple) else (ext,)
     return name if ext is None else f"{name}_{''.join(map(str, parts))}"
+
+
+def in_header(name):
+    """Name of an exposure as the value of a FITS card, which is ASCII: the rest as escapes."""
+    return name.encode("ascii", "backslashreplace").decode().rstrip()
 
 
 def check_exposure_name(name, origin=None):

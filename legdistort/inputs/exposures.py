@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.wcs import WCS
-from astropy.wcs.utils import proj_plane_pixel_scales
 
 from ..exceptions import DamagedError, InputError
 from .exposure_names import check_exposure_name
@@ -20,14 +18,8 @@ KEYWORDS = {
     "saturation": ("SATURATE", "SATLEVEL"),
     "gain": ("EGAIN", "GAIN", "CCDGAIN", "HIERARCH ESO DET OUT1 CONAD"),
     "read_noise": ("RDNOISE", "READNOIS", "READNSE", "RON", "HIERARCH ESO DET OUT1 RON"),
-    "exposure_time": ("EXPTIME", "EXPOSURE", "XPOSURE", "ITIME"),
+    "exposure_time": ("EXPTIME", "EXPOSURE", "XPOSURE", "ITIME", "EFFEXPTM"),
 }
-
-#: A header WCS is believed for pixel scales in this range [degrees]: 0.1 mas to 6 arcmin.
-PIXEL_SCALES = (0.0001 / 3600, 0.1)
-#: ... and a reference pixel not farther from the centre than this many frame sizes (mosaics need several).
-REFERENCE_DISTANCE = 20
-
 
 #: What to do about an exposure that has nothing to offer.
 LEAVE_OUT = "; leave this exposure out or mend it"
@@ -46,8 +38,8 @@ class Exposure:
         True = bad; pixels that are not finite are always masked. None = all good.
     uncertainty : ndarray or None
         Standard deviation of every pixel, in units of the data.
-    wcs : `~astropy.wcs.WCS` or None
-        Nominal WCS, celestial and believable (see `believable_wcs`).
+    wcs : `~astropy.wcs.WCS`, gwcs or other WCS of the shared interface (APE 14), or None
+        Nominal WCS, celestial and believable (see `legdistort.inputs.sky_wcs.believable_wcs`).
     header : `~astropy.io.fits.Header`
     saturation : float or None
         Pixels at or above it are saturated [ADU].
@@ -72,7 +64,7 @@ class Exposure:
     data: np.ndarray
     mask: np.ndarray | None = None
     uncertainty: np.ndarray | None = None
-    wcs: WCS | None = None
+    wcs: object = None
     header: fits.Header = field(default_factory=fits.Header)
     saturation: float | None = None
     gain: float | None = None
@@ -165,45 +157,3 @@ def _as_float(data, name):
     if data.dtype.kind != "f":
         raise InputError(f"{name}: the data must be real numbers, got {data.dtype}")
     return data.astype(data.dtype.newbyteorder("="), copy=False)
-
-
-def believable_wcs(wcs, shape, name=""):
-    """The celestial part of a WCS, or None with a log entry if it is not to be believed.
-
-    Believable is a WCS that has two celestial axes, a pixel scale in `PIXEL_SCALES` that is the same in x
-    and y within a factor of two, its reference pixel within `REFERENCE_DISTANCE` frame sizes of the
-    centre, and that maps corners and centre to the sky and back within 0.01 of the frame.
-
-    Parameters
-    ----------
-    wcs : `~astropy.wcs.WCS`
-        As the header gives it.
-    shape : tuple
-        ``(ny, nx)``.
-    name : str, optional
-        For the log.
-    """
-    if not wcs.has_celestial:
-        return None
-    wcs = wcs.celestial
-    ny, nx = shape
-    scales = proj_plane_pixel_scales(wcs)
-    corners = np.array([[0, 0], [nx - 1, 0], [0, ny - 1], [nx - 1, ny - 1], [(nx - 1) / 2, (ny - 1) / 2]])
-    off_centre = np.abs(wcs.wcs.crpix - 1 - corners[-1]).max() / max(ny, nx)
-    reason = None
-    if not (scales.min() > PIXEL_SCALES[0] and scales.max() < PIXEL_SCALES[1] and scales.max() < 2 * scales.min()):
-        reason = f"pixel scale {scales[0]:.3g}, {scales[1]:.3g} degrees"
-    elif not off_centre < REFERENCE_DISTANCE:
-        reason = f"reference pixel {off_centre:.0f} frame sizes off the centre"
-    else:
-        try:
-            back = wcs.all_world2pix(wcs.all_pix2world(corners, 0), 0, quiet=True)
-        except Exception as error:  # singular matrices and the like, raised by wcslib under many names
-            reason = str(error)
-        else:
-            if not np.all(np.abs(back - corners) < 0.01 * max(ny, nx)):
-                reason = "it does not map the corners to the sky and back"
-    if reason:
-        log.info("%s: WCS of the header not used: %s", name, reason)
-        return None
-    return wcs

@@ -8,10 +8,17 @@ from astropy import units as u
 from astropy.table import QTable
 from scipy.sparse.csgraph import connected_components
 
-from ..exceptions import InputError, MatchError, some_of
+from ..exceptions import AssumptionWarning, InputError, MatchError, some_of, warn
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
-from . import column_contract, exposure_names, start_poses
+from . import column_contract, exposure_names, repetitions, start_poses
+
+#: Positions belong on their detector, give or take this part of its size: distortions move stars over its edge.
+MARGIN = 0.1
+#: Where more than this part of the positions of an exposure does not, its shape is taken for wrong.
+STRAY = 0.1
+#: Rows that a message names.
+_MOST_NAMED = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +134,7 @@ class Matches:
             raise MatchError(
                 "no exposure agrees with the others: " + "; ".join(f"{k}: {v}" for k, v in reasons.items())
             )
-        known = {"sky": self.sky, "left_out": left_out, "epoch": self.epoch}
+        known = {"sky": self.sky, "left_out": left_out, "epoch": self.epoch, "allow_copies": True}
         return type(self).from_table(table, shape=self.shapes, poses=kept, **known)
 
     def to_meta(self):
@@ -156,14 +163,16 @@ class Matches:
         return f"<Matches: {len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures>"
 
     @classmethod
-    def from_table(cls, table, *, shape, poses=None, columns=None, sky=None, left_out=None, epoch=None):
+    def from_table(
+        cls, table, *, shape, poses=None, columns=None, sky=None, left_out=None, epoch=None, allow_copies=False
+    ):
         """Matches from anybody's table.
 
         Parameters
         ----------
         table : `~astropy.table.Table`
             Columns ``exposure``, ``star`` (int or str), ``x``, ``y``, ``x_err``, ``y_err`` (pixels,
-            0-based, standard deviations), optional ``xy_corr``, ``detector``, ``flux``.
+            0-based, standard deviations), optional ``xy_corr``, ``detector``, ``flux`` or ``mag``.
         shape : tuple or dict
             ``(ny, nx)``, or that by exposure.
         poses : dict, optional
@@ -174,7 +183,10 @@ class Matches:
         left_out : dict, optional
             Passed on.
         epoch : float, optional
-            Mean of the exposures, a Julian year.
+            Mean of the exposures, a Julian year; by default that of a column ``epoch``, if there is one.
+        allow_copies : bool
+            Keep exposures whose positions are those of another one to the last bit, as in simulations without noise;
+            else they are left out with a warning: five stars or more, and over half of those of the shorter list.
 
         Raises
         ------
@@ -182,16 +194,28 @@ class Matches:
             For missing columns, bad values, duplicate (exposure, star) rows, a missing shape or pose.
         MatchError
             For one exposure only, or exposures in groups without a common star.
+
+        Warns
+        -----
+        AssumptionWarning
+            Naming positions outside their detector, which are left out; more than a tenth of those of an exposure are
+            an `InputError`.
         """
         if columns:
             table = column_contract.rename(table, columns)
         table = column_contract.check(table, column_contract.MATCHED, "the table of matched positions")
         table["exposure"] = table["exposure"].astype(str)
-        seen = Observations.of(table)
+        seen, left_out = Observations.of(table), dict(left_out or {})
+        if not allow_copies and (copies := repetitions.reasons(seen.names, seen.exposure, seen.xy)):
+            table, left_out = table[~np.isin(table["exposure"], list(copies))], left_out | copies
+            seen = Observations.of(table)
         for name in seen.names:
             exposure_names.check_exposure_name(name)
         shapes = shapes_by_exposure(shape, seen.names)
-        _check_inside(seen, shapes)
+        inside = _inside(seen, shapes)
+        if not inside.all():
+            table = table[inside]
+            seen = Observations.of(table)
         _check_duplicates(seen)
         _check_connected(seen)
         if poses is None:
@@ -199,7 +223,10 @@ class Matches:
             poses = dict(zip(seen.names, found, strict=True))
         else:
             poses = _check_poses(poses, seen.names)
-        return cls(table, shapes, poses, sky, dict(left_out or {}), epoch, observations=seen)
+        if epoch is None and "epoch" in table.colnames:
+            epochs = column_contract.values(table, "epoch", u.yr)
+            epoch = float(np.nanmean(epochs)) if np.isfinite(epochs).any() else None
+        return cls(table, shapes, poses, sky, left_out, epoch, observations=seen)
 
 
 def shapes_by_exposure(shape, names):
@@ -261,22 +288,42 @@ def _check_duplicates(seen):
         )
 
 
-def _check_inside(seen, shapes):
-    """Positions belong on their detector, give or take a tenth of its size."""
+def _inside(seen, shapes):
+    """Which positions lie on their detector, give or take a tenth of its size; a few others are warned of.
+
+    Raises
+    ------
+    InputError
+        If so many of an exposure lie outside that its shape is to be doubted.
+    """
     xy, sizes = seen.xy, np.array([shapes[name][::-1] for name in seen.names])
     smallest = sizes.min(axis=0)
-    if np.all(xy.min(axis=0) >= -0.1 * smallest) and np.all(xy.max(axis=0) <= 1.1 * smallest):
-        return
+    if np.all(xy.min(axis=0) >= -MARGIN * smallest) and np.all(xy.max(axis=0) <= (1 + MARGIN) * smallest):
+        return np.ones(len(xy), dtype=bool)
     size = sizes[seen.exposure]
-    out = ((xy < -0.1 * size) | (xy > 1.1 * size)).any(axis=1)
-    if out.any():
-        row = int(np.flatnonzero(out)[0])
-        name = seen.names[seen.exposure[row]]
+    out = ((xy < -MARGIN * size) | (xy > (1 + MARGIN) * size)).any(axis=1)
+    if not out.any():
+        return ~out
+    rows = np.flatnonzero(out)
+    named = [
+        f"star {seen.stars[seen.star[row]]} of exposure {seen.names[seen.exposure[row]]} at ({xy[row, 0]:.0f}, "
+        f"{xy[row, 1]:.0f})"
+        for row in rows[:_MOST_NAMED]
+    ]
+    share = np.bincount(seen.exposure[rows], minlength=len(sizes)) / np.bincount(seen.exposure)
+    if share.max() > STRAY:
+        name = seen.names[int(np.argmax(share))]
         raise InputError(
-            f"{np.count_nonzero(out)} positions lie outside their detector; the first is row {row}, star "
-            f"{seen.stars[seen.star[row]]} of exposure {name} at ({xy[row, 0]:.0f}, {xy[row, 1]:.0f}) px, where the "
-            f"shape is {shapes[name]} (ny, nx): correct the shape or the position"
+            f"{len(rows)} positions lie outside their detector, {100 * share.max():.0f} % of those of exposure {name}, "
+            f"whose shape is {shapes[name]} (ny, nx); the first are {'; '.join(named)} px: correct the shape or the "
+            "positions"
         )
+    more = f" and {len(rows) - len(named)} more" * (len(rows) > len(named))
+    warn(
+        f"{len(rows)} positions lie outside their detector and are left out: {'; '.join(named)} px{more}",
+        AssumptionWarning,
+    )
+    return ~out
 
 
 def _check_connected(seen):

@@ -14,7 +14,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import Table
 from astropy.time import Time
 
-from ..exceptions import InputError
+from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry.tangent_plane import angles, compass, directions
 from . import column_contract
 from .table_files import read_table
@@ -29,6 +29,8 @@ VIZIER = {
 _PARAMETERS = ("ra", "dec", "pmra", "pmdec")
 _UNITS = dict.fromkeys(("ra", "dec"), u.deg) | dict.fromkeys(("pmra", "pmdec"), u.mas / u.yr)
 _MAS = np.radians(1 / 3.6e6)
+#: Error of what is taken as exact: mas, and mas a year.
+EXACT = 1e-3
 #: Years between catalogue and exposures within which a star without proper motion still serves.
 _SAME_TIME = 0.01
 
@@ -176,12 +178,19 @@ def read_reference(reference):
 
     Parameters
     ----------
-    reference : `~astropy.table.Table`, str, path or Reference
+    reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord`, str, path or Reference
+        Of a table the column that holds a `~astropy.coordinates.SkyCoord`, if there is one, gives positions, motions
+        and epoch. A `~astropy.coordinates.SkyCoord` alone is taken as exact.
 
     Raises
     ------
     InputError
         For columns that are missing or hold no numbers, and for a table without a usable row.
+
+    Warns
+    -----
+    AssumptionWarning
+        For a `~astropy.coordinates.SkyCoord` alone, which has no errors.
     """
     if isinstance(reference, Reference):
         return reference
@@ -189,9 +198,11 @@ def read_reference(reference):
         label, table = f"the reference {reference}", read_table(reference)
     elif isinstance(reference, Table):
         label, table = "the reference", Table(reference)  # Quantities become columns with a unit
+    elif isinstance(reference, SkyCoord):
+        label, table = "the reference", _exact(reference)
     else:
-        raise InputError(f"reference must be a table or the path of one, got {type(reference).__name__}")
-    table = _named(table)
+        raise InputError(f"reference must be a table, the path of one, or a SkyCoord, got {type(reference).__name__}")
+    table = _named(_with_coordinates(table, label))
     celestial = {"ra", "dec"} <= set(table.colnames)
     if not celestial and not {"x", "y"} <= set(table.colnames):
         raise InputError(
@@ -209,6 +220,44 @@ def read_reference(reference):
         names, count = np.unique(made.star[good], return_counts=True)
         raise InputError(f"{label} names star {names[count > 1][0]} more than once")
     return made.subset(good)
+
+
+def _exact(coordinates):
+    """A table of coordinates, and of their motions, with errors too small to matter."""
+    if coordinates.isscalar or coordinates.ndim != 1:
+        raise InputError(f"the SkyCoord of a reference must be a list of places, got shape {coordinates.shape}")
+    warn(
+        "a SkyCoord has no errors: its positions are taken as exact; give a table with this column and ra_error, "
+        "dec_error (and pmra_error, pmdec_error) for others",
+        AssumptionWarning,
+    )
+    table = Table({"sky": coordinates})
+    for name in ("ra_error", "dec_error", "pmra_error", "pmdec_error"):
+        table[name] = np.full(len(table), EXACT)
+    return table
+
+
+def _with_coordinates(table, label):
+    """The table with the columns of Gaia where it has a SkyCoord."""
+    found = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
+    if len(found) > 1 and "sky" not in found:
+        raise InputError(f"{label} has several columns of coordinates, {', '.join(found)}: name one sky, or leave one")
+    if not found:
+        return table
+    name = "sky" if "sky" in found else found[0]
+    coordinates, table = table[name], table[[other for other in table.colnames if other not in found]]
+    icrs = coordinates.icrs
+    table["ra"], table["dec"] = icrs.ra.deg, icrs.dec.deg
+    if "s" in icrs.data.differentials:
+        table["pmra"] = icrs.pm_ra_cosdec.to_value(u.mas / u.yr)
+        table["pmdec"] = icrs.pm_dec.to_value(u.mas / u.yr)
+        if coordinates.obstime is None and "ref_epoch" not in table.colnames:
+            raise InputError(
+                f"{label} has proper motions but its SkyCoord has no obstime, the time of its positions: add it"
+            )
+    if coordinates.obstime is not None and "ref_epoch" not in table.colnames:
+        table["ref_epoch"] = np.broadcast_to(coordinates.obstime.jyear, len(table)).copy()
+    return table
 
 
 def _named(table):
@@ -305,6 +354,7 @@ def _star(table):
 def _flux(table):
     if "flux" in table.colnames:
         return np.nan_to_num(column_contract.values(table, "flux"), nan=0.0)
-    if "phot_g_mean_mag" in table.colnames:
-        return np.nan_to_num(10 ** (-0.4 * column_contract.values(table, "phot_g_mean_mag")), nan=0.0)
+    for name in ("phot_g_mean_mag", "mag"):
+        if name in table.colnames:
+            return np.nan_to_num(column_contract.flux_of(column_contract.values(table, name)), nan=0.0)
     return None

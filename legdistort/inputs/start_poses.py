@@ -3,7 +3,10 @@
 import numpy as np
 
 from ..exceptions import MatchError
-from ..geometry import similarity
+from ..geometry import pair_agreement, similarity
+
+#: Exposures whose stars typically lie farther from their means than this part of their extent are compared in pairs.
+_FAR = 0.01
 
 
 def star_means(xy, star, n_stars):
@@ -19,6 +22,7 @@ def estimate_poses(exposure, star, xy, *, names=None):
 
     The exposure with the most stars becomes the reference plane; the others are tied one after the
     other, each to all that already stand, the best connected first, then all are refined together.
+    Exposures that contradict most others get a pose as well, but have no say in those of the others.
 
     Parameters
     ----------
@@ -36,17 +40,29 @@ def estimate_poses(exposure, star, xy, *, names=None):
     MatchError
         Naming an exposure that shares fewer than two stars with all the others.
     """
-    n_exposures, n_stars = exposure.max() + 1, star.max() + 1
+    n_exposures = exposure.max() + 1
     names = range(n_exposures) if names is None else names
     rows = [np.flatnonzero(exposure == i) for i in range(n_exposures)]
-    first = int(np.argmax([len(r) for r in rows]))
+    has_say = np.ones(n_exposures, dtype=bool)
+    found = _tie(rows, star, xy, has_say, names)
+    if _far_off(found, rows, star, xy):
+        has_say[list(pair_agreement.compare(exposure, star, xy).against)] = False
+        if not has_say.all():
+            found = _tie(rows, star, xy, has_say, names)
+    return found
+
+
+def _tie(rows, star, xy, has_say, names):
+    """Poses from the positions of exposures that have a say."""
+    has_say, n_stars = has_say.copy(), star.max() + 1
+    first = int(np.argmax([len(r) * say for r, say in zip(rows, has_say, strict=True)]))
     found = {first: similarity.identity()}
     sums, counts = np.zeros((n_stars, 2)), np.zeros(n_stars)
     np.add.at(sums, star[rows[first]], xy[rows[first]])
     np.add.at(counts, star[rows[first]], 1)
-    while len(found) < n_exposures:
-        shared = {i: rows[i][counts[star[rows[i]]] > 0] for i in range(n_exposures) if i not in found}
-        best = max(shared, key=lambda i: len(shared[i]))
+    while len(found) < len(rows):
+        shared = {i: r[counts[star[r]] > 0] for i, r in enumerate(rows) if i not in found}
+        best = max(shared, key=lambda i: (has_say[i], len(shared[i])))
         r = shared[best]
         if len(r) < 2 or np.all(np.ptp(xy[r], axis=0) == 0):
             raise MatchError(
@@ -56,31 +72,44 @@ def estimate_poses(exposure, star, xy, *, names=None):
         mean = sums[star[r]] / counts[star[r], None]
         found[best] = similarity.robust_similarity(mean, xy[r])
         off = np.hypot(*(similarity.apply(found[best], mean) - xy[r]).T)
-        if np.median(off) > 0.05 * np.ptp(xy[r], axis=0).max():
-            continue  # mismatched: it gets a pose, but has no say in those of the others
-        back = similarity.apply(similarity.invert(found[best]), xy[rows[best]])
-        np.add.at(sums, star[rows[best]], back)
-        np.add.at(counts, star[rows[best]], 1)
-    return _refine_poses([found[i] for i in range(n_exposures)], rows, star, xy)
+        has_say[best] &= np.median(off) <= 0.05 * np.ptp(xy[r], axis=0).max()
+        if has_say[best]:
+            back = similarity.apply(similarity.invert(found[best]), xy[rows[best]])
+            np.add.at(sums, star[rows[best]], back)
+            np.add.at(counts, star[rows[best]], 1)
+    return _refine_poses([found[i] for i in range(len(rows))], rows, star, xy, has_say)
 
 
-def _scales(pose_list):
-    return np.sqrt(np.abs(np.linalg.det(np.stack(pose_list)[:, :, :2])))
-
-
-def _refine_poses(pose_list, rows, star, xy, n_sweeps=3):
-    """Refit every pose to the mean of all, the first one's plane held by the mean of the poses."""
+def _refine_poses(pose_list, rows, star, xy, has_say, n_sweeps=3):
+    """Refit every pose to the mean of those with a say, the first one's plane held by the mean of their poses."""
     ends = np.array([xy.min(axis=0), xy.max(axis=0)])
     for _ in range(n_sweeps):
-        back = np.empty_like(xy)
+        mean = _means(pose_list, rows, star, xy, has_say)
+        refined = []
         for pose, r in zip(pose_list, rows, strict=True):
-            back[r] = similarity.apply(similarity.invert(pose), xy[r])
-        mean = star_means(back, star, star.max() + 1)
-        refined = [similarity.robust_similarity(mean[star[r]], xy[r]) for r in rows]
-        old, new = ([similarity.apply(similarity.invert(p), ends) for p in pair] for pair in (pose_list, refined))
-        usual = np.abs(np.log(_scales(refined) / np.median(_scales(refined)))) < np.log(1.5)
-        old, new = (np.concatenate([pair for pair, keep in zip(ends_of, usual, strict=True) if keep])
-                    for ends_of in (old, new))  # fmt: skip
+            known = r[np.isfinite(mean[star[r], 0])]  # two at least: it was tied to them
+            refined.append(similarity.robust_similarity(mean[star[known]], xy[known]) if len(known) > 1 else pose)
+        old, new = (
+            np.concatenate([similarity.apply(similarity.invert(pair[i]), ends) for i in np.flatnonzero(has_say)])
+            for pair in (pose_list, refined)
+        )
         common = similarity.robust_similarity(old, new)
         pose_list = [similarity.compose(pose, common) for pose in refined]
     return pose_list
+
+
+def _means(pose_list, rows, star, xy, has_say):
+    """Mean position (n_stars, 2) of every star in the exposures with a say."""
+    voices = np.flatnonzero(has_say)
+    back = np.concatenate([similarity.apply(similarity.invert(pose_list[i]), xy[rows[i]]) for i in voices])
+    return star_means(back, star[np.concatenate([rows[i] for i in voices])], star.max() + 1)
+
+
+def _far_off(pose_list, rows, star, xy):
+    """Whether the stars of some exposure typically lie far from their means."""
+    mean = _means(pose_list, rows, star, xy, np.ones(len(rows), dtype=bool))
+    for pose, r in zip(pose_list, rows, strict=True):
+        off = np.hypot(*(similarity.apply(pose, mean[star[r]]) - xy[r]).T)
+        if np.median(off) > _FAR * np.ptp(xy[r], axis=0).max():
+            return True
+    return False

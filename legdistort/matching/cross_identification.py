@@ -176,8 +176,8 @@ def _by_pattern(reference, positions, flux, pixel_scale):
         f"the exposures have no WCS, and the pattern of their {len(positions)} stars is not that of the "
         f"{len(reference)} of {reference.label}"
         + (f" at {pixel_scale:g} arcsec a pixel" if pixel_scale else "")
-        + ": another field, too small a part of it, or another pixel scale (pixel_scale=, --pixel-scale)? A column "
-        "star that names them also helps"
+        + ": another field, too small a part of it, or another pixel scale (pixel_scale=, --pixel-scale)? The "
+        "brightest stars of it alone, as many as the exposures have, or a column star that names them help as well"
     )
 
 

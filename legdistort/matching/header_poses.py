@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
-from astropy.wcs.utils import wcs_to_celestial_frame
 
 from ..exceptions import AssumptionWarning, warn
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
+from ..inputs.sky_wcs import to_icrs
 from ..priors.from_headers import undistorted_plane
 
 #: Headers that disagree with the others by more than this part of the field do not say where the field lies.
@@ -115,10 +115,10 @@ def _undistorted(wcs, shape):
     A distortion has a similarity in it (the linear part of a header holds at its reference pixel alone): the pixels are
     those that a static distortion without one leads to, as in a prior.
     """
-    wcs, plane = wcs.celestial, undistorted_plane(wcs.celestial, shape)
+    plane = undistorted_plane(wcs, shape)
 
     def to_sky(xy):
-        lon, lat = wcs.wcs_pix2world(xy, 0).T if plane is None else plane.model()(*xy.T)
-        return SkyCoord(lon * u.deg, lat * u.deg, frame=wcs_to_celestial_frame(wcs)).icrs
+        lon, lat = to_icrs(wcs, xy, distortion=False) if plane is None else plane.model()(*xy.T)
+        return SkyCoord(lon * u.deg, lat * u.deg, frame="icrs")
 
     return to_sky

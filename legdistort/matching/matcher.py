@@ -7,7 +7,7 @@ import numpy as np
 from astropy import units as u
 
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
-from ..inputs import column_contract
+from ..inputs import column_contract, repetitions
 from ..inputs.matches import Matches, shapes_by_exposure
 from ..inputs.reference_catalogue import mean_epoch
 from ..inputs.start_poses import estimate_poses
@@ -98,6 +98,8 @@ def match(
     if "flags" in table.colnames:
         table = table[(np.asarray(table["flags"]).astype(int) & int(reject_flags)) == 0]
     table = _without_repetitions(table)
+    copies = _copies(table)
+    table, names = table[~np.isin(table["exposure"], list(copies))], [name for name in names if name not in copies]
     headers = HeaderPoses.from_wcs({n: e.wcs for n, e in (named or {}).items() if e.wcs is not None}, shapes)
 
     rows = {name: np.flatnonzero(table["exposure"] == name) for name in names}
@@ -115,7 +117,8 @@ def match(
     table, star = _keep_common(table, star, min_exposures, left_out)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
-    return _finish(table, star, shapes, headers, left_out, epoch, distortions)
+    matches = _finish(table, star, shapes, headers, left_out, epoch, distortions)
+    return replace(matches, left_out=copies | left_out)
 
 
 def _without_repetitions(table):
@@ -125,6 +128,13 @@ def _without_repetitions(table):
     if len(first) < len(table):
         log.warning("%d detections stand twice at the very same place; one of each is kept", len(table) - len(first))
     return table[first]
+
+
+def _copies(table):
+    """Exposures that repeat another one, ``{name: reason}``."""
+    names, exposure = np.unique(table["exposure"], return_inverse=True)
+    xy = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
+    return repetitions.reasons([str(name) for name in names], exposure, xy)
 
 
 def _check_names(table, names, min_exposures):

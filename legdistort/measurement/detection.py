@@ -1,19 +1,17 @@
 """Where the stars of a frame are: sky, noise, and the peaks that stand out."""
 
-import logging
-import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from astropy.stats import SigmaClip
-from photutils.background import Background2D
-from scipy.interpolate import make_interp_spline
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_dilation, gaussian_filter
 
-log = logging.getLogger(__name__)
+from .background import is_steep, sky_and_noise, sky_variance, smooth_light
+from .sidelobes import side_light
 
 _CLIPPED = 0.986  # standard deviation of a unit normal after clipping at 3 sigma until nothing changes
 _KERNEL = 0.7  # width relative to the stars: costs 6 % of the signal-to-noise ratio, tells apart closer pairs
+_LOCAL = 5.0  # width of the local mean taken off, in that of the kernel: costs another 6 %, and removes halos
+_EXTRAPOLATED = 0.5  # of a local light that is extrapolated, over an edge, part that may be wrong
 _COVERED = 0.2  # part of a star, by its weight in the detection, on good pixels; in the corners of an image it is 0.25
 #: Pixels over which the sky is taken as constant.
 MESH = 64
@@ -28,20 +26,27 @@ class Frame:
     signal : ndarray, shape (ny, nx)
         Data without the sky; float32, as the variance.
     variance : ndarray, shape (ny, nx)
-        Of the sky alone, or of everything if the exposure has an uncertainty plane.
+        Of the sky alone, or of everything if the exposure has an uncertainty plane. From `prepare` it holds the
+        structure of crowded fields too, which `detect` takes out.
+    sky : ndarray, shape (ny, nx)
+        What was taken off.
     good, saturated : ndarray of bool, shape (ny, nx)
     photon : float or None
         Variance per unit of star light to be added: 1 / gain, 0 with an uncertainty plane, None if unknown.
     noise_given : bool
         Whether the variance comes from an uncertainty plane.
+    floor : float
+        The least that the variance of the sky can be.
     """
 
     signal: np.ndarray
     variance: np.ndarray
+    sky: np.ndarray
     good: np.ndarray
     saturated: np.ndarray
     photon: float | None
     noise_given: bool = False
+    floor: float = 0.0
 
 
 def prepare(exposure, *, mesh=MESH):
@@ -50,57 +55,26 @@ def prepare(exposure, *, mesh=MESH):
     data = np.where(exposure.mask, 0, exposure.data).astype(np.float32)
     saturated = (data >= saturation) & ~exposure.mask if saturation else np.zeros(data.shape, dtype=bool)
     bad = exposure.mask | saturated
-    sky, rms = _background(data, bad, mesh)
-    if _is_steep(sky, rms, mesh):  # the slope within the meshes has passed for noise
-        sky, _ = _background(data, bad, mesh, steep=True)
-        rest, rms = _background(data - sky, bad, mesh // 2, steep=True)
+    sky, rms = sky_and_noise(data, bad, mesh)
+    if is_steep(sky, rms, mesh):  # the slope within the meshes has passed for noise
+        sky, _ = sky_and_noise(data, bad, mesh, steep=True)
+        rest, rms = sky_and_noise(data - sky, bad, mesh // 2, steep=True)
         sky += rest
     if exposure.uncertainty is not None:
         variance = np.where(exposure.mask, 1, exposure.uncertainty**2).astype(np.float32)
-        return Frame(data - sky, variance, ~exposure.mask, saturated, 0.0, noise_given=True)
+        return Frame(data - sky, variance, sky, ~exposure.mask, saturated, 0.0, noise_given=True)
     floor = max(1e-6 * np.ptp(data[~exposure.mask]), read_noise / gain if gain and read_noise else 0.0)
-    variance = np.maximum(rms / np.float32(_CLIPPED), np.float32(floor or 1.0)) ** 2
-    return Frame(data - sky, variance, ~exposure.mask, saturated, 1 / gain if gain else None)
-
-
-def _background(data, mask, mesh, *, steep=False):
-    """Sky and its standard deviation, smooth maps; of a steep sky no medians of meshes are taken."""
-    box = tuple(min(mesh, n) for n in data.shape)
-    clip = SigmaClip(sigma=3.0, maxiters=10)
-    with warnings.catch_warnings(action="ignore"):  # of meshes without good pixels, which are interpolated
-        for exclude in (50.0, 100.0):
-            try:
-                found = Background2D(
-                    data, box, mask=mask, sigma_clip=clip, exclude_percentile=exclude, filter_size=1 if steep else 3
-                )
-            except ValueError:
-                log.debug("background: too few good pixels with exclude_percentile=%g", exclude)
-            else:
-                rms = found.background_rms_mesh
-                sky = _enlarge(found.background_mesh, box, data.shape, degree=3 if steep else 1)
-                return sky, _enlarge(rms, box, data.shape).clip(rms.min())
-    values = clip(data[~mask] if not mask.all() else data.ravel(), masked=False)
-    return np.full_like(data, np.median(values)), np.full_like(data, np.std(values))
-
-
-def _is_steep(sky, rms, mesh):
-    """Whether the sky rises across a mesh by as much as the noise, somewhere."""
-    step = max(1, mesh // 2)
-    coarse, noise = sky[::step, ::step], rms[::step, ::step]
-    return any(np.any(np.abs(np.diff(coarse, axis=i)) > 0.5 * np.delete(noise, 0, axis=i)) for i in (0, 1))
-
-
-def _enlarge(mesh, box, shape, degree=1):
-    """Spline interpolation of a mesh to all pixels (that of photutils takes as long as all the fits)."""
-    across = []
-    for n_mesh, width, n in zip(mesh.shape, box, shape, strict=True):
-        centres, degree_here = (np.arange(n_mesh) + 0.5) * width - 0.5, min(degree, n_mesh - 1)
-        across.append(make_interp_spline(centres, np.eye(n_mesh), k=degree_here)(np.arange(n)).astype(np.float32))
-    return across[0] @ mesh.astype(np.float32) @ across[1].T
+    floor = float(floor or 1.0) ** 2
+    variance = np.maximum((rms / np.float32(_CLIPPED)) ** 2, np.float32(floor))
+    return Frame(data - sky, variance, sky, ~exposure.mask, saturated, 1 / gain if gain else None, floor=floor)
 
 
 def detect(frame, fwhm, threshold):
-    """Peaks of the frame filtered with a Gaussian.
+    """Peaks of the frame filtered with a Gaussian from which the local light has been taken off.
+
+    The kernel has zero sum, so that no halo of a star and no error of the sky passes for stars; the noise is that of
+    the sky and of the photons of the local light. Peaks no brighter than the side lobes of other stars at the same
+    distance from a bright one are left out (`legdistort.measurement.sidelobes`).
 
     Parameters
     ----------
@@ -113,28 +87,67 @@ def detect(frame, fwhm, threshold):
 
     Returns
     -------
-    ndarray of int, shape (n, 2)
+    centres : ndarray of int, shape (n, 2)
         Pixels (x, y), the highest signal-to-noise ratio first.
+    frame : Frame
+        With the variance of the sky alone, as seen where there are no stars; unchanged if the noise was given.
     """
     sigma = _KERNEL * np.sqrt((fwhm / 2.3548) ** 2 + 1 / 12)  # 1/12: the pixel
-    weight = np.where(frame.good, 1 / frame.variance, 0)
-    # Best linear detection of a Gaussian star in noise that differs from pixel to pixel: sum(g w d) / sqrt(sum(g^2 w)).
-    # The square of a Gaussian is a Gaussian narrower by sqrt(2), here with the sum `norm`.
-    point = np.zeros((2 * int(4 * sigma + 2) + 1,) * 2)
-    point[len(point) // 2, len(point) // 2] = 1
-    norm = (_blur(point, sigma) ** 2).sum()
-    if frame.good.all() and not frame.noise_given:  # a smooth map needs no smoothing
-        below = norm * weight
-    else:
-        below = norm * _blur(weight, sigma / np.sqrt(2))
-        below = np.maximum(below, 1e-6 * below.max())
-    ratio = _blur(frame.signal * weight, sigma) / np.sqrt(below)
+    seen = frame.good & ~frame.saturated
+    # The sky is put back: in crowded fields its map follows the halos, in steps that would pass for stars.
+    data = frame.signal + frame.sky
+    level, extrapolated, step = smooth_light(data, seen, _LOCAL * sigma, variance=frame.variance)
+    residual = np.where(frame.good, data - level, np.float32(0))
+    filtered, norm = _blur(residual, sigma), np.float32(_norm(sigma))
+    variance = frame.variance
+    if not frame.noise_given:
+        light = frame.signal - residual
+        variance, photon = sky_variance(
+            residual, filtered, light, frame.good, start=variance, noise=norm, photon=frame.photon, mesh=MESH,
+            floor=frame.floor,
+        )  # fmt: skip
+        frame = replace(frame, variance=variance)
+        variance = variance + np.float32(photon) * np.maximum(light, 0)
+    x, y, ratio = _peaks(residual, filtered, norm * variance, frame, (sigma, fwhm, threshold))
+    # of the light of a peak, the part that is neither a side lobe nor an error of the light taken off
+    spoilt = binary_dilation(frame.saturated, iterations=int(np.ceil(2 * sigma))) if frame.saturated.any() else None
+    other = side_light(filtered, x, y, fwhm, hidden=spoilt) + _EXTRAPOLATED * extrapolated[y // step, x // step]
+    star = ratio * (1 - other / np.maximum(filtered[y, x], np.finfo(np.float32).tiny)) > threshold
+    return np.column_stack([x, y])[star][np.argsort(-ratio[star], kind="stable")], frame
+
+
+def _norm(sigma):
+    """Sum of the squares of the kernel of zero sum."""
+    half = int(3 * _LOCAL * sigma + 3 * sigma) + 2
+    point = np.zeros((2 * half + 1,) * 2)
+    point[half, half] = 1
+    kernel = _blur(point, sigma)
+    return ((kernel - _blur(kernel, _LOCAL * sigma)) ** 2).sum()
+
+
+def _peaks(residual, filtered, variance, frame, settings):
+    """Peaks above the threshold, and their signal-to-noise ratios; `variance` is that of the filtered image."""
+    sigma, fwhm, threshold = settings
+    whole = frame.good.all() and not frame.noise_given  # a smooth map of the variance needs no smoothing
+    image = filtered if whole else _weighted_ratio(residual, variance, frame, sigma)
+    y, x = np.nonzero((filtered > 0) & (filtered**2 > threshold**2 * variance) if whole else image > threshold)
+    peak = _is_highest(image, x, y, max(1, int(fwhm / 2)))
+    x, y = x[peak], y[peak]
+    return x, y, filtered[y, x] / np.sqrt(variance[y, x]) if whole else image[y, x]
+
+
+def _weighted_ratio(residual, variance, frame, sigma):
+    """Signal-to-noise ratio of a star at every pixel.
+
+    Best linear detection of a Gaussian star in noise that differs from pixel to pixel: sum(g w d) / sqrt(sum(g^2 w)).
+    """
+    weight = np.where(frame.good, 1 / variance, 0)
+    # The square of a Gaussian is a Gaussian narrower by sqrt(2).
+    below = _blur(weight, sigma / np.sqrt(2))
+    ratio = _blur(residual * weight, sigma) / np.sqrt(np.maximum(below, 1e-6 * below.max()))
     if not frame.good.all():  # where most of a star would lie on bad pixels the rest tells little
         ratio[_blur(frame.good.astype(np.float32), sigma / np.sqrt(2)) < _COVERED] = 0
-    y, x = np.nonzero(ratio > threshold)
-    peak = _is_highest(ratio, x, y, max(1, int(fwhm / 2)))
-    x, y = x[peak], y[peak]
-    return np.column_stack([x, y])[np.argsort(-ratio[y, x], kind="stable")]
+    return ratio
 
 
 def _blur(image, sigma):
@@ -143,9 +156,12 @@ def _blur(image, sigma):
 
 def _is_highest(image, x, y, reach):
     """Whether pixels are the highest of the square around them; of the few that matter, not of all the image."""
-    highest = np.ones(len(x), dtype=bool)
-    for dy in range(-reach, reach + 1):
-        for dx in range(-reach, reach + 1):
-            other = image[np.clip(y + dy, 0, image.shape[0] - 1), np.clip(x + dx, 0, image.shape[1] - 1)]
-            highest &= image[y, x] >= other
+    steps = [(dy, dx) for dy in range(-reach, reach + 1) for dx in range(-reach, reach + 1)]
+    left = np.arange(len(x))
+    for dy, dx in sorted(steps, key=lambda step: abs(step[0]) + abs(step[1])):  # next to it most are told
+        here, other = (y[left], x[left]), (y[left] + dy, x[left] + dx)
+        other = np.clip(other[0], 0, image.shape[0] - 1), np.clip(other[1], 0, image.shape[1] - 1)
+        left = left[image[here] >= image[other]]
+    highest = np.zeros(len(x), dtype=bool)
+    highest[left] = True
     return highest

@@ -83,7 +83,7 @@ def _calibrate(exposure, *, options, **stars):
     exposure = options.with_detector(exposure.read())
 
     def remeasure(image, *, fwhm=options.fwhm):
-        return measure_exposure(image, replace(options, fwhm=fwhm))[0]
+        return measure_exposure(image, replace(options, fwhm=fwhm, psf="moffat"))[0]  # as what is put in
 
     curves = calibrate_frame(exposure, remeasure, threshold=options.threshold, **stars)
     return curves, None if exposure.gain else curves.table.meta["photon"][exposure.name]

@@ -5,8 +5,9 @@ from numbers import Integral, Real
 
 import numpy as np
 
-from ..exceptions import InputError
+from ..exceptions import InputError, some_of
 from ..runtime.checks import check_choice
+from .effective.sources import psf_from
 from .noise_curves import SOURCES
 from .profiles.frame_fit import BLENDS, PROFILES
 
@@ -33,6 +34,7 @@ class MeasureOptions:
     read_noise: float | None = None
     saturation: float | None = None
     errors: str = "fit"
+    psf: object = "auto"
 
     def __post_init__(self):
         if self.fwhm is not None and not (isinstance(self.fwhm, Real) and 0.5 <= self.fwhm <= 200):
@@ -46,10 +48,28 @@ class MeasureOptions:
         check_choice(self.errors, SOURCES, "errors")
         check_choice(self.profile, PROFILES, "profile")
         check_choice(self.blends, BLENDS, "blends")
+        object.__setattr__(self, "psf", psf_from(self.psf))
+        if self.profile != "own" and self.psf not in ("auto", "moffat"):
+            raise InputError(f"profile={self.profile!r} is one of Moffat profiles: give psf='moffat', or no profile")
+        if self.errors != "fit" and self.psf not in ("auto", "moffat"):
+            raise InputError(
+                f"errors={self.errors!r} come from Moffat profiles that are put into the frame: give psf='moffat', or "
+                "errors='fit'"
+            )
         for key in _DETECTOR:
             value = getattr(self, key)
             if value is not None and not (isinstance(value, Real) and 0 < value < np.inf):
                 raise InputError(f"{key} must be a positive number, got {value!r}")
+
+    def psf_of(self, name):
+        """What the exposure of this name is measured with: "auto", "moffat", "effective" or an `EffectivePSF`."""
+        if isinstance(self.psf, dict):
+            if name not in self.psf:
+                raise InputError(f"psf has no PSF for exposure {name}: it has those of {some_of(list(self.psf), 3)}")
+            return self.psf[name]
+        if self.psf == "auto" and (self.profile != "own" or self.errors != "fit"):
+            return "moffat"
+        return self.psf
 
     def with_detector(self, exposure):
         """The exposure with the gain, read noise and saturation that are given here in place of its own."""

@@ -3,16 +3,22 @@
 import logging
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable, vstack
 from scipy.spatial import cKDTree
 
-from ..exceptions import AssumptionWarning, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs.exposure_files import listed
+from ..runtime import outputs
 from ..runtime.parallel import map_items
+from . import camera_gain
 from .crowding import crowding, is_deformed
+from .effective import frame_psf
+from .effective.building import STARS_NEEDED
+from .effective.model import EffectivePSF
 from .flags import UNUSABLE, Flag
 from .injection import calibrate_frame
 from .options import MeasureOptions
@@ -38,12 +44,15 @@ def measure(
     read_noise=None,
     saturation=None,
     errors="fit",
+    psf="auto",
+    write_psf=None,
     workers=None,
     progress=False,
 ):
-    """Detect stars and measure their positions by fitting elliptical Moffat profiles.
+    """Detect stars and measure their positions by fitting elliptical Moffat profiles, or the effective PSF.
 
-    Stars are peaks of the image filtered with a Gaussian of the width of the stars. The profile has eight free
+    Stars are peaks of the image filtered with a Gaussian of the width of the stars, the local light (sky, halos) taken
+    off, and no side lobes of brighter ones (`legdistort.measurement.detection.detect`). The profile has eight free
     parameters (`legdistort.measurement.profiles.moffat`); all stars of a frame are fitted at once, three times: with
     the noise of the sky alone, then twice with the photon noise of the model of the pass before and the models of the
     neighbours subtracted. (Photon noise taken from the data instead of a model would bias the fit.) In images
@@ -78,6 +87,15 @@ def measure(
         Errors of the positions: of the fit; by the noise curve of every exposure at the star's flux, from stars put
         into it and measured (`legdistort.calibrate_noise`), as in the paper; or those of the fit times the ratio of
         that curve to what fits of this flux state. The latter two take some seconds a frame.
+    psf : {"auto", "moffat", "effective"}, EffectivePSF, path, photutils model or dict of those, optional
+        What the stars are fitted with: a Moffat profile each, or the effective PSF of every exposure, made from its own
+        stars (`legdistort.effective_psf`), or one from elsewhere: a file (FITS cube, PSFEx), an ``ImagePSF`` or
+        ``GriddedPSFModel`` of photutils, `EffectivePSF.from_array`; a dict has one for every exposure by name.
+        "auto": the effective PSF if it describes the bright stars better in most of the exposures, else Moffat
+        profiles. Positions are those of the core-weighted centre with all PSFs but the Moffat profiles. Exposures with
+        too few stars for a PSF of their own are measured with Moffat profiles, and named in a warning.
+    write_psf : str or path, optional
+        Folder for the PSF of every exposure that has one, ``NAME.fits``.
     workers : int, optional
         Processes that share the frames. None = the current ``dask.distributed.Client`` if there is one, else this
         process. The table is the same.
@@ -91,28 +109,139 @@ def measure(
         (0-based, standard deviations), ``xy_corr``, ``flux``, ``flux_err`` (of the whole profile, in units
         of the data), ``fwhm`` [pix], ``chi2`` (reduced), ``flags`` (bits of `Flag`; see `UNUSABLE`),
         ``crowding`` (how far detected neighbours would pull the position, were their light left in, in standard errors:
-        see `legdistort.measurement.crowding`). An exposure in which nothing is found has no rows.
+        see `legdistort.measurement.crowding`), ``psf`` (what was fitted: "moffat", "effective" or where the PSF came
+        from). An exposure in which nothing is found has no rows.
 
     Raises
     ------
     InputError
-        For arguments out of range.
+        For arguments out of range, and PSFs that are none.
 
     Warns
     -----
     AssumptionWarning
-        Once, if exposures lack a gain: the photon noise is then estimated from the residuals of the fits.
+        Once, if exposures lack a gain: the photon noise is then estimated from the residuals of the fits, one for all
+        frames of a camera (`legdistort.measurement.camera_gain`). Once, if exposures have too few stars for an
+        effective PSF.
     """
     exposures = listed(exposures, "measure")
     options = MeasureOptions(
         fwhm=fwhm, threshold=threshold, max_stars=max_stars, box=box, profile=profile, blends=blends, gain=gain,
-        read_noise=read_noise, saturation=saturation, errors=errors,
+        read_noise=read_noise, saturation=saturation, errors=errors, psf=psf,
     )  # fmt: skip
-    work = partial(measure_exposure, options=options)
-    measured = list(map_items(work, exposures, workers=workers, progress=progress, description="measuring"))
-    _warn_of_gain({exposure.name: photon for exposure, (_, photon) in zip(exposures, measured, strict=True)})
-    filled = [table for table, _ in measured if len(table)]
-    return vstack(filled) if filled else _empty()
+    if write_psf is not None:
+        outputs.check_folder(write_psf)
+    table, psfs = measure_with_psfs(exposures, options, workers=workers, progress=progress)
+    if write_psf is not None:
+        with outputs.replacing_folder(write_psf) as folder:
+            write_psfs(psfs, folder)
+    return table
+
+
+def effective_psf(exposure, *, fwhm=None, threshold=5.0, box=None, gain=None, read_noise=None, saturation=None):
+    """Make the effective PSF of an exposure from its bright, isolated, unsaturated stars.
+
+    Positions of the stars and the oversampled grid are fitted together (Anderson & King 2000, PASP 112, 1360); how much
+    it varies over the field, up to the second degree in x and y, the stars tell. Its core-weighted centre, the place
+    where the first moments under a Gaussian of standard deviation FWHM / 4 vanish, is 0 everywhere in the field.
+
+    Parameters
+    ----------
+    exposure : Exposure
+    fwhm, threshold, box, gain, read_noise, saturation : optional
+        As for `legdistort.measure`.
+
+    Returns
+    -------
+    EffectivePSF
+
+    Raises
+    ------
+    InputError
+        If there are too few stars.
+    """
+    options = MeasureOptions(
+        fwhm=fwhm, threshold=threshold, box=box, gain=gain, read_noise=read_noise, saturation=saturation,
+        psf="effective",
+    )  # fmt: skip
+    measured = measure_exposure(exposure, options)
+    if measured.psf is None:
+        raise InputError(
+            f"{exposure.name}: {measured.verdict.n_usable} bright, isolated, unsaturated stars, and an effective PSF "
+            f"needs {STARS_NEEDED}; take another exposure, or a PSF from elsewhere"
+        )
+    return measured.psf
+
+
+def write_psfs(psfs, folder):
+    """Write ``NAME.fits`` for the PSF of every exposure; a folder is made if there is any."""
+    for name, psf in psfs.items():
+        folder.mkdir(exist_ok=True)
+        psf.write(folder / f"{name}.fits")
+
+
+def measure_with_psfs(exposures, options, *, workers=None, progress=False):
+    """What `measure` returns, and the PSFs of the exposures that have one, by name.
+
+    Parameters
+    ----------
+    exposures : sequence of Exposure
+    options : `~legdistort.measurement.options.MeasureOptions`
+    workers : int, optional
+    progress : bool
+    """
+    share = partial(map_items, workers=workers, progress=progress)
+    gains = {} if options.gain else _camera_gains(exposures, options, share)
+
+    def measured(which, options):
+        pairs = [(exposure, gains.get(exposure.name)) for exposure in which]
+        return list(share(partial(_measure_with_gain, options=options), pairs, description="measuring"))
+
+    found = measured(exposures, options)
+    votes = [one.verdict.psf == "effective" for one in found if one.verdict.decided]
+    if options.psf == "auto" and any(votes) and not all(votes):  # one definition of the centre for all exposures
+        chosen = "effective" if np.mean(votes) > 0.5 else "moffat"
+        again = [i for i, one in enumerate(found) if one.verdict.decided and one.verdict.psf != chosen]
+        anew = measured([exposures[i] for i in again], replace(options, psf=chosen))
+        found = [anew[again.index(i)] if i in again else one for i, one in enumerate(found)]
+    names = [exposure.name for exposure in exposures]
+    _warn_of_gain({name: one.photon for name, one in zip(names, found, strict=True)})
+    verdicts = {name: one.verdict for name, one in zip(names, found, strict=True)}
+    if options.psf == "effective" or any(v.psf == "effective" for v in verdicts.values()):
+        _warn_of_psf(verdicts)
+    filled = [one.table for one in found if len(one.table)]
+    psfs = {name: one.psf for name, one in zip(names, found, strict=True) if one.psf is not None}
+    return vstack(filled) if filled else _empty(), psfs
+
+
+def _warn_of_psf(verdicts):
+    """Warn of exposures that have too few stars for an effective PSF."""
+    lacking = {name: v.n_usable for name, v in verdicts.items() if v.psf == "moffat" and v.n_usable < STARS_NEEDED}
+    if lacking:
+        each = some_of([f"{name} has {n}" for name, n in lacking.items()], 3)
+        warn(
+            f"too few bright, isolated, unsaturated stars for an effective PSF, which needs {STARS_NEEDED}: {each}; "
+            "measured with Moffat profiles",
+            AssumptionWarning,
+        )
+
+
+def _camera_gains(exposures, options, share):
+    """Gains of exposures that have none, found from several frames of their camera: ``{name: e-/ADU}``."""
+    asked = camera_gain.pilots(exposures)
+    work = partial(measure_exposure, options=replace(options, errors="fit", psf="moffat"))
+    told = iter(list(share(work, [frame for frames in asked.values() for frame in frames], description="gain")))
+    gains = {camera: camera_gain.pooled([next(told).photon for _ in frames]) for camera, frames in asked.items()}
+    found = {e.name: gains.get(camera_gain.camera(e)) for e in exposures if not e.gain}
+    return {name: gain for name, gain in found.items() if gain is not None}
+
+
+def _measure_with_gain(pair, options):
+    """What `measure_exposure` gives for an exposure and the gain found for its camera, or None."""
+    exposure, gain = pair
+    if gain is None:
+        return measure_exposure(exposure, options)
+    return measure_exposure(exposure, replace(options, gain=gain))._replace(photon=1 / gain)
 
 
 def _warn_of_gain(photons):
@@ -139,73 +268,132 @@ def measure_exposure(exposure, options):
 
     Returns
     -------
+    MeasuredExposure
+    """
+    exposure = options.with_detector(exposure.read())
+    measured = _measure_frame(exposure, options)
+    if options.errors != "fit" and np.any((measured.table["flags"] & UNUSABLE) == 0):
+
+        def remeasure(image, *, fwhm=options.fwhm):
+            return _measure_frame(image, replace(options, max_stars=None, fwhm=fwhm)).table
+
+        curves = calibrate_frame(exposure, remeasure, threshold=options.threshold)
+        measured = measured._replace(table=curves.apply(measured.table, options.errors))
+    return measured
+
+
+class MeasuredExposure(NamedTuple):
+    """Detections of one exposure.
+
+    Attributes
+    ----------
     table : `~astropy.table.QTable`
         As from `measure`.
     photon : float or None
         Variance per unit of star light if it had to be estimated, for want of a gain.
+    psf : `~legdistort.measurement.effective.model.EffectivePSF` or None
+        None if Moffat profiles were fitted.
+    verdict : `~legdistort.measurement.effective.frame_psf.Verdict`
     """
-    exposure = options.with_detector(exposure.read())
-    table, photon = _measure_frame(exposure, options)
-    if options.errors != "fit" and np.any((table["flags"] & UNUSABLE) == 0):
 
-        def remeasure(image, *, fwhm=options.fwhm):
-            return _measure_frame(image, replace(options, max_stars=None, fwhm=fwhm))[0]
-
-        table = calibrate_frame(exposure, remeasure, threshold=options.threshold).apply(table, options.errors)
-    return table, photon
+    table: QTable
+    photon: float | None
+    psf: EffectivePSF | None
+    verdict: frame_psf.Verdict
 
 
 def _measure_frame(exposure, options):
     """What `measure_exposure` gives, errors as the fits state them."""
     name, max_stars = exposure.name, options.max_stars
+    psf = options.psf_of(name)
     frame, centres, shape = frame_fit.locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
     if len(centres) == 0:
         log.warning("%s: no star above %g times the noise", name, options.threshold)
-        return _empty(), None
+        return MeasuredExposure(_empty(), None, None, frame_psf.Verdict("moffat", 0))
     if max_stars is not None:
         centres = centres[: 3 * max_stars]  # some will turn out to be hot pixels or saturated
     fwhm = float(moffat.fwhm(shape))
     stamps = Stamps(frame, centres, options.box // 2 if options.box else frame_fit.box_half(fwhm))
-    fit, flags, snr, photon = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
-    shapes, covariance = fit.params[:, 3:7], fit.covariance[:, 3:7, 3:7]
-    usable = ((flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
-    deformed = is_deformed(shapes, covariance, snr=snr, usable=usable)
-    table = _table(name, stamps, fit, flags=flags | np.where(deformed, Flag.DEFORMED, 0), snr=snr)
+    fitted = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
+    measured, verdict = frame_psf.measure_frame(stamps, fitted, shape, psf)
+    shapes, covariance = fitted.found.params[:, 3:7], fitted.found.covariance[:, 3:7, 3:7]
+    usable = ((fitted.flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
+    deformed = is_deformed(shapes, covariance, snr=fitted.snr, usable=usable)
+    stars = _moffat_stars(fitted) if measured is None else _psf_stars(fitted, measured)
+    stars = stars._replace(flags=stars.flags | np.where(deformed, Flag.DEFORMED, 0))
+    table = _table(name, stamps, stars)
     table = table[_distinct(table, fwhm)]
     table["crowding"] = crowding(table, fwhm)
+    table["psf"] = np.full(len(table), verdict.psf)
     if max_stars is not None:
         table = table[(table["flags"] & UNUSABLE) == 0][:max_stars]
-    log.info("%s: %d detections, FWHM %.2f px", name, len(table), fwhm)
+    log.info("%s: %d detections, FWHM %.2f px, %s", name, len(table), fwhm, verdict.psf)
     known = exposure.gain or exposure.uncertainty is not None or not len(table)
-    return table, None if known else photon
+    own = None if measured is None else measured.psf.named(exposure=name)
+    return MeasuredExposure(table, None if known else fitted.photon, own, verdict)
+
+
+class _Stars(NamedTuple):
+    """Fits of all stars of a frame: x, y from the central pixels and their covariance, fluxes, widths, quality."""
+
+    xy: np.ndarray
+    covariance: np.ndarray
+    flux: np.ndarray
+    flux_err: np.ndarray
+    width: np.ndarray
+    chi2: np.ndarray
+    dof: np.ndarray
+    snr: np.ndarray
+    flags: np.ndarray
+
+
+def _moffat_stars(fitted):
+    found = fitted.found
+    flux = moffat.flux(found.params, found.covariance)
+    width = moffat.fwhm(found.params)
+    return _Stars(
+        found.params[:, :2], found.covariance[:, :2, :2], *flux, width, found.chi2, found.dof, fitted.snr, fitted.flags
+    )
+
+
+def _psf_stars(fitted, measured):
+    fit = measured.fit
+    known = fitted.flags & ~(Flag.NOT_CONVERGED | Flag.INSIGNIFICANT | Flag.SHARED_SHAPE)
+    lost = ~fit.converged | ~(fit.params[:, 2] > 0) | measured.astray
+    flags = known | np.where(lost, Flag.NOT_CONVERGED, 0) | np.where(measured.snr < 3, Flag.INSIGNIFICANT, 0)
+    flux_err = np.sqrt(np.maximum(fit.covariance[:, 2, 2], 0))
+    width = moffat.fwhm(fitted.found.params)
+    return _Stars(
+        fit.params[:, :2], fit.covariance[:, :2, :2], fit.params[:, 2], flux_err, width, fit.chi2, fit.dof,
+        measured.snr, flags,
+    )  # fmt: skip
 
 
 def _empty():
     columns = {name: np.zeros(0) * (u.pix if name in _PIXELS else 1) for name in _COLUMNS}
-    kinds = {"flags": np.zeros(0, dtype=int), "crowding": np.zeros(0)}
+    kinds = {"flags": np.zeros(0, dtype=int), "crowding": np.zeros(0), "psf": np.zeros(0, dtype="U1")}
     return QTable({"exposure": np.zeros(0, dtype="U1"), **columns, **kinds})
 
 
-def _table(name, stamps, fit, *, flags, snr):
+def _table(name, stamps, stars):
     """Table of one frame, brightest first; errors scaled where the fit leaves more than noise."""
     ny, nx = stamps.frame.signal.shape
-    dof = np.maximum(fit.dof, 1)
-    chi2 = fit.chi2 / dof
+    flags, flux, width = stars.flags, stars.flux, stars.width
+    dof = np.maximum(stars.dof, 1)
+    chi2 = stars.chi2 / dof
     # Three standard deviations of chi2 are allowed for, else chance alone would raise the errors of good fits.
     scale = np.sqrt(np.maximum(1, chi2 - 3 * np.sqrt(2 / dof)))
-    flux, flux_err = moffat.flux(fit.params, fit.covariance)
-    error = np.sqrt(np.einsum("nii->ni", fit.covariance)[:, :2])
+    error = np.sqrt(np.einsum("nii->ni", stars.covariance))
     lost = ~(error < stamps.half).all(axis=1)
-    corr = np.where(lost, 0.0, fit.covariance[:, 0, 1] / error.prod(axis=1))
+    corr = np.where(lost, 0.0, stars.covariance[:, 0, 1] / error.prod(axis=1))
     # Near the detection limit the fit is no longer linear (measured at a ratio of 7: errors 8 to 15 % too small).
-    scale *= 1 + 5 / np.maximum(snr, 1) ** 2
+    scale *= 1 + 5 / np.maximum(stars.snr, 1) ** 2
     error = np.where(lost[:, None], stamps.half, scale[:, None] * error)
     hot = (flags & Flag.HOT) != 0  # they stay on their pixel: a profile fitted to one pixel wanders off
-    xy = stamps.centres + np.where(hot[:, None], 0.0, fit.params[:, :2])
-    width = moffat.fwhm(fit.params)
+    xy = stamps.centres + np.where(hot[:, None], 0.0, stars.xy)
     to_edge = np.minimum(xy + 0.5, np.array([nx, ny]) - 0.5 - xy).min(axis=1)
     flags = flags | np.where(lost, Flag.NOT_CONVERGED, 0) | np.where(to_edge < width, Flag.EDGE, 0)
-    columns = (xy[:, 0], xy[:, 1], error[:, 0], error[:, 1], corr, flux, scale * flux_err, width, chi2)
+    columns = (xy[:, 0], xy[:, 1], error[:, 0], error[:, 1], corr, flux, scale * stars.flux_err, width, chi2)
     named = {key: v * u.pix if key in _PIXELS else v for key, v in zip(_COLUMNS, columns, strict=True)}
     return QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})[np.argsort(-flux, kind="stable")]
 

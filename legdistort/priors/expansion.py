@@ -1,5 +1,7 @@
 """Any map of a detector as a similarity and a Legendre series, with the measured error of leaving off the rest."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..exceptions import InputError
@@ -57,6 +59,59 @@ def expand(source, degree, parity=None):
         if np.abs(similarity.apply(shift, pixels) - pixels).max() < 1e-10:
             break
     return mean, pose, _truncation(to_plane, pose, Distortion(mean, shape))
+
+
+def expand_placed(source, degree, parity, *, shape, offset):
+    """The same for a source that is a part of the detector, or more than it: `expand` there, and carried over.
+
+    A polynomial on one box is one of the same degree on another. Where the source does not reach, it is continued.
+
+    Parameters
+    ----------
+    source, degree, parity
+        As for `expand`.
+    shape : tuple
+        ``(ny, nx)`` of the detector.
+    offset : tuple of float
+        Pixel (x, y) of the detector on which the first pixel of the source lies, 0-based.
+
+    Returns
+    -------
+    coefficients, pose, truncation
+        As of `expand`; the truncation over the source.
+    covered : float
+        Part of the detector that the source covers.
+
+    Raises
+    ------
+    InputError
+        If the source lies beside the detector, or folds where it is continued.
+    """
+    offset = np.asarray(offset, dtype=float)
+    ends = np.minimum(offset + source.shape[::-1], shape[::-1]) - np.maximum(offset, 0)
+    if not np.all(ends > 0):
+        raise InputError(
+            f"{source.name} of shape {source.shape} (ny, nx) at x, y = {offset[0]:g}, {offset[1]:g} lies beside the "
+            f"detector of shape {tuple(shape)}: offset (--offset X Y) is where its first pixel lies"
+        )
+    mean, pose, truncation = expand(source, degree, parity)
+    series = Distortion(mean, source.shape)
+
+    def function(x, y):
+        return (series(np.stack([x, y], axis=-1) - offset) + offset).T
+
+    kind = {"direction": "reference_to_detector", "origin": 0, "shape": tuple(shape)}
+    whole = replace(source, function=function, sphere=None, from_middle=False, **kind)
+    covered = float(np.prod(ends) / np.prod(shape))
+    try:
+        mean, shift, _ = expand(whole, degree)
+    except InputError as error:
+        raise InputError(
+            f"continued over the {100 * (1 - covered):.0f} % of the detector that it does not cover, at degree "
+            f"{degree}: {error}; lower the degree (--degree)"
+        ) from None
+    pose = similarity.compose(shift, similarity.compose(np.column_stack([np.eye(2), offset]), pose))
+    return mean, pose, truncation, covered
 
 
 def _truncation(to_plane, pose, series):

@@ -12,19 +12,16 @@ import gwcs
 import numpy as np
 from astropy.io import fits
 from astropy.modeling import Model
-from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
 
-from ..exceptions import AssumptionWarning, InputError, warn
+from ..exceptions import AssumptionWarning, InputError, warn, without_astropy_warnings
 from ..geometry import basis
 from ..geometry.gsaoi import GSAOI_SIZE, gsaoi_static
 from ..inputs.exposure_files import read_exposures
-from ..runtime.asdf_files import WITH_WCS, read_tree
+from ..runtime.asdf_files import ARCHIVES, read_tree
 from .from_objects import as_source, of_model
 from .source import DIRECTIONS, of_maps, of_powers
 
-#: Tags of ASDF files that hold a WCS: those of gwcs, and what the archives of JWST and Roman put around it.
-TAGS = (*WITH_WCS, "tag:stsci.edu:jwst_pipeline/", "tag:stsci.edu:jwst_datamodel/", "asdf://stsci.edu/datamodels/")
 #: Highest order of SIP polynomials in a header (the convention allows 9).
 SIP_ORDER = 20
 _POLYNOMIAL = re.compile(r"^\s*(poly\s*\d+|cubic|quartic|quintic|refpix\b.*)\s*$", re.MULTILINE)
@@ -76,7 +73,7 @@ def read_source(where, *, ext=None, frame=None):
             "siaf:INSTRUMENT/APERTURE"
         )
     # files are often a little off the standard; what matters is checked here
-    with warnings.catch_warnings(action="ignore", category=AstropyWarning):
+    with without_astropy_warnings():
         return _read_file(path, ext, frame)
 
 
@@ -92,7 +89,7 @@ def _read_file(path, ext, frame):
     with path.open("rb") as file:
         start = file.read(2880)
     if start.startswith(b"#ASDF"):
-        source = _from_tree(read_tree(path, tags=TAGS), ext, frame, str(path))
+        source = _from_tree(read_tree(path, tags=ARCHIVES), ext, frame, str(path))
     elif start.startswith((b"\x1f\x8b", b"BZh")) or (start.startswith(b"SIMPLE  =") and b"\n" not in start):
         source = _read_fits(path, ext, frame)
     elif b"\0" not in start:
@@ -161,7 +158,7 @@ def _read_fits(path, ext, frame):
 def _from_hdu(hdu, frame, name):
     """The gwcs that JWST and legdistort put into a table of one row (`stdatamodels.asdf_in_fits`)."""
     name, content = f"{name}[ASDF]", np.asarray(hdu.data["ASDF_METADATA"]).tobytes()
-    return _from_tree(read_tree(name, content=content, tags=TAGS), None, frame, name)
+    return _from_tree(read_tree(name, content=content, tags=ARCHIVES), None, frame, name)
 
 
 def _from_hdulist(hdulist, ext, name):

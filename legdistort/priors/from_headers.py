@@ -7,15 +7,19 @@ right whether or not the distortion is used, as far as a similarity can be.
 
 import contextlib
 from dataclasses import dataclass, replace
+from functools import partial
 
+import gwcs
 import numpy as np
+from astropy.wcs import WCS
 
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis, similarity
 from ..geometry.tangent_plane import TangentPlane
+from ..inputs.sky_wcs import to_icrs
 from .expansion import POSE_GRID, expand
 from .from_files import read_source
-from .from_objects import as_source
+from .from_objects import as_source, of_sky
 from .source import Source
 
 #: Headers tell one distortion if their series differ by less than this [pix] all over the detector; the degree of a
@@ -94,12 +98,15 @@ def header_source(exposure):
 
 
 def wcs_source(wcs, shape, name="the WCS"):
-    """The distortion of a celestial WCS as a complete `Source`."""
-    source = replace(as_source(wcs, name=name), shape=tuple(shape), kind=_kind(wcs))
-    return source.stated()
+    """The distortion of a believable WCS as a complete `Source` that leads to the sky (ICRS)."""
+    if isinstance(wcs, WCS):
+        as_source(wcs, name=name)  # refuses one without a distortion
+    return replace(of_sky(partial(to_icrs, wcs), shape, name), kind=_kind(wcs)).stated()
 
 
 def _kind(wcs):
+    if not isinstance(wcs, WCS):
+        return "gwcs" if isinstance(wcs, gwcs.WCS) else "WCS"
     kinds = ["SIP"] * (wcs.sip is not None)
     kinds += ["look-up tables"] * any(t is not None for t in (wcs.cpdis1, wcs.cpdis2, wcs.det2im1, wcs.det2im2))
     return " and ".join(kinds) or wcs.wcs.ctype[0][-3:]
@@ -153,7 +160,7 @@ def undistorted_plane(wcs, shape):
     Returns
     -------
     `~legdistort.geometry.tangent_plane.TangentPlane` or None
-        In the celestial frame of the WCS.
+        ICRS.
     """
     try:
         source = wcs_source(wcs, shape)

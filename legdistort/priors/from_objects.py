@@ -124,17 +124,41 @@ def _of_fits_wcs(wcs, name):
         sky = wcs.all_pix2world(x, y, 0)
         return sky[wcs.wcs.lng], sky[wcs.wcs.lat]
 
-    crval, centre = wcs.wcs.crval, wcs.wcs.crpix - 1
-    grid = (np.stack(np.meshgrid(*[np.linspace(-500, 500, 5)] * 2), axis=-1).reshape(-1, 2)) + centre
+    _check_distorted(function, wcs.wcs.crpix - 1, wcs.wcs.crval[[wcs.wcs.lng, wcs.wcs.lat]], (1001, 1001), name)
+    known = {"direction": DIRECTIONS[0], "origin": 0, "sphere": 1.0}
+    return Source(name, "FITS WCS", function, shape=None if shape is None else check_shape(shape), **known)
+
+
+def of_sky(function, shape, name):
+    """A function from pixels (n, 2) of a detector to places on the sky (2, n), degrees.
+
+    Raises
+    ------
+    InputError
+        If it has no distortion.
+    """
+    centre = (np.array(shape[::-1]) - 1) / 2
+
+    def by_axes(x, y):
+        x, y = np.broadcast_arrays(x, y)
+        return function(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(2, *x.shape)
+
+    _check_distorted(by_axes, centre, function(centre[None])[:, 0], shape, name)
+    known = {"direction": DIRECTIONS[0], "origin": 0, "sphere": 1.0, "shape": check_shape(shape)}
+    return Source(name, "WCS", by_axes, **known)
+
+
+def _check_distorted(function, centre, place, shape, name):
+    """Raise `InputError` if a function from pixels to the sky is linear about a pixel that leads to a place there."""
+    t = [np.linspace(-0.5, 0.5, 5) * (n - 1) for n in shape[::-1]]
+    grid = np.stack(np.meshgrid(*t), axis=-1).reshape(-1, 2) + centre
     linear = np.column_stack([grid, np.ones(len(grid))])
     with np.errstate(all="ignore"):
-        sky = np.column_stack(gnomonic(*function(*grid.T), crval[wcs.wcs.lng], crval[wcs.wcs.lat]))
+        sky = np.column_stack(gnomonic(*function(*grid.T), *place))
         matrix = np.linalg.lstsq(linear, np.nan_to_num(sky), rcond=None)[0]
         left = np.abs(linear @ matrix - sky).max() / np.sqrt(abs(np.linalg.det(matrix[:2])))
     if left < NOTHING:  # not if it is NaN
         raise InputError(f"{name} has no distortion (SIP, TPV or other), only a linear matrix and a projection")
-    known = {"direction": DIRECTIONS[0], "origin": 0, "sphere": 1.0}
-    return Source(name, "FITS WCS", function, shape=None if shape is None else check_shape(shape), **known)
 
 
 def _of_aperture(aperture, frame, name):

@@ -5,8 +5,9 @@ from numbers import Real
 
 import numpy as np
 
-from ..exceptions import InputError
+from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis
+from .source import check_shape
 
 #: As `sigma` of a `Prior`: to be found from the exposures.
 EVIDENCE = "evidence"
@@ -188,6 +189,7 @@ class Prior:
         frame=None,
         degree=5,
         parity=None,
+        offset=None,
         sigma=None,
         static_sigma=None,
     ):
@@ -214,6 +216,9 @@ class Prior:
             Total degree of the Legendre series; `truncation` tells what it leaves out.
         parity : {1, -1, None}
             Orientation of the plane relative to the detector; None takes what fits.
+        offset : tuple of float, optional
+            Pixel (x, y) of the detector, 0-based, on which the first pixel of a source lies that has another size than
+            the detector, whose size is then `shape`. Where the source does not reach, its polynomial is continued.
         sigma, static_sigma
             As for `Prior`.
 
@@ -221,12 +226,24 @@ class Prior:
         ------
         InputError
             For a wrong direction or origin, or a model that cannot be followed over the detector.
+
+        Warns
+        -----
+        AssumptionWarning
+            If the source covers only a part of the detector, saying which.
         """
         from .expansion import expand
         from .from_objects import as_source
 
-        source = as_source(model, frame=frame).stated(shape=shape, direction=direction, origin=origin)
-        mean, plane, truncation = expand(source, basis.check_degree(degree), parity)
+        source, degree = as_source(model, frame=frame), basis.check_degree(degree)
+        if offset is not None:
+            if source.shape is None:
+                raise InputError(f"{source.name} ({source.kind}) has no size of its own: leave offset (--offset) out")
+            source = source.stated(direction=direction, origin=origin)
+            known = _placed(source, degree, parity, check_shape(source.shape if shape is None else shape), offset)
+            return cls(**known, sigma=sigma, static_sigma=static_sigma)
+        source = source.stated(shape=shape, direction=direction, origin=origin)
+        mean, plane, truncation = expand(source, degree, parity)
         known = {"shape": source.shape, "truncation": truncation, "plane": plane, "source": source.record()}
         return cls(mean, sigma=sigma, static_sigma=static_sigma, **known)
 
@@ -244,7 +261,7 @@ class Prior:
             Extension of FITS files, header of a text, or place in the tree of an ASDF file.
         frame : str, optional
         **options
-            As for `from_model`: shape, direction, origin, degree, parity, sigma, static_sigma.
+            As for `from_model`: shape, direction, origin, degree, parity, offset, sigma, static_sigma.
 
         Raises
         ------
@@ -301,6 +318,27 @@ class Prior:
         from .storage import read_prior
 
         return read_prior(path, cls)
+
+
+def _placed(source, degree, parity, shape, offset):
+    """Arguments of `Prior` for a source of another size than the detector."""
+    from .expansion import expand_placed
+
+    try:
+        x, y = (float(value) for value in offset)
+    except (TypeError, ValueError):
+        x = y = np.nan
+    if not np.isfinite([x, y]).all():
+        raise InputError(f"offset must be x, y in pixels of the detector, got {offset!r}")
+    mean, plane, truncation, covered = expand_placed(source, degree, parity, shape=shape, offset=(x, y))
+    if covered < 1:
+        warn(
+            f"{source.name} covers {100 * covered:.0f} % of the detector; elsewhere its polynomial of degree {degree} "
+            "is continued: keep the degree low, or state how uncertain it is (static_sigma, --static-sigma)",
+            AssumptionWarning,
+        )
+    record = source.record() | {"offset": [x, y], "source_shape": list(source.shape), "covered": covered}
+    return {"mean": mean, "shape": shape, "truncation": truncation, "plane": plane, "source": record}
 
 
 @dataclass(frozen=True, eq=False)

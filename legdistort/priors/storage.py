@@ -52,7 +52,7 @@ def read_prior(path, kind):
         raise InputError(f"{path} holds no legdistort prior (no entry 'legdistort_prior'); make one: legdistort prior")
     if tree["layout"] != LAYOUT:
         raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
-    check_tree({"legdistort_prior": tree}, "prior-1.schema.yaml", path)
+    check_tree({"legdistort_prior": tree}, "prior-1.0.0", path)
     try:
         given = ((key, tree[key]) for key in ("coefficients", "sigma", "static_sigma", "plane"))
         arrays = {key: np.array(value) if hasattr(value, "shape") else value for key, value in given}

@@ -13,7 +13,13 @@ body { margin: 2rem auto; max-width: 62rem; padding: 0 1.2rem; background: #fff;
        font: 16px/1.5 system-ui, "Segoe UI", Helvetica, Arial, sans-serif; }
 h1 { font-size: 1.7rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; }
 p.lead { margin: .2rem 0 1.4rem; color: #51606d; }
-p.warning { border-left: 4px solid #a84300; padding-left: .8rem; font-weight: 600; }
+section.verdict { border-left: 6px solid #2f7d4f; background: #f4f7f5; padding: .7rem 1rem; margin: 0 0 1.6rem; }
+section.verdict.warn, section.verdict.unknown { border-color: #c98a00; background: #fdf8ec; }
+section.verdict.fail { border-color: #b3261e; background: #fcf1f0; }
+section.verdict h2 { margin: 0 0 .4rem; }
+.state { border-radius: .6rem; padding: .05rem .6rem; color: #fff; background: #7a6200; font-size: .8rem; }
+.state.fail { background: #b3261e; } .state.unknown { background: #51606d; }
+details summary { cursor: pointer; font-size: .88rem; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .28rem .7rem; border-bottom: 1px solid #dde3e8; text-align: left; vertical-align: top; }
 table.facts th { white-space: nowrap; font-weight: 600; }

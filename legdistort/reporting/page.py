@@ -1,6 +1,7 @@
 """One HTML page for a finished run, complete in itself: no scripts, no links, pictures inside."""
 
 import warnings
+from dataclasses import asdict
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
@@ -10,8 +11,9 @@ import numpy as np
 from ..exceptions import FoldError
 from ..geometry import similarity
 from ..inputs import column_contract
-from ..plots import solution_plots, stack_plots
+from ..plots import psf_plots, solution_plots, stack_plots
 from ..runtime.outputs import replacing
+from .checks_table import verdict
 from .comparison import compared_corrections, compared_stacks, sharpness
 from .html import STYLE, count, detached_figure, figure, wide_table
 
@@ -19,7 +21,9 @@ from .html import STYLE, count, detached_figure, figure, wide_table
 _MARK = 2.0
 
 
-def write_report(path, solution, *, mosaic=None, summary=None, comparison=None, stacks=None, overwrite=False):
+def write_report(
+    path, solution, *, mosaic=None, psfs=None, summary=None, comparison=None, stacks=None, overwrite=False
+):
     """Write the report of a run as one self-contained HTML page.
 
     Parameters
@@ -30,10 +34,13 @@ def write_report(path, solution, *, mosaic=None, summary=None, comparison=None, 
         What is reported.
     mosaic : `~legdistort.coaddition.mosaic.Mosaic`, optional
         The co-added image.
+    psfs : dict, optional
+        ``{name: EffectivePSF}``: the PSFs that stars were measured with; that of the first exposure is drawn.
     summary : dict, optional
         Results of the run that replace or complete what follows from the solution: ``n_exposures``, ``n_stars``,
         ``n_observations``, ``chi2``, ``dof``, ``rms_px``, ``sigma_px``, ``max_inverse_error_px``, ``left_out``
-        (``{name: reason}``), ``timings`` (``{step: seconds}``), ``quality`` (of the mosaic, a
+        (``{name: reason}``), ``checks`` (dicts of
+        `~legdistort.results.check.Check`), ``timings`` (``{step: seconds}``), ``quality`` (of the mosaic, a
         `~legdistort.assessment.stack_quality.Quality` as a dict).
     comparison : dict, optional
         ``{name: Solution}`` of `legdistort.assessment.baselines.compare`: a table and a picture are added.
@@ -53,12 +60,13 @@ def write_report(path, solution, *, mosaic=None, summary=None, comparison=None, 
         If the file exists and `overwrite` is false, or its folder does not exist.
     """
     with replacing(path, overwrite=overwrite) as file:
-        page = render(solution, mosaic=mosaic, summary=summary, comparison=comparison, stacks=stacks)
+        shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks}
+        page = render(solution, summary=summary, **shown)
         file.write(page.encode())
     return Path(path)
 
 
-def render(solution, *, mosaic=None, summary=None, comparison=None, stacks=None):
+def render(solution, *, mosaic=None, psfs=None, summary=None, comparison=None, stacks=None):
     """The page of `write_report` as a string."""
     from matplotlib import style
 
@@ -72,14 +80,14 @@ def render(solution, *, mosaic=None, summary=None, comparison=None, stacks=None)
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # a name in a script that the font lacks
         body = [
             f'<h1>{title}</h1><p class="lead">{lead}</p>',
-            _warning(solution.gauge),
+            verdict(facts["checks"]),
             _facts_table(solution, facts),
             "<h2>Exposures</h2>",
             _exposures_table(solution),
             compared_corrections(comparison) if comparison else "",
             compared_stacks(stacks) if stacks else "",
             "<h2>Pictures</h2>",
-            _pictures(solution, mosaic),
+            _pictures(solution, mosaic, psfs),
             f"<footer>Written by legdistort {version('legdistort')}. Pixels count from 0 at the centre of the first; "
             "x is the column. Residuals are measured minus predicted positions on the detector.</footer>",
         ]
@@ -88,12 +96,6 @@ def render(solution, *, mosaic=None, summary=None, comparison=None, stacks=None)
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<style>{STYLE}</style>\n</head>\n<body>\n" + "\n".join(body) + "\n</body>\n</html>\n"
     )
-
-
-def _warning(gauge):
-    """That absolute positions are not known, and what to do, if that is so."""
-    text = gauge.warning
-    return f'<p class="warning">{escape(text[0].upper() + text[1:])}.</p>' if text else ""
 
 
 def _facts(solution, summary):
@@ -105,6 +107,7 @@ def _facts(solution, summary):
         "dof": solution.dof,
         "rms_px": solution.rms,
         "left_out": solution.left_out,
+        "checks": [asdict(check) for check in solution.checks],
     } | summary
     if "max_inverse_error_px" not in facts:
         try:
@@ -206,7 +209,7 @@ def _sizes(solution):
     return [np.sqrt(np.sum(part[:, :, 1:] ** 2, axis=(1, 2))) / 2 for part in parts]
 
 
-def _pictures(solution, mosaic):
+def _pictures(solution, mosaic, psfs):
     residuals = figure(
         solution_plots.plot_residuals(solution, ax=detached_figure(6.4, 6.4).subplots()),
         "Residuals of all exposures at their places on the detector, magnified: arrows that point the same way "
@@ -224,6 +227,15 @@ def _pictures(solution, mosaic):
     )
     figures = [f'<div class="pair">{residuals}{scatter}</div>', *_distortion_figures(solution), coefficients]
     figures += _error_figure(solution)
+    for name, psf in list((psfs or {}).items())[:1]:
+        figures.append(
+            figure(
+                psf_plots.plot_psf(psf, fig=detached_figure())[0],
+                f"The effective PSF of {name}, what it leaves of the stars that made it, and how it varies over the "
+                "field: rings or lobes of more than some per cent that are left would mean positions that depend on "
+                "brightness.",
+            )
+        )
     if mosaic is not None:
         figures.append(
             figure(

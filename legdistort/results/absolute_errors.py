@@ -8,6 +8,8 @@ relative errors.
 
 import numpy as np
 
+from ..geometry import basis
+
 
 def plain_directions(gauge, xy, n):
     """Displacements (n_stars, 2, 2 n) by the modes of the reference plane themselves."""
@@ -29,12 +31,17 @@ def _spread(directions, covariance):
 def relative_variance(gauge, uncertainty, xy):
     """Covariance xx, yy, xy (3, n_stars) of positions (n_stars, 2) once a common map of the fitted degree is taken off.
 
-    That in the gauge, and the part of the common map that is of second order.
+    That under the convention of the gauge, and the part of the common map that is of second order.
     """
     good = np.isfinite(xy[:, 0]) & np.isfinite(uncertainty.stars[0])
     out = np.where(np.isfinite(xy[:, 0]), uncertainty.stars, np.nan)
     if gauge.plane is not None or not np.count_nonzero(good):
         return out
+    if uncertainty.bends is not None:
+        shared = uncertainty.bends[good] @ gauge.directions[good].transpose(0, 2, 1)
+        both = shared + shared.transpose(0, 2, 1)
+        out[:, good] += np.stack([both[:, 0, 0], both[:, 1, 1], both[:, 0, 1]])
+        out[:, good] += _spread(gauge.directions[good], gauge.bend_errors(uncertainty.coefficients)[1])
     directions = _directions(gauge, xy)[good]
     plain = gauge.modes_at(xy[good], directions.shape[2] // 2).T
     left = directions - np.einsum("jm,mac->jac", plain, np.einsum("mj,jac->mac", np.linalg.pinv(plain), directions))
@@ -59,6 +66,22 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
         for each in gauge.unknown:
             out[:, np.sum(each.stars**2, axis=1) > out[0] + out[1]] = np.nan
     return out
+
+
+def relative_coefficients(gauge, uncertainty, i):
+    """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i under the convention of the gauge."""
+    size = len(uncertainty.coefficients) // len(gauge.motion)
+    mine = slice(i * size, (i + 1) * size)
+    block = uncertainty.coefficients[mine, mine]
+    if uncertainty.bends is None:
+        return block
+    shared, bend = gauge.bend_errors(uncertainty.coefficients)
+    moved = basis.change_degree(
+        gauge.motion[i].reshape(2, gauge.n_modes, -1).swapaxes(1, 2), basis.degree_of(size // 2)
+    )
+    moved = moved.swapaxes(1, 2).reshape(size, -1)
+    both = shared[mine] @ moved.T
+    return block - both - both.T + moved @ bend @ moved.T
 
 
 def coefficient_variance(gauge, block, i):

@@ -59,6 +59,67 @@ def bias_by_star(estimated, true, *, removed=None):
     return out
 
 
+def known_offsets(solution, xy):
+    """Positions of the stars from elsewhere less those of a solution, without what the solution does not know.
+
+    A similarity of the plane, unless a reference has tied it, and the directions of `Gauge.unknown` are fitted and
+    taken off, so that what is left compares with ``x_err_known``, ``y_err_known``. They are followed to second order: a
+    solution that is wrong by g pixels along them is off by g times the gradient of g across them, which the directions
+    at the solution, ``gauge.unknown`` by itself, leave behind.
+
+    Parameters
+    ----------
+    solution : Solution
+        As returned by `legdistort.solve`.
+    xy : array_like, shape (n_stars, 2)
+        Pixels of the reference plane; NaN for a star that is not there.
+
+    Returns
+    -------
+    ndarray, shape (n_stars, 2)
+
+    Raises
+    ------
+    InputError
+        If the solution was read from a file and has unknown directions, or too few stars are given.
+    """
+    xy, unknown = np.asarray(xy, dtype=float), solution.gauge.unknown
+    if xy.shape != solution.positions.shape:
+        raise InputError(f"xy must have one row for each of the {len(solution.positions)} stars, got shape {xy.shape}")
+    offsets = xy - solution.positions
+    good = np.tile(np.isfinite(offsets).all(axis=1), 2)
+    similar = np.zeros((good.sum(), 0))
+    if solution.gauge.tie is None:
+        similar = _columns(xy[good[: len(xy)]], "similarity")
+    if np.count_nonzero(good) <= similar.shape[1] + len(unknown):
+        raise InputError(
+            f"{similar.shape[1] + len(unknown)} directions cannot be taken off the offsets of {good.sum() // 2} stars"
+        )
+    if unknown and not hasattr(type(solution.uncertainty), "unknown_at"):
+        raise InputError("a solution read from a file keeps no equations; call solve again")
+    values = offsets.T.ravel()[good]
+    here = np.stack([each.stars.T.ravel() for each in unknown], axis=1) if unknown else np.zeros((2 * len(xy), 0))
+    design = np.hstack([similar, here[good]])
+    amounts = np.linalg.lstsq(design, values, rcond=None)[0]
+    if unknown:  # the mean of the directions at both ends is exact to second order
+        there = _unknown_at(solution, amounts[similar.shape[1] :])
+        design = np.hstack([similar, (here + there)[good] / 2])
+        amounts = np.linalg.lstsq(design, values, rcond=None)[0]
+    out = np.full(xy.shape, np.nan)
+    out.T.flat[good] = values - design @ amounts
+    return out
+
+
+def _unknown_at(solution, amounts):
+    """Directions (2 n_stars, m) where a solution has moved so far (m,) along those that it does not know."""
+    positions, coefficients = np.nan_to_num(solution.positions), solution.coefficients.copy()
+    for amount, each in zip(amounts, solution.gauge.unknown, strict=True):
+        positions = positions + amount * np.nan_to_num(each.stars)
+        coefficients[:, :, : each.coefficients.shape[2]] += amount * each.coefficients
+    poses = np.stack([solution.poses[name] for name in solution.names])
+    return solution.uncertainty.unknown_at(positions, coefficients, poses)
+
+
 def expected_bias(solution, *, removed=None, absolute=False):
     """What `bias` should be, from the covariance of the solution.
 

@@ -114,6 +114,43 @@ class UsedReference:
 
 
 @dataclass(frozen=True)
+class ErrorLaw:
+    """Errors by brightness: ``sigma^2 = factor^2 ((a / flux)^2 + b^2 / flux + floor^2)``, the same in x and y.
+
+    Attributes
+    ----------
+    a, b, floor : float
+        Pixels, in units of the flux of the observations.
+    factors : dict
+        ``{exposure: factor}``.
+    """
+
+    a: float
+    b: float
+    floor: float
+    factors: dict
+
+    def sigma(self, flux, exposure=None):
+        """Error [pix] of positions with a flux (n,), in the exposures named (n,); by default of the average one."""
+        flux = np.asarray(flux, dtype=float)
+        sigma = np.sqrt((self.a / flux) ** 2 + self.b**2 / flux + self.floor**2)
+        if exposure is None:
+            return sigma
+        return sigma * np.array([self.factors.get(name, 1.0) for name in np.asarray(exposure).tolist()])
+
+    def scaled(self, factor):
+        """The law with all errors multiplied."""
+        return ErrorLaw(self.a * factor, self.b * factor, self.floor * factor, self.factors)
+
+    def __str__(self):
+        factors = list(self.factors.values())
+        return (
+            f"by brightness, from the scatter of the stars: sqrt(({self.a:.4g} / flux)^2 + {self.b:.4g}^2 / flux + "
+            f"{self.floor:.4g}^2) px, times {min(factors):.2f} to {max(factors):.2f} by exposure"
+        )
+
+
+@dataclass(frozen=True)
 class Diagnostics:
     """What `solve` found out; None for what was not asked for.
 
@@ -123,6 +160,10 @@ class Diagnostics:
         Pixels, added in quadrature to every stated error.
     error_scale : float
         Factor on the stated errors.
+    error_law : ErrorLaw or None
+        Errors by brightness that took the place of those stated.
+    epoch : float or None
+        Of the positions, a Julian year.
     sky : {"exposures", "reference", None}
         From which the place on the sky is known.
     reference : UsedReference or None
@@ -148,16 +189,18 @@ class Diagnostics:
     departure_ratio: float | None = None
     selection: DegreeChoice | None = None
     validation: Validation | None = None
+    error_law: ErrorLaw | None = None
+    epoch: float | None = None
 
     def in_words(self):
-        """Sentences on the widths of a prior, the degree chosen, and the stars that were kept out.
+        """Sentences on errors found, the widths of a prior, the degree chosen, and the stars that were kept out.
 
         Returns
         -------
         dict
-            ``{"widths" | "modes" | "degree" | "kept": sentence}``, those that there is something to say on.
+            ``{"errors" | "widths" | "modes" | "degree" | "kept": sentence}``, those that there is something to say on.
         """
-        words = {}
+        words = {} if self.error_law is None else {"errors": str(self.error_law)}
         if widths := _in_words(self.widths):
             words["widths"] = f"scatter of a coefficient, found from the exposures: {widths}"
         if self.effective_modes and self.prior_has_widths:
@@ -179,7 +222,7 @@ class Diagnostics:
 
     def summary(self):
         """What there is of it as plain numbers and strings by name, for summaries."""
-        names = "widths", "effective_modes", "departure_ratio", "selection", "validation"
+        names = "widths", "effective_modes", "departure_ratio", "selection", "validation", "error_law"
         return {name: found for name, found in asdict(self).items() if name in names and found is not None}
 
 

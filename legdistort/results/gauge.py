@@ -106,6 +106,10 @@ class Gauge:
         Maps of the reference plane, as columns, that the residuals determine.
     tie : `legdistort.results.catalogue_tie.Tie` or None
         How a reference catalogue measured the common map.
+    convention : ndarray, same shape as `constraint`, or None
+        Rows of the convention by itself, where something else takes its place in `constraint`. Relative errors are
+        those under the convention: what determines a common map otherwise is less precise than positions are, and
+        that is a matter of the absolute error.
     responses : object
         With ``directions``: see there.
     plane : str or None
@@ -124,6 +128,7 @@ class Gauge:
     values: np.ndarray | None = None
     released: np.ndarray | None = None
     tie: object = None
+    convention: np.ndarray | None = None
     responses: object = field(default=None, repr=False, compare=False)
     plane: str | None = None
 
@@ -155,6 +160,37 @@ class Gauge:
     def reach(self):
         """Reference-plane modes -> values of the orthonormal constraints, shape (n_constraints, 2 n_modes)."""
         return self.orthonormal @ self.motion.reshape(-1, 2 * self.n_modes)
+
+    @cached_property
+    def to_convention(self):
+        """Errors of all A_i -> bend of the plane (2 n_modes,) that takes them to the convention; None if it holds.
+
+        Shape (2 n_modes, n_exposures * 2 n_modes). The bend g moves stars by `directions` g and each A_i by
+        ``-motion`` g.
+        """
+        if self.convention is None:
+            return None
+        rows = self.convention.reshape(len(self.convention), -1)
+        return np.linalg.pinv(rows @ self.motion.reshape(rows.shape[1], -1)) @ rows
+
+    def bend_errors(self, covariance):
+        """Covariance of the bend to the convention with all coefficients, and its own, of theirs.
+
+        Parameters
+        ----------
+        covariance : ndarray, shape (n_exposures * 2 k,) squared
+            Of the fitted coefficients, k >= n_modes, px^2.
+
+        Returns
+        -------
+        ndarray, shape (n_exposures * 2 k, 2 n_modes)
+        ndarray, shape (2 n_modes, 2 n_modes)
+        """
+        n, degree = len(self.motion), basis.degree_of(len(covariance) // (2 * len(self.motion)))
+        rows = self.to_convention.reshape(2 * self.n_modes, n, 2, -1)
+        rows = basis.change_degree(rows, degree).reshape(len(rows), -1)
+        shared = covariance @ rows.T
+        return shared, rows @ shared
 
     @property
     def measured(self):
@@ -247,9 +283,10 @@ class Gauge:
         error = np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()]))
         tied = f"{self.tie.sentence}; " if self.tie is not None else ""
         after = f" after {_listed(self.unknown_names)}" if self.unknown_names else ""
-        known = f"{tied}absolute to {error:.2g} px rms per axis{after}" + (
-            ", pointing aside" if self.tie is None else ""
-        )
+        aside = ", pointing aside" if self.tie is None else ""
+        known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}"
+        if after and error == 0:  # nothing of the common map is known
+            known = "absolute positions are not known"
         return f"{self.kind} ({_CONVENTIONS[self.kind]}), {self.n_constraints} modes of a common map; {known}"
 
     def __repr__(self):

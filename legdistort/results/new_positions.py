@@ -100,16 +100,17 @@ def covariances(solution, name, q, measured):
     """
     gauge, i = solution.gauge, solution.index(name)
     by_modes, back = response(solution, name, q)
-    own = carried(back, measured) + carried(by_modes, solution.coefficient_covariance(name))
+    noise = carried(back, measured)
+    own = noise + carried(by_modes, solution.coefficient_covariance(name))
     if gauge.plane is not None:
         return own, np.full_like(own, np.nan)
     xy = similarity.apply(similarity.invert(solution.poses[name]), q)
     hidden = gauge.absolute_covariance
     plain = absolute_errors.plain_directions(gauge, xy, len(hidden) // 2)
-    relative, directions = own, plain
+    relative, directions = noise + carried(by_modes, solution.coefficient_covariance(name, relative=True)), plain
     if len(hidden) == 2 * gauge.n_modes:
         directions = by_modes @ widened(gauge.motion[i], solution.degree)
-        relative = own + carried(directions - plain @ _taken_off(gauge, solution.positions), hidden)
+        relative = relative + carried(directions - plain @ _taken_off(gauge, solution.positions), hidden)
     absolute = own + carried(directions, hidden)
     for each in gauge.unknown:
         moved = by_modes @ widened(each.coefficients[i].reshape(-1, 1), solution.degree)

@@ -6,7 +6,9 @@ from functools import cached_property
 
 import numpy as np
 from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.table import QTable
+from astropy.time import Time
 from astropy.wcs import WCS
 
 from ..exceptions import InputError
@@ -17,6 +19,7 @@ from ..geometry.star_hull import support, supported
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from . import absolute_errors, new_positions
+from .check import in_lines
 from .diagnostics import Diagnostics
 from .gauge import Gauge
 from .settings import Settings
@@ -73,12 +76,16 @@ class Solution:
         ``created``, ``versions`` of packages and, if files went in, ``inputs`` ``{base name: SHA-256}``.
     form : `legdistort.solving.model_forms.Form` or None
         The model that was given to `solve`. Files do not keep it: `model` then has the usual form, the same function.
+    checked : callable or tuple of Check
+        The `checks`, or what makes them of the solution.
 
     Parameters
     ----------
     inverses : dict, optional
         ``{exposure: Inverse}`` that were certified for these coefficients earlier; checked again where they are used.
         What `dataclasses.replace` makes finds its own.
+    file_checksum : str, optional
+        SHA-256 of the file that it was read from. What `dataclasses.replace` makes is another solution and has none.
     """
 
     names: tuple
@@ -101,10 +108,23 @@ class Solution:
     left_out: dict = field(default_factory=dict)
     provenance: dict = field(default_factory=dict)
     form: object = None
+    checked: object = field(default=(), repr=False)
     inverses: InitVar[dict | None] = None
+    file_checksum: InitVar[str | None] = None
 
-    def __post_init__(self, inverses):
+    def __post_init__(self, inverses, file_checksum):
         object.__setattr__(self, "_inverses", inverses or {})
+        object.__setattr__(self, "_checksum", file_checksum)
+
+    @property
+    def checksum(self):
+        """SHA-256 of the file that it was read from, in hexadecimal digits; None if it was not."""
+        return self._checksum
+
+    @cached_property
+    def checks(self):
+        """What a referee would ask, answered: a tuple of `legdistort.results.check.Check`; made at first use."""
+        return self.checked(self) if callable(self.checked) else self.checked
 
     # -- tables
 
@@ -118,7 +138,9 @@ class Solution:
         unknown directions are taken off. Pointing, rotation and scale common to all exposures are those of the nominal
         poses and are not part of these errors, unless a reference ties them: then they are. On the sky:
         ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
-        ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue.
+        ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue, and ``sky``, the same places as a
+        `~astropy.coordinates.SkyCoord` (not in files). ``meta`` has ``frame``, ``epoch`` (a Julian year, if it is
+        known), ``gauge``, ``degree``, ``prior`` and ``version``.
         """
         table = QTable({"star": self.star_names, "x": self.positions[:, 0] * u.pix, "y": self.positions[:, 1] * u.pix})
         variance = absolute_errors.relative_variance(self.gauge, self.uncertainty, self.positions)
@@ -135,7 +157,30 @@ class Solution:
                 table["flux"] = np.bincount(index, used["flux"], len(table)) / table["n"]
         if self.sky is not None:
             new_positions.add_sky(table, self.sky, self.positions, variance, absolute)
+            table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=self._obstime)
+        table.meta = self._stars_meta()
         return column_contract.describe_stars(table)
+
+    @property
+    def _obstime(self):
+        return None if self.diagnostics.epoch is None else Time(self.diagnostics.epoch, format="jyear")
+
+    def _stars_meta(self):
+        """What must be known of a table of stars by itself, in words and numbers that any file can hold."""
+        prior = self.settings.prior
+        if isinstance(prior, dict):
+            prior = prior.get("source", "one for each detector or exposure")
+        if isinstance(prior, dict):
+            prior = prior.get("name", "")
+        meta = {
+            "frame": "reference plane" if self.sky is None else "ICRS",
+            "epoch": self.diagnostics.epoch,
+            "gauge": self.gauge.kind,
+            "degree": self.degree,
+            "prior": None if self.settings.prior is None else str(prior or "given"),
+            "version": f"legdistort {self.provenance.get('versions', {}).get('legdistort', '')}".strip(),
+        }
+        return {key: value for key, value in meta.items() if value is not None}
 
     @property
     def residuals(self):
@@ -302,6 +347,21 @@ class Solution:
         wcs.array_shape = self.shapes[name]
         return wcs
 
+    def orientation(self, name):
+        """Position angle of an exposure's y axis [deg, north through east] and pixel scale [arcsec], at its centre.
+
+        Those of its pose: without the distortion, whose linear part stays out.
+
+        Raises
+        ------
+        InputError
+            If the sky is not known.
+        """
+        self.index(name)
+        if self.sky is None:
+            raise InputError("no position angle: where the exposures lie on the sky is not known")
+        return self.sky.orientation(self.poses[name], self.shapes[name])
+
     @property
     def max_inverse_error(self):
         """Largest certified round-trip error over all exposures, pixels."""
@@ -313,15 +373,20 @@ class Solution:
         """Standard deviations (2, n_modes) of the fitted coefficients of an exposure, pixels.
 
         With the error of the common map, and NaN for what changes with an unknown direction (`Gauge.unknown`); or
-        `relative` ones, in the gauge.
+        `relative` ones, under the convention of the gauge.
         """
-        block = self.coefficient_covariance(name)
+        block = self.coefficient_covariance(name, relative=relative)
         if relative or self.gauge.plane is not None:
             return np.sqrt(np.diag(block)).reshape(2, -1)
         return np.sqrt(absolute_errors.coefficient_variance(self.gauge, block, self.index(name)))
 
-    def coefficient_covariance(self, name):
-        """Covariance (2 n_modes, 2 n_modes) of the fitted coefficients of an exposure in the gauge, px^2; x first."""
+    def coefficient_covariance(self, name, *, relative=False):
+        """Covariance (2 n_modes, 2 n_modes) of the fitted coefficients of an exposure, px^2; x first.
+
+        Under the constraints of the gauge; or `relative`, under its convention alone (`Gauge.convention`).
+        """
+        if relative:
+            return absolute_errors.relative_coefficients(self.gauge, self.uncertainty, self.index(name))
         size = 2 * basis.n_modes(self.degree)
         mine = slice(self.index(name) * size, (self.index(name) + 1) * size)
         return self.uncertainty.coefficients[mine, mine]
@@ -337,8 +402,7 @@ class Solution:
         support : bool
             NaN outside the convex hull of the stars used in this exposure, where the correction is extrapolated.
         absolute : bool
-            With the error of the common map, NaN where that is not known (`Gauge.unknown`); else relative, in the
-            gauge.
+            With the error of the common map, NaN where that is not known (`Gauge.unknown`); else relative.
 
         Returns
         -------
@@ -358,7 +422,7 @@ class Solution:
             covariance = new_positions.covariances(self, name, q, np.zeros((len(q), 2, 2)))[1]
         else:
             by_modes = new_positions.response(self, name, q)[0]
-            covariance = new_positions.carried(by_modes, self.coefficient_covariance(name))
+            covariance = new_positions.carried(by_modes, self.coefficient_covariance(name, relative=True))
         variance = np.einsum("naa->na", covariance)
         sigma = np.sqrt(np.maximum(variance, 0)).reshape(len(y), len(x), 2)
         if support:
@@ -400,10 +464,20 @@ class Solution:
         mine = f"modes up to degree {own}" if own else "its pose alone"
         return [f"static  fitted: one distortion for all exposures of a detector, {mine} for every exposure"]
 
+    def _orientation_in_words(self, name=None):
+        """Columns of an exposure in the printed table, or their heads; empty without a sky."""
+        if self.sky is None:
+            return ""
+        if name is None:
+            return f" {'PA [deg]':>9s} {'arcsec/px':>9s}"
+        angle, scale = self.orientation(name)
+        return f" {angle:9.4f} {scale:9.6f}"
+
     def __str__(self):
         used = self.observations["used"]
         lines = [
             repr(self)[1:-1],
+            *in_lines(self.checks),
             f"status  {self.status}",
             *self._static_in_words(),
             *_wrapped("gauge", self.gauge.sentence),
@@ -413,7 +487,7 @@ class Solution:
             *(line for key, text in self.diagnostics.in_words().items() for line in _wrapped(key, text)),
             "",
             f"{'exposure':24s} {'stars':>5s} {'shift x':>9s} {'shift y':>9s} {'rotation':>9s} {'scale':>9s} "
-            f"{'rms x':>7s} {'rms y':>7s} {'distortion':>10s}",
+            f"{'rms x':>7s} {'rms y':>7s} {'distortion':>10s}{self._orientation_in_words()}",
         ]
         for name, a in zip(self.names, self.coefficients, strict=True):
             rows = self.observations[used & (self.observations["exposure"] == name)]
@@ -421,7 +495,7 @@ class Solution:
             rms = [np.sqrt(np.mean(rows[k].to_value(u.pix) ** 2)) if len(rows) else np.nan for k in ("dx", "dy")]
             lines.append(
                 f"{name[:24]:24s} {len(rows):5d} {d['dx']:9.2f} {d['dy']:9.2f} {d['rotation']:9.4f} {d['scale']:9.6f} "
-                f"{rms[0]:7.4f} {rms[1]:7.4f} {np.sqrt((a**2).sum()) / 2:10.3f}"
+                f"{rms[0]:7.4f} {rms[1]:7.4f} {np.sqrt((a**2).sum()) / 2:10.3f}{self._orientation_in_words(name)}"
             )
         lines += [f"left out {name}: {reason}" for name, reason in self.left_out.items()]
         return "\n".join(lines)

@@ -22,8 +22,10 @@ from ..inputs import column_contract
 from ..inputs.plain_columns import plain, plain_columns, restored
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
+from ..runtime.provenance import checksums
 from .catalogue_tie import Tie
-from .diagnostics import AliasedDegree, DegreeChoice, Diagnostics, UsedReference, Validation
+from .check import Check
+from .diagnostics import AliasedDegree, DegreeChoice, Diagnostics, ErrorLaw, UsedReference, Validation
 from .gauge import Gauge, UnknownDirection, UnknownMap
 from .settings import Settings
 
@@ -39,6 +41,7 @@ class StoredUncertainty:
     stars: np.ndarray
     directions: np.ndarray
     weak: tuple
+    bends: np.ndarray | None = None
 
 
 def write_solution(solution, path, *, overwrite=False):
@@ -57,11 +60,14 @@ def write_solution(solution, path, *, overwrite=False):
         "stars": {"star": np.asarray(solution.star_names), "position": solution.positions},
         "columns": table.colnames,  # their order: that of a mapping is lost in files
         "observations": {name: plain(table[name]) for name in table.colnames},
-        "covariance": {key: getattr(solution.uncertainty, key) for key in ("coefficients", "stars", "directions")}
+        "covariance": {
+            key: getattr(solution.uncertainty, key) for key in ("coefficients", "stars", "directions", "bends")
+        }
         | {"weak": [dataclasses.asdict(each) for each in solution.uncertainty.weak]},
         "gauge": _gauge_tree(solution.gauge),
         "sky": solution.sky and dataclasses.asdict(solution.sky),
         "left_out": solution.left_out,
+        "checks": [dataclasses.asdict(each) for each in solution.checks],
     }
     content = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
     for column in tree["observations"].values():  # names repeat; covariances and coefficients would not get smaller
@@ -108,15 +114,19 @@ def read_solution(path, kind, *, max_bytes=None):
         raise InputError(f"{path} holds no legdistort solution (no entry 'legdistort'); give a solution.asdf")
     if tree["layout"] != LAYOUT:
         raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
-    check_tree({"legdistort": tree}, "solution-1.schema.yaml", path)
-    return understood(path, partial(_from_tree, kind), tree)
+    check_tree({"legdistort": tree}, "solution-1.0.0", path)
+    (checksum,) = checksums(path).values()
+    return understood(path, partial(_from_tree, kind, checksum), tree)
 
 
 def _made(kind, tree, **inner):
-    """A dataclass from its fields by name, with dataclasses in some of them, ``field=kind``; None for None."""
+    """A dataclass from its fields by name, with dataclasses in some of them, ``field=kind``; None for None.
+
+    Fields that files of earlier versions lack have their defaults.
+    """
     if tree is None:
         return None
-    made = {name: _made(each, tree[name]) for name, each in inner.items()}
+    made = {name: _made(each, tree[name]) for name, each in inner.items() if name in tree}
     return kind(**{name: _own(value) for name, value in tree.items()} | made)
 
 
@@ -131,7 +141,8 @@ def _own(value):
 
 def _diagnostics(tree, names):
     """`Diagnostics`; with exposures in their order, which mappings in files do not keep."""
-    found = _made(Diagnostics, tree, reference=UsedReference, selection=DegreeChoice, validation=Validation)
+    parts = {"selection": DegreeChoice, "validation": Validation, "error_law": ErrorLaw}
+    found = _made(Diagnostics, tree, reference=UsedReference, **parts)
     if (chosen := found.selection) is not None:
         degrees = tuple(AliasedDegree(**each) for each in chosen.aliasing)
         found = dataclasses.replace(found, selection=dataclasses.replace(chosen, aliasing=degrees))
@@ -139,7 +150,7 @@ def _diagnostics(tree, names):
     return dataclasses.replace(found, effective_modes=effective and {name: effective[name] for name in names})
 
 
-def _from_tree(kind, tree):
+def _from_tree(kind, checksum, tree):
     exposures = tree["exposures"]
     uncertainty = _made(StoredUncertainty, tree["covariance"])
     weak = tuple(UnknownDirection(**each) for each in uncertainty.weak)
@@ -168,7 +179,9 @@ def _from_tree(kind, tree):
         sky=_made(TangentPlane, tree["sky"]),
         left_out=dict(tree["left_out"]),
         provenance=dict(tree["provenance"]),
+        checked=tuple(Check(**each) for each in tree.get("checks", ())),
         inverses={e["name"]: _inverse(e["inverse"]) for e in exposures if e["inverse"] is not None},
+        file_checksum=checksum,
     )
     _check_consistent(solution)
     solution.distortion(solution.names[0])  # checks the certificates of all
@@ -197,7 +210,9 @@ def _check_consistent(solution):
         ("covariance of the coefficients", solution.uncertainty.coefficients, (n * own, n * own)),
         ("covariance of the stars", solution.uncertainty.stars, (3, n_stars)),
         ("directions", solution.uncertainty.directions, (n_stars, 2, modes)),
+        ("covariance of the stars with the bend to the convention", solution.uncertainty.bends, (n_stars, 2, modes)),
         ("gauge.constraint", gauge.constraint, (held, n, modes)),
+        ("gauge.convention", gauge.convention, (held, n, modes)),
         ("gauge.motion", gauge.motion, (n, modes, modes)),
         ("gauge.dynamic", gauge.dynamic, (n, modes, modes)),
         ("gauge.box", gauge.box, (2, 2)),

@@ -24,6 +24,7 @@ from pathlib import Path
 import asdf
 import numpy as np
 import yaml
+from asdf.resource import DirectoryResourceMapping
 from asdf.tags.core.ndarray import asdf_datatype_to_numpy_dtype
 
 from ..exceptions import InputError
@@ -31,6 +32,8 @@ from .checks import first_line
 
 #: Version of the ASDF standard that is written.
 ASDF_STANDARD = "1.5.0"
+#: Beginning of the ``id`` of our schemas; version and all stand in the names of their files.
+SCHEMAS = "asdf://legdistort/schemas/"
 #: Bytes that the arrays of a file may take in memory, unless more are allowed.
 MAX_BYTES = 2 << 30
 #: Tags of plain trees: arrays, and what asdf says of itself.
@@ -44,8 +47,11 @@ WITH_WCS = (
     "tag:astropy.org:astropy/transform/",
     "tag:astropy.org:astropy/units/",
 )
+#: Tags of files that hold a WCS: those of gwcs, and what the archives of JWST and Roman put around it.
+ARCHIVES = (*WITH_WCS, "tag:stsci.edu:jwst_pipeline/", "tag:stsci.edu:jwst_datamodel/", "asdf://stsci.edu/datamodels/")
 _PLAIN = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "seq", "map", "timestamp")}
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _MAX_DEPTH = 100
 _BYTES_PER_NODE = 2048  # what a node of YAML takes in memory while it is read, about
 _BLOCK = b"\xd3BLK"
@@ -59,7 +65,8 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
     ----------
     path : str or path
     content : bytes, optional
-        What stands in the file, if it is part of another one; `path` then is a name for messages.
+        What stands in the file, if it is part of another one; `path` then is a name for messages. Arrays that are
+        other HDUs of that FITS file (``source: fits:SCI,1``, as JWST has them) are None in the tree.
     tags : tuple of str
         Beginnings of the YAML tags that may stand in the file; a tag makes asdf call a converter.
     max_bytes : int
@@ -73,6 +80,8 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
     if not isinstance(max_bytes, int) or max_bytes < 1:
         raise InputError(f"max_bytes must be a positive number of bytes, got {max_bytes!r}")
     inside = content is not None
+    if inside and b"fits:" in content:
+        content = _without_fits_arrays(path, content)
     if not inside and not Path(path).exists():
         raise InputError(f"{path}: no such file")
     if not inside and not Path(path).is_file():
@@ -96,6 +105,11 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
         raise InputError(f"{path} is not a readable ASDF file: {first_line(error)}") from None
 
 
+def schema_resources():
+    """Entry point ``asdf.resource_mappings``: our schemas by their ``id``."""
+    return [DirectoryResourceMapping(resources.files("legdistort") / "data" / "schemas", SCHEMAS)]
+
+
 def check_tree(tree, schema, path):
     """Check a tree against a schema of the package.
 
@@ -103,7 +117,7 @@ def check_tree(tree, schema, path):
     ----------
     tree : dict
     schema : str
-        Name of a file in ``legdistort/data``.
+        Name of a file in ``legdistort/data/schemas`` without ``.yaml``.
     path : str or path
         The file, for messages.
 
@@ -112,11 +126,11 @@ def check_tree(tree, schema, path):
     InputError
         Naming the entry, what stands there and what should.
     """
-    place, uri = resources.files("legdistort") / "data" / schema, f"asdf://legdistort/{schema}"
     try:
-        with asdf.config_context() as config:  # under a name of its own: asdf would take the path for a URL
-            config.add_resource_mapping({uri: place.read_bytes()})
-            asdf.AsdfFile(tree, custom_schema=uri).validate()
+        with asdf.config_context() as config:  # for those who have the package without installing it
+            for mapping in schema_resources():
+                config.add_resource_mapping(mapping)
+            asdf.AsdfFile(tree, custom_schema=f"{SCHEMAS}{schema}").validate()
     except asdf.exceptions.ValidationError as error:
         entry = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in error.absolute_path).lstrip(".")
         meaning = "" if error.validator == "required" else error.schema.get("description", "")
@@ -126,6 +140,33 @@ def check_tree(tree, schema, path):
         ) from None
     except Exception as error:  # a tree that asdf cannot take
         raise InputError(f"{path} is damaged: {first_line(error)}") from None
+
+
+def _without_fits_arrays(path, content):
+    """The file with null in the place of the arrays that are HDUs of the FITS file around it."""
+    end = re.compile(rb"\r?\n\.\.\.\r?\n").search(content)
+    if end is None:
+        return content  # which will be told
+    kept, held, depth, elsewhere = [], [], 0, False
+    try:
+        for event in yaml.parse(content[: end.end()], Loader=_LOADER):
+            if held or (isinstance(event, yaml.events.MappingStartEvent) and "/core/ndarray-" in (event.tag or "")):
+                held.append(event)
+                depth += isinstance(event, yaml.events.CollectionStartEvent)
+                depth -= isinstance(event, yaml.events.CollectionEndEvent)
+                elsewhere |= isinstance(event, yaml.events.ScalarEvent) and event.value.startswith("fits:")
+                if depth == 0:
+                    null = yaml.events.ScalarEvent(held[0].anchor, None, (True, False), "null")
+                    kept += [null] if elsewhere else held
+                    held, elsewhere = [], False
+            else:
+                kept.append(event)
+        comments = [line for line in content[: end.end()].splitlines() if line.startswith(b"#ASDF")]
+        text = yaml.emit(kept, Dumper=_DUMPER, allow_unicode=True, width=1000).encode()
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is not a readable ASDF file: {first_line(error)}") from None
+    text = text if text.rstrip().endswith(b"...") else text.rstrip() + b"\n..."
+    return b"\n".join(comments) + b"\n" + text.rstrip() + b"\n" + content[end.end() :]
 
 
 class _TooLargeError(Exception):

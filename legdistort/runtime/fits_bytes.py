@@ -7,16 +7,14 @@ import bz2
 import gzip
 import io
 import re
-import warnings
 import zlib
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from astropy.io import fits
-from astropy.utils.exceptions import AstropyWarning
 
-from ..exceptions import InputError
+from ..exceptions import InputError, without_astropy_warnings
 
 BLOCK = 2880
 _CARD = 80
@@ -59,7 +57,7 @@ def read_bytes(path):
 
 def open_bytes(raw, **options):
     """An HDUList of the content of a file, its oddities left alone."""
-    with warnings.catch_warnings(action="ignore", category=AstropyWarning):
+    with without_astropy_warnings():
         hdulist = fits.open(io.BytesIO(raw), memmap=False, **options)
         len(hdulist)  # astropy reads headers when they are asked for
     return hdulist
@@ -105,7 +103,8 @@ def exchange_cards(header, data, new, obsolete):
     new : `~astropy.io.fits.Header`
         Cards that take the place of the first card removed, or go to the end.
     obsolete : compiled regular expression
-        A card whose keyword matches it wholly is removed, together with its continuation.
+        A card whose keyword matches it wholly is removed, together with its continuation; of ``HISTORY``, one whose
+        whole text with the keyword does.
     """
     cards, place, removing = [], None, False
     for start in range(0, len(header), _CARD):
@@ -113,7 +112,8 @@ def exchange_cards(header, data, new, obsolete):
         keyword = card[:8].decode("ascii", "replace").rstrip()
         if keyword == "END":
             break
-        removing = obsolete.fullmatch(keyword) is not None or (removing and keyword == "CONTINUE")
+        label = card.decode("ascii", "replace").rstrip() if keyword == "HISTORY" else keyword
+        removing = obsolete.fullmatch(label) is not None or (removing and keyword == "CONTINUE")
         if not removing:
             cards.append(card)
         elif place is None:
@@ -130,6 +130,11 @@ def _with_checksum(header, data):
     By hand: ``add_checksum`` of astropy sums the header as astropy would write it, cards that it mends and the new date
     in the comment included, and not the bytes that stand here.
     """
+    return with_checksum(header, sum32(data))
+
+
+def with_checksum(header, datasum):
+    """The bytes of a header with its ``CHECKSUM`` card, if any, made true; `datasum` is that of the data."""
     found = re.match(rb"(?:.{80})*?(?=CHECKSUM=)", header, re.DOTALL)
     if found is None:
         return header
@@ -138,13 +143,13 @@ def _with_checksum(header, data):
     def with_value(value):
         return header[:place] + f"CHECKSUM= '{value}'".ljust(_CARD).encode("ascii") + header[place + _CARD :]
 
-    return with_value(_encode(0xFFFFFFFF ^ _sum32(with_value("0" * 16) + data)))
+    return with_value(_encode(0xFFFFFFFF ^ sum32(with_value("0" * 16), datasum)))
 
 
-def _sum32(content):
-    """Sum of 32-bit words in ones' complement (FITS standard 4.0, appendix J.1)."""
-    total = int(np.frombuffer(content, ">u4").sum(dtype=np.uint64))
-    return (total - 1) % 0xFFFFFFFF + 1  # carries come back at the low end; a header is never all 0
+def sum32(content, before=0):
+    """Sum of 32-bit words in ones' complement (FITS standard 4.0, appendix J.1), and that of what stands before."""
+    total = before + int(np.frombuffer(content, ">u4").sum(dtype=np.uint64))
+    return total and (total - 1) % 0xFFFFFFFF + 1  # carries come back at the low end
 
 
 def _encode(value):

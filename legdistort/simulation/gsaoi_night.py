@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields, replace
 from datetime import datetime, timedelta
+from functools import cached_property
 
 import numpy as np
 from astropy.io import fits
@@ -12,6 +13,7 @@ from ..geometry.gsaoi import GsaoiMap
 from ..geometry.tangent_plane import TangentPlane
 from ..runtime.checks import check_counts
 from . import rendering
+from .pupil import PupilPSF
 from .truth import (
     Truth,
     draw_coefficients,
@@ -54,8 +56,10 @@ class Night:
         Position errors of the brightest and of the faintest star, pixels; they set the fluxes.
     fwhm, beta, ellipticity : float
         Moffat profile: pixels, exponent, 1 - axis ratio. Exposures scatter about them (5 %, 0, 30 %).
-    halo, halo_fwhm : float
-        Part of the flux that adaptive optics leave in a wide round halo of the same exponent, and its width, pixels.
+    psf : object, optional
+        Instead of these: a `~legdistort.simulation.pupil.PupilPSF`, about which exposures scatter; anything else that
+        `~legdistort.simulation.rendering.as_psf` takes, the same in all; a list with one for every exposure; or a
+        function of the exposure's number that returns one.
     sky : float
         ADU a pixel.
     gain, read_noise, saturation : float
@@ -77,8 +81,7 @@ class Night:
     fwhm: float = 4.5
     beta: float = 2.8
     ellipticity: float = 0.1
-    halo: float = 0.0
-    halo_fwhm: float = 30.0
+    psf: object = None
     sky: float = 200.0
     gain: float = 2.0
     read_noise: float = 15.0
@@ -90,20 +93,32 @@ class Night:
         lo, hi = self.sigma_range
         if not 0 < lo <= hi:
             raise InputError(f"sigma_range must be (smallest, largest) error in pixels, got {self.sigma_range!r}")
-        if not (0 <= self.halo < 1 and self.residue_rms >= 0):
-            raise InputError(
-                f"halo must be in [0, 1) and residue_rms not negative, got {self.halo!r} and {self.residue_rms!r}"
-            )
+        if not self.residue_rms >= 0:
+            raise InputError(f"residue_rms must not be negative, got {self.residue_rms!r}")
+        if isinstance(self.psf, (list, tuple)) and len(self.psf) != self.n_exposures:
+            raise InputError(f"psf lists {len(self.psf)} for {self.n_exposures} exposures")
+        if self.psf is not None:
+            object.__setattr__(self, "fwhm", self._middle.fwhm)
 
-    @property
-    def psf(self):
-        """The mean profile, round."""
-        return rendering.Moffat(self.fwhm, self.beta)
+    def psf_of(self, exposure, rng=None):
+        """What renders one exposure, by its number; what scatters from exposure to exposure is drawn from `rng`."""
+        if isinstance(self.psf, (list, tuple)):
+            return self.psf[exposure]
+        if callable(self.psf) and not rendering.is_psf(self.psf):
+            return self.psf(exposure)
+        psf = rendering.Moffat(self.fwhm, self.beta, self.ellipticity) if self.psf is None else self.psf
+        return psf.varied(rng) if rng is not None and isinstance(psf, (rendering.Moffat, PupilPSF)) else psf
+
+    @cached_property
+    def _middle(self):
+        """The PSF of the first exposure, in the middle of the field."""
+        psf, shape = self.psf_of(0), (self.size, self.size)
+        return psf.over(shape, nodes=1) if isinstance(psf, PupilPSF) else rendering.as_psf(psf, shape)
 
     def position_error(self, flux):
-        """Smallest possible position error [pix] at these fluxes [ADU]; a halo only takes flux away."""
+        """Smallest possible position error [pix] at these fluxes [ADU], in the middle of the field."""
         camera = {"sky": self.sky, "gain": self.gain, "read_noise": self.read_noise}
-        return rendering.position_error((1 - self.halo) * np.asarray(flux), psf=self.psf, **camera)
+        return rendering.position_error(flux, psf=self._middle, **camera)
 
 
 #: A night that is rendered and reduced in seconds.

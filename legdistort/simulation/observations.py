@@ -3,7 +3,7 @@
 One source of synthetic truth for tests, demonstrations and benchmarks.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -50,10 +50,13 @@ class SimulatedExposures:
     hdus : dict
         ``{name: HDUList}``, image in the primary HDU.
     truth : Truth
+    psfs : dict
+        ``{name: PSF}``, what `~legdistort.simulation.rendering.render` was given for each.
     """
 
     hdus: dict
     truth: Truth
+    psfs: dict = field(default_factory=dict)
 
     def write(self, folder):
         """Write ``NAME.fits`` for every exposure and ``truth.ecsv``; return the paths of the images."""
@@ -200,26 +203,18 @@ def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **set
     """
     night = gsaoi_night.make_night(small, **settings)
     truth, rng = gsaoi_night.draw_night(night, seed)
-    hdus = {}
+    hdus, psfs = {}, {}
     for i, name in enumerate(tqdm(truth.names, desc="simulate", disable=not progress)):
-        psf = replace(
-            night.psf,
-            fwhm=night.fwhm * (1 + 0.05 * np.clip(rng.normal(), -2, 2)),
-            ellipticity=night.ellipticity * (1 + 0.3 * np.clip(rng.normal(), -2, 2)),
-            angle=rng.uniform(0, np.pi),
-        )
+        psfs[name] = psf = night.psf_of(i, rng)
         xy = truth.distort(name, truth.positions)
-        image = rendering.render(truth.shape, xy, (1 - night.halo) * truth.flux, psf=psf, sky=night.sky)
-        if night.halo:
-            wide = replace(night.psf, fwhm=night.halo_fwhm)
-            image += rendering.render(truth.shape, xy, night.halo * truth.flux, psf=wide)
+        image = rendering.render(truth.shape, xy, truth.flux, psf=psf, sky=night.sky)
         if noise:
             image = rendering.add_noise(image, rng, gain=night.gain, read_noise=night.read_noise)
             image = np.rint(np.clip(image, 0, min(night.saturation, 65535))).astype(np.uint16)
         else:
             image = image.astype(np.float32)
         hdus[name] = fits.HDUList([fits.PrimaryHDU(image, gsaoi_night.header(truth, name, night, i))])
-    return SimulatedExposures(hdus, truth)
+    return SimulatedExposures(hdus, truth, psfs)
 
 
 def simulate_gsaoi_matches(*, small=False, seed=0, **settings):
@@ -269,4 +264,4 @@ def matches_from(truth, observed, sigma, rng, *, noise=1.0, corr=0.0, sky=None):
         table["xy_corr"] = np.full(len(star), float(corr))
     if truth.flux is not None:
         table["flux"] = truth.flux[star]
-    return Matches.from_table(table, shape=truth.shape, poses=truth.nominal_poses, sky=sky)
+    return Matches.from_table(table, shape=truth.shape, poses=truth.nominal_poses, sky=sky, allow_copies=not noise)

@@ -1,14 +1,25 @@
-"""Images of simulated stars: Moffat profiles integrated over pixels, sky, photon and read noise.
+"""Images of simulated stars: their light in every pixel, sky, photon and read noise.
 
-The profile is written apart from `legdistort.measurement.profiles.moffat`, so that an error in the one that is fitted
-cannot hide in its own tests.
+A point-spread function is anything with
+
+- ``on_pixels(columns, rows, xy)``: the part of a star's light in these pixels, shape (rows, columns);
+- ``reach(level)``: how far from the star a pixel holds more than this part of the light [pix];
+- ``fwhm``, pixels.
+
+`Moffat` and `~legdistort.simulation.gridded_psf.GriddedPSF` have them; `as_psf` makes the latter of a
+`~legdistort.simulation.pupil.PupilPSF` and of what photutils calls ``ImagePSF`` and ``GriddedPSFModel``.
+
+The Moffat profile is written apart from `legdistort.measurement.profiles.moffat`, so that an error in the one that is
+fitted cannot hide in its own tests.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..exceptions import InputError
+from .gridded_psf import GriddedPSF
+from .pupil import PupilPSF
 
 
 @dataclass(frozen=True)
@@ -53,10 +64,82 @@ class Moffat:
         squash = 1 - self.ellipticity
         return self.peak * (1 + (along**2 * squash + across**2 / squash) / self.core**2) ** -self.beta
 
-    def radius(self, level):
-        """Where the surface brightness along the major axis has fallen to `level` [1 / pixel^2], pixels."""
+    def reach(self, level):
+        """Where the surface brightness along the major axis has fallen to `level` [1 / pixel^2], 4 FWHM at least."""
         ratio = max(self.peak / level, 1.0)
-        return self.core * np.sqrt((ratio ** (1 / self.beta) - 1) / (1 - self.ellipticity))
+        radius = self.core * np.sqrt((ratio ** (1 / self.beta) - 1) / (1 - self.ellipticity))
+        return int(np.ceil(max(radius, 4 * self.fwhm)))
+
+    def on_pixels(self, columns, rows, xy):
+        """Part of a star's light in every pixel, shape (rows, columns)."""
+        # three Gauss-Legendre nodes a pixel and axis: relative error below 1e-6 for a FWHM of 4.5 pixels
+        nodes, weights = np.polynomial.legendre.leggauss(3)
+        dx, dy = ((r[:, None] + nodes / 2 - c).ravel() for r, c in zip((columns, rows), xy, strict=True))
+        fine = self(dx[None, :], dy[:, None]).reshape(len(rows), 3, len(columns), 3)
+        return np.einsum("aibj,i,j->ab", fine, weights / 2, weights / 2, optimize=True)
+
+    def varied(self, rng):
+        """That of another exposure: width, ellipticity and angle drawn anew about these."""
+        return replace(
+            self,
+            fwhm=self.fwhm * (1 + 0.05 * np.clip(rng.normal(), -2, 2)),
+            ellipticity=self.ellipticity * (1 + 0.3 * np.clip(rng.normal(), -2, 2)),
+            angle=rng.uniform(0, np.pi),
+        )
+
+    def information(self, flux, *, sky, gain, read_noise):
+        """Fisher information on x of stars of these fluxes (n,), ellipticity left out [1 / pixel^2]."""
+        # the light of a round profile ring by ring: d profile/dx = -2 beta x profile / (core^2 + r^2), mean x^2 = r^2/2
+        r = np.linspace(0, 8 * self.fwhm, 2000)
+        profile = self.peak * (1 + (r / self.core) ** 2) ** -self.beta
+        slope2 = (2 * self.beta * profile / (self.core**2 + r**2)) ** 2 * r**2 / 2
+        variance = (sky + flux[..., None] * profile) / gain + (read_noise / gain) ** 2
+        return np.trapezoid(flux[..., None] ** 2 * slope2 / variance * 2 * np.pi * r, r, axis=-1)
+
+
+def is_psf(psf):
+    """Whether `as_psf` takes it."""
+    known = isinstance(psf, (Moffat, GriddedPSF, PupilPSF))
+    return known or all(hasattr(psf, name) for name in ("data", "oversampling", "origin"))  # photutils
+
+
+def as_psf(psf, shape):
+    """What renders stars on a detector.
+
+    Parameters
+    ----------
+    psf : object
+        A `Moffat`, `~legdistort.simulation.gridded_psf.GriddedPSF`, `~legdistort.simulation.pupil.PupilPSF`, photutils
+        ``ImagePSF`` or ``GriddedPSFModel``.
+    shape : tuple of int
+        ``(ny, nx)`` of the detector, over which a `PupilPSF` varies.
+
+    Returns
+    -------
+    object
+        With ``on_pixels``, ``reach`` and ``fwhm``.
+
+    Raises
+    ------
+    InputError
+        For what is none of these, and for arrays whose sum is not that of a PSF.
+    """
+    if not is_psf(psf):
+        raise InputError(
+            "psf must be a Moffat, a PupilPSF, a GriddedPSF or a photutils ImagePSF or GriddedPSFModel, "
+            f"got {type(psf).__name__}; an array goes into GriddedPSF(array, oversampling)"
+        )
+    if isinstance(psf, PupilPSF):
+        psf = psf.over(shape)
+    elif not isinstance(psf, (Moffat, GriddedPSF)):
+        psf = GriddedPSF.from_model(psf)
+    if isinstance(psf, GriddedPSF) and not (psf.total[0] > 0.5 and psf.total[1] < 1.1):
+        low, high = (total * np.prod(psf.oversampling) for total in psf.total)
+        raise InputError(
+            f"with oversampling {psf.oversampling} a PSF sums to {np.prod(psf.oversampling)}, less what lies outside "
+            f"the array, but this one to {low:.4g} ... {high:.4g}: multiply its values, or correct the oversampling"
+        )
+    return psf
 
 
 def add_star(image, xy, flux, psf, *, faintest=0.01):
@@ -67,26 +150,22 @@ def add_star(image, xy, flux, psf, *, faintest=0.01):
     image : ndarray, shape (ny, nx)
         Changed.
     xy : array_like, shape (2,)
-        Centre, 0-based pixels; it may lie off the image.
+        Position, 0-based pixels; it may lie off the image.
     flux : float
         Total.
-    psf : Moffat
-        Profile.
+    psf : object
+        From `as_psf`.
     faintest : float
-        The cut-out reaches to where a pixel holds less than this, and at least 4 FWHM.
+        The cut-out reaches to where a pixel holds less than this.
     """
-    half = int(np.ceil(max(psf.radius(faintest / flux), 4 * psf.fwhm)))
-    # three Gauss-Legendre nodes a pixel and axis: relative error below 1e-6 for a FWHM of 4.5 pixels
-    nodes, weights = np.polynomial.legendre.leggauss(3)
+    half = psf.reach(faintest / flux)
     ranges = [
         np.arange(max(round(c) - half, 0), min(round(c) + half + 1, n))
         for c, n in zip((float(xy[0]), float(xy[1])), image.shape[::-1], strict=True)
     ]
     if not all(len(r) for r in ranges):
         return
-    dx, dy = ((r[:, None] + nodes / 2 - c).ravel() for r, c in zip(ranges, xy, strict=True))
-    fine = psf(dx[None, :], dy[:, None]).reshape(len(ranges[1]), 3, len(ranges[0]), 3)
-    stamp = np.einsum("aibj,i,j->ab", fine, weights / 2, weights / 2, optimize=True)
+    stamp = psf.on_pixels(*ranges, xy)
     image[ranges[1][0] : ranges[1][-1] + 1, ranges[0][0] : ranges[0][-1] + 1] += flux * stamp
 
 
@@ -98,19 +177,24 @@ def render(shape, xy, flux, *, psf, sky=0.0):
     shape : tuple of int
         ``(ny, nx)``.
     xy : array_like, shape (n, 2)
-        Centres, 0-based pixels.
+        Positions, 0-based pixels.
     flux : array_like, shape (n,)
         Total of every star.
-    psf : Moffat
-        Profile, the same for all.
+    psf : object
+        What `as_psf` takes.
     sky : float
         Of a pixel.
 
     Returns
     -------
     ndarray, shape (ny, nx)
+
+    Raises
+    ------
+    InputError
+        For a psf that is none.
     """
-    image = np.full(shape, float(sky))
+    image, psf = np.full(shape, float(sky)), as_psf(psf, shape)
     for centre, f in zip(xy, flux, strict=True):
         add_star(image, centre, f, psf)
     return image
@@ -150,8 +234,8 @@ def position_error(flux, *, psf, sky, gain, read_noise):
     ----------
     flux : array_like, shape (n,)
         ADU.
-    psf : Moffat
-        Its ellipticity is left out.
+    psf : object
+        From `as_psf`; one that varies over the field is taken in its middle.
     sky : float
         ADU a pixel.
     gain, read_noise : float
@@ -163,9 +247,48 @@ def position_error(flux, *, psf, sky, gain, read_noise):
         Pixels.
     """
     flux = np.asarray(flux, dtype=float)
-    # the light of a round profile ring by ring: d profile/dx = -2 beta x profile / (core^2 + r^2), mean x^2 = r^2/2
-    r = np.linspace(0, 8 * psf.fwhm, 2000)
-    profile = psf.peak * (1 + (r / psf.core) ** 2) ** -psf.beta
-    slope2 = (2 * psf.beta * profile / (psf.core**2 + r**2)) ** 2 * r**2 / 2
-    variance = (sky + flux[..., None] * profile) / gain + (read_noise / gain) ** 2
-    return 1 / np.sqrt(np.trapezoid(flux[..., None] ** 2 * slope2 / variance * 2 * np.pi * r, r, axis=-1))
+    return 1 / np.sqrt(psf.information(flux, sky=sky, gain=gain, read_noise=read_noise))
+
+
+def position_covariance(xy, flux, expected, *, psf, gain, read_noise, half=None):
+    """Smallest possible covariance of every star's position in an image, the PSF being known.
+
+    The Cramer-Rao bound with four free parameters a star: x, y, flux, and the sky under it. The light of the other
+    stars counts as noise; that their own positions are not known does not.
+
+    Parameters
+    ----------
+    xy : array_like, shape (n, 2)
+        Positions, 0-based pixels.
+    flux : array_like, shape (n,)
+        ADU.
+    expected : ndarray, shape (ny, nx)
+        The image without noise, sky included, from `render`.
+    psf : object
+        From `as_psf`.
+    gain, read_noise : float
+        Electrons per ADU, electrons.
+    half : int, optional
+        Half side of the square around a star that tells of it [pix]; by default 4 FWHM.
+
+    Returns
+    -------
+    covariance : ndarray, shape (n, 2, 2)
+        Pixels^2.
+    flux_error : ndarray, shape (n,)
+        ADU.
+    """
+    half, step = half or int(np.ceil(4 * psf.fwhm)), 1e-3
+    out = np.empty((len(xy), 4, 4))
+    for k, (centre, f) in enumerate(zip(np.asarray(xy, dtype=float), flux, strict=True)):
+        columns, rows = (
+            np.arange(max(round(c) - half, 0), min(round(c) + half + 1, n))
+            for c, n in zip(centre.tolist(), expected.shape[::-1], strict=True)
+        )
+        variance = expected[np.ix_(rows, columns)] / gain + (read_noise / gain) ** 2
+        moved = [[psf.on_pixels(columns, rows, centre + s * step * e) for s in (1, -1)] for e in np.eye(2)]
+        slopes = [f * (there - back) / (2 * step) for there, back in moved]
+        jac = np.array([*slopes, psf.on_pixels(columns, rows, centre), np.ones(variance.shape)])
+        jac = (jac / np.sqrt(variance)).reshape(4, -1)
+        out[k] = np.linalg.inv(jac @ jac.T)
+    return out[:, :2, :2], np.sqrt(out[:, 2, 2])

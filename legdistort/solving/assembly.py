@@ -1,6 +1,7 @@
 """The one place where arrays of a fit become a `Solution`, in the order and the words of the user."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from astropy import units as u
@@ -9,6 +10,7 @@ from astropy.table import QTable
 from ..results.diagnostics import Diagnostics
 from ..results.solution import Solution
 from ..runtime import provenance
+from .checks.solution_checks import check_solution
 
 
 def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, status, dof, chi2=None,
@@ -65,4 +67,12 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
         left_out=dict(sorted(matches.left_out.items())),
         provenance=provenance.stamp(),
         form=form,
+        checked=partial(
+            check_solution,
+            problem=problem,
+            state=state,
+            blocks=blocks,
+            uncertainty=uncertainty,
+            header_distortion=matches.header_distortion if np.all(np.isinf(problem.mean_sigma)) else None,
+        ),
     )

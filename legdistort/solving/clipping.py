@@ -1,30 +1,65 @@
 """Rejection of mismatched or blended observations, in a way that cannot oscillate."""
 
+import contextlib
 import warnings
 
 import numpy as np
 
-from ..exceptions import ConvergenceWarning
-from . import minimisers
-from .equations import criterion, elimination
+from ..exceptions import ConvergenceWarning, SolveError
+from ..geometry import basis
+from . import agreement, minimisers
+from .equations import criterion
+from .equations.leverage import leverages
 
 #: Rounds of rejection after the robust start; each only takes away.
 MAX_ROUNDS = 8
+#: Deviations that chance brings about in this share of the sets with true errors give no cause to look for gross ones.
+BY_CHANCE = 0.01
+#: A usual deviation of this many stated errors may be the work of gross errors, whatever the largest one is.
+SUSPECT = 2.0
+#: Least part of an observation that counts as not taken up by its own fit.
+LEAST_FREE = 0.1
 
 
-def solve_clipped(problem, start, *, clip, gauge="minimal", loss="linear", max_iterations=None):
+def is_explained(problem, result, *, clip):
+    """Whether chance explains all deviations from a plain fit, at the observed scale if it is little above the stated.
+
+    Parameters
+    ----------
+    problem : Problem
+    result : Result
+        Of all its observations.
+    clip : float
+    """
+    if not result.converged:
+        return False
+    squares, n = criterion.squares(problem, result.blocks.residual), problem.xy.shape[1]
+    hidden = 2 * basis.n_modes(problem.unknowns.gauge_degree)  # maps that the gauge holds are no unknowns
+    free = max(1 - (2 * problem.n_stars + problem.unknowns.size - hidden) / (2 * n), LEAST_FREE)
+    scale2 = np.median(squares) / (2 * np.log(2) * free)
+    if scale2 > SUSPECT**2:
+        return False
+    limit2 = max(clip**2, 2 * np.log(n / BY_CHANCE)) * max(1.0, scale2)
+    rows = np.flatnonzero(squares > LEAST_FREE * limit2)
+    return bool(np.all(deviations(problem, result.state, result.robust, result.blocks, rows) ** 2 <= limit2))
+
+
+def solve_clipped(problem, start, *, clip, plain=None, gauge="minimal", loss="linear", max_iterations=None):
     """Joint solution without the observations that deviate by more than `clip` standard errors.
 
     A solution with the Cauchy loss, which gross errors hardly move, says which observations deviate. They
     are left out of a fit with the loss asked for, and further rounds only take away, so the set settles. The
     residuals are compared with their own errors (the pull of an observation on its own fit is allowed for), at
-    the observed scale where that is larger than the stated errors.
+    the observed scale where that is larger than the stated errors. A star of whose observations no majority is left
+    goes with all of them.
 
     Parameters
     ----------
     problem : Problem
     start : State
     clip : float
+    plain : Result, optional
+        Of all observations, with the loss asked for: the result if none deviates.
     gauge, loss, max_iterations
         As for `legdistort.solving.minimisers.solve_joint`.
 
@@ -34,68 +69,65 @@ def solve_clipped(problem, start, *, clip, gauge="minimal", loss="linear", max_i
     ndarray of bool, shape (n,)
         Observations that were used, in the order of the problem.
     dict
-        ``{exposure: reason}`` of exposures most of whose observations deviate: they should be left out as a whole.
+        ``{exposure: reason}`` of exposures that the fit cannot follow.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # a start, good to a fraction of the errors, is enough
-        result = minimisers.solve_joint(problem, start, gauge=gauge, loss="cauchy", max_iterations=20, tolerance=0.02)
-    used, unfit = np.ones(problem.xy.shape[1], dtype=bool), {}
+    result = _robust(problem, start, plain, gauge)
+    good = used = np.ones(problem.xy.shape[1], dtype=bool)
     for count in range(MAX_ROUNDS):
-        weighted = problem.scaled(result.robust * used)
-        pull = deviations(problem, weighted, criterion.linearise(weighted, result.state))
-        typical = np.median(pull[used]) / np.sqrt(2 * np.log(2))
-        fresh = used & (pull > clip * max(1.0, typical))
-        if count and not fresh.any():
-            break
-        used &= ~fresh
-        unfit = unfit_exposures(problem, used)
-        if unfit:
+        pull = deviations(problem, result.state, result.robust * used)
+        changed = good
+        if count == 1:  # the scale of few observations is not well known before most are fitted at full weight
+            fair = pull <= clip * max(1.0, np.sqrt(np.mean(pull[used] ** 2) / 2))
+            changed = good | (fair & (np.bincount(problem.star, used) > 0)[problem.star])
+        if np.array_equal(changed, good):
+            changed = good & (pull <= clip * max(1.0, np.median(pull[used]) / np.sqrt(2 * np.log(2))))
+            if count and np.array_equal(changed, good):
+                break
+        if plain is not None and changed.all():
+            return plain, changed, {}
+        good = changed
+        if unfollowed := agreement.unfollowed(problem, good):
+            return result, used, unfollowed
+        used = agreement.without_contradictions(problem, good)
+        if agreement.starved(problem, used):
             break
         kept = problem.scaled(used.astype(float))
         result = minimisers.solve_joint(kept, result.state, gauge=gauge, loss=loss, max_iterations=max_iterations)
-    return result, used, unfit
+    return result, used, {}
 
 
-def deviations(problem, weighted, blocks):
-    """Normalised residual radius of every observation, its share in its own fit allowed for, shape (n,).
+def _robust(problem, start, plain, gauge):
+    """The fit with the Cauchy loss; the plain one, if there is one, where it has no answer."""
+    with warnings.catch_warnings(), contextlib.suppress(*[SolveError] * (plain is not None)):
+        warnings.simplefilter("ignore", ConvergenceWarning)  # a start, good to a fraction of the errors, is enough
+        return minimisers.solve_joint(problem, start, gauge=gauge, loss="cauchy", max_iterations=20, tolerance=0.02)
+    return plain
 
-    ``t^2 = r' W r / (1 - h)``, with the leverage h of the star's and the exposure's part of the fit, mean of the
-    axes; at most 0.9, so that an observation that alone determines something is not blown up.
+
+def deviations(problem, state, factor, blocks=None, rows=slice(None)):
+    """Deviation of observations from a fit, in standard errors of the residuals, shape (n,).
+
+    ``t^2 = r' W r / ((1 - h_star) (1 - h_exposure))``, with the leverages of the star's and the exposure's part of the
+    fit, mean of the axes: exact in a two-way table of means, where what both could do is counted once. Where an
+    observation took no part, its residual is larger by what the fit errs there: 1 + h. The product is at least 0.1, so
+    that an observation that alone determines something is not blown up.
 
     Parameters
     ----------
     problem : Problem
         With the stated errors.
-    weighted : Problem
-        With the weights of the fit.
-    blocks : Blocks
-        Of the weighted problem.
+    state : State
+        The fit.
+    factor : ndarray, shape (n,)
+        On the weights in the fit, 0 to 1.
+    blocks : Blocks, optional
+        Of the problem at this state, if all factors are 1 and they are known.
+    rows : ndarray of int or slice
+        Which observations, ascending; all if not given.
     """
-    leverage = np.zeros(problem.xy.shape[1])
-    star_inverse, n_modes = elimination.inverse_star_blocks(blocks.v), problem.n_modes
-    for i in range(problem.n_exposures):
-        part = problem.part(i)
-        w, f, b = weighted.weight[:, part], blocks.coupling[:, :, part], blocks.values[:, part]
-        s = star_inverse[:, problem.star[part]]
-        exposure = np.linalg.inv(blocks.u[i]).reshape(2, n_modes, 2, n_modes)
-        for k in (0, 1):
-            star_share = f[0, k] ** 2 * s[0] + f[1, k] ** 2 * s[1] + 2 * f[0, k] * f[1, k] * s[2]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                leverage[part] += np.nan_to_num(star_share / w[k]) / 2
-            leverage[part] += np.einsum("mn,mk,kn->n", b, exposure[k, :, k], b, optimize=True) * w[k] / 2
-    squares = criterion.squares(problem, blocks.residual)
-    return np.sqrt(squares / (1 - np.minimum(leverage, 0.9)))
-
-
-def unfit_exposures(problem, used):
-    """Exposures left with fewer than half their observations, or fewer than modes: ``{name: reason}``."""
-    out = {}
-    for i, name in enumerate(problem.names):
-        mine = used[problem.part(i)]
-        left = np.count_nonzero(mine)
-        if left < max(len(mine) / 2, problem.n_free(i), 1):
-            out[name] = (
-                f"{len(mine) - left} of its {len(mine)} stars deviate from the solution of the others "
-                "(mismatched, or not this field?)"
-            )
-    return out
+    full = criterion.linearise(problem, state) if blocks is None else blocks
+    fitted = criterion.linearise(problem.scaled(factor), state) if np.any(factor != 1) else full
+    of_star, of_exposure = leverages(problem, fitted, at=full, rows=rows)
+    sign = 1 - 2 * factor[rows]
+    variance = np.maximum(1 + sign * of_star, 0) * np.maximum(1 + sign * of_exposure, 0)
+    return np.sqrt(criterion.squares(problem, full.residual)[rows] / np.maximum(variance, LEAST_FREE))

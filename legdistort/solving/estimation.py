@@ -6,20 +6,24 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, warn
+from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, some_of, warn
 from ..inputs.matches import Matches
 from ..priors.prior import tells
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
 from . import model_forms, reference_tie, single_fit
 from .assembly import assemble
+from .brightness_errors import estimate_by_brightness
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
 from .equations import effective_modes
 from .equations.covariances import Uncertainty
-from .options import SolveOptions, check_reference
+from .options import CLIP, SolveOptions, check_reference
 
 log = logging.getLogger(__name__)
+
+#: Stars and exposures that a warning names.
+_MOST_NAMED = 6
 
 
 def solve(
@@ -33,7 +37,7 @@ def solve(
     gauge="minimal",
     method="joint",
     loss="linear",
-    clip=None,
+    clip=CLIP,
     error_floor=0.0,
     errors="stated",
     max_iterations=None,
@@ -77,24 +81,29 @@ def solve(
     loss : {"linear", "huber", "cauchy"}
         Robust losses give deviant observations less weight. Against many gross mismatches "huber" is too mild: use
         `clip`, or "cauchy".
-    clip : float, optional
+    clip : float or None
         Leave out observations whose residual exceeds this many standard errors (at the observed scale, if
-        that is larger than the stated errors); they are listed in ``residuals["used"]``.
+        that is larger than the stated errors), where chance does not explain what a plain fit leaves; they are listed
+        in ``residuals["used"]``. Stars and exposures that contradict the others go as a whole, with a warning. None
+        keeps all. ``method="alternating"`` takes none.
     error_floor : float
         Pixels, added in quadrature to every stated error.
-    errors : {"stated", "scale", "floor"}
+    errors : {"stated", "scale", "floor", "by-brightness"}
         Take the stated errors as they are; or scale the reported errors by sqrt(chi2/dof); or find the error floor
-        that makes chi2 its degrees of freedom (zero if it is smaller already). What was found is in ``diagnostics``.
+        that makes chi2 its degrees of freedom (zero if it is smaller already); or let a smooth law of brightness, found
+        from the residuals, take the place of the stated ones (`legdistort.solving.brightness_errors`; needs fluxes).
+        What was found is in ``diagnostics``.
     max_iterations : int, optional
     validate : float, optional
         Keep this fraction of the stars, 0 to 0.5, out of everything, and report their scatter beside the one to be
         expected: ``diagnostics.validation``. They are not in the tables of the solution.
-    reference : `~astropy.table.Table` or path, optional
+    reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord` or path, optional
         Positions with errors that tie shift, rotation and scale, and the maps that the exposures do not tell; relative
         positions stay as precise as they are. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error`` [mas]
         and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``ref_epoch`` [yr] and correlations,
         as in the Gaia catalogue; or ``x``, ``y``, ``x_err``, ``y_err`` in pixels of the reference plane; and perhaps
-        ``star``, the stars of the matches, which are otherwise found by their positions.
+        ``star``, the stars of the matches, which are otherwise found by their positions. A column that holds a
+        `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch.
     epoch : float or `~astropy.time.Time`, optional
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
@@ -109,7 +118,8 @@ def solve(
     InputError
         For bad options.
     SolveError
-        If an exposure has fewer stars than modes, or the unknowns are not determined.
+        If an exposure has fewer stars than modes, the unknowns are not determined, or exposures contradict one another
+        and no majority says which are right.
     """
     asked = SolveOptions(
         degree=degree, prior=prior, model=model, static=static, exposure_degree=exposure_degree, gauge=gauge,
@@ -132,22 +142,31 @@ def solve(
         if options.chooses_degree:
             selection = _choose_degree(given, options)
             options = replace(options, degree=selection.degree)
-        fit = single_fit.estimate(given, options)
-        if errors == "floor":
-            fit = single_fit.estimate_with_floor(given, fit, options)
+        fit, law = _estimate(given, options)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
-        diagnostics = _diagnostics(fit, prior, scale, selection)
+        diagnostics = replace(_diagnostics(fit, prior, scale, selection), error_law=law)
         if catalogue is not None:
             fit = reference_tie.tie_to(fit, catalogue, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
+    epoch = given.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
-    found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue))
+    found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
     solution = _solution(fit, scale, _settings(asked, options, form), found, form)
     if solution.gauge.warning:
         log.warning("%s", solution.gauge.warning)
     if kept_out is None:
         return solution
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
+
+
+def _estimate(matches, options):
+    """The fit with the errors that were asked for, and the law of brightness that was found, or None."""
+    if options.errors == "by-brightness":
+        return estimate_by_brightness(matches, options)
+    fit = single_fit.estimate(matches, options)
+    if options.errors == "floor":
+        fit = single_fit.estimate_with_floor(matches, fit, options)
+    return fit, None
 
 
 def _warn_of_header(matches, prior):
@@ -182,13 +201,32 @@ def _tell(fit, matches):
     log.info("%s; chi2 %.1f for %d degrees of freedom", fit.result.status, fit.chi2, fit.dof)
     for name, reason in fit.matches.left_out.items():
         if name not in matches.left_out:
-            log.warning("exposure %s is left out: %s", name, reason)
+            warn(f"exposure {name} is left out: {reason}", AssumptionWarning)
+    _tell_lost_stars(fit)
     if fit.problem.unknowns.shared and (n_weak := fit.result.n_weak):
         warn(
             f"static='fit': {n_weak} of {fit.problem.unknowns.n_common} unknowns of the shared distortion are not told "
             "by these exposures and stay where the prior has them; dithers with rolls tell more",
             AssumptionWarning,
         )
+
+
+def _tell_lost_stars(fit):
+    """Warn of stars whose observations contradict one another, so that none of them is used."""
+    star, used = fit.problem.star, fit.used
+    lost = np.flatnonzero((np.bincount(star) > 0) & (np.bincount(star, used) == 0))
+    if not len(lost):
+        return
+    named = []
+    for j in lost[:_MOST_NAMED]:
+        seen = np.searchsorted(fit.problem.start, np.flatnonzero(star == j), side="right") - 1
+        named.append(f"{fit.matches.stars[j]} ({some_of([fit.problem.names[i] for i in seen], _MOST_NAMED)})")
+    more = f" and {len(lost) - len(named)} more" * (len(lost) > len(named))
+    warn(
+        f"{len(lost)} star{'s have' if len(lost) > 1 else ' has'} no position, the observations contradict one another "
+        f"and there is no majority: {', '.join(named)}{more}; look whether they are matched rightly, or leave them out",
+        AssumptionWarning,
+    )
 
 
 def _diagnostics(fit, prior, scale, selection):

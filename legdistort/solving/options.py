@@ -16,7 +16,15 @@ from .gauge.constraints import KINDS
 from .minimisers import LOSSES
 
 METHODS = ("joint", "alternating")
-ERRORS = ("stated", "scale", "floor")
+ERRORS = ("stated", "scale", "floor", "by-brightness")
+
+
+class Unasked(float):
+    """The value of an option that nobody asked for: it yields to others that exclude it."""
+
+
+#: Standard errors beyond which an observation is left out, unless the caller says otherwise.
+CLIP = Unasked(5.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +37,15 @@ class SolveOptions(Settings):
         For options that are out of range or contradict one another.
     """
 
+    clip: float | None = CLIP
+
     def __post_init__(self):
         self._check_distortion()
         check_choice(self.gauge, KINDS, "gauge")
         check_error_floor(self.error_floor)
         check_choice(self.method, METHODS, "method")
+        if self.method == "alternating" and isinstance(self.clip, Unasked):
+            object.__setattr__(self, "clip", None)
         if self.method == "alternating" and (self.loss != "linear" or self.clip is not None):
             raise InputError("method='alternating' is the published scheme: it takes neither loss nor clip")
         check_choice(self.loss, LOSSES, "loss")
@@ -44,6 +56,8 @@ class SolveOptions(Settings):
             )
         if self.errors == "floor" and self.error_floor:
             raise InputError("errors='floor' finds the error floor itself: leave error_floor out")
+        if self.errors == "by-brightness" and self.error_floor:
+            raise InputError("errors='by-brightness' finds the errors, their floor too: leave error_floor out")
         if self.max_iterations is not None and not (isinstance(self.max_iterations, int) and self.max_iterations > 0):
             raise InputError(f"max_iterations must be a positive integer, got {self.max_iterations!r}")
         if self.clip is not None and not (isinstance(self.clip, Real) and self.clip > 1):

@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 _ROUNDS = 10
 #: The plane is settled when it would move by less than this part of its error, rms over the stars.
 _SETTLED = 0.01
+#: Not settled, but within this part of its error: absolute errors would change by 5 % at most.
+_HARMLESS = 0.3
 #: Offsets larger than expected by this factor in chi2 are told.
 _LARGE = 2.0
 
@@ -73,7 +75,7 @@ class ReferenceTie:
         status, first = result.status, self._rough(result.state)
         if first is not None:
             result = self.solve(problem, _moved(result.state, first))
-        prior = None
+        prior, rest = None, ""
         for count in range(_ROUNDS):
             if count < 2:  # afterwards the plane moves too little for another
                 errors = self._errors(problem, result)
@@ -81,7 +83,8 @@ class ReferenceTie:
                 prior = self._prior(result.gauge, directions) if prior is None else prior
             equations = self._equations(result, directions, errors, prior)
             step, made = catalogue_map.estimate(equations, catalogue_map.accepted(equations, self.label), self.names)
-            if count and self._is_settled(directions, step, made):
+            moved, error = self._move(directions, step, made)
+            if count and moved < max(_SETTLED * error, 1e-8):
                 break
             similar = similarity_basis(prior.size, prior.n_modes)
             shift = similar.T @ (similar @ step)
@@ -94,12 +97,20 @@ class ReferenceTie:
             else:
                 result = self.solve(problem, state, common=common)
         else:
-            log.warning("the tie to %s is not settled after %d rounds", self.label, _ROUNDS)
+            log.warning(
+                "the tie to %s is not settled after %d rounds: the last of them moved the plane by %.2g px rms, where "
+                "its error is %.2g px: %s",
+                *(self.label, _ROUNDS, moved, error),
+                "too little to matter"
+                if moved < _HARMLESS * error
+                else "absolute positions may be off by as much; look for mismatched stars, or give a prior",
+            )
+            rest = ", not settled"
         unknown = hierarchy.named(equations.determined(made.used)[2], result.gauge, result.state.positions.T)
         self._warn(made)
         log.info("%s", made.sentence)
         if result.converged:
-            result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds")
+            result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds{rest}")
         return replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown))
 
     def _warn(self, made):
@@ -159,11 +170,12 @@ class ReferenceTie:
         relative = errors.star_matrix if len(positions) <= catalogue_map.DENSE else errors.stars
         return catalogue_map.MapEquations(offsets, directions, relative, prior)
 
-    def _is_settled(self, directions, step, made):
-        move = np.mean((directions @ step) ** 2)
-        variance = np.mean(np.einsum("nak,kl,nal->na", directions, made.covariance, directions, optimize=True))
-        log.debug("the plane would move by %.2g px", np.sqrt(move))
-        return move < max(_SETTLED**2 * variance, 1e-16)
+    def _move(self, directions, step, made):
+        """By how much a step of the map moves the plane, and the error of the plane: rms over the stars, pixels."""
+        variance = np.einsum("nak,kl,nal->na", directions, made.covariance, directions, optimize=True)
+        moved, error = np.sqrt(np.mean((directions @ step) ** 2)), np.sqrt(np.mean(variance))
+        log.debug("the plane moves by %.2g px", moved)
+        return moved, error
 
 
 def _common(problem, result, step):

@@ -1,24 +1,29 @@
 """One fit from beginning to end: problem, start values, minimisation, and whole exposures that do not fit left out."""
 
-from contextlib import nullcontext
-from dataclasses import dataclass, replace
+import contextlib
+import logging
+import warnings
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
 import numpy as np
 from scipy.optimize import brentq
 
+from ..exceptions import ConvergenceWarning, LegdistortError, SolveError, warn
 from ..inputs.matches import Matches
-from . import clipping, minimisers, start_values
+from . import agreement, clipping, minimisers, start_values
 from .choices import prior_widths
 from .equations import criterion, effective_modes
 from .equations.covariances import Uncertainty
 from .equations.problem import Problem, build_problem, uses_compiled_loops
 
+log = logging.getLogger(__name__)
+
 
 def threads(matches):
     """One thread for linear algebra while the compiled loops use them all; nothing special otherwise."""
     if not uses_compiled_loops(len(matches.table)):
-        return nullcontext()
+        return contextlib.nullcontext()
     from .equations import compiled
 
     return compiled.one_blas_thread()
@@ -39,6 +44,8 @@ class Fit:
         With the prior and the error floor that were in force.
     widths : `legdistort.solving.choices.prior_widths.Widths` or None
         Those of the prior that were found.
+    unfollowed : dict
+        ``{exposure: reason}`` of exposures that the fit cannot follow, if it was not judged.
     """
 
     matches: Matches
@@ -47,6 +54,7 @@ class Fit:
     used: np.ndarray
     options: object
     widths: prior_widths.Widths | None = None
+    unfollowed: dict = field(default_factory=dict)
 
     @cached_property
     def weighted(self):
@@ -96,17 +104,26 @@ def estimate(matches, options):
         return minimise(matches, options)
     unit = np.hypot(np.sqrt(np.median(matches.observations.covariance[:, :2])), options.error_floor)
     fit, widths = prior_widths.find_widths(
-        lambda resolved: minimise(matches, replace(options, prior=resolved)),
+        # with the small widths of the first fits an exposure may seem to contradict the others, and does not
+        lambda resolved: minimise(matches, replace(options, prior=resolved), judged=False),
         prior,
         options.degree if options.own_degree is None else options.own_degree,
         unit,
         scale=options.errors == "scale",
     )
+    if fit.unfollowed:
+        fit = minimise(matches, fit.options)
+        if len(fit.matches.names) < len(matches.names):
+            return estimate(fit.matches, options)
     return replace(fit, widths=widths)
 
 
-def minimise(matches, options):
-    """Minimise; exposures whose stars mostly deviate are left out, with the reason, and the rest is solved again."""
+def minimise(matches, options, *, judged=True):
+    """Minimise; exposures that contradict the others are left out, with the reason, and the rest is solved again.
+
+    With ``clip`` the fit is a plain one as long as chance explains what it leaves. Exposures that the fit cannot follow
+    stay in one that is not `judged`.
+    """
     problem = build_problem(
         matches,
         options.degree,
@@ -115,22 +132,62 @@ def minimise(matches, options):
         own_degree=options.own_degree,
     )
     nominal = np.stack([matches.poses[name] for name in matches.names])
-    robust = options.clip is not None or options.loss != "linear"
-    start, misplaced = start_values.start(problem, nominal, robust=robust)
-    if robust and misplaced.any():
-        reason = "its stars lie nowhere near where the other exposures put them (mismatched, or not this field?)"
-        return minimise(matches.without({problem.names[i]: reason for i in np.flatnonzero(misplaced)}), options)
-    used = np.ones(problem.xy.shape[1], dtype=bool)
+    start, typical = start_values.start(problem, nominal, robust=options.loss != "linear")
+    everything = np.ones(problem.xy.shape[1], dtype=bool)
     common = {"gauge": options.gauge, "max_iterations": options.max_iterations}
     if options.method == "alternating":
-        result = minimisers.solve_alternating(problem, start, **common)
-    elif options.clip is None:
-        result = minimisers.solve_joint(problem, start, loss=options.loss, **common)
-    else:
-        result, used, unfit = clipping.solve_clipped(problem, start, clip=options.clip, loss=options.loss, **common)
-        if unfit:
-            return minimise(matches.without(unfit), options)
+        return Fit(matches, problem, minimisers.solve_alternating(problem, start, **common), everything, options)
+    common["loss"] = options.loss
+    if options.clip is None:
+        if options.loss != "linear" and (lost := _misplaced(problem, typical)):
+            return minimise(matches.without(lost), options, judged=judged)
+        return Fit(matches, problem, minimisers.solve_joint(problem, start, **common), everything, options)
+    if start_values.far_off(problem, typical).any() and (astray := agreement.astray(problem)):
+        return minimise(matches.without(astray), options, judged=judged)
+    plain = _plain(problem, start, common)
+    if plain is not None and clipping.is_explained(problem, plain, clip=options.clip):
+        return Fit(matches, problem, plain, everything, options)
+    start, typical = start_values.start(problem, nominal, robust=True)
+    if lost := _misplaced(problem, typical):
+        return minimise(matches.without(lost), options, judged=judged)
+    result, used, unfollowed = clipping.solve_clipped(problem, start, clip=options.clip, plain=plain, **common)
+    if unfollowed and not judged and plain is not None:
+        return Fit(matches, problem, plain, everything, options, unfollowed=unfollowed)
+    if unfollowed:
+        _check_majority(matches, options, unfollowed)
+    if lost := unfollowed or agreement.starved(problem, used):
+        return minimise(matches.without(lost), options, judged=judged)
+    if result is plain and not plain.converged:
+        warn(plain.status, ConvergenceWarning)
     return Fit(matches, problem, result, used, options)
+
+
+def _plain(problem, start, common):
+    """The fit of all observations; None where it has no answer, as with gross errors."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # told if it is the result
+        try:
+            return minimisers.solve_joint(problem, start, **common)
+        except SolveError as error:
+            log.debug("the plain fit failed: %s", error)
+            return None
+
+
+def _misplaced(problem, typical):
+    reason = "its stars lie nowhere near where the other exposures put them (mismatched, or not this field?)"
+    return {problem.names[i]: reason for i in np.flatnonzero(start_values.misplaced(problem, typical))}
+
+
+def _check_majority(matches, options, unfollowed):
+    """Raise `SolveError` unless more exposures agree than contradict them with one voice."""
+    group = [name for name in matches.names if name not in unfollowed]
+    enough = len(group) >= agreement.FEWEST
+    if enough and len(group) <= len(unfollowed):  # only then can these be as many
+        with contextlib.suppress(LegdistortError), warnings.catch_warnings(action="ignore"):
+            others = minimise(matches.without(dict.fromkeys(group, "")), options)
+            enough = len(others.matches.names) < len(group)
+    if not enough:
+        raise SolveError(agreement.contradiction(group, list(unfollowed)))
 
 
 def estimate_with_floor(matches, fit, options):

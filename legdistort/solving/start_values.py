@@ -21,8 +21,8 @@ def start(problem, nominal, *, robust=False):
     Returns
     -------
     State
-    ndarray of bool, shape (n_exposures,)
-        Exposures that are `misplaced`.
+    ndarray, shape (n_exposures,)
+        Median distance of the stars of an exposure from their mean positions, detector pixels.
 
     Raises
     ------
@@ -42,11 +42,12 @@ def start(problem, nominal, *, robust=False):
             distance2 = distances(problem, current, q, positions)
             weight = full / (1 + distance2 / (2 * np.median(distance2) + 1e-12))
         current = refine(problem, current, q, positions, weight)
-    astray = misplaced(problem, distances(problem, current, q, positions))
-    common = _common_similarity(problem, nominal, current, astray)
+    distance2 = distances(problem, current, q, positions)
+    typical = np.array([np.sqrt(np.median(distance2[problem.part(i)])) for i in range(problem.n_exposures)])
+    common = _common_similarity(problem, nominal, current, misplaced(problem, typical))
     current = np.stack([similarity.compose(pose, common) for pose in current])
     positions = similarity.apply(similarity.invert(common), positions.T).T
-    return State(positions, problem.prior_mean.copy(), current), astray
+    return State(positions, problem.prior_mean.copy(), current), typical
 
 
 def _check_prior(problem):
@@ -107,14 +108,25 @@ def _common_similarity(problem, nominal, refined, astray):
     return similarity.fit_similarity(np.concatenate(old), np.concatenate(new), weights=np.repeat(weight, 4), parity=1)
 
 
-def misplaced(problem, distance2):
-    """Whether the stars of an exposure lie nowhere near their mean positions, shape (n_exposures,).
+def far_off(problem, typical):
+    """Exposures whose stars lie farther from their means than 1 % of the detector, which few distortions explain.
 
-    Ten times farther than usual, and more than 1 % of the detector, which no distortion known beforehand explains.
+    Parameters
+    ----------
+    problem : Problem
+    typical : ndarray, shape (n_exposures,)
+        As `start` gives it.
+
+    Returns
+    -------
+    ndarray of bool, shape (n_exposures,)
     """
-    typical = np.array([np.sqrt(np.median(distance2[problem.part(i)])) for i in range(problem.n_exposures)])
-    size = np.max(problem.shapes, axis=1)
-    return (typical > 10 * np.median(typical)) & (typical > 0.01 * size)
+    return typical > 0.01 * np.max(problem.shapes, axis=1)
+
+
+def misplaced(problem, typical):
+    """Exposures that are `far_off`, and ten times farther than usual: shape (n_exposures,)."""
+    return (typical > 10 * np.median(typical)) & far_off(problem, typical)
 
 
 def distances(problem, pose_list, q, positions):

@@ -1,25 +1,29 @@
-"""Tells asdf to write our models as the stock ones of the same function: files need nothing of ours to be read."""
+"""Tells asdf to write our models and WCSs as the stock ones that do the same: files need nothing of ours to be read."""
 
 from asdf.extension import Converter, Extension
 
 
 class StockConverter(Converter):
-    """Defers to the converter of the stock model."""
+    """Defers to the converter of the stock class."""
 
     tags = ()
-    types = ("legdistort.geometry.models.FastLegendre2D", "legdistort.geometry.models.Similarity2D")
+    types = (
+        "legdistort.geometry.models.FastLegendre2D",
+        "legdistort.geometry.models.Similarity2D",
+        "legdistort.wcs.exposure_wcs.ExposureWCS",
+    )
 
     def select_tag(self, obj, tags, ctx):
         """None: asdf then looks for the type that `to_yaml_tree` returns."""
         return
 
     def to_yaml_tree(self, obj, tag, ctx):
-        """The stock model of the same function."""
+        """The stock object that does the same."""
         return obj.stock()
 
     def from_yaml_tree(self, node, tag, ctx):
-        """Never called: files hold the stock model only."""
-        raise TypeError("files hold stock models only")
+        """Never called: files hold stock objects only."""
+        raise TypeError("files hold stock objects only")
 
 
 class LegdistortExtension(Extension):

@@ -1,9 +1,11 @@
 """A solution goes into the frames it was made from: distortion in their headers, and the exact gwcs as a table."""
 
+import datetime
 import io
 import logging
 import re
 import shutil
+import textwrap
 import zlib
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -23,9 +25,12 @@ from .storage import wcs_tree
 
 log = logging.getLogger(__name__)
 
+#: What the header of an image says of a WCS that was written into it; `attach` takes it for its own later.
+_HISTORY = "legdistort {} wrote the WCS of this image"
 #: Keywords of the primary WCS and its distortion, all of which give way; those of alternative WCSs end in a letter.
 WCS_KEYWORDS = re.compile(
-    r"WCSAXES|WCSNAME|LONPOLE|LATPOLE|RADESYS|RADECSYS|EQUINOX|D2IMARR|AXISCORR|(SIP|TPV)(MX|IV)ERR|ZHECKSUM"
+    rf"HISTORY {_HISTORY.format('.*')}.*|SOLSHA"
+    r"|WCSAXES|WCSNAME|LONPOLE|LATPOLE|RADESYS|RADECSYS|EQUINOX|D2IMARR|AXISCORR|(SIP|TPV)(MX|IV)ERR|ZHECKSUM"
     r"|(CTYPE|CUNIT|CRVAL|CRPIX|CDELT|CROTA|CNAME|CRDER|CSYER|CPDIS|CQDIS|CPERR|CQERR|D2IMDIS|D2IMERR)\d+"
     r"|(PC|CD|PV|PS)\d+_\d+|(PC|CD)\d{6}|WAT\d+_\d+|(DP|DQ|D2IM)\d+|(A|B|AP|BP)_(ORDER|DMAX|\d+_\d+)"
 )
@@ -74,8 +79,9 @@ def attach(
 
     Two things go in: in the header of the image the keywords of `legdistort.wcs.fits_headers.make_header`, instead of
     those of the former WCS, and an extension ``ASDF`` with the exact gwcs at ``meta.wcs``, which
-    ``stdatamodels.asdf_in_fits.open`` reads. Every other HDU, card and byte stays as it is. Nothing is written unless
-    everything can be.
+    ``stdatamodels.asdf_in_fits.open`` reads. Errors, flags and weights beside the image (``ERR``, ``DQ`` and the like,
+    of its shape and ``EXTVER``) get the keywords as well. Every other HDU, card and byte stays as it is. Nothing is
+    written unless everything can be.
 
     Frames are told by their names, as `read_exposures` gives them. A frame that was left out of the solution is
     skipped, which is logged.
@@ -187,46 +193,59 @@ def _plan(solution, path, target, *, kind, max_error, ext, overwrite):
     raw, _ = read_bytes(path)
     spans = locate(raw, path)
     headers, edits = {}, []
-    images = _images(solution, raw, path, ext)
-    for name, image in images.items():
-        headers[name] = None
-        if kind is not None:
-            headers[name] = _header(solution, name, kind, max_error)
-            start, data, stop, _ = spans[image]
-            edits.append((start, data, exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)))
-    if images:
-        edits += _asdf_edits(solution, images, spans, path=path, overwrite=overwrite)
+    with open_bytes(raw) as hdulist:
+        images = _images(solution, hdulist, path, ext)
+        for name, image in images.items():
+            headers[name] = None
+            if kind is not None:
+                headers[name] = _header(solution, name, kind, max_error)
+                planes = exposure_files.planes_beside(hdulist, hdulist[image])
+                for number in (image, *(_number(hdulist, plane) for plane in planes)):
+                    start, data, stop, _ = spans[number]
+                    new = exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)
+                    edits.append((start, data, new))
+        if images:
+            edits += _asdf_edits(solution, images, spans, *_tables(hdulist, spans, path, overwrite))
     return _Plan(path, target, zlib.crc32(raw), headers, edits)
 
 
 def _header(solution, name, kind, max_error):
     try:
-        return solution.header(name, kind=kind, max_error=max_error)
+        header = solution.header(name, kind=kind, max_error=max_error)
     except (ExportError, InputError) as error:
         raise type(error)(f"{error}; kind=None (--asdf-only) attaches the exact WCS alone") from None
+    if solution.checksum is not None:
+        header["SOLSHA"] = solution.checksum  # no room for a comment
+    header["HISTORY"] = f"{_HISTORY.format(version('legdistort'))}, {_now()[:10]}"
+    return header
 
 
-def _images(solution, raw, path, ext):
+def _now():
+    return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%S")
+
+
+def _number(hdulist, hdu):
+    return next(i for i, other in enumerate(hdulist) if other is hdu)
+
+
+def _images(solution, hdulist, path, ext):
     """``{exposure: number of its HDU}`` of one file; empty if it was left out of the solution."""
-    with open_bytes(raw) as hdulist:
-        candidates = {exposure_names.exposure_name(path, ext): ext}
-        if ext is None:
-            for i, hdu in enumerate(hdulist):
-                forms = (i, hdu.name, (hdu.name, hdu.ver)) if hdu.name else (i,)
-                candidates |= {exposure_names.exposure_name(path, form): form for form in forms}
-        found = {name: form for name, form in candidates.items() if name in solution.names}
-        if not found:
-            return _nothing(solution, path, next(iter(candidates)))
-        images = {}
-        for name, form in found.items():
-            # of several images the first, if the solution knows the file by its name alone
-            hdu = exposure_files.find_image(hdulist, form, str(path), of_several=True)
-            if hdu.shape != tuple(solution.shapes[name]):
-                raise InputError(
-                    f"{path}: the image has shape {hdu.shape}, exposure {name} of the solution "
-                    f"{tuple(solution.shapes[name])}; give the frames that the solution was made from"
-                )
-            images[name] = next(i for i, other in enumerate(hdulist) if other is hdu)
+    candidates = {exposure_names.exposure_name(path, ext): ext}
+    if ext is None:
+        candidates = exposure_files.extension_names(hdulist, path)
+    found = {name: form for name, form in candidates.items() if name in solution.names}
+    if not found:
+        return _nothing(solution, path, next(iter(candidates)))
+    images = {}
+    for name, form in found.items():
+        # of several images the first, if the solution knows the file by its name alone
+        hdu = exposure_files.find_image(hdulist, form, str(path), of_several=True)
+        if hdu.shape != tuple(solution.shapes[name]):
+            raise InputError(
+                f"{path}: the image has shape {hdu.shape}, exposure {name} of the solution "
+                f"{tuple(solution.shapes[name])}; give the frames that the solution was made from"
+            )
+        images[name] = _number(hdulist, hdu)
     if len(set(images.values())) < len(images):
         raise InputError(f"{path}: exposures {', '.join(images)} are the same image; choose one with ext= (--ext)")
     return images
@@ -242,35 +261,62 @@ def _nothing(solution, path, name):
     return {}
 
 
-def _asdf_edits(solution, images, spans, *, path, overwrite):
-    """Edits that replace or append the ASDF extensions of the images."""
-    present = [span for span in spans if span.header.get("EXTNAME") == "ASDF"]
-    ours = {span.header["IMAGEHDU"]: span for span in present if "IMAGEHDU" in span.header}
-    foreign = [span for span in present if "IMAGEHDU" not in span.header]
-    if foreign and not overwrite:
-        raise InputError(
-            f"{path} already has an extension ASDF of another program, {foreign[0].header.get('CREATOR', 'unnamed')}, "
-            "which may hold more than the WCS; give overwrite=True (--overwrite) to replace it"
-        )
-    edits = [(span.start, span.stop, b"") for span in foreign]
-    numbers = {image: span.header.get("EXTVER", 1) for image, span in ours.items()}
+def _tables(hdulist, spans, path, overwrite):
+    """Extensions ASDF of a file: ``{number of the image: Span}``, and a list of those to be removed.
+
+    One of ours names its exposure: numbers of HDUs change when fpack and other programs move them. Where that is no
+    image of this file, since the file was renamed, it is removed, and so, if asked for, is that of another program.
+    """
+    named, of_images, others = exposure_files.named_images(hdulist, path), {}, []
+    for span in spans:
+        if span.header.get("EXTNAME") != "ASDF":
+            continue
+        exposure = span.header.get("EXPNAME")
+        if exposure is None and not overwrite:
+            raise InputError(
+                f"{path} already has an extension ASDF of another program, {span.header.get('CREATOR', 'unnamed')}, "
+                "which may hold more than the WCS; give overwrite=True (--overwrite) to replace it"
+            )
+        image = _number(hdulist, named[exposure]) if exposure in named else None
+        if image is None or image in of_images:
+            others.append(span)
+            log.info("%s: the extension ASDF of %s is removed, it is of no image here", path, exposure)
+        else:
+            of_images[image] = span
+    return of_images, others
+
+
+def _asdf_edits(solution, images, spans, of_images, others):
+    """Edits that replace or append the ASDF extensions of the images and remove the others."""
+    edits = [(span.start, span.stop, b"") for span in others]
+    numbers = {image: span.header.get("EXTVER", 1) for image, span in of_images.items()}
     end = spans[-1].stop
     for name, image in images.items():
         if image not in numbers:
             numbers[image] = next(n for n in range(1, len(spans) + 2) if n not in numbers.values())
-        start, stop = (ours[image].start, ours[image].stop) if image in ours else (end, end)
-        edits.append((start, stop, _asdf_hdu(wcs_tree(solution, name), image, numbers[image])))
+        start, stop = (of_images[image].start, of_images[image].stop) if image in of_images else (end, end)
+        edits.append((start, stop, _asdf_hdu(solution, name, numbers[image])))
     return edits
 
 
-def _asdf_hdu(tree, image, number):
-    """Bytes of the one-row table that holds an ASDF file."""
+def _asdf_hdu(solution, name, number):
+    """Bytes of the one-row table that holds the ASDF file of an exposure."""
     content, file = io.BytesIO(), io.BytesIO()
+    tree = wcs_tree(solution, name)
     asdf.AsdfFile(tree, version=ASDF_STANDARD).write_to(content)
     row = np.frombuffer(content.getvalue(), np.uint8)[None]
     column = fits.Column(name="ASDF_METADATA", array=row, format=f"{row.size}B")
     hdu = fits.BinTableHDU.from_columns([column], name="ASDF", ver=number)
-    hdu.header["CREATOR"] = f"legdistort {version('legdistort')}"
-    hdu.header["IMAGEHDU"] = (image, "number of the HDU it belongs to, primary = 0")
+    header = hdu.header
+    header["EXPNAME"] = exposure_names.in_header(name)
+    header["CREATOR"] = f"legdistort {version('legdistort')}"
+    header["DATE"] = (_now(), "UTC, when this extension was made")
+    if solution.checksum is not None:
+        header["SOLSHA"] = solution.checksum  # no room for a comment
+    made = tree["meta"]["provenance"]
+    packages = ", ".join(f"{package} {each}" for package, each in made["versions"].items())
+    told = f"The solution was made {made['created']} with {packages}. SOLSHA, if known, is the SHA-256 of its file."
+    for line in textwrap.wrap(told, 72):
+        header["HISTORY"] = line
     fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(file, checksum=True)
     return file.getvalue()[BLOCK:]

@@ -8,6 +8,31 @@ from gwcs import coordinate_frames as cf
 from ..geometry import models, similarity
 
 
+class ExposureWCS(gwcs.WCS):
+    """`gwcs.WCS` that loses no position of the detector on the way from the sky to pixels.
+
+    The stock class takes a box in right ascension and declination around the four corners for the footprint: where
+    distortion bends an edge outwards, and around a pole, positions on the detector become NaN (docs/upstream.md). Here
+    they become NaN outside the bounding box and outside the region for which the distortion is meant, and nowhere else.
+    Files hold the stock class.
+    """
+
+    def outside_footprint(self, world_arrays):
+        """World coordinates as they are: the bounding box of the pixels, and the models, say what is outside."""
+        return world_arrays
+
+    def stock(self):
+        """The same WCS as a plain `gwcs.WCS`."""
+        return rebuilt(gwcs.WCS, self)
+
+
+def rebuilt(kind, wcs):
+    """A gwcs as another class, with the same steps, name, shape and bounding box."""
+    made = kind(wcs.pipeline, name=wcs.name)
+    made.pixel_shape = wcs.pixel_shape
+    return made
+
+
 def exposure_wcs(name, pose, distortion, sky=None):
     """The gwcs of one exposure: detector -> undistorted -> reference (-> icrs).
 
@@ -20,6 +45,10 @@ def exposure_wcs(name, pose, distortion, sky=None):
     pose : ndarray, shape (2, 3)
     distortion : Distortion
     sky : TangentPlane, optional
+
+    Returns
+    -------
+    ExposureWCS
     """
     ny, nx = distortion.shape
 
@@ -32,8 +61,11 @@ def exposure_wcs(name, pose, distortion, sky=None):
         (plane("reference"), None if sky is None else sky.model()),
     ]
     if sky is not None:
-        steps.append((cf.CelestialFrame(name="icrs", reference_frame=ICRS(), unit=(u.deg, u.deg)), None))
-    wcs = gwcs.WCS(steps, name=name)
+        sky_frame = cf.CelestialFrame(
+            name="icrs", reference_frame=ICRS(), unit=(u.deg, u.deg), axes_names=("ra", "dec")
+        )
+        steps.append((sky_frame, None))
+    wcs = ExposureWCS(steps, name=name)
     wcs.bounding_box = ((-0.5, nx - 0.5), (-0.5, ny - 0.5))
     wcs.pixel_shape = (nx, ny)
     return wcs

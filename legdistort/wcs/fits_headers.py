@@ -148,7 +148,7 @@ def _exact_sky(pose, distortion, sky, points):
     if sky is None:
         raise InputError(
             f"the solution does not know the sky, so exposure {distortion.name} can have no FITS header: solve "
-            "exposures whose headers have a WCS, or give solve() a reference catalogue with ra and dec"
+            "frames whose headers have a WCS, or give a reference catalogue with ra and dec (reference=, --reference)"
         )
     distortion.check_fold()
     return sky.to_sky(similarity.apply(similarity.invert(pose), distortion.invert(points)))

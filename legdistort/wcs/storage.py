@@ -14,6 +14,16 @@ from ..geometry.models import correction_model, displacement_model, leaves
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, WITH_WCS, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
+from .exposure_wcs import ExposureWCS, rebuilt
+
+#: What those should know who open a file without legdistort.
+NOTE = (
+    "Stock models only: asdf and gwcs are enough to read this. The models do not know where they end: keep to "
+    "valid_undistorted_px from the sky to pixels. gwcs takes a box in right ascension and declination around the four "
+    "corners for the footprint, so that positions near edges, and nearly all around a pole, become NaN from the sky to "
+    "pixels: set wcs.bounding_box = None before resampling. Legendre2D of astropy gives wrong numbers when threads "
+    "share it: give each a deep copy of the WCS. legdistort.read_wcs returns a WCS without these limits."
+)
 
 
 def wcs_tree(solution, name):
@@ -26,6 +36,7 @@ def wcs_tree(solution, name):
         "inverse_error_px": inverse.error,
         "valid_undistorted_px": list(inverse.valid),
         "provenance": {key: origin[key] for key in ("created", "versions")},
+        "note": NOTE,
     }
     return {"meta": meta}
 
@@ -51,8 +62,8 @@ def read_wcs(path, *, max_bytes=None):
 
     Returns
     -------
-    `~gwcs.WCS`
-        ``detector`` -> ``undistorted`` -> ``reference`` (-> ``icrs``).
+    ExposureWCS
+        A `gwcs.WCS`, ``detector`` -> ``undistorted`` -> ``reference`` (-> ``icrs``).
 
     Raises
     ------
@@ -65,7 +76,7 @@ def read_wcs(path, *, max_bytes=None):
         raise InputError(
             f"{path} holds no WCS written by legdistort (no entry meta.inverse_error_px); open it with asdf.open"
         )
-    check_tree({"meta": meta}, "wcs-1.schema.yaml", path)
+    check_tree({"meta": meta}, "wcs-1.0.0", path)
     return understood(path, _checked_wcs, meta)
 
 
@@ -87,7 +98,7 @@ def _checked_wcs(meta):
     Distortion(basis.from_tensor(tensors[0]), shape, meta["exposure"], inverse)  # checks the certificate
     wcs.set_transform("detector", "undistorted", correction_model(tensors[0], inverse, shape))
     wcs.bounding_box = box
-    return wcs
+    return rebuilt(ExposureWCS, wcs)
 
 
 def _series(model):

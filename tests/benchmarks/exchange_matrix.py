@@ -1,4 +1,4 @@
-"""Every import and export against an independent reader: ``python tests/benchmarks/exchange_matrix.py``.
+"""Every import and export against an independent reader: ``python tests/benchmarks/exchange_matrix.py [FUNCTION...]``.
 
 A row function yields `Row` objects: the largest distance [pix] between what comes in or goes out here and what the
 reader named says, over the whole detector with edges and corners, and the truncation error of a prior at its degree (of
@@ -7,16 +7,23 @@ a header, the degree it took). It raises `Skip` with the reason when data or a r
 """
 
 import contextlib
+import importlib
 import io
 import json
+import re
+import shutil
+import subprocess
 import sys
 import tempfile
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import asdf
+import gwcs
 import numpy as np
+from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 from numpy.polynomial import polynomial
@@ -29,9 +36,11 @@ from legdistort.priors.from_files import read_source
 from legdistort.priors.prior import Prior
 from legdistort.wcs.attachment import attach
 from legdistort.wcs.exposure_wcs import exposure_wcs
+from legdistort.wcs.refinement import refine
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import test_headers
+import test_refinement
 from conftest import data_folder
 
 COLUMNS = "{:40s} {:20s} {:>9s} {:>7s} {:>10s}"
@@ -336,6 +345,126 @@ def tables_in_fits():
               test_headers.largest(test_headers.pixels_of(solution, "a", *sky), p), 5)  # fmt: skip
 
 
+# -- peers: the exact WCS of an exposure in the hands of other packages, 25 px of distortion, the detector on a pole
+
+
+def bent():
+    """The solution that the tests of peers have, its pixels (n, 2) and where they are on the sky."""
+    made = test_headers.geometries()(5, 25.0, lat=90.0, turn=0.0, shape=(400, 560))
+    solution = replace(made, coefficients=-made.coefficients, sky=TangentPlane(10.0, 90.0, 50 * made.sky.matrix))
+    p, ra, dec = (a[404:] for a in test_headers.detector(solution, "a"))
+    return solution, p, SkyCoord(ra, dec, unit="deg")
+
+
+def peer(module):
+    """A module, or `Skip`."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise Skip(str(error)) from None
+
+
+def apart(found, expected):
+    """Largest distance [pix]; NaN if one position is lost."""
+    return float(np.hypot(*(np.column_stack(found) - expected).T).max())
+
+
+def wcs_in_gwcs():
+    """World to pixels by our class and by the stock class that files hold."""
+    solution, p, sky = bent()
+    wcs = solution.wcs("a")
+    yield Row("gwcs at the pole, 25 px, in memory", f"gwcs {gwcs.__version__}", apart(wcs.world_to_pixel(sky), p))
+    stock = wcs.stock()
+    yield Row("the same from a file", "gwcs", apart(stock.world_to_pixel(sky), p))
+    stock.bounding_box = None
+    yield Row("the same, bounding_box = None", "gwcs", apart(stock.world_to_pixel(sky), p))
+
+
+def wcs_in_reproject():
+    """Where every pixel of a plain grid comes from, by an image whose values are its positions."""
+    reproject = peer("reproject")
+    solution, _, _ = bent()
+    ny, nx = solution.shapes["a"]
+    y, x = np.mgrid[:ny, :nx].astype(float)
+    grid_ = WCS(naxis=2)
+    grid_.wcs.ctype, grid_.wcs.crval, grid_.wcs.crpix = ["RA---TAN", "DEC--TAN"], [10.0, 90.0], [140.5, 100.5]
+    grid_.wcs.cdelt = np.array([-2.0, 2.0]) * solution.sky.pixel_scale / 3600
+    to = np.indices((200, 280))[::-1].reshape(2, -1).T
+    came = test_headers.pixels_of(solution, "a", *grid_.all_pix2world(to, 0).T)
+    well = ((came > 6) & (came < [nx - 7, ny - 7])).all(axis=1)
+    for method in ("interp", "adaptive", "exact"):
+        function = getattr(reproject, f"reproject_{method}")
+        found = [function((a, solution.wcs("a")), grid_, shape_out=(200, 280))[0].ravel()[well] for a in (x, y)]
+        yield Row("gwcs at the pole, 25 px, resampled", f"reproject_{method}", apart(found, came[well]))
+
+
+def wcs_in_photutils():
+    """Apertures from the sky to pixels."""
+    aperture = peer("photutils.aperture")
+    solution, p, sky = bent()
+    found = aperture.SkyCircularAperture(sky, r=2 * u.arcsec).to_pixel(solution.wcs("a")).positions
+    yield Row("sky apertures to pixels", "photutils", apart(found.T, p))
+
+
+def wcs_in_ndcube():
+    """The WCS of a part of a cube."""
+    ndcube = peer("ndcube")
+    solution, p, sky = bent()
+    part = ndcube.NDCube(np.zeros(solution.shapes["a"]), wcs=solution.wcs("a"))[30:, 50:]
+    inside = (p > [50, 30]).all(axis=1)
+    yield Row("a part of an image", "ndcube", apart(part.wcs.world_to_pixel(sky[inside]), p[inside] - [50, 30]))
+
+
+def wcs_in_regions():
+    """Regions from the sky to pixels."""
+    regions = peer("regions")
+    solution, p, sky = bent()
+    wcs = solution.wcs("a")
+    found = [regions.CircleSkyRegion(s, 1 * u.arcsec).to_pixel(wcs).center.xy for s in sky[:50]]
+    yield Row("sky regions to pixels", "regions", apart(np.transpose(found), p[:50]))
+
+
+def wcs_in_pipelines():
+    """`refine` of NIRCam's WCS, in tweakwcs, stcal and a file as Roman has them."""
+    with asdf.open(data("gwcs_interop", "nircamwcs.asdf"), memmap=False, lazy_load=False) as file:
+        solution = test_refinement.solution_at(file["wcs"], (2048, 2048), 5.0)
+        made = refine(file["wcs"], solution, "a")
+    p, ra, dec = test_headers.detector(solution, "a")
+    p, sky = p[404:], SkyCoord(ra[404:], dec[404:], unit="deg")
+    with contextlib.suppress(Skip):
+        info = {"v2_ref": 86.039, "v3_ref": -493.386, "roll_ref": 0.0}
+        corrector = peer("tweakwcs.correctors").JWSTWCSCorrector(made, info)
+        found = test_headers.pixels_of(solution, "a", *corrector.det_to_world(*p.T))
+        yield Row("refine(NIRCam), detector to sky", "tweakwcs", apart(found.T, p))
+    with contextlib.suppress(Skip):
+        pixmap = peer("stcal.resample.utils").calc_pixmap(made, solution.fits_wcs("a"), shape=(2048, 2048))
+        y, x = np.mgrid[:2048, :2048]
+        off = np.hypot(pixmap[..., 0] - x, pixmap[..., 1] - y)
+        yield Row("refine(NIRCam), map to our SIP", "stcal", float(off.max()))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "r.asdf")
+        asdf.AsdfFile({"roman": {"meta": {"wcs": made}}}).write_to(path)
+        with asdf.open(path, lazy_load=False, memmap=False) as file:
+            back = file["roman"]["meta"]["wcs"]
+        yield Row("refine(NIRCam), at roman.meta.wcs", "asdf, gwcs", apart(back.invert(sky.ra.deg, sky.dec.deg), p))
+
+
+def files_for_fitsverify():
+    """Errors and warnings, not pixels, of a frame with everything attached."""
+    if shutil.which("fitsverify") is None:
+        raise Skip("fitsverify is not installed")
+    solution, _, _ = bent()
+    with tempfile.TemporaryDirectory() as folder:
+        for kind in ("sip", "tpv"):
+            frame = Path(folder, "a.fits")
+            fits.PrimaryHDU(np.zeros(solution.shapes["a"], np.int16)).writeto(frame, overwrite=True)
+            attach(solution, [frame], in_place=True, kind=kind, max_error=1.0)
+            said = subprocess.run(["fitsverify", "-q", frame], capture_output=True, text=True, check=False).stdout
+            counts = re.search(r"(\d+) warnings? and (\d+) errors?", said)
+            yield Row(f"attached frame, {kind.upper()}: number of complaints", "fitsverify",
+                      float(sum(map(int, counts.groups()))) if counts else 0.0 if "OK" in said else np.nan)  # fmt: skip
+
+
 IMPORTS = [
     astropy_models,
     gwcs_files,
@@ -349,9 +478,18 @@ IMPORTS = [
     prior_file,
 ]
 EXPORTS = [headers_in_astropy, headers_in_ast, tables_in_fits]
+PEERS = [
+    wcs_in_gwcs,
+    wcs_in_reproject,
+    wcs_in_photutils,
+    wcs_in_ndcube,
+    wcs_in_regions,
+    wcs_in_pipelines,
+    files_for_fitsverify,
+]
 
 
-def main(functions=(*IMPORTS, *EXPORTS)):
+def main(functions=(*IMPORTS, *EXPORTS, *PEERS)):
     """Print the rows of all functions, or why there are none."""
     print(COLUMNS.format("what", "against", "error px", "degree", "trunc. px"))
     for function in functions:
@@ -363,8 +501,9 @@ def main(functions=(*IMPORTS, *EXPORTS)):
 
 
 if __name__ == "__main__":
+    chosen = [f for f in (*IMPORTS, *EXPORTS, *PEERS) if not sys.argv[1:] or f.__name__ in sys.argv[1:]]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LegdistortWarning)
         warnings.simplefilter("ignore", fits.verify.VerifyWarning)
         warnings.simplefilter("ignore", FITSFixedWarning)
-        main()
+        main(chosen)

@@ -5,8 +5,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from . import moffat
-
 _LARGEST = 6  # stars fitted together; the work grows with the square
 
 
@@ -47,15 +45,25 @@ def members(labels):
         yield order[first[sizes == size][:, None] + np.arange(size)]
 
 
-def partner_models(stamps, labels, params, nodes):
-    """Light that the other stars of its group leave on every stamp, (n, npix)."""
+def partner_models(stamps, labels, params, evaluate):
+    """Light that the other stars of its group leave on every stamp, (n, npix).
+
+    Parameters
+    ----------
+    stamps : `~legdistort.measurement.profiles.cutouts.Stamps`
+    labels : ndarray of int, shape (n,)
+    params : ndarray, shape (n, k)
+        Of the stars, the first three: x, y from the central pixel of the stamp, peak or flux.
+    evaluate : callable
+        ``evaluate(params, stars)``: light (m, npix) of stars on stamps, positions counted from their middles.
+    """
     out = np.zeros_like(stamps.data)
     for stars in members(labels):
         if (g := stars.shape[1]) > 1:
             i, j = (k.ravel() for k in np.nonzero(~np.eye(g, dtype=bool)))
             seen = params[stars[:, i]]
             seen[..., :2] += stamps.centres[stars[:, i]] - stamps.centres[stars[:, j]]
-            light = moffat.evaluate(seen.reshape(-1, 8), stamps.half, nodes).reshape(*seen.shape[:2], -1)
+            light = evaluate(seen.reshape(-1, seen.shape[-1]), stars[:, i].ravel()).reshape(*seen.shape[:2], -1)
             light[params[stars[:, i], 2] <= 0] = 0  # as the models of all stars
             np.add.at(out, stars[:, j], light)
     return np.where(stamps.inside, out, 0)
@@ -92,7 +100,7 @@ def fit_groups(found, labels, pixels, start, *, stamps, centre, fitting):
             rows = stars[:, 0]
             part = fitting(data[rows], weights[rows], start[rows], centre=centre[rows])
         else:
-            once = _once(weights[stars].reshape(m, -1), stamps.index[stars].reshape(m, -1))
+            once = counted_once(weights[stars].reshape(m, -1), stamps.index[stars].reshape(m, -1))
             leader = stars[np.arange(m), np.argmax(start[stars, 2], axis=1)]
             first = np.hstack([start[stars, :3].reshape(m, -1), centre[leader], start[leader, 7:]])
             offsets = stamps.centres[stars]
@@ -101,8 +109,8 @@ def fit_groups(found, labels, pixels, start, *, stamps, centre, fitting):
     return found
 
 
-def _once(weights, index):
-    """Weights with every pixel counted once, in the first stamp that has it."""
+def counted_once(weights, index):
+    """Weights (n, k), every pixel counted once, in the first stamp that has it; `index` (n, k) names pixels."""
     index = np.where(weights > 0, index, -1 - np.arange(index.shape[1]))
     order = np.argsort(index, axis=1, kind="stable")
     ordered = np.take_along_axis(index, order, axis=1)

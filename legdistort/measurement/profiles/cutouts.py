@@ -52,7 +52,9 @@ class Stamps:
             # far from the centre pixels need no integration
             wide = moffat.evaluate(params[rows], 2 * self.half, moffat.CENTRES)
             wide[:, self.core] = own[rows]
-            wide[params[rows, 2] <= 0] = 0
+            # a fit that has wandered off, from a saturated trail, stands for the light of another star
+            wandered = np.abs(params[rows, :2]).max(axis=1) > self.half / 2
+            wide[(params[rows, 2] <= 0) | wandered] = 0
             core[rows] = wide[:, self.core]
             np.add.at(total, self.index_wide[rows][self.inside_wide[rows]], wide[self.inside_wide[rows]])
         return own, np.where(self.inside, total[self.index] - core, 0)

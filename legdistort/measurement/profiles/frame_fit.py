@@ -1,6 +1,7 @@
 """All stars of a frame fitted: neighbours subtracted, noise from the model, hot pixels told from stars."""
 
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,21 +10,51 @@ from ..flags import Flag
 from . import moffat
 from .blends import fit_groups, group_stars, partner_models
 from .cutouts import Stamps
-from .levenberg_marquardt import HELD, SHAPE_SIGMA, Limits, fit
-from .pixel_noise import NEIGHBOUR, pixel_noise
+from .levenberg_marquardt import HELD, SHAPE_SIGMA, Fit, Limits, fit
+from .local_sky import slopes
+from .pixel_noise import NEIGHBOUR, pixel_noise, pixel_variance
 from .shape_field import shape_field
 
 #: Shapes of stars, and ways to fit those that touch: see `fit_stars`.
 PROFILES, BLENDS = ("own", "shared", "linear"), ("together", "alone")
 
 _FIRST_FWHM = 3.0
-_OUTLIER = 6.0  # standard deviations ...
+OUTLIER = 6.0  # standard deviations ...
 _OUTLIER_MODEL = 0.2  # ... plus this fraction of the star itself, which no real profile follows exactly
 #: Limits of the passes: what the first leaves tells the noise, the second prepares the last.
 _FIRST, _MIDDLE, _LAST = Limits(20, 1e-4), Limits(20, 1e-2), Limits(40, 1e-4)
 _SHAPELY = 20  # signal-to-noise ratio of stars that tell the shape of all
 _GAP = 1 / 3  # part of the pixels within one FWHM that may be missing
+_WANDERS = 0.75  # FWHM from the peak: a cosmic ray beside a star draws the peak away by half a FWHM and more
 _POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no star, however sharp, has so little
+
+
+class FrameFit(NamedTuple):
+    """All stars of a frame fitted, one row a star: what `fit_stars` returns.
+
+    Attributes
+    ----------
+    found : `~legdistort.measurement.profiles.levenberg_marquardt.Fit`
+    flags : ndarray of int, shape (n,)
+    snr : ndarray, shape (n,)
+        Signal-to-noise ratio of the flux at known shape.
+    models : tuple of ndarray, shape (n, npix)
+        Every star on its own stamp, and the sum of all others there.
+    labels : ndarray of int, shape (n,)
+        Numbers of the groups that were fitted together; negative ones were not fitted in the last pass.
+    sky : ndarray, shape (n, npix)
+        Variance of the sky.
+    photon : float
+        Variance per unit of star light.
+    """
+
+    found: Fit
+    flags: np.ndarray
+    snr: np.ndarray
+    models: tuple
+    labels: np.ndarray
+    sky: np.ndarray
+    photon: float
 
 
 def _start(stamps, shape):
@@ -49,6 +80,8 @@ def find_stars(frame, threshold, fwhm=None):
 
     Returns
     -------
+    frame : `~legdistort.measurement.detection.Frame`
+        With the variance of the sky alone, see `legdistort.measurement.detection.detect`.
     centres : ndarray of int, shape (n, 2)
         Pixels (x, y), the highest signal-to-noise ratio first.
     shape : ndarray, shape (4,)
@@ -57,14 +90,14 @@ def find_stars(frame, threshold, fwhm=None):
     kernel = fwhm or _FIRST_FWHM
     shape = moffat.shape(kernel)
     for _ in range(6):
-        centres = detect(frame, kernel, threshold)
+        centres, frame = detect(frame, kernel, threshold)
         if len(centres) == 0:
             break
         shape = _common_shape(Stamps(frame, centres[:150], box_half(kernel)), kernel)
         before, kernel = kernel, float(moffat.fwhm(shape))
         if fwhm is not None or abs(before - kernel) < 0.1 * kernel:
             break
-    return centres, shape
+    return frame, centres, shape
 
 
 def locate_stars(exposure, *, threshold, fwhm=None):
@@ -84,11 +117,9 @@ def locate_stars(exposure, *, threshold, fwhm=None):
     centres : ndarray of int, shape (n, 2)
     shape : ndarray, shape (4,)
     """
-    frame = prepare(exposure)
-    centres, shape = find_stars(frame, threshold, fwhm)
+    frame, centres, shape = find_stars(prepare(exposure), threshold, fwhm)
     if moffat.fwhm(shape) > MESH / 8:  # stars as wide as that would pass for sky
-        frame = prepare(exposure, mesh=int(8 * moffat.fwhm(shape)))
-        centres, shape = find_stars(frame, threshold, fwhm)
+        frame, centres, shape = find_stars(prepare(exposure, mesh=int(8 * moffat.fwhm(shape))), threshold, fwhm)
     return frame, centres, shape
 
 
@@ -157,13 +188,7 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
 
     Returns
     -------
-    found : `~legdistort.measurement.profiles.levenberg_marquardt.Fit`
-        One row a star.
-    flags : ndarray of int, shape (n,)
-    snr : ndarray, shape (n,)
-        Signal-to-noise ratio of the flux at known shape.
-    photon : float
-        Variance per unit of star light that was used.
+    FrameFit
     """
     width = float(moffat.fwhm(shape))
     nodes = moffat.quadrature(width)
@@ -194,7 +219,8 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
         models[0][wild] = moffat.evaluate(found.params[wild], stamps.half, nodes)
         hot[wild] |= _is_hot(stamps, found, models, weights > 0)[wild]
     snr = _ratio(models, weights)
-    return found, _flags(stamps, found, weights > 0, (wild, hot, snr), width), snr, noise[1]
+    flags = _flags(stamps, found, weights > 0, (wild, hot, snr), width)
+    return FrameFit(found, flags, snr, models, labels, *noise)
 
 
 def _ratio(models, weights):
@@ -228,14 +254,21 @@ def _touching(stamps, found, hot, done, radius):
 
 
 def _separate(stamps, found, models, labels, noise, nodes):
-    """Stamps without the light of other groups, and weights; 0 for pixels that follow no model."""
+    """Stamps less other groups and the slope of the sky, and weights; 0 for pixels that follow no model."""
     own, others = models
-    sky, photon = noise
-    partners = partner_models(stamps, labels, found.params, nodes)
-    variance = sky + photon * np.maximum(own + others, 0) + (NEIGHBOUR * (others - partners)) ** 2
-    residual = np.abs(stamps.data - own - others - found.params[:, 7:])
-    good = stamps.good & (residual < _OUTLIER * np.sqrt(variance) + _OUTLIER_MODEL * np.abs(own + partners))
-    return stamps.data - (others - partners), _weights(good, variance)
+    partners = partner_models(stamps, labels, found.params, lambda p, _: moffat.evaluate(p, stamps.half, nodes))
+    light = own + others + found.params[:, 7:].astype(own.dtype)
+    variance = pixel_variance(noise, light) + (NEIGHBOUR * (others - partners)) ** 2
+    left, allowed = stamps.data - light, OUTLIER * np.sqrt(variance) + _OUTLIER_MODEL * np.abs(own + partners)
+
+    def derivatives(rows):
+        return moffat.evaluate(found.params[rows].astype(own.dtype), stamps.half, nodes, jacobian=True)[1]
+
+    usual = OUTLIER * 1.5 * np.median(np.abs(left), axis=1)[:, None]  # a slope leaves more than noise everywhere
+    weights = _weights(stamps.good & (np.abs(left) < np.maximum(allowed, usual)), variance)
+    slope = slopes(left, weights, found.covariance, derivatives)
+    weights = _weights(stamps.good & (np.abs(left - slope) < allowed), variance)
+    return stamps.data - slope - (others - partners), weights
 
 
 def _is_hot(stamps, found, models, good):
@@ -248,7 +281,7 @@ def _is_hot(stamps, found, models, good):
 def _is_wild(fit, width):
     ratio = moffat.fwhm(fit.params) / width
     shift = np.hypot(fit.params[:, 0], fit.params[:, 1])
-    return ~fit.converged | (fit.params[:, 2] <= 0) | (ratio > 3) | (ratio < 1 / 3) | (shift > 1 + 0.5 * width)
+    return ~fit.converged | (fit.params[:, 2] <= 0) | (ratio > 3) | (ratio < 1 / 3) | (shift > 1 + _WANDERS * width)
 
 
 def _share_shape(data, weights, found, rows, *, shape, nodes):

@@ -15,8 +15,10 @@ HELD = np.full(4, 1e-3)
 _CHUNK = 36_000  # pixels: their Jacobian stays in the processor's cache
 _SMALLEST = 0.3  # smallest full width at half maximum [pix]: anything narrower lies within one pixel
 #: Bounds of the shape, and of the background, which has none.
-_LOW = np.array([-np.inf, -np.inf, -0.95, moffat.LOG_BETA[0], -np.inf])
-_HIGH = np.array([2 * np.log(2 / _SMALLEST)] * 2 + [0.95, moffat.LOG_BETA[1], np.inf])
+_BOUNDS = (
+    np.array([-np.inf, -np.inf, -0.95, moffat.LOG_BETA[0], -np.inf]),
+    np.array([2 * np.log(2 / _SMALLEST)] * 2 + [0.95, moffat.LOG_BETA[1], np.inf]),
+)
 
 
 class Limits(NamedTuple):
@@ -32,14 +34,15 @@ FULL = Limits(60, 1e-4)
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of `fit`: parameters of groups, or after `Fit.by_star` of stars.
+    """Result of a fit: parameters of groups, or after `Fit.by_star` of stars.
 
     Attributes
     ----------
-    params : ndarray, shape (n, 3 g + 5)
-        ``x``, ``y``, ``peak`` of every star of the group, then shape and background of all: with one star (g = 1)
-        the order of `legdistort.measurement.profiles.moffat.NAMES`.
-    covariance : ndarray, shape (n, 3 g + 5, 3 g + 5)
+    params : ndarray, shape (n, 3 g + c)
+        ``x``, ``y``, ``peak`` (or flux) of every star of the group, then what all have in common: of Moffat profiles
+        the shape and the background (c = 5; with one star, g = 1, the order of
+        `legdistort.measurement.profiles.moffat.NAMES`), of an effective PSF the background (c = 1).
+    covariance : ndarray, shape (n, 3 g + c, 3 g + c)
     chi2 : ndarray, shape (n,)
         Of the pixels, without the prior.
     dof : ndarray of int, shape (n,)
@@ -56,13 +59,13 @@ class Fit:
     def __repr__(self):
         return f"<Fit: {len(self.params)} stars, {np.count_nonzero(self.converged)} converged>"
 
-    def by_star(self):
+    def by_star(self, common=5):
         """The same with one row a star; the stars of a group follow each other and share chi2."""
-        g = (self.params.shape[1] - 5) // 3
-        own = np.column_stack([np.arange(3 * g).reshape(g, 3), np.tile(np.arange(3 * g, 3 * g + 5), (g, 1))])
-        covariance = self.covariance[:, own[:, :, None], own[:, None, :]].reshape(-1, 8, 8)
+        g = (self.params.shape[1] - common) // 3
+        own = np.column_stack([np.arange(3 * g).reshape(g, 3), np.tile(np.arange(3 * g, 3 * g + common), (g, 1))])
+        covariance = self.covariance[:, own[:, :, None], own[:, None, :]].reshape(-1, 3 + common, 3 + common)
         rest = (np.repeat(a, g) for a in (self.chi2, self.dof, self.converged))
-        return Fit(self.params[:, own].reshape(-1, 8), covariance, *rest)
+        return Fit(self.params[:, own].reshape(-1, 3 + common), covariance, *rest)
 
     def updated(self, rows, other):
         """The same with some rows replaced by those of another fit."""
@@ -107,8 +110,16 @@ def fit(stamps, weights, start, *, nodes, centre, sigma=SHAPE_SIGMA, limits=FULL
     size = max(1, _CHUNK // (stamps.shape[1] * g))
     centre = np.broadcast_to(centre, (n, 4))
     offsets = np.zeros((n, 1, 2)) if offsets is None else offsets
+    mean, precision = np.zeros_like(start), np.zeros(width)
+    mean[:, -5:-1], precision[-5:-1] = centre, 1 / np.asarray(sigma) ** 2
     parts = [
-        _fit(_Pixels(stamps[i:j], weights[i:j], offsets[i:j], nodes), start[i:j], (centre[i:j], sigma), limits)
+        minimise(
+            _Pixels(stamps[i:j], weights[i:j], offsets[i:j], nodes),
+            start[i:j],
+            prior=(mean[i:j], precision),
+            bounds=_BOUNDS,
+            limits=limits,
+        )
         for i, j in ((i, i + size) for i in range(0, max(n, 1), size))
     ]
     held = np.count_nonzero(np.asarray(sigma) <= HELD)
@@ -157,12 +168,32 @@ class _Pixels:
         return model.reshape(n, g, self.target.shape[1]).sum(axis=1), whole.reshape(n, 3 * g + 5, self.target.shape[1])
 
 
-def _fit(pixels, start, prior, limits):
-    mean, precision = np.zeros_like(start), np.zeros(start.shape[1])
-    mean[:, -5:-1], precision[-5:-1] = prior[0], 1 / np.asarray(prior[1]) ** 2
+def minimise(pixels, start, *, prior, bounds, limits):
+    """Levenberg-Marquardt iterations of groups of stars, each with its own damping.
+
+    Parameters
+    ----------
+    pixels : object
+        What is fitted: ``linearise(params, rows)`` gives chi2, negative half gradient and half Hessian of some groups;
+        ``half`` is half the side of a stamp, ``dof`` (n,) the degrees of freedom.
+    start : ndarray, shape (n, 3 g + c)
+        As `Fit.params`.
+    prior : tuple of ndarray
+        Means (n, 3 g + c) and inverse variances (3 g + c,) of the parameters; 0 for none.
+    bounds : tuple of ndarray, shape (c,)
+        Lowest and highest values of what the stars have in common.
+    limits : Limits
+
+    Returns
+    -------
+    params, covariance, chi2, converged : ndarray
+        As the attributes of `Fit`.
+    """
+    mean, precision = prior
+    common = len(bounds[0])
 
     def linearise(p, rows):
-        """As `_Pixels.linearise`, the prior added; second comes chi2 with it."""
+        """As that of the pixels, the prior added; second comes chi2 with it."""
         chi2, gradient, hessian = pixels.linearise(p, rows)
         off = mean[rows] - p
         return chi2, chi2 + (off**2) @ precision, gradient + precision * off, hessian + np.diag(precision)
@@ -175,12 +206,14 @@ def _fit(pixels, start, prior, limits):
         active = np.flatnonzero(~converged & (damping < 1e10))
         if len(active) == 0:
             break
-        step, gain = _step(params[active], gradient[active], hessian[active], damping[active])
+        step, gain = _step(params[active], gradient[active], hessian[active], damping[active], bounds)
         trial = params[active] + step
-        trial[:, -5:] = np.clip(trial[:, -5:], _LOW, _HIGH)
-        legal = (np.abs(trial[:, :-5].reshape(len(trial), -1, 3)[..., :2]) < pixels.half + 1).all(axis=(1, 2))
+        trial[:, -common:] = np.clip(trial[:, -common:], *bounds)
+        legal = (np.abs(trial[:, :-common].reshape(len(trial), -1, 3)[..., :2]) < pixels.half + 1).all(axis=(1, 2))
         rows, trial, gain = active[legal], trial[legal], gain[legal]
         damping[active[~legal]] *= 10
+        if len(rows) == 0:
+            continue
         new = linearise(trial, rows)
         better = new[1] <= cost[rows]
         good = rows[better]
@@ -196,11 +229,12 @@ def _fit(pixels, start, prior, limits):
     return params, _covariance(hessian), chi2, converged
 
 
-def _step(params, gradient, hessian, damping):
+def _step(params, gradient, hessian, damping, bounds):
     """Damped step of every group, and the gain foreseen; what pushes against its bound is held."""
-    last, slope = params[:, -5:], gradient[:, -5:]
-    held = ((last <= _LOW) & (slope < 0)) | ((last >= _HIGH) & (slope > 0))
-    free = np.pad(~held, ((0, 0), (params.shape[1] - 5, 0)), constant_values=True)
+    (low, high), common = bounds, len(bounds[0])
+    last, slope = params[:, -common:], gradient[:, -common:]
+    held = ((last <= low) & (slope < 0)) | ((last >= high) & (slope > 0))
+    free = np.pad(~held, ((0, 0), (params.shape[1] - common, 0)), constant_values=True)
     gradient, hessian = gradient * free, hessian * free[:, :, None] * free[:, None, :]
     normal, scale = _normal(hessian, damping)
     step = np.linalg.solve(normal, (gradient / scale)[:, :, None])[:, :, 0] / scale
@@ -219,4 +253,7 @@ def _normal(hessian, damping):
 
 def _covariance(hessian):
     normal, scale = _normal(hessian, 1e-6)  # what a fit does not determine gets an error that is large, not imaginary
-    return np.linalg.inv(normal) / (scale[:, :, None] * scale[:, None, :])
+    inverse = np.linalg.inv(normal)
+    diagonal = np.arange(hessian.shape[1])
+    inverse[:, diagonal, diagonal] = np.abs(inverse[:, diagonal, diagonal])  # rounding takes a large one below 0
+    return inverse / (scale[:, :, None] * scale[:, None, :])

@@ -6,14 +6,34 @@ from . import moffat
 
 #: A subtracted neighbour leaves residuals of this fraction of itself.
 NEIGHBOUR = 0.05
+_LEAST = 0.25  # of the variance of the sky: what is left of it in the darkest places
+
+
+def pixel_variance(noise, light):
+    """Variance of pixels.
+
+    Parameters
+    ----------
+    noise : tuple
+        From `pixel_noise`.
+    light : ndarray, shape (n, npix)
+        Above the sky that was taken off: stars, and halos in the fitted background.
+
+    Returns
+    -------
+    ndarray, shape (n, npix)
+    """
+    sky, photon = noise
+    return np.maximum(sky + photon * light, _LEAST * sky)  # between halos the sky taken off was too high
 
 
 def pixel_noise(stamps, fit, models, nodes):
-    """Variance of the sky on all stamps, and variance per unit of star light.
+    """Variance of the sky on all stamps, and variance per unit of light.
 
     Parameters
     ----------
     stamps : `~legdistort.measurement.profiles.cutouts.Stamps`
+        Their variance is that of the sky where no star is seen (`legdistort.measurement.detection.detect`).
     fit : `~legdistort.measurement.profiles.levenberg_marquardt.Fit`
         Of the stars one by one, with the variance of the stamps.
     models : tuple of ndarray
@@ -27,11 +47,7 @@ def pixel_noise(stamps, fit, models, nodes):
     photon : float
     """
     sky, photon = stamps.variance, stamps.frame.photon
-    if stamps.frame.noise_given:
-        return sky, photon
-    remains = _residuals(stamps, fit, models, nodes)
-    sky = sky * sky.dtype.type(_sky_factor(stamps, fit, remains))
-    return sky, _photon_noise(stamps, sky, fit, remains) if photon is None else photon
+    return sky, _photon_noise(stamps, fit, _residuals(stamps, fit, models, nodes)) if photon is None else photon
 
 
 def _residuals(stamps, fit, models, nodes):
@@ -44,19 +60,7 @@ def _residuals(stamps, fit, models, nodes):
     return rows, own, others, square
 
 
-def _sky_factor(stamps, fit, remains):
-    """Variance of the sky around the stars, relative to the map: the faint wings of stars raise the latter."""
-    rows, own, others, square = remains
-    variance = stamps.variance[rows]
-    dark = stamps.good[rows] & (own + others < 0.5 * np.sqrt(variance))
-    use = fit.converged[rows] & (dark.mean(axis=1) > 0.4)
-    if np.count_nonzero(use) < 20:  # then the map is known better
-        return 1.0
-    # The median of a squared unit normal is 0.4549; unlike the mean it overlooks stars too faint to be detected.
-    return float(np.clip(np.median((square / variance)[dark & use[:, None]]) / 0.4549, 0.5, 2.0))
-
-
-def _photon_noise(stamps, sky, fit, remains):
+def _photon_noise(stamps, fit, remains):
     """Variance per unit of star light, from the residuals of the first pass.
 
     The squared residual of a pixel is expected at ``sky variance + photon * model``. Profiles that do not quite fit add
@@ -65,7 +69,7 @@ def _photon_noise(stamps, sky, fit, remains):
     raise single stars only.
     """
     rows, own, others, square = remains
-    sky = sky[rows].astype(float)
+    sky = stamps.variance[rows].astype(float)
     use = fit.converged & (fit.params[:, 2] > 0) & ~stamps.saturated.any(axis=1)
     own = np.where(stamps.good[rows] & use[rows, None], own, 0.0)
     photon = misfit = 0.0

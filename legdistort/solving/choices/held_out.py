@@ -44,9 +44,8 @@ def hold_out(matches, fraction, *, seed=0):
 
 def only_rows(matches, rows):
     """The same matches with some rows of the table."""
-    kept = Matches.from_table(
-        matches.table[rows], shape=matches.shapes, poses=matches.poses, sky=matches.sky, left_out=matches.left_out
-    )
+    known = {"poses": matches.poses, "sky": matches.sky, "left_out": matches.left_out, "allow_copies": True}
+    kept = Matches.from_table(matches.table[rows], shape=matches.shapes, **known)
     lost = [name for name in matches.names if name not in kept.names]
     if lost:
         raise InputError(

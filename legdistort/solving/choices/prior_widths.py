@@ -272,6 +272,7 @@ def evidence(problem, state, labels, motion):
     sigma = np.where(wanted[:, None, None], np.inf, problem.prior_sigma)
     problem = replace(problem, prior_sigma=None if np.isinf(sigma).all() else sigma)
     blocks, unknowns = criterion.linearise(problem, state), problem.unknowns
+    tangents = blocks.unknowns
     n = problem.n_modes
     degree, departure = detector_modes.dynamic_degrees(n), state.coefficients - problem.prior_mean
     sought = degree <= labels.shape[1]
@@ -285,7 +286,7 @@ def evidence(problem, state, labels, motion):
         origin.append(mine @ departure[i, :, :n].ravel())
     rows, origin = np.concatenate(rows), np.concatenate(origin)
     moved = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
-    pull = unknowns.gather(blocks.g_exposure - elimination.to_exposures(problem, blocks, moved))
+    pull = tangents.gather(blocks.g_exposure - elimination.to_exposures(problem, blocks, moved))
     matrix = elimination.reduced_matrix(problem, blocks)
     common = motion.reshape(problem.n_exposures, 2, -1, motion.shape[2])
     common = np.pad(common, ((0, 0), (0, 0), (0, n - common.shape[2]), (0, 0)))

@@ -6,7 +6,8 @@ import numpy as np
 
 from ...exceptions import AssumptionWarning, warn
 from ...results.gauge import UnknownDirection
-from . import elimination, reduced_system
+from . import criterion, elimination, reduced_system
+from .problem import State
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
 DENSE_LIMIT = 8000
@@ -71,28 +72,71 @@ class Uncertainty:
         return out
 
     @cached_property
-    def _system(self):
+    def system(self):
+        """The reduced system at the solution."""
         return reduced_system.reduced_system(self._problem, self._blocks, self._gauge)
 
     @cached_property
     def directions(self):
         """See `legdistort.results.gauge.Gauge.directions`."""
-        gauge, system = self._gauge, self._system
+        return self._directions(self.system)
+
+    def _directions(self, system):
+        gauge = self._gauge
         moved = np.stack([system.follow(d) for d in system.moves[: gauge.n_constraints]], axis=2)
         return -(moved @ gauge.reach).transpose(1, 0, 2)
+
+    def unknown_at(self, positions, coefficients, poses):
+        """How the directions of `Gauge.unknown` move the stars where the solution has moved to: (2 n_stars, m).
+
+        All x first; each for the same change of what holds the solution as here. They turn as the solution moves along
+        them, which is of second order.
+        """
+        n = self._gauge.n_constraints
+        blocks = criterion.linearise(self._problem, State(positions.T, coefficients, poses))
+        system = reduced_system.reduced_system(self._problem, blocks, self._gauge, self.system.rows[n:])
+        maps = self._directions(system)
+        columns = [(maps @ each.map).T.ravel() for each in self._gauge.unknown_maps]
+        here, there = self.system.moves[n:], system.moves[n:]
+        if self.weak:
+            columns += [
+                system.follow(d).ravel() / self._unit(self.system.follow(h)) for h, d in zip(here, there, strict=True)
+            ]
+        return np.stack(columns, axis=1)
+
+    def _unit(self, stars):
+        """Rms per axis of what moves the stars (2, n_stars)."""
+        return np.sqrt(np.mean(stars[:, self._blocks.v[0] > 0] ** 2))
+
+    @cached_property
+    def bends(self):
+        """Covariance of star positions with the bend that leads to the convention, (n_stars, 2, 2 n_modes), px^2.
+
+        See `legdistort.results.gauge.Gauge.to_convention`; None where the convention holds, or the covariance of the
+        coefficients is approximated.
+        """
+        problem, blocks = self._problem, self._blocks
+        if self._gauge.to_convention is None or len(self.coefficients) > DENSE_LIMIT:
+            return None
+        inverse, moved = elimination.inverse_star_blocks(blocks.v), []
+        for errors in self._gauge.bend_errors(self.coefficients)[0].T:
+            on_stars = elimination.to_stars(problem, blocks, errors.reshape(problem.n_exposures, -1))
+            moved.append(-elimination.symmetric_times(inverse, on_stars))
+        return np.stack(moved, axis=2).transpose(1, 0, 2)
 
     @cached_property
     def weak(self):
         """Directions of a distortion that exposures share and do not determine, as a tuple of `UnknownDirection`."""
-        problem, system = self._problem, self._system
-        if not system.n_weak or problem.static_sigma is not None:
+        problem = self._problem
+        if not problem.unknowns.shared or problem.static_sigma is not None or not self.system.n_weak:
             return ()
+        system = self.system
         made = []
         for d in system.moves[self._gauge.n_constraints :]:
-            stars, coefficients = system.follow(d).T, problem.unknowns.spread(d)
-            unit = np.sqrt(np.mean(stars[self._blocks.v[0] > 0] ** 2))
+            stars, coefficients = system.follow(d), problem.unknowns.spread(d)
+            unit = self._unit(stars)
             made.append(
-                UnknownDirection("static", stars / unit, (coefficients / unit).reshape(len(coefficients), 2, -1))
+                UnknownDirection("static", stars.T / unit, (coefficients / unit).reshape(len(coefficients), 2, -1))
             )
         return tuple(made)
 

@@ -47,6 +47,8 @@ class Blocks:
         F = J' W, star coordinate first.
     values : ndarray, shape (n_modes, n)
         Basis at every observation.
+    unknowns : Unknowns
+        The tangents at this state.
     """
 
     chi2: float
@@ -59,6 +61,7 @@ class Blocks:
     g_exposure: np.ndarray
     coupling: np.ndarray
     values: np.ndarray
+    unknowns: object
 
     @property
     def cost(self):
@@ -153,7 +156,8 @@ def linearise(problem, state):
                 rows = problem.fixed[i]
                 u[i] += _HOLD * np.trace(u_data[i]) / len(departure) * rows.T @ rows
                 g_exposure[i] -= rows.T @ (rows @ g_exposure[i])
-    return Blocks(chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values)
+    tangents = problem.unknowns.at(state.coefficients)
+    return Blocks(chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values, tangents)
 
 
 def _sums(problem, state):

@@ -52,7 +52,7 @@ def reduced_matrix(problem, blocks):
 
     The product is taken over blocks of stars, each a dense matrix product.
     """
-    unknowns = problem.unknowns
+    unknowns = blocks.unknowns
     out = unknowns.matrix(blocks.u)
     for factor in star_factors(problem, blocks):
         factor = unknowns.gather(factor.reshape(*blocks.g_exposure.shape, -1))

@@ -23,9 +23,9 @@ _DIRECT_COST = 4e9
 _WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not told
 
 
-def reduced_system(problem, blocks, gauge):
+def reduced_system(problem, blocks, gauge, weak=None):
     """`Direct` or `Iterative`, by the size of the problem."""
-    return (Direct if uses_direct(problem) else Iterative)(problem, blocks, gauge)
+    return Direct(problem, blocks, gauge, weak) if uses_direct(problem) else Iterative(problem, blocks, gauge)
 
 
 def uses_direct(problem):
@@ -48,7 +48,7 @@ class _Reduced:
 
     def __init__(self, problem, blocks, gauge):
         self.problem, self.blocks, self.gauge = problem, blocks, gauge
-        self.unknowns = problem.unknowns
+        self.unknowns = blocks.unknowns
         self.rows = self._on_unknowns(gauge)
         self.inverse = elimination.inverse_star_blocks(blocks.v)
 
@@ -57,7 +57,7 @@ class _Reduced:
         n, size = len(gauge.motion), self.problem.n_modes
         rows = gauge.orthonormal.reshape(gauge.n_constraints, n, 2, -1)
         rows = np.pad(rows, ((0, 0), (0, 0), (0, 0), (0, size - rows.shape[3]))).reshape(-1, n, 2 * size)
-        return self.unknowns.gather(rows.transpose(1, 2, 0)).T
+        return self.problem.unknowns.gather(rows.transpose(1, 2, 0)).T
 
     def _couple(self, d):
         """E d, shape (2, n_stars)."""
@@ -95,13 +95,19 @@ class _Reduced:
 class Direct(_Reduced):
     """The reduced matrix S, factorised together with the constraints of the gauge.
 
+    Parameters
+    ----------
+    problem, blocks, gauge
+    weak : ndarray, shape (n_weak, n), optional
+        Rows that hold what the exposures do not determine of a distortion that they share; sought if not given.
+
     Raises
     ------
     SolveError
         If S is singular beyond the gauge, naming the exposures concerned.
     """
 
-    def __init__(self, problem, blocks, gauge):
+    def __init__(self, problem, blocks, gauge, weak=None):
         super().__init__(problem, blocks, gauge)
         s = elimination.reduced_matrix(problem, blocks)
         self.scale = np.mean(np.diag(s))
@@ -114,7 +120,7 @@ class Direct(_Reduced):
         s *= self._unit[:, None]
         s *= self._unit
         if self.unknowns.shared:
-            self._hold_weak(s)
+            self._hold_weak(s, weak)
         try:
             self._factor = cho_factor(s, lower=True, overwrite_a=False, check_finite=True)
             if np.diag(self._factor[0]).min() < 1e-7:
@@ -124,7 +130,7 @@ class Direct(_Reduced):
         self._lifted = self._apply_inverse(self.rows.T)
         self._border = np.linalg.inv(self.rows @ self._lifted)
 
-    def _hold_weak(self, s):
+    def _hold_weak(self, s, rows):
         """Hold what neither dithers nor rolls tell of a common distortion: more rows, that keep to the start.
 
         Raises
@@ -132,8 +138,11 @@ class Direct(_Reduced):
         SolveError
             If that is all of it.
         """
-        values, vectors = np.linalg.eigh(s)
-        weak = vectors[:, values < _WEAK]
+        if rows is None:
+            values, vectors = np.linalg.eigh(s)
+            weak = vectors[:, values < _WEAK]
+        else:
+            weak = (rows * self._unit).T
         self.n_weak = weak.shape[1]
         if self.n_weak >= self.unknowns.n_common:
             raise SolveError(
@@ -172,6 +181,8 @@ class Direct(_Reduced):
     def step(self, target, accuracy):
         """Gauss-Newton step under the constraints of the gauge; exact whatever the accuracy asked for.
 
+        That of the coefficients has the similarities for the poses in it, which take along what they carry.
+
         Parameters
         ----------
         target : ndarray, shape (n_constraints,)
@@ -185,7 +196,13 @@ class Direct(_Reduced):
         d_exposure : ndarray, shape (n_exposures, 2 n_modes)
         """
         d = self.solve(self.rhs, target)
-        return self._stars(self.blocks.g_star - self._couple(d)), self.unknowns.spread(d)
+        return self._stars(self.blocks.g_star - self._couple(d)), self.problem.unknowns.spread(d)
+
+    def respond(self, gradients):
+        """C g, with the covariance C of the coefficients in the gauge, for gradients g (n_exposures, 2 n_modes, k)."""
+        free = self._apply_inverse(self.unknowns.gather(gradients))
+        solved = free - self._lifted @ (self._border @ (self.rows @ free))
+        return np.stack([self.unknowns.spread(d) for d in solved.T], axis=2)
 
     @property
     def moves(self):
@@ -227,6 +244,10 @@ class Iterative(_Reduced):
 
     def _block_solve(self, r):
         return np.einsum("iab,ib->ia", self._block_inverses, r.reshape(self.blocks.g_exposure.shape)).ravel()
+
+    def respond(self, gradients):
+        """As for `Direct`, the positions of the stars taken as known."""
+        return self._block_inverses @ gradients
 
     @cached_property
     def moves(self):

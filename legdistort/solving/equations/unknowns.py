@@ -5,7 +5,7 @@ its pose, and the rest is one static distortion for all exposures of a detector.
 built per exposure, and gathered here.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -30,12 +30,27 @@ class Unknowns:
         Exposures with the same number share the rest.
     shapes : list of (ny, nx)
         By exposure; one in a group.
+    carried : ndarray, shape (n_exposures, 4, 2 n_modes), or None
+        What a pose does beside the similarity itself, see `at`.
     """
 
     degree: int
     own_degree: int | None
     group: np.ndarray
     shapes: list
+    carried: np.ndarray | None = None
+
+    def at(self, coefficients):
+        """The tangents where exposures have some coefficients (n_exposures, 2, n_all), as another `Unknowns`.
+
+        A similarity is part of the pose, in front of the distortion: a step s of it moves ``q + A b(q)`` by
+        ``s + (grad A b) s``. Coefficients that an exposure has for itself take the second part up again; a distortion
+        that it shares does not.
+        """
+        if not self.shared:
+            return self
+        made = [_carried(a, shape, self.degree) for a, shape in zip(coefficients, self.shapes, strict=True)]
+        return replace(self, carried=np.stack(made))
 
     @property
     def shared(self):
@@ -65,6 +80,14 @@ class Unknowns:
             common.append(rows[~mine])
         return np.stack(own), np.stack(common)
 
+    @cached_property
+    def _own(self):
+        """Rows (n_exposures, k, 2 n_modes) of what every exposure has for itself."""
+        rows = self._rows[0][self.group]
+        if self.carried is not None:
+            rows[:, : self.carried.shape[1]] += self.carried
+        return rows
+
     @property
     def n_own(self):
         """Unknowns that every exposure has for itself."""
@@ -85,9 +108,8 @@ class Unknowns:
         n = len(self.group)
         if not self.shared:
             return unknowns.reshape(n, -1)
-        own, common = self._rows
-        split = n * self.n_own
-        out = np.einsum("ik,ikm->im", unknowns[:split].reshape(n, -1), own[self.group])
+        common, split = self._rows[1], n * self.n_own
+        out = np.einsum("ik,ikm->im", unknowns[:split].reshape(n, -1), self._own)
         return out + np.einsum("gk,gkm->gm", unknowns[split:].reshape(len(common), -1), common)[self.group]
 
     def gather(self, gradient):
@@ -95,8 +117,8 @@ class Unknowns:
         n, rest = len(self.group), gradient.shape[2:]
         if not self.shared:
             return gradient.reshape(-1, *rest)
-        own, common = self._rows
-        mine = np.einsum("ikm,im...->ik...", own[self.group], gradient)
+        common = self._rows[1]
+        mine = np.einsum("ikm,im...->ik...", self._own, gradient)
         total = np.zeros((len(common), *gradient.shape[1:]))
         np.add.at(total, self.group, gradient)
         theirs = np.einsum("gkm,gm...->gk...", common, total)
@@ -111,7 +133,7 @@ class Unknowns:
             if not self.shared:
                 out[mine, mine] = block
                 continue
-            own, common = (rows[self.group[i]] for rows in self._rows)
+            own, common = self._own[i], self._rows[1][self.group[i]]
             theirs = slice(split + self.group[i] * len(common), split + (self.group[i] + 1) * len(common))
             out[mine, mine] = own @ block @ own.T
             out[mine, theirs] = own @ block @ common.T
@@ -119,18 +141,24 @@ class Unknowns:
             out[theirs, theirs] += common @ block @ common.T
         return out
 
-    def keep_common(self, before, after):
-        """Coefficients (n_exposures, 2 n_modes) with what is own of `after` and what is common of `before`."""
-        if not self.shared:
-            return after
-        own = self._rows[0][self.group]
-        return before + np.einsum("ikm,ikn,in->im", own, own, after - before)
-
     def common_precision(self, sigma):
         """What widths (2 n_modes,) say of the common part, a share for each exposure: (n_exposures, 2 n_modes, ...)."""
         common = self._rows[1]
         whole = common.transpose(0, 2, 1) @ np.linalg.solve(common * sigma**2 @ common.transpose(0, 2, 1), common)
         return (whole / np.bincount(self.group)[:, None, None])[self.group]
+
+    def conditional_covariances(self, blocks):
+        """Inverses of exposure blocks (n_exposures, 2 n_modes, 2 n_modes), what is shared told by all that share it.
+
+        The covariance of an exposure's coefficients, stars given; own and common part each given the other.
+        """
+        if not self.shared:
+            return _inverse(blocks)
+        own, common = (rows[self.group] for rows in self._rows)
+        total = np.zeros((self.group.max() + 1, *blocks.shape[1:]))
+        np.add.at(total, self.group, blocks)
+        parts = (own, blocks), (common, total[self.group])
+        return sum(r.mT @ _inverse(r @ block @ r.mT) @ r for r, block in parts)
 
     def covariance(self, matrix):
         """Covariance (size, size) of the vector as that of the coefficients, (n_exposures * 2 n_modes,) squared."""
@@ -138,3 +166,23 @@ class Unknowns:
             return matrix
         spread = np.stack([self.spread(unit).ravel() for unit in np.eye(self.size)], axis=1)
         return spread @ matrix @ spread.T
+
+
+def _carried(coefficients, shape, degree):
+    """Coefficients (4, 2 n_modes) of ``(grad A b) s`` for the unit similarities s of a detector, A (2, n_all)."""
+    n, top = basis.n_modes(degree), basis.degree_of(coefficients.shape[1])
+    u, v, w = basis.quadrature(max(top, 1))
+    values, by_u, by_v = basis.gradients(top, u, v)
+    slope = np.stack([coefficients @ by_u * (2 / shape[1]), coefficients @ by_v * (2 / shape[0])])
+    similar = detector_modes.similarity_basis(shape, n)
+    moved = similar.reshape(len(similar), 2, n) @ values[:n]
+    carried = np.einsum("akp,sap->skp", slope, moved)
+    return (carried @ (values[:n] * w).T).reshape(len(similar), -1)
+
+
+def _inverse(blocks):
+    """Inverse of symmetric matrices (n, k, k); of what is singular, on what it determines."""
+    try:
+        return np.linalg.inv(blocks)
+    except np.linalg.LinAlgError:
+        return np.linalg.pinv(blocks, hermitian=True)

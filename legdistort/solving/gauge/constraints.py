@@ -64,7 +64,8 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     weight = np.where(held, 1, influence(error, others))[:, None, None] * np.linalg.inv(spread)
     positions = state.positions.T[used]
     values = basis.values(problem.degree, *((positions - box[0]) / box[1]).T)
-    hierarchy = Hierarchy(motion, others, dynamic, weight, group, static, maps, tuple(2 * box[1, ::-1]), values)
+    power = values @ values.T / values.shape[1]
+    hierarchy = Hierarchy(motion, others, dynamic, weight, group, static, maps, tuple(2 * box[1, ::-1]), power)
     poses = _pose_rows(kind, motion, error, similar, box)
     known = hierarchy.solve(kind, released)
     rows = np.concatenate([known.rows, poses])
@@ -78,6 +79,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         unknown_maps=known.unknown,
         static=_in_a_word(static, shared),
         prior=bool(held.any()),
+        convention=np.concatenate([hierarchy.convention(kind), poses]) if static.any() else None,
     )
     if common is None:
         return made
@@ -200,7 +202,8 @@ def absorb_similarities(problem, state):
     """Move the similarity part of every dynamic distortion into its pose; D_i stays what it is.
 
     ``q' = S q`` and ``A' b(q') = q - q' + A b(S^-1 q')``, a polynomial of the same degree, so the change is exact
-    (prior modes beyond the fitted degree excepted: they stay with the detector).
+    (prior modes beyond the fitted degree excepted: they stay with the detector). A distortion that exposures share
+    stays with the detector as a whole, so that D_i becomes what `Unknowns.at` says of a pose.
 
     Returns
     -------
@@ -223,17 +226,19 @@ def absorb_similarities(problem, state):
         largest = max(largest, move)
         if move < 1e-9:
             break
+        turned = shift[:, :, :2] @ pose_list
+        turned[:, :, 2] += shift[:, :, 2]
+        pose_list = turned
+        if problem.unknowns.shared:  # what is common stays with the detector
+            similar = _by_shape(similarity_basis, problem)
+            own = np.einsum("ika,ikb,ib->ia", similar, similar, departure.reshape(len(departure), -1), optimize=True)
+            coefficients[:, :, :n_modes] -= own.reshape(departure.shape)
+            continue
         linear = np.linalg.inv(shift[:, :, :2])
         old = (nodes - shift[:, None, :, 2]) @ linear.transpose(0, 2, 1)
         values = basis.values(degree, *np.moveaxis((2 * old + 1) / pixels - 1, -1, 0))
         changed = ((old - nodes).transpose(0, 2, 1) + np.einsum("iam,mik->iak", coefficients, values)) @ project
         coefficients[:, :, :n_modes] = changed[:, :, :n_modes]
-        turned = shift[:, :, :2] @ pose_list
-        turned[:, :, 2] += shift[:, :, 2]
-        pose_list = turned
-    if problem.unknowns.shared:  # what is common stays with the detector as well
-        before, after = (a[:, :, :n_modes].reshape(len(a), -1) for a in (state.coefficients, coefficients))
-        coefficients[:, :, :n_modes] = problem.unknowns.keep_common(before, after).reshape(-1, 2, n_modes)
     if problem.fixed is not None:
         for a, mean, rows in zip(coefficients, problem.prior_mean, problem.fixed, strict=True):
             departure = (a - mean)[:, :n_modes].ravel()

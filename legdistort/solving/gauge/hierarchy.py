@@ -65,8 +65,8 @@ class Hierarchy:
         Orthonormal rows: the maps that every exposure can take back, similarities aside.
     size : tuple
         ``(ny, nx)`` of the box of the reference plane on which the modes are defined, pixels.
-    values : ndarray, shape (n, n_stars)
-        Modes of the reference plane at the stars.
+    power : ndarray, shape (n, n)
+        Mean products of the modes of the reference plane, over the stars.
     """
 
     motion: np.ndarray
@@ -77,7 +77,7 @@ class Hierarchy:
     static: np.ndarray
     maps: np.ndarray
     size: tuple
-    values: np.ndarray
+    power: np.ndarray
 
     def rows(self, static):
         """Rows M' (D + 1 S 1')^-1 of the constraints, (m, n_exposures, 2 n), for a variance (n_groups, K) of A_0."""
@@ -102,12 +102,12 @@ class Hierarchy:
 
     @cached_property
     def _pointed(self):
-        return _pointing_off(self.values, self.size)
+        return _pointing_off(self.power, self.size)
 
     @cached_property
     def metric(self):
         """Mean square displacement of the stars, per axis, by modes (2 n,) squared, once a similarity is taken off."""
-        return _metric(self.values, self._pointed)
+        return _metric(self.power, self._pointed)
 
     def solve(self, kind, released=None):
         """What is known of the common map, with constraints: `Constraints`.
@@ -146,7 +146,7 @@ class Hierarchy:
         poses : ndarray, shape (4, n_exposures, 2 n)
             Constraints that hold the similarities.
         """
-        rows, similar = np.concatenate([known.rows, poses]), similarity_basis(self.size, len(self.values)).T
+        rows, similar = np.concatenate([known.rows, poses]), similarity_basis(self.size, len(self.power)).T
         maps = np.hstack([known.known, *(each.map[:, None] for each in known.unknown), similar])
         n = known.known.shape[1]
         inside = np.einsum("bia,iac,dic->bd", rows, self.dynamic, rows, optimize=True)
@@ -183,24 +183,27 @@ def named(maps, gauge, positions):
     if not maps.shape[1] or len(maps) != 2 * gauge.n_modes:
         return ()
     size, values = tuple(2 * gauge.box[1, ::-1]), gauge.modes_at(positions[np.isfinite(positions[:, 0])])
-    pointed = _pointing_off(values, size)
-    metric = _metric(values, pointed)
-    power, vectors = np.linalg.eigh(maps.T @ metric @ maps)
-    kept = power > 0.5
-    return _named(maps @ vectors[:, kept] / np.sqrt(power[kept]), pointed, metric, size)
+    power = values @ values.T / values.shape[1]
+    pointed = _pointing_off(power, size)
+    metric = _metric(power, pointed)
+    moved, vectors = np.linalg.eigh(maps.T @ metric @ maps)
+    kept = moved > 0.5
+    return _named(maps @ vectors[:, kept] / np.sqrt(moved[kept]), pointed, metric, size)
 
 
-def _pointing_off(values, size):
-    """Takes off modes (2 n,) of a map the similarity that they do to the stars, (2 n, 2 n)."""
-    modes = np.kron(np.eye(2), values.T)
-    similar = similarity_basis(size, len(values)).T
-    return np.eye(len(similar)) - similar @ np.linalg.lstsq(modes @ similar, modes, rcond=None)[0]
+def _pointing_off(power, size):
+    """Takes off modes (2 n,) of a map the similarity that they do to the stars, (2 n, 2 n).
+
+    `power` (n, n) are the mean products of the modes, over the stars.
+    """
+    similar = similarity_basis(size, len(power)).T
+    pulled = similar.T @ np.kron(np.eye(2), power)
+    return np.eye(len(similar)) - similar @ np.linalg.pinv(pulled @ similar, rcond=1e-12, hermitian=True) @ pulled
 
 
-def _metric(values, pointed):
+def _metric(power, pointed):
     """Mean square displacement of the stars, per axis, by modes (2 n,) squared, once a similarity is taken off."""
-    modes = np.kron(np.eye(2), values.T) @ pointed
-    return modes.T @ modes / len(modes)
+    return pointed.T @ np.kron(np.eye(2), power / 2) @ pointed
 
 
 def _named(maps, pointed, metric, size):

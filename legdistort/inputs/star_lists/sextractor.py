@@ -10,8 +10,8 @@ import re
 import numpy as np
 from astropy.table import Table
 
-from ..exceptions import InputError
-from .column_contract import values
+from ...exceptions import InputError
+from ..column_contract import values
 
 log = logging.getLogger(__name__)
 
@@ -22,6 +22,7 @@ _OTHERS = {
     "flux": ("FLUX_PSF", "FLUX_AUTO", "FLUX_APER", "FLUX_ISO"),
     "flux_err": ("FLUXERR_PSF", "FLUXERR_AUTO", "FLUXERR_APER", "FLUXERR_ISO"),
     "fwhm": ("FWHM_IMAGE",),
+    "mag": ("MAG_PSF", "MAG_AUTO", "MAG_APER", "MAG_ISO"),
 }
 #: Bits of SExtractor -> bits of `legdistort.measurement.flags.Flag`: a neighbour or a blend is BLENDED, saturated
 #: SATURATED, truncated at the edge or with incomplete data EDGE, memory overflow NOT_CONVERGED.
@@ -33,8 +34,8 @@ def is_pixel(name):
     return re.fullmatch(r"[XY](PSF|WIN|MODEL|PEAK)?_IMAGE(_DBL)?", name) is not None
 
 
-def understand(table, columns):
-    """Add x, y, x_err, y_err, xy_corr, flux, flux_err, fwhm and flags where columns of SExtractor tell them.
+def understand(table, columns, *, without_errors=False):
+    """Add x, y, x_err, y_err, xy_corr, flux, flux_err, mag, fwhm and flags where columns of SExtractor tell them.
 
     Columns that the table has under these names already, or that the caller maps, are left alone. Rows without
     a usable error are left out. Positions stay counted from 1.
@@ -44,6 +45,8 @@ def understand(table, columns):
     table : `~astropy.table.Table`
     columns : dict
         The caller's ``{contract name: name in the table}``.
+    without_errors : bool
+        Whether positions may come without errors.
 
     Returns
     -------
@@ -54,7 +57,7 @@ def understand(table, columns):
     Raises
     ------
     InputError
-        If there are positions without their errors.
+        If there are positions without their errors, unless `without_errors`.
     """
     present = set(table.colnames)
     kinds = [kind for kind in KINDS if {f"X{kind}_IMAGE", f"Y{kind}_IMAGE"} <= present]
@@ -64,11 +67,11 @@ def understand(table, columns):
     errors = {kind: _covariance(table, kind) for kind in mapped or kinds}
     kind = next((kind for kind in errors if errors[kind] is not None), (mapped or kinds)[0])
     taken = present | set(columns)
-    if errors[kind] is None and not {"x_err", "y_err"} <= taken:
+    if errors[kind] is None and not without_errors and not {"x_err", "y_err"} <= taken:
         raise InputError(
             f"X{kind}_IMAGE comes without errors: let SExtractor write ERRX2{kind}_IMAGE, ERRY2{kind}_IMAGE and "
-            f"ERRXY{kind}_IMAGE (or ERRA{kind}_IMAGE, ERRB{kind}_IMAGE, ERRTHETA{kind}_IMAGE), or map columns to "
-            "x_err and y_err"
+            f"ERRXY{kind}_IMAGE (or ERRA{kind}_IMAGE, ERRB{kind}_IMAGE, ERRTHETA{kind}_IMAGE), map columns to x_err "
+            "and y_err, or give one error for all (error=, --error PIXELS)"
         )
     made = {"x": table[f"X{kind}_IMAGE"], "y": table[f"Y{kind}_IMAGE"]}
     for name, choices in _OTHERS.items():
@@ -81,11 +84,14 @@ def understand(table, columns):
     if errors[kind] is not None and not {"x_err", "y_err"} & taken:
         made |= _standard(*errors[kind])
         good = np.isfinite(made["xy_corr"])
+        if without_errors:  # these rows get the error of all
+            made |= {name: np.where(good, made[name], np.nan) for name in ("x_err", "y_err")}
+            made["xy_corr"], good = np.where(good, made["xy_corr"], 0.0), slice(None)
     out = Table(table, copy=False)
     for name, column in made.items():
         if name not in taken:
             out[name] = column
-    if not np.all(good):
+    if isinstance(good, np.ndarray) and not np.all(good):
         bad = np.count_nonzero(~good)
         log.warning("%d of %d detections have no usable error of position and are left out", bad, len(table))
         out = out[good]

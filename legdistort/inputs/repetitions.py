@@ -1,0 +1,59 @@
+"""The same exposure twice, under two names: its positions agree to the last bit, which two measurements never do."""
+
+import numpy as np
+
+from ..exceptions import AssumptionWarning, warn
+
+#: Positions that must agree, and they are more than half of those of the exposure that has fewer.
+FEWEST = 5
+
+
+def copies(exposure, xy):
+    """Exposures that repeat another one.
+
+    Parameters
+    ----------
+    exposure : ndarray of int, shape (n,)
+    xy : ndarray, shape (n, 2)
+
+    Returns
+    -------
+    dict of int to int
+        ``{exposure: the first one that it repeats}``.
+    """
+    bits = np.ascontiguousarray(xy + 0.0).view(np.uint64)  # -0.0 is 0.0
+    key = (
+        bits[:, 0] * np.uint64(0x9E3779B97F4A7C15) + bits[:, 1]
+    )  # wraps around; what falls together is looked at below
+    order = np.argsort(key)
+    again = key[order[1:]] == key[order[:-1]]
+    if np.count_nonzero(again) < FEWEST:
+        return {}
+    places = {}
+    for row in order[np.concatenate([[False], again]) | np.concatenate([again, [False]])]:
+        places.setdefault(tuple(xy[row].tolist()), set()).add(int(exposure[row]))
+    alike = {}
+    for found in places.values():
+        for one in found:
+            for other in found:
+                if one < other:
+                    alike[one, other] = alike.get((one, other), 0) + 1
+    counts, out = np.bincount(exposure), {}
+    for (one, other), n in sorted(alike.items()):
+        if one not in out and other not in out and n >= FEWEST and n > min(counts[one], counts[other]) / 2:
+            out[other] = one
+    return out
+
+
+def reasons(names, exposure, xy):
+    """`copies` in words, ``{name: reason}``, with a warning that names both."""
+    found = {names[copy]: names[original] for copy, original in copies(exposure, xy).items()}
+    return told({name: f"its positions are those of {original} to the last bit" for name, original in found.items()})
+
+
+def told(repeated):
+    """Exposures that repeat another one, ``{name: reason}``, after a warning of them."""
+    if repeated:
+        listed = "; ".join(f"{name}: {reason}" for name, reason in repeated.items())
+        warn(f"the same exposure more than once, which counts as one: {listed}", AssumptionWarning)
+    return repeated

@@ -1,0 +1,138 @@
+"""World coordinate systems of exposures: which are believed, and where on the sky they lead.
+
+`~astropy.wcs.WCS` objects of FITS headers, with their distortions or without, and any other that has astropy's shared
+interface for world coordinates (APE 14) and leads to the sky, such as a gwcs.
+"""
+
+import logging
+
+import gwcs
+import numpy as np
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.wcs import WCS
+from astropy.wcs.utils import proj_plane_pixel_scales, wcs_to_celestial_frame
+from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS, HighLevelWCSWrapper
+from astropy.wcs.wcsapi.high_level_api import values_to_high_level_objects
+
+from ..exceptions import InputError
+
+log = logging.getLogger(__name__)
+
+#: A WCS is believed for pixel scales in this range [degrees]: 0.1 mas to 6 arcmin.
+PIXEL_SCALES = (0.0001 / 3600, 0.1)
+#: ... and a reference pixel not farther from the centre than this many frame sizes (mosaics need several).
+REFERENCE_DISTANCE = 20
+
+
+def believable_wcs(wcs, shape, name=""):
+    """The celestial part of a WCS, or None with a log entry if it is not to be believed.
+
+    Believable is a WCS that has two celestial axes, a pixel scale in `PIXEL_SCALES` that is the same in x
+    and y within a factor of two, and leads from the whole detector to the sky. One of a FITS header must also have its
+    reference pixel within `REFERENCE_DISTANCE` frame sizes of the centre, and map corners and centre to the sky and
+    back within 0.01 of the frame.
+
+    Parameters
+    ----------
+    wcs : `~astropy.wcs.WCS`, gwcs, any other WCS of the shared interface (APE 14), or None
+    shape : tuple
+        ``(ny, nx)``.
+    name : str, optional
+        For the log.
+
+    Raises
+    ------
+    InputError
+        For what is no WCS.
+    """
+    if wcs is None:
+        return None
+    if isinstance(wcs, WCS):
+        wcs, reason = _believable_fits(wcs, shape)
+    elif isinstance(wcs, BaseHighLevelWCS | BaseLowLevelWCS):
+        wcs = wcs if isinstance(wcs, BaseHighLevelWCS) else HighLevelWCSWrapper(wcs)
+        reason = _against_shared(wcs, shape)
+    else:
+        raise InputError(
+            f"{name}: the WCS must be an astropy.wcs.WCS, a gwcs or another one of the shared interface (APE 14), got "
+            f"{type(wcs).__name__}"
+        )
+    if reason:
+        log.info("%s: WCS of the header not used: %s", name, reason)
+        return None
+    return wcs
+
+
+def to_icrs(wcs, xy, *, distortion=True):
+    """Right ascension and declination (2, n) [deg, ICRS] of pixels (n, 2), counted from 0, by a believable WCS.
+
+    Parameters
+    ----------
+    wcs : as `believable_wcs` gives it
+    xy : array_like, shape (n, 2)
+    distortion : bool
+        False leaves the distortion of a FITS header out, its linear part and projection remain.
+    """
+    x, y = np.asarray(xy, dtype=float).T
+    if isinstance(wcs, WCS):
+        world = (wcs.all_pix2world if distortion else wcs.wcs_pix2world)(x, y, 0)
+        lon, lat = world[wcs.wcs.lng] * u.deg, world[wcs.wcs.lat] * u.deg
+        sky = SkyCoord(lon, lat, frame=wcs_to_celestial_frame(wcs)).icrs
+    elif isinstance(wcs, gwcs.WCS):  # beyond its bounding box too: a pixel of undistorted edge lies there
+        values = wcs(x, y, with_bounding_box=False)
+        sky = _place(values_to_high_level_objects(*values, low_level_wcs=wcs)).icrs
+    else:
+        sky = _place(wcs.pixel_to_world(x, y)).icrs
+    return np.stack([sky.ra.deg, sky.dec.deg])
+
+
+def _place(found):
+    """The place on the sky among what a WCS of the shared interface gives for pixels; `ValueError` without one."""
+    for each in found if isinstance(found, (list, tuple)) else [found]:
+        if isinstance(each, SkyCoord):
+            return each
+    raise ValueError("it does not lead to the sky")
+
+
+def _against_shared(wcs, shape):
+    """What speaks against a WCS of the shared interface, or None."""
+    ny, nx = shape
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, nx - 1, 5), np.linspace(0, ny - 1, 5)))
+    try:
+        if getattr(wcs, "low_level_wcs", wcs).pixel_n_dim != 2:
+            return "it has not two pixel axes"
+        places = [_place(wcs.pixel_to_world(x + dx, y + dy)).icrs for dx, dy in ((0, 0), (0.25, 0), (0, 0.25))]
+    except Exception as error:  # WCSs raise what they like
+        return str(error)
+    if not all(np.isfinite(place.ra.deg + place.dec.deg).all() for place in places):
+        return "it gives no place on the sky for a part of the detector"
+    scales = np.array([places[0].separation(place).deg.mean() / 0.25 for place in places[1:]])
+    if not (scales.min() > PIXEL_SCALES[0] and scales.max() < PIXEL_SCALES[1] and scales.max() < 2 * scales.min()):
+        return f"pixel scale {scales[0]:.3g}, {scales[1]:.3g} degrees"
+    return None
+
+
+def _believable_fits(wcs, shape):
+    """The celestial part of a WCS of a FITS header, and what speaks against it."""
+    if not wcs.has_celestial:
+        return None, "it has no celestial axes"
+    wcs = wcs.celestial
+    ny, nx = shape
+    scales = proj_plane_pixel_scales(wcs)
+    corners = np.array([[0, 0], [nx - 1, 0], [0, ny - 1], [nx - 1, ny - 1], [(nx - 1) / 2, (ny - 1) / 2]])
+    off_centre = np.abs(wcs.wcs.crpix - 1 - corners[-1]).max() / max(ny, nx)
+    reason = None
+    if not (scales.min() > PIXEL_SCALES[0] and scales.max() < PIXEL_SCALES[1] and scales.max() < 2 * scales.min()):
+        reason = f"pixel scale {scales[0]:.3g}, {scales[1]:.3g} degrees"
+    elif not off_centre < REFERENCE_DISTANCE:
+        reason = f"reference pixel {off_centre:.0f} frame sizes off the centre"
+    else:
+        try:
+            back = wcs.all_world2pix(wcs.all_pix2world(corners, 0), 0, quiet=True)
+        except Exception as error:  # singular matrices and the like, raised by wcslib under many names
+            reason = str(error)
+        else:
+            if not np.all(np.abs(back - corners) < 0.01 * max(ny, nx)):
+                reason = "it does not map the corners to the sky and back"
+    return wcs, reason

@@ -1,0 +1,169 @@
+"""Which program wrote a table of positions, by its columns, and what they are called here.
+
+Another program is another `Dialect`. Those of SExtractor need arithmetic and have a module of their own.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...exceptions import InputError
+from ..column_contract import values
+from . import sextractor
+
+log = logging.getLogger(__name__)
+
+#: Bits of `legdistort.measurement.flags.Flag`.
+_SATURATED, _EDGE, _NOT_CONVERGED = 1, 2, 8
+#: Rows of the lower chip of ACS/WFC and WFC3/UVIS in the pixels of hst1pass, which puts the other one above it.
+_LOWER_CHIP = 2048
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """The columns of one program.
+
+    Attributes
+    ----------
+    program : str
+    columns : dict
+        ``{contract name: names, the best first}``.
+    marks : tuple of str
+        Columns that tell it, if the file does not; none for one that the file tells.
+    origin : int
+        Coordinate of the centre of the first pixel.
+    flags : callable
+        Our flags of a table, or None.
+    """
+
+    program: str
+    columns: dict
+    marks: tuple = ()
+    origin: int = 0
+    flags: Callable = field(default=lambda table: None)
+
+    def speaks(self, table):
+        """Whether a table is of this kind."""
+        told = table.meta.get("program")
+        return told == self.program if told else bool(self.marks) and set(self.marks) <= set(table.colnames)
+
+
+def _positive(name, bit):
+    """Our flag where a column is above zero."""
+    return lambda table: np.where(values(table, name) > 0, bit, 0) if name in table.colnames else None
+
+
+def _photutils_flags(table):
+    """Those of ``PSFPhotometry``: 1 = masked pixels, higher bits = no positive flux, not converged, no errors."""
+    if "flags" not in table.colnames:
+        return None
+    theirs = np.nan_to_num(values(table, "flags")).astype(int)
+    return np.where(theirs & 1, _EDGE, 0) | np.where(theirs & ~1, _NOT_CONVERGED, 0)
+
+
+#: FlyStar and StarFinder; hst1pass (Anderson 2022, WFC3 ISR 2022-05), whose X, Y are x, y after the correction for
+#: charge transfer, u, v and U, V those without distortion; DAOPHOT of Stetson and of IRAF; photutils.
+DIALECTS = (
+    Dialect("FlyStar", {"x_err": ("xe",), "y_err": ("ye",), "mag": ("m",), "epoch": ("t",)}, ("x", "y", "xe", "ye")),
+    Dialect(
+        "hst1pass",
+        {"x": ("X", "x"), "y": ("Y", "y"), "mag": ("M", "m", "w", "W"), "epoch": ("t",)},
+        origin=1,
+        flags=_positive("n", _SATURATED),
+    ),
+    Dialect("DAOPHOT", {"x": ("X",), "y": ("Y",), "mag": ("MAG",)}, origin=1),
+    Dialect(
+        "DAOPHOT of IRAF",
+        {"x": ("XCENTER",), "y": ("YCENTER",), "mag": ("MAG", "MAG1")},
+        ("XCENTER", "YCENTER"),
+        origin=1,
+        flags=_positive("PIER", _NOT_CONVERGED),
+    ),
+    Dialect(
+        "PSFPhotometry of photutils",
+        {"x": ("x_fit",), "y": ("y_fit",), "flux": ("flux_fit",), "flux_err": ("flux_err",)},
+        ("x_fit", "y_fit"),
+        flags=_photutils_flags,
+    ),
+    Dialect("photutils", {"x": ("xcentroid",), "y": ("ycentroid",)}, ("xcentroid", "ycentroid")),
+    Dialect("photutils", {"x": ("x_centroid",), "y": ("y_centroid",)}, ("x_centroid", "y_centroid")),
+)
+
+
+def understand(table, columns, *, without_errors=False):
+    """What the columns of a table are in the words of the contract; where the caller says it, that holds.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+    columns : dict
+        The caller's ``{contract name: name in the table}``.
+    without_errors : bool
+        Whether positions may come without errors.
+
+    Returns
+    -------
+    table : `~astropy.table.Table`
+        The same, with columns added where they had to be worked out.
+    columns : dict
+        The caller's, with those that were understood.
+    origin : int
+        Coordinate of the centre of the first pixel.
+
+    Raises
+    ------
+    InputError
+        For positions that are not those of the detector, and for those of SExtractor without errors, unless
+        `without_errors`.
+    """
+    table, source = sextractor.understand(table, columns, without_errors=without_errors)
+    source = columns.get("x", source)
+    if source is not None and sextractor.is_pixel(source):
+        return table, columns, 1
+    dialect = next((dialect for dialect in DIALECTS if dialect.speaks(table)), None)
+    if dialect is None:
+        return table, columns, 0
+    present, found = set(table.colnames), {}
+    for name, choices in dialect.columns.items():
+        theirs = next((choice for choice in choices if choice in present), None)
+        if theirs is not None and name not in columns and theirs not in columns.values():
+            found[name] = theirs
+    if dialect.program == "hst1pass":
+        _check_pixels(found, columns, present)
+    log.info("columns of %s: %s", dialect.program, ", ".join(f"{ours} = {theirs}" for ours, theirs in found.items()))
+    flags = dialect.flags(table)
+    if flags is not None and "flags" not in columns:
+        table = table.copy(copy_data=False)
+        table["flags"] = flags
+    return table, columns | found, dialect.origin
+
+
+def _check_pixels(found, columns, present):
+    missing = [name for name in "xy" if name not in found and name not in columns]
+    if missing:
+        raise InputError(
+            f"hst1pass wrote no pixel positions, but {', '.join(sorted(present - {'epoch'}))}; u, v and U, V are "
+            "corrected for distortion: let it write x, y or X, Y (OUT=XYMpqk), or take what is there with columns= "
+            "(--columns x=u,y=v), if what is left of the distortion is wanted"
+        )
+
+
+def chips(table):
+    """The tables of single chips, ``{number: table}``, of a table of hst1pass; one without a number of chips is one.
+
+    Its pixels of the second chip of ACS/WFC and WFC3/UVIS lie above those of the first, 2048 rows up; here each chip
+    counts its own.
+    """
+    if table.meta.get("program") != "hst1pass" or not {"k", "K"} & set(table.colnames):
+        return {}
+    if "k" in table.colnames:
+        number = np.asarray(values(table, "k"), dtype=int)
+    else:  # K1, K2
+        number = np.array([int(str(word).lstrip("K")) for word in table["K"]])
+    out = {int(chip): table[number == chip] for chip in np.unique(number)}
+    for name in {"y", "Y"} & set(table.colnames):
+        if 2 in out and np.nanmin(values(out[2], name)) > _LOWER_CHIP:
+            out[2][name] = values(out[2], name) - _LOWER_CHIP
+    return out

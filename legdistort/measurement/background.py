@@ -1,0 +1,272 @@
+"""The sky of a frame, the smooth light around its stars (halos, unresolved stars), and the noise of both."""
+
+import logging
+import warnings
+from functools import partial
+
+import numpy as np
+from astropy.stats import SigmaClip
+from photutils.background import Background2D
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+
+log = logging.getLogger(__name__)
+
+_DARK = 2.5  # filtered signal, in its noise, up to which a pixel tells the noise of the sky
+_CLIP = 3.0  # standard deviations beyond which a pixel is left out of the noise
+#: Variance of a unit normal clipped at `_CLIP` (0.973), then where the filtered image is within `_DARK` of its noise.
+_REMAINS = 0.973 * 0.975
+_SETTLED = 0.03
+_ROUNDS = 5  # from a noise that is several times too high, in crowded fields
+_BRIGHT = 5.0  # standard deviations of a binned pixel above the light around it: part of a star
+_ENOUGH = 1_000_000  # pixels: of more every fourth serves
+_FEWEST = 50  # pixels of a mesh that tell its noise
+_STEPS = 12  # of light, for the photon noise
+
+
+def sky_and_noise(data, mask, mesh, *, steep=False):
+    """Sky and its standard deviation, smooth maps; of a steep sky no medians of meshes are taken.
+
+    Parameters
+    ----------
+    data : ndarray, shape (ny, nx)
+    mask : ndarray of bool, shape (ny, nx)
+        Pixels that do not count.
+    mesh : int
+        Pixels over which the sky is taken as constant.
+    steep : bool
+
+    Returns
+    -------
+    sky, rms : ndarray, shape (ny, nx)
+    """
+    box = tuple(min(mesh, n) for n in data.shape)
+    clip = SigmaClip(sigma=3.0, maxiters=10)
+    with warnings.catch_warnings(action="ignore"):  # of meshes without good pixels, which are interpolated
+        for exclude in (50.0, 100.0):
+            try:
+                found = Background2D(
+                    data, box, mask=mask, sigma_clip=clip, exclude_percentile=exclude, filter_size=1 if steep else 3
+                )
+            except ValueError:
+                log.debug("background: too few good pixels with exclude_percentile=%g", exclude)
+            else:
+                rms = found.background_rms_mesh
+                sky = _enlarge(found.background_mesh, box, data.shape, degree=3 if steep else 2)
+                return sky, _enlarge(rms, box, data.shape).clip(rms.min())
+    values = clip(data[~mask] if not mask.all() else data.ravel(), masked=False)
+    return np.full_like(data, np.median(values)), np.full_like(data, np.std(values))
+
+
+def is_steep(sky, rms, mesh):
+    """Whether the sky rises across a mesh by as much as the noise, somewhere."""
+    step = max(1, mesh // 2)
+    coarse, noise = sky[::step, ::step], rms[::step, ::step]
+    return any(np.any(np.abs(np.diff(coarse, axis=i)) > 0.5 * np.delete(noise, 0, axis=i)) for i in (0, 1))
+
+
+def _enlarge(mesh, box, shape, degree=2):
+    """A mesh spread over all pixels (the function of photutils takes as long as all the fits).
+
+    Degree 2: by quadratic B-splines that have the values of the mesh as coefficients, linear beyond its first and last
+    centre. Interpolation of degree 1 would have edges, which pass for stars in crowded fields, and 3 would overshoot.
+    """
+    across = []
+    for n_mesh, width, n in zip(mesh.shape, box, shape, strict=True):
+        at = (np.arange(n) + 0.5) / width - 0.5
+        if degree == 3 or n_mesh == 1:
+            matrix = make_interp_spline(np.arange(n_mesh), np.eye(n_mesh), k=min(3, n_mesh - 1))(at)
+        else:
+            matrix = BSpline(np.arange(-2.5, n_mesh + 2), _extended(n_mesh), 2)(at)
+        across.append(matrix.astype(np.float32))
+    return across[0] @ mesh.astype(np.float32) @ across[1].T
+
+
+def _extended(n):
+    """Matrix (n + 2, n) that continues n values linearly by one on either side."""
+    out = np.pad(np.eye(n), ((1, 1), (0, 0)))
+    out[0, :2] = out[-1, :-3:-1] = 2, -1
+    return out
+
+
+def smooth_light(signal, good, sigma, *, variance=None):
+    """The light around every pixel: of the plane fitted to its surroundings, the value at the pixel.
+
+    A plane, because a mean would be wrong on slopes beside edges and gaps. The weights of the fit are Gaussian; it is
+    made on pixels binned so that 2 to 4 of them make up `sigma`, and interpolated.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (ny, nx)
+    good : ndarray of bool, shape (ny, nx)
+        Pixels that count.
+    sigma : float
+        Standard deviation of the weights [pix].
+    variance : ndarray, shape (ny, nx), optional
+        Of a pixel. If given, the fit is made once more without what stands out by `_BRIGHT` standard deviations: the
+        cores of stars.
+
+    Returns
+    -------
+    level : ndarray, shape (ny, nx)
+    extrapolated : ndarray, shape (ceil(ny / step), ceil(nx / step))
+        By how much the plane differs from a mean, in the binned pixels.
+    step : int
+        Pixels binned along each axis.
+    """
+    step = max(1, int(sigma / 2))
+    n, total = _binned(good.astype(signal.dtype), step), _binned(np.where(good, signal, 0), step)
+    level, extrapolated = _planes(n, total, sigma / step, whole=good.all())
+    if variance is not None:
+        faint = total - n * level < _BRIGHT * np.sqrt(n * variance[::step, ::step])
+        level, extrapolated = _planes(n * faint, total * faint, sigma / step)
+    return _spread(level, step, signal.shape), extrapolated, step
+
+
+def _planes(n, total, width, *, whole=False):
+    """Values of planes fitted around all pixels, and how much they differ from means.
+
+    Parameters
+    ----------
+    n, total : ndarray, shape (ny, nx)
+        Number of measurements in a pixel, and their sum.
+    width : float
+        Standard deviation of the Gaussian weights.
+    whole : bool
+        Whether no measurement is missing; sums of `n` are then products.
+    """
+    area = width**2
+    smooth = partial(gaussian_filter, sigma=width, mode="constant", truncate=3.0)
+
+    def weighted(order):
+        """Sum of Gaussian weight * n * offset^order, but for a factor: by derivatives of the Gaussian."""
+        if not whole:
+            return smooth(n, order=order)
+        along = partial(gaussian_filter1d, sigma=width, mode="constant", truncate=3.0)
+        middle = np.maximum(n[0, 0], 1)
+        return np.outer(along(n[:, 0], order=order[0]), along(n[0], order=order[1])) / middle
+
+    weight = weighted((0, 0)) + np.finfo(n.dtype).eps
+    mean = smooth(total) / weight
+    x, y = (area * weighted(order) / weight for order in ((0, 1), (1, 0)))
+    # never narrower than a quarter of the Gaussian's width: what is left of a star beside a gap tells no slope
+    xx, yy = (
+        np.maximum(area + area**2 * weighted(order) / weight - c**2, 0.06 * area)
+        for order, c in (((0, 2), x), ((2, 0), y))
+    )
+    xy = area**2 * weighted((1, 1)) / weight - x * y
+    by_x, by_y = (area * smooth(total, order=order) / weight - c * mean for order, c in (((0, 1), x), ((1, 0), y)))
+    determinant = np.maximum(xx * yy - xy**2, 0.02 * area**2)
+    shift = ((yy * by_x - xy * by_y) * x + (xx * by_y - xy * by_x) * y) / determinant
+    return mean - shift, np.abs(shift)
+
+
+def _binned(image, step):
+    """Sums over squares of pixels, the last ones padded with zeros."""
+    ny, nx = image.shape
+    if step == 1:
+        return image
+    if ny % step or nx % step:
+        image = np.pad(image, ((0, -ny % step), (0, -nx % step)))
+    return sum(image[i::step, j::step] for i in range(step) for j in range(step))
+
+
+def _spread(image, step, shape):
+    """Binned pixels interpolated linearly to all pixels."""
+    for axis, n in enumerate(shape):
+        padded = np.pad(np.moveaxis(image, axis, 0), ((1, 1), (0, 0)), mode="edge")
+        out = np.empty((step * image.shape[axis], padded.shape[1]), dtype=image.dtype)
+        for i in range(step):
+            off = (i + 0.5) / step - 0.5  # from the middle of the bin
+            beside = padded[2:] if off > 0 else padded[:-2]
+            out[i::step] = (1 - abs(off)) * padded[1:-1] + abs(off) * beside
+        image = np.moveaxis(out[:n], 0, axis)
+    return np.ascontiguousarray(image)
+
+
+def sky_variance(residual, filtered, light, good, *, start, noise, photon, mesh, floor):
+    """Variance of the sky at the level 0, without the photons of halos, from pixels on which no star is seen.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (ny, nx)
+        Signal without the smooth light.
+    filtered : ndarray, shape (ny, nx)
+        The same filtered, which tells where stars are.
+    light : ndarray, shape (ny, nx)
+        The smooth light.
+    good : ndarray of bool, shape (ny, nx)
+    start : ndarray, shape (ny, nx)
+        Variance that may be too high.
+    noise : float
+        Variance of `filtered` where that of a pixel is 1.
+    photon : float or None
+        Variance per unit of light; None: estimated, for this purpose alone.
+    mesh : int
+        Pixels over which it is taken as constant.
+    floor : float
+        The least it can be.
+
+    Returns
+    -------
+    variance : ndarray, shape (ny, nx)
+    photon : float
+        As given, or as estimated.
+    """
+    step = 1 if residual.size < _ENOUGH else 2
+    thin = np.s_[::step, ::step]
+    square, filtered, light, good, variance = (
+        residual[thin] ** 2,
+        filtered[thin] ** 2,
+        light[thin],
+        good[thin],
+        start[thin],
+    )
+    mesh, slope = mesh // step, photon or 0.0
+    for _ in range(_ROUNDS):
+        total = np.maximum(variance + slope * light, 0.25 * variance)
+        dark = good & (filtered < _DARK**2 * noise * total) & (square < _CLIP**2 * total)
+        if photon is None:
+            slope = _photon_slope(square[dark], light[dark])
+        means = _means_of_meshes(square / _REMAINS - slope * light, dark, mesh)
+        if means is None:
+            return start, slope
+        before, variance = variance, np.maximum(_enlarge(means, (mesh, mesh), square.shape), np.float32(floor))
+        if np.all(np.abs(variance - before)[::4, ::4] < _SETTLED * before[::4, ::4]):
+            break
+    return np.maximum(_enlarge(means, (mesh * step,) * 2, residual.shape), np.float32(floor)), slope
+
+
+def _means_of_meshes(image, use, mesh):
+    """Means over meshes, each the median of those around it; None if no mesh has enough pixels."""
+    total, n = (
+        np.add.reduceat(
+            np.add.reduceat(values, np.arange(0, image.shape[1], mesh), axis=1),
+            np.arange(0, image.shape[0], mesh),
+            axis=0,
+        )
+        for values in (np.where(use, image, 0), use.astype(np.float32))
+    )
+    told = n >= _FEWEST
+    if not told.any():
+        return None
+    mean = np.where(told, total / np.maximum(n, 1), np.nan)
+    padded = np.pad(mean, 1, constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*mean.shape, 9)
+    with warnings.catch_warnings(action="ignore"):  # of a mesh with nothing around it
+        smooth = np.nanmedian(around, axis=-1)
+    return np.where(np.isfinite(smooth), smooth, np.median(mean[told]))
+
+
+def _photon_slope(square, light):
+    """Variance per unit of light, of pixels on which no star is seen: 0 where light does not differ by enough."""
+    if len(light) < _STEPS * _FEWEST:
+        return 0.0
+    edges = np.quantile(light[:: max(1, len(light) // 100_000)], np.linspace(0, 1, _STEPS + 1)[1:-1])
+    step = np.searchsorted(edges, light)
+    n = np.maximum(np.bincount(step, minlength=_STEPS), 1)
+    x, y = (np.bincount(step, weights=values, minlength=_STEPS) / n for values in (light, square))
+    half = _STEPS // 2
+    rise, run = y[half:] - y[:half].mean(), x[half:] - x[:half].mean()
+    # the least of them: what is not noise, in cores that pass for light, only adds
+    return max(float((rise / run).min()), 0.0) if (run > 0).all() else 0.0

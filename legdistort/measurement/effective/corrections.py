@@ -1,0 +1,143 @@
+"""Corrections to the grid of a PSF: patterns that an image of a telescope could have, and the size expected of them.
+
+Raw patterns are products of smooth functions of x and of y (eigenvectors of a Gaussian correlation), times the size of
+corrections expected at the place: about that of the profile itself. Every term of the field takes those combinations
+of them that carry no light in sum, have no first moment in the core and vanish on the edge in the mean: fluxes,
+positions and local skies of the stars would take these up. Their amplitudes have a normal prior of unit width.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import null_space
+
+from . import splines
+from .model import moments
+
+_SMOOTH = 0.4  # FWHM, correlation length: shorter than any structure that a telescope makes
+_CUT = (3e-3, 3e-2, 3e-2)  # part of the variance of the largest pattern, below which one is left out, by degree
+_SIZE = (1.0, 0.1, 0.1)  # relative to the profile, by degree of the term
+_FLOOR = 0.03  # of the peak: expected where the profile has no light, falling with the square of the distance
+_REACH = 2.75  # FWHM, half the side of the square that is corrected; at most the stamp
+
+
+@dataclass(frozen=True, eq=False)
+class Corrections:
+    """Patterns on the inner knots of a grid, and the combinations that are free.
+
+    Attributes
+    ----------
+    modes : ndarray, shape (n_modes, k, k)
+        Raw patterns, as spline coefficients.
+    size : int
+        Knots of the whole grid.
+    free : tuple of ndarray, shape (n_modes, n_free)
+        For every term of the field.
+    """
+
+    modes: np.ndarray
+    size: int
+    free: tuple
+
+    @classmethod
+    def around(cls, base, spacing, powers, half, *, per_fwhm=4):
+        """Those around a profile.
+
+        Parameters
+        ----------
+        base : ndarray, shape (n, n)
+            Spline coefficients of the profile.
+        spacing : float
+            Of its knots [pix].
+        powers : sequence of tuple
+            Powers of x and y of the terms of the field.
+        half : int
+            Half the side of the stamps.
+        per_fwhm : int
+            Knots a FWHM.
+        """
+        n, fwhm = len(base), spacing * per_fwhm
+        places = splines.knots(n, spacing)
+        inner = np.flatnonzero(np.abs(places) <= min(half + 0.5 + spacing, _REACH * fwhm))
+        at = places[inner]
+        variance, along = np.linalg.eigh(np.exp(-(((at[:, None] - at) / (_SMOOTH * fwhm)) ** 2) / 2))
+        both = np.outer(variance, variance) / variance.max() ** 2
+        j, i = np.nonzero(both > min(_CUT))
+        order = np.argsort(-both[j, i], kind="stable")
+        j, i = j[order], i[order]
+        block = base[np.ix_(inner, inner)]
+        expected = block + _FLOOR * base.max() / (1 + (at[:, None] ** 2 + at**2) / fwhm**2)
+        modes = along.T[j][:, :, None] * along.T[i][:, None, :] * expected
+        modes *= np.sqrt(both[j, i])[:, None, None] * variance.max()
+        light, core, first = moments(n, spacing, fwhm)[:, inner]
+        edge = np.zeros_like(block)
+        edge[0], edge[-1], edge[:, 0], edge[:, -1] = 1, 1, 1, 1
+        taken = [np.outer(light, light), np.outer(core, first), np.outer(first, core), edge]
+        taken = np.tensordot(modes, np.stack(taken, axis=-1), 2).T
+        free = []
+        for degree in (min(a + b, 2) for a, b in powers):
+            m = np.count_nonzero(both[j, i] > _CUT[degree])
+            kept = null_space(taken[:, :m] / np.linalg.norm(taken, axis=1, keepdims=True))
+            free.append(_SIZE[degree] * np.pad(kept, ((0, len(modes) - m), (0, 0))))
+        return cls(modes, n, tuple(free))
+
+    @property
+    def n_amplitudes(self):
+        """Of all terms."""
+        return sum(f.shape[1] for f in self.free)
+
+    def by_term(self, values):
+        """Values (n_terms,) repeated for the amplitudes of every term."""
+        return np.repeat(values, [f.shape[1] for f in self.free])
+
+    @property
+    def _inner(self):
+        edge = (self.size - self.modes.shape[1]) // 2
+        return slice(edge, self.size - edge)
+
+    def raw(self, amplitudes):
+        """Amplitudes (n_amplitudes,) as sums of raw patterns, (n_terms, n_modes)."""
+        ends = np.cumsum([f.shape[1] for f in self.free])[:-1]
+        return np.stack([f @ a for f, a in zip(self.free, np.split(amplitudes, ends), strict=True)])
+
+    def reduced(self, raw):
+        """The adjoint of `raw`: (..., n_terms, n_modes) to (..., n_amplitudes)."""
+        return np.concatenate([raw[..., t, :] @ f for t, f in enumerate(self.free)], axis=-1)
+
+    def normal(self, pairs):
+        """Normal matrix of the amplitudes, its lower half, from those of the raw patterns for the pairs of terms.
+
+        Those are (n_pairs, n_modes, n_modes) in the order of `numpy.tril_indices`.
+        """
+        ends = np.cumsum([0, *(f.shape[1] for f in self.free)])
+        out = np.zeros((ends[-1], ends[-1]))
+        for k, (t, u) in enumerate(zip(*np.tril_indices(len(self.free)), strict=True)):
+            block = self.free[t].T @ pairs[k] @ self.free[u]
+            out[ends[t] : ends[t + 1], ends[u] : ends[u + 1]] = block
+        return out
+
+    def grids(self, raw):
+        """Whole grids (n, size, size) of sums of raw patterns (n, n_modes)."""
+        out = np.zeros((len(raw), self.size, self.size))
+        out[:, self._inner, self._inner] = np.tensordot(raw, self.modes, 1)
+        return out
+
+    def on_stamps(self, xy, half, spacing):
+        """Raw patterns on the stamps of stars, (n, n_modes, npix)."""
+        x, y = self._bases(xy, half, spacing)
+        m, k, n, size = *self.modes.shape[:2], *x.shape[:2]
+        along = (self.modes.reshape(m * k, k) @ x.reshape(n * size, k).T).reshape(m, k, n, size)
+        across = y @ along.transpose(2, 1, 0, 3).reshape(n, k, m * size)
+        return across.reshape(n, size, m, size).swapaxes(1, 2).reshape(n, m, size**2)
+
+    def against(self, images, xy, half, spacing):
+        """Products of images (n, a, npix) on the stamps of stars with the raw patterns there, (n, a, n_modes)."""
+        n, a = images.shape[:2]
+        x, y = self._bases(xy, half, spacing)
+        size = 2 * half + 1
+        laid = y[:, None].swapaxes(2, 3) @ images.reshape(n, a, size, size) @ x[:, None]
+        return laid.reshape(n, a, -1) @ self.modes.reshape(len(self.modes), -1).T
+
+    def _bases(self, xy, half, spacing):
+        pixels = np.arange(-half, half + 1)
+        return (splines.basis(pixels - xy[:, i, None], self.size, spacing)[..., self._inner] for i in (0, 1))

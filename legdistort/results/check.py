@@ -1,0 +1,70 @@
+"""What is checked of a result: one question a referee would ask, the answer, and what to do about it."""
+
+import textwrap
+from dataclasses import dataclass
+from math import isfinite
+
+#: Probability with which a check warns of a set in which nothing is wrong; all of them together make 2 %.
+FALSE_ALARM = 1e-3
+#: From best to worst; "unknown" is a question that the data cannot answer.
+STATES = ("pass", "unknown", "warn", "fail")
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check of a result.
+
+    Attributes
+    ----------
+    name : str
+        Stable: "chi2", "time", "place" and so on.
+    state : {"pass", "unknown", "warn", "fail"}
+    value, limit : float or None
+        What was found, and beyond what the state is no longer "pass"; what they measure is in the sentence.
+    sentence : str
+        What was found, in words.
+    cure : str
+        What to do about it; empty for a pass.
+    """
+
+    name: str
+    state: str
+    value: float | None
+    limit: float | None
+    sentence: str
+    cure: str = ""
+
+    def __post_init__(self):
+        for name in ("value", "limit"):
+            number = getattr(self, name)
+            if number is not None:  # plain numbers, as files and JSON have them
+                object.__setattr__(self, name, float(number) if isfinite(number) else None)
+
+    def __str__(self):
+        return f"{self.state:7s} {self.name}: {self.sentence}{'; ' * bool(self.cure)}{self.cure}"
+
+
+def worst(checks):
+    """The worst state of some checks; "pass" without any."""
+    return max((check.state for check in checks), key=STATES.index, default="pass")
+
+
+def in_lines(checks, *, width=110):
+    """A line for what passes, and one for each check that does not, the worst first.
+
+    Parameters
+    ----------
+    checks : iterable of Check
+    width : int
+        Characters of a line.
+
+    Returns
+    -------
+    list of str
+    """
+    checks = tuple(checks)
+    open_ones = sorted((c for c in checks if c.state != "pass"), key=lambda c: -STATES.index(c.state))
+    passed = [c.name for c in checks if c.state == "pass"]
+    lines = [f"checks  {len(passed)} of {len(checks)} pass" + (f": {', '.join(passed)}" if passed else "")]
+    lines += [str(check) for check in open_ones]
+    return [part for line in lines for part in textwrap.wrap(line, width, subsequent_indent=" " * 8)]

@@ -1,0 +1,1 @@
+"""What a referee would ask of a solution, answered from its residuals."""

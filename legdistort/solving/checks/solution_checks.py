@@ -1,0 +1,327 @@
+"""The checks of a solution: `Solution.checks`.
+
+They ask what a referee would ask. Are the errors right? Do residuals depend on the exposure, the brightness, the place
+on the detector, the time? Is the degree too low or too high? Are absolute positions known, and how much of a frame is
+extrapolated? Was anything left out? Limits follow from the null distribution of each statistic
+(`legdistort.solving.checks.residual_tests`), never from a value that looks large.
+"""
+
+import numpy as np
+from scipy import special, stats
+
+from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
+from ...geometry.star_hull import enclosed_area
+from ...results.check import FALSE_ALARM, Check
+from .residual_tests import Residuals
+
+#: What is less probable than this is beyond doubt: "fail", where it is also large enough to matter.
+CERTAIN = 1e-6
+#: Errors right to this fraction pass, however many observations prove the rest.
+NEGLIGIBLE = 0.05
+#: Usual share of gross errors (Hampel et al. 1986: 1 to 10 % in routine data).
+GROSS_ERRORS = 0.05
+_TOO_MUCH = 0.5  # of a frame without stars around
+_SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
+
+
+def check_solution(solution, *, problem, state, blocks, uncertainty, header_distortion=None):
+    """All checks of a solution.
+
+    Parameters
+    ----------
+    solution : Solution
+    problem : `legdistort.solving.equations.problem.Problem`
+        With the weights that were in force.
+    state : State
+    blocks : Blocks
+    uncertainty : Uncertainty
+    header_distortion : str, optional
+        Distortion of the headers that was not used, in words.
+
+    Returns
+    -------
+    tuple of Check
+    """
+    residuals = Residuals(problem, state, blocks, uncertainty.system, solution.dof)
+    made = [
+        errors_check(solution, residuals),
+        exposures_check(solution, residuals),
+        brightness_check(solution, residuals),
+        place_check(residuals),
+        time_check(solution, residuals),
+        degree_check(solution, residuals, uncertainty),
+        dynamic_check(solution, blocks),
+        absolute_check(solution),
+        extrapolation_check(residuals),
+        rejection_check(solution),
+        completeness_check(solution),
+        duplicates_check(solution, residuals),
+        header_check(header_distortion),
+    ]
+    return tuple(check for check in made if check is not None)
+
+
+def _state(p, matters=True):
+    return "pass" if p > FALSE_ALARM else "fail" if p < CERTAIN and matters else "warn"
+
+
+def _star_error(residuals):
+    """Typical error of a star's position, pixels."""
+    v = residuals.blocks.v[:2]
+    return float(np.median(1 / np.sqrt(v[v > 0]))) if np.any(v > 0) else np.nan
+
+
+def _stated(solution, residuals):
+    """Chi2 at the stated errors, without floor or scale."""
+    table = solution.observations
+    rows = np.asarray(table["used"])
+    x, y, a, b = (table[name][rows].value for name in ("dx", "dy", "x_err", "y_err"))
+    c = np.asarray(table["xy_corr"])[rows] if "xy_corr" in table.colnames else np.zeros(len(x))
+    square = ((x / a) ** 2 + (y / b) ** 2 - 2 * c * x * y / (a * b)) / (1 - c**2)
+    return float(square.sum()) if solution.diagnostics.error_floor else residuals.chi2
+
+
+def errors_check(solution, residuals):
+    """Do residuals scatter as the stated errors say?"""
+    dof = solution.dof
+    if dof < 1:
+        return Check("chi2", "unknown", None, None, "no degrees of freedom are left to judge the errors by",
+                     "lower the degree, or add stars or exposures")  # fmt: skip
+    ratio = _stated(solution, residuals) / dof
+    low, high = (stats.chi2.isf(p, dof) / dof for p in (1 - FALSE_ALARM / 2, FALSE_ALARM / 2))
+    low, high = min(low, (1 - NEGLIGIBLE) ** 2), max(high, (1 + NEGLIGIBLE) ** 2)
+    floor, scale = solution.diagnostics.error_floor, solution.diagnostics.error_scale
+    found = f"chi2/dof {ratio:.3g} at the stated errors, {low:.2f} to {high:.2f} by chance"
+    if floor:
+        found += f"; a floor of {floor:.3g} px was added to them"
+    elif scale != 1:
+        found += f"; they were scaled by {scale:.3g}"
+    if ratio > high:
+        state = "fail" if special.chdtrc(dof, ratio * dof) < CERTAIN and ratio > 2 else "warn"
+        cure = "stated errors are too small, or stars move, or the distortion is more complex"
+        cure += "" if floor or scale != 1 else ": see the other checks, or --errors floor"
+        return Check("chi2", state, ratio, high, found, cure)
+    if ratio < low:
+        return Check("chi2", "warn", ratio, low, found, "stated errors are too large: --errors scale takes the scatter")
+    return Check("chi2", "pass", ratio, high, found)
+
+
+def exposures_check(solution, residuals):
+    """Does an exposure scatter more than the others?"""
+    names = residuals.problem.names
+    scores = residuals.of_groups(residuals.exposure)
+    worst = int(np.argmin([s.p for s in scores]))
+    s, name = scores[worst], names[worst]
+    typical = np.median([t.t / max(t.nu, 1e-9) for t in scores])
+    ratio = np.sqrt(s.t / max(s.nu, 1e-9) / typical) if typical > 0 else 1.0
+    state = _state(s.p, ratio > 2)
+    if state == "pass":
+        return Check("exposures", "pass", ratio, None, f"residuals of all {len(names)} exposures are alike")
+    return Check("exposures", state, ratio, None, f"residuals of {name} are {ratio:.3g} times those of the others",
+                 "look at the frame (seeing, guiding, clouds), or leave it out")  # fmt: skip
+
+
+def brightness_check(solution, residuals):
+    """Are the errors of bright and of faint stars right alike?"""
+    table = solution.observations
+    if "flux" in table.colnames:
+        key, what = -np.asarray(table["flux"], dtype=float), "brightest"
+    else:
+        key, what = np.hypot(table["x_err"].value, table["y_err"].value), "most precise"
+    key = key[residuals.problem.order]
+    good = residuals.used & np.isfinite(key)
+    if np.ptp(key[good]) == 0 or residuals.dof < 30:
+        return None
+    edges = np.quantile(key[good], [1 / 3, 2 / 3])
+    labels = np.where(good, np.searchsorted(edges, key), -1)
+    scores = residuals.of_groups(labels)
+    worst = int(np.argmin([s.p for s in scores]))
+    s = scores[worst]
+    ratios = [np.sqrt(s.t / max(s.nu, 1e-9)) for s in scores]
+    state = _state(s.p, s.rms > _star_error(residuals))
+    which = f"{('the ' + what, 'the middle', 'the other')[worst]} third of the observations"
+    if state == "pass":
+        return Check("brightness", "pass", ratios[worst], None, "errors of bright and faint stars are right alike")
+    return Check("brightness", state, ratios[worst], None,
+                 f"{which} scatters by {ratios[worst]:.3g} times its errors, all of them by "
+                 f"{np.sqrt(residuals.chi2 / residuals.dof):.3g}",
+                 "bright stars: --errors floor; faint ones: errors of the measurement are too small")  # fmt: skip
+
+
+def place_check(residuals):
+    """Is there a pattern on the detector that all exposures have in common?"""
+    problem = residuals.problem
+    n = problem.degree + 2
+    groups = np.broadcast_to(problem.group, problem.n_exposures)[residuals.exposure]
+    size = np.array(problem.shapes)[residuals.exposure][:, ::-1].T
+    x, y = np.clip(((problem.xy + 0.5) / size * n).astype(int), 0, n - 1)
+    score = residuals.of_cells((groups * n + y) * n + x)
+    error = _star_error(residuals)
+    state = _state(score.p, score.rms > error)
+    if state == "pass":
+        return Check("place", "pass", score.rms, None, f"no pattern in {n} x {n} cells of the detector")
+    return Check("place", state, score.rms, error,
+                 f"residuals have a pattern of {score.rms:.2g} px rms in {n} x {n} cells of the detector "
+                 f"(typical error of a star {error:.2g} px)",
+                 "raise --degree, or give a prior of the static distortion")  # fmt: skip
+
+
+def time_check(solution, residuals):
+    """Do stars move through the set?"""
+    score = residuals.of_motion(np.arange(residuals.problem.n_exposures))
+    error = _star_error(residuals)
+    state = _state(score.p, score.rms > error)
+    if state == "pass":
+        return Check("time", "pass", score.rms, None, "stars stay where they are, in the order of the exposures")
+    return Check("time", state, score.rms, error,
+                 f"stars move in the order of the exposures, by {score.rms:.2g} px rms (typical error of a star "
+                 f"{error:.2g} px)", "solve the epochs apart, and compare their positions")  # fmt: skip
+
+
+def degree_check(solution, residuals, uncertainty):
+    """Is the degree too low or too high?"""
+    score, more = residuals.next_degree
+    error = _star_error(residuals)
+    state = _state(score.p, score.rms > error)
+    if state != "pass":
+        return Check("degree", state, score.rms, error,
+                     f"degree {more} would explain {score.rms:.2g} px rms more (typical error of a star "
+                     f"{error:.2g} px)",
+                     f"--degree {more}, or --degree auto")  # fmt: skip
+    p = _significance(solution, residuals.blocks, top_only=True)
+    if solution.degree > 1 and p > 0.05 and not solution.diagnostics.prior_has_widths:
+        return Check("degree", "warn", score.rms, error,
+                     f"no exposure has modes of degree {solution.degree} beyond noise",
+                     f"--degree {solution.degree - 1} says the same with smaller errors")  # fmt: skip
+    return Check("degree", "pass", score.rms, error, f"degree {more} would explain nothing more")
+
+
+def _significance(solution, blocks, *, top_only=False):
+    """Probability by chance of the largest distortion of an exposure, shift, rotation and scale taken off."""
+    n, size = len(solution.names), blocks.u.shape[1] // 2
+    best, scale = 1.0, max(1.0, solution.chi2 / max(solution.dof, 1)) * n / max(n - 1, 1)
+    for i, name in enumerate(solution.names):
+        rows = dynamic_basis(solution.shapes[name], size)
+        if top_only:
+            rows = rows[dynamic_degrees(size) == solution.degree]
+        if not len(rows):
+            continue
+        a = rows @ (solution.coefficients[i] - solution.prior_mean[i])[:, :size].ravel()
+        t = a @ np.linalg.solve(rows @ np.linalg.inv(blocks.u[i]) @ rows.T, a) / scale
+        best = min(best, n * special.chdtrc(len(rows), t))
+    return best
+
+
+def dynamic_check(solution, blocks):
+    """Is any exposure distorted beyond noise?"""
+    if solution.degree < 1 or solution.settings.static == "fit":
+        return None
+    p = _significance(solution, blocks)
+    static = "the static distortion" if np.any(solution.prior_mean) else "shift, rotation and scale"
+    if p < FALSE_ALARM:
+        return Check("dynamic part", "pass", p, FALSE_ALARM, f"exposures depart from {static} beyond noise")
+    return Check("dynamic part", "warn", p, FALSE_ALARM,
+                 f"none of {len(solution.names)} exposures departs from {static} beyond noise",
+                 "a lower --degree says the same with smaller errors")  # fmt: skip
+
+
+def absolute_check(solution):
+    """Are absolute positions known?"""
+    if solution.gauge.plane is not None:
+        return None
+    unknown, warning = solution.gauge.unknown_names, solution.gauge.warning
+    if unknown:
+        sentence, _, cure = warning.partition("; ")
+        return Check("absolute", "unknown", len(unknown), 0, sentence, cure)
+    stars = solution.stars
+    error = float(np.sqrt(np.nanmean(stars["x_err_abs"].value ** 2 + stars["y_err_abs"].value ** 2) / 2))
+    return Check("absolute", "pass", error, None, f"absolute positions are known to {error:.2g} px rms per axis")
+
+
+def extrapolation_check(residuals):
+    """How much of a frame lies outside its stars?"""
+    problem = residuals.problem
+    shares, numbers = np.ones(problem.n_exposures), np.zeros(problem.n_exposures)
+    for i, (ny, nx) in enumerate(problem.shapes):
+        xy = problem.xy[:, problem.part(i)][:, residuals.used[problem.part(i)]].T
+        shares[i], numbers[i] = 1 - enclosed_area(xy) / (nx * ny), len(xy)
+    worst = int(np.argmax(shares))
+    share, name, n = shares[worst], problem.names[worst], max(numbers[worst], 3)
+    # Of n points spread evenly 8/3 ln n / n lies outside the hull in the mean (Renyi & Sulanke 1963); the scatter is
+    # that of simulated points. Dithers take more: half of a frame is too much in any case.
+    limit = max(_TOO_MUCH, min(0.95, 8 / 3 * np.log(n) / n + 5 / n**0.85))
+    words = f"up to {share:.0%} of a frame lies outside its stars, where distortions are extrapolated ({name})"
+    if share > limit:
+        return Check("extrapolation", "warn", share, limit, words,
+                     "fainter stars there (--threshold), or trust the correction only within the stars")  # fmt: skip
+    return Check("extrapolation", "pass", share, limit, words)
+
+
+def rejection_check(solution):
+    """Was much left out?"""
+    used = np.asarray(solution.observations["used"])
+    n, out = len(used), int(np.count_nonzero(~used))
+    share, p = out / n, stats.binom.sf(out - 1, n, GROSS_ERRORS) if out else 1.0
+    lost = solution.left_out
+    words = f"{out} of {n} observations ({share:.1%}) were left out"
+    if lost:
+        words += f", and {len(lost)} exposures: " + "; ".join(f"{k} ({v})" for k, v in list(lost.items())[:3])
+    if p < FALSE_ALARM:
+        return Check("rejection", "fail" if share > 0.3 else "warn", share, GROSS_ERRORS, words,
+                     "mismatches or blends: look at the exposures with most of them, or match with a smaller radius"
+                     )  # fmt: skip
+    if lost:
+        return Check("rejection", "warn", share, GROSS_ERRORS, words, "look at these frames")
+    return Check("rejection", "pass", share, GROSS_ERRORS, words)
+
+
+def completeness_check(solution):
+    """Does every exposure have the stars that lie on it?"""
+    table, names = solution.observations, solution.names
+    found, expected = np.zeros(len(names)), np.zeros(len(names))
+    index = {name: i for i, name in enumerate(names)}
+    number = np.array([index.get(name, -1) for name in table["exposure"]])
+    have = np.bincount(number[number >= 0], minlength=len(names))
+    common = solution.positions[np.isfinite(solution.positions[:, 0])]
+    for i, name in enumerate(names):
+        ny, nx = solution.shapes[name]
+        pose = solution.poses[name]
+        q = common @ pose[:, :2].T + pose[:, 2]
+        margin = 0.02 * max(nx, ny)
+        inside = (q > margin).all(axis=1) & (q < np.array([nx, ny]) - margin).all(axis=1)
+        expected[i], found[i] = np.count_nonzero(inside), have[i]
+    share = np.minimum(found / np.maximum(expected, 1), 1)
+    usual = np.median(share)
+    p = stats.binom.cdf(np.minimum(found, expected), expected, usual) * len(names)
+    i = int(np.argmin(np.where(share < usual / 2, p, 1)))
+    words = f"exposures have {share.min():.0%} to {share.max():.0%} of the stars that lie on them"
+    if share[i] < usual / 2 and p[i] < FALSE_ALARM:
+        words = f"{names[i]} has {found[i]:.0f} of the {expected[i]:.0f} stars that lie on it, others {usual:.0%}"
+        return Check("completeness", "warn", share[i], usual / 2, words, "look at the frame (trailed, clouds, focus)")
+    return Check("completeness", "pass", share.min(), usual / 2, words)
+
+
+def duplicates_check(solution, residuals):
+    """Do two exposures have the same noise?"""
+    if len(solution.names) < 2 or len(solution.names) > 2000:
+        return None
+    correlation, number = residuals.correlations()
+    free = np.maximum(2 * number * residuals.freedom.sum() / (2 * np.count_nonzero(residuals.used)) - 3, 0)
+    z = (np.arctanh(np.clip(correlation, -0.999999, 0.999999)) - np.arctanh(_SAME)) * np.sqrt(free)
+    i, j = np.triu_indices(len(solution.names), 1)
+    worst = int(np.argmax(z[i, j]))
+    i, j, pairs = i[worst], j[worst], len(i)
+    value = correlation[i, j]
+    if pairs * stats.norm.sf(z[i, j]) < FALSE_ALARM:
+        return Check("duplicates", "fail", value, _SAME,
+                     f"residuals of {solution.names[i]} and {solution.names[j]} are the same (correlation {value:.2f})",
+                     "leave one of them out")  # fmt: skip
+    return Check("duplicates", "pass", value, _SAME, "no two exposures have the same noise")
+
+
+def header_check(header_distortion):
+    """Do headers know a distortion that was not used?"""
+    if not header_distortion:
+        return Check("header distortion", "pass", None, None, "no distortion of the headers was left unused")
+    return Check("header distortion", "warn", None, None, f"the headers have a distortion that was not used: "
+                 f"{header_distortion}", "--prior header takes it as the static distortion")  # fmt: skip

@@ -1,0 +1,151 @@
+"""How often checks warn of sets in which nothing is wrong, and how surely they see what is.
+
+``python tests/benchmarks/checks_table.py alarms --sets 1000`` and ``... power --sets 200``. Distortions are Chebyshev
+polynomials (`calibration_table.simulated`), none of them made by the package.
+"""
+
+import argparse
+import logging
+import warnings
+from collections import Counter
+
+import numpy as np
+from astropy import units as u
+from astropy.table import vstack
+from calibration_table import simulated
+from scipy.stats import beta
+
+import legdistort as ld
+from legdistort.exceptions import LegdistortWarning
+
+SIGMA = 0.02
+
+
+def limits(count, n):
+    """Upper 95 % limit of a share of which `count` of n were seen (Clopper & Pearson 1934)."""
+    return 1.0 if count == n else beta.ppf(0.95, count + 1, n - count)
+
+
+def solved(matches, prior=None, **options):
+    """The solution; messages on what is not known are not what is looked at."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LegdistortWarning)
+        return ld.solve(matches, degree=3, prior=prior, **options)
+
+
+def clean(seed):
+    """A set in which nothing is wrong: 4 to 40 exposures, 20 to 1000 stars on a frame, with and without dithers."""
+    rng = np.random.default_rng(seed)
+    n_exposures = int(np.exp(rng.uniform(np.log(4), np.log(40.99))))
+    n_stars = int(np.exp(rng.uniform(np.log(20), np.log(1000))))
+    matches, _, static = simulated(
+        seed, n_exposures=n_exposures, n_stars=n_stars, dither=rng.choice([0.0, 50.0, 150.0]), sigma=SIGMA
+    )
+    return matches, static
+
+
+def legendre(static):
+    """A Chebyshev series (2, 4, 4) as the mean of a `Prior`, by a fit at points of the detector."""
+    from legdistort.geometry import basis
+
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-1, 1, 9)] * 2))
+    values = np.stack([np.polynomial.chebyshev.chebval2d(x, y, each) for each in static])
+    return np.linalg.lstsq(basis.values(3, x, y).T, values.T, rcond=None)[0].T
+
+
+def alarms(n_sets):
+    """Print how often each check warns."""
+    for label, with_prior in (("no prior", False), ("exact prior", True)):
+        seen = Counter()
+        for seed in range(n_sets // 2):
+            matches, static = clean(seed)
+            solution = solved(matches, ld.Prior(legendre(static)) if with_prior else None)
+            bad = [check for check in solution.checks if check.state in ("warn", "fail")]
+            seen.update(check.name for check in bad)
+            seen["any"] += bool(bad)
+            names = [check.name for check in solution.checks]
+        n = n_sets // 2
+        print(f"{label}: {n} sets")
+        for name in [*names, "any"]:
+            print(f"  {name:18s} {seen[name]:4d}  upper 95 % limit {100 * limits(seen[name], n):.2f} %", flush=True)
+
+
+def _moved(table, rows, shift):
+    table["x"][rows] += shift[:, 0] * u.pix
+    table["y"][rows] += shift[:, 1] * u.pix
+
+
+def spoiled(kind, seed, *, n_exposures=11, n_stars=70):
+    """A set with one fault; the matches, and further arguments of `solve`."""
+    rng = np.random.default_rng(10_000 + seed)
+    matches = simulated(seed, n_exposures=n_exposures, n_stars=n_stars, dither=50.0, sigma=SIGMA)[0]
+    table = matches.table.copy()
+    exposure = np.unique(table["exposure"], return_inverse=True)[1]
+    stars, star = np.unique(table["star"], return_inverse=True)
+    if kind == "errors 1.3 x too small":
+        table["x_err"] /= 1.3
+        table["y_err"] /= 1.3
+    elif kind == "half of the stars move":  # by 3 errors of the mean of an epoch, over three epochs
+        v = rng.normal(size=(len(stars), 2))
+        v *= 3 * SIGMA / np.sqrt(n_exposures / 3) / np.hypot(*v.T)[:, None]
+        v[rng.permutation(len(stars))[: len(stars) // 2]] = 0
+        _moved(table, slice(None), v[star] * (exposure * 3 // n_exposures)[:, None])
+    elif kind == "degree too low":  # 3 errors of a star's mean position, of degree 4, drawn for every exposure
+        x, y = (2 * (table[k].value + 0.5) / 2048 - 1 for k in "xy")
+        modes = np.stack(
+            [np.polynomial.chebyshev.chebval2d(x, y, np.eye(5)[:, [i]] * np.eye(5)[4 - i]) for i in range(5)]
+        )
+        c = rng.normal(size=(2, n_exposures, 5))
+        shift = np.einsum("ane,en->na", c[:, exposure], modes)
+        _moved(table, slice(None), 3 * SIGMA * shift / np.sqrt(np.mean(shift**2)))
+    elif kind == "a duplicate, measured again":
+        again = table[exposure == 3].copy()
+        again["exposure"] = "e99"
+        _moved(again, slice(None), rng.normal(0, 0.3 * SIGMA, (len(again), 2)))
+        table = vstack([table, again])
+    elif kind == "20 % mismatches":
+        wrong = np.flatnonzero(rng.random(len(table)) < 0.2)
+        _moved(table, wrong, rng.uniform(-20, 20, (len(wrong), 2)))
+    elif kind == "an exposure twice as noisy":
+        rows = np.flatnonzero(exposure == 5)
+        _moved(table, rows, rng.normal(0, np.sqrt(3) * SIGMA, (len(rows), 2)))
+    elif kind == "an exposure with a third of its stars":
+        rows = rng.permutation(np.flatnonzero(exposure == 5))
+        table.remove_rows(rows[len(rows) // 3 :])
+    poses = dict(matches.poses) | {"e99": matches.poses["e03"]}
+    poses = {name: poses[name] for name in np.unique(table["exposure"])}
+    return ld.Matches.from_table(table, shape=matches.shapes[matches.names[0]], poses=poses)
+
+
+#: What is wrong, and the check that should say so.
+FAULTS = {
+    "errors 1.3 x too small": "chi2",
+    "half of the stars move": "time",
+    "degree too low": "degree",
+    "a duplicate, measured again": "duplicates",
+    "20 % mismatches": "rejection",
+    "an exposure twice as noisy": "exposures",
+    "an exposure with a third of its stars": "completeness",
+}
+
+
+def power(n_sets):
+    """Print how often each fault is seen, and by the check that should."""
+    for kind, expected in FAULTS.items():
+        seen = Counter()
+        for seed in range(n_sets):
+            checks = solved(spoiled(kind, seed), clip=5).checks
+            bad = {check.name for check in checks if check.state in ("warn", "fail")}
+            seen.update(bad)
+            seen["any"] += bool(bad)
+        others = ", ".join(f"{name} {count}" for name, count in seen.most_common() if name not in ("any", expected))
+        print(f"{kind:40s} {seen['any']:4d} of {n_sets}; {expected} {seen[expected]}; {others}", flush=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("alarms", "power"))
+    parser.add_argument("--sets", type=int, default=100)
+    arguments = parser.parse_args()
+    logging.disable(logging.WARNING)
+    (alarms if arguments.what == "alarms" else power)(arguments.sets)

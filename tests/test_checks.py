@@ -1,0 +1,358 @@
+"""The checks of a solution: their statistics against refits, their words, what they see and what they leave alone."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import vstack
+from scipy import ndimage
+
+import legdistort as ld
+from legdistort.assessment.run_checks import check_run, image_check
+from legdistort.assessment.stack_quality import Quality
+from legdistort.cli import main
+from legdistort.reporting.page import render
+from legdistort.results.check import Check, in_lines, worst
+from legdistort.solving.checks.residual_tests import Residuals
+
+SIGMA = 0.14
+
+
+def simulated(seed=0, **options):
+    return ld.simulate_matches(**{"n_exposures": 6, "n_stars": 60, "degree": 2, "sigma": SIGMA, "seed": seed} | options)
+
+
+def solved(matches, **options):
+    return ld.solve(matches, **{"degree": 2, "clip": None} | options)
+
+
+def changed(matches, table):
+    return ld.Matches.from_table(table, shape=(2048, 2048), poses={n: matches.poses[n] for n in matches.names})
+
+
+def residuals(solution):
+    parts = solution.checked.keywords
+    return Residuals(parts["problem"], parts["state"], parts["blocks"], parts["uncertainty"].system, solution.dof)
+
+
+def states(solution):
+    return {check.name: check.state for check in solution.checks}
+
+
+def design(found):
+    """All columns of the linear problem in units of the errors, (2 n, unknowns), with equal errors."""
+    problem, blocks = found.problem, found.blocks
+    n, n_stars, n_modes = problem.xy.shape[1], problem.n_stars, problem.n_modes
+    columns = np.zeros((2, n, 2 * n_stars + problem.n_exposures * 2 * n_modes))
+    for axis in (0, 1):
+        for a in (0, 1):
+            columns[axis, np.arange(n), a * n_stars + problem.star] = blocks.coupling[a, axis] / problem.weight[0]
+        for i in range(problem.n_exposures):
+            first = 2 * n_stars + (2 * i + axis) * n_modes
+            columns[axis, problem.part(i), first : first + n_modes] = blocks.values[:, problem.part(i)].T
+    return columns.reshape(2 * n, -1) / SIGMA
+
+
+def fitted(columns):
+    """Orthonormal columns that span what is fitted, without what only rounding makes independent."""
+    u_, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return u_[:, size > 1e-4 * size[0]]
+
+
+@pytest.mark.parametrize("n_exposures", [4, 8])
+def test_score_of_the_next_degree_is_the_chi2_that_a_refit_gains(n_exposures):
+    matches = simulated(n_exposures=n_exposures, n_stars=80, static=0.01, dynamic=0.01).matches
+    low, high = solved(matches), solved(matches, degree=3)
+    found = residuals(low)
+    score, degree = found.next_degree
+    assert degree == 3
+    assert found.released.shape[2] == 0  # such small distortions have no second order
+    assert score.t == pytest.approx(low.chi2 - high.chi2, rel=0.01)
+    assert score.nu == pytest.approx(low.dof - high.dof, rel=0.01)
+
+
+def test_score_of_motions_has_the_mean_that_dense_algebra_gives():
+    times = np.array([0.0, 0.1, 1.0, 1.1, 2.5])
+    found = residuals(solved(simulated(n_exposures=5, n_stars=40).matches))
+    score = found.of_motion(times)
+    problem, t = found.problem, times[found.exposure]
+    off = t - np.bincount(problem.star, t)[problem.star] / np.bincount(problem.star)[problem.star]
+    n = len(t)
+    moved = np.zeros((2, n, 2, problem.n_stars))
+    for axis in (0, 1):
+        moved[axis, np.arange(n), axis, problem.star] = off
+    p = fitted(moved.reshape(2 * n, -1))
+    assert score.t == pytest.approx(np.sum((p.T @ found.residual.ravel() / SIGMA) ** 2), rel=1e-6)
+    free = p - (q := fitted(design(found))) @ (q.T @ p)
+    assert score.nu == pytest.approx(np.sum(free**2), rel=0.03)
+
+
+def test_score_of_cells_is_the_chi2_that_a_dense_fit_gains():
+    found = residuals(solved(simulated(n_exposures=6, n_stars=50, dither=500.0).matches))
+    n = found.problem.xy.shape[1]
+    cells = (found.problem.xy[0] > 1024).astype(int) + 2 * (found.problem.xy[1] > 700)
+    score = found.of_cells(cells)
+    moved = np.zeros((2, n, 2, 4))
+    for axis in (0, 1):
+        moved[axis, np.arange(n), axis, cells] = 1
+    known = np.concatenate([design(found), found.released.reshape(2 * n, -1)], axis=1)
+    e = found.residual.ravel() / SIGMA
+
+    def left(columns):
+        return np.sum((e - (q := fitted(columns)) @ (q.T @ e)) ** 2)
+
+    assert score.nu == 6  # of 8 displacements one in each axis is a shift of all exposures
+    gained = left(known) - left(np.concatenate([known, moved.reshape(2 * n, -1) / SIGMA], axis=1))
+    assert score.t == pytest.approx(gained, rel=0.05)
+
+
+def test_statistics_have_the_mean_they_state():
+    found = [residuals(solved(simulated(seed, n_exposures=4, n_stars=30).matches)) for seed in range(25)]
+    for get in (
+        lambda r: r.next_degree[0],
+        lambda r: r.of_motion(np.arange(4)),
+        lambda r: r.of_rows(r.exposure == 1),
+        lambda r: r.of_rows(r.problem.xy[0] > 1500),
+    ):
+        scores = [get(r) for r in found]
+        pull = np.array([(s.t - s.nu) / np.sqrt(2 * s.nu) for s in scores])
+        assert abs(pull.mean()) < 0.6
+        assert pull.std() < 1.5
+
+
+def test_freedom_of_observations_sums_to_that_of_chi2():
+    solution = solved(simulated(dither=300.0).matches)
+    found = residuals(solution)
+    assert found.freedom.sum() == pytest.approx(solution.dof - found.released.shape[2])
+
+
+def test_second_order_of_the_gauge_is_no_fault_of_the_degree():
+    # Many precise positions show where a common map is held at a value that is not the true one.
+    matches = ld.simulate_matches(n_exposures=20, n_stars=400, sigma=0.02, degree=3, static=1.5, seed=5).matches
+    solution = ld.solve(matches, degree=3, clip=None)
+    found = residuals(solution)
+    assert found.chi2 < solution.chi2 - 30
+    assert states(solution)["degree"] == "pass"
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_clean_sets_pass(seed):
+    n_exposures, n_stars = (4, 30) if seed % 2 else (12, 80)
+    solution = solved(simulated(seed, n_exposures=n_exposures, n_stars=n_stars).matches)
+    assert worst(solution.checks) in ("pass", "unknown")
+    assert [c.name for c in solution.checks if c.state == "unknown"] == ["absolute"]
+
+
+def spoiled(kind):
+    matches = simulated(3, n_exposures=9).matches
+    table, rng = matches.table.copy(), np.random.default_rng(1)
+    exposure = np.unique(table["exposure"], return_inverse=True)[1]
+    if kind == "chi2":
+        table["x_err"] /= 1.3
+        table["y_err"] /= 1.3
+    elif kind == "chi2, too large":
+        table["x_err"] *= 1.3
+        table["y_err"] *= 1.3
+    elif kind == "time":
+        v = rng.normal(0, 0.3 * SIGMA, (60, 2))[table["star"]] * exposure[:, None]
+        table["x"] += v[:, 0] * u.pix
+        table["y"] += v[:, 1] * u.pix
+    elif kind == "degree":
+        x = 2 * table["x"].value / 2048 - 1
+        table["y"] += SIGMA * rng.choice([-1, 1], 9)[exposure] * (5 * x**3 - 3 * x) * u.pix
+    elif kind == "place":
+        table["x"] += 3 * SIGMA * np.sign(table["x"].value - 1024) * np.sign(table["y"].value - 1024) * u.pix
+    elif kind == "duplicates":
+        again = table[exposure == 3].copy()
+        again["exposure"] = "exp99"
+        again["x"] += rng.normal(0, 0.3 * SIGMA, len(again)) * u.pix
+        table = vstack([table, again])
+        poses = matches.poses | {"exp99": matches.poses["exp03"]}
+        return ld.Matches.from_table(table, shape=(2048, 2048), poses=poses)
+    elif kind == "rejection":
+        wrong = rng.random(len(table)) < 0.2
+        table["x"][wrong] += rng.uniform(10, 20, wrong.sum()) * u.pix
+    elif kind == "exposures":
+        table["x"][exposure == 5] += rng.normal(0, 2.5 * SIGMA, np.sum(exposure == 5)) * u.pix
+    elif kind == "completeness":
+        table.remove_rows(np.flatnonzero(exposure == 5)[20:])
+    elif kind == "brightness":
+        table["flux"] = np.geomspace(1, 1000, 60)[table["star"]]
+        bright = table["flux"] > 100
+        table["x"][bright] += rng.normal(0, 1.5 * SIGMA, bright.sum()) * u.pix
+    return changed(matches, table)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("chi2", "errors are too small"),
+        ("chi2, too large", "errors are too large"),
+        ("time", "stars move in the order of the exposures"),
+        ("degree", "--degree 3"),
+        ("duplicates", "residuals of exp03 and exp99 are the same"),
+        ("rejection", "observations .* were left out"),
+        ("exposures", "residuals of exp05 are"),
+        ("completeness", "exp05 has 20 of the"),
+        ("brightness", "the brightest third"),
+    ],
+)
+def test_what_is_wrong_is_seen_and_said(kind, words):
+    solution = solved(spoiled(kind), clip=5 if kind == "rejection" else None)
+    name = kind.partition(",")[0]
+    check = next(c for c in solution.checks if c.name == name)
+    assert check.state in ("warn", "fail")
+    assert check.cure
+    assert re.search(words, str(check))
+    assert any(name in line for line in str(solution).splitlines()[1:8])
+
+
+def test_a_pattern_on_the_detector_is_seen_where_exposures_are_dithered():
+    matches = simulated(2, n_exposures=10, n_stars=120, dither=600.0).matches
+    table = matches.table.copy()
+    table["x"] += 2 * SIGMA * np.sign(table["x"].value - 1024) * np.sign(table["y"].value - 1024) * u.pix
+    assert states(solved(changed(matches, table)))["place"] != "pass"
+    assert states(solved(matches))["place"] == "pass"
+
+
+def test_frames_with_stars_in_one_corner_are_called_extrapolated():
+    matches = simulated(3, n_exposures=6, n_stars=300).matches
+    table = matches.table[(matches.table["x"].value < 900) & (matches.table["y"].value < 900)]
+    solution = solved(ld.Matches.from_table(table, shape=(2048, 2048), poses=matches.poses), degree=1)
+    check = next(c for c in solution.checks if c.name == "extrapolation")
+    assert check.state == "warn"
+    assert check.value > 0.8
+
+
+def test_a_degree_too_high_is_said():
+    matches = simulated(4, n_exposures=8, n_stars=80, degree=1).matches
+    check = next(c for c in solved(matches, degree=3).checks if c.name == "degree")
+    assert check.state == "warn"
+    assert "--degree 2 says the same" in check.cure
+
+
+def test_exposures_that_are_not_distorted_are_said_to_be_so():
+    matches = simulated(4, n_exposures=8, n_stars=80, static=0.0, dynamic=0.0).matches
+    assert states(solved(matches))["dynamic part"] == "warn"
+
+
+def test_a_floor_does_not_hide_that_stated_errors_are_too_small():
+    table = simulated(5).matches.table.copy()
+    table["x_err"] /= 2
+    table["y_err"] /= 2
+    matches = changed(simulated(5).matches, table)
+    for errors, word in (("floor", "a floor of"), ("scale", "scaled by")):
+        check = solved(matches, errors=errors).checks[0]
+        assert check.state == "fail"
+        assert check.value == pytest.approx(4, rel=0.3)
+        assert word in check.sentence
+
+
+def test_a_distortion_of_the_headers_that_is_not_used_is_a_warning():
+    matches = replace(simulated(1).matches, header_distortion="SIP of up to 1.2 px")
+    with pytest.warns(ld.exceptions.AssumptionWarning):
+        solution = solved(matches)
+    check = next(c for c in solution.checks if c.name == "header distortion")
+    assert check.state == "warn"
+    assert "1.2 px" in check.sentence
+    known = solved(matches, prior=ld.Prior(np.full((2, 6), 0.1), static_sigma=1.0))
+    assert states(known)["header distortion"] == "pass"
+
+
+def test_checks_are_kept_in_files_and_summaries(tmp_path):
+    solution = solved(spoiled("chi2"))
+    solution.write(tmp_path / "s.asdf")
+    again = ld.Solution.read(tmp_path / "s.asdf")
+    assert again.checks == solution.checks
+    assert str(again) == str(solution)
+
+
+def test_strict_ends_with_status_3(tmp_path, capsys):
+    solution = solved(changed(simulated(5).matches, _too_precise(simulated(5).matches.table)))
+    solution.write(tmp_path / "s.asdf")
+    assert main(["show", str(tmp_path / "s.asdf")]) == 0
+    assert main(["show", str(tmp_path / "s.asdf"), "--strict"]) == 3
+    assert main(["show", str(tmp_path / "s.asdf"), "--strict", "--json"]) == 3
+    captured = capsys.readouterr()
+    assert "fail" in captured.err
+    shown = json.loads(captured.out[captured.out.rindex("\n{\n") :])
+    assert shown["checks"][0]["state"] == "fail"
+
+
+def _too_precise(table):
+    table = table.copy()
+    table["x_err"] /= 3
+    table["y_err"] /= 3
+    return table
+
+
+def test_report_leads_with_the_verdict():
+    page = render(solved(spoiled("chi2")))
+    assert page.index("Something should be looked at") < page.index("Degrees of freedom".lower())
+    assert "What to do:" in page
+
+
+def test_lines_have_the_worst_first():
+    checks = [
+        Check("a", "pass", 1, None, "fine"),
+        Check("b", "warn", 1.5, 1, "odd", "look"),
+        Check("c", "fail", float("nan"), 1, "wrong", "stop"),
+    ]
+    assert worst(checks) == "fail"
+    assert checks[2].value is None
+    assert in_lines(checks) == ["checks  1 of 3 pass: a", "fail    c: wrong; stop", "warn    b: odd; look"]
+    assert worst([]) == "pass"
+
+
+def quality(exposures, *, ratio=1.0):
+    return Quality(20, 4.5, 0.05, 0.03, 0.01, ratio, 1.0, exposures=exposures)
+
+
+def test_a_run_is_asked_for_odd_frames_and_a_blurred_stack():
+    solution = solved(simulated().matches)
+    rng = np.random.default_rng(2)
+    alike = {f"exp{i:02d}": (4.5 + 0.1 * rng.normal(), 0.05 + 0.01 * rng.normal()) for i in range(8)}
+    good = {c.name: c.state for c in check_run(solution, quality(alike))}
+    assert good == {"images": "pass", "sharpness": "pass", "inverse": "pass"}
+    trailed, blurred = alike | {"exp03": (4.9, 0.27)}, alike | {"exp05": (7.0, 0.05)}
+    images = check_run(solution, quality(trailed, ratio=1.2))
+    assert [c.state for c in images] == ["warn", "warn", "pass"]
+    assert "exp03 are more elongated" in images[0].sentence
+    assert "1.2" in images[1].sentence
+    assert "exp05 are more wide" in image_check(quality(blurred)).sentence
+    assert image_check(None).state == "unknown"
+
+
+def test_frames_that_differ_by_chance_are_alike():
+    rng = np.random.default_rng(3)
+    for n in (4, 11, 40):
+        states_ = [
+            image_check(
+                quality({str(i): (4.5 * np.exp(0.05 * rng.normal()), 0.1 + 0.02 * rng.normal()) for i in range(n)})
+            )
+            for _ in range(60)
+        ]
+        assert sum(c.state != "pass" for c in states_) <= 1
+
+
+@pytest.mark.slow
+def test_a_trailed_frame_is_seen_in_a_run(tmp_path):
+    night = ld.simulate_exposures(small=True, seed=2)
+    paths = night.write(tmp_path / "night")
+    with fits.open(paths[2]) as hdulist:
+        pixels, header = hdulist[0].data.astype(float), hdulist[0].header
+        steps = np.linspace(-2.25, 2.25, 9)  # one FWHM along x
+        trailed = np.mean([ndimage.shift(pixels, (0, step), order=1, mode="nearest") for step in steps], axis=0)
+        trailed = np.rint(trailed + np.random.default_rng(0).normal(0, 4, trailed.shape))
+        fits.writeto(paths[2], trailed.astype(np.uint16), header, overwrite=True)
+    result = ld.run(paths, out=tmp_path / "out", degree=3)
+    found = {check.name: check for check in result.checks}
+    assert found["images"].state == "warn"
+    assert "exp02" in found["images"].sentence
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert {check["name"] for check in summary["checks"]} >= {"chi2", "images", "sharpness", "inverse"}
+    assert "exp02 are more elongated" in (tmp_path / "out" / "report.html").read_text()

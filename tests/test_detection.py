@@ -1,0 +1,110 @@
+"""Detection on halos, side lobes, slopes and edges: false stars, and stars that are missed."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from star_images import GAIN, ladder, observe, scattered
+from star_images import image as render
+
+from legdistort.inputs.exposures import Exposure
+from legdistort.measurement.background import smooth_light
+from legdistort.measurement.detection import detect, prepare
+from legdistort.measurement.profiles.frame_fit import locate_stars
+from legdistort.simulation.pupil import PupilPSF
+from legdistort.simulation.rendering import add_noise, as_psf
+from legdistort.simulation.rendering import render as render_psf
+
+
+def found(centres, xy, fwhm):
+    """Which stars were found, and the detections that are none."""
+    apart, _ = cKDTree(centres).query(xy)
+    off, _ = cKDTree(xy).query(centres)
+    return apart < 0.6 * fwhm, centres[off > fwhm]
+
+
+@pytest.mark.parametrize("psf", [{"strehl": 0.1}, {"strehl": 0.3, "halo_fwhm": 12.0}, {"strehl": 0.5, "coma": 0.4}])
+@pytest.mark.parametrize("crowded", [False, True])
+def test_halos_and_rings_are_no_stars(psf, crowded):
+    rng, shape = np.random.default_rng(3), (512, 512)
+    psf = as_psf(PupilPSF(resolution=3.5, **psf), shape)
+    xy = rng.uniform(5, 506, (214, 2)) if crowded else scattered(rng, 49, 512)  # one star a (10 FWHM)^2
+    flux = 10 ** rng.uniform(3.5, 6.5, len(xy))
+    image = add_noise(render_psf(shape, xy, flux, psf=psf, sky=100.0), rng, gain=GAIN, read_noise=10.0)
+    for gain in (GAIN, None):
+        _, centres, _ = locate_stars(Exposure("halos", image, gain=gain), threshold=5.0)
+        stars, false = found(centres, xy, 4.0)
+        assert len(false) <= 1 + 0.01 * len(xy)
+        assert stars[flux > 1e5].mean() > (0.9 if crowded else 0.99)
+
+
+def ringed(dx, dy, fwhm):
+    """A core with a ring at 1.7 FWHM that is brighter on one side, as obstruction and coma make it; not normalised."""
+    r, angle = np.hypot(dx, dy) / fwhm, np.arctan2(dy, dx)
+    return np.exp(-2.77 * r**2) + 0.08 * (1 + np.cos(angle)) * np.exp(-0.5 * ((r - 1.7) / 0.25) ** 2)
+
+
+@pytest.mark.parametrize("companions", [0, 10])
+def test_side_lobes_of_bright_stars_are_no_stars(companions):
+    """The companions put beside some of the stars, twice as bright as the ring, are found."""
+    rng, fwhm, size = np.random.default_rng(5), 3.5, 480
+    xy, peak = scattered(rng, 49, size), 10 ** rng.uniform(2.5, 4.5, 49)
+    if companions:
+        turn = rng.uniform(0, 2 * np.pi, companions)
+        beside = xy[:companions] + 1.9 * fwhm * np.column_stack([np.cos(turn), np.sin(turn)])
+        xy, peak = np.concatenate([xy, beside]), np.concatenate([peak, 0.35 * peak[:companions]])
+    y, x = np.mgrid[:size, :size]
+    light = 100.0 + sum(f * ringed(x - a, y - b, fwhm) for (a, b), f in zip(xy, peak, strict=True))
+    centres, _ = detect(prepare(Exposure("rings", observe(light, rng), gain=GAIN)), fwhm, 5.0)
+    stars, false = found(centres, xy, fwhm)
+    assert len(false) == 0
+    assert stars[:49].all()
+    assert np.count_nonzero(stars[49:]) >= 0.8 * companions
+
+
+def test_crowded_stars_of_a_grid_are_not_taken_for_rings():
+    """Neighbours at the same distance from every star."""
+    rng, fwhm = np.random.default_rng(6), 3.5
+    _, flux, _ = ladder(400, fwhm, 9, 500)
+    xy = scattered(rng, 400, 500)
+    frame = prepare(Exposure("grid", observe(render((500, 500), xy, rng.permutation(flux), fwhm), rng), gain=GAIN))
+    stars, false = found(detect(frame, fwhm, 5.0)[0], xy, fwhm)
+    assert len(false) <= 1
+    assert stars.mean() > 0.97
+
+
+def test_smooth_light_is_exact_on_a_slope_beside_edges_and_gaps():
+    y, x = np.mgrid[:90, :70]
+    slope, good = (3.0 * x - 2.0 * y + 7).astype(np.float64), np.ones((90, 70), dtype=bool)
+    good[30:34], good[:, 50:] = False, False
+    for seen in (np.ones_like(good), good):
+        light, extrapolated, step = smooth_light(np.where(seen, slope, 1e6), seen, 4.0)
+        near = np.s_[4:-4, 4:48]  # binned pixels of gaps and ends count half
+        np.testing.assert_allclose(light[near], slope[near], atol=0.8)
+    assert extrapolated[30 // step, 10] > 1
+    assert extrapolated[60 // step, 10] < 1e-3
+
+
+def test_variance_is_that_of_the_sky_in_a_crowded_field_with_halos():
+    """The map of `prepare` holds the structure of the halos."""
+    rng, size = np.random.default_rng(7), 512
+    xy, flux = rng.uniform(0, size, (160, 2)), 10 ** rng.uniform(3, 5.5, 160)
+    light = render((size, size), xy, 0.3 * flux, 3.5) + render((size, size), xy, 0.7 * flux, 25.0, half=60) - 100.0
+    exposure = Exposure("crowd", observe(light, rng), gain=GAIN)
+    frame, _, _ = locate_stars(exposure, threshold=5.0)
+    expected = frame.sky / GAIN + 25.0  # photons of what was taken off, read noise
+    assert np.median(prepare(exposure).variance / expected) > 2
+    assert np.median(frame.variance / expected) == pytest.approx(1, abs=0.12)
+    unknown, _, _ = locate_stars(Exposure("crowd", observe(light, rng)), threshold=5.0)
+    assert np.median(unknown.variance / expected) == pytest.approx(1, abs=0.25)
+
+
+@pytest.mark.parametrize("fwhm", [1.4, 8.0, 14.0])
+def test_narrow_and_wide_stars_are_found_once(fwhm):
+    rng = np.random.default_rng(8)
+    size = 700 if fwhm > 5 else 300
+    xy, (_, flux, _) = scattered(rng, 36, size), ladder(36, fwhm, 20, 500)
+    exposure = Exposure("wide", observe(render((size, size), xy, rng.permutation(flux), fwhm), rng), gain=GAIN)
+    _, centres, _ = locate_stars(exposure, threshold=5.0)
+    stars, false = found(centres, xy, fwhm)
+    assert stars.all()
+    assert len(false) <= 1
