@@ -61,9 +61,15 @@ class AssumptionWarning(LegdistortWarning):
 @contextlib.contextmanager
 def without_astropy_warnings():
     """Ignore the warnings of astropy, of files a little off the standard; ours, a kind of them, stay as they were."""
-    ours = [each[0] for each in warnings.filters if issubclass(LegdistortWarning, each[2]) and not (each[1] or each[3])]
+    before = list(warnings.filters)
     with warnings.catch_warnings(action="ignore", category=AstropyWarning):
-        warnings.simplefilter(next(iter(ours), "default"), LegdistortWarning)
+        warnings.simplefilter("default", LegdistortWarning)
+        for action, message, category, module, line in reversed(before):
+            if issubclass(LegdistortWarning, category):
+                category = LegdistortWarning
+            if issubclass(category, LegdistortWarning):
+                texts = (each.pattern if each else "" for each in (message, module))
+                warnings.filterwarnings(action, next(texts), category, next(texts), line)
         yield
 
 

@@ -209,7 +209,8 @@ def test_a_mismatched_star_has_no_say():
     bad = np.flatnonzero(table["star"] == 7)
     table["x"][bad] += 40 * np.random.default_rng(0).normal(size=len(bad)) * u.pix
     matches = Matches.from_table(table, shape=SHAPE, poses=sim.matches.poses)
-    assert solve(matches, degree="auto", clip=5).degree == 2
+    with warns_here(AssumptionWarning, match=r"1 star has no position.*: 7 \("):
+        assert solve(matches, degree="auto").degree == 2
 
 
 def test_kept_out_stars_do_not_choose():
@@ -240,12 +241,12 @@ def test_x4_folds_as_foretold(margin):
     shift, modes of the same parity.
     """
     sim = fourth(margin=margin)
-    told = degree_choice.folding(solved(sim, degree=4), 3, 4)
+    told = degree_choice.folding(solved(sim, degree=4, clip=None), 3, 4)
     assert told.mode == (4, 0)
     put_in = np.sqrt(np.mean(sim.truth.dynamic[:, 0, 10] ** 2) / 2) / 2  # rms over both axes and the field
     assert told.energy == pytest.approx(put_in, rel=0.05)
     assert told.noise < 0.1 * told.energy
-    low = solved(sim, degree=3)
+    low = solved(sim, degree=3, clip=None)
     wrong = (low.coefficients - low.prior_mean)[:, :, :10]
     for degree in (2, 3):  # those below are, in part, in the poses
         part = slice(degree * (degree + 1) // 2, (degree + 1) * (degree + 2) // 2)
@@ -265,8 +266,8 @@ def test_few_stars_fold_more():
         width = np.zeros(10)
         width[6:] = 0.4
         sim = simulate_matches(n_stars=25, dynamic=width, sigma=0.01, noise=0, seed=seed)
-        told.append(degree_choice.folding(solved(sim), 2, 3).folds_into[2])
-        low = solved(sim, degree=2)
+        told.append(degree_choice.folding(solved(sim, clip=None), 2, 3).folds_into[2])
+        low = solved(sim, degree=2, clip=None)
         wrong = (low.coefficients - low.prior_mean)[:, :, 3:6]
         done.append(np.sqrt((wrong**2).mean(axis=(0, 1)).sum()) / 2)
     assert np.sqrt(np.mean(np.square(told))) == pytest.approx(np.sqrt(np.mean(np.square(done))), rel=0.15)
@@ -282,7 +283,7 @@ def test_alarm_is_raised():
     """Sixteen stars, precise, with more distortion than they can be fitted with at degree 3."""
     sim = simulate(16, 0.5, 0.5, 0.5, 0.3, 0.3, sigma=0.01, seed=2)
     with warns_here(AssumptionWarning, match=r"degree \d, of 0 to .*Degree \d is there as well, .* px rms beyond"):
-        solution = solved(sim, degree="auto")
+        solution = solved(sim, degree="auto", clip=None)
     chosen = solution.diagnostics.selection
     assert chosen.alarm
     assert [a.degree for a in chosen.aliasing] == [solution.degree + 1, solution.degree + 2][: len(chosen.aliasing)]

@@ -102,6 +102,8 @@ def estimate(matches, options):
     prior = options.prior
     if not prior_widths.sought(prior):
         return minimise(matches, options)
+    if options.clip is not None and (plain := _with_plain_widths(matches, options)):
+        return plain
     unit = np.hypot(np.sqrt(np.median(matches.observations.covariance[:, :2])), options.error_floor)
     fit, widths = prior_widths.find_widths(
         # with the small widths of the first fits an exposure may seem to contradict the others, and does not
@@ -116,6 +118,21 @@ def estimate(matches, options):
         if len(fit.matches.names) < len(matches.names):
             return estimate(fit.matches, options)
     return replace(fit, widths=widths)
+
+
+def _with_plain_widths(matches, options):
+    """The fit to all observations with the widths that they say; None unless chance explains what it leaves.
+
+    With the small widths that a search begins with, good observations of few stars may seem to deviate.
+    """
+    explained = None
+    with warnings.catch_warnings(record=True, action="always") as caught, contextlib.suppress(SolveError):
+        fit = estimate(matches, replace(options, clip=None))
+        if clipping.is_explained(fit.problem, fit.result, clip=options.clip):
+            explained = replace(fit, options=replace(fit.options, clip=options.clip))
+    for warning in caught if explained else ():
+        warn(warning.message, warning.category)
+    return explained
 
 
 def minimise(matches, options, *, judged=True):
