@@ -22,6 +22,7 @@ import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData
 from caller_warnings import warns_here
+from threadpoolctl import threadpool_info
 from test_coaddition import SHAPE, expose, scene
 
 import legdistort as ld
@@ -30,11 +31,39 @@ from legdistort.coaddition.resampling import engines
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError, LegdistortError
 from legdistort.inputs.exposure_files import ExposureFile, file_checksums
 from legdistort.runtime import scratch
-from legdistort.runtime.parallel import map_items
+from legdistort.runtime.parallel import map_items, one_blas_thread
 from legdistort.runtime.provenance import checksums
 
 COMPILED = pytest.mark.parametrize("compiled_from", [0, 1 << 62], ids=["compiled", "plain"])
 WORK = {"serial": {"workers": 1}, "threads": {"workers": 2, "threads": True}, "processes": {"workers": 2}}
+
+
+def blas_threads():
+    """Threads of every linear algebra library in this process."""
+    return [each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"]
+
+
+def test_linear_algebra_on_one_thread_from_the_first_to_the_last_of_those_who_ask():
+    before = blas_threads()
+    inside, leave, seen = threading.Event(), threading.Event(), []
+
+    def other():
+        with one_blas_thread():
+            inside.set()
+            leave.wait(10)
+
+    thread = threading.Thread(target=other)
+    with one_blas_thread():
+        thread.start()
+        inside.wait(10)
+    seen.append(blas_threads())  # the other is still at work
+    leave.set()
+    thread.join()
+    assert before and seen == [[1] * len(before)]
+    assert blas_threads() == before
+    seen = list(map_items(lambda _: blas_threads(), range(2)))
+    assert seen == [[1] * len(before)] * 2
+    assert blas_threads() == before
 
 
 def work(i):

@@ -3,16 +3,19 @@
 import logging
 import signal
 import sys
+import threading
 import warnings
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from logging.handlers import QueueHandler
 from multiprocessing import get_context
 from queue import SimpleQueue
 
+import scipy.linalg  # noqa: F401  (it comes with a linear algebra library of its own, which is to be loaded by then)
+from threadpoolctl import ThreadpoolController
 from tqdm import tqdm
 
 from ..exceptions import InputError, LegdistortError, warn
@@ -57,6 +60,7 @@ def map_items(function, items, *, workers=None, threads=False, progress=False, d
         total=len(items) if hasattr(items, "__len__") else None, desc=description, unit=unit, disable=not progress
     )
     with bar:
+        function = partial(_on_one_thread, function)
         if client is None and workers == 1:
             results = map(function, items)
         else:
@@ -64,6 +68,47 @@ def map_items(function, items, *, workers=None, threads=False, progress=False, d
         for result in results:
             bar.update()
             yield result
+
+
+class _OneThread:
+    """The limit on the linear algebra library, from the first of the threads that ask for it to the last."""
+
+    def __init__(self):
+        self.lock, self.users, self.limit = threading.Lock(), 0, None
+
+    def __enter__(self):
+        with self.lock:
+            if self.users == 0:
+                self.limit = _libraries().limit(limits=1, user_api="blas")
+            self.users += 1
+
+    def __exit__(self, *_):
+        with self.lock:
+            self.users -= 1
+            if self.users == 0:
+                self.limit.restore_original_limits()
+
+
+_ONE_THREAD = _OneThread()
+
+
+@cache
+def _libraries():
+    return ThreadpoolController()
+
+
+def one_blas_thread():
+    """Context in which the linear algebra library keeps to one thread, whoever else uses it in this process.
+
+    Its threads wait for one another in a busy loop. With small matrices that costs more than they gain, and on cores
+    that others use as well, or our own loops, it takes many times as long.
+    """
+    return _ONE_THREAD
+
+
+def _on_one_thread(function, item):
+    with one_blas_thread():
+        return function(item)
 
 
 def check_workers(workers):

@@ -15,6 +15,8 @@ from .equations.leverage import leverages
 MAX_ROUNDS = 8
 #: Deviations that chance brings about in this share of the sets with true errors give no cause to look for gross ones.
 BY_CHANCE = 0.01
+#: Share of gross errors up to which they are usual: 1 to 10 % in routine data (Hampel et al. 1986, section 1.2c).
+USUAL = 0.1
 #: A usual deviation of this many stated errors may be the work of gross errors, whatever the largest one is.
 SUSPECT = 2.0
 #: Share of the observations that are taken to be without gross errors where the errors are far above the stated ones.

@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 
 from ..exceptions import ConvergenceWarning, LegdistortError, SolveError, warn
 from ..inputs.matches import Matches
+from ..runtime import parallel
 from . import agreement, clipping, minimisers, start_values
 from .choices import prior_widths
 from .equations import criterion, effective_modes
@@ -19,14 +20,14 @@ from .equations.problem import Problem, build_problem, uses_compiled_loops
 
 log = logging.getLogger(__name__)
 
+#: Beyond this number of exposures the matrices are large enough to gain by several threads.
+_MANY_EXPOSURES = 50
+
 
 def threads(matches):
-    """One thread for linear algebra while the compiled loops use them all; nothing special otherwise."""
-    if not uses_compiled_loops(len(matches.table)):
-        return contextlib.nullcontext()
-    from .equations import compiled
-
-    return compiled.one_blas_thread()
+    """One thread for linear algebra, but for large matrices where no compiled loops use all cores beside it."""
+    many = len(matches.names) > _MANY_EXPOSURES and not uses_compiled_loops(len(matches.table))
+    return contextlib.nullcontext() if many else parallel.one_blas_thread()
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +103,6 @@ def estimate(matches, options):
     prior = options.prior
     if not prior_widths.sought(prior):
         return minimise(matches, options)
-    if options.clip is not None and (plain := _with_plain_widths(matches, options)):
-        return plain
     unit = np.hypot(np.sqrt(np.median(matches.observations.covariance[:, :2])), options.error_floor)
     fit, widths = prior_widths.find_widths(
         # with the small widths of the first fits an exposure may seem to contradict the others, and does not
@@ -117,13 +116,16 @@ def estimate(matches, options):
         fit = minimise(matches, fit.options)
         if len(fit.matches.names) < len(matches.names):
             return estimate(fit.matches, options)
+    if np.mean(fit.used) < 1 - clipping.USUAL and (plain := _with_plain_widths(matches, options)):
+        return plain
     return replace(fit, widths=widths)
 
 
 def _with_plain_widths(matches, options):
     """The fit to all observations with the widths that they say; None unless chance explains what it leaves.
 
-    With the small widths that a search begins with, good observations of few stars may seem to deviate.
+    With the small widths that a search begins with, good observations of few stars may seem to deviate, and widths
+    without these stay small.
     """
     explained = None
     with warnings.catch_warnings(record=True, action="always") as caught, contextlib.suppress(SolveError):

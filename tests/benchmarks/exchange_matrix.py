@@ -24,7 +24,7 @@ import gwcs
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
-from astropy.io import fits
+from astropy.io import fits, votable
 from astropy.wcs import WCS, FITSFixedWarning
 from numpy.polynomial import polynomial
 
@@ -289,16 +289,21 @@ def prior_file():
 # -- exports: the distortion of an exposure, 1100 x 700 px, as other software reads it
 
 
+def closest_header(solution, kind):
+    """The header of the exposure with the smallest error allowed that it can keep."""
+    for allowed in (1e-3, 1e-2, 1e-1):  # strong distortions are beyond SIP and TPV
+        with contextlib.suppress(ExportError):
+            return solution.header("a", kind=kind, max_error=allowed)
+    raise Skip(f"no {kind.upper()} header keeps 0.1 px")
+
+
 def exported(reader, read):
     """Rows of one reader: ``read(solution, header) -> ra, dec`` [deg] of pixels, for headers of several distortions."""
     make = test_headers.geometries()
     for kind in ("sip", "tpv"):
         for degree, peak in ((3, 5), (3, 20), (3, 100), (5, 5), (5, 20)):
             solution = make(degree, peak)
-            for allowed in (1e-3, 1e-2, 1e-1):  # strong distortions are beyond SIP and TPV
-                with contextlib.suppress(ExportError):
-                    header = solution.header("a", kind=kind, max_error=allowed)
-                    break
+            header = closest_header(solution, kind)
             p, _, _ = test_headers.detector(solution, "a")
             back = test_headers.pixels_of(solution, "a", *read(header, p))
             what = f"{kind.upper()} header, degree {degree}, {peak} px"
@@ -465,6 +470,198 @@ def files_for_fitsverify():
                       float(sum(map(int, counts.groups()))) if counts else 0.0 if "OK" in said else np.nan)  # fmt: skip
 
 
+def program(*names):
+    """Path of the first of these programs that is installed, or `Skip`."""
+    found = next(filter(None, map(shutil.which, names)), None)
+    if found is None:
+        raise Skip(f"{' or '.join(names)} is not installed")
+    return found
+
+
+def called(folder, *command):
+    """What a program says; `Skip` with its last line if it fails."""
+    made = subprocess.run([str(word) for word in command], cwd=folder, capture_output=True, text=True, check=False)
+    if made.returncode:
+        raise Skip(
+            f"{command[0]} ended with {made.returncode}: {(made.stderr.strip().splitlines() or ['no word'])[-1]}"
+        )
+    return made.stdout
+
+
+def starry_frame(path, solution, kind, *, n_stars=120, seed=0):
+    """A frame with Gaussian stars and our header; positions (n, 2)."""
+    ny, nx = solution.shapes["a"]
+    rng = np.random.default_rng(seed)
+    places = np.mgrid[12 : nx - 12 : 24, 12 : ny - 12 : 24].reshape(2, -1).T
+    p = rng.choice(places, n_stars, replace=False) + rng.uniform(-2, 2, (n_stars, 2))
+    y, x = np.mgrid[:ny, :nx]
+    image = rng.normal(100, 1, (ny, nx))
+    for x0, y0 in p:
+        part = np.s_[int(y0) - 10 : int(y0) + 11, int(x0) - 10 : int(x0) + 11]
+        image[part] += 3000 * np.exp(-0.5 * ((x[part] - x0) ** 2 + (y[part] - y0) ** 2) / 1.5**2)
+    header = closest_header(solution, kind)
+    fits.PrimaryHDU(image.astype(np.float32), header).writeto(path, overwrite=True)
+    return p
+
+
+def catalogue_of(folder, frame, kind):
+    """SExtractor's catalogue of a frame (FITS LDAC), in the folder."""
+    Path(folder, "a.param").write_text(
+        "XWIN_IMAGE\nYWIN_IMAGE\nERRAWIN_IMAGE\nERRBWIN_IMAGE\nERRTHETAWIN_IMAGE\nALPHAWIN_J2000\nDELTAWIN_J2000\n"
+        "FLUX_AUTO\nFLUXERR_AUTO\nFLAGS\nFLUX_RADIUS\nELONGATION\n"
+    )
+    options = ["-PARAMETERS_NAME", "a.param", "-FILTER", "N", "-CATALOG_TYPE", "FITS_LDAC"]
+    name = f"{kind}.cat"
+    called(folder, program("source-extractor", "sex"), frame, "-CATALOG_NAME", name, *options)
+    return Path(folder, name)
+
+
+def headers_in_sextractor():
+    """Positions on the sky of the sources that SExtractor finds, taken back to the pixels where it found them."""
+    solution = test_headers.geometries()(3, 20)
+    with tempfile.TemporaryDirectory() as folder:
+        for kind in ("tpv", "sip"):
+            frame = Path(folder, f"{kind}.fits")
+            starry_frame(frame, solution, kind)
+            with fits.open(catalogue_of(folder, frame, kind)) as hdulist:
+                found = np.array(hdulist["LDAC_OBJECTS"].data)
+            found = found[found["FLUX_AUTO"] > 50 * found["FLUXERR_AUTO"]]
+            sky = found["ALPHAWIN_J2000"], found["DELTAWIN_J2000"]
+            back = test_headers.pixels_of(solution, "a", *(np.asarray(a, dtype=float) for a in sky))
+            seen = np.column_stack([found["XWIN_IMAGE"], found["YWIN_IMAGE"]]) - 1
+            yield Row(f"{kind.upper()} header, degree 3, 20 px: {len(found)} stars", "SExtractor", apart(back.T, seen))
+
+
+def headers_in_swarp():
+    """Where every pixel of SWarp's grid comes from, by frames whose values are positions."""
+    swarp = program("SWarp", "swarp")
+    solution = test_headers.geometries()(3, 20)
+    ny, nx = solution.shapes["a"]
+    header = closest_header(solution, "tpv")
+    with tempfile.TemporaryDirectory() as folder:
+        found = []
+        for name, values in zip("xy", np.mgrid[:ny, :nx][::-1], strict=True):
+            fits.PrimaryHDU(values.astype(np.float32) + 1000, header).writeto(Path(folder, f"{name}.fits"))
+            called(
+                folder, swarp, f"{name}.fits", "-IMAGEOUT_NAME", f"{name}.out.fits", "-SUBTRACT_BACK", "N",
+                "-FSCALASTRO_TYPE", "NONE", "-RESAMPLING_TYPE", "BILINEAR", "-WEIGHTOUT_NAME", f"{name}.weight.fits",
+            )  # fmt: skip
+            with fits.open(Path(folder, f"{name}.out.fits")) as hdulist:
+                out, made = hdulist[0].data.astype(float), WCS(hdulist[0].header)
+            weight = fits.getdata(Path(folder, f"{name}.weight.fits"))
+            found.append(out - 1000)
+        y, x = np.indices(out.shape)
+        came = test_headers.pixels_of(solution, "a", *made.all_pix2world(np.column_stack([x.ravel(), y.ravel()]), 0).T)
+        well = ((came > 3) & (came < [nx - 4, ny - 4])).all(axis=1) & (weight.ravel() > 0)
+        yield Row(
+            "TPV header, degree 3, 20 px, resampled", "SWarp", apart([a.ravel()[well] for a in found], came[well])
+        )
+
+
+def headers_in_scamp():
+    """What SCAMP says of catalogues with our headers against a reference that holds the truth: scatter, pixels.
+
+    A plain TAN header of the same stars stands beside it, with the distortion that it leaves out.
+    """
+    scamp = program("scamp")
+    solution = test_headers.geometries()(3, 20)
+    for n_stars in (36, 200):
+        for kind in ("tpv", "tan"):
+            with tempfile.TemporaryDirectory() as folder:
+                frame = Path(folder, f"{kind}.fits")
+                p = starry_frame(frame, solution, "tpv", n_stars=n_stars)
+                if kind == "tan":
+                    with fits.open(frame, mode="update") as hdulist:
+                        head = hdulist[0].header
+                        for key in [key for key in head if re.fullmatch(r"PV\d_\d+", key)]:
+                            head.remove(key)
+                        head["CTYPE1"], head["CTYPE2"] = "RA---TAN", "DEC--TAN"
+                catalogue_of(folder, frame, kind)
+                _reference_for_scamp(Path(folder, "ref.cat"), solution, p)
+                try:
+                    called(
+                        folder, scamp, f"{kind}.cat", "-ASTREF_CATALOG", "FILE", "-ASTREFCAT_NAME", "ref.cat",
+                        "-ASTREFCENT_KEYS", "X_WORLD,Y_WORLD", "-ASTREFMAG_KEY", "MAG", "-ASTREFMAGERR_KEY", "MAGERR",
+                        "-ASTREFERR_KEYS", "ERRA_WORLD,ERRB_WORLD,ERRTHETA_WORLD", "-ASTREFOBSDATE_KEY", "OBSDATE",
+                        "-CENTROID_KEYS", "XWIN_IMAGE,YWIN_IMAGE",
+                        "-CENTROIDERR_KEYS", "ERRAWIN_IMAGE,ERRBWIN_IMAGE,ERRTHETAWIN_IMAGE",
+                        "-SN_THRESHOLDS", "5,20", "-CROSSID_RADIUS", "3", "-MATCH", "N", "-SOLVE_ASTROM", "N",
+                        "-SOLVE_PHOTOM", "N", "-CHECKPLOT_TYPE", "NONE", "-WRITE_XML", "Y", "-XML_NAME", "scamp.xml",
+                    )  # fmt: skip
+                    error = _scamp_scatter(Path(folder, "scamp.xml"), solution)
+                except Skip as reason:
+                    print(f"headers_in_scamp: {kind.upper()}, {n_stars} stars: {reason}")
+                    continue
+            yield Row(f"{kind.upper()} header, 20 px, {n_stars} stars, scatter", "SCAMP", error)
+
+
+def _reference_for_scamp(path, solution, p):
+    """Catalogue (FITS LDAC) of the true places of stars."""
+    pose = solution.poses["a"]
+    sky = test_headers.sky_of(solution, "a", solution.correct("a", p) @ pose[:, :2].T + pose[:, 2])
+    small = np.full(len(p), 1e-7)
+    columns = dict(zip(("X_WORLD", "Y_WORLD"), sky, strict=True))
+    columns |= {"ERRA_WORLD": small, "ERRB_WORLD": small, "ERRTHETA_WORLD": 0 * small, "MAG": 15 + 0 * small}
+    columns |= {"MAGERR": 0.01 + 0 * small, "OBSDATE": 2000 + 0 * small}
+    cards = fits.Header({"SIMPLE": True, "BITPIX": 8, "NAXIS": 0}).tostring(padding=True)
+    cards = np.array([[cards[k : k + 80] for k in range(0, len(cards), 80)]])
+    fields = fits.BinTableHDU.from_columns(
+        [fits.Column("Field Header Card", f"{cards.size * 80}A", array=cards, dim=f"(80, {cards.size})")],
+        name="LDAC_IMHEAD",
+    )
+    objects = fits.BinTableHDU.from_columns(
+        [fits.Column(name, "1D", array=values) for name, values in columns.items()], name="LDAC_OBJECTS"
+    )
+    fits.HDUList([fits.PrimaryHDU(), fields, objects]).writeto(path)
+
+
+def _scamp_scatter(path, solution):
+    """Scatter against the reference, larger axis, pixels."""
+    table = votable.parse(path, verify="ignore").get_table_by_id("Fields").array
+    scatter = np.ravel(table["AstromSigma_Reference"])
+    return float(np.max(scatter) / solution.sky.pixel_scale)
+
+
+def headers_in_ds9():
+    """Regions at pixels, loaded in DS9 and saved in degrees."""
+    ds9, screen = program("ds9"), program("xvfb-run")
+    solution = test_headers.geometries()(3, 20)
+    p = test_headers.detector(solution, "a")[0][404:444]
+    with tempfile.TemporaryDirectory() as folder:
+        for kind in ("sip", "tpv"):
+            header = closest_header(solution, kind)
+            fits.PrimaryHDU(np.zeros(solution.shapes["a"], np.uint8), header).writeto(
+                Path(folder, "a.fits"), overwrite=True
+            )
+            lines = [f"image;point({x + 1:.9f},{y + 1:.9f})" for x, y in p]
+            Path(folder, "in.reg").write_text("\n".join(lines) + "\n")
+            called(
+                folder, screen, "-a", ds9, "a.fits", "-regions", "load", "in.reg", "-regions", "system", "wcs",
+                "-regions", "sky", "icrs", "-regions", "skyformat", "degrees", "-regions", "save", "out.reg", "-exit",
+            )  # fmt: skip
+            said = re.findall(r"point\(([-\d.]+),([-\d.]+)\)", Path(folder, "out.reg").read_text())
+            back = test_headers.pixels_of(solution, "a", *np.array(said, dtype=float).T)
+            yield Row(f"{kind.upper()} header, degree 3, 20 px, regions", "DS9", apart(back.T, p))
+
+
+def refined_in_roman():
+    """`refine` of Roman's WCS in the data model of Roman, written and read."""
+    datamodels = peer("roman_datamodels.datamodels")
+    with asdf.open(data("gwcs_interop", "roman_wcs.asdf"), memmap=False, lazy_load=False) as file:
+        wcs = file["roman"]["wcs"] if "roman" in file.tree else file["wcs"]
+        solution = test_refinement.solution_at(wcs, (5000, 5000), 5.0)
+        made = refine(wcs, solution, "a")
+    p, ra, dec = test_headers.detector(solution, "a")
+    model = datamodels.ImageModel.create_fake_data(shape=(8, 8))
+    model.meta.wcs = made.stock()
+    with tempfile.TemporaryDirectory() as folder:
+        model.save(Path(folder, "r.asdf"))
+        back = datamodels.open(Path(folder, "r.asdf")).meta.wcs
+        yield Row(
+            "refine(Roman), in its data model", "roman_datamodels", apart(back.invert(ra[404:], dec[404:]), p[404:])
+        )
+
+
 IMPORTS = [
     astropy_models,
     gwcs_files,
@@ -486,6 +683,11 @@ PEERS = [
     wcs_in_regions,
     wcs_in_pipelines,
     files_for_fitsverify,
+    headers_in_sextractor,
+    headers_in_swarp,
+    headers_in_scamp,
+    headers_in_ds9,
+    refined_in_roman,
 ]
 
 

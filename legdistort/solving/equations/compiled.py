@@ -7,29 +7,13 @@ its own, so results do not depend on timing. The coupling is kept in single prec
 gradient, which decides where the minimum is, stays in double.
 """
 
-from functools import cache
-
 import numpy as np
 from numba import get_num_threads, njit, prange
-from threadpoolctl import ThreadpoolController
 
 from ...geometry import basis
 
 _BATCH = 64
 _FAST = {"contract", "reassoc", "nsz"}  # sums may be reordered; NaN and infinity keep their meaning
-
-
-@cache
-def _libraries():
-    return ThreadpoolController()
-
-
-def one_blas_thread():
-    """Context in which the linear algebra library keeps to one thread.
-
-    The loops here use all cores; idle threads of the library, which wait in a busy loop, would take turns with them.
-    """
-    return _libraries().limit(limits=1, user_api="blas")
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
