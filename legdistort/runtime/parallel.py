@@ -3,7 +3,6 @@
 import logging
 import signal
 import sys
-import threading
 import warnings
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -70,40 +69,18 @@ def map_items(function, items, *, workers=None, threads=False, progress=False, d
             yield result
 
 
-class _OneThread:
-    """The limit on the linear algebra library, from the first of the threads that ask for it to the last."""
-
-    def __init__(self):
-        self.lock, self.users, self.limit = threading.Lock(), 0, None
-
-    def __enter__(self):
-        with self.lock:
-            if self.users == 0:
-                self.limit = _libraries().limit(limits=1, user_api="blas")
-            self.users += 1
-
-    def __exit__(self, *_):
-        with self.lock:
-            self.users -= 1
-            if self.users == 0:
-                self.limit.restore_original_limits()
-
-
-_ONE_THREAD = _OneThread()
-
-
 @cache
 def _libraries():
     return ThreadpoolController()
 
 
 def one_blas_thread():
-    """Context in which the linear algebra library keeps to one thread, whoever else uses it in this process.
+    """Context in which the linear algebra library keeps to one thread when this thread calls it.
 
     Its threads wait for one another in a busy loop. With small matrices that costs more than they gain, and on cores
     that others use as well, or our own loops, it takes many times as long.
     """
-    return _ONE_THREAD
+    return _libraries().limit(limits=1, user_api="blas")
 
 
 def _on_one_thread(function, item):
