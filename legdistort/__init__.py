@@ -8,8 +8,6 @@ gwcs objects, ASDF files and a co-added image.
 from importlib import import_module
 from importlib.metadata import version
 
-import astropy.modeling.fitting  # noqa: F401  (it loads our fitter: before that is being imported by anybody else)
-
 __version__ = version("legdistort")
 
 # Loaded when first asked for: astropy.modeling looks into this package for a fitter while it is itself half imported,
