@@ -164,6 +164,23 @@ def test_noise_frame_is_left_out_by_name(night, tmp_path, capsys):
     assert list(summary["left_out"]) == ["empty"]
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["slove", "m.ecsv"], r"legdistort: .*'slove'.*; did you mean solve\?"),
+        (["solve", "m.ecsv", "--degre", "3", "--out", "x"], r"legdistort solve: .* --degre 3; did you mean --degree\?"),
+        (["run", "a.fits", "--over", "--out", "x"], r"legdistort run: .* --over; did you mean --overwrite\?"),
+        (["solve"], r"legdistort solve: the following arguments are required: TABLE, --out \("),
+    ],
+)
+def test_wrong_usage_is_told_in_a_line_with_the_nearest_option(capsys, words, message):
+    with pytest.raises(SystemExit) as stopped:
+        parser.main(words)
+    assert stopped.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.match(message, line)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
 def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, number):
     """By Ctrl-C, or by a batch system."""
@@ -173,7 +190,7 @@ def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, numb
     usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
     before = signal.signal(number, usual)
     try:
-        assert run(night, tmp_path / "out") == 1
+        assert run(night, tmp_path / "out") == 130
         assert signal.getsignal(number) == usual
     finally:
         signal.signal(number, before)

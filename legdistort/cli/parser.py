@@ -1,7 +1,9 @@
 """The command ``legdistort``: thin calls of the functions of the package."""
 
 import argparse
+import difflib
 import logging
+import re
 import signal
 import sys
 import threading
@@ -21,9 +23,11 @@ log = logging.getLogger("legdistort")
 def main(argv=None):
     """Run the command line; returns the exit status.
 
-    0; 1 for a failed run, 2 for wrong usage, 3 where `--strict` is given and a check fails.
+    0; 1 for a failed run, 2 for wrong usage, 3 where `--strict` is given and a check fails, 130 after Ctrl-C.
     """
-    arguments = _parser().parse_args(argv)
+    arguments, unknown = _parser().parse_known_args(argv)
+    if unknown:
+        arguments.parser.error(f"no option or place for {' '.join(unknown)}")
     try:
         with _stopping(), _logging(arguments), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of other packages
@@ -47,7 +51,7 @@ def main(argv=None):
         return 1
     except KeyboardInterrupt:
         print("legdistort: interrupted; nothing was left half-written", file=sys.stderr)
-        return 1
+        return 130
     return status or 0
 
 
@@ -83,8 +87,29 @@ def _logging(arguments):
         log.setLevel(before[2])
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that takes no shortened options, and says in one line what is wrong, with the nearest option."""
+
+    def __init__(self, **settings):
+        super().__init__(allow_abbrev=False, **settings)
+
+    def error(self, message):
+        known = list(self._option_string_actions)
+        if wrong := re.search(r"invalid choice: '?([^' ]*)'? \(choose from (.*)\)", message):
+            known = re.findall(r"[^', ]+", wrong[2])
+        words = [wrong[1]] if wrong else re.findall(r"(?<!\S)-[\w-]+", message)
+        near = [match for word in words if word not in known for match in _nearest(word, known)]
+        hint = f"; did you mean {' '.join(near)}?" if near else ""
+        self.exit(2, f"{self.prog}: {message}{hint} ({self.prog} --help lists what there is)\n")
+
+
+def _nearest(word, known):
+    """What begins with a word, or is spelled much like it; a list of one or none."""
+    return ([each for each in known if each.startswith(word)] or difflib.get_close_matches(word, known, n=1))[:1]
+
+
 def _parser():
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="legdistort",
         description="Star positions and image distortions from dithered exposures, as WCS and mosaic.",
         epilog="Start with: legdistort demo --out demo",
@@ -98,6 +123,6 @@ def _parser():
             description=command.what[0].upper() + command.what[1:] + ".",
             epilog=f"Example: legdistort {name} {command.example}",
         )
-        p.set_defaults(command=command)
+        p.set_defaults(command=command, parser=p)
         add_options(p, command.groups)
     return parser
