@@ -195,6 +195,22 @@ def test_many_mismatches_cost_little_and_no_exposure(share):
     assert error(solution, sim) < 1.1 * error(clean, sim)
 
 
+def test_the_choice_of_the_degree_decides_mismatches_once_a_degree(monkeypatch):
+    """Not anew in each of the fits that leave some stars out; and they do not sway it."""
+    sim = precise(4, n_stars=34, degree=1)
+    bad = sim.matches.table.copy()
+    bad["x"][[7, 50, 91]] += [300, -40, 25] * u.pix
+    matches = Matches.from_table(bad, shape=SHAPE, poses=sim.matches.poses)
+    calls, clipped = [], clipping.solve_clipped
+    monkeypatch.setattr(clipping, "solve_clipped", lambda *a, **k: calls.append(1) or clipped(*a, **k))
+    prior = Prior(sim.truth.static)
+    chosen = solve(matches, prior=prior, degree="auto").diagnostics.selection
+    clean = solve(sim.matches, prior=prior, degree="auto", clip=None).diagnostics.selection
+    assert chosen.degree == clean.degree == 1
+    assert chosen.scores == pytest.approx(clean.scores, rel=0.2)
+    assert 3 <= len(calls) <= len(chosen.degrees) + 2  # with the alarm and the solution itself
+
+
 # --- clean data --------------------------------------------------------------------------------------------------
 
 

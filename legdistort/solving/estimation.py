@@ -3,6 +3,7 @@
 import logging
 import warnings
 from dataclasses import fields, replace
+from functools import cache
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from . import model_forms, reference_tie, single_fit
 from .assembly import assemble
 from .brightness_errors import estimate_by_brightness
 from .choices.degree_choice import choose_degree
-from .choices.held_out import hold_out, validation
+from .choices.held_out import hold_out, only_rows, validation
 from .equations import effective_modes
 from .equations.covariances import Uncertainty
 from .options import CLIP, SolveOptions, check_reference
@@ -183,14 +184,23 @@ def _choose_degree(matches, options):
     """The `DegreeChoice`; an alarm is told."""
 
     def fit(part, degree):
-        trial = single_fit.estimate(part, replace(options, degree=degree))
+        trial = single_fit.estimate(part, replace(options, degree=degree, clip=None))
         return _solution(
             trial, 1.0, Settings(degree, method=options.method), Diagnostics(error_floor=options.error_floor)
         )
 
+    @cache
+    def sound(degree):
+        if options.clip is None:
+            return matches
+        trial = single_fit.estimate(matches, replace(options, degree=degree))
+        used = np.empty_like(trial.used)
+        used[trial.problem.order] = trial.used
+        return only_rows(trial.matches, used)
+
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", LegdistortWarning)  # of fits that are thrown away
-        chosen = choose_degree(matches, fit)
+        chosen = choose_degree(matches, fit, sound)
     if chosen.alarm:
         warn(f"degree {chosen.sentence}", AssumptionWarning)
     return chosen

@@ -297,15 +297,20 @@ def dynamic_spread():
 
 
 def expected(solution, true):
-    """Reported mean square error of what `accuracy.known_offsets` leaves of noise and common map."""
-    known = np.einsum("nkk->nk", solution.absolute_covariance(without_unknown=True))
-    columns = [each.stars.T.reshape(-1, 1) for each in solution.gauge.unknown]
+    """Reported mean square error of what `accuracy.known_offsets` leaves of noise and common map.
+
+    Of the stars that have a position: one that contradicts itself has none.
+    """
+    good = np.isfinite(solution.positions).all(axis=1)
+    both = np.tile(good, 2)
+    known = np.einsum("nkk->nk", solution.absolute_covariance(without_unknown=True))[good]
+    columns = [each.stars.T.reshape(-1, 1)[both] for each in solution.gauge.unknown]
     if solution.gauge.tie is None:
-        columns.append(similarity_fields(true))
+        columns.append(similarity_fields(true[good]))
     if not columns:
         return np.mean(known)
-    maps = solution.gauge.directions.transpose(1, 0, 2).reshape(known.size, -1)
-    covariance = solution.uncertainty.star_matrix
+    maps = solution.gauge.directions[good].transpose(1, 0, 2).reshape(known.size, -1)
+    covariance = solution.uncertainty.star_matrix[np.ix_(both, both)]
     hidden = solution.gauge.absolute_covariance
     if len(hidden) == maps.shape[1]:
         covariance = covariance + maps @ hidden @ maps.T
@@ -323,8 +328,9 @@ def one(seed, simulating, solving, *, with_ideal=False):
     reported = expected(solution, sky[star])
     unknown, best = solution.gauge.unknown, np.nan
     if with_ideal:
-        best = ideal(matches, sky, star, len(unknown), dynamic_spread())
-    return np.mean(left**2), reported, best, tuple(each.name for each in unknown), solution.status
+        found = star[np.isfinite(left[:, 0])]
+        best = ideal(matches, sky, found, len(unknown), dynamic_spread())
+    return np.nanmean(left**2), reported, best, tuple(each.name for each in unknown), solution.status
 
 
 def row(name, n_sets, **changed):

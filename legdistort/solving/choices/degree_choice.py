@@ -30,14 +30,18 @@ ALARM = 5.0
 _OUTLIER = 25.0  # times the usual squared scatter of a star, at every degree: mismatched, it has no say
 
 
-def choose_degree(matches, fit):
+def choose_degree(matches, fit, sound):
     """The degree from 0 to 6 whose distortions serve stars best that had no part in them.
+
+    What contradicts a fit of all stars takes no part in those of the same degree without some of them.
 
     Parameters
     ----------
     matches : Matches
     fit : callable
-        ``fit(matches, degree)``, a `Solution`.
+        ``fit(matches, degree)``, a `Solution` of all these observations.
+    sound : callable
+        ``sound(degree)``, the matches without what contradicts a fit of all.
 
     Returns
     -------
@@ -52,8 +56,11 @@ def choose_degree(matches, fit):
     degrees, squares = [], []
     for tried in range(HIGHEST + 1):
         try:
+            kept = sound(tried)
+            parts = [only_rows(kept, ~_of(kept, stars)) for stars in folds]
+            tests = [matches.table[_of(matches, stars)] for stars in folds]
             squares.append(
-                np.concatenate([_squares(fit(only_rows(matches, ~out), tried), matches.table[out]) for out in folds])
+                np.concatenate([_squares(fit(p, tried), table) for p, table in zip(parts, tests, strict=True)])
             )
         except LegdistortError as error:
             if tried == 0:
@@ -65,7 +72,7 @@ def choose_degree(matches, fit):
         degree = int(np.argmax(scores <= (1 + CLOSE) * scores.min()))
         if tried - degree >= N_WORSE:
             break
-    aliasing = _aliasing(matches, fit, degree)
+    aliasing = _aliasing(lambda top: fit(sound(top), top), degree)
     return DegreeChoice(
         degree=degree,
         degrees=tuple(degrees),
@@ -86,13 +93,18 @@ def _scores(squares):
 
 
 def _folds(matches):
-    """Rows (n,) of bool to be left out, in turn."""
+    """Stars to be left out, in turn."""
     star = matches.observations.star
     seen = np.flatnonzero(np.bincount(star) > 1)
     if len(seen) < 2:
         raise InputError(f"degree={AUTO!r} needs stars that two exposures or more see; there are {len(seen)} of them")
     n = len(seen) if len(seen) <= FEW else N_FOLDS
-    return [np.isin(star, part) for part in np.array_split(np.random.default_rng(0).permutation(seen), n)]
+    return np.array_split(np.asarray(matches.stars)[np.random.default_rng(0).permutation(seen)], n)
+
+
+def _of(matches, stars):
+    """Rows (n,) of some stars."""
+    return np.isin(matches.table["star"], stars)
 
 
 def _squares(solution, table):
@@ -109,11 +121,11 @@ def _squares(solution, table):
 # -- the aliasing alarm
 
 
-def _aliasing(matches, fit, degree):
-    """`folding` for the two degrees beyond the one chosen, as far as the stars allow."""
+def _aliasing(fit, degree):
+    """`folding` for the two degrees beyond the one chosen, as far as the stars allow; ``fit(degree)`` takes all."""
     for top in (degree + 2, degree + 1):
         try:
-            solution = fit(matches, top)
+            solution = fit(top)
             return tuple(folding(solution, degree, d) for d in range(degree + 1, top + 1))
         except LegdistortError as error:
             log.debug("degree %d is beyond these stars: %s", top, error)
