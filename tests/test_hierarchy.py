@@ -1,13 +1,18 @@
 """The model of a common map: what counts as known, and how far single exposures scatter."""
 
+import contextlib
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from legdistort.geometry.detector_modes import dynamic_degrees
+from legdistort.exceptions import SolveError
+from legdistort.geometry.detector_modes import dynamic_basis, dynamic_degrees
+from legdistort.results.gauge import UnknownMap
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve
-from legdistort.solving.gauge import dynamic_scatter, hierarchy
+from legdistort.solving.gauge import catalogue_map, constraints, dynamic_scatter, hierarchy
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +85,136 @@ def test_a_mode_is_drawn_to_its_degree_as_ten_exposures_would():
                 off.append(np.mean(np.log(made / true) ** 2))
         spread.append(np.mean(off))
     assert spread[0] < min(spread[1:])
+
+
+def test_of_a_degree_that_nothing_determines_twice_the_largest_scatter_is_assumed():
+    degree = dynamic_degrees(10)
+    variance, dof = np.array([9.0, 0.3, 0.7])[degree - 1], np.where(degree == 1, 0.0, 1e6)
+    assert_allclose(dynamic_scatter._pooled(variance, dof, 5.0), np.array([1.4, 0.3, 0.7])[degree - 1], rtol=1e-4)
+    assert_allclose(dynamic_scatter._pooled(variance, np.zeros(len(degree)), 5.0), 5.0)
+
+
+@pytest.mark.parametrize(("ratio", "counts"), [(9.5, True), (10.5, False)])
+def test_scatter_is_that_of_exposures_of_less_than_ten_times_the_usual_variance(ratio, counts):
+    """What an exposure departs by says nothing where its errors are that large."""
+    n, modes = 9, 6
+    own = np.random.default_rng(0).normal(0, 0.1, (n, 2, modes))
+    others = np.stack([dynamic_basis((1000, 1000), modes)] * n)
+
+    def scatter(departure):
+        own[-1] = departure
+        error = 1e-4 * np.where(np.arange(n) == n - 1, ratio, 1.0)[:, None, None] * np.eye(2 * modes)
+        problem = SimpleNamespace(n_modes=modes, n_exposures=n, prior_mean=0.0, has_widths=lambda i: False)
+        state, maps, exact = SimpleNamespace(coefficients=own), np.zeros((n, 8, 0)), np.zeros((1, 8))
+        return dynamic_scatter.dynamic_covariance(problem, state, error, maps, others, np.zeros(n, int), exact)[0]
+
+    assert (np.trace(scatter(3.0)) > 2 * np.trace(scatter(0.1))) == counts
+
+
+# --- what residuals determine ------------------------------------------------------------------------------------
+
+
+def released(chi2, gain, curvature=(100.0, 100.0), dof=400):
+    """Number of two unknown maps that residuals determine, of so much gain in chi2 and so much information."""
+    information, n = np.diag([*curvature, 0, 0, 0, 0]), 3
+    system = SimpleNamespace(
+        dof=dof,
+        blocks=SimpleNamespace(chi2=chi2),
+        information=information,
+        pull=np.sqrt(np.diag(information) * [*gain, 0, 0, 0, 0]),
+    )
+    maps = tuple(UnknownMap("degree 2", 2, row) for row in np.eye(2 * n)[:2])
+    gauge = SimpleNamespace(unknown_maps=maps, reach=np.eye(2 * n), n_modes=n)
+    return hierarchy.determined_by_residuals(system, gauge).shape[1]
+
+
+def test_residuals_determine_a_map_by_five_standard_errors():
+    assert [released(600.0, (200.0, gain)) for gain in (4.6**2, 5.4**2)] == [1, 2]
+    assert [released(960.0, (300.0, 1.6 * z**2)) for z in (4.6, 5.4)] == [1, 2]  # at the observed scale
+
+
+def test_residuals_determine_a_map_to_a_pixel():
+    assert [released(600.0, (200.0, 200.0), (100.0, sigma**-2)) for sigma in (1.1, 0.9)] == [1, 2]
+    assert [released(960.0, (200.0, 200.0), (100.0, 1.4 * sigma**-2)) for sigma in (1.1, 0.9)] == [1, 2]
+
+
+def test_residuals_that_chance_explains_determine_nothing():
+    """chi2 scatters by sqrt(2 * 400) = 28."""
+    assert [released(400 + z * 28.3, (60.0, 60.0)) for z in (4.7, 5.3)] == [0, 2]
+
+
+def test_residuals_with_another_cause_determine_nothing():
+    """Two per degree of freedom are left, and more than a tenth."""
+    assert [released(2000.0, (600.0, left)) for left in (580.0, 620.0)] == [0, 2]
+    assert [released(20000.0, (9000.0, gain)) for gain in (8900.0, 9100.0)] == [0, 2]
+
+
+# --- names of unknown maps, and constraints ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("share", "name"), [(0.87, "degree 2"), (0.93, "z^2")])
+def test_a_map_has_the_name_of_what_it_mostly_is(share, name):
+    size, power = (1000, 1000), np.eye(6) / 4
+    pointed = hierarchy._pointing_off(power, size)
+    metric = hierarchy._metric(power, pointed)
+    patterns = {each: pattern for each, _, pattern in hierarchy._patterns(6, size)}
+    u, v = np.meshgrid(*[(np.arange(200) + 0.5) / 100 - 1] * 2)
+    square = np.real((u + 1j * v) ** 2)  # by its definition
+    modes = [np.sqrt(5) / 2 * (3 * each**2 - 1) / np.sqrt(4) for each in (u, v)]
+    along = patterns["z^2"] / np.sqrt(patterns["z^2"] @ metric @ patterns["z^2"])
+    assert along[3] / along[5] == pytest.approx(np.mean(square * modes[0]) / np.mean(square * modes[1]))
+    across = np.where(np.isin(np.arange(12), [3, 5]), 1.0, 0.0)  # x^2 + y^2 in x alone, which turns no angle right
+    across -= along * (along @ metric @ across)
+    across /= np.sqrt(across @ metric @ across)
+    maps = (np.sqrt(share) * along + np.sqrt(1 - share) * across)[:, None]
+    assert [each.name for each in hierarchy._named(maps, pointed, metric, size)] == [name]
+
+
+@pytest.mark.parametrize(("degrees", "refused"), [(3.0, True), (4.5, False)])
+def test_the_mean_gauge_is_refused_where_rolls_nearly_cancel(degrees, refused):
+    """A shift seen by two exposures 180 degrees apart, but for so much: sin^2 of half of that is left of it."""
+    angle = np.radians(180 - degrees)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    expected = pytest.raises(SolveError, match="of these exposures cancel") if refused else contextlib.nullcontext()
+    with expected:
+        constraints._check_mean(np.stack([np.eye(2), turn]))
+
+
+@pytest.mark.parametrize(("seen", "taken_back"), [(0.007, 8), (0.014, 7)])
+def test_a_map_of_which_a_percent_is_not_taken_back_is_left_to_the_data(seen, taken_back):
+    """One mode of six per axis is fixed in all exposures, and a map of the plane shows in it by so much."""
+    motion = np.stack([np.eye(12)] * 3)
+    motion[:, 4, 4] = seen
+    problem = SimpleNamespace(n_modes=6, n_exposures=3, fixed=[np.eye(12)[4:5]] * 3)
+    maps = constraints._taken_back(problem, motion, np.array([[500.0, 500], [500, 500]]), False)
+    assert len(maps) == taken_back
+    assert (np.abs(maps[:, 4]).max() > 0.1) == (taken_back == 8)
+
+
+@pytest.mark.parametrize(("scale", "counts"), [(1.9, True), (2.1, False)])
+def test_an_exposure_of_twice_the_scale_is_no_part_of_the_plane(scale, counts):
+    poses = np.stack([np.eye(2, 3)] * 4)
+    poses[-1, :, :2] /= scale
+    problem = SimpleNamespace(shapes=[(1000, 1000)] * 4, n_modes=6)
+    _, half = constraints.reference_box(problem, SimpleNamespace(poses=poses))
+    assert_allclose(half * 2, 1000 * (scale if counts else 1), rtol=1e-3)
+
+
+# --- offsets of a reference --------------------------------------------------------------------------------------
+
+
+def offsets(pulls):
+    """Equations of a reference of unit errors, for shift, rotation and scale, whose x are so many of them off."""
+    n = len(pulls)
+    xy = np.random.default_rng(0).uniform(-1, 1, (n, 2))
+    values = np.column_stack([np.ones(n), xy])
+    directions = np.kron(np.eye(2), values).reshape(2, n, 6).transpose(1, 0, 2)
+    made = catalogue_map.Offsets(np.arange(n), np.column_stack([pulls, np.zeros(n)]), np.stack([np.eye(2)] * n))
+    prior = catalogue_map.MapPrior(np.zeros((6, 6)), np.zeros(6), (2, 2))
+    return catalogue_map.MapEquations(made, directions, 1e-6 * np.eye(2 * n), prior)
+
+
+def test_a_star_of_a_reference_is_a_mismatch_from_five_standard_errors():
+    for pull, fair in ((4.7, True), (5.4, False)):
+        used = catalogue_map.accepted(offsets(np.where(np.arange(80) == 7, pull, 0.0)), "a catalogue")
+        assert used.tolist() == [fair or k != 7 for k in range(80)]

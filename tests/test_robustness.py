@@ -413,6 +413,12 @@ def test_start_values_are_doubted_from_one_percent_of_the_detector():
     assert start_values.far_off(problem, np.array([19.0, 21.0])).tolist() == [False, True]
 
 
+def test_an_exposure_is_misplaced_from_ten_times_the_usual_distance():
+    problem = SimpleNamespace(shapes=[(2000, 2000)] * 6)
+    found = start_values.misplaced(problem, np.array([5.0, 5.0, 5.0, 5.0, 47.0, 53.0]))
+    assert np.flatnonzero(found).tolist() == [5]
+
+
 def fitted(sim, **options):
     """Problem and plain fit."""
     fit = single_fit.minimise(sim.matches, SolveOptions(clip=None, prior=Prior(sim.truth.static), **options))
