@@ -84,40 +84,67 @@ def known_offsets(solution, xy):
         If the solution was read from a file and has unknown directions, or too few stars are given.
     """
     xy, unknown = np.asarray(xy, dtype=float), solution.gauge.unknown
+    good = _compared(solution, xy)
+    similar = _columns(xy[good], "similarity") if solution.gauge.tie is None else np.zeros((2 * good.sum(), 0))
+    stars = np.stack([each.stars for each in unknown], axis=2) if unknown else np.zeros((*xy.shape, 0))
+    moves = [each.coefficients for each in unknown]
+    return _without_directions(solution, xy, similar, stars, moves, "unknown_at")
+
+
+def relative_offsets(solution, xy):
+    """Positions of the stars from elsewhere less those of a solution, without any common map that exposures take back.
+
+    What is left compares with the covariance of relative positions. `Gauge.directions`, the directions at the solution,
+    are followed to second order, as for `known_offsets`.
+
+    Parameters and errors are those of `known_offsets`.
+
+    Returns
+    -------
+    ndarray, shape (n_stars, 2)
+    """
+    xy, gauge = np.asarray(xy, dtype=float), solution.gauge
+    moves = -gauge.motion.reshape(len(gauge.motion), 2, gauge.n_modes, -1)
+    similar = np.zeros((2 * _compared(solution, xy).sum(), 0))
+    return _without_directions(solution, xy, similar, gauge.directions, np.moveaxis(moves, -1, 0), "directions_at")
+
+
+def _compared(solution, xy):
+    """Stars (n,) that have a position in both."""
     if xy.shape != solution.positions.shape:
         raise InputError(f"xy must have one row for each of the {len(solution.positions)} stars, got shape {xy.shape}")
-    offsets = xy - solution.positions
-    good = np.tile(np.isfinite(offsets).all(axis=1), 2)
-    similar = np.zeros((good.sum(), 0))
-    if solution.gauge.tie is None:
-        similar = _columns(xy[good[: len(xy)]], "similarity")
-    if np.count_nonzero(good) <= similar.shape[1] + len(unknown):
+    return np.isfinite(xy - solution.positions).all(axis=1)
+
+
+def _without_directions(solution, xy, similar, stars, moves, there):
+    """Offsets (n_stars, 2) without displacements `similar` (2 n, k) of stars that count, and without directions.
+
+    The latter move the stars by `stars` (n_stars, 2, m) and the coefficients by `moves`, m of shape
+    (n_exposures, 2, n_modes); where the solution has moved to, `there` of the uncertainty knows them.
+    """
+    good, m = np.tile(_compared(solution, xy), 2), stars.shape[2]
+    if np.count_nonzero(good) <= similar.shape[1] + m:
         raise InputError(
-            f"{similar.shape[1] + len(unknown)} directions cannot be taken off the offsets of {good.sum() // 2} stars"
+            f"{similar.shape[1] + m} directions cannot be taken off the offsets of {good.sum() // 2} stars"
         )
-    if unknown and not hasattr(type(solution.uncertainty), "unknown_at"):
+    if m and not hasattr(type(solution.uncertainty), there):
         raise InputError("a solution read from a file keeps no equations; call solve again")
-    values = offsets.T.ravel()[good]
-    here = np.stack([each.stars.T.ravel() for each in unknown], axis=1) if unknown else np.zeros((2 * len(xy), 0))
+    values = (xy - solution.positions).T.ravel()[good]
+    here = stars.transpose(1, 0, 2).reshape(2 * len(xy), m)
     design = np.hstack([similar, here[good]])
     amounts = np.linalg.lstsq(design, values, rcond=None)[0]
-    if unknown:  # the mean of the directions at both ends is exact to second order
-        there = _unknown_at(solution, amounts[similar.shape[1] :])
-        design = np.hstack([similar, (here + there)[good] / 2])
+    if m:  # the mean of the directions at both ends is exact to second order
+        coefficients = solution.coefficients.copy()
+        for amount, move in zip(amounts[-m:], moves, strict=True):
+            coefficients[:, :, : move.shape[2]] += amount * move
+        positions = np.nan_to_num(solution.positions) + np.nan_to_num(stars) @ amounts[-m:]
+        poses = np.stack([solution.poses[name] for name in solution.names])
+        moved = getattr(solution.uncertainty, there)(positions, coefficients, poses)
+        design = np.hstack([similar, (here + moved)[good] / 2])
         amounts = np.linalg.lstsq(design, values, rcond=None)[0]
     out = np.full(xy.shape, np.nan)
     out.T.flat[good] = values - design @ amounts
     return out
-
-
-def _unknown_at(solution, amounts):
-    """Directions (2 n_stars, m) where a solution has moved so far (m,) along those that it does not know."""
-    positions, coefficients = np.nan_to_num(solution.positions), solution.coefficients.copy()
-    for amount, each in zip(amounts, solution.gauge.unknown, strict=True):
-        positions = positions + amount * np.nan_to_num(each.stars)
-        coefficients[:, :, : each.coefficients.shape[2]] += amount * each.coefficients
-    poses = np.stack([solution.poses[name] for name in solution.names])
-    return solution.uncertainty.unknown_at(positions, coefficients, poses)
 
 
 def expected_bias(solution, *, removed=None, absolute=False):

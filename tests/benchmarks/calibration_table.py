@@ -343,12 +343,14 @@ def row(name, n_sets, **changed):
     true, reported, best = np.array([r[:3] for r in results]).T
     named = [r[3] for r in results]
     usual = max(set(named), key=named.count)
-    ratio = true.mean() / reported.mean()
+    ratio, each = true.mean() / reported.mean(), true / reported
     return Row(
         true=true.mean() ** 0.5,
         reported=reported.mean() ** 0.5,
         ratio=ratio,
         error=np.sqrt(np.sum((true - ratio * reported) ** 2)) / reported.sum(),
+        each=each.mean(),
+        each_error=each.std() / n_sets**0.5,
         over_ideal=(true.mean() / best.mean()) ** 0.5,
         unknown={part: usual.count(part) for part in usual},
         share=named.count(usual) / n_sets,
@@ -360,14 +362,18 @@ def row(name, n_sets, **changed):
 class Row:
     """Rms true and reported error, pixels; ratio of their squares with its standard error; true over ideal error.
 
-    `unknown` is the list most frequently named, with numbers, `share` how often it was; `unsettled` the number of sets
-    whose tie to a reference did not settle.
+    `each` is the mean of that ratio over the sets, with its standard error: where few sets have by far the largest
+    errors, as with few reference stars, the ratio of the means is theirs alone. `unknown` is the list most frequently
+    named, with numbers, `share` how often it was; `unsettled` the number of sets whose tie to a reference did not
+    settle.
     """
 
     true: float
     reported: float
     ratio: float
     error: float
+    each: float
+    each_error: float
     over_ideal: float
     unknown: dict
     share: float
@@ -375,16 +381,16 @@ class Row:
 
     HEAD = (
         f"{'setting':28s} {'exposures':>9s} {'true rms':>9s} {'reported':>9s} {'ratio of squares':>17s} "
-        f"{'true/ideal':>10s}  unknown"
+        f"{'set by set':>17s} {'true/ideal':>10s}  unknown"
     )
 
     def line(self, name, n):
         """The row as text."""
         words = ", ".join(f"{k} {part}" if k > 1 else part for part, k in self.unknown.items()) or "nothing"
         best = f"{self.over_ideal:10.2f}" if np.isfinite(self.over_ideal) else f"{'':10s}"
-        ratio = f"{self.ratio:.2f} +- {self.error:.2f}"
+        ratio, each = f"{self.ratio:.2f} +- {self.error:.2f}", f"{self.each:.2f} +- {self.each_error:.2f}"
         rest = f"; {self.unsettled} ties not settled" if self.unsettled else ""
-        figures = f"{self.true:9.4f} {self.reported:9.4f} {ratio:>17s} {best}"
+        figures = f"{self.true:9.4f} {self.reported:9.4f} {ratio:>17s} {each:>17s} {best}"
         return f"{name:28s} {n:9d} {figures}  {words} ({self.share:.0%}){rest}"
 
 

@@ -4,7 +4,9 @@ Sets as those of ``calibration_table.py``, of several degrees and very precise, 
 Squared over expected pull, (true over reported error)^2 summed over the stars against what the reported covariance
 leads to expect once the same fields are fitted and taken off; both should be 1:
 
-- after the exact directions of a common map (`Gauge.directions`);
+- after the exact directions of a common map (`Gauge.directions`), followed to second order
+  (`legdistort.results.accuracy.relative_offsets`): a solution that does not know the static distortion is pixels off
+  along them;
 - after a plain polynomial map of the fitted degree, the absolute covariance taken. Without a prior the static
   distortion is unknown, and so is its part of second order, which no such map takes off.
 
@@ -18,6 +20,7 @@ import numpy as np
 
 import legdistort as ld
 from legdistort.exceptions import LegdistortWarning
+from legdistort.results import accuracy
 
 PRIORS = ("none", "exact", "stated")
 DEGREES = (3, 5, 6)
@@ -57,8 +60,9 @@ def one(seed, degree, kind, **simulating):
     directions = solution.gauge.directions[good].transpose(1, 0, 2).reshape(len(wrong), -1)
     plain = polynomials(true[good], degree)
     whole = noise + directions @ solution.gauge.absolute_covariance @ directions.T
-    settings = ((noise, directions), (whole, plain), (noise, plain))
-    return [squared_pull(wrong, covariance, fields) for covariance, fields in settings]
+    relative = accuracy.relative_offsets(solution, true)[good].T.ravel()
+    settings = ((relative, noise, directions), (wrong, whole, plain), (wrong, noise, plain))
+    return [squared_pull(*setting) for setting in settings]
 
 
 def row(kind, degree, n_sets, **simulating):

@@ -92,9 +92,7 @@ class Uncertainty:
         All x first; each for the same change of what holds the solution as here. They turn as the solution moves along
         them, which is of second order.
         """
-        n = self._gauge.n_constraints
-        blocks = criterion.linearise(self._problem, State(positions.T, coefficients, poses))
-        system = reduced_system.reduced_system(self._problem, blocks, self._gauge, self.system.rows[n:])
+        n, system = self._gauge.n_constraints, self._system_at(positions, coefficients, poses)
         maps = self._directions(system)
         columns = [(maps @ each.map).T.ravel() for each in self._gauge.unknown_maps]
         here, there = self.system.moves[n:], system.moves[n:]
@@ -103,6 +101,17 @@ class Uncertainty:
                 system.follow(d).ravel() / self._unit(self.system.follow(h)) for h, d in zip(here, there, strict=True)
             ]
         return np.stack(columns, axis=1)
+
+    def directions_at(self, positions, coefficients, poses):
+        """`directions` where the solution has moved to, (2 n_stars, 2 n_modes), all x first."""
+        maps = self._directions(self._system_at(positions, coefficients, poses))
+        return maps.transpose(1, 0, 2).reshape(2 * len(maps), -1)
+
+    def _system_at(self, positions, coefficients, poses):
+        """The reduced system there, with the same constraints."""
+        blocks = criterion.linearise(self._problem, State(positions.T, coefficients, poses))
+        rows = self.system.rows[self._gauge.n_constraints :]
+        return reduced_system.reduced_system(self._problem, blocks, self._gauge, rows)
 
     def _unit(self, stars):
         """Rms per axis of what moves the stars (2, n_stars)."""
