@@ -15,6 +15,7 @@ from legdistort.results import accuracy
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 import calibration_table as table
+import relative_errors_table
 
 pytestmark = pytest.mark.filterwarnings(
     f"ignore::{LegdistortWarning.__module__}.{LegdistortWarning.__qualname__}"  # what is not known is known here
@@ -61,6 +62,22 @@ def test_known_offsets_are_those_after_a_similarity_where_all_is_known():
     assert np.sqrt(np.mean(accuracy.known_offsets(solution, true) ** 2)) == pytest.approx(expected)
 
 
+@pytest.mark.parametrize(("prior", "least"), [("none", 1.2), ("exact", 0.8)])
+def test_relative_errors_are_calibrated_after_any_common_map(prior, least):
+    """Positions good to 0.003 px; without a prior the solution is pixels off, and a linear map is not enough."""
+    after, linear = [], []
+    for seed in range(4):
+        after.append(relative_errors_table.one(seed, 3, prior, n_exposures=6)[0])
+        matches, sky, common = table.simulated(seed, n_stars=150, sigma=0.003, n_exposures=6)
+        given = table.as_prior(common, None) if prior == "exact" else None
+        solution = ld.solve(matches, prior=given)
+        wrong = (solution.positions - sky[solution.star_names]).T.ravel()
+        directions = solution.gauge.directions.transpose(1, 0, 2).reshape(len(wrong), -1)
+        linear.append(relative_errors_table.squared_pull(wrong, solution.uncertainty.star_matrix, directions))
+    assert np.mean(after) == pytest.approx(1, abs=0.15)
+    assert least < np.mean(linear) < least + 2
+
+
 def test_known_offsets_refuse_what_they_cannot_do(tmp_path):
     solution, true = offsets("no prior, no dithers", n_exposures=4)
     with pytest.raises(InputError, match=r"one row for each of the 70 stars, got shape \(3, 2\)"):
@@ -68,8 +85,9 @@ def test_known_offsets_refuse_what_they_cannot_do(tmp_path):
     with pytest.raises(InputError, match="20 directions cannot be taken off the offsets of 10 stars"):
         accuracy.known_offsets(solution, np.where(np.arange(len(true))[:, None] < 10, true, np.nan))
     solution.write(tmp_path / "solution.asdf")
-    with pytest.raises(InputError, match="read from a file keeps no equations; call solve again"):
-        accuracy.known_offsets(ld.Solution.read(tmp_path / "solution.asdf"), true)
+    for compare in (accuracy.known_offsets, accuracy.relative_offsets):
+        with pytest.raises(InputError, match="read from a file keeps no equations; call solve again"):
+            compare(ld.Solution.read(tmp_path / "solution.asdf"), true)
 
 
 @pytest.mark.slow
