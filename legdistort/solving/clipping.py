@@ -1,6 +1,7 @@
 """Rejection of mismatched or blended observations, in a way that cannot oscillate."""
 
 import contextlib
+import itertools
 import warnings
 
 import numpy as np
@@ -11,8 +12,6 @@ from . import agreement, minimisers
 from .equations import criterion
 from .equations.leverage import leverages
 
-#: Rounds of rejection after the robust start; each only takes away.
-MAX_ROUNDS = 8
 #: Deviations that chance brings about in this share of the sets with true errors give no cause to look for gross ones.
 BY_CHANCE = 0.01
 #: Share of gross errors up to which they are usual: 1 to 10 % in routine data (Hampel et al. 1986, section 1.2c).
@@ -77,7 +76,7 @@ def solve_clipped(problem, start, *, clip, plain=None, gauge="minimal", loss="li
     """
     result = _robust(problem, start, plain, gauge)
     good = used = np.ones(problem.xy.shape[1], dtype=bool)
-    for count in range(MAX_ROUNDS):
+    for count in itertools.count():
         pull = deviations(problem, result.state, result.robust * used)
         changed = good
         if count == 1:  # the scale of few observations is not well known before most are fitted at full weight

@@ -363,7 +363,8 @@ class Row:
     """Rms true and reported error, pixels; ratio of their squares with its standard error; true over ideal error.
 
     `each` is the mean of that ratio over the sets, with its standard error: where few sets have by far the largest
-    errors, as with few reference stars, the ratio of the means is theirs alone. `unknown` is the list most frequently
+    errors, as with few reference stars, the ratio of the means is theirs alone; it is larger where the reported error
+    scatters. `unknown` is the list most frequently
     named, with numbers, `share` how often it was; `unsettled` the number of sets whose tie to a reference did not
     settle.
     """
