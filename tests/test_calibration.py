@@ -90,6 +90,21 @@ def test_known_offsets_refuse_what_they_cannot_do(tmp_path):
             compare(ld.Solution.read(tmp_path / "solution.asdf"), true)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_constraints_follow_the_state_to_the_solution(seed):
+    """Held after two iterations, they cost 16 and 21."""
+    solution, _ = offsets("no prior, no dithers", seed, n_exposures=4)
+    assert int(solution.status.split()[2]) <= 10
+
+
+def test_constraints_do_not_follow_the_state_away():
+    """Twelve stars for twenty modes of the plane: constraints that never stop would take this set pixels off."""
+    simulating, solving = table.settings()["12 reference stars"]
+    true, reported, *_, status = table.one(46, simulating | {"n_exposures": 4}, solving)
+    assert "not converged" not in status
+    assert true < 9 * reported
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "n_exposures", "n_sets", "tolerance"),

@@ -25,6 +25,9 @@ log = logging.getLogger(__name__)
 LOSSES = ("linear", "huber", "cauchy")
 #: Iterations of the joint solver and sweeps of the alternating one at most, unless another number is given.
 MAX_ITERATIONS, MAX_SWEEPS = 50, 1000
+#: The constraints follow the state for so many iterations; then they are held. After one or two they are not yet those of
+#: the solution; where few stars of a reference bend the plane by many pixels, state and constraints may chase each other.
+_MADE = 6
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
 
 
@@ -137,6 +140,7 @@ class _Descent:
     def __init__(self, problem, state, rules, *, released=None, steps=()):
         self.problem, self.state, self.rules = problem, state, rules
         self.released, self.steps, self.converged = released, list(steps), False
+        self.n_made = 0
         self._reweight(criterion.residuals(problem, state) if rules.loss != "linear" else None)
         self.blocks = criterion.linearise(self.weighted, state)
         self._prepare()
@@ -150,8 +154,10 @@ class _Descent:
 
     def _prepare(self):
         """The gauge and the reduced system at the current state."""
-        how = {"released": self.released, "common": self.rules.common}
-        self.convention = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks, **how)
+        if self.n_made < _MADE:
+            how = {"released": self.released, "common": self.rules.common}
+            self.convention = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks, **how)
+            self.n_made += 1
         self.system = reduced_system.reduced_system(self.weighted, self.blocks, self.convention)
 
     def descend(self, max_iterations, tolerance):
