@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 LOSSES = ("linear", "huber", "cauchy")
 #: Iterations of the joint solver and sweeps of the alternating one at most, unless another number is given.
 MAX_ITERATIONS, MAX_SWEEPS = 50, 1000
-#: The constraints follow the state for so many iterations; then they are held. After one or two they are not yet those of
-#: the solution; where few stars of a reference bend the plane by many pixels, state and constraints may chase each other.
+#: The constraints follow the state for so many iterations; then they are held. After one or two they are not yet those
+#: of the solution; where few stars of a reference bend the plane by much, state and constraints may chase each other.
 _MADE = 6
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
 
