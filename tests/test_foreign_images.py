@@ -240,16 +240,16 @@ def test_jwst_rate_has_no_gwcs(data, tmp_path):
 
 
 def write_roman(path, data, **changes):
-    """The public tree of a Roman image (tags of roman_datamodels, which need not be there)."""
+    """The public tree of a Roman image; with tags of a version that roman_datamodels, if it is there, does not check."""
     flags = np.zeros(SHAPE, np.uint32)
     flags[7, 8], flags[9, 10] = 1, 4
     exposure = asdf.tagged.TaggedDict(
         {"exposure_time": 139.8, "start_time": Time("2027-03-01T00:00:00")},
-        "asdf://stsci.edu/datamodels/roman/tags/exposure-1.3.0",
+        "asdf://stsci.edu/datamodels/roman/tags/exposure-0.0.0",
     )
     meta = {"wcs": bent_wcs(), "exposure": exposure, "instrument": {"name": "WFI", "detector": "WFI07"}}
     image = {"data": data, "err": np.full(SHAPE, 2, np.float16), "dq": flags, "meta": meta} | changes
-    roman = asdf.tagged.TaggedDict(image, "asdf://stsci.edu/datamodels/roman/tags/wfi_image-1.4.0")
+    roman = asdf.tagged.TaggedDict(image, "asdf://stsci.edu/datamodels/roman/tags/wfi_image-0.0.0")
     asdf.AsdfFile({"roman": roman}).write_to(path)
     return path
 
