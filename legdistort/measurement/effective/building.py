@@ -14,6 +14,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
 from ..profiles import moffat
+from ..profiles.pixel_noise import pixel_variance
 from . import splines
 from .corrections import Corrections
 from .model import EffectivePSF, Polynomial
@@ -44,7 +45,7 @@ class Ensemble:
     data : ndarray, shape (n, npix)
         Stamps without the light of other stars.
     sky : ndarray, shape (n, npix)
-        Variance without photon noise of the star; infinite where a pixel is not to be used.
+        Variance without photon noise of the star and of its local sky; infinite where a pixel is not to be used.
     photon : float
         Variance per unit of star light.
     """
@@ -58,6 +59,10 @@ class Ensemble:
     def half(self):
         """Half the side of a stamp, without the central pixel."""
         return (round(np.sqrt(self.data.shape[1])) - 1) // 2
+
+    def variance(self, light):
+        """Of the pixels, with this light of the stars and their local skies."""
+        return pixel_variance((self.sky, self.photon), light)
 
     def part(self, rows):
         """Some of the stars."""
@@ -259,8 +264,8 @@ def _linearise(stars, params, grids, spacing, misfit):
     value, by_x, by_y = splines.on_stamps(grids, params[:, :2], stars.half, spacing, slopes=True)
     flux = params[:, 2:3]
     model = flux * value
-    light = np.maximum(model + params[:, 3:], 0)  # a level that PSF and sky share must not change the noise
-    weights = 1 / (stars.sky + stars.photon * light + (misfit * model) ** 2)
+    # with the local sky: a level that PSF and sky share must not change the noise
+    weights = 1 / (stars.variance(model + params[:, 3:]) + (misfit * model) ** 2)
     slopes = np.stack([flux * by_x, flux * by_y, value, np.ones_like(value)], axis=1)
     weighted = slopes * weights[:, None]
     inverse = np.linalg.inv(weighted @ slopes.swapaxes(1, 2))

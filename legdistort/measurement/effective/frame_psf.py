@@ -12,8 +12,8 @@ import numpy as np
 
 from ..flags import UNUSABLE, Flag
 from ..profiles import moffat
-from ..profiles.frame_fit import OUTLIER
 from ..profiles.levenberg_marquardt import Fit
+from ..profiles.local_sky import separate
 from ..profiles.pixel_noise import NEIGHBOUR
 from . import building, fitting, splines
 from .own_error import own_covariance
@@ -22,9 +22,8 @@ _BRIGHT = 10.0  # signal-to-noise ratio of a star that helps to make the PSF
 _DISTURBED = 0.05  # light of others within one FWHM, relative to that of the star
 _MOST = 150  # stars that make the PSF, the brightest
 _NOTICED = 1e-2  # light of others, relative to that of the star: worth to be subtracted with the PSF itself
-_TOO_MANY = 1 / 4  # of the pixels of a core
-_MODEL = 0.1  # pixels off by this part of the star, beyond their noise, follow no PSF
-
+_SLOPED = 1 / 4  # of the stars, on a sky that is not flat: the PSF is made anew, without the slopes
+_DEVIATES = 0.1  # fraction of a star by which pixels may deviate from the PSF
 
 _DECIDE = 60  # brightest usable stars that decide whether the PSF is worth while
 _NOTHING_LEFT = 1.25  # median chi2 / dof that Moffat profiles leave of them, by noise and its estimate alone
@@ -153,8 +152,10 @@ def make_psf(stamps, fitted, shape, rows):
     built = _first_psf(stamps, fitted, shape, rows)
     fit = fit_all(stamps, fitted, started(fitted, built.psf), built.psf, models=fitted.models)
     own, others = fitting.light_of(built.psf, stamps, fit.params)
-    if (others[rows].sum(axis=1) > _NOTICED * own[rows].sum(axis=1)).any():
-        built = building.improved(built, ensemble(stamps, fitted, rows, others))
+    slope = _separate(stamps, fitted, fit, built.psf, (own, others))[2]
+    lit = (others[rows].sum(axis=1) > _NOTICED * own[rows].sum(axis=1)).any()
+    if lit or slope[rows].any(axis=1).mean() > _SLOPED:
+        built = building.improved(built, ensemble(stamps, fitted, rows, others, slope))
     return built, fit
 
 
@@ -177,10 +178,11 @@ def started(fitted, psf):
     return Fit(params, covariance, found.chi2, found.dof, found.converged)
 
 
-def ensemble(stamps, fitted, rows, others):
-    """Some stars of a frame, with the light of the others taken off."""
-    data = (stamps.data[rows] - others[rows]).astype(float)
-    sky = fitted.sky[rows].astype(float) + (NEIGHBOUR * others[rows]) ** 2
+def ensemble(stamps, fitted, rows, others, slope=None):
+    """Some stars of a frame, with the light of the others, and the slope of the sky, taken off."""
+    others = others[rows].astype(float)
+    data = stamps.data[rows] - others - (0 if slope is None else slope[rows])
+    sky = fitted.sky[rows] + fitted.photon * others + (NEIGHBOUR * others) ** 2
     return building.Ensemble(stamps.centres[rows], data, np.where(stamps.good[rows], sky, np.inf), float(fitted.photon))
 
 
@@ -201,22 +203,22 @@ def fit_all(stamps, fitted, fit, psf, *, models):
     -------
     `~legdistort.measurement.profiles.levenberg_marquardt.Fit`
     """
-    pixels = _separate(stamps, fitted, fit, psf, models)
+    pixels = _separate(stamps, fitted, fit, psf, models)[:2]
     return fitting.fit_stars(fit, fitted.labels, pixels, stamps=stamps, psf=psf)
 
 
 def _separate(stamps, fitted, fit, psf, models):
-    own, others = models
+    """See `separate`; where the models are still Moffat profiles, what they leave tells no slope of the sky."""
     partners = fitting.light_of_partners(psf, stamps, fitted.labels, fit.params)
-    light = np.maximum(own + others + fit.params[:, 3:], 0)
-    variance = fitted.sky + fitted.photon * light + (NEIGHBOUR * (others - partners)) ** 2
-    residual = np.abs(stamps.data - own - others - fit.params[:, 3:])
-    good = stamps.good & (residual < OUTLIER * np.sqrt(variance) + _MODEL * np.abs(own + partners))
-    # where much of a core deviates it is the PSF that is wrong, not the pixels, and chi2 shall say so
-    core = stamps.near(fit.params, psf.fwhm / 2) & stamps.good
-    keep = (core & ~good).sum(axis=1) > _TOO_MANY * core.sum(axis=1)
-    good |= keep[:, None] & stamps.good
-    return stamps.data - (others - partners), np.where(good, 1 / variance, 0.0)
+
+    def derivatives(rows):
+        return fitting.derivatives(psf, stamps, fit.params, rows)
+
+    return separate(
+        stamps, models, partners, fit.params[:, 3:], (fitted.sky, fitted.photon),
+        deviates=_DEVIATES, derivatives=None if models is fitted.models else derivatives,
+        core=stamps.near(fit.params, psf.fwhm / 2),
+    )  # fmt: skip
 
 
 def measure_with(stamps, fitted, fit, psf, built=None):
@@ -234,7 +236,7 @@ def measure_with(stamps, fitted, fit, psf, built=None):
     Measured
     """
     models = fitting.light_of(psf, stamps, fit.params)
-    data, weights = _separate(stamps, fitted, fit, psf, models)
+    data, weights, _ = _separate(stamps, fitted, fit, psf, models)
     fit = fitting.fit_stars(fit, fitted.labels, (data, weights), stamps=stamps, psf=psf)
     own, others = fitting.light_of(psf, stamps, fit.params)
     snr = np.sqrt((weights * own**2).sum(axis=1))
