@@ -501,13 +501,40 @@ def test_bad_arrays_and_files_say_what_is_wrong(tmp_path):
         EffectivePSF.read(tmp_path / "bare.fits")
 
 
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [({"profile": "shared"}, "profile='shared' is one of Moffat"), ({"errors": "injected"}, "give psf='moffat'")],
-)
-def test_options_that_belong_to_moffat_profiles(more, words):
-    with pytest.raises(InputError, match=words):
-        ld.measure(moffat_exposure(), psf="effective", **more)
+def test_options_that_belong_to_moffat_profiles():
+    with pytest.raises(InputError, match="profile='shared' is one of Moffat"):
+        ld.measure(moffat_exposure(), psf="effective", profile="shared")
+    with pytest.raises(InputError, match="fwhm is that of Moffat profiles: leave it out"):
+        ld.calibrate_noise(moffat_exposure(), fwhm=4.0, measuring={"psf": "effective"})
+
+
+# --- errors by injected stars ------------------------------------------------------------------------------------
+
+
+def test_noise_curve_is_that_of_the_true_psf(made):
+    """Stars put in as the effective PSF of the frame, and its halo: errors are at the bound of the pupil's."""
+    exposure, xy, _, _ = night()
+    _, _, true_flux = drawn(0, 49, 1000)
+    measured = made["effective"][:15]
+    scale = np.median(true_flux[identify(measured, xy)] / measured["flux"])  # the halo's light passes for sky
+    assert scale > 2
+    flux = np.geomspace(1e3, 3e5, 5)
+    curves = ld.calibrate_noise(exposure, fluxes=flux, n_positions=60, seed=1)
+    least = [np.mean([np.trace(bound(x, 210.3, f * scale)[0]) / 2 for x in (60.2, 360.7)]) ** 0.5 for f in flux]
+    # 120 coordinates and a law of three parameters: 5 %; the PSF in which they stand is known to some per cent
+    assert_allclose(curves.sigma(flux), least, rtol=0.17)
+    ratio = np.concatenate([curves.table["x_ratio"], curves.table["y_ratio"]])
+    assert np.mean(ratio) == pytest.approx(1, abs=0.1)
+
+
+def test_errors_of_injected_stars_are_true_on_these_images(made):
+    _, xy, covariance, _ = night()
+    table = ld.measure(night()[0], errors="injected")
+    assert set(table["psf"]) == {"effective"}
+    assert np.array_equal(table["x"], made["effective"]["x"])
+    star, _, own = ratios(table, xy, covariance)
+    assert len(star) >= 48
+    assert rms(own) / rms(with_true_psf()[star]) == pytest.approx(1, abs=0.12)
 
 
 # --- pictures ----------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
+from scipy.stats import theilslopes
 
 from ..profiles import moffat
 from ..profiles.pixel_noise import pixel_variance
@@ -202,7 +203,8 @@ def improved(before, stars, *, iterations=2):
     coefficients = corrections.grids(corrections.raw(amplitudes))
     coefficients[0] += base
     known = {"n_stars": int(used.sum()), "residual": _mean_residual(stars, params, grids, spacing, used)}
-    psf = replace(before.psf, coefficients=coefficients, **known)
+    halo = max(float(theilslopes(params[used, 3], params[used, 2]).slope), 0.0)
+    psf = replace(before.psf, coefficients=coefficients, halo=halo, **known)
     return Built(base, psf, params, used, corrections, amplitudes, precision, factor)
 
 
