@@ -273,7 +273,6 @@ def measure_exposure(exposure, options):
     exposure = options.with_detector(exposure.read())
     measured = _measure_frame(exposure, options)
     if options.errors != "fit" and np.any((measured.table["flags"] & UNUSABLE) == 0):
-
         held = replace(options, max_stars=None, psf=measured.psf or "moffat")
 
         def remeasure(image, *, fwhm=options.fwhm):
