@@ -315,6 +315,19 @@ def test_it_is_the_psf_of_the_pupil(psf):
         assert np.abs(ours / scale - truth).max() < 0.04 * truth.max()
 
 
+def test_its_halo_is_that_of_the_pupil(psf):
+    """What passes for local sky in the fits, and would be missing around stars that are put in."""
+    pixels = np.arange(-6, 7)
+    ours = psf.on_stamps(np.array([[210, 210]]), np.zeros((1, 2)), 6)[0]
+    truth = true_psf(pixels + 210, pixels + 210, 210.0, 210.0).ravel()
+    far = np.hypot(*np.meshgrid(pixels, pixels)).ravel() > 5
+    part = [light[far].mean() / light.max() for light in (ours, truth)]
+    assert part[1] > 0.03
+    assert part[0] == pytest.approx(part[1], rel=0.15)
+    read = psf.named(halo=0.0).on_stamps(np.array([[210, 210]]), np.zeros((1, 2)), 6)[0]
+    assert abs(read[far].mean()) < 0.3 * part[1] * read.max()
+
+
 def test_repr_says_what_it_is(psf):
     text = str(psf)
     assert text.startswith(f"<EffectivePSF 'night0': from {psf.n_stars} stars, quadratic, FWHM ")
@@ -424,6 +437,7 @@ def test_written_files_read_back_and_are_read_by_photutils(psf, tmp_path):
     back = EffectivePSF.read(tmp_path / "a.fits")
     assert np.array_equal(back.coefficients, psf.coefficients)
     assert np.array_equal(back.residual, psf.residual)
+    assert back.halo == psf.halo > 0
     assert str(back) == str(psf)
     x, y = np.meshgrid(np.arange(205.0, 217), np.arange(95.0, 107))
     ours = psf(x - 211.3, y - 101.2, at=(211.3, 101.2))
@@ -518,11 +532,13 @@ def test_noise_curve_is_that_of_the_true_psf(made):
     measured = made["effective"][:15]
     scale = np.median(true_flux[identify(measured, xy)] / measured["flux"])  # the halo's light passes for sky
     assert scale > 2
-    flux = np.geomspace(1e3, 3e5, 5)
+    flux = np.geomspace(3e3, 3e5, 4)
     curves = ld.calibrate_noise(exposure, fluxes=flux, n_positions=60, seed=1)
     least = [np.mean([np.trace(bound(x, 210.3, f * scale)[0]) / 2 for x in (60.2, 360.7)]) ** 0.5 for f in flux]
-    # 120 coordinates and a law of three parameters: 5 %; the PSF in which they stand is known to some per cent
-    assert_allclose(curves.sigma(flux), least, rtol=0.17)
+    # 120 coordinates a flux and a law of three parameters: 5 %; many stand in the halos of others, which cost some 10 %
+    ratio = curves.sigma(flux) / least
+    assert (ratio > 0.95).all()
+    assert (ratio < 1.25).all()
     ratio = np.concatenate([curves.table["x_ratio"], curves.table["y_ratio"]])
     assert np.mean(ratio) == pytest.approx(1, abs=0.1)
 

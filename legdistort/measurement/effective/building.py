@@ -27,6 +27,7 @@ DEGREE = 2
 
 _PER_FWHM = 4  # knots: cubic splines then follow a diffraction-limited core to 0.1 % of its peak
 _ITERATIONS = 4
+_ANEW = 3  # with other stars, from a PSF that is nearly right
 _MOVE = 0.3  # FWHM, largest step of a star in one iteration
 _SETTLE = 2  # iterations of the stars alone
 _DEVIANT = 3.0  # times the median of chi2 / dof: such a star is no single one
@@ -100,6 +101,10 @@ class Built:
     precision: np.ndarray
     factor: tuple
 
+    def for_stars(self, params):
+        """The same with other stars: x, y, flux, background (n, 4)."""
+        return replace(self, params=params, used=np.ones(len(params), dtype=bool))
+
 
 def profile_psf(shape, half, image_shape):
     """A Moffat profile as `EffectivePSF`, constant over the field: what a PSF is made to start from.
@@ -161,14 +166,14 @@ def build(stars, start, base):
     return improved(first, stars, iterations=_ITERATIONS)
 
 
-def improved(before, stars, *, iterations=2):
-    """A PSF fitted anew to the same stars, by Gauss-Newton iterations.
+def improved(before, stars, *, iterations=_ANEW):
+    """A PSF fitted anew to its stars, by Gauss-Newton iterations.
 
     Parameters
     ----------
     before : Built
     stars : Ensemble
-        Their neighbours subtracted better.
+        Those of its parameters.
     iterations : int
 
     Returns
@@ -307,7 +312,9 @@ def _normal(stars, linear, params, corrections, spacing, terms, used):
     followed = np.zeros((len(terms), 4, n_modes))
     rows = np.flatnonzero(used)
     for part in np.array_split(rows, max(1, len(rows) // _AT_ONCE)):
-        light = params[part, 2, None, None] * corrections.on_stamps(params[part, :2], stars.half, spacing)
+        # single precision for the patterns: all that follows sees the same ones
+        light = corrections.on_stamps(params[part, :2].astype(np.float32), stars.half, spacing).astype(float)
+        light *= params[part, 2, None, None]
         weighted = light * linear.weights[part, None]
         mixed = linear.slopes[part] @ weighted.swapaxes(1, 2)
         followed[part] = linear.inverse[part] @ mixed
