@@ -13,8 +13,10 @@ SKY, GAIN, READ_NOISE = 200.0, 2.0, 15.0
 STREHLS = (0.1, 0.3, 0.6)
 #: What is added to a round pupil of 2.8 px resolution in a halo of 25 px.
 SHAPES = {"symmetric": {}, "elongated": {"elongation": 1.2}, "coma": {"coma": 0.4}}
-#: Order of the polynomial in x and y after which positions are compared: that of the PSF, and so of its centre.
-ORDERS = {"symmetric": 0, "elongated": 2, "coma": 1, "psfao": 0}
+#: Order of the polynomial in x and y after which positions are compared: that of the PSF's centre. With coma that grows
+#: linearly the centre of the core moves by an odd function of the place: after a linear map 2.5 x the bound of bright
+#: stars is left of its true course, after a cubic one 0.1.
+ORDERS = {"symmetric": 0, "elongated": 2, "coma": 3, "psfao": 0}
 
 
 @dataclass(frozen=True, eq=False)

@@ -165,12 +165,12 @@ def test_positions_lie_in_free_sky():
 
 def test_light_put_in_is_what_was_asked():
     exposure = Exposure("e", np.zeros((200, 200)), uncertainty=np.full((200, 200), 3.0))
-    shape = injection.moffat.shape(4.5, beta=2.8)
+    stars = injection.MoffatStars(injection.moffat.shape(4.5, beta=2.8))
     xy, flux = np.array([[60.3, 70.8], [120.0, 130.49]]), np.array([1e5, 3e4])
-    clean = injection.inject(exposure, xy, flux, shape, photon=0.0, rng=None)
+    clean = injection.inject(exposure, xy, flux, stars, photon=0.0, rng=None)
     true = render((200, 200), xy, flux, psf=PSF)
     np.testing.assert_allclose(clean.data, true, atol=0.03 * flux.max() * PSF.peak * 0.02)
-    noisy = injection.inject(exposure, xy, flux, shape, photon=0.5, rng=np.random.default_rng(0))
+    noisy = injection.inject(exposure, xy, flux, stars, photon=0.5, rng=np.random.default_rng(0))
     lit = true > 50
     assert np.std((noisy.data - true)[lit] / np.sqrt(0.5 * true[lit])) == pytest.approx(1, abs=0.1)
     np.testing.assert_allclose(noisy.uncertainty**2, 9 + 0.5 * clean.data, rtol=1e-5)

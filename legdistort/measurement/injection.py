@@ -2,7 +2,7 @@
 
 import logging
 import zlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -33,7 +33,7 @@ _RANGE = 1000  # highest flux, at least so many times the lowest: both regimes s
 _BELOW_SATURATION = 0.8
 
 
-def calibrate_frame(exposure, remeasure, *, threshold=5.0, widths=None, fluxes=None, n_positions=100, seed=0):
+def calibrate_frame(exposure, remeasure, *, psf=None, threshold=5.0, widths=None, fluxes=None, n_positions=100, seed=0):
     """Errors of positions in one frame, from stars put into it and measured.
 
     Parameters
@@ -41,10 +41,12 @@ def calibrate_frame(exposure, remeasure, *, threshold=5.0, widths=None, fluxes=N
     exposure : `~legdistort.inputs.exposures.Exposure`
     remeasure : callable
         ``remeasure(exposure)`` and ``remeasure(exposure, fwhm=...)``: table of detections.
+    psf : `~legdistort.measurement.effective.model.EffectivePSF`, optional
+        What is put in; by default the median Moffat profile of the frame.
     threshold : float
         Detection limit of `remeasure`.
     widths : sequence of float, optional
-        FWHM of the stars put in [pix]; by default that of the frame's own.
+        FWHM of the Moffat profiles put in [pix]; by default that of the frame's own.
     fluxes : sequence of float, optional
         By default from the detection limit to the brightest star of the frame or a thousand times the limit, but
         below saturation.
@@ -67,18 +69,52 @@ def calibrate_frame(exposure, remeasure, *, threshold=5.0, widths=None, fluxes=N
     if not len(centres) and widths is None:
         raise InputError(f"{name}: no star above {threshold:g} times the noise tells how wide stars are; give fwhm")
     photon = _photon_noise(frame, exposure, centres, shape)
-    own = float(moffat.fwhm(shape)) if len(centres) else None
+    own = psf or (MoffatStars(shape) if len(centres) else None)
+    profiles = [own] if widths is None else [MoffatStars(scaled(shape, width)) for width in widths]
     rows = []
-    for width in widths or [own]:
-        profile = scaled(shape, width)
+    for profile, width in zip(profiles, widths or [own.fwhm], strict=True):
         levels = np.sort(fluxes if fluxes is not None else default_fluxes(exposure, frame, centres, profile, threshold))
-        again = remeasure if width == own else partial(remeasure, fwhm=width)
+        again = remeasure if own and width == own.fwhm else partial(remeasure, fwhm=width)
         each = np.repeat(levels[::-1], n_positions)  # stars of about the same flux come into one frame
         off = _offsets(exposure, centres, each, profile, photon=photon, again=again, rng=rng)
         log.info("%s: FWHM %.2f px, %d stars put in at %d fluxes", name, width, len(each), len(levels))
         known = {"exposure": name, "fwhm": width * u.pix}
         rows += [known | {"flux": flux} | _statistics(off[each == flux]) for flux in levels]
-    return NoiseCurves(QTable(rows, meta={"fwhm": {name: own}, "photon": {name: float(photon)}}))
+    return NoiseCurves(QTable(rows, meta={"fwhm": {name: own and own.fwhm}, "photon": {name: float(photon)}}))
+
+
+@dataclass(frozen=True, eq=False)
+class MoffatStars:
+    """Moffat profiles of one shape, as stars to be put into a frame; an `EffectivePSF` serves as well.
+
+    Attributes
+    ----------
+    shape : ndarray, shape (4,)
+        Shape parameters of `legdistort.measurement.profiles.moffat`.
+    """
+
+    shape: np.ndarray
+
+    @property
+    def fwhm(self):
+        """Full width at half maximum [pix]."""
+        return float(moffat.fwhm(self.shape))
+
+    @property
+    def reach(self):
+        """How far from the star there is light [pix]."""
+        return int(np.ceil(8 * self.fwhm))
+
+    def on_stamps(self, centres, offsets, half):
+        """Parts of the light on square stamps, see `EffectivePSF.on_stamps`; averaged over every pixel of the core."""
+        nodes = moffat.quadrature(min(self.fwhm, 2.0))  # 3 or 5 points a pixel, however wide
+        params = moffat.parameters(np.ones(len(centres)), self.shape, offsets)
+        params[:, 2] /= moffat.flux(params)
+        core = min(half, frame_fit.box_half(self.fwhm))
+        out = moffat.evaluate(params, half, moffat.CENTRES)
+        inner = np.flatnonzero((np.abs(np.mgrid[-half : half + 1, -half : half + 1]) <= core).all(axis=0))
+        out[:, inner] = moffat.evaluate(params, core, nodes)
+        return out
 
 
 def _photon_noise(frame, exposure, centres, shape):
@@ -94,10 +130,10 @@ def _photon_noise(frame, exposure, centres, shape):
     return max(float(np.median(above / np.maximum(frame.signal[y, x], 1e-30))), 0.0)
 
 
-def default_fluxes(exposure, frame, centres, shape, threshold):
+def default_fluxes(exposure, frame, centres, profile, threshold):
     """Fluxes from the detection limit to bright stars, evenly spaced in their logarithm; see `calibrate_frame`."""
-    params = moffat.parameters(np.ones(1), shape)
-    unit = moffat.evaluate(params, frame_fit.box_half(moffat.fwhm(shape)), moffat.CENTRES)[0] / moffat.flux(params)
+    middle = np.array(exposure.shape[::-1])[None] // 2
+    unit = profile.on_stamps(middle, np.zeros((1, 2)), frame_fit.box_half(profile.fwhm))[0]
     lowest = _FAINTEST * threshold * np.sqrt(np.median(frame.variance[frame.good]) / (unit**2).sum())
     highest = _RANGE * lowest
     if len(centres):
@@ -110,9 +146,9 @@ def default_fluxes(exposure, frame, centres, shape, threshold):
     return np.geomspace(lowest, highest, N_FLUXES)
 
 
-def _offsets(exposure, centres, flux, shape, *, photon, again, rng):
+def _offsets(exposure, centres, flux, profile, *, photon, again, rng):
     """Measured less true positions and errors stated (n, 4): x, y, x_err, y_err; NaN for stars not found."""
-    fwhm, n, done = float(moffat.fwhm(shape)), len(flux), 0
+    fwhm, n, done = profile.fwhm, len(flux), 0
     out = np.full((n, 4), np.nan)
     while done < n:
         xy = free_positions(exposure, centres, fwhm, n=n - done, rng=rng)
@@ -123,7 +159,7 @@ def _offsets(exposure, centres, flux, shape, *, photon, again, rng):
                 "fwhm, another frame, or a higher threshold"
             )
         part = slice(done, done + len(xy))
-        table = again(inject(exposure, xy, flux[part], shape, photon=photon, rng=rng))
+        table = again(inject(exposure, xy, flux[part], profile, photon=photon, rng=rng))
         table = table[(table["flags"] & UNUSABLE) == 0]
         if len(table):
             found = np.column_stack([table[name].value for name in ("x", "y", "x_err", "y_err")])
@@ -199,10 +235,8 @@ def free_positions(exposure, taken, fwhm, *, n, rng):
     return xy[keep][:n]
 
 
-def inject(exposure, xy, flux, shape, *, photon, rng):
+def inject(exposure, xy, flux, profile, *, photon, rng):
     """An exposure with stars added, and their photon noise.
-
-    The profile is averaged over every pixel of the core, and reaches to 8 FWHM.
 
     Parameters
     ----------
@@ -211,8 +245,7 @@ def inject(exposure, xy, flux, shape, *, photon, rng):
         Centres [pix].
     flux : ndarray, shape (n,)
         Of the whole profiles, in units of the data.
-    shape : ndarray, shape (4,)
-        Shape parameters of `legdistort.measurement.profiles.moffat`.
+    profile : MoffatStars or `~legdistort.measurement.effective.model.EffectivePSF`
     photon : float
         Variance per unit of star light (1 / gain); 0 adds no noise.
     rng : `~numpy.random.Generator`
@@ -222,28 +255,22 @@ def inject(exposure, xy, flux, shape, *, photon, rng):
     `~legdistort.inputs.exposures.Exposure`
         A copy; its uncertainty plane, if there is one, has the photon noise too.
     """
-    light = _light(exposure.shape, xy, flux, shape)
-    added = light if not photon else photon * rng.poisson(light / photon)
+    light = _light(exposure.shape, xy, flux, profile)
+    seen = np.maximum(light, 0)  # an effective PSF may dip below the sky
+    added = light if not photon else light - seen + photon * rng.poisson(seen / photon)
     before = exposure.uncertainty
-    uncertainty = None if before is None else np.sqrt(before**2 + photon * light)
+    uncertainty = None if before is None else np.sqrt(before**2 + photon * seen)
     return replace(exposure, data=exposure.data + added, uncertainty=uncertainty)
 
 
-def _light(image_shape, xy, flux, shape):
-    ny, nx = image_shape
-    width = float(moffat.fwhm(shape))
-    nodes = moffat.quadrature(min(width, 2.0))  # 3 or 5 points a pixel, however wide
-    half, wide = frame_fit.box_half(width), int(np.ceil(8 * width))
+def _light(image_shape, xy, flux, profile):
+    (ny, nx), wide = image_shape, profile.reach
     offset = np.arange(-wide, wide + 1)
-    core = np.flatnonzero((np.abs(offset)[:, None] <= half) & (np.abs(offset) <= half))
     out = np.zeros(ny * nx)
     for k in range(0, len(xy), 100):
         part = slice(k, k + 100)
         pixel = np.round(xy[part]).astype(int)
-        params = moffat.parameters(np.ones(len(pixel)), shape, xy[part] - pixel)
-        params[:, 2] = flux[part] / moffat.flux(params)
-        stamp = moffat.evaluate(params, wide, moffat.CENTRES)
-        stamp[:, core] = moffat.evaluate(params, half, nodes)
+        stamp = flux[part, None] * profile.on_stamps(pixel, xy[part] - pixel, wide)
         x = (pixel[:, :1, None] + offset) + np.zeros((len(offset), 1), dtype=int)
         y = (pixel[:, 1:, None] + offset[:, None]) + np.zeros(len(offset), dtype=int)
         inside = ((x >= 0) & (x < nx) & (y >= 0) & (y < ny)).reshape(stamp.shape)

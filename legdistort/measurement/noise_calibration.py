@@ -12,7 +12,7 @@ from ..runtime import checks, parallel
 from .injection import calibrate_frame
 from .noise_curves import NoiseCurves
 from .options import MeasureOptions
-from .positions import measure_exposure
+from .positions import measure_exposure, warn_of_psf
 
 
 def calibrate_noise(
@@ -20,9 +20,10 @@ def calibrate_noise(
 ):
     """Find the error of a position as a function of flux, by putting stars into the real background.
 
-    As in section 5.2.2 of Bernard et al. 2017: profiles of given FWHM and flux are added at known random positions,
-    with photon noise, and measured by `legdistort.measure`. They stand three FWHM or more from every detection and
-    eight from one another, as many in one copy of the frame as find room. Their shape is the median one of the frame.
+    As in section 5.2.2 of Bernard et al. 2017: stars of given flux are added at known random positions, with photon
+    noise, and measured by `legdistort.measure`. They stand three FWHM or more from every detection and eight from one
+    another, as many in one copy of the frame as find room. They have the effective PSF of the frame, where `measure`
+    would take that, and are measured with it; else, and where `fwhm` is given, the median Moffat profile.
 
     Parameters
     ----------
@@ -32,7 +33,7 @@ def calibrate_noise(
         In units of the data; by default twelve from the detection limit to the brightest star, or a thousand times
         the limit, but below saturation.
     fwhm : float or sequence of float, optional
-        Widths [pix]; by default that of the frame's own stars.
+        Widths of Moffat profiles [pix]; by default stars are as wide as the frame's own.
     n_positions : int
         Stars for every flux and width, at least 10.
     seed : int
@@ -61,6 +62,8 @@ def calibrate_noise(
     exposures = listed(exposures, "calibrate_noise")
     fluxes, widths = check_injection(fluxes, fwhm, n_positions, seed)
     options = checks.options_from(MeasureOptions, measuring, "measuring")
+    if widths is not None and options.psf not in ("auto", "moffat"):
+        raise InputError("fwhm is that of Moffat profiles: leave it out, or give measuring={'psf': 'moffat'}")
     work = partial(_calibrate, options=options, fluxes=fluxes, widths=widths, n_positions=n_positions, seed=seed)
     curves = list(parallel.map_items(work, exposures, workers=workers, progress=progress, description="noise"))
     photons = {exposure.name: photon for exposure, (_, photon) in zip(exposures, curves, strict=True)}
@@ -78,14 +81,21 @@ def calibrate_noise(
     return NoiseCurves(table)
 
 
-def _calibrate(exposure, *, options, **stars):
+def _calibrate(exposure, *, options, widths, **stars):
     """Curves of one exposure, and its photon noise if that is an estimate; `stars` put in."""
     exposure = options.with_detector(exposure.read())
+    options = replace(options, errors="fit", max_stars=None)
+    psf = None
+    if widths is None and options.psf != "moffat":
+        _, _, psf, verdict = measure_exposure(exposure, options)
+        if options.psf == "effective":
+            warn_of_psf({exposure.name: verdict})
+    options = replace(options, psf=psf or "moffat")
 
     def remeasure(image, *, fwhm=options.fwhm):
-        return measure_exposure(image, replace(options, fwhm=fwhm, psf="moffat"))[0]  # as what is put in
+        return measure_exposure(image, replace(options, fwhm=fwhm)).table
 
-    curves = calibrate_frame(exposure, remeasure, threshold=options.threshold, **stars)
+    curves = calibrate_frame(exposure, remeasure, psf=psf, threshold=options.threshold, widths=widths, **stars)
     return curves, None if exposure.gain else curves.table.meta["photon"][exposure.name]
 
 

@@ -51,11 +51,6 @@ class MeasureOptions:
         object.__setattr__(self, "psf", psf_from(self.psf))
         if self.profile != "own" and self.psf not in ("auto", "moffat"):
             raise InputError(f"profile={self.profile!r} is one of Moffat profiles: give psf='moffat', or no profile")
-        if self.errors != "fit" and self.psf not in ("auto", "moffat"):
-            raise InputError(
-                f"errors={self.errors!r} come from Moffat profiles that are put into the frame: give psf='moffat', or "
-                "errors='fit'"
-            )
         for key in _DETECTOR:
             value = getattr(self, key)
             if value is not None and not (isinstance(value, Real) and 0 < value < np.inf):
@@ -67,7 +62,7 @@ class MeasureOptions:
             if name not in self.psf:
                 raise InputError(f"psf has no PSF for exposure {name}: it has those of {some_of(list(self.psf), 3)}")
             return self.psf[name]
-        if self.psf == "auto" and (self.profile != "own" or self.errors != "fit"):
+        if self.psf == "auto" and self.profile != "own":
             return "moffat"
         return self.psf
 

@@ -208,14 +208,14 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
     _warn_of_gain({name: one.photon for name, one in zip(names, found, strict=True)})
     verdicts = {name: one.verdict for name, one in zip(names, found, strict=True)}
     if options.psf == "effective" or any(v.psf == "effective" for v in verdicts.values()):
-        _warn_of_psf(verdicts)
+        warn_of_psf(verdicts)
     filled = [one.table for one in found if len(one.table)]
     psfs = {name: one.psf for name, one in zip(names, found, strict=True) if one.psf is not None}
     return vstack(filled) if filled else _empty(), psfs
 
 
-def _warn_of_psf(verdicts):
-    """Warn of exposures that have too few stars for an effective PSF."""
+def warn_of_psf(verdicts):
+    """Warn of exposures that have too few stars for an effective PSF: ``{name: Verdict}``."""
     lacking = {name: v.n_usable for name, v in verdicts.items() if v.psf == "moffat" and v.n_usable < STARS_NEEDED}
     if lacking:
         each = some_of([f"{name} has {n}" for name, n in lacking.items()], 3)
@@ -273,11 +273,12 @@ def measure_exposure(exposure, options):
     exposure = options.with_detector(exposure.read())
     measured = _measure_frame(exposure, options)
     if options.errors != "fit" and np.any((measured.table["flags"] & UNUSABLE) == 0):
+        held = replace(options, max_stars=None, psf=measured.psf or "moffat")
 
         def remeasure(image, *, fwhm=options.fwhm):
-            return _measure_frame(image, replace(options, max_stars=None, fwhm=fwhm)).table
+            return _measure_frame(image, replace(held, fwhm=fwhm)).table
 
-        curves = calibrate_frame(exposure, remeasure, threshold=options.threshold)
+        curves = calibrate_frame(exposure, remeasure, psf=measured.psf, threshold=options.threshold)
         measured = measured._replace(table=curves.apply(measured.table, options.errors))
     return measured
 

@@ -76,7 +76,7 @@ def psfex(frame):
         ]
         _sextractor(folder, [*stars, "VIGNET(35,35)"], CATALOG_TYPE="FITS_LDAC", CATALOG_NAME=folder / "stars.cat")
         options = {
-            "PSFVAR_DEGREES": frame.order, "PSF_SIZE": "61,61", "PSF_SAMPLING": 0.5, "SAMPLE_MINSN": 20,
+            "PSFVAR_DEGREES": min(frame.order, 2), "PSF_SIZE": "61,61", "PSF_SAMPLING": 0.5, "SAMPLE_MINSN": 20,
             "SAMPLE_MAXELLIP": 0.5, "SAMPLE_FWHMRANGE": "1.5,20.0", "SAMPLE_VARIABILITY": 0.5, "CHECKPLOT_DEV": "NULL",
             "CHECKPLOT_TYPE": "NONE", "CHECKIMAGE_TYPE": "NONE", "WRITE_XML": "N", "VERBOSE_TYPE": "QUIET",
             "NTHREADS": 1,

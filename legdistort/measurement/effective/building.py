@@ -12,8 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
+from scipy.stats import theilslopes
 
 from ..profiles import moffat
+from ..profiles.pixel_noise import pixel_variance
 from . import splines
 from .corrections import Corrections
 from .model import EffectivePSF, Polynomial
@@ -25,6 +27,7 @@ DEGREE = 2
 
 _PER_FWHM = 4  # knots: cubic splines then follow a diffraction-limited core to 0.1 % of its peak
 _ITERATIONS = 4
+_ANEW = 3  # with other stars, from a PSF that is nearly right
 _MOVE = 0.3  # FWHM, largest step of a star in one iteration
 _SETTLE = 2  # iterations of the stars alone
 _DEVIANT = 3.0  # times the median of chi2 / dof: such a star is no single one
@@ -44,7 +47,7 @@ class Ensemble:
     data : ndarray, shape (n, npix)
         Stamps without the light of other stars.
     sky : ndarray, shape (n, npix)
-        Variance without photon noise of the star; infinite where a pixel is not to be used.
+        Variance without photon noise of the star and of its local sky; infinite where a pixel is not to be used.
     photon : float
         Variance per unit of star light.
     """
@@ -58,6 +61,10 @@ class Ensemble:
     def half(self):
         """Half the side of a stamp, without the central pixel."""
         return (round(np.sqrt(self.data.shape[1])) - 1) // 2
+
+    def variance(self, light):
+        """Of the pixels, with this light of the stars and their local skies."""
+        return pixel_variance((self.sky, self.photon), light)
 
     def part(self, rows):
         """Some of the stars."""
@@ -93,6 +100,10 @@ class Built:
     amplitudes: np.ndarray
     precision: np.ndarray
     factor: tuple
+
+    def for_stars(self, params):
+        """The same with other stars: x, y, flux, background (n, 4)."""
+        return replace(self, params=params, used=np.ones(len(params), dtype=bool))
 
 
 def profile_psf(shape, half, image_shape):
@@ -155,14 +166,14 @@ def build(stars, start, base):
     return improved(first, stars, iterations=_ITERATIONS)
 
 
-def improved(before, stars, *, iterations=2):
-    """A PSF fitted anew to the same stars, by Gauss-Newton iterations.
+def improved(before, stars, *, iterations=_ANEW):
+    """A PSF fitted anew to its stars, by Gauss-Newton iterations.
 
     Parameters
     ----------
     before : Built
     stars : Ensemble
-        Their neighbours subtracted better.
+        Those of its parameters.
     iterations : int
 
     Returns
@@ -197,7 +208,8 @@ def improved(before, stars, *, iterations=2):
     coefficients = corrections.grids(corrections.raw(amplitudes))
     coefficients[0] += base
     known = {"n_stars": int(used.sum()), "residual": _mean_residual(stars, params, grids, spacing, used)}
-    psf = replace(before.psf, coefficients=coefficients, **known)
+    halo = max(float(theilslopes(params[used, 3], params[used, 2]).slope), 0.0)
+    psf = replace(before.psf, coefficients=coefficients, halo=halo, **known)
     return Built(base, psf, params, used, corrections, amplitudes, precision, factor)
 
 
@@ -259,8 +271,8 @@ def _linearise(stars, params, grids, spacing, misfit):
     value, by_x, by_y = splines.on_stamps(grids, params[:, :2], stars.half, spacing, slopes=True)
     flux = params[:, 2:3]
     model = flux * value
-    light = np.maximum(model + params[:, 3:], 0)  # a level that PSF and sky share must not change the noise
-    weights = 1 / (stars.sky + stars.photon * light + (misfit * model) ** 2)
+    # with the local sky: a level that PSF and sky share must not change the noise
+    weights = 1 / (stars.variance(model + params[:, 3:]) + (misfit * model) ** 2)
     slopes = np.stack([flux * by_x, flux * by_y, value, np.ones_like(value)], axis=1)
     weighted = slopes * weights[:, None]
     inverse = np.linalg.inv(weighted @ slopes.swapaxes(1, 2))
@@ -300,7 +312,9 @@ def _normal(stars, linear, params, corrections, spacing, terms, used):
     followed = np.zeros((len(terms), 4, n_modes))
     rows = np.flatnonzero(used)
     for part in np.array_split(rows, max(1, len(rows) // _AT_ONCE)):
-        light = params[part, 2, None, None] * corrections.on_stamps(params[part, :2], stars.half, spacing)
+        # single precision for the patterns: all that follows sees the same ones
+        light = corrections.on_stamps(params[part, :2].astype(np.float32), stars.half, spacing).astype(float)
+        light *= params[part, 2, None, None]
         weighted = light * linear.weights[part, None]
         mixed = linear.slopes[part] @ weighted.swapaxes(1, 2)
         followed[part] = linear.inverse[part] @ mixed

@@ -123,10 +123,10 @@ class Corrections:
         return out
 
     def on_stamps(self, xy, half, spacing):
-        """Raw patterns on the stamps of stars, (n, n_modes, npix)."""
+        """Raw patterns on the stamps of stars, (n, n_modes, npix), in the precision of the places."""
         x, y = self._bases(xy, half, spacing)
         m, k, n, size = *self.modes.shape[:2], *x.shape[:2]
-        along = (self.modes.reshape(m * k, k) @ x.reshape(n * size, k).T).reshape(m, k, n, size)
+        along = (self.modes.astype(xy.dtype).reshape(m * k, k) @ x.reshape(n * size, k).T).reshape(m, k, n, size)
         across = y @ along.transpose(2, 1, 0, 3).reshape(n, k, m * size)
         return across.reshape(n, size, m, size).swapaxes(1, 2).reshape(n, m, size**2)
 
@@ -139,5 +139,5 @@ class Corrections:
         return laid.reshape(n, a, -1) @ self.modes.reshape(len(self.modes), -1).T
 
     def _bases(self, xy, half, spacing):
-        pixels = np.arange(-half, half + 1)
+        pixels = np.arange(-half, half + 1, dtype=xy.dtype)
         return (splines.basis(pixels - xy[:, i, None], self.size, spacing)[..., self._inner] for i in (0, 1))

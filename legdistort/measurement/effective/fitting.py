@@ -94,6 +94,15 @@ def _fit_groups(params, stars, data, weights, *, stamps, psf, limits):
     return Fit(*result[:3], dof, result[3])
 
 
+def derivatives(psf, stamps, params, rows):
+    """Derivatives of the light of some stars by x, y, flux and background, (m, 4, npix)."""
+    kind = stamps.data.dtype
+    grids = psf.grids(stamps.centres[rows] + params[rows, :2])
+    value, by_x, by_y = splines.on_stamps(grids, params[rows, :2].astype(kind), stamps.half, psf.spacing, slopes=True)
+    flux = params[rows, 2:3].astype(kind)
+    return np.stack([flux * by_x, flux * by_y, value, np.ones_like(value)], axis=1)
+
+
 def light_of(psf, stamps, params):
     """Light of every star on its own stamp, and the sum of that of all others there; (n, npix) each."""
     kind, wide = stamps.data.dtype, 2 * stamps.half

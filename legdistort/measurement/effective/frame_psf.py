@@ -12,19 +12,17 @@ import numpy as np
 
 from ..flags import UNUSABLE, Flag
 from ..profiles import moffat
-from ..profiles.frame_fit import OUTLIER
 from ..profiles.levenberg_marquardt import Fit
+from ..profiles.local_sky import separate
 from ..profiles.pixel_noise import NEIGHBOUR
 from . import building, fitting, splines
 from .own_error import own_covariance
 
 _BRIGHT = 10.0  # signal-to-noise ratio of a star that helps to make the PSF
 _DISTURBED = 0.05  # light of others within one FWHM, relative to that of the star
-_MOST = 150  # stars that make the PSF, the brightest
-_NOTICED = 1e-2  # light of others, relative to that of the star: worth to be subtracted with the PSF itself
-_TOO_MANY = 1 / 4  # of the pixels of a core
-_MODEL = 0.1  # pixels off by this part of the star, beyond their noise, follow no PSF
-
+_MOST = 100  # stars that make the PSF, the brightest
+_SLOPED = 1 / 4  # of the stars, on a sky that is not flat: the PSF is made anew, without the slopes
+_DEVIATES = 0.1  # fraction of a star by which pixels may deviate from the PSF
 
 _DECIDE = 60  # brightest usable stars that decide whether the PSF is worth while
 _NOTHING_LEFT = 1.25  # median chi2 / dof that Moffat profiles leave of them, by noise and its estimate alone
@@ -96,24 +94,33 @@ def measure_frame(stamps, fitted, shape, psf):
     rows = usable_stars(stamps, fitted, float(moffat.fwhm(shape)))
     if len(rows) < building.STARS_NEEDED:
         return None, Verdict("moffat", len(rows))
-    if psf == "auto" and not _is_better(stamps, fitted, shape, rows):
+    if psf == "auto" and _leaves_nothing(fitted, rows):
         return None, Verdict("moffat", len(rows), decided=True)
-    built, start = make_psf(stamps, fitted, shape, rows)
+    # too few to be divided: then the stars that make the PSF judge it, too
+    brightest = rows[:_DECIDE]
+    making, judging = (brightest[1::2], brightest[::2]) if len(rows) >= 2 * building.STARS_NEEDED else (rows, rows)
+    first = _first_psf(stamps, fitted, shape, making)
+    if psf == "auto" and not _is_better(stamps, fitted, first.psf, judging):
+        return None, Verdict("moffat", len(rows), decided=True)
+    built, start = make_psf(stamps, fitted, first, rows)
     return measure_with(stamps, fitted, start, built.psf, built), Verdict("effective", len(rows), decided=True)
 
 
-def _is_better(stamps, fitted, shape, rows):
-    """Whether an effective PSF describes the brightest stars better than Moffat profiles."""
-    rows = rows[:_DECIDE]
-    with_moffat = fitted.found.chi2[rows] / np.maximum(fitted.found.dof[rows], 1)
-    left = np.median(with_moffat[: len(rows) // 2])
-    if left < _NOTHING_LEFT:
-        log.debug("Moffat profiles leave chi2 / dof %.2f of the brighter stars: nothing to gain", left)
-        return False
-    # too few to be divided: then the stars that make the PSF judge it, too
-    making, judging = (rows[1::2], rows[::2]) if len(rows) >= 2 * building.STARS_NEEDED else (rows, rows)
-    psf = _first_psf(stamps, fitted, shape, making).psf
-    start = started(fitted, psf).params[judging]
+def _chi2_of_moffat(fitted, rows):
+    """Median of chi2 / dof of the brighter half of some stars, the brightest first."""
+    return np.median((fitted.found.chi2[rows] / np.maximum(fitted.found.dof[rows], 1))[: len(rows) // 2])
+
+
+def _leaves_nothing(fitted, rows):
+    """Whether Moffat profiles leave no more than noise of the brightest stars."""
+    left = _chi2_of_moffat(fitted, rows[:_DECIDE])
+    log.debug("Moffat profiles leave chi2 / dof %.2f of the brighter stars", left)
+    return left < _NOTHING_LEFT
+
+
+def _is_better(stamps, fitted, psf, judging):
+    """Whether a PSF describes stars that it was not made from better than Moffat profiles of their own."""
+    left, start = _chi2_of_moffat(fitted, judging), started(fitted, psf).params[judging]
     _, chi2, dof = building.settled(ensemble(stamps, fitted, judging, fitted.models[1]), start, psf)
     held_out = np.median((chi2 / dof)[: len(judging) // 2])
     log.debug("chi2 / dof of the brighter stars: Moffat %.2f, effective PSF of other stars %.2f", left, held_out)
@@ -131,15 +138,14 @@ def usable_stars(stamps, fitted, width):
     return rows[np.argsort(-fitted.snr[rows], kind="stable")]
 
 
-def make_psf(stamps, fitted, shape, rows):
-    """An effective PSF from some stars of a frame, iterated with their positions and neighbours.
+def make_psf(stamps, fitted, first, rows):
+    """An effective PSF made anew from more stars, neighbours and slopes of the sky taken off by means of a first one.
 
     Parameters
     ----------
     stamps : `~legdistort.measurement.profiles.cutouts.Stamps`
     fitted : `~legdistort.measurement.profiles.frame_fit.FrameFit`
-    shape : ndarray, shape (4,)
-        Moffat profile of the frame.
+    first : `~legdistort.measurement.effective.building.Built`
     rows : ndarray of int
         From `usable_stars`; enough of them (`building.STARS_NEEDED`).
 
@@ -147,15 +153,16 @@ def make_psf(stamps, fitted, shape, rows):
     -------
     built : `~legdistort.measurement.effective.building.Built`
     fit : `~legdistort.measurement.profiles.levenberg_marquardt.Fit`
-        All stars, fitted with the PSF before its last improvement.
+        All stars, fitted with the first PSF.
     """
     rows = rows[:_MOST]
-    built = _first_psf(stamps, fitted, shape, rows)
-    fit = fit_all(stamps, fitted, started(fitted, built.psf), built.psf, models=fitted.models)
-    own, others = fitting.light_of(built.psf, stamps, fit.params)
-    if (others[rows].sum(axis=1) > _NOTICED * own[rows].sum(axis=1)).any():
-        built = building.improved(built, ensemble(stamps, fitted, rows, others))
-    return built, fit
+    fit = fit_all(stamps, fitted, started(fitted, first.psf), first.psf, models=fitted.models)
+    models = fitting.light_of(first.psf, stamps, fit.params)
+    slope = _separate(stamps, fitted, fit, first.psf, models)[2]
+    if slope[rows].any(axis=1).mean() < _SLOPED:
+        slope = None
+    stars = ensemble(stamps, fitted, rows, models[1], slope)
+    return building.improved(first.for_stars(fit.params[rows]), stars), fit
 
 
 def _first_psf(stamps, fitted, shape, rows):
@@ -177,10 +184,11 @@ def started(fitted, psf):
     return Fit(params, covariance, found.chi2, found.dof, found.converged)
 
 
-def ensemble(stamps, fitted, rows, others):
-    """Some stars of a frame, with the light of the others taken off."""
-    data = (stamps.data[rows] - others[rows]).astype(float)
-    sky = fitted.sky[rows].astype(float) + (NEIGHBOUR * others[rows]) ** 2
+def ensemble(stamps, fitted, rows, others, slope=None):
+    """Some stars of a frame, with the light of the others, and the slope of the sky, taken off."""
+    others = others[rows].astype(float)
+    data = stamps.data[rows] - others - (0 if slope is None else slope[rows])
+    sky = fitted.sky[rows] + fitted.photon * others + (NEIGHBOUR * others) ** 2
     return building.Ensemble(stamps.centres[rows], data, np.where(stamps.good[rows], sky, np.inf), float(fitted.photon))
 
 
@@ -201,22 +209,22 @@ def fit_all(stamps, fitted, fit, psf, *, models):
     -------
     `~legdistort.measurement.profiles.levenberg_marquardt.Fit`
     """
-    pixels = _separate(stamps, fitted, fit, psf, models)
+    pixels = _separate(stamps, fitted, fit, psf, models)[:2]
     return fitting.fit_stars(fit, fitted.labels, pixels, stamps=stamps, psf=psf)
 
 
 def _separate(stamps, fitted, fit, psf, models):
-    own, others = models
+    """See `separate`; where the models are still Moffat profiles, what they leave tells no slope of the sky."""
     partners = fitting.light_of_partners(psf, stamps, fitted.labels, fit.params)
-    light = np.maximum(own + others + fit.params[:, 3:], 0)
-    variance = fitted.sky + fitted.photon * light + (NEIGHBOUR * (others - partners)) ** 2
-    residual = np.abs(stamps.data - own - others - fit.params[:, 3:])
-    good = stamps.good & (residual < OUTLIER * np.sqrt(variance) + _MODEL * np.abs(own + partners))
-    # where much of a core deviates it is the PSF that is wrong, not the pixels, and chi2 shall say so
-    core = stamps.near(fit.params, psf.fwhm / 2) & stamps.good
-    keep = (core & ~good).sum(axis=1) > _TOO_MANY * core.sum(axis=1)
-    good |= keep[:, None] & stamps.good
-    return stamps.data - (others - partners), np.where(good, 1 / variance, 0.0)
+
+    def derivatives(rows):
+        return fitting.derivatives(psf, stamps, fit.params, rows)
+
+    return separate(
+        stamps, models, partners, fit.params[:, 3:], (fitted.sky, fitted.photon),
+        deviates=_DEVIATES, derivatives=None if models is fitted.models else derivatives,
+        core=stamps.near(fit.params, psf.fwhm / 2),
+    )  # fmt: skip
 
 
 def measure_with(stamps, fitted, fit, psf, built=None):
@@ -234,7 +242,7 @@ def measure_with(stamps, fitted, fit, psf, built=None):
     Measured
     """
     models = fitting.light_of(psf, stamps, fit.params)
-    data, weights = _separate(stamps, fitted, fit, psf, models)
+    data, weights, _ = _separate(stamps, fitted, fit, psf, models)
     fit = fitting.fit_stars(fit, fitted.labels, (data, weights), stamps=stamps, psf=psf)
     own, others = fitting.light_of(psf, stamps, fit.params)
     snr = np.sqrt((weights * own**2).sum(axis=1))

@@ -103,6 +103,8 @@ class EffectivePSF:
         "effective", or where it came from: what the column ``psf`` of detections says.
     residual : ndarray, shape (k, k), or None
         What it leaves of the stars that made it, on the pixels around them: the weighted mean, in parts of their light.
+    halo : float
+        What the local skies of its stars hold of their light, on each pixel: wide halos pass for sky.
     fwhm : float
         Full width at half maximum at the centre of the field, of a circle of the area above half maximum [pix].
     """
@@ -115,6 +117,7 @@ class EffectivePSF:
     n_stars: int | None = None
     source: str = "effective"
     residual: np.ndarray | None = None
+    halo: float = 0.0
     fwhm: float = field(init=False)
 
     def __post_init__(self):
@@ -171,6 +174,31 @@ class EffectivePSF:
         x, y = (np.linspace(*end, _NODES) for end in ends)
         there = self.centre(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(_NODES, _NODES, 2)
         return np.stack([RectBivariateSpline(x, y, there[..., i].T).ev(*xy.T) for i in (0, 1)], axis=1)
+
+    @property
+    def reach(self):
+        """How far from the star there is light [pix]."""
+        return int(self.spacing * (max(self.coefficients.shape[1:]) - 1) / 2)
+
+    def on_stamps(self, centres, offsets, half):
+        """Parts of the light of stars on square stamps around pixels, the halo too, (n, npix), rows (y) first.
+
+        Parameters
+        ----------
+        centres : ndarray of int, shape (n, 2)
+            Central pixels (x, y) of the stamps.
+        offsets : ndarray, shape (n, 2)
+            Of the core-weighted centres of the stars from them [pix].
+        half : int
+            Stamps reach from -half to half.
+        """
+        xy = centres + offsets
+        light = splines.on_stamps(self.grids(xy), offsets - self.centre(xy), half, self.spacing)
+        if not self.halo:
+            return light
+        v, u = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, 1, -1)
+        r = np.hypot(u - offsets[:, :1], v - offsets[:, 1:])
+        return light + self.halo * np.cos(np.pi / 2 * np.clip(2 * r / self.reach - 1, 0, 1)) ** 2
 
     @classmethod
     def from_array(cls, data, *, oversampling, positions=None, source="array"):
@@ -274,7 +302,7 @@ class EffectivePSF:
         exact = fits.ImageHDU(self.coefficients, name=EXTENSION)
         exact.header["SPACING"] = (self.spacing, "of the knots [pix]")
         exact.header["FWHM"] = (self.fwhm, "[pix]")
-        exact.header["SOURCE"] = self.source
+        exact.header["SOURCE"], exact.header["HALO"] = self.source, self.halo
         if self.exposure is not None:
             exact.header["EXPOSURE"] = self.exposure
         if self.n_stars is not None:
@@ -319,6 +347,7 @@ class EffectivePSF:
                 variation = Grid(*(tuple(first[f"{k}{i:02d}"] - 1 for i in range(1, n + 1)) for k, n in sizes.items()))
             shape = (header["DETNY"], header["DETNX"]) if "DETNY" in header else None
             known = {"exposure": header.get("EXPOSURE"), "n_stars": header.get("NSTARS"), "source": header["SOURCE"]}
+            known["halo"] = float(header.get("HALO", 0.0))
             if _RESIDUAL in [hdu.name for hdu in hdus]:
                 known["residual"] = np.asarray(hdus[_RESIDUAL].data, dtype=float)
             coefficients = np.asarray(hdus[EXTENSION].data, dtype=float)

@@ -61,7 +61,7 @@ def _lever(built, stars, rows, params, covariance):
     grids = built.psf.grids(stars.centres[rows] + params[rows, :2])
     value, by_x, by_y = splines.on_stamps(grids, params[rows, :2], half, spacing, slopes=True)
     flux = params[rows, 2:3]
-    weights = 1 / (stars.sky[rows] + stars.photon * np.maximum(flux * value + params[rows, 3:], 0))
+    weights = 1 / stars.part(rows).variance(flux * value + params[rows, 3:])
     slopes = np.stack([flux * by_x, flux * by_y, value, np.ones_like(value)], axis=1)
     seen = flux[:, None] * (covariance[rows, :2] @ slopes) * weights[:, None]
     return built.corrections.against(seen, params[rows, :2], half, spacing)

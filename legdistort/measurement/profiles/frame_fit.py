@@ -11,16 +11,15 @@ from . import moffat
 from .blends import fit_groups, group_stars, partner_models
 from .cutouts import Stamps
 from .levenberg_marquardt import HELD, SHAPE_SIGMA, Fit, Limits, fit
-from .local_sky import slopes
-from .pixel_noise import NEIGHBOUR, pixel_noise, pixel_variance
+from .local_sky import separate
+from .pixel_noise import NEIGHBOUR, pixel_noise
 from .shape_field import shape_field
 
 #: Shapes of stars, and ways to fit those that touch: see `fit_stars`.
 PROFILES, BLENDS = ("own", "shared", "linear"), ("together", "alone")
 
 _FIRST_FWHM = 3.0
-OUTLIER = 6.0  # standard deviations ...
-_OUTLIER_MODEL = 0.2  # ... plus this fraction of the star itself, which no real profile follows exactly
+_DEVIATES = 0.2  # fraction of a star by which pixels may deviate from a Moffat profile
 #: Limits of the passes: what the first leaves tells the noise, the second prepares the last.
 _FIRST, _MIDDLE, _LAST = Limits(20, 1e-4), Limits(20, 1e-2), Limits(40, 1e-4)
 _SHAPELY = 20  # signal-to-noise ratio of stars that tell the shape of all
@@ -255,20 +254,16 @@ def _touching(stamps, found, hot, done, radius):
 
 def _separate(stamps, found, models, labels, noise, nodes):
     """Stamps less other groups and the slope of the sky, and weights; 0 for pixels that follow no model."""
-    own, others = models
     partners = partner_models(stamps, labels, found.params, lambda p, _: moffat.evaluate(p, stamps.half, nodes))
-    light = own + others + found.params[:, 7:].astype(own.dtype)
-    variance = pixel_variance(noise, light) + (NEIGHBOUR * (others - partners)) ** 2
-    left, allowed = stamps.data - light, OUTLIER * np.sqrt(variance) + _OUTLIER_MODEL * np.abs(own + partners)
 
     def derivatives(rows):
-        return moffat.evaluate(found.params[rows].astype(own.dtype), stamps.half, nodes, jacobian=True)[1]
+        return moffat.evaluate(found.params[rows].astype(stamps.data.dtype), stamps.half, nodes, jacobian=True)[1]
 
-    usual = OUTLIER * 1.5 * np.median(np.abs(left), axis=1)[:, None]  # a slope leaves more than noise everywhere
-    weights = _weights(stamps.good & (np.abs(left) < np.maximum(allowed, usual)), variance)
-    slope = slopes(left, weights, found.covariance, derivatives)
-    weights = _weights(stamps.good & (np.abs(left - slope) < allowed), variance)
-    return stamps.data - slope - (others - partners), weights
+    prior = np.pad(SHAPE_SIGMA**-2, (3, 1))
+    return separate(
+        stamps, models, partners, found.params[:, 7:], noise,
+        deviates=_DEVIATES, derivatives=derivatives, precision=prior,
+    )[:2]  # fmt: skip
 
 
 def _is_hot(stamps, found, models, good):
