@@ -119,6 +119,20 @@ class Matches:
             back[rows] = similarity.apply(similarity.invert(self.poses[name]), obs.xy[rows])
         return start_poses.star_means(back, obs.star, len(self.stars))
 
+    @cached_property
+    def times(self):
+        """Times (n_exposures,) from the first exposure on, and their unit, by the column ``epoch``.
+
+        In "days"; in "exposures", their order, where it does not tell all of them apart.
+        """
+        n = len(self.names)
+        if "epoch" in self.table.colnames:
+            first = np.unique(self.observations.exposure, return_index=True)[1]
+            years = column_contract.values(self.table, "epoch", u.yr)[first]
+            if np.isfinite(years).all() and len(np.unique(years)) == n:
+                return u.yr.to(u.day) * (years - years.min()), "days"
+        return np.arange(n, dtype=float), "exposures"
+
     def without(self, reasons):
         """The same matches without some exposures, ``{name: reason}``, which join `left_out`.
 

@@ -156,11 +156,12 @@ def year(epoch):
 
 def mean_epoch(headers):
     """Mean epoch of exposures by their headers (MJD-AVG, MJD-OBS, DATE-AVG or DATE-OBS), a Julian year, or None."""
-    found = [value for value in map(_header_epoch, headers) if value is not None]
+    found = [value for value in map(header_epoch, headers) if value is not None]
     return float(np.mean(found)) if found else None
 
 
-def _header_epoch(header):
+def header_epoch(header):
+    """Epoch of an exposure by its header, a Julian year, or None; of the day alone if that is all it tells."""
     for key in ("MJD-AVG", "MJD-OBS", "DATE-AVG", "DATE-OBS"):
         value = header.get(key)
         try:

@@ -9,7 +9,7 @@ from astropy import units as u
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..inputs import column_contract, repetitions
 from ..inputs.matches import Matches, shapes_by_exposure
-from ..inputs.reference_catalogue import mean_epoch
+from ..inputs.reference_catalogue import header_epoch, mean_epoch
 from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
@@ -116,9 +116,17 @@ def match(
         star[~isolated] = -1
     table, star = _keep_common(table, star, min_exposures, left_out)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
+    _add_epochs(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
     matches = _finish(table, star, shapes, headers, left_out, epoch, distortions)
     return replace(matches, left_out=copies | left_out)
+
+
+def _add_epochs(table, named):
+    """Add the column ``epoch`` [yr] if the headers of all exposures tell it and the table does not."""
+    epochs = {name: header_epoch(exposure.header) for name, exposure in named.items()}
+    if epochs and None not in epochs.values() and "epoch" not in table.colnames:
+        table["epoch"] = [epochs[name] for name in table["exposure"]] * u.yr
 
 
 def _without_repetitions(table):

@@ -151,6 +151,64 @@ class ErrorLaw:
 
 
 @dataclass(frozen=True)
+class CorrelatedErrors:
+    """Errors of a star that are alike in neighbouring exposures, found from the residuals of all stars.
+
+    What is the same in all exposures is not among them: it is in the positions, and nothing tells it.
+
+    Attributes
+    ----------
+    floor : float
+        Of the independent errors, pixels, in quadrature to the stated ones.
+    x, y : float
+        Standard deviations of the others by axis of the reference plane, pixels.
+    along : {"time", "x", "y"} or None
+        They are alike in exposures that are near one another in time, or that have the star near the same x or y of the
+        detector. None: there are none that could be seen, or too few exposures or stars to see them.
+    length, longest : float
+        Over which their correlation falls to 1/e, and the largest such length that could have been found.
+    unit : str
+        Of these: "exposures", "days", or "px".
+    reason : str
+        Why they could not be looked for.
+    """
+
+    floor: float
+    x: float = 0.0
+    y: float = 0.0
+    along: str | None = None
+    length: float = 0.0
+    longest: float = 0.0
+    unit: str = ""
+    reason: str = ""
+
+    def __str__(self):
+        constant = "what is the same in all exposures cannot be measured"
+        if self.reason:
+            return f"those that exposures share are not measurable: {self.reason}"
+        if self.along is None:
+            return f"none that neighbouring exposures share were found; {constant}"
+        number, unit, most = _readable(self.length, self.longest, self.unit)
+        where = "in time" if self.along == "time" else f"along {self.along} of the detector"
+        length = f"{number:.2g} {unit}"
+        if self.length > 0.95 * self.longest:
+            length = f"{most:.2g} {unit} or more: their slower part is not measured well"
+        return (
+            f"{self.x:.2g} px in x and {self.y:.2g} px in y of every star are shared by exposures near one another "
+            f"{where}, over {length}; they are in the errors of the stars; {constant}"
+        )
+
+
+def _readable(length, longest, unit):
+    """Lengths in a unit that suits them."""
+    if unit == "days":
+        for factor, name in ((1440, "min"), (24, "h"), (1, "days")):
+            if length * factor < 100 or name == "days":
+                return length * factor, name, longest * factor
+    return length, unit, longest
+
+
+@dataclass(frozen=True)
 class Diagnostics:
     """What `solve` found out; None for what was not asked for.
 
@@ -162,6 +220,8 @@ class Diagnostics:
         Factor on the stated errors.
     error_law : ErrorLaw or None
         Errors by brightness that took the place of those stated.
+    correlated : CorrelatedErrors or None
+        Errors that neighbouring exposures share.
     epoch : float or None
         Of the positions, a Julian year.
     sky : {"exposures", "reference", None}
@@ -191,6 +251,7 @@ class Diagnostics:
     validation: Validation | None = None
     error_law: ErrorLaw | None = None
     epoch: float | None = None
+    correlated: CorrelatedErrors | None = None
 
     def in_words(self):
         """Sentences on errors found, the widths of a prior, the degree chosen, and the stars that were kept out.
@@ -200,7 +261,8 @@ class Diagnostics:
         dict
             ``{"errors" | "widths" | "modes" | "degree" | "kept": sentence}``, those that there is something to say on.
         """
-        words = {} if self.error_law is None else {"errors": str(self.error_law)}
+        found = self.error_law or self.correlated
+        words = {} if found is None else {"errors": str(found)}
         if widths := _in_words(self.widths):
             words["widths"] = f"scatter of a coefficient, found from the exposures: {widths}"
         if self.effective_modes and self.prior_has_widths:
@@ -222,7 +284,7 @@ class Diagnostics:
 
     def summary(self):
         """What there is of it as plain numbers and strings by name, for summaries."""
-        names = "widths", "effective_modes", "departure_ratio", "selection", "validation", "error_law"
+        names = "widths", "effective_modes", "departure_ratio", "selection", "validation", "error_law", "correlated"
         return {name: found for name, found in asdict(self).items() if name in names and found is not None}
 
 

@@ -25,7 +25,7 @@ from ..runtime.outputs import replacing
 from ..runtime.provenance import checksums
 from .catalogue_tie import Tie
 from .check import Check
-from .diagnostics import AliasedDegree, DegreeChoice, Diagnostics, ErrorLaw, UsedReference, Validation
+from .diagnostics import AliasedDegree, CorrelatedErrors, DegreeChoice, Diagnostics, ErrorLaw, UsedReference, Validation
 from .gauge import Gauge, UnknownDirection, UnknownMap
 from .settings import Settings
 
@@ -141,7 +141,7 @@ def _own(value):
 
 def _diagnostics(tree, names):
     """`Diagnostics`; with exposures in their order, which mappings in files do not keep."""
-    parts = {"selection": DegreeChoice, "validation": Validation, "error_law": ErrorLaw}
+    parts = {"selection": DegreeChoice, "validation": Validation, "error_law": ErrorLaw, "correlated": CorrelatedErrors}
     found = _made(Diagnostics, tree, reference=UsedReference, **parts)
     if (chosen := found.selection) is not None:
         degrees = tuple(AliasedDegree(**each) for each in chosen.aliasing)

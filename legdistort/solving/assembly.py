@@ -73,6 +73,7 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
             state=state,
             blocks=blocks,
             uncertainty=uncertainty,
+            times=matches.times,
             header_distortion=matches.header_distortion if np.all(np.isinf(problem.mean_sigma)) else None,
         ),
     )

@@ -17,6 +17,7 @@ from .assembly import assemble
 from .brightness_errors import estimate_by_brightness
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, only_rows, validation
+from .correlated_errors import estimate_with_correlations
 from .equations import effective_modes
 from .equations.covariances import Uncertainty
 from .options import CLIP, SolveOptions, check_reference
@@ -89,10 +90,12 @@ def solve(
         keeps all. ``method="alternating"`` takes none.
     error_floor : float
         Pixels, added in quadrature to every stated error.
-    errors : {"stated", "scale", "floor", "by-brightness"}
+    errors : {"stated", "scale", "floor", "by-brightness", "correlated"}
         Take the stated errors as they are; or scale the reported errors by sqrt(chi2/dof); or find the error floor
         that makes chi2 its degrees of freedom (zero if it is smaller already); or let a smooth law of brightness, found
-        from the residuals, take the place of the stated ones (`legdistort.solving.brightness_errors`; needs fluxes).
+        from the residuals, take the place of the stated ones (`legdistort.solving.brightness_errors`; needs fluxes);
+        or find the floor, and the errors that a star has in common in neighbouring exposures and that do not average
+        down (`legdistort.solving.correlated_errors`; 8 exposures and 50 stars at least).
         What was found is in ``diagnostics``.
     max_iterations : int, optional
     validate : float, optional
@@ -143,10 +146,10 @@ def solve(
         if options.chooses_degree:
             selection = _choose_degree(given, options)
             options = replace(options, degree=selection.degree)
-        fit, law = _estimate(given, options)
+        fit, errors_found = _estimate(given, options)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
-        diagnostics = replace(_diagnostics(fit, prior, scale, selection), error_law=law)
+        diagnostics = replace(_diagnostics(fit, prior, scale, selection), **errors_found)
         if catalogue is not None:
             fit = reference_tie.tie_to(fit, catalogue, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
     epoch = given.epoch if epoch is None else epoch
@@ -161,13 +164,17 @@ def solve(
 
 
 def _estimate(matches, options):
-    """The fit with the errors that were asked for, and the law of brightness that was found, or None."""
+    """The fit with the errors that were asked for, and what was found of them for the `Diagnostics`."""
     if options.errors == "by-brightness":
-        return estimate_by_brightness(matches, options)
+        fit, law = estimate_by_brightness(matches, options)
+        return fit, {"error_law": law}
+    if options.errors == "correlated":
+        fit, found = estimate_with_correlations(matches, options)
+        return fit, {"correlated": found}
     fit = single_fit.estimate(matches, options)
     if options.errors == "floor":
         fit = single_fit.estimate_with_floor(matches, fit, options)
-    return fit, None
+    return fit, {}
 
 
 def _warn_of_header(matches, prior):

@@ -16,7 +16,7 @@ from .gauge.constraints import KINDS
 from .minimisers import LOSSES
 
 METHODS = ("joint", "alternating")
-ERRORS = ("stated", "scale", "floor", "by-brightness")
+ERRORS = ("stated", "scale", "floor", "by-brightness", "correlated")
 
 
 class Unasked(float):
@@ -54,8 +54,8 @@ class SolveOptions(Settings):
             raise InputError(
                 f"errors={self.errors!r} compares chi2 with its expectation, which loss={self.loss!r} changes; use clip"
             )
-        if self.errors == "floor" and self.error_floor:
-            raise InputError("errors='floor' finds the error floor itself: leave error_floor out")
+        if self.errors in ("floor", "correlated") and self.error_floor:
+            raise InputError(f"errors={self.errors!r} finds the error floor itself: leave error_floor out")
         if self.errors == "by-brightness" and self.error_floor:
             raise InputError("errors='by-brightness' finds the errors, their floor too: leave error_floor out")
         if self.max_iterations is not None and not (isinstance(self.max_iterations, int) and self.max_iterations > 0):

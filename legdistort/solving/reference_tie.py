@@ -49,6 +49,8 @@ class ReferenceTie:
         Factor on the stated errors of the exposures.
     solve : callable
         ``solve(problem, state, common=None)``: `legdistort.solving.minimisers.solve_joint` with the options of the fit.
+    shared_errors : ndarray, optional
+        See `Uncertainty`.
     """
 
     identified: object
@@ -56,6 +58,7 @@ class ReferenceTie:
     names: np.ndarray
     scale: float
     solve: object
+    shared_errors: object = None
 
     def tie(self, problem, result):
         """The `Result` with the plane where the reference puts it, and the `Tie` in its gauge.
@@ -140,7 +143,7 @@ class ReferenceTie:
     def _errors(self, problem, result):
         weighted = problem.scaled(result.robust)
         blocks = criterion.linearise(weighted, result.state)
-        return Uncertainty(weighted, blocks, result.gauge, scale=self.scale)
+        return Uncertainty(weighted, blocks, result.gauge, scale=self.scale, shared_errors=self.shared_errors)
 
     def _directions(self, gauge, errors, positions):
         """How maps of three modes at least move the stars."""
@@ -245,6 +248,7 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         matches.stars,
         scale=scale,
         solve=partial(minimisers.solve_joint, gauge=of.gauge, loss=of.loss, max_iterations=of.max_iterations),
+        shared_errors=fit.shared_errors,
     )
     result = tying.tie(fit.problem.scaled(fit.used.astype(float)), result)
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)

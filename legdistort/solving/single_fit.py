@@ -4,7 +4,7 @@ import contextlib
 import logging
 import warnings
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import brentq
@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 #: Beyond this number of exposures the matrices are large enough to gain by several threads.
 _MANY_EXPOSURES = 50
+#: An error floor is found when chi2 is its degrees of freedom to this part; fits that are made at most to find it.
+_EQUAL, _REFITS = 0.005, 4
 
 
 def threads(matches):
@@ -47,6 +49,8 @@ class Fit:
         Those of the prior that were found.
     unfollowed : dict
         ``{exposure: reason}`` of exposures that the fit cannot follow, if it was not judged.
+    shared_errors : ndarray, shape (3, n_stars), or None
+        See `Uncertainty`.
     """
 
     matches: Matches
@@ -56,6 +60,7 @@ class Fit:
     options: object
     widths: prior_widths.Widths | None = None
     unfollowed: dict = field(default_factory=dict)
+    shared_errors: np.ndarray | None = None
 
     @cached_property
     def weighted(self):
@@ -74,7 +79,7 @@ class Fit:
     @cached_property
     def uncertainty(self):
         """Covariances at the stated errors."""
-        return Uncertainty(self.weighted, self.blocks, self.result.gauge)
+        return Uncertainty(self.weighted, self.blocks, self.result.gauge, shared_errors=self.shared_errors)
 
     @property
     def chi2(self):
@@ -210,20 +215,32 @@ def _check_majority(matches, options, unfollowed):
 
 
 def estimate_with_floor(matches, fit, options):
-    """The fit whose error floor makes chi2 its degrees of freedom."""
-    if fit.dof <= 0 or fit.chi2 <= fit.dof:
-        return fit
-    residual = np.sqrt(np.mean(fit.result.blocks.residual[:, fit.used] ** 2))
+    """The fit whose error floor makes chi2 its degrees of freedom, to `_EQUAL`.
 
-    @cache
-    def with_floor(log_floor):
-        return estimate(matches, replace(options, errors="stated", error_floor=np.exp(log_floor)))
+    The floor that does so for the residuals of one fit is the floor of the next: they hardly change with the weights.
+    """
+    for _ in range(_REFITS):
+        if fit.dof <= 0 or fit.chi2 <= 0 or abs(np.log(fit.chi2 / fit.dof)) < _EQUAL:
+            break
+        floor = _floor(fit)
+        if floor == fit.options.error_floor:
+            break
+        fit = estimate(matches, replace(options, errors="stated", error_floor=floor))
+    return fit
+
+
+def _floor(fit):
+    """The error floor with which chi2 of the residuals of a fit, as they are, is its degrees of freedom; or 0."""
+    obs, problem = fit.matches.observations, fit.problem
+    x, y = fit.blocks.residual[:, fit.used]
+    a, b, c = obs.covariance[problem.order][fit.used].T
 
     def excess(log_floor):
-        fitted = with_floor(log_floor)
-        return np.log(fitted.chi2 / fitted.dof)
+        p, q = a + np.exp(2 * log_floor), b + np.exp(2 * log_floor)
+        return np.log(np.sum((q * x**2 + p * y**2 - 2 * c * x * y) / (p * q - c**2)) / fit.dof)
 
-    high = np.log(4 * residual)
+    high = np.log(4 * np.sqrt(np.mean(x**2 + y**2)))
     low = high - 12  # a floor of 1e-5 of the residuals is none
-    best = brentq(excess, low, high, xtol=1e-3, maxiter=40) if excess(low) > 0 > excess(high) else high
-    return with_floor(best)
+    if not excess(low) > 0:
+        return 0.0
+    return float(np.exp(brentq(excess, low, high, xtol=1e-4) if excess(high) < 0 else high))

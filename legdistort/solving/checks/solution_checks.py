@@ -24,7 +24,7 @@ _TOO_MUCH = 0.5  # of a frame without stars around
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
 
 
-def check_solution(solution, *, problem, state, blocks, uncertainty, header_distortion=None):
+def check_solution(solution, *, problem, state, blocks, uncertainty, times, header_distortion=None):
     """All checks of a solution.
 
     Parameters
@@ -35,6 +35,8 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, header_dist
     state : State
     blocks : Blocks
     uncertainty : Uncertainty
+    times : (ndarray, str)
+        Of the exposures, and their unit: see `Matches.times`.
     header_distortion : str, optional
         Distortion of the headers that was not used, in words.
 
@@ -48,7 +50,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, header_dist
         exposures_check(solution, residuals),
         brightness_check(solution, residuals),
         place_check(residuals),
-        time_check(solution, residuals),
+        time_check(residuals, times),
         degree_check(solution, residuals, uncertainty),
         dynamic_check(solution, blocks),
         absolute_check(solution),
@@ -166,15 +168,17 @@ def place_check(residuals):
                  "raise --degree, or give a prior of the static distortion")  # fmt: skip
 
 
-def time_check(solution, residuals):
+def time_check(residuals, times):
     """Do stars move through the set?"""
-    score = residuals.of_motion(np.arange(residuals.problem.n_exposures))
+    times, unit = times
+    how = "in time" if unit == "days" else "in the order of the exposures"
+    score = residuals.of_motion(times)
     error = _star_error(residuals)
     state = _state(score.p, score.rms > error)
     if state == "pass":
-        return Check("time", "pass", score.rms, None, "stars stay where they are, in the order of the exposures")
+        return Check("time", "pass", score.rms, None, f"stars stay where they are, {how}")
     return Check("time", state, score.rms, error,
-                 f"stars move in the order of the exposures, by {score.rms:.2g} px rms (typical error of a star "
+                 f"stars move {how}, by {score.rms:.2g} px rms (typical error of a star "
                  f"{error:.2g} px)", "solve the epochs apart, and compare their positions")  # fmt: skip
 
 

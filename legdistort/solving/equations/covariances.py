@@ -29,11 +29,13 @@ class Uncertainty:
         Factor on all standard deviations (1: the stated errors are taken as they are).
     coefficients : ndarray, optional
         Covariance of the coefficients, if they were found in another way than with the stars, `scale` in it.
+    shared_errors : ndarray, shape (3, n_stars), optional
+        Covariance xx, yy, xy of star positions by errors that exposures share, beside that of independent ones, px^2.
     """
 
-    def __init__(self, problem, blocks, gauge, *, scale=1.0, coefficients=None):
+    def __init__(self, problem, blocks, gauge, *, scale=1.0, coefficients=None, shared_errors=None):
         self._problem, self._blocks, self._gauge, self._scale = problem, blocks, gauge, scale
-        self._given = coefficients
+        self._given, self._shared = coefficients, 0.0 if shared_errors is None else shared_errors
 
     @cached_property
     def coefficients(self):
@@ -67,7 +69,7 @@ class Uncertainty:
         extra_xx = l00**2 * c00
         extra_xy = l00 * (l10 * c00 + l11 * c01)
         extra_yy = l10**2 * c00 + 2 * l10 * l11 * c01 + l11**2 * c11
-        out = self._scale**2 * (inverse + np.stack([extra_xx, extra_yy, extra_xy]))
+        out = self._scale**2 * (inverse + np.stack([extra_xx, extra_yy, extra_xy])) + self._shared
         out[:, blocks.v[0] <= 0] = np.nan
         return out
 
@@ -155,18 +157,20 @@ class Uncertainty:
         problem, blocks = self._problem, self._blocks
         inverse = elimination.inverse_star_blocks(blocks.v)
         n = problem.n_stars
-        alone = np.zeros((2, n, 2, n))
-        index = np.arange(n)
-        alone[0, index, 0, index], alone[1, index, 1, index] = inverse[0], inverse[1]
-        alone[0, index, 1, index] = alone[1, index, 0, index] = inverse[2]
-        alone = alone.reshape(2 * n, 2 * n)
+        alone = _star_blocks(inverse)
         coupling = np.zeros((2, n, problem.n_exposures, 2 * problem.n_modes))
         for i in range(problem.n_exposures):
             part = problem.part(i)
             f, b = blocks.coupling[:, :, part], blocks.values[:, part]
             coupling[:, problem.star[part], i] = np.einsum("can,mn->cnam", f, b).reshape(2, b.shape[1], -1)
         spread = alone @ coupling.reshape(2 * n, -1)
-        return self._scale**2 * alone + spread @ self.coefficients @ spread.T
+        shared = _star_blocks(np.broadcast_to(self._shared, inverse.shape))
+        return self._scale**2 * alone + shared + spread @ self.coefficients @ spread.T
+
+
+def _star_blocks(block):
+    """Symmetric 2 x 2 blocks (3, n) of the stars as one matrix (2 n, 2 n), all x first."""
+    return np.block([[np.diag(block[0]), np.diag(block[2])], [np.diag(block[2]), np.diag(block[1])]])
 
 
 def _block_diagonal(factor, covariance):

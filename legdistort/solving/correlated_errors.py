@@ -1,0 +1,269 @@
+"""Errors that stay alike from one exposure to the next: found from the residuals, and counted in the errors of stars.
+
+Trails of charge, the place of a star on its pixel, refraction by its colour: an exposure errs in a star about as much
+as the one before, or as another one in which the star fell on the same place. Such errors do not average down with the
+number of exposures, and no error floor says so. Here every star has a random error of its own in each axis (random
+effects), of one variance for all stars, whose correlation falls exponentially along the time or along an axis of the
+detector. Beside it stand independent errors, the stated ones with a floor. The variances and the length of the
+correlation are those of the largest restricted likelihood (REML; Patterson & Thompson 1971): that of the residuals, in
+which nothing is left of what is the same in all exposures. That part is in the positions, and no data tell it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+
+from ..results.diagnostics import CorrelatedErrors
+from . import single_fit
+from .equations.leverage import leverages
+
+#: Blocks of two exposures that are needed, and stars.
+BLOCKS, STARS = 4, 50
+#: The correlation length is at most this part of what the exposures span.
+LONGEST = 0.5
+#: Gain in twice the logarithm of the likelihood from which correlated errors are found: in none of 200 sets
+#: that have none (`tests/benchmarks/correlated_errors_table.py`).
+FOUND = 12.0
+#: Stars that are looked at, the most precise ones: more would tell the variances to better than 2 %.
+MOST_STARS = 2000
+_ALONG = "time", "x", "y"
+_STARTS = 0.05, 0.3  # of the longest correlation length
+
+
+def estimate_with_correlations(matches, options):
+    """The fit with an error floor, and with the errors that are alike between exposures in the errors of its stars.
+
+    Parameters
+    ----------
+    matches : Matches
+    options : SolveOptions
+        With ``errors="correlated"``.
+
+    Returns
+    -------
+    Fit
+        Its floor holds all errors of a single exposure, so that weights are right.
+    CorrelatedErrors
+    """
+    options = replace(options, errors="stated")
+    fit = single_fit.estimate_with_floor(matches, single_fit.estimate(matches, options), options)
+    found = measure(fit)
+    if found.along is None:
+        return fit, found
+    floor = float(np.sqrt(found.floor**2 + (found.x**2 + found.y**2) / 2))
+    fit = single_fit.estimate(matches, replace(options, error_floor=floor))
+    return replace(fit, shared_errors=_of_stars(fit, found)), found
+
+
+def measure(fit):
+    """`CorrelatedErrors` in the residuals of a fit.
+
+    Parameters
+    ----------
+    fit : Fit
+
+    Returns
+    -------
+    CorrelatedErrors
+    """
+    n_stars = np.count_nonzero(np.bincount(fit.problem.star, fit.used) > 1)
+    n = fit.problem.n_exposures
+    if n < 2 * BLOCKS or n_stars < STARS:
+        reason = f"{n} exposures, {n_stars} stars seen twice; it takes {2 * BLOCKS} and {STARS}"
+        return CorrelatedErrors(float(fit.options.error_floor), reason=reason)
+    rows = _Rows.of(fit)
+    alone = minimize_scalar(lambda p: rows.along("time").deviance(p, 0.0, 0.0, 1.0), bounds=rows.bounds[0])
+    best, along, size = alone.fun, None, None
+    for name in _ALONG:
+        series = rows.along(name)
+        if not series.longest > series.shortest > 0:
+            continue
+        tried = min((_largest(series, rows.bounds, alone.x, part) for part in _STARTS), key=lambda each: each.fun)
+        if tried.fun < min(best, alone.fun - FOUND):
+            best, along, size = tried.fun, series, np.exp(tried.x)
+    if along is None:
+        return CorrelatedErrors(float(np.exp(alone.x)))
+    floor, x, y, length = map(float, size)
+    return CorrelatedErrors(floor, x, y, along.name, length, along.longest, rows.unit if along.name == "time" else "px")
+
+
+def _largest(series, bounds, floor, part):
+    """The largest likelihood of a series, from a correlation length on that is a part of the longest."""
+    lengths = np.log([series.shortest, series.longest])
+    start = [floor - 0.5, floor - 0.5, floor - 0.5, np.clip(np.log(part * series.longest), *lengths)]
+    start[:3] = np.clip(start[:3], *bounds[0])
+    return minimize(
+        lambda p: series.deviance(p[0], np.exp(p[1]), np.exp(p[2]), np.exp(p[3])),
+        start,
+        method="L-BFGS-B",
+        bounds=[*bounds, lengths],
+        options={"maxiter": 40, "ftol": 1e-7},
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Observations of the stars that are looked at.
+
+    Attributes
+    ----------
+    star, exposure : ndarray of int, shape (n,)
+    residual, variance : ndarray, shape (2, n)
+        In the reference plane, pixels; the variances as stated.
+    place : dict
+        ``{"time" | "x" | "y": (n,)}``.
+    free : ndarray, shape (n_stars,)
+        Part of the variance of a star's residuals that the exposures leave.
+    unit : str
+        Of the time.
+    """
+
+    star: np.ndarray
+    exposure: np.ndarray
+    residual: np.ndarray
+    variance: np.ndarray
+    place: dict
+    free: np.ndarray
+    unit: str
+
+    @classmethod
+    def of(cls, fit):
+        """Those of a `Fit`."""
+        problem, obs = fit.problem, fit.matches.observations
+        exposure = np.repeat(np.arange(problem.n_exposures), np.diff(problem.start))
+        taken = leverages(fit.weighted, fit.blocks)[1]
+        number = np.bincount(problem.star, fit.used, problem.n_stars)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            free = 1 - np.bincount(problem.star, taken * fit.used, problem.n_stars) / number
+            precision = np.where(number > 1, fit.blocks.v[0] + fit.blocks.v[1], 0)
+        chosen = np.zeros(problem.n_stars, dtype=bool)
+        chosen[np.argsort(-precision, kind="stable")[:MOST_STARS]] = True
+        rows = np.flatnonzero(fit.used & (chosen & (number > 1))[problem.star])
+        to_plane = np.linalg.inv(fit.result.state.poses[:, :, :2])[exposure[rows]]
+        stated = obs.covariance[problem.order][rows]
+        covariance = stated[:, [[0, 2], [2, 1]]]
+        moved = np.einsum("nab,nbc,ndc->nad", to_plane, covariance, to_plane)
+        times, unit = fit.matches.times
+        return cls(
+            star=np.unique(problem.star[rows], return_inverse=True)[1],
+            exposure=exposure[rows],
+            residual=np.einsum("nab,bn->an", to_plane, fit.blocks.residual[:, rows]),
+            variance=np.stack([moved[:, 0, 0], moved[:, 1, 1]]),
+            place={"time": times[exposure[rows]], "x": problem.xy[0, rows], "y": problem.xy[1, rows]},
+            free=np.clip(free[np.unique(problem.star[rows])], 0.1, 1),
+            unit=unit,
+        )
+
+    @property
+    def bounds(self):
+        """Of the logarithms of three standard deviations: from nearly nothing to all of the residuals."""
+        high = np.log(4 * np.sqrt(np.mean(self.residual**2)))
+        return [(high - 8, high)] * 3
+
+    def along(self, name):
+        """The `_Series` of every star along the time or an axis of the detector."""
+        place, n_stars = self.place[name], self.star.max() + 1
+        order = np.lexsort([place, self.star])
+        first = np.searchsorted(self.star[order], np.arange(n_stars))
+        rank = np.arange(len(order)) - first[self.star[order]]
+        where = rank, self.star[order]
+        shape = rank.max() + 1, n_stars
+
+        def padded(values, filling):
+            out = np.full(shape, filling)
+            out[where] = values[order]
+            return out
+
+        steps = np.diff(padded(place, np.nan), axis=0)
+        span = np.nanmax(padded(place, np.nan), axis=0) - place[order][first]
+        steps = steps[np.isfinite(steps) & (steps > 0)]
+        return _Series(
+            name,
+            place=np.nan_to_num(np.diff(padded(place, np.nan), axis=0, prepend=np.nan), nan=np.inf),
+            there=padded(np.ones(len(order)), 0.0),
+            residual=np.stack([padded(each, 0.0) for each in self.residual]),
+            variance=np.stack([padded(each, 1.0) for each in self.variance]),
+            free=self.free,
+            shortest=float(np.median(steps)) if len(steps) else 0.0,
+            longest=LONGEST * float(np.median(span)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Series:
+    """Residuals of every star in the order of time or place, rank by star, padded.
+
+    Attributes
+    ----------
+    name : str
+    place : ndarray, shape (n_ranks, n_stars)
+        Distance from the one before.
+    there : ndarray, shape (n_ranks, n_stars)
+        1, or 0 for what is padded.
+    residual, variance : ndarray, shape (2, n_ranks, n_stars)
+    free : ndarray, shape (n_stars,)
+    shortest, longest : float
+        Correlation lengths.
+    """
+
+    name: str
+    place: np.ndarray
+    there: np.ndarray
+    residual: np.ndarray
+    variance: np.ndarray
+    free: np.ndarray
+    shortest: float
+    longest: float
+
+    def deviance(self, log_floor, x, y, length):
+        """Minus twice the logarithm of the restricted likelihood, up to a constant.
+
+        The innovations of a Kalman filter (Jones 1981, for series with gaps) stand for the inverse of the covariance of
+        a star; its mean is free. What the exposures take up counts as so many fewer stars.
+        """
+        decay = np.exp(-self.place / length)
+        total = 0.0
+        for k, size in enumerate((x, y)):
+            noise, spread = self.variance[k] + np.exp(2 * log_floor), size**2
+            mean, known = np.zeros((2, noise.shape[1])), np.full(noise.shape[1], spread)
+            logs, squares = np.zeros(noise.shape[1]), np.zeros((3, noise.shape[1]))
+            for step, there, r, s in zip(decay, self.there, self.residual[k], noise, strict=True):
+                mean, known = mean * step, spread + step**2 * (known - spread)
+                new = np.stack([np.ones_like(r), r]) - mean
+                variance = known + s
+                weight = there / variance
+                logs += there * np.log(variance)
+                squares += weight * new[[0, 0, 1]] * new[[0, 1, 1]]
+                gain = known * weight
+                mean, known = mean + gain * new, known * (1 - gain)
+            ones, cross, own = squares
+            total += np.sum(self.free * (logs + np.log(ones)) + own - cross**2 / ones)
+        return float(total)
+
+
+def _of_stars(fit, found):
+    """Covariance xx, yy, xy (3, n_stars), px^2, by which correlated errors add to the errors of stars in a fit."""
+    problem = fit.problem
+    exposure = np.repeat(np.arange(problem.n_exposures), np.diff(problem.start))
+    weight = fit.weighted.weight[0] + fit.weighted.weight[1]
+    sums = np.bincount(problem.star, weight, problem.n_stars)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        part = np.nan_to_num(weight / sums[problem.star])
+    values = fit.matches.times[0][exposure] if found.along == "time" else problem.xy["xy".index(found.along)]
+    order = np.lexsort([values, problem.star])
+    star, part, values = problem.star[order], part[order], values[order]
+    first = np.searchsorted(star, np.arange(problem.n_stars))
+    rank = np.arange(len(star)) - first[star]
+    behind, double, square, last = np.zeros((4, problem.n_stars))
+    for k in range(rank.max() + 1):  # behind: sum of the parts before, each as correlated as it is near
+        mine = np.flatnonzero(rank == k)
+        j = star[mine]
+        behind[j] *= np.exp(-(values[mine] - last[j]) / found.length)
+        double[j] += 2 * part[mine] * behind[j]
+        square[j] += part[mine] ** 2
+        behind[j] += part[mine]
+        last[j] = values[mine]
+    both = double + square
+    mean = (found.x**2 + found.y**2) / 2
+    return np.stack([found.x**2 * both - mean * square, found.y**2 * both - mean * square, np.zeros(len(both))])
