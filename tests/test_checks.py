@@ -211,6 +211,41 @@ def test_what_is_wrong_is_seen_and_said(kind, words):
     assert any(name in line for line in str(solution).splitlines()[1:8])
 
 
+def test_motions_go_with_the_times_where_they_are_known():
+    # three exposures of one night and three years later: little moves from one to the next, much between the years
+    matches = simulated(6, n_exposures=6).matches
+    table, rng = matches.table.copy(), np.random.default_rng(1)
+    years = np.array([0, 0.001, 0.002, 3, 3.001, 3.002])[np.unique(table["exposure"], return_inverse=True)[1]]
+    v = rng.normal(0, 0.4 * SIGMA, (60, 2))[table["star"]]
+    for k, axis in enumerate("xy"):
+        table[axis] += v[:, k] * years * u.pix
+    table["epoch"] = (2018.0 + years) * u.yr
+    dated = next(c for c in solved(changed(matches, table)).checks if c.name == "time")
+    assert dated.state != "pass"
+    assert "stars move in time" in dated.sentence
+    assert dated.cure == "solve the epochs apart, and compare their positions"
+    table["epoch"] = 2018.0 + years / 3000
+    assert (
+        "in one night it is the measured places that drift"
+        in next(c for c in solved(changed(matches, table)).checks if c.name == "time").cure
+    )
+    late = np.argsort(
+        np.argsort([3, 0, 4, 1, 5, 2])[np.unique(table["exposure"], return_inverse=True)[1]], kind="stable"
+    )
+    table["epoch"] = (2018.0 + years) * u.yr
+    shuffled = next(c for c in solved(changed(matches, table[late])).checks if c.name == "time")
+    assert shuffled.value == pytest.approx(dated.value, rel=1e-3)
+
+
+def test_what_may_be_the_cause_is_named_first():
+    table = spoiled("degree").table.copy()
+    noisy = table["exposure"] == "exp05"
+    table["y"][noisy] += np.random.default_rng(2).normal(0, 4 * SIGMA, noisy.sum()) * u.pix
+    checks = {check.name: check for check in solved(changed(simulated(3, n_exposures=9).matches, table)).checks}
+    assert checks["degree"].cure == "--degree 3, or --degree auto"
+    assert checks["exposures"].cure.startswith("see degree first, which may be the cause; else look at the frame")
+
+
 def test_a_pattern_on_the_detector_is_seen_where_exposures_are_dithered():
     matches = simulated(2, n_exposures=10, n_stars=120, dither=600.0).matches
     table = matches.table.copy()

@@ -106,7 +106,7 @@ def solved(matches, errors):
 
 def bright(table, faintest=1 / 3):
     """Whether stars are among the brightest part, by their stated errors."""
-    return table <= np.quantile(table, faintest)
+    return table <= np.nanquantile(table, faintest)
 
 
 def cubic(xy):
@@ -174,7 +174,7 @@ def frames():
     matches = ld.match(ld.measure(exposures), exposures=exposures)
     for errors in ERRORS:
         solution = solved(matches, errors)
-        print(f"{errors}: x_err of the brightest sixth {np.median(_brightest(solution)):.4f} px")
+        print(f"{errors}: x_err of the brightest sixth {np.nanmedian(_brightest(solution)):.4f} px", flush=True)
         if (correlated := solution.diagnostics.correlated) is not None:
             print(f"  {correlated}")
             halves(matches, solution, correlated)
@@ -194,7 +194,7 @@ def halves(matches, whole, correlated):
         for chosen in (first, [name for name in names if name not in first]):
             rest = dict.fromkeys([name for name in names if name not in chosen], "other half")
             parts.append(solved(matches.without(rest), "floor"))
-        common = np.intersect1d(parts[0].star_names, parts[1].star_names)
+        common = np.intersect1d(*[part.star_names[np.isfinite(part.positions[:, 0])] for part in parts])
         index = [np.searchsorted(part.star_names, common) for part in parts]
         flux = parts[0].stars["flux"].value[index[0]]
         a, b = (part.positions[i] for part, i in zip(parts, index, strict=True))
@@ -212,7 +212,8 @@ def halves(matches, whole, correlated):
             square = np.mean(squares, axis=0)
             print(
                 f"  {label}, {name}: chi2/2n {np.mean(square):.2f}, of the brightest sixth "
-                f"{np.mean(square[bright(-flux, 1 / 6)]):.2f}"
+                f"{np.mean(square[bright(-flux, 1 / 6)]):.2f}, {len(common)} stars",
+                flush=True,
             )
 
 

@@ -6,6 +6,8 @@ extrapolated? Was anything left out? Limits follow from the null distribution of
 (`legdistort.solving.checks.residual_tests`), never from a value that looks large.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import special, stats
 
@@ -20,6 +22,8 @@ CERTAIN = 1e-6
 NEGLIGIBLE = 0.05
 #: Usual share of gross errors (Hampel et al. 1986: 1 to 10 % in routine data).
 GROSS_ERRORS = 0.05
+#: What else may be behind a check that does not pass.
+_CAUSES = dict.fromkeys(("exposures", "place", "duplicates"), ("degree", "time")) | {"time": ("degree",)}
 _TOO_MUCH = 0.5  # of a frame without stars around
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
 
@@ -60,7 +64,20 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
         duplicates_check(solution, residuals),
         header_check(header_distortion),
     ]
-    return tuple(check for check in made if check is not None)
+    return _causes_first([check for check in made if check is not None])
+
+
+def _causes_first(checks):
+    """Checks whose cures name those that do not pass either and may be the cause of theirs."""
+    wrong = [check.name for check in checks if check.state in ("warn", "fail")]
+
+    def told(check):
+        causes = [name for name in _CAUSES.get(check.name, ()) if name in wrong]
+        if not causes or check.name not in wrong:
+            return check
+        return replace(check, cure=f"see {' and '.join(causes)} first, which may be the cause; else {check.cure}")
+
+    return tuple(map(told, checks))
 
 
 def _state(p, matters=True):
@@ -172,6 +189,10 @@ def time_check(residuals, times):
     """Do stars move through the set?"""
     times, unit = times
     how = "in time" if unit == "days" else "in the order of the exposures"
+    cure = "solve the epochs apart, and compare their positions"
+    if unit != "days" or np.ptp(times) < 1:
+        within = "in one night it is the measured places that drift, and --errors correlated counts that"
+        cure = within if unit == "days" else f"{within}; over years, {cure}"
     score = residuals.of_motion(times)
     error = _star_error(residuals)
     state = _state(score.p, score.rms > error)
@@ -179,7 +200,7 @@ def time_check(residuals, times):
         return Check("time", "pass", score.rms, None, f"stars stay where they are, {how}")
     return Check("time", state, score.rms, error,
                  f"stars move {how}, by {score.rms:.2g} px rms (typical error of a star "
-                 f"{error:.2g} px)", "solve the epochs apart, and compare their positions")  # fmt: skip
+                 f"{error:.2g} px)", cure)  # fmt: skip
 
 
 def degree_check(solution, residuals, uncertainty):
