@@ -222,7 +222,7 @@ def test_motions_go_with_the_times_where_they_are_known():
     table["epoch"] = (2018.0 + years) * u.yr
     dated = next(c for c in solved(changed(matches, table)).checks if c.name == "time")
     assert dated.state != "pass"
-    assert "stars move in time" in dated.sentence
+    assert "stars move with time" in dated.sentence
     assert dated.cure == "solve the epochs apart, and compare their positions"
     table["epoch"] = 2018.0 + years / 3000
     assert (

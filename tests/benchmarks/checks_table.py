@@ -1,13 +1,16 @@
 """How often checks warn of sets in which nothing is wrong, and how surely they see what is.
 
-``python tests/benchmarks/checks_table.py alarms --sets 1000`` and ``... power --sets 200``. Distortions are Chebyshev
-polynomials (`calibration_table.simulated`), none of them made by the package.
+``python tests/benchmarks/checks_table.py alarms --sets 2000``, ``... power --sets 200``, and ``... images --sets 100`` for
+runs on simulated frames. The distortions of the first two are Chebyshev polynomials (`calibration_table.simulated`), none
+of them made by the package.
 """
 
 import argparse
 import logging
+import tempfile
 import warnings
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 from astropy import units as u
@@ -142,10 +145,27 @@ def power(n_sets):
         print(f"{kind:40s} {seen['any']:4d} of {n_sets}; {expected} {seen[expected]}; {others}", flush=True)
 
 
+def images(n_sets):
+    """Print how often each check warns of a run on frames in which nothing is wrong: 4 to 11 of them."""
+    seen, n = Counter(), 0
+    for seed in range(n_sets):
+        frames = 4 + seed % 8
+        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            night = ld.simulate_exposures(small=True, seed=100 + seed, n_exposures=frames)
+            checks = ld.run(night.write(Path(folder) / "night"), out=Path(folder) / "out", degree=3).checks
+        bad = [check for check in checks if check.state in ("warn", "fail")]
+        seen.update([check.name for check in bad] + ["any"] * bool(bad))
+        n += 1
+        if bad or n % 10 == 0:
+            print(f"{n} runs, {seen['any']} with a warning, upper 95 % limit {100 * limits(seen['any'], n):.1f} %")
+            print("".join(f"  seed {seed}, {frames} frames: {check}\n" for check in bad), end="", flush=True)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("alarms", "power"))
+    parser.add_argument("what", choices=("alarms", "power", "images"))
     parser.add_argument("--sets", type=int, default=100)
     arguments = parser.parse_args()
     logging.disable(logging.WARNING)
-    (alarms if arguments.what == "alarms" else power)(arguments.sets)
+    {"alarms": alarms, "power": power, "images": images}[arguments.what](arguments.sets)

@@ -188,7 +188,7 @@ def place_check(residuals):
 def time_check(residuals, times):
     """Do stars move through the set?"""
     times, unit = times
-    how = "in time" if unit == "days" else "in the order of the exposures"
+    how = "with time" if unit == "days" else "in the order of the exposures"
     cure = "solve the epochs apart, and compare their positions"
     if unit != "days" or np.ptp(times) < 1:
         within = "in one night it is the measured places that drift, and --errors correlated counts that"
@@ -197,7 +197,7 @@ def time_check(residuals, times):
     error = _star_error(residuals)
     state = _state(score.p, score.rms > error)
     if state == "pass":
-        return Check("time", "pass", score.rms, None, f"stars stay where they are, {how}")
+        return Check("time", "pass", score.rms, None, f"stars do not move {how}")
     return Check("time", state, score.rms, error,
                  f"stars move {how}, by {score.rms:.2g} px rms (typical error of a star "
                  f"{error:.2g} px)", cure)  # fmt: skip
