@@ -1,8 +1,8 @@
 """How often checks warn of sets in which nothing is wrong, and how surely they see what is.
 
-``python tests/benchmarks/checks_table.py alarms --sets 2000``, ``... power --sets 200``, and ``... images --sets 100`` for
-runs on simulated frames. The distortions of the first two are Chebyshev polynomials (`calibration_table.simulated`), none
-of them made by the package.
+``python tests/benchmarks/checks_table.py alarms --sets 2000``, ``... power --sets 200``, and ``... images --sets 100``
+for runs on simulated frames. Distortions of the first two are Chebyshev polynomials (`calibration_table.simulated`),
+none of them made by the package.
 """
 
 import argparse

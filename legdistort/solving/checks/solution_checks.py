@@ -23,7 +23,7 @@ NEGLIGIBLE = 0.05
 #: Usual share of gross errors (Hampel et al. 1986: 1 to 10 % in routine data).
 GROSS_ERRORS = 0.05
 #: What else may be behind a check that does not pass.
-_CAUSES = dict.fromkeys(("exposures", "place", "duplicates"), ("degree", "time")) | {"time": ("degree",)}
+_CAUSES = {"time": ("degree",)} | dict.fromkeys(("exposures", "brightness", "place", "duplicates"), ("degree", "time"))
 _TOO_MUCH = 0.5  # of a frame without stars around
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
 
