@@ -182,8 +182,8 @@ class _Rows:
             name,
             place=np.nan_to_num(np.diff(padded(place, np.nan), axis=0, prepend=np.nan), nan=np.inf),
             there=padded(np.ones(len(order)), 0.0),
-            residual=np.stack([padded(each, 0.0) for each in self.residual]),
-            variance=np.stack([padded(each, 1.0) for each in self.variance]),
+            residual=np.stack([padded(each, 0.0) for each in self.residual], axis=1),
+            variance=np.stack([padded(each, 1.0) for each in self.variance], axis=1),
             free=self.free,
             shortest=float(np.median(steps)) if len(steps) else 0.0,
             longest=LONGEST * float(np.median(span)),
@@ -201,7 +201,7 @@ class _Series:
         Distance from the one before.
     there : ndarray, shape (n_ranks, n_stars)
         1, or 0 for what is padded.
-    residual, variance : ndarray, shape (2, n_ranks, n_stars)
+    residual, variance : ndarray, shape (n_ranks, 2, n_stars)
     free : ndarray, shape (n_stars,)
     shortest, longest : float
         Correlation lengths.
@@ -222,24 +222,21 @@ class _Series:
         The innovations of a Kalman filter (Jones 1981, for series with gaps) stand for the inverse of the covariance of
         a star; its mean is free. What the exposures take up counts as so many fewer stars.
         """
-        decay = np.exp(-self.place / length)
-        total = 0.0
-        for k, size in enumerate((x, y)):
-            noise, spread = self.variance[k] + np.exp(2 * log_floor), size**2
-            mean, known = np.zeros((2, noise.shape[1])), np.full(noise.shape[1], spread)
-            logs, squares = np.zeros(noise.shape[1]), np.zeros((3, noise.shape[1]))
-            for step, there, r, s in zip(decay, self.there, self.residual[k], noise, strict=True):
-                mean, known = mean * step, spread + step**2 * (known - spread)
-                new = np.stack([np.ones_like(r), r]) - mean
-                variance = known + s
-                weight = there / variance
-                logs += there * np.log(variance)
-                squares += weight * new[[0, 0, 1]] * new[[0, 1, 1]]
-                gain = known * weight
-                mean, known = mean + gain * new, known * (1 - gain)
-            ones, cross, own = squares
-            total += np.sum(self.free * (logs + np.log(ones)) + own - cross**2 / ones)
-        return float(total)
+        decay, there = np.exp(-self.place / length)[:, None], self.there[:, None]
+        spread = np.array([[x], [y]]) ** 2
+        noise = self.variance + np.exp(2 * log_floor)
+        new, variance = np.stack([np.ones_like(noise), self.residual], axis=1), np.empty_like(noise)
+        mean, known = np.zeros_like(new[0]), np.broadcast_to(spread, noise[0].shape)
+        for k, (step, here) in enumerate(zip(decay, there, strict=True)):
+            mean, known = mean * step, spread + step**2 * (known - spread)
+            new[k] -= mean
+            variance[k] = known + noise[k]
+            gain = here * known / variance[k]
+            mean, known = mean + gain * new[k], known * (1 - gain)
+        weight, (one, r) = there / variance, new.swapaxes(0, 1)
+        logs, ones = np.sum(there * np.log(variance), axis=0), np.sum(weight * one**2, axis=0)
+        cross, own = np.sum(weight * one * r, axis=0), np.sum(weight * r**2, axis=0)
+        return float(np.sum(self.free * (logs + np.log(ones)) + own - cross**2 / ones))
 
 
 def _of_stars(fit, found):

@@ -147,16 +147,15 @@ def power(n_sets):
 
 def images(n_sets):
     """Print how often each check warns of a run on frames in which nothing is wrong: 4 to 11 of them."""
-    seen, n = Counter(), 0
-    for seed in range(n_sets):
-        frames = 4 + seed % 8
+    seen = Counter()
+    for n in range(1, n_sets + 1):
+        seed, frames = n - 1, 4 + (n - 1) % 8
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             night = ld.simulate_exposures(small=True, seed=100 + seed, n_exposures=frames)
             checks = ld.run(night.write(Path(folder) / "night"), out=Path(folder) / "out", degree=3).checks
         bad = [check for check in checks if check.state in ("warn", "fail")]
         seen.update([check.name for check in bad] + ["any"] * bool(bad))
-        n += 1
         if bad or n % 10 == 0:
             print(f"{n} runs, {seen['any']} with a warning, upper 95 % limit {100 * limits(seen['any'], n):.1f} %")
             print("".join(f"  seed {seed}, {frames} frames: {check}\n" for check in bad), end="", flush=True)
