@@ -254,6 +254,22 @@ def test_a_pattern_on_the_detector_is_seen_where_exposures_are_dithered():
     assert states(solved(matches))["place"] == "pass"
 
 
+def test_a_pattern_too_small_to_matter_passes_and_is_said():
+    matches = simulated(2, n_exposures=12, n_stars=500, dither=300.0).matches
+    table = matches.table.copy()
+    pattern = np.sign(table["x"].value - 1024) * np.sign(table["y"].value - 1024)
+
+    def place(size):
+        moved = table.copy()
+        moved["x"] += size * SIGMA * pattern * u.pix
+        return next(c for c in solved(changed(matches, moved)).checks if c.name == "place")
+
+    slight, large = place(0.19), place(0.45)
+    assert slight.state == "pass"
+    assert "too little to matter" in slight.sentence
+    assert large.state == "warn"
+
+
 def test_frames_with_stars_in_one_corner_are_called_extrapolated():
     matches = simulated(3, n_exposures=6, n_stars=300).matches
     table = matches.table[(matches.table["x"].value < 900) & (matches.table["y"].value < 900)]

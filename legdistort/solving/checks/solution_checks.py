@@ -84,10 +84,22 @@ def _state(p, matters=True):
     return "pass" if p > FALSE_ALARM else "fail" if p < CERTAIN and matters else "warn"
 
 
-def _star_error(residuals):
-    """Typical error of a star's position, pixels."""
+def _star_error(residuals, part=0.5):
+    """Error that a part of the star positions has at most, pixels; the typical one."""
     v = residuals.blocks.v[:2]
-    return float(np.median(1 / np.sqrt(v[v > 0]))) if np.any(v > 0) else np.nan
+    return float(np.quantile(1 / np.sqrt(v[v > 0]), part)) if np.any(v > 0) else np.nan
+
+
+def _pattern_state(score, residuals):
+    """State of a pattern in the residuals, and words on one that is there but too small to matter.
+
+    It does not matter if the errors of the best sixth of the positions are right to `NEGLIGIBLE` in spite of it.
+    """
+    least = np.sqrt((1 + NEGLIGIBLE) ** 2 - 1) * _star_error(residuals, 1 / 6)
+    state = _state(score.p, score.rms > _star_error(residuals))
+    if state != "pass" and score.rms < least:
+        return "pass", f" beyond {score.rms:.2g} px rms, too little to matter"
+    return state, ""
 
 
 def _stated(solution, residuals):
@@ -176,9 +188,9 @@ def place_check(residuals):
     x, y = np.clip(((problem.xy + 0.5) / size * n).astype(int), 0, n - 1)
     score = residuals.of_cells((groups * n + y) * n + x)
     error = _star_error(residuals)
-    state = _state(score.p, score.rms > error)
+    state, little = _pattern_state(score, residuals)
     if state == "pass":
-        return Check("place", "pass", score.rms, None, f"no pattern in {n} x {n} cells of the detector")
+        return Check("place", "pass", score.rms, None, f"no pattern in {n} x {n} cells of the detector{little}")
     return Check("place", state, score.rms, error,
                  f"residuals have a pattern of {score.rms:.2g} px rms in {n} x {n} cells of the detector "
                  f"(typical error of a star {error:.2g} px)",
@@ -195,9 +207,9 @@ def time_check(residuals, times):
         cure = within if unit == "days" else f"{within}; over years, {cure}"
     score = residuals.of_motion(times)
     error = _star_error(residuals)
-    state = _state(score.p, score.rms > error)
+    state, little = _pattern_state(score, residuals)
     if state == "pass":
-        return Check("time", "pass", score.rms, None, f"stars do not move {how}")
+        return Check("time", "pass", score.rms, None, f"stars do not move {how}{little}")
     return Check("time", state, score.rms, error,
                  f"stars move {how}, by {score.rms:.2g} px rms (typical error of a star "
                  f"{error:.2g} px)", cure)  # fmt: skip
@@ -207,7 +219,7 @@ def degree_check(solution, residuals, uncertainty):
     """Is the degree too low or too high?"""
     score, more = residuals.next_degree
     error = _star_error(residuals)
-    state = _state(score.p, score.rms > error)
+    state, little = _pattern_state(score, residuals)
     if state != "pass":
         return Check("degree", state, score.rms, error,
                      f"degree {more} would explain {score.rms:.2g} px rms more (typical error of a star "
@@ -218,7 +230,7 @@ def degree_check(solution, residuals, uncertainty):
         return Check("degree", "warn", score.rms, error,
                      f"no exposure has modes of degree {solution.degree} beyond noise",
                      f"--degree {solution.degree - 1} says the same with smaller errors")  # fmt: skip
-    return Check("degree", "pass", score.rms, error, f"degree {more} would explain nothing more")
+    return Check("degree", "pass", score.rms, error, f"degree {more} would explain nothing more{little}")
 
 
 def _significance(solution, blocks, *, top_only=False):
