@@ -316,9 +316,8 @@ def _measure_frame(exposure, options):
     stamps = Stamps(frame, centres, options.box // 2 if options.box else frame_fit.box_half(fwhm))
     fitted = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     measured, verdict = frame_psf.measure_frame(stamps, fitted, shape, psf)
-    shapes, covariance = fitted.found.params[:, 3:7], fitted.found.covariance[:, 3:7, 3:7]
     usable = ((fitted.flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
-    deformed = is_deformed(shapes, covariance, snr=fitted.snr, usable=usable)
+    deformed = _is_deformed(stamps, fitted, usable)
     stars = _moffat_stars(fitted) if measured is None else _psf_stars(fitted, measured)
     stars = stars._replace(flags=stars.flags | np.where(deformed, Flag.DEFORMED, 0))
     table = _table(name, stamps, stars)
@@ -331,6 +330,14 @@ def _measure_frame(exposure, options):
     known = exposure.gain or exposure.uncertainty is not None or not len(table)
     own = None if measured is None else measured.psf.named(exposure=name)
     return MeasuredExposure(table, None if known else fitted.photon, own, verdict)
+
+
+def _is_deformed(stamps, fitted, usable):
+    """`is_deformed` of the stars of a frame."""
+    found = fitted.found
+    shapes, covariance = found.params[:, 3:7], found.covariance[:, 3:7, 3:7]
+    xy, chi2 = stamps.centres + found.params[:, :2], found.chi2 / np.maximum(found.dof, 1)
+    return is_deformed(shapes, covariance, xy=xy, snr=fitted.snr, chi2=chi2, usable=usable)
 
 
 class _Stars(NamedTuple):

@@ -203,7 +203,9 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
         if last and profile != "own":
             use = ~hot & ~_is_wild(found, width) & (_ratio(models, weights) > _SHAPELY)
             xy = stamps.centres + found.params[:, :2]
-            centre, sigma = shape_field(found, xy, use, linear=profile == "linear", fallback=shape), HELD
+            known = found.params[:, 3:7], found.covariance[:, 3:7, 3:7]
+            centre = shape_field(*known, xy, use, degree=int(profile == "linear"), fallback=shape)
+            sigma = HELD
         labels = _touching(stamps, found, hot, done, radius)
         pixels = _, weights = _separate(stamps, found, models, labels, noise, nodes)
         start = np.where(_is_wild(found, width)[:, None], _start(stamps, shape), found.params)
