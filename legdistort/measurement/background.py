@@ -123,6 +123,14 @@ def smooth_light(signal, good, sigma, *, variance=None):
     return _spread(level, step, signal.shape), extrapolated, step
 
 
+def mean_light(signal, good, sigma):
+    """Means around binned pixels, with Gaussian weights; and the pixels binned along each axis."""
+    step = max(1, int(sigma / 2))
+    smooth = partial(gaussian_filter, sigma=sigma / step, mode="constant", truncate=3.0)
+    total, n = (smooth(_binned(np.where(good, values, 0).astype(np.float32), step)) for values in (signal, 1))
+    return total / np.maximum(n, np.finfo(n.dtype).eps), step
+
+
 def _planes(n, total, width, *, whole=False):
     """Values of planes fitted around all pixels, and how much they differ from means.
 

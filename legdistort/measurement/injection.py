@@ -16,7 +16,8 @@ from ..exceptions import InputError
 from .flags import UNUSABLE
 from .noise_curves import NoiseCurves
 from .profiles import frame_fit, moffat
-from .profiles.cutouts import Stamps
+from .profiles.cutouts import Stamps, box_half
+from .profiles.location import locate_stars
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ def calibrate_frame(exposure, remeasure, *, threshold=5.0, widths=None, fluxes=N
         For a frame without stars if `widths` or the gain are missing, without room, or saturated at the faintest stars.
     """
     name, rng = exposure.name, np.random.default_rng([seed, zlib.crc32(exposure.name.encode())])
-    frame, centres, shape = frame_fit.locate_stars(exposure, threshold=threshold)
+    frame, centres, shape = locate_stars(exposure, threshold=threshold)
     if not len(centres) and widths is None:
         raise InputError(f"{name}: no star above {threshold:g} times the noise tells how wide stars are; give fwhm")
     photon = _photon_noise(frame, exposure, centres, shape)
@@ -88,7 +89,7 @@ def _photon_noise(frame, exposure, centres, shape):
     if not len(centres):
         raise InputError(f"{exposure.name}: neither a gain nor stars that would tell the photon noise; give gain")
     if not frame.noise_given:
-        return frame_fit.fit_stars(Stamps(frame, centres, frame_fit.box_half(moffat.fwhm(shape))), shape)[-1]
+        return frame_fit.fit_stars(Stamps(frame, centres, box_half(moffat.fwhm(shape))), shape)[-1]
     x, y = centres[:50].T
     above = frame.variance[y, x] - np.median(frame.variance[frame.good])
     return max(float(np.median(above / np.maximum(frame.signal[y, x], 1e-30))), 0.0)
@@ -97,7 +98,7 @@ def _photon_noise(frame, exposure, centres, shape):
 def default_fluxes(exposure, frame, centres, shape, threshold):
     """Fluxes from the detection limit to bright stars, evenly spaced in their logarithm; see `calibrate_frame`."""
     params = moffat.parameters(np.ones(1), shape)
-    unit = moffat.evaluate(params, frame_fit.box_half(moffat.fwhm(shape)), moffat.CENTRES)[0] / moffat.flux(params)
+    unit = moffat.evaluate(params, box_half(moffat.fwhm(shape)), moffat.CENTRES)[0] / moffat.flux(params)
     lowest = _FAINTEST * threshold * np.sqrt(np.median(frame.variance[frame.good]) / (unit**2).sum())
     highest = _RANGE * lowest
     if len(centres):
@@ -178,7 +179,7 @@ def free_positions(exposure, taken, fwhm, *, n, rng):
     ndarray, shape (at most n, 2)
     """
     ny, nx = exposure.shape
-    half = frame_fit.box_half(fwhm)
+    half = box_half(fwhm)
     if min(ny, nx) < 2 * half + 2:
         return np.zeros((0, 2))
     bad = exposure.mask if not exposure.saturation else exposure.mask | (exposure.data >= exposure.saturation)
@@ -233,7 +234,7 @@ def _light(image_shape, xy, flux, shape):
     ny, nx = image_shape
     width = float(moffat.fwhm(shape))
     nodes = moffat.quadrature(min(width, 2.0))  # 3 or 5 points a pixel, however wide
-    half, wide = frame_fit.box_half(width), int(np.ceil(8 * width))
+    half, wide = box_half(width), int(np.ceil(8 * width))
     offset = np.arange(-wide, wide + 1)
     core = np.flatnonzero((np.abs(offset)[:, None] <= half) & (np.abs(offset) <= half))
     out = np.zeros(ny * nx)

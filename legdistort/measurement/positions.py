@@ -23,7 +23,8 @@ from .flags import UNUSABLE, Flag
 from .injection import calibrate_frame
 from .options import MeasureOptions
 from .profiles import frame_fit, moffat
-from .profiles.cutouts import Stamps
+from .profiles.cutouts import Stamps, box_half
+from .profiles.location import locate_stars
 
 log = logging.getLogger(__name__)
 
@@ -306,14 +307,14 @@ def _measure_frame(exposure, options):
     """What `measure_exposure` gives, errors as the fits state them."""
     name, max_stars = exposure.name, options.max_stars
     psf = options.psf_of(name)
-    frame, centres, shape = frame_fit.locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
+    frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
     if len(centres) == 0:
         log.warning("%s: no star above %g times the noise", name, options.threshold)
         return MeasuredExposure(_empty(), None, None, frame_psf.Verdict("moffat", 0))
     if max_stars is not None:
         centres = centres[: 3 * max_stars]  # some will turn out to be hot pixels or saturated
     fwhm = float(moffat.fwhm(shape))
-    stamps = Stamps(frame, centres, options.box // 2 if options.box else frame_fit.box_half(fwhm))
+    stamps = Stamps(frame, centres, options.box // 2 if options.box else box_half(fwhm))
     fitted = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     measured, verdict = frame_psf.measure_frame(stamps, fitted, shape, psf)
     usable = ((fitted.flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
