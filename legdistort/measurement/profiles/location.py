@@ -15,7 +15,8 @@ _SETTLED = 0.1  # relative change of the width that ends the search
 _POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no star, however sharp, has so little
 _STEADY = 0.02  # relative error of a width below which stars count alike
 _FEWEST = 10  # stars whose widths are averaged, if there are
-_CROWDED = 0.8  # of the variance at first: what is left of it where much of it was stars
+_WIDER = 1.05  # than a Moffat function fitted to a core in a halo: the core itself
+_CROWDED = 0.6  # of the variance at first: what is left of it where much of it was stars
 #: Pixels: nothing wider is taken for stars unasked. Sky and detector have structures of any width.
 WIDEST = 30.0
 
@@ -50,7 +51,7 @@ def locate_stars(exposure, *, threshold, fwhm=None):
     if moffat.fwhm(shape) > mesh / 8:  # stars as wide as that would pass for sky
         frame = prepare(exposure, mesh=int(8 * moffat.fwhm(shape)))
         shape = _frame_shape(frame, fwhm, exposure.name)
-    kernel, before = fwhm or float(moffat.fwhm(shape)), frame
+    kernel, before = fwhm or _WIDER * float(moffat.fwhm(shape)), frame
     centres, frame = detect(before, kernel, threshold)
     if np.median(frame.variance[::8, ::8]) < _CROWDED * np.median(before.variance[::8, ::8]):
         centres, frame = detect(frame, kernel, threshold)  # stars have passed for noise, and so for light around others
