@@ -15,7 +15,6 @@ _SETTLED = 0.1  # relative change of the width that ends the search
 _POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no star, however sharp, has so little
 _STEADY = 0.02  # relative error of a width below which stars count alike
 _FEWEST = 10  # stars whose widths are averaged, if there are
-_WIDER = 1.05  # than a Moffat function fitted to a core in a halo: the core itself
 _CROWDED = 0.6  # of the variance at first: what is left of it where much of it was stars
 #: Pixels: nothing wider is taken for stars unasked. Sky and detector have structures of any width.
 WIDEST = 30.0
@@ -47,11 +46,11 @@ def locate_stars(exposure, *, threshold, fwhm=None):
         If what is seen is wider than stars are.
     """
     frame, mesh = prepare(exposure), MESH
-    shape = _frame_shape(frame, fwhm, exposure.name)
+    kernel, shape = _frame_shape(frame, fwhm, exposure.name)
     if moffat.fwhm(shape) > mesh / 8:  # stars as wide as that would pass for sky
         frame = prepare(exposure, mesh=int(8 * moffat.fwhm(shape)))
-        shape = _frame_shape(frame, fwhm, exposure.name)
-    kernel, before = fwhm or _WIDER * float(moffat.fwhm(shape)), frame
+        kernel, shape = _frame_shape(frame, fwhm, exposure.name)
+    before = frame
     centres, frame = detect(before, kernel, threshold)
     if np.median(frame.variance[::8, ::8]) < _CROWDED * np.median(before.variance[::8, ::8]):
         centres, frame = detect(frame, kernel, threshold)  # stars have passed for noise, and so for light around others
@@ -59,24 +58,23 @@ def locate_stars(exposure, *, threshold, fwhm=None):
 
 
 def _frame_shape(frame, fwhm, name):
-    """Usual shape of the bright stars, found by trying if the width is unknown."""
+    """A width that serves to detect stars, and the usual shape of bright ones; found by trying if not known."""
     kernel, shape = fwhm or _FIRST_FWHM, moffat.shape(fwhm or _FIRST_FWHM)
     for _ in range(6):
         peaks = bright_peaks(frame, kernel)[:_TELLING]
         if len(peaks) == 0:
             break
         shape = _usual_shape(Stamps(frame, peaks, box_half(kernel)), kernel)
-        before, kernel = kernel, float(moffat.fwhm(shape))
-        if fwhm is not None:
-            break
-        if kernel > WIDEST:
+        width = float(moffat.fwhm(shape))
+        if fwhm is None and width > WIDEST:
             raise InputError(
-                f"{name}: no stars to be seen: what stands out of the sky has a FWHM of {kernel:.0f} pixels. Calibrate "
+                f"{name}: no stars to be seen: what stands out of the sky has a FWHM of {width:.0f} pixels. Calibrate "
                 "the frame (dark, flat field), mask what is no sky, or say how wide the stars are (fwhm=)"
             )
-        if abs(before - kernel) < _SETTLED * kernel:
+        if fwhm is not None or abs(width - kernel) < _SETTLED * width:
             break
-    return shape
+        kernel = width
+    return kernel, shape
 
 
 def _usual_shape(stamps, fwhm):
