@@ -103,7 +103,7 @@ def smooth_light(signal, good, sigma, *, variance=None):
     """The light around every pixel: of the plane fitted to its surroundings, the value at the pixel.
 
     A plane, because a mean would be wrong on slopes beside edges and gaps. The weights of the fit are Gaussian; it is
-    made on pixels binned so that 1.4 to 2.8 of them make up `sigma`, and interpolated.
+    made on pixels binned so that 2 to 4 of them make up `sigma`, and interpolated.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def smooth_light(signal, good, sigma, *, variance=None):
     step : int
         Pixels binned along each axis.
     """
-    step = max(1, int(sigma / 1.4))
+    step = max(1, int(sigma / 2))
     n, total = _binned(good.astype(signal.dtype), step), _binned(np.where(good, signal, 0), step)
     level, extrapolated = _planes(n, total, sigma / step, whole=good.all())
     if variance is not None:
@@ -135,7 +135,7 @@ def smooth_light(signal, good, sigma, *, variance=None):
 
 def mean_light(signal, good, sigma):
     """Means around binned pixels, with Gaussian weights; and the pixels binned along each axis."""
-    step = max(1, int(sigma / 1.4))
+    step = max(1, int(sigma / 2))
     smooth = partial(gaussian_filter, sigma=sigma / step, mode="constant", truncate=3.0)
     total, n = (smooth(_binned(np.where(good, values, 0).astype(np.float32), step)) for values in (signal, 1))
     return total / np.maximum(n, np.finfo(n.dtype).eps), step
