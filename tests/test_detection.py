@@ -1,15 +1,21 @@
 """Detection on halos, side lobes, slopes and edges: false stars, and stars that are missed."""
 
+import time
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from star_images import GAIN, ladder, observe, scattered
+from star_images import GAIN, ladder, observe, positions, scattered, usable
 from star_images import image as render
 
+from legdistort.exceptions import InputError
 from legdistort.inputs.exposures import Exposure
 from legdistort.measurement.background import smooth_light
+from legdistort.measurement.crowding import is_isolated
 from legdistort.measurement.detection import detect, prepare
-from legdistort.measurement.profiles.frame_fit import locate_stars
+from legdistort.measurement.positions import measure
+from legdistort.measurement.profiles import moffat
+from legdistort.measurement.profiles.location import locate_stars
 from legdistort.simulation.pupil import PupilPSF
 from legdistort.simulation.rendering import add_noise, as_psf
 from legdistort.simulation.rendering import render as render_psf
@@ -108,3 +114,40 @@ def test_narrow_and_wide_stars_are_found_once(fwhm):
     stars, false = found(centres, xy, fwhm)
     assert stars.all()
     assert len(false) <= 1
+
+
+@pytest.mark.parametrize("saturated", [False, True])
+def test_one_width_and_one_position_in_all_cut_outs_of_a_crowded_field(saturated):
+    """The same pixels in four frames, undersampled; the brightest stars have flat tops, and no header says so."""
+    rng, fwhm, size, part = np.random.default_rng(9), 1.4, 360, 250
+    n = int((size / (8 * fwhm)) ** 2)
+    xy, flux = rng.uniform(0, size, (n, 2)), (800**-0.5 + rng.uniform(size=n) * (1e6**-0.5 - 800**-0.5)) ** -2.0
+    image = observe(render((size, size), xy, flux, fwhm), rng)
+    if saturated:
+        image = np.minimum(image, np.sort(image, axis=None)[-90])
+    widths, found = [], []
+    for x, y in ((0, 0), (0, size - part), (size - part, 0), (size - part, size - part)):
+        exposure = Exposure("part", image[y : y + part, x : x + part], gain=GAIN)
+        widths.append(moffat.fwhm(locate_stars(exposure, threshold=5.0)[2]))
+        table = usable(measure(exposure, psf="moffat"))
+        found.append(positions(table[is_isolated(table)]) + [x, y])
+    assert np.ptp(widths) < 0.02 * fwhm
+    assert np.mean(widths) == pytest.approx(fwhm, rel=0.02)
+    for other in found[1:]:
+        distance, same = cKDTree(found[0]).query(other)
+        off = (other - found[0][same])[distance < 0.5]
+        assert len(off) > 50
+        assert np.sqrt(np.mean(off**2)) < 0.02
+
+
+def test_a_width_that_no_star_has_is_an_error_within_seconds():
+    """Structure of a raw frame, far above the noise and without a star."""
+    rng, size = np.random.default_rng(1), 768
+    y, x = np.mgrid[:size, :size]
+    data = rng.normal(1000, 10, (size, size))
+    for a, b in rng.uniform(0, size, (12, 2)):
+        data += 2000.0 * (np.abs(np.hypot(x - a, y - b) - 40) < 15)
+    start = time.process_time()
+    with pytest.raises(InputError, match=r"raw: no stars to be seen: .* has a FWHM of \d+ pixels. .*fwhm="):
+        measure(Exposure("raw", data, gain=1.0))
+    assert time.process_time() - start < 5

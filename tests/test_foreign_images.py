@@ -240,7 +240,7 @@ def test_jwst_rate_has_no_gwcs(data, tmp_path):
 
 
 def write_roman(path, data, **changes):
-    """The public tree of a Roman image; with tags of a version that roman_datamodels, if it is there, does not check."""
+    """The public tree of a Roman image, with tags of a version that roman_datamodels does not check."""
     flags = np.zeros(SHAPE, np.uint32)
     flags[7, 8], flags[9, 10] = 1, 4
     exposure = asdf.tagged.TaggedDict(

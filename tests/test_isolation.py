@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from ao_images import apart, identify
 from astropy.stats import biweight_scale
 from astropy.table import QTable
 from scipy.spatial import cKDTree
@@ -11,7 +12,9 @@ from legdistort.exceptions import InputError
 from legdistort.inputs.exposures import Exposure
 from legdistort.measurement.crowding import LIMIT, displacement, is_deformed, is_isolated
 from legdistort.measurement.flags import UNUSABLE, Flag
-from legdistort.simulation.rendering import Moffat, add_noise, render
+from legdistort.measurement.profiles.shape_field import shape_field
+from legdistort.simulation.pupil import PupilPSF
+from legdistort.simulation.rendering import Moffat, add_noise, as_psf, render
 
 SKY, GAIN, READ_NOISE = 100.0, 2.0, 10.0
 PSF = Moffat(4.5, 3.0)
@@ -115,14 +118,56 @@ def test_unresolved_pairs_are_deformed_and_single_stars_are_not():
     assert not is_isolated(table)[deformed].any()
 
 
+@pytest.mark.parametrize(("shape", "least"), [({"elongation": 2.0}, 0.4), ({"coma": 0.4}, 0.9)])
+def test_shapes_that_vary_over_the_field_make_no_star_deformed(shape, least):
+    """Behind adaptive optics, images elongated and lopsided off the axis; one star in eight has a companion."""
+    rng, size = np.random.default_rng(14), 1024
+    psf = as_psf(PupilPSF(strehl=0.4, jitter=0.4, axis=(0.1, -0.1), **shape), (size, size))
+    xy, flux = apart(rng, 120, size, 40, 25), 10 ** rng.uniform(4, 6, 120)
+    turn = rng.uniform(0, 2 * np.pi, 15)
+    beside = xy[:15] + 1.8 * np.column_stack([np.cos(turn), np.sin(turn)])  # 0.6 FWHM
+    flux[:15] = np.geomspace(2e5, 1e6, 15)
+    light = render((size, size), [*xy, *beside], [*flux, *0.15 * flux[:15]], psf=psf, sky=SKY)
+    image = add_noise(light, rng, gain=GAIN, read_noise=READ_NOISE)
+    table = ld.measure(Exposure("field", image, gain=GAIN), psf="moffat")
+    found = identify(np.column_stack([table["x"].value, table["y"].value]), xy, 2.5)
+    assert (found >= 0).all()
+    deformed = (table["flags"][found] & Flag.DEFORMED) != 0
+    off_axis = np.hypot(*(xy - size / 2).T) > size / 4
+    assert deformed[15:][off_axis[15:]].mean() < 0.05
+    assert is_isolated(table[found])[15:].mean() > 0.95
+    assert deformed[:15].mean() > least
+
+
+def test_expected_shape_is_that_of_images_blurred_across_the_field():
+    """Half widths squared add up exactly: a blur that grows with the square of the distance, and a third are blends."""
+    rng = np.random.default_rng(15)
+    xy = rng.uniform(0, 1000, (80, 2))
+    u, v = (xy / 500 - 1).T
+    xx, yy, both = 2.0 + 1.5 * u**2, 2.0 + 1.5 * v**2, 1.5 * u * v
+    form = np.linalg.inv(np.moveaxis([[xx, both], [both, yy]], -1, 0))
+    a, b = form[:, 0, 0], form[:, 1, 1]
+    truth = np.column_stack([np.log(a), np.log(b), form[:, 0, 1] / np.sqrt(a * b), 1.0 + 0.1 * u])
+    shapes = truth + 0.01 * rng.standard_normal(truth.shape)
+    shapes[:23, :2] -= rng.uniform(0.1, 0.5, (23, 1))
+    covariance, use = np.tile(np.diag(np.full(4, 1e-4)), (80, 1, 1)), np.arange(80) < 70
+    options = {"degree": 2, "fallback": np.median(truth, axis=0)}
+    found = shape_field(shapes, covariance, xy, use, **options)
+    np.testing.assert_allclose(found[:70], truth[:70], atol=0.05)
+    with_few = shape_field(shapes, covariance, xy, use & (np.arange(80) < 3), **options)
+    np.testing.assert_array_equal(with_few, np.tile(options["fallback"], (80, 1)))
+
+
 def test_shapes_that_scatter_make_no_star_deformed():
     """A profile that differs from star to star by much more than the noise of the shapes."""
     rng = np.random.default_rng(5)
     shapes = np.array([-1.2, -1.2, 0.0, 1.0]) + 0.1 * rng.standard_normal((200, 4))
     covariance = np.tile(np.diag(np.full(4, 1e-6)), (200, 1, 1))
     usable, snr = np.ones(200, dtype=bool), rng.uniform(10, 100, 200)
-    assert is_deformed(shapes, covariance, snr=snr, usable=usable).mean() < 0.05
-    assert not is_deformed(shapes[:5], covariance[:5], snr=snr[:5], usable=usable[:5]).any()  # too few to tell
+    given = {"xy": rng.uniform(0, 500, (200, 2)), "snr": snr, "chi2": np.ones(200), "usable": usable}
+    assert is_deformed(shapes, covariance, **given).mean() < 0.05
+    few = {name: values[:5] for name, values in given.items()}
+    assert not is_deformed(shapes[:5], covariance[:5], **few).any()  # too few to tell
 
 
 def test_limit():

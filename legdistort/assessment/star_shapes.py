@@ -6,7 +6,7 @@ a star and whatever else there is: a star doubled or smeared by a wrong distorti
 
 import numpy as np
 
-from ..measurement.profiles import frame_fit, levenberg_marquardt, moffat
+from ..measurement.profiles import cutouts, levenberg_marquardt, moffat
 
 
 def measure_shapes(image, xy, *, fwhm, bad=None, saturation=None):
@@ -30,7 +30,7 @@ def measure_shapes(image, xy, *, fwhm, bad=None, saturation=None):
         x, y, FWHM, ellipticity, peak over flux; NaN for a star near the edge, with bad pixels at its centre or many
         around it, or without a fit.
     """
-    half, (ny, nx) = frame_fit.box_half(fwhm), np.shape(image)
+    half, (ny, nx) = cutouts.box_half(fwhm), np.shape(image)
     xy = np.asarray(xy, dtype=float).reshape(-1, 2)
     out = np.full((len(xy), 5), np.nan)
     centres = np.round(np.nan_to_num(xy, nan=-1e6)).astype(int)

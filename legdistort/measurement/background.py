@@ -21,6 +21,7 @@ _ROUNDS = 5  # from a noise that is several times too high, in crowded fields
 _BRIGHT = 5.0  # standard deviations of a binned pixel above the light around it: part of a star
 _ENOUGH = 1_000_000  # pixels: of more every fourth serves
 _FEWEST = 50  # pixels of a mesh that tell its noise
+_ORDERS = (0, 0), (0, 1), (1, 0), (0, 2), (2, 0), (1, 1)  # of moments, by rows and columns
 _STEPS = 12  # of light, for the photon noise
 
 
@@ -40,22 +41,31 @@ def sky_and_noise(data, mask, mesh, *, steep=False):
     -------
     sky, rms : ndarray, shape (ny, nx)
     """
-    box = tuple(min(mesh, n) for n in data.shape)
+    box, shape = tuple(min(mesh, n) for n in data.shape), data.shape
     clip = SigmaClip(sigma=3.0, maxiters=10)
+    high = box[0]
+    if data.size >= _ENOUGH and mesh % 8 == 0:  # whole rows, even and odd ones: detectors have patterns
+        rows = np.flatnonzero(np.isin(np.arange(len(data)) % 8, (0, 3)))
+        data, mask, high = data[rows], mask[rows], high // 4
     with warnings.catch_warnings(action="ignore"):  # of meshes without good pixels, which are interpolated
         for exclude in (50.0, 100.0):
             try:
                 found = Background2D(
-                    data, box, mask=mask, sigma_clip=clip, exclude_percentile=exclude, filter_size=1 if steep else 3
+                    data,
+                    (high, box[1]),
+                    mask=mask,
+                    sigma_clip=clip,
+                    exclude_percentile=exclude,
+                    filter_size=1 if steep else 3,
                 )
             except ValueError:
                 log.debug("background: too few good pixels with exclude_percentile=%g", exclude)
             else:
                 rms = found.background_rms_mesh
-                sky = _enlarge(found.background_mesh, box, data.shape, degree=3 if steep else 2)
-                return sky, _enlarge(rms, box, data.shape).clip(rms.min())
+                sky = _enlarge(found.background_mesh, box, shape, degree=3 if steep else 2)
+                return sky, _enlarge(rms, box, shape).clip(rms.min())
     values = clip(data[~mask] if not mask.all() else data.ravel(), masked=False)
-    return np.full_like(data, np.median(values)), np.full_like(data, np.std(values))
+    return tuple(np.full(shape, value, dtype=data.dtype) for value in (np.median(values), np.std(values)))
 
 
 def is_steep(sky, rms, mesh):
@@ -123,6 +133,14 @@ def smooth_light(signal, good, sigma, *, variance=None):
     return _spread(level, step, signal.shape), extrapolated, step
 
 
+def mean_light(signal, good, sigma):
+    """Means around binned pixels, with Gaussian weights; and the pixels binned along each axis."""
+    step = max(1, int(sigma / 2))
+    smooth = partial(gaussian_filter, sigma=sigma / step, mode="constant", truncate=3.0)
+    total, n = (smooth(_binned(np.where(good, values, 0).astype(np.float32), step)) for values in (signal, 1))
+    return total / np.maximum(n, np.finfo(n.dtype).eps), step
+
+
 def _planes(n, total, width, *, whole=False):
     """Values of planes fitted around all pixels, and how much they differ from means.
 
@@ -136,26 +154,28 @@ def _planes(n, total, width, *, whole=False):
         Whether no measurement is missing; sums of `n` are then products.
     """
     area = width**2
-    smooth = partial(gaussian_filter, sigma=width, mode="constant", truncate=3.0)
+    along = partial(gaussian_filter1d, sigma=width, mode="constant", truncate=3.0)
 
-    def weighted(order):
-        """Sum of Gaussian weight * n * offset^order, but for a factor: by derivatives of the Gaussian."""
-        if not whole:
-            return smooth(n, order=order)
-        along = partial(gaussian_filter1d, sigma=width, mode="constant", truncate=3.0)
-        middle = np.maximum(n[0, 0], 1)
-        return np.outer(along(n[:, 0], order=order[0]), along(n[0], order=order[1])) / middle
+    def sums(image, orders):
+        """Sums of Gaussian weight * image * offset^order, but for a factor: by derivatives of the Gaussian."""
+        down = {i: along(image, axis=0, order=i) for i in sorted({order[0] for order in orders})}
+        return (along(down[i], axis=1, order=j) for i, j in orders)
 
-    weight = weighted((0, 0)) + np.finfo(n.dtype).eps
-    mean = smooth(total) / weight
-    x, y = (area * weighted(order) / weight for order in ((0, 1), (1, 0)))
+    if whole:
+        column, row = ([along(part, order=i) for i in range(3)] for part in (n[:, 0] / np.maximum(n[0, 0], 1), n[0]))
+        moments = (np.outer(column[i], row[j]) for i, j in _ORDERS)
+    else:
+        moments = sums(n, _ORDERS)
+    weight, in_x, in_y, in_xx, in_yy, in_xy = moments
+    weight += np.finfo(n.dtype).eps
+    scale = area / weight
+    mean, by_x, by_y = sums(total, _ORDERS[:3])
+    mean /= weight
+    x, y = scale * in_x, scale * in_y
     # never narrower than a quarter of the Gaussian's width: what is left of a star beside a gap tells no slope
-    xx, yy = (
-        np.maximum(area + area**2 * weighted(order) / weight - c**2, 0.06 * area)
-        for order, c in (((0, 2), x), ((2, 0), y))
-    )
-    xy = area**2 * weighted((1, 1)) / weight - x * y
-    by_x, by_y = (area * smooth(total, order=order) / weight - c * mean for order, c in (((0, 1), x), ((1, 0), y)))
+    xx, yy = (np.maximum(area + area * scale * m - c**2, 0.06 * area) for m, c in ((in_xx, x), (in_yy, y)))
+    xy = area * scale * in_xy - x * y
+    by_x, by_y = scale * by_x - x * mean, scale * by_y - y * mean
     determinant = np.maximum(xx * yy - xy**2, 0.02 * area**2)
     shift = ((yy * by_x - xy * by_y) * x + (xx * by_y - xy * by_x) * y) / determinant
     return mean - shift, np.abs(shift)

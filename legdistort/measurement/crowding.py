@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 from ..exceptions import InputError
 from .flags import Flag
+from .profiles.shape_field import deviation, shape_field, usual
 
 #: Largest `crowding` of a star called isolated: what subtraction leaves of it is then a small part of its error.
 LIMIT = 3.0
@@ -23,7 +24,7 @@ DEFORMED = 4.0
 _BETA = 3.0
 _REACH = 6.0  # FWHM: neighbours farther away than this pull at nothing but the background
 _QUARTILE = 0.3186  # of the absolute value of a unit normal
-_QUARTILE_OF_CHI2 = 1.923  # with 4 degrees of freedom
+_SHAPELY = 20  # signal-to-noise ratio of stars that tell what shape is usual
 _FEWEST = 20  # stars that tell what shape is usual
 
 
@@ -135,18 +136,23 @@ def crowding(table, fwhm):
     return np.where(np.isnan(ratio), np.inf, ratio)
 
 
-def is_deformed(shapes, covariance, *, snr, usable):
-    """Whether shapes differ from that of the other stars of the frame by more than their noise.
+def is_deformed(shapes, covariance, *, xy, snr, chi2, usable):
+    """Whether shapes differ by more than their noise from what is usual at their place in the frame.
 
-    The usual shape is the median of the best quarter of the stars, by signal-to-noise ratio; the scatter among them
-    beyond their noise (the profile varies over the field, and no profile is quite a Moffat function) is allowed for.
+    What is usual is a polynomial of degree 2 in x and y through the shapes of bright stars (`shape_field`). Allowed
+    for, besides noise, are what Moffat profiles leave of bright stars whose images are none, and the scatter of shapes
+    among the best quarter of the stars.
 
     Parameters
     ----------
     shapes : ndarray, shape (n, 4)
         Of fitted profiles, see `legdistort.measurement.profiles.moffat.NAMES`.
     covariance : ndarray, shape (n, 4, 4)
+    xy : ndarray, shape (n, 2)
+        Positions [pix].
     snr : ndarray, shape (n,)
+    chi2 : ndarray, shape (n,)
+        Of the fits, reduced.
     usable : ndarray of bool, shape (n,)
         Stars whose shape counts for what is usual.
 
@@ -154,15 +160,17 @@ def is_deformed(shapes, covariance, *, snr, usable):
     -------
     ndarray of bool, shape (n,)
     """
-    best = np.flatnonzero(usable)[np.argsort(-snr[usable], kind="stable")]
-    best = best[: max(_FEWEST, len(best) // 4)]
+    order = np.flatnonzero(usable)[np.argsort(-snr[usable], kind="stable")]
+    best = order[: max(_FEWEST, len(order) // 4)]
     if len(best) < 8:
         return np.zeros(len(shapes), dtype=bool)
-    off = shapes - np.median(shapes[best], axis=0)
     # the quartile stays what it is among single stars even where half of the others are blends
+    misfit = max(0.0, np.quantile((chi2[best] - 1) / snr[best] ** 2, 0.25))
+    covariance = covariance * (1 + misfit * snr**2)[:, None, None]
+    telling = np.zeros(len(shapes), dtype=bool)
+    telling[order[: max(len(best), np.count_nonzero(snr[order] > _SHAPELY))]] = True
+    off = shapes - shape_field(shapes, covariance, xy, telling, degree=2, fallback=np.median(shapes[best], axis=0))
     spread = (np.quantile(np.abs(off[best]), 0.25, axis=0) / _QUARTILE) ** 2
     noise = np.median(np.einsum("nii->ni", covariance[best]), axis=0)
-    total = covariance + np.diag(np.maximum(spread - noise, 0))
-    chi2 = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off)
-    usual = max(1.0, np.quantile(chi2[best], 0.25) / _QUARTILE_OF_CHI2)  # the spread is itself known from few stars
-    return chi2 > DEFORMED * shapes.shape[1] * usual
+    deviations = deviation(off, np.linalg.inv(covariance + np.diag(np.maximum(spread - noise, 0))))
+    return deviations > DEFORMED * shapes.shape[1] * usual(deviations[best])  # the spread is known from few stars

@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from .background import is_steep, sky_and_noise, sky_variance, smooth_light
+from .background import is_steep, mean_light, sky_and_noise, sky_variance, smooth_light
 from .sidelobes import side_light
 
 _CLIPPED = 0.986  # standard deviation of a unit normal after clipping at 3 sigma until nothing changes
 _KERNEL = 0.7  # width relative to the stars: costs 6 % of the signal-to-noise ratio, tells apart closer pairs
 _LOCAL = 5.0  # width of the local mean taken off, in that of the kernel: costs another 6 %, and removes halos
 _EXTRAPOLATED = 0.5  # of a local light that is extrapolated, over an edge, part that may be wrong
+_STANDS_OUT = 5.0  # signal-to-noise ratio of bright peaks
 _COVERED = 0.2  # part of a star, by its weight in the detection, on good pixels; in the corners of an image it is 0.25
 #: Pixels over which the sky is taken as constant.
 MESH = 64
@@ -69,6 +70,31 @@ def prepare(exposure, *, mesh=MESH):
     return Frame(data - sky, variance, sky, ~exposure.mask, saturated, 1 / gain if gain else None, floor=floor)
 
 
+def bright_peaks(frame, fwhm):
+    """Peaks that stand out of the light around them, among them all bright stars: what tells how wide these are.
+
+    Parameters
+    ----------
+    frame : Frame
+    fwhm : float
+        Of the stars, roughly [pix].
+
+    Returns
+    -------
+    ndarray of int, shape (n, 2)
+        Pixels (x, y), the highest signal-to-noise ratio first.
+    """
+    sigma = _kernel(fwhm)
+    seen = frame.good & ~frame.saturated
+    signal = np.where(frame.good, frame.signal, np.float32(0))
+    filtered, noise = _blur(signal, sigma), np.float32(_norm(sigma)) * frame.variance
+    y, x = np.nonzero((filtered > 0) & (filtered**2 > _STANDS_OUT**2 * noise))
+    mean, step = mean_light(signal, seen, _LOCAL * sigma)
+    ratio = (filtered[y, x] - mean[y // step, x // step]) / np.sqrt(noise[y, x])
+    use = (ratio > _STANDS_OUT) & _is_highest(filtered, x, y, max(1, int(fwhm / 2)))
+    return np.column_stack([x, y])[use][np.argsort(-ratio[use], kind="stable")]
+
+
 def detect(frame, fwhm, threshold):
     """Peaks of the frame filtered with a Gaussian from which the local light has been taken off.
 
@@ -92,7 +118,7 @@ def detect(frame, fwhm, threshold):
     frame : Frame
         With the variance of the sky alone, as seen where there are no stars; unchanged if the noise was given.
     """
-    sigma = _KERNEL * np.sqrt((fwhm / 2.3548) ** 2 + 1 / 12)  # 1/12: the pixel
+    sigma = _kernel(fwhm)
     seen = frame.good & ~frame.saturated
     # The sky is put back: in crowded fields its map follows the halos, in steps that would pass for stars.
     data = frame.signal + frame.sky
@@ -114,6 +140,11 @@ def detect(frame, fwhm, threshold):
     other = side_light(filtered, x, y, fwhm, hidden=spoilt) + _EXTRAPOLATED * extrapolated[y // step, x // step]
     star = ratio * (1 - other / np.maximum(filtered[y, x], np.finfo(np.float32).tiny)) > threshold
     return np.column_stack([x, y])[star][np.argsort(-ratio[star], kind="stable")], frame
+
+
+def _kernel(fwhm):
+    """Standard deviation of the kernel [pix]."""
+    return _KERNEL * np.sqrt((fwhm / 2.3548) ** 2 + 1 / 12)  # 1/12: the pixel
 
 
 def _norm(sigma):

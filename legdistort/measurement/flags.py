@@ -14,7 +14,7 @@ class Flag(IntFlag):
     BLENDED = 32  #: another detection within two FWHM (fitted together with it, or its model was subtracted)
     MASKED = 64  #: bad or outlying pixels within one FWHM of the centre were left out of the fit
     SHARED_SHAPE = 128  #: too faint or disturbed for a shape of its own: fitted with that of the frame
-    DEFORMED = 256  #: the shape is not that of the frame's stars: an unresolved companion, see `is_deformed`
+    DEFORMED = 256  #: the shape is not what is usual at this place: an unresolved companion, see `is_deformed`
 
 
 #: Flags that make a detection useless as a star position.

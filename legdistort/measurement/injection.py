@@ -16,7 +16,8 @@ from ..exceptions import InputError
 from .flags import UNUSABLE
 from .noise_curves import NoiseCurves
 from .profiles import frame_fit, moffat
-from .profiles.cutouts import Stamps
+from .profiles.cutouts import Stamps, box_half
+from .profiles.location import locate_stars
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +66,7 @@ def calibrate_frame(exposure, remeasure, *, psf=None, threshold=5.0, widths=None
         For a frame without stars if `widths` or the gain are missing, without room, or saturated at the faintest stars.
     """
     name, rng = exposure.name, np.random.default_rng([seed, zlib.crc32(exposure.name.encode())])
-    frame, centres, shape = frame_fit.locate_stars(exposure, threshold=threshold)
+    frame, centres, shape = locate_stars(exposure, threshold=threshold)
     if not len(centres) and widths is None:
         raise InputError(f"{name}: no star above {threshold:g} times the noise tells how wide stars are; give fwhm")
     photon = _photon_noise(frame, exposure, centres, shape)
@@ -110,7 +111,7 @@ class MoffatStars:
         nodes = moffat.quadrature(min(self.fwhm, 2.0))  # 3 or 5 points a pixel, however wide
         params = moffat.parameters(np.ones(len(centres)), self.shape, offsets)
         params[:, 2] /= moffat.flux(params)
-        core = min(half, frame_fit.box_half(self.fwhm))
+        core = min(half, box_half(self.fwhm))
         out = moffat.evaluate(params, half, moffat.CENTRES)
         inner = np.flatnonzero((np.abs(np.mgrid[-half : half + 1, -half : half + 1]) <= core).all(axis=0))
         out[:, inner] = moffat.evaluate(params, core, nodes)
@@ -124,7 +125,7 @@ def _photon_noise(frame, exposure, centres, shape):
     if not len(centres):
         raise InputError(f"{exposure.name}: neither a gain nor stars that would tell the photon noise; give gain")
     if not frame.noise_given:
-        return frame_fit.fit_stars(Stamps(frame, centres, frame_fit.box_half(moffat.fwhm(shape))), shape)[-1]
+        return frame_fit.fit_stars(Stamps(frame, centres, box_half(moffat.fwhm(shape))), shape)[-1]
     x, y = centres[:50].T
     above = frame.variance[y, x] - np.median(frame.variance[frame.good])
     return max(float(np.median(above / np.maximum(frame.signal[y, x], 1e-30))), 0.0)
@@ -133,7 +134,7 @@ def _photon_noise(frame, exposure, centres, shape):
 def default_fluxes(exposure, frame, centres, profile, threshold):
     """Fluxes from the detection limit to bright stars, evenly spaced in their logarithm; see `calibrate_frame`."""
     middle = np.array(exposure.shape[::-1])[None] // 2
-    unit = profile.on_stamps(middle, np.zeros((1, 2)), frame_fit.box_half(profile.fwhm))[0]
+    unit = profile.on_stamps(middle, np.zeros((1, 2)), box_half(profile.fwhm))[0]
     lowest = _FAINTEST * threshold * np.sqrt(np.median(frame.variance[frame.good]) / (unit**2).sum())
     highest = _RANGE * lowest
     if len(centres):
@@ -214,7 +215,7 @@ def free_positions(exposure, taken, fwhm, *, n, rng):
     ndarray, shape (at most n, 2)
     """
     ny, nx = exposure.shape
-    half = frame_fit.box_half(fwhm)
+    half = box_half(fwhm)
     if min(ny, nx) < 2 * half + 2:
         return np.zeros((0, 2))
     bad = exposure.mask if not exposure.saturation else exposure.mask | (exposure.data >= exposure.saturation)

@@ -23,7 +23,8 @@ from .flags import UNUSABLE, Flag
 from .injection import calibrate_frame
 from .options import MeasureOptions
 from .profiles import frame_fit, moffat
-from .profiles.cutouts import Stamps
+from .profiles.cutouts import Stamps, box_half
+from .profiles.location import locate_stars
 
 log = logging.getLogger(__name__)
 
@@ -307,19 +308,18 @@ def _measure_frame(exposure, options):
     """What `measure_exposure` gives, errors as the fits state them."""
     name, max_stars = exposure.name, options.max_stars
     psf = options.psf_of(name)
-    frame, centres, shape = frame_fit.locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
+    frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
     if len(centres) == 0:
         log.warning("%s: no star above %g times the noise", name, options.threshold)
         return MeasuredExposure(_empty(), None, None, frame_psf.Verdict("moffat", 0))
     if max_stars is not None:
         centres = centres[: 3 * max_stars]  # some will turn out to be hot pixels or saturated
     fwhm = float(moffat.fwhm(shape))
-    stamps = Stamps(frame, centres, options.box // 2 if options.box else frame_fit.box_half(fwhm))
+    stamps = Stamps(frame, centres, options.box // 2 if options.box else box_half(fwhm))
     fitted = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     measured, verdict = frame_psf.measure_frame(stamps, fitted, shape, psf)
-    shapes, covariance = fitted.found.params[:, 3:7], fitted.found.covariance[:, 3:7, 3:7]
     usable = ((fitted.flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
-    deformed = is_deformed(shapes, covariance, snr=fitted.snr, usable=usable)
+    deformed = _is_deformed(stamps, fitted, usable)
     stars = _moffat_stars(fitted) if measured is None else _psf_stars(fitted, measured)
     stars = stars._replace(flags=stars.flags | np.where(deformed, Flag.DEFORMED, 0))
     table = _table(name, stamps, stars)
@@ -332,6 +332,14 @@ def _measure_frame(exposure, options):
     known = exposure.gain or exposure.uncertainty is not None or not len(table)
     own = None if measured is None else measured.psf.named(exposure=name)
     return MeasuredExposure(table, None if known else fitted.photon, own, verdict)
+
+
+def _is_deformed(stamps, fitted, usable):
+    """`is_deformed` of the stars of a frame."""
+    found = fitted.found
+    shapes, covariance = found.params[:, 3:7], found.covariance[:, 3:7, 3:7]
+    xy, chi2 = stamps.centres + found.params[:, :2], found.chi2 / np.maximum(found.dof, 1)
+    return is_deformed(shapes, covariance, xy=xy, snr=fitted.snr, chi2=chi2, usable=usable)
 
 
 class _Stars(NamedTuple):

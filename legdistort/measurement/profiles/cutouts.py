@@ -7,6 +7,11 @@ from . import moffat
 _CHUNK = 200  # stars: their models stay in the processor's cache
 
 
+def box_half(fwhm):
+    """Half the side of the box fitted, without the central pixel."""
+    return max(4, int(np.ceil(2 * fwhm)))
+
+
 class Stamps:
     """Square cut-outs around integer positions, and models of all stars laid over each other.
 

@@ -5,27 +5,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..detection import MESH, detect, prepare
 from ..flags import Flag
 from . import moffat
 from .blends import fit_groups, group_stars, partner_models
-from .cutouts import Stamps
+from .first_fit import fit_once, point_chi2, started, weighted
 from .levenberg_marquardt import HELD, SHAPE_SIGMA, Fit, Limits, fit
 from .local_sky import separate
-from .pixel_noise import NEIGHBOUR, pixel_noise
+from .pixel_noise import pixel_noise
 from .shape_field import shape_field
 
 #: Shapes of stars, and ways to fit those that touch: see `fit_stars`.
 PROFILES, BLENDS = ("own", "shared", "linear"), ("together", "alone")
 
-_FIRST_FWHM = 3.0
 _DEVIATES = 0.2  # fraction of a star by which pixels may deviate from a Moffat profile
-#: Limits of the passes: what the first leaves tells the noise, the second prepares the last.
-_FIRST, _MIDDLE, _LAST = Limits(20, 1e-4), Limits(20, 1e-2), Limits(40, 1e-4)
+#: Limits of the passes after the first: the second prepares the last.
+_MIDDLE, _LAST = Limits(20, 1e-2), Limits(40, 1e-4)
 _SHAPELY = 20  # signal-to-noise ratio of stars that tell the shape of all
 _GAP = 1 / 3  # part of the pixels within one FWHM that may be missing
 _WANDERS = 0.75  # FWHM from the peak: a cosmic ray beside a star draws the peak away by half a FWHM and more
-_POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no star, however sharp, has so little
 
 
 class FrameFit(NamedTuple):
@@ -56,117 +53,6 @@ class FrameFit(NamedTuple):
     photon: float
 
 
-def _start(stamps, shape):
-    middle = stamps.data.shape[1] // 2
-    return moffat.parameters(np.maximum(stamps.data[:, middle], np.sqrt(stamps.variance[:, middle])), shape)
-
-
-def _weights(good, variance):
-    return np.where(good, 1 / variance, 0.0)
-
-
-def find_stars(frame, threshold, fwhm=None):
-    """Detect with a kernel as wide as the stars, which is found by trying.
-
-    Parameters
-    ----------
-    frame : `~legdistort.measurement.detection.Frame`
-        From `legdistort.measurement.detection.prepare`.
-    threshold : float
-        Signal-to-noise ratio.
-    fwhm : float, optional
-        Width of the kernel [pix], if it is known.
-
-    Returns
-    -------
-    frame : `~legdistort.measurement.detection.Frame`
-        With the variance of the sky alone, see `legdistort.measurement.detection.detect`.
-    centres : ndarray of int, shape (n, 2)
-        Pixels (x, y), the highest signal-to-noise ratio first.
-    shape : ndarray, shape (4,)
-        Median of the bright stars, hot pixels left out (see `legdistort.measurement.profiles.moffat.shape`).
-    """
-    kernel = fwhm or _FIRST_FWHM
-    shape = moffat.shape(kernel)
-    for _ in range(6):
-        centres, frame = detect(frame, kernel, threshold)
-        if len(centres) == 0:
-            break
-        shape = _common_shape(Stamps(frame, centres[:150], box_half(kernel)), kernel)
-        before, kernel = kernel, float(moffat.fwhm(shape))
-        if fwhm is not None or abs(before - kernel) < 0.1 * kernel:
-            break
-    return frame, centres, shape
-
-
-def locate_stars(exposure, *, threshold, fwhm=None):
-    """An exposure prepared for fitting, and its stars: `legdistort.measurement.detection.prepare` and `find_stars`.
-
-    Parameters
-    ----------
-    exposure : `~legdistort.inputs.exposures.Exposure`
-    threshold : float
-        Signal-to-noise ratio.
-    fwhm : float, optional
-        Of the stars [pix], if it is known.
-
-    Returns
-    -------
-    frame : `~legdistort.measurement.detection.Frame`
-    centres : ndarray of int, shape (n, 2)
-    shape : ndarray, shape (4,)
-    """
-    frame, centres, shape = find_stars(prepare(exposure), threshold, fwhm)
-    if moffat.fwhm(shape) > MESH / 8:  # stars as wide as that would pass for sky
-        frame, centres, shape = find_stars(prepare(exposure, mesh=int(8 * moffat.fwhm(shape))), threshold, fwhm)
-    return frame, centres, shape
-
-
-def box_half(fwhm):
-    """Half the side of the box fitted, without the central pixel."""
-    return max(4, int(np.ceil(2 * fwhm)))
-
-
-def _common_shape(stamps, fwhm):
-    """Median shape of the bright stars."""
-    start = moffat.shape(fwhm)
-    fit, pointlike = _fit_once(stamps, start, moffat.quadrature(fwhm))
-    clean = fit.converged & ~(stamps.saturated & stamps.near(fit.params, fwhm)).any(axis=1)
-    clean &= (pointlike[:, 0] > _POINTLIKE * pointlike[:, 1]) & (pointlike[:, 0] > fit.chi2) & (fit.params[:, 2] > 0)
-    if not clean.any():
-        return start
-    # the better half by signal-to-noise ratio, or 10 of them: faint stars have no shape to speak of
-    ratio = np.where(clean, fit.params[:, 2] / np.sqrt(fit.covariance[:, 2, 2]), -1)
-    best = np.argsort(-ratio)[: min(max(10, clean.sum() // 2), clean.sum())]
-    return np.median(fit.params[best, 3:7], axis=0)
-
-
-def _fit_once(stamps, shape, nodes):
-    """First pass, with the noise of the sky alone; the fit, and `_point_chi2` of the same pixels."""
-    start = _start(stamps, shape)
-    _, others = stamps.models(start, nodes)
-    data, weights = stamps.data - others, _weights(stamps.good, stamps.variance + (NEIGHBOUR * others) ** 2)
-    return fit(data, weights, start, nodes=nodes, centre=shape, limits=_FIRST), _point_chi2(data, weights)
-
-
-def _point_chi2(data, weights):
-    """Chi2 of a single bright pixel on a flat background, and of the background alone; (n, 2)."""
-    n, npix = data.shape
-    size = round(np.sqrt(npix))
-    middle = np.zeros((size, size), dtype=bool)
-    middle[size // 2 - 1 : size // 2 + 2, size // 2 - 1 : size // 2 + 2] = True
-    peak = np.argmax(np.where(middle.ravel() & (weights > 0), data, -np.inf), axis=1)
-    rest = weights.copy()
-    rest[np.arange(n), peak] = 0
-    return np.column_stack([_flat_chi2(data, rest), _flat_chi2(data, weights)])
-
-
-def _flat_chi2(data, weights):
-    """Chi2 of a flat background, (n,)."""
-    mean = (weights * data).sum(axis=1) / np.maximum(weights.sum(axis=1), np.finfo(weights.dtype).tiny)
-    return (weights * (data - mean[:, None]) ** 2).sum(axis=1)
-
-
 def fit_stars(stamps, shape, *, profile="own", blends="together"):
     """Fit all stars of a frame in three passes.
 
@@ -191,7 +77,7 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
     """
     width = float(moffat.fwhm(shape))
     nodes = moffat.quadrature(width)
-    found, _ = _fit_once(stamps, shape, nodes)
+    found, _ = fit_once(stamps, shape, nodes)
     models = stamps.models(found.params, nodes)
     noise = pixel_noise(stamps, found, models, nodes)
     radius = min(2 * width, stamps.half) if blends == "together" else 0.0
@@ -202,10 +88,12 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
         if last and profile != "own":
             use = ~hot & ~_is_wild(found, width) & (_ratio(models, weights) > _SHAPELY)
             xy = stamps.centres + found.params[:, :2]
-            centre, sigma = shape_field(found, xy, use, linear=profile == "linear", fallback=shape), HELD
+            known = found.params[:, 3:7], found.covariance[:, 3:7, 3:7]
+            centre = shape_field(*known, xy, use, degree=int(profile == "linear"), fallback=shape)
+            sigma = HELD
         labels = _touching(stamps, found, hot, done, radius)
         pixels = _, weights = _separate(stamps, found, models, labels, noise, nodes)
-        start = np.where(_is_wild(found, width)[:, None], _start(stamps, shape), found.params)
+        start = np.where(_is_wild(found, width)[:, None], started(stamps, shape), found.params)
         fitting = partial(fit, nodes=nodes, sigma=sigma, limits=_LAST if last else _MIDDLE)
         found = fit_groups(found, labels, pixels, start, stamps=stamps, centre=centre, fitting=fitting)
         models = stamps.models(found.params, nodes)
@@ -268,9 +156,9 @@ def _separate(stamps, found, models, labels, noise, nodes):
 
 def _is_hot(stamps, found, models, good):
     """Stars explained better by one bright pixel than by a profile."""
-    data, weights = stamps.data - models[1], _weights(good, stamps.variance)
+    data, weights = stamps.data - models[1], weighted(good, stamps.variance)
     residual = data - models[0] - found.params[:, 7:]
-    return _point_chi2(data, weights)[:, 0] <= (weights * residual**2).sum(axis=1)
+    return point_chi2(data, weights)[:, 0] <= (weights * residual**2).sum(axis=1)
 
 
 def _is_wild(fit, width):
