@@ -314,13 +314,14 @@ def _normal(stars, linear, params, corrections, spacing, terms, used):
     for part in np.array_split(rows, max(1, len(rows) // _AT_ONCE)):
         # single precision for the patterns: all that follows sees the same ones
         light = corrections.on_stamps(params[part, :2].astype(np.float32), stars.half, spacing).astype(float)
-        root = np.sqrt(linear.weights[part])
-        light *= (params[part, 2, None] * root)[:, None]
-        slopes, residual = linear.slopes[part] * root[:, None], (linear.residual[part] * root)[:, :, None]
-        mixed = slopes @ light.swapaxes(1, 2)
+        light *= params[part, 2, None, None]
+        weighted = light * linear.weights[part, None]
+        mixed = linear.slopes[part] @ weighted.swapaxes(1, 2)
         followed[part] = linear.inverse[part] @ mixed
-        own = light @ light.swapaxes(1, 2) - mixed.swapaxes(1, 2) @ followed[part]  # a product that is symmetric
-        rest = (light @ residual - followed[part].swapaxes(1, 2) @ (slopes @ residual))[:, :, 0]
+        own = weighted @ light.swapaxes(1, 2) - mixed.swapaxes(1, 2) @ followed[part]
+        residual = linear.residual[part, :, None]
+        told = linear.slopes[part] @ (linear.weights[part, :, None] * residual)
+        rest = (weighted @ residual - followed[part].swapaxes(1, 2) @ told)[:, :, 0]
         t = terms[part]
         pairs += np.tensordot(t[:, first] * t[:, second], own, (0, 0))
         right += t.T @ rest
