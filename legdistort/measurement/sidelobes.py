@@ -45,7 +45,8 @@ def side_light(image, x, y, fwhm, *, hidden=None):
     ndarray, shape (n,)
         In units of the image.
     """
-    value, xy, out = image[y, x].astype(float), _summits(image, x, y), np.zeros(len(x))
+    value = np.maximum(image[y, x].astype(float), np.finfo(np.float32).tiny)  # beside bad pixels it may be negative
+    xy, out = _summits(image, x, y), np.zeros(len(x))
     pairs = cKDTree(xy).query_pairs(_REACH * fwhm, output_type="ndarray")
     if not len(pairs):
         return out

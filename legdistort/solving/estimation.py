@@ -241,7 +241,8 @@ def _tell_lost_stars(fit):
     more = f" and {len(lost) - len(named)} more" * (len(lost) > len(named))
     warn(
         f"{len(lost)} star{'s have' if len(lost) > 1 else ' has'} no position, the observations contradict one another "
-        f"and there is no majority: {', '.join(named)}{more}; look whether they are matched rightly, or leave them out",
+        f"and there is no majority: {', '.join(named)}{more}; look whether they are matched rightly, or leave "
+        "them out; bright ones may have errors that are too small: errors='floor' (--errors floor)",
         AssumptionWarning,
     )
 

@@ -14,7 +14,7 @@ from ..flags import UNUSABLE, Flag
 from ..profiles import moffat
 from ..profiles.levenberg_marquardt import Fit
 from ..profiles.local_sky import separate
-from ..profiles.pixel_noise import NEIGHBOUR
+from ..profiles.pixel_noise import NEIGHBOUR, pixel_variance
 from . import building, fitting, splines
 from .own_error import own_covariance
 
@@ -188,7 +188,7 @@ def ensemble(stamps, fitted, rows, others, slope=None):
     """Some stars of a frame, with the light of the others, and the slope of the sky, taken off."""
     others = others[rows].astype(float)
     data = stamps.data[rows] - others - (0 if slope is None else slope[rows])
-    sky = fitted.sky[rows] + fitted.photon * others + (NEIGHBOUR * others) ** 2
+    sky = pixel_variance((fitted.sky[rows], fitted.photon), others) + (NEIGHBOUR * others) ** 2
     return building.Ensemble(stamps.centres[rows], data, np.where(stamps.good[rows], sky, np.inf), float(fitted.photon))
 
 
