@@ -22,8 +22,7 @@ def astray(problem):
     SolveError
         If there is no majority.
     """
-    exposure = np.repeat(np.arange(problem.n_exposures), np.diff(problem.start))
-    found = pair_agreement.compare(exposure, problem.star, start_values.undistorted(problem).T)
+    found = pair_agreement.compare(problem.exposure, problem.star, start_values.undistorted(problem).T)
     group, against, rivals = ([problem.names[i] for i in part] for part in (found.group, found.against, found.rivals))
     if against and (len(group) < FEWEST or len(group) <= len(rivals)):
         raise SolveError(contradiction(group, rivals if len(rivals) > 1 else against))

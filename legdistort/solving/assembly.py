@@ -40,10 +40,8 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
     Solution
     """
     table = QTable(matches.table, copy=False)
-    residual, used = np.empty_like(blocks.residual), np.empty(len(table), dtype=bool)
-    residual[:, problem.order], used[problem.order] = blocks.residual, problem.weight[0] > 0
-    table["dx"], table["dy"] = residual * u.pix
-    table["used"] = used
+    table["dx"], table["dy"] = problem.in_table_order(blocks.residual) * u.pix
+    table["used"] = problem.in_table_order(problem.weight[0] > 0)
     positions = state.positions.T.copy()
     positions[blocks.v[0] <= 0] = np.nan
     return Solution(

@@ -83,17 +83,15 @@ def _with_errors(matches, sigma):
 
 def _law(fit, before):
     """The `ErrorLaw` of the residuals of a fit; `before` is that of its weights, if there is one."""
-    names, obs, order = fit.problem.names, fit.matches.observations, fit.problem.order
-    pull, used = np.empty(len(obs.xy)), np.empty(len(obs.xy), dtype=bool)
-    pull[order] = clipping.deviations(fit.problem, fit.result.state, fit.used * fit.result.robust)
-    used[order] = fit.used
+    problem, obs = fit.problem, fit.matches.observations
+    names = problem.names
+    pull = problem.in_table_order(clipping.deviations(problem, fit.result.state, fit.used * fit.result.robust))
+    used = problem.in_table_order(fit.used)
     measured = (pull**2 / 2 * obs.covariance[:, :2].mean(axis=1))[used]
     flux, exposure = _fluxes(fit.matches)[used], obs.exposure[used]
     factor = np.array([before.factors.get(name, 1.0) if before else 1.0 for name in names])
-    terms, count = (
-        np.column_stack([flux**-2.0, 1 / flux, np.ones(len(flux))]),
-        np.bincount(exposure, minlength=len(names)),
-    )
+    terms = np.column_stack([flux**-2.0, 1 / flux, np.ones(len(flux))])
+    count = np.bincount(exposure, minlength=len(names))
     for _ in range(2):
         size = _gamma_fit(terms, measured / factor[exposure] ** 2)
         ratio = np.bincount(exposure, measured / (terms @ size), len(names))

@@ -131,7 +131,6 @@ class _Rows:
     def of(cls, fit):
         """Those of a `Fit`."""
         problem, obs = fit.problem, fit.matches.observations
-        exposure = np.repeat(np.arange(problem.n_exposures), np.diff(problem.start))
         taken = leverages(fit.weighted, fit.blocks)[1]
         number = np.bincount(problem.star, fit.used, problem.n_stars)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -140,17 +139,17 @@ class _Rows:
         chosen = np.zeros(problem.n_stars, dtype=bool)
         chosen[np.argsort(-precision, kind="stable")[:MOST_STARS]] = True
         rows = np.flatnonzero(fit.used & (chosen & (number > 1))[problem.star])
-        to_plane = np.linalg.inv(fit.result.state.poses[:, :, :2])[exposure[rows]]
+        to_plane = np.linalg.inv(fit.result.state.poses[:, :, :2])[problem.exposure[rows]]
         stated = obs.covariance[problem.order][rows]
         covariance = stated[:, [[0, 2], [2, 1]]]
         moved = np.einsum("nab,nbc,ndc->nad", to_plane, covariance, to_plane)
         times, unit = fit.matches.times
         return cls(
             star=np.unique(problem.star[rows], return_inverse=True)[1],
-            exposure=exposure[rows],
+            exposure=problem.exposure[rows],
             residual=np.einsum("nab,bn->an", to_plane, fit.blocks.residual[:, rows]),
             variance=np.stack([moved[:, 0, 0], moved[:, 1, 1]]),
-            place={"time": times[exposure[rows]], "x": problem.xy[0, rows], "y": problem.xy[1, rows]},
+            place={"time": times[problem.exposure[rows]], "x": problem.xy[0, rows], "y": problem.xy[1, rows]},
             free=np.clip(free[np.unique(problem.star[rows])], 0.1, 1),
             unit=unit,
         )
@@ -164,9 +163,7 @@ class _Rows:
     def along(self, name):
         """The `_Series` of every star along the time or an axis of the detector."""
         place, n_stars = self.place[name], self.star.max() + 1
-        order = np.lexsort([place, self.star])
-        first = np.searchsorted(self.star[order], np.arange(n_stars))
-        rank = np.arange(len(order)) - first[self.star[order]]
+        order, first, rank = _ranks(self.star, place, n_stars)
         where = rank, self.star[order]
         shape = rank.max() + 1, n_stars
 
@@ -188,6 +185,13 @@ class _Rows:
             shortest=float(np.median(steps)) if len(steps) else 0.0,
             longest=LONGEST * float(np.median(span)),
         )
+
+
+def _ranks(star, place, n_stars):
+    """Observations by star, and by place within a star: their order, the first of every star, ranks within a star."""
+    order = np.lexsort([place, star])
+    first = np.searchsorted(star[order], np.arange(n_stars))
+    return order, first, np.arange(len(order)) - first[star[order]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,16 +246,13 @@ class _Series:
 def _of_stars(fit, found):
     """Covariance xx, yy, xy (3, n_stars), px^2, by which correlated errors add to the errors of stars in a fit."""
     problem = fit.problem
-    exposure = np.repeat(np.arange(problem.n_exposures), np.diff(problem.start))
     weight = fit.weighted.weight[0] + fit.weighted.weight[1]
     sums = np.bincount(problem.star, weight, problem.n_stars)
     with np.errstate(invalid="ignore", divide="ignore"):
         part = np.nan_to_num(weight / sums[problem.star])
-    values = fit.matches.times[0][exposure] if found.along == "time" else problem.xy["xy".index(found.along)]
-    order = np.lexsort([values, problem.star])
+    values = fit.matches.times[0][problem.exposure] if found.along == "time" else problem.xy["xy".index(found.along)]
+    order, _, rank = _ranks(problem.star, values, problem.n_stars)
     star, part, values = problem.star[order], part[order], values[order]
-    first = np.searchsorted(star, np.arange(problem.n_stars))
-    rank = np.arange(len(star)) - first[star]
     behind, double, square, last = np.zeros((4, problem.n_stars))
     for k in range(rank.max() + 1):  # behind: sum of the parts before, each as correlated as it is near
         mine = np.flatnonzero(rank == k)

@@ -201,9 +201,7 @@ def _choose_degree(matches, options):
         if options.clip is None:
             return matches
         trial = single_fit.estimate(matches, replace(options, degree=degree))
-        used = np.empty_like(trial.used)
-        used[trial.problem.order] = trial.used
-        return only_rows(trial.matches, used)
+        return only_rows(trial.matches, trial.problem.in_table_order(trial.used))
 
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", LegdistortWarning)  # of fits that are thrown away
@@ -236,7 +234,7 @@ def _tell_lost_stars(fit):
         return
     named = []
     for j in lost[:_MOST_NAMED]:
-        seen = np.searchsorted(fit.problem.start, np.flatnonzero(star == j), side="right") - 1
+        seen = fit.problem.exposure[star == j]
         named.append(f"{fit.matches.stars[j]} ({some_of([fit.problem.names[i] for i in seen], _MOST_NAMED)})")
     more = f" and {len(lost) - len(named)} more" * (len(lost) > len(named))
     warn(

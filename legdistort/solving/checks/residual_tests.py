@@ -59,7 +59,7 @@ class Residuals:
 
     def __init__(self, problem, state, blocks, system, dof):
         self.problem, self.state, self.blocks, self.system, self.dof = problem, state, blocks, system, dof
-        self.exposure = np.repeat(np.arange(problem.n_exposures), np.diff(problem.start))
+        self.exposure = problem.exposure
         self.used = problem.weight[0] > 0
         patterns = self._patterns()
         self.residual = blocks.residual

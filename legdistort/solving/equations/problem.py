@@ -87,6 +87,11 @@ class Problem:
         return len(self.shapes)
 
     @cached_property
+    def exposure(self):
+        """Exposure of every observation, ndarray of int, shape (n,)."""
+        return np.repeat(np.arange(self.n_exposures), np.diff(self.start))
+
+    @cached_property
     def unknowns(self):
         """The unknown coefficients as one vector."""
         return Unknowns(self.degree, self.own_degree, self.group, self.shapes)
@@ -125,6 +130,12 @@ class Problem:
     def part(self, i):
         """Observations of exposure i, as a slice."""
         return slice(self.start[i], self.start[i + 1])
+
+    def in_table_order(self, values):
+        """Values of the observations (..., n), in the order of the rows of the table."""
+        out = np.empty_like(values)
+        out[..., self.order] = values
+        return out
 
     def scaled(self, factor):
         """The same problem with all weights multiplied by `factor` (n,); zero leaves an observation out."""
