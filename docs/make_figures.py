@@ -36,6 +36,7 @@ def main():
     IMAGES.mkdir(exist_ok=True)
     save(sweeps(), "sweeps.png")
     save(planned(), "planning.png", colours=256)
+    save(ld.Camera.gsaoi().plot().figure, "gsaoi_camera.png")
     with tempfile.TemporaryDirectory() as folder:
         night = run_demo(out=Path(folder) / "night")
         save(before_after(night.solution), "before_after.png", colours=256)

@@ -13,6 +13,8 @@ __version__ = version("legdistort")
 # Loaded when first asked for: astropy.modeling looks into this package for a fitter while it is itself half imported,
 # and a program that only fits models should not wait for the rest.
 _PLACES = {
+    "Camera": "cameras.camera",
+    "Detector": "cameras.detector",
     "EffectivePSF": "measurement.effective.model",
     "Exposure": "inputs.exposures",
     "LegdistortError": "exceptions",

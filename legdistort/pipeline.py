@@ -225,12 +225,17 @@ def _assessed(solution, quality, comparison, stacks):
 
 
 def write_results(solution, target, *, psfs=None):
-    """Write ``solution.asdf``, ``stars.ecsv``, ``wcs/NAME.asdf`` and ``psf/NAME.fits`` into an existing folder."""
+    """Write ``solution.asdf``, ``stars.ecsv``, ``wcs/NAME.asdf`` and ``psf/NAME.fits`` into an existing folder.
+
+    Of a camera the WCSs are those of its detectors, ``wcs/NAME_DETECTOR.asdf``.
+    """
     solution.write(target / "solution.asdf")
     table_files.write_stars(solution, target / "stars.ecsv")
     (target / "wcs").mkdir()
     for name in solution.names:
-        write_wcs(solution, name, target / "wcs" / f"{name}.asdf")
+        for detector in solution.camera.detectors if solution.camera else [None]:
+            file = f"{name}.asdf" if detector is None else f"{name}_{detector}.asdf"
+            write_wcs(solution, name, target / "wcs" / file, detector=detector)
     write_psfs(psfs or {}, target / "psf")
 
 

@@ -747,7 +747,9 @@ def test_schemas_are_valid_and_registered():
     """By the checker of asdf, which also holds the names of properties to their types."""
     module, _, name = PYPROJECT["project"]["entry-points"]["asdf.resource_mappings"]["legdistort"].partition(":")
     (mapping,) = getattr(importlib.import_module(module), name)()
-    assert sorted(mapping) == [f"asdf://legdistort/schemas/{kind}-1.0.0" for kind in ("prior", "solution", "wcs")]
+    assert sorted(mapping) == [
+        f"asdf://legdistort/schemas/{kind}-1.0.0" for kind in ("camera", "prior", "solution", "wcs")
+    ]
     with asdf.config_context() as config:
         config.add_resource_mapping(mapping)
         for uri in mapping:

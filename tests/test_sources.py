@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from numpy.polynomial import polynomial
 from numpy.testing import assert_allclose, assert_array_equal
 
+from legdistort.cameras.source import Source
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
 from legdistort.geometry import basis, similarity
@@ -29,7 +30,6 @@ from legdistort.geometry.gsaoi import GsaoiMap, gsaoi_polynomials, gsaoi_static
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.priors.from_files import read_source
 from legdistort.priors.prior import Prior
-from legdistort.priors.source import Source
 from legdistort.results.solution import Solution
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve

@@ -135,7 +135,8 @@ def compare(matches, solution, *, prior=None):
     table = solution.observations[solution.observations["used"]]
     table = table[matches.table.colnames]
     kept = {name: matches.poses[name] for name in solution.names}
-    same = Matches.from_table(table, shape=solution.shapes, poses=kept, sky=matches.sky, allow_copies=True)
+    known = {"poses": kept, "sky": matches.sky, "allow_copies": True, "camera": matches.camera}
+    same = Matches.from_table(table, shape=solution.shapes, **known)
     floor = solution.diagnostics.error_floor
     calls = {
         "shift": lambda: solve_shifts(same),

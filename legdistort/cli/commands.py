@@ -186,6 +186,7 @@ def do_noise(a):
     options.TABLES,
     options.out("table (ECSV) of matched positions"),
     options.TABLE,
+    options.CAMERA,
     options.MATCHING,
 )
 def do_match(a):
@@ -196,9 +197,8 @@ def do_match(a):
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
-    matches = legdistort.match(
-        stack(tables), shape=tuple(a.shape) if a.shape else shapes or None, **given(a, options.MATCHING)
-    )
+    known = {"shape": tuple(a.shape) if a.shape else shapes or None, "camera": _camera(a.camera)}
+    matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
     bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
     bad = {name: reason for name, reason in bad.items() if name not in names}
@@ -218,6 +218,7 @@ def do_match(a):
     options.STRICT,
     options.out("folder for the results", path="results"),
     options.TABLE,
+    options.CAMERA,
     options.SOLVING,
 )
 def do_solve(a):
@@ -228,9 +229,11 @@ def do_solve(a):
     check_results(a.out, a.overwrite)
     table = _read_table(a.table, a)
     shape = tuple(a.shape) if a.shape else table.meta.get("shapes")
-    if shape is None:
+    camera = _camera(a.camera, table.meta.get("camera"))
+    if shape is None and camera is None:
         raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
-    matches = legdistort.Matches.from_table(table, shape=shape, **legdistort.Matches.read_meta(table.meta))
+    known = {"shape": shape, "camera": camera} | legdistort.Matches.read_meta(table.meta)
+    matches = legdistort.Matches.from_table(table, **known)
     solution = provenance.with_inputs(legdistort.solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
     summary = summarise(solution)
     with outputs.replacing_folder(a.out) as target:
@@ -469,6 +472,13 @@ def _prior(text, shape, static_sigma):
 
 def _read_table(path, a):
     return read_table(path, columns=dict(a.columns), origin=a.origin, error=a.error)
+
+
+def _camera(given, meta=None):
+    """The camera of ``--camera``, or else that of a table; None without one."""
+    if given is None:
+        return None if meta is None else legdistort.Camera.from_meta(meta)
+    return legdistort.Camera.gsaoi() if given == "gsaoi" else legdistort.Camera.read(given)
 
 
 def _solution(a):

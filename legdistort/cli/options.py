@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from ..cameras.source import DIRECTIONS
 from ..coaddition.options import ALGORITHMS, CONSERVE, EXTRAPOLATED, ORDERS, SCALES, WEIGHTS
 from ..coaddition.options import METHODS as COMBINATIONS
 from ..coaddition.resampling.drizzling import KERNELS
-from ..priors.source import DIRECTIONS
 from ..solving.gauge.constraints import KINDS
 from ..solving.minimisers import LOSSES
 from ..solving.options import ERRORS, METHODS
@@ -111,6 +111,11 @@ INJECTING = {
     "fluxes": Option("in units of the data (default: chosen by the frame)", type=float, nargs="+"),
     "n_positions": Option("stars for every flux and width (default 100)", type=int),
     "seed": Option("of the random numbers (default 0)", type=int),
+}
+CAMERA = {
+    "camera": Option(
+        "several detectors in an exposure, by the column detector: a camera file, or gsaoi", metavar="CAMERA"
+    )
 }
 MATCHING = {
     "min_exposures": Option("keep stars seen in so many exposures (default 4)", type=int),

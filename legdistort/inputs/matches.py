@@ -84,6 +84,9 @@ class Matches:
         The largest distortion of the headers, in words, if they have one; it is not in the poses.
     observations : Observations
         The table as plain arrays; need not be given.
+    camera : `legdistort.Camera` or None
+        Where exposures have several detectors. Positions then are those in its focal plane; those on the detectors
+        stand in ``x_detector``, ``y_detector``.
     """
 
     table: QTable
@@ -94,6 +97,7 @@ class Matches:
     epoch: float | None = None
     header_distortion: str | None = None
     observations: Observations | None = None
+    camera: object = None
 
     def __post_init__(self):
         if self.observations is None or self.observations.table is not self.table:
@@ -149,6 +153,7 @@ class Matches:
                 "no exposure agrees with the others: " + "; ".join(f"{k}: {v}" for k, v in reasons.items())
             )
         known = {"sky": self.sky, "left_out": left_out, "epoch": self.epoch, "allow_copies": True}
+        known["camera"] = self.camera
         return type(self).from_table(table, shape=self.shapes, poses=kept, **known)
 
     def to_meta(self):
@@ -160,6 +165,7 @@ class Matches:
             "sky": None if sky is None else {"lon": sky.lon, "lat": sky.lat, "matrix": sky.matrix.tolist()},
             "left_out": dict(self.left_out),
             "epoch": self.epoch,
+            "camera": None if self.camera is None else self.camera.to_meta(),
         }
 
     @staticmethod
@@ -178,7 +184,17 @@ class Matches:
 
     @classmethod
     def from_table(
-        cls, table, *, shape, poses=None, columns=None, sky=None, left_out=None, epoch=None, allow_copies=False
+        cls,
+        table,
+        *,
+        shape=None,
+        poses=None,
+        columns=None,
+        sky=None,
+        left_out=None,
+        epoch=None,
+        allow_copies=False,
+        camera=None,
     ):
         """Matches from anybody's table.
 
@@ -188,7 +204,7 @@ class Matches:
             Columns ``exposure``, ``star`` (int or str), ``x``, ``y``, ``x_err``, ``y_err`` (pixels,
             0-based, standard deviations), optional ``xy_corr``, ``detector``, ``flux`` or ``mag``.
         shape : tuple or dict
-            ``(ny, nx)``, or that by exposure.
+            ``(ny, nx)``, or that by exposure; not needed with a camera.
         poses : dict, optional
             ``{exposure: (2, 3)}``, reference -> undistorted pixels; estimated from the positions if not given.
         columns : dict, optional
@@ -201,6 +217,10 @@ class Matches:
         allow_copies : bool
             Keep exposures whose positions are those of another one to the last bit, as in simulations without noise;
             else they are left out with a warning: five stars or more, and over half of those of the shorter list.
+        camera : `legdistort.Camera`, optional
+            Where exposures have several detectors, told apart by the column ``detector``: they become one, the focal
+            plane of the camera, whose layout and static distortion count as known. What an exposure adds is then a
+            distortion of the focal plane as a whole.
 
         Raises
         ------
@@ -219,6 +239,8 @@ class Matches:
             table = column_contract.rename(table, columns)
         table = column_contract.check(table, column_contract.MATCHED, "the table of matched positions")
         table["exposure"] = table["exposure"].astype(str)
+        if camera is not None:
+            table, shape = in_focal_plane(table, camera), camera.field
         seen, left_out = Observations.of(table), dict(left_out or {})
         if not allow_copies and (copies := repetitions.reasons(seen.names, seen.exposure, seen.xy)):
             table, left_out = table[~np.isin(table["exposure"], list(copies))], left_out | copies
@@ -240,7 +262,7 @@ class Matches:
         if epoch is None and "epoch" in table.colnames:
             epochs = column_contract.values(table, "epoch", u.yr)
             epoch = float(np.nanmean(epochs)) if np.isfinite(epochs).any() else None
-        return cls(table, shapes, poses, sky, left_out, epoch, observations=seen)
+        return cls(table, shapes, poses, sky, left_out, epoch, observations=seen, camera=camera)
 
 
 def shapes_by_exposure(shape, names):
@@ -338,6 +360,18 @@ def _inside(seen, shapes):
         AssumptionWarning,
     )
     return ~out
+
+
+def in_focal_plane(table, camera):
+    """The table with positions in the focal plane of a camera, without those outside of their detector (`_inside`)."""
+    if "x_detector" not in table.colnames:
+        detector, part = camera.ids(table), QTable(table, copy=False)
+        if "star" not in table.colnames:
+            part["star"] = np.arange(len(table))
+        part["exposure"] = [f"{name}[{key}]" for name, key in zip(table["exposure"], detector, strict=True)]
+        seen, of_part = Observations.of(part), dict(zip(part["exposure"], detector, strict=True))
+        table = table[_inside(seen, {name: camera[of_part[name]].shape for name in seen.names})]
+    return camera.in_focal_plane(table)
 
 
 def _check_connected(seen):

@@ -8,7 +8,7 @@ from astropy import units as u
 
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..inputs import column_contract, repetitions
-from ..inputs.matches import Matches, shapes_by_exposure
+from ..inputs.matches import Matches, in_focal_plane, shapes_by_exposure
 from ..inputs.reference_catalogue import header_epoch, mean_epoch
 from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
@@ -31,6 +31,7 @@ def match(
     *,
     exposures=None,
     shape=None,
+    camera=None,
     min_exposures=4,
     columns=None,
     tolerance=None,
@@ -53,6 +54,9 @@ def match(
         Give the shapes and the nominal WCSs, by name.
     shape : tuple or dict, optional
         ``(ny, nx)``, or that by exposure, when there are no `exposures`.
+    camera : `legdistort.Camera`, optional
+        Where exposures have several detectors, told apart by the column ``detector``: they are matched as one, the
+        focal plane. `exposures` are not needed then.
     min_exposures : int
         A star is kept when it was found in that many exposures.
     columns : dict, optional
@@ -91,6 +95,10 @@ def match(
         detections = column_contract.rename(detections, columns)
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
     table["exposure"] = table["exposure"].astype(str)
+    if camera is not None:
+        if exposures is not None:
+            raise InputError("with a camera the focal plane is that of the camera: leave exposures out")
+        table, shape = in_focal_plane(table, camera), camera.field
     named = None if exposures is None else {e.name: e for e in exposures}
     names = list(named or dict.fromkeys(table["exposure"].tolist()))
     _check_names(table, names, min_exposures)
@@ -119,7 +127,7 @@ def match(
     _add_epochs(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
     matches = _finish(table, star, shapes, headers, left_out, epoch, distortions)
-    return replace(matches, left_out=copies | left_out)
+    return replace(matches, left_out=copies | left_out, camera=camera)
 
 
 def _add_epochs(table, named):

@@ -14,13 +14,13 @@ from astropy.io import fits
 from astropy.modeling import Model
 from astropy.wcs import WCS
 
+from ..cameras.source import DIRECTIONS, of_maps, of_powers
 from ..exceptions import AssumptionWarning, InputError, warn, without_astropy_warnings
 from ..geometry import basis
 from ..geometry.gsaoi import GSAOI_SIZE, gsaoi_static
 from ..inputs.exposure_files import read_exposures
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from .from_objects import as_source, of_model
-from .source import DIRECTIONS, of_maps, of_powers
 
 #: Highest order of SIP polynomials in a header (the convention allows 9).
 SIP_ORDER = 20

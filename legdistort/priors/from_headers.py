@@ -1,6 +1,6 @@
 """The distortions that the headers of exposures have: as a prior, as a sentence, and in the place on the sky.
 
-A header WCS leads to the sky. Its map is taken apart as any other source is (`legdistort.priors.expansion`): a
+A header WCS leads to the sky. Its map is taken apart as any other source is (`legdistort.cameras.expansion`): a
 similarity, which belongs to the pose, and a static distortion without one. So a sky that is taken from the pose is
 right whether or not the distortion is used, as far as a similarity can be.
 """
@@ -13,14 +13,14 @@ import gwcs
 import numpy as np
 from astropy.wcs import WCS
 
+from ..cameras.expansion import POSE_GRID, expand
+from ..cameras.source import Source
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis, similarity
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs.sky_wcs import to_icrs
-from .expansion import POSE_GRID, expand
 from .from_files import read_source
 from .from_objects import as_source, of_sky
-from .source import Source
 
 #: Headers tell one distortion if their series differ by less than this [pix] all over the detector; the degree of a
 #: series is raised until it leaves less out. It is what `legdistort attach` allows a header by default.

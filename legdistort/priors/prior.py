@@ -5,9 +5,9 @@ from numbers import Real
 
 import numpy as np
 
+from ..cameras.source import check_shape
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis
-from .source import check_shape
 
 #: As `sigma` of a `Prior`: to be found from the exposures.
 EVIDENCE = "evidence"
@@ -232,7 +232,7 @@ class Prior:
         AssumptionWarning
             If the source covers only a part of the detector, saying which.
         """
-        from .expansion import expand
+        from ..cameras.expansion import expand
         from .from_objects import as_source
 
         source, degree = as_source(model, frame=frame), basis.check_degree(degree)
@@ -322,7 +322,7 @@ class Prior:
 
 def _placed(source, degree, parity, shape, offset):
     """Arguments of `Prior` for a source of another size than the detector."""
-    from .expansion import expand_placed
+    from ..cameras.expansion import expand_placed
 
     try:
         x, y = (float(value) for value in offset)

@@ -7,6 +7,7 @@ from pathlib import Path
 import asdf
 import numpy as np
 
+from ..cameras.source import check_shape
 from ..exceptions import InputError
 from ..geometry import similarity
 from ..geometry.basis import check_degree
@@ -15,7 +16,6 @@ from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, check_tree, read_tree
 from ..runtime.outputs import replacing
 from .from_files import read_source
-from .source import check_shape
 
 #: Version of the layout under ``legdistort_prior``.
 LAYOUT = 1

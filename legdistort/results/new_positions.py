@@ -38,10 +38,12 @@ class Corrected(NamedTuple):
     absolute: np.ndarray
 
 
-def correct_with_errors(solution, name, xy, errors):
+def correct_with_errors(solution, name, xy, errors, detector=None):
     """`Solution.correct` with errors; see there."""
     pixels = np.atleast_2d(to_pixels(xy))
     measured = _covariance(errors, len(pixels))
+    if detector is not None:
+        pixels, measured = detector.to_focal_plane(pixels, measured)
     distortion = solution.distortion(name)
     distortion.check_fold()
     q = distortion.invert(pixels)
@@ -141,6 +143,8 @@ def _taken_off(gauge, positions):
 def correct_table(solution, table):
     """`Solution.correct_table`; see there."""
     table = column_contract.check(table, column_contract.DETECTED, "the table of positions")
+    if solution.camera is not None:
+        table = solution.camera.in_focal_plane(table)
     exposures = np.asarray(table["exposure"]).astype(str)
     pixels, x_err, y_err = (table[name].to_value(u.pix) for name in ("x", "x_err", "y_err"))
     pixels = np.column_stack([pixels, table["y"].to_value(u.pix)])

@@ -76,6 +76,9 @@ class Solution:
         ``created``, ``versions`` of packages and, if files went in, ``inputs`` ``{base name: SHA-256}``.
     form : `legdistort.solving.model_forms.Form` or None
         The model that was given to `solve`. Files do not keep it: `model` then has the usual form, the same function.
+    camera : `legdistort.Camera` or None
+        Where several detectors were solved as one focal plane: positions, shapes and distortions then are those of the
+        focal plane.
     checked : callable or tuple of Check
         The `checks`, or what makes them of the solution.
 
@@ -108,6 +111,7 @@ class Solution:
     left_out: dict = field(default_factory=dict)
     provenance: dict = field(default_factory=dict)
     form: object = None
+    camera: object = None
     checked: object = field(default=(), repr=False)
     inverses: InitVar[dict | None] = None
     file_checksum: InitVar[str | None] = None
@@ -239,18 +243,25 @@ class Solution:
         """The `Distortion` of an exposure: undistorted -> detector pixels, without the pose."""
         return self._distortions[self.index(name)]
 
-    def distort(self, name, xy):
+    def _detector(self, detector):
+        """The `Detector` of an id; `InputError` where there are none."""
+        if self.camera is None:
+            raise InputError(f"detector={detector!r}: this solution has no camera with several detectors; leave it out")
+        return self.camera[detector]
+
+    def distort(self, name, xy, *, detector=None):
         """Reference positions (n, 2) -> detector pixels (n, 2); NaN where the exposure does not reach.
 
-        A quantity in pixels gives a quantity.
+        A quantity in pixels gives a quantity. Of a camera the pixels are those of the focal plane, or of a `detector`,
+        also where that ends.
         """
         distortion = self.distortion(name)
         q = similarity.apply(self.poses[name], np.atleast_2d(to_pixels(xy)))
         p = distortion(q)
         p[outside(distortion.inverse.valid, q[:, 0], q[:, 1])] = np.nan
-        return like(xy, p)
+        return like(xy, p if detector is None else self._detector(detector).to_pixels(p))
 
-    def correct(self, name, xy, *, errors=None):
+    def correct(self, name, xy, *, errors=None, detector=None):
         """Detector pixels (n, 2) -> reference positions (n, 2), exact (section 3.3, criterion J_3).
 
         A quantity in pixels gives a quantity.
@@ -263,6 +274,8 @@ class Solution:
         errors : array_like, shape (n, 2) or (n, 2, 2), optional
             Of the measurement: standard deviations per axis [pix], or covariances [pix^2]; zeros leave the errors of
             the correction alone.
+        detector : str, optional
+            Of a camera, to which the pixels and their errors belong; without it they are those of the focal plane.
 
         Returns
         -------
@@ -278,11 +291,13 @@ class Solution:
         FoldError
             If the distortion folds.
         """
+        chip = None if detector is None else self._detector(detector)
         if errors is not None:
-            return new_positions.correct_with_errors(self, name, xy, errors)
+            return new_positions.correct_with_errors(self, name, xy, errors, chip)
         distortion = self.distortion(name)
         distortion.check_fold()
-        q = distortion.invert(np.atleast_2d(to_pixels(xy)))
+        pixels = np.atleast_2d(to_pixels(xy))
+        q = distortion.invert(pixels if chip is None else chip.to_focal_plane(pixels))
         return like(xy, similarity.apply(similarity.invert(self.poses[name]), q))
 
     def correct_table(self, table):
@@ -313,12 +328,16 @@ class Solution:
         distortion = self.distortion(name)
         return exposure_model(self.poses[name], distortion, self.form)
 
-    def wcs(self, name):
-        """The gwcs of an exposure: detector -> undistorted -> reference -> icrs (the last if the sky is known)."""
+    def wcs(self, name, detector=None):
+        """The gwcs of an exposure: detector -> undistorted -> reference -> icrs (the last if the sky is known).
+
+        That of a `detector` of a camera: detector -> undistorted -> focal_plane -> reference -> icrs.
+        """
         from ..wcs.exposure_wcs import exposure_wcs
 
         distortion = self.distortion(name)
-        return exposure_wcs(name, self.poses[name], distortion, self.sky)
+        chip = None if detector is None else self._detector(detector)
+        return exposure_wcs(name, self.poses[name], distortion, self.sky, chip)
 
     def header(self, name, *, kind="sip", max_error=1e-3):
         """FITS header of an exposure, TAN-SIP or TPV, with its error in it (`legdistort.wcs.fits_headers`)."""
@@ -457,6 +476,13 @@ class Solution:
             f"chi2 {self.chi2:.1f} for {self.dof} degrees of freedom>"
         )
 
+    def _camera_in_words(self):
+        if self.camera is None:
+            return []
+        ny, nx = self.camera.field
+        ids = ", ".join(self.camera.detectors)
+        return [f"camera  {self.camera.name}, detectors {ids}; positions in its focal plane, {nx} x {ny} px"]
+
     def _static_in_words(self):
         if self.settings.static != "fit":
             return []
@@ -479,6 +505,7 @@ class Solution:
             repr(self)[1:-1],
             *in_lines(self.checks),
             f"status  {self.status}",
+            *self._camera_in_words(),
             *self._static_in_words(),
             *_wrapped("gauge", self.gauge.sentence),
             f"sky     {self.sky_sentence}",

@@ -14,6 +14,8 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
+from ..cameras import storage as cameras
+from ..cameras.camera import Camera
 from ..exceptions import FoldError, InputError
 from ..geometry import basis
 from ..geometry.distortion import Inverse
@@ -67,6 +69,7 @@ def write_solution(solution, path, *, overwrite=False):
         "gauge": _gauge_tree(solution.gauge),
         "sky": solution.sky and dataclasses.asdict(solution.sky),
         "left_out": solution.left_out,
+        "camera": solution.camera and cameras.to_tree(solution.camera),
         "checks": [dataclasses.asdict(each) for each in solution.checks],
     }
     content = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
@@ -179,6 +182,7 @@ def _from_tree(kind, checksum, tree):
         sky=_made(TangentPlane, tree["sky"]),
         left_out=dict(tree["left_out"]),
         provenance=dict(tree["provenance"]),
+        camera=tree.get("camera") and cameras.from_tree(tree["camera"], Camera),
         checked=tuple(Check(**each) for each in tree.get("checks", ())),
         inverses={e["name"]: _inverse(e["inverse"]) for e in exposures if e["inverse"] is not None},
         file_checksum=checksum,

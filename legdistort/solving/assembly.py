@@ -65,6 +65,7 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
         left_out=dict(sorted(matches.left_out.items())),
         provenance=provenance.stamp(),
         form=form,
+        camera=matches.camera,
         checked=partial(
             check_solution,
             problem=problem,

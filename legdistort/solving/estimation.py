@@ -9,7 +9,7 @@ import numpy as np
 
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, some_of, warn
 from ..inputs.matches import Matches
-from ..priors.prior import tells
+from ..priors.prior import Prior, tells
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
 from . import model_forms, reference_tie, single_fit
@@ -125,16 +125,17 @@ def solve(
         If an exposure has fewer stars than modes, the unknowns are not determined, or exposures contradict one another
         and no majority says which are right.
     """
+    if not isinstance(matches, Matches):
+        raise InputError(
+            f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
+        )
+    prior = _of_camera(matches.camera, prior, static, model)
     asked = SolveOptions(
         degree=degree, prior=prior, model=model, static=static, exposure_degree=exposure_degree, gauge=gauge,
         method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors, max_iterations=max_iterations,
         validate=validate,
     )  # fmt: skip
     catalogue, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
-    if not isinstance(matches, Matches):
-        raise InputError(
-            f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
-        )
     if model is None:
         _warn_of_header(matches, prior)
     options, form, selection = asked, None, None
@@ -161,6 +162,31 @@ def solve(
     if kept_out is None:
         return solution
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
+
+
+def _of_camera(camera, prior, static, model):
+    """The prior where positions are those in the focal plane of a camera: no distortion, for its detectors have theirs.
+
+    Raises
+    ------
+    InputError
+        For what is known of single detectors: the camera has it.
+    """
+    if camera is None:
+        return prior
+    if static is not None or isinstance(prior, dict):
+        raise InputError(
+            "with a camera, layout and static distortion of its detectors are taken as known: leave static out, and "
+            "give what is known of the detectors to the camera (Detector(..., static=)), not as prior"
+        )
+    if any(w is not None for each in camera.detectors.values() for w in (each.layout_sigma, each.static_sigma)):
+        warn(
+            f"layout and static distortion of camera {camera.name} are taken as exact: their uncertainties are not in "
+            "the errors",
+            AssumptionWarning,
+        )
+    stated = prior is not None or model is not None
+    return prior if stated else Prior(np.zeros((2, 1)), source=f"camera {camera.name}")
 
 
 def _estimate(matches, options):

@@ -33,33 +33,41 @@ def rebuilt(kind, wcs):
     return made
 
 
-def exposure_wcs(name, pose, distortion, sky=None):
+def exposure_wcs(name, pose, distortion, sky=None, detector=None):
     """The gwcs of one exposure: detector -> undistorted -> reference (-> icrs).
 
-    Forward (pixel to sky) uses the certified inverse, backward is exact; NaN outside the detector forward and
-    outside its image backward.
+    That of a detector of a camera: detector -> undistorted -> focal_plane -> reference (-> icrs). Forward (pixel to
+    sky) uses the certified inverse, backward is exact; NaN outside the detector forward and outside its image backward.
 
     Parameters
     ----------
     name : str
     pose : ndarray, shape (2, 3)
     distortion : Distortion
+        Undistorted -> detector pixels; with a detector of a camera, to the pixels of the focal plane.
     sky : TangentPlane, optional
+    detector : `~legdistort.Detector`, optional
 
     Returns
     -------
     ExposureWCS
     """
-    ny, nx = distortion.shape
+    ny, nx = (distortion if detector is None else detector).shape
 
     def plane(frame):
         return cf.Frame2D(name=frame, axes_order=(0, 1), unit=(u.pix, u.pix))
 
-    steps = [
-        (plane("detector"), distortion.correction_model()),
-        (plane("undistorted"), models.pose_model(similarity.invert(pose), "pose_inverse")),
-        (plane("reference"), None if sky is None else sky.model()),
-    ]
+    back = models.pose_model(similarity.invert(pose), "pose_inverse")
+    if detector is None:
+        steps = [(plane("detector"), distortion.correction_model()), (plane("undistorted"), back)]
+    else:
+        layout = models.pose_model(similarity.invert(detector.layout), "layout_inverse")
+        steps = [
+            (plane("detector"), detector.distortion.correction_model()),
+            (plane("undistorted"), layout),
+            (plane("focal_plane"), from_focal_plane(distortion.correction_model(), back)),
+        ]
+    steps.append((plane("reference"), None if sky is None else sky.model()))
     if sky is not None:
         sky_frame = cf.CelestialFrame(
             name="icrs", reference_frame=ICRS(), unit=(u.deg, u.deg), axes_names=("ra", "dec")
@@ -69,3 +77,10 @@ def exposure_wcs(name, pose, distortion, sky=None):
     wcs.bounding_box = ((-0.5, nx - 0.5), (-0.5, ny - 0.5))
     wcs.pixel_shape = (nx, ny)
     return wcs
+
+
+def from_focal_plane(correction, back):
+    """Focal plane -> reference plane, ``correction | back``, with the exact opposite attached."""
+    model = correction | back
+    model.inverse = back.inverse | correction.inverse
+    return model

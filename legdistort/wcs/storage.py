@@ -10,11 +10,11 @@ from astropy.modeling import models
 from ..exceptions import InputError
 from ..geometry import basis
 from ..geometry.distortion import Distortion, Inverse
-from ..geometry.models import correction_model, displacement_model, leaves
+from ..geometry.models import correction_model, displacement_model, leaves, pose_model
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, WITH_WCS, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
-from .exposure_wcs import ExposureWCS, rebuilt
+from .exposure_wcs import ExposureWCS, from_focal_plane, rebuilt
 
 #: What those should know who open a file without legdistort.
 NOTE = (
@@ -26,25 +26,28 @@ NOTE = (
 )
 
 
-def wcs_tree(solution, name):
-    """The ASDF tree of one exposure: its gwcs at ``meta.wcs``, with the measured error of the inverse."""
-    inverse = solution.distortion(name).inverse
+def wcs_tree(solution, name, detector=None):
+    """The ASDF tree of one exposure, or of a detector of it: its gwcs at ``meta.wcs``, with the errors of inverses."""
+    distortion = solution.distortion(name)
     origin = solution.provenance or provenance.stamp()
-    meta = {
-        "wcs": solution.wcs(name),
-        "exposure": name,
-        "inverse_error_px": inverse.error,
-        "valid_undistorted_px": list(inverse.valid),
-        "provenance": {key: origin[key] for key in ("created", "versions")},
-        "note": NOTE,
-    }
+    meta = {"wcs": solution.wcs(name, detector), "exposure": name}
+    if detector is None:
+        meta |= _certificate(distortion.inverse)
+    else:
+        meta |= {"detector": str(detector)} | _certificate(solution.camera[detector].distortion.inverse)
+        meta["focal_plane"] = _certificate(distortion.inverse)
+    meta |= {"provenance": {key: origin[key] for key in ("created", "versions")}, "note": NOTE}
     return {"meta": meta}
 
 
-def write_wcs(solution, name, path, *, overwrite=False):
-    """Write the gwcs of one exposure, with its measured inverse error, to an ASDF file."""
+def _certificate(inverse):
+    return {"inverse_error_px": inverse.error, "valid_undistorted_px": list(inverse.valid)}
+
+
+def write_wcs(solution, name, path, *, detector=None, overwrite=False):
+    """Write the gwcs of one exposure, or of a detector of it, with its measured inverse error, to an ASDF file."""
     with replacing(path, overwrite=overwrite) as file:
-        asdf.AsdfFile(wcs_tree(solution, name), version=ASDF_STANDARD).write_to(file)
+        asdf.AsdfFile(wcs_tree(solution, name, detector), version=ASDF_STANDARD).write_to(file)
     return Path(path)
 
 
@@ -63,7 +66,7 @@ def read_wcs(path, *, max_bytes=None):
     Returns
     -------
     ExposureWCS
-        A `gwcs.WCS`, ``detector`` -> ``undistorted`` -> ``reference`` (-> ``icrs``).
+        A `gwcs.WCS`, ``detector`` -> ``undistorted`` (-> ``focal_plane``) -> ``reference`` (-> ``icrs``).
 
     Raises
     ------
@@ -83,10 +86,24 @@ def read_wcs(path, *, max_bytes=None):
 def _checked_wcs(meta):
     """The gwcs of a file with its inverse checked and its region of validity."""
     wcs = meta["wcs"]
-    if not isinstance(wcs, gwcs.WCS) or tuple(wcs.available_frames[:3]) != ("detector", "undistorted", "reference"):
-        raise ValueError("meta.wcs should be a gwcs detector -> undistorted -> reference")
-    correction = wcs.get_transform("detector", "undistorted")
+    frames = ["detector", "undistorted", *["focal_plane"] * ("focal_plane" in meta), "reference"]
+    if not isinstance(wcs, gwcs.WCS) or wcs.available_frames[: len(frames)] != frames:
+        raise ValueError(f"meta.wcs should be a gwcs {' -> '.join(frames)}")
     box = wcs.bounding_box
+    correction = _checked_correction(wcs.get_transform("detector", "undistorted"), meta, meta["exposure"])
+    wcs.set_transform("detector", "undistorted", correction)
+    if "focal_plane" in meta:
+        whole = wcs.get_transform("focal_plane", "reference")
+        whole.left.inverse = whole.inverse.right
+        correction = _checked_correction(whole.left, meta["focal_plane"], meta["exposure"])
+        back = pose_model(np.column_stack([whole.right.matrix.value, whole.right.translation.value]), whole.right.name)
+        wcs.set_transform("focal_plane", "reference", from_focal_plane(correction, back))
+    wcs.bounding_box = box
+    return rebuilt(ExposureWCS, wcs)
+
+
+def _checked_correction(correction, certificate, name):
+    """A correction with its inverse checked against its certificate, and its region of validity."""
     parts = _series(correction.inverse)
     (x0, x1), (y0, y1) = parts[0].x_domain, parts[0].y_domain
     shape = round(y1 - y0), round(x1 - x0)
@@ -94,11 +111,9 @@ def _checked_wcs(meta):
                for m in (correction.inverse, correction)]  # fmt: skip
     for model, tensor in zip((correction.inverse, correction), tensors, strict=True):
         _check_same(model, displacement_model(tensor, shape), shape)
-    inverse = Inverse(tensors[1], meta["inverse_error_px"], tuple(meta["valid_undistorted_px"]))
-    Distortion(basis.from_tensor(tensors[0]), shape, meta["exposure"], inverse)  # checks the certificate
-    wcs.set_transform("detector", "undistorted", correction_model(tensors[0], inverse, shape))
-    wcs.bounding_box = box
-    return rebuilt(ExposureWCS, wcs)
+    inverse = Inverse(tensors[1], certificate["inverse_error_px"], tuple(certificate["valid_undistorted_px"]))
+    Distortion(basis.from_tensor(tensors[0]), shape, name, inverse)  # checks the certificate
+    return correction_model(tensors[0], inverse, shape)
 
 
 def _series(model):

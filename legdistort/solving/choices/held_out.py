@@ -45,6 +45,7 @@ def hold_out(matches, fraction, *, seed=0):
 def only_rows(matches, rows):
     """The same matches with some rows of the table."""
     known = {"poses": matches.poses, "sky": matches.sky, "left_out": matches.left_out, "allow_copies": True}
+    known["camera"] = matches.camera
     kept = Matches.from_table(matches.table[rows], shape=matches.shapes, **known)
     lost = [name for name in matches.names if name not in kept.names]
     if lost:

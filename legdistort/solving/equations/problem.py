@@ -251,10 +251,24 @@ def _groups(matches):
 
 
 def _detectors(matches):
-    """``{exposure: detector}`` by the column of that name; empty without one."""
-    if "detector" not in matches.table.colnames:
+    """``{exposure: detector}`` by the column of that name; empty without one, and with a camera.
+
+    Raises
+    ------
+    InputError
+        For an exposure with positions on several detectors.
+    """
+    if "detector" not in matches.table.colnames or matches.camera is not None:
         return {}
-    first = np.unique(matches.observations.exposure, return_index=True)[1]
+    detector, exposure = np.asarray(matches.table["detector"]), matches.observations.exposure
+    first = np.unique(exposure, return_index=True)[1]
+    if np.any(several := detector != detector[first][exposure]):
+        row = int(np.argmax(several))
+        raise InputError(
+            f"exposure {matches.names[exposure[row]]} has positions on several detectors, "
+            f"{detector[first][exposure[row]]} and {detector[row]}: give the camera that they belong to "
+            "(Matches.from_table(..., camera=)), or name every detector's part an exposure of its own"
+        )
     return {name: matches.table["detector"][k] for name, k in zip(matches.names, first, strict=True)}
 
 

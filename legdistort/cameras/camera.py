@@ -1,0 +1,258 @@
+"""Cameras: several detectors in one focal plane.
+
+The optics and the atmosphere distort the focal plane; detectors are fixed in it. A position f of the focal plane falls
+on the pixel ``x = q + sum_m s_m b_m(q)`` of a detector, ``q = P f``. P, an affine map, is the layout of the detector,
+and s its static distortion, normalised Legendre modes of orders 2 and more. Both are common to all exposures. What an
+exposure adds to them is a distortion of the focal plane as a whole.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy import units as u
+
+from ..exceptions import InputError
+from ..geometry import basis, similarity
+from ..geometry.gsaoi import GSAOI_SIZE, GsaoiMap
+from . import storage
+from .detector import Detector
+from .from_wcs import camera_of
+from .source import check_shape
+
+#: Detectors may lie on each other by this part of their area: layouts to begin with are not exact.
+OVERLAP = 0.05
+#: Degree of the series that stand for the published distortions of GSAOI: they differ by less than 1e-6 px.
+GSAOI_DEGREE = 6
+#: Size of a pixel of the focal plane of GSAOI [arcsec], about that of its detectors.
+GSAOI_SCALE = 0.0197
+_SIDE = 32  # points along a side of a detector that are sought on others
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Camera:
+    """Detectors in one focal plane.
+
+    Parameters
+    ----------
+    name : str
+    detectors : dict
+        ``{id: Detector}``; ids are strings (numbers become strings), as in the column ``detector`` of tables.
+    field : tuple, optional
+        ``(ny, nx)`` of the focal plane, whose pixels are counted from 0 as those of a detector. None: the box around
+        all detectors, to which the layouts are shifted.
+
+    Raises
+    ------
+    InputError
+        For no detector, detectors that lie on each other, or outside of the field.
+    """
+
+    name: str
+    detectors: dict
+    field: tuple | None = None
+
+    def __post_init__(self):
+        if not isinstance(self.detectors, dict) or not self.detectors:
+            raise InputError(f"detectors must be a dict {{id: Detector}} with one at least, got {self.detectors!r}")
+        for key, detector in self.detectors.items():
+            if not isinstance(detector, Detector):
+                raise InputError(f"detector {key} must be a legdistort.Detector, got {type(detector).__name__}")
+        detectors = {str(key): detector for key, detector in self.detectors.items()}
+        for key in detectors:
+            if not re.fullmatch(r"[\w.+-]+", key):
+                raise InputError(f"ids of detectors become part of file names: letters, digits, _ . + -; got {key!r}")
+        edges = np.concatenate([each.outline for each in detectors.values()])
+        low, high = edges.min(axis=0), edges.max(axis=0)
+        field = self.field
+        if field is None:
+            first = np.floor(low + 0.5)
+            field = tuple(int(n) for n in np.ceil(high - first + 0.5))[::-1]
+            if np.any(first):
+                detectors = {key: _shifted(each, first) for key, each in detectors.items()}
+        field = check_shape(field)
+        outside = [key for key, each in detectors.items() if not _within(each.outline, field)]
+        if outside:
+            raise InputError(
+                f"detector{'s' * (len(outside) > 1)} {', '.join(outside)} of camera {self.name} "
+                f"lie{'s' * (len(outside) == 1)} outside of the focal plane, {field} (ny, nx); leave field out, or "
+                "correct the layouts"
+            )
+        object.__setattr__(self, "detectors", detectors)
+        object.__setattr__(self, "field", field)
+        self._check_overlaps()
+
+    def _check_overlaps(self):
+        keys = list(self.detectors)
+        for i, first in enumerate(keys):
+            for second in keys[i + 1 :]:
+                share = _overlap(self.detectors[first], self.detectors[second])
+                if share > OVERLAP:
+                    raise InputError(
+                        f"detectors {first} and {second} of camera {self.name} lie on each other by "
+                        f"{100 * share:.0f} % of their area: correct the layouts (focal plane -> undistorted pixels)"
+                    )
+
+    def __getitem__(self, key):
+        """The `Detector` of an id."""
+        if str(key) not in self.detectors:
+            raise InputError(f"camera {self.name} has no detector {str(key)!r}; it has {', '.join(self.detectors)}")
+        return self.detectors[str(key)]
+
+    def in_focal_plane(self, table):
+        """A table of positions on detectors with those in the focal plane in their place.
+
+        Parameters
+        ----------
+        table : `~astropy.table.QTable`
+            Columns ``detector``, ``x``, ``y``, ``x_err``, ``y_err`` [pix] and perhaps ``xy_corr``. What has the columns
+            ``x_detector`` and ``y_detector`` is in the focal plane already.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            With ``x_detector``, ``y_detector`` added: the positions as given.
+
+        Raises
+        ------
+        InputError
+            Without the column ``detector``, or for a detector that the camera does not have.
+        """
+        if "x_detector" in table.colnames:
+            return table
+        table, detector = table.copy(), self.ids(table)
+        x, y, x_err, y_err = (table[name].to_value(u.pix) for name in ("x", "y", "x_err", "y_err"))
+        both = (np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else 0) * x_err * y_err
+        xy, covariance = np.stack([x, y], axis=1), np.moveaxis(np.array([[x_err**2, both], [both, y_err**2]]), 2, 0)
+        for key in np.unique(detector):
+            rows = detector == key
+            xy[rows], covariance[rows] = self[key].to_focal_plane(xy[rows], covariance[rows])
+        table["x_detector"], table["y_detector"] = table["x"], table["y"]
+        table["x"], table["y"] = xy.T * u.pix
+        table["x_err"], table["y_err"] = np.sqrt(covariance[:, [0, 1], [0, 1]]).T * u.pix
+        table["xy_corr"] = covariance[:, 0, 1] / np.sqrt(covariance[:, 0, 0] * covariance[:, 1, 1])
+        return table
+
+    def ids(self, table):
+        """Detector of every row of a table, as strings; `InputError` if there is none, or one that is not known."""
+        if "detector" not in table.colnames:
+            raise InputError(
+                f"the table has no column detector, which of {', '.join(self.detectors)} of camera {self.name}"
+            )
+        detector = np.asarray(table["detector"]).astype(str)
+        for key in np.unique(detector):
+            self[key]  # refuses an unknown one
+        return detector
+
+    def __repr__(self):
+        ny, nx = self.field
+        return f"<Camera {self.name}: {len(self.detectors)} detectors in a focal plane of {nx} x {ny} px>"
+
+    def __str__(self):
+        lines = [
+            repr(self)[1:-1],
+            f"{'detector':10s} {'size [px]':>13s} {'centre x':>10s} {'centre y':>10s} {'rotation':>9s} {'scale':>9s} "
+            f"{'static':>8s}",
+        ]
+        for key, each in self.detectors.items():
+            ny, nx = each.shape
+            x, y = each.to_focal_plane(basis.denormalize(np.zeros(1), np.zeros(1), each.shape))[0]
+            d = similarity.describe(each.layout)
+            lines.append(
+                f"{key[:10]:10s} {f'{nx} x {ny}':>13s} {x:10.2f} {y:10.2f} {d['rotation']:9.4f} {d['scale']:9.6f} "
+                f"{each.rms:8.3f}"
+            )
+        return "\n".join(lines)
+
+    @classmethod
+    def gsaoi(cls):
+        """The four detectors of GSAOI at Gemini South, "1" to "4", by the polynomials that DRAGONS uses.
+
+        1 is the lower right one, 2 lower left, 3 upper left, 4 upper right. A pixel of the focal plane is 0.0197
+        arcsec. The uncertainty of the published numbers is not known.
+        """
+        size, detectors = (GSAOI_SIZE, GSAOI_SIZE), {}
+        for k in (1, 2, 3, 4):
+            published = GsaoiMap(k)
+
+            def shift(u, v, published=published):
+                q = basis.denormalize(u, v, size)
+                return (published.distort(q) - q).T
+
+            scale = np.column_stack([GSAOI_SCALE * np.eye(2), np.zeros(2)])
+            layout = similarity.compose(similarity.invert(published.similarity), scale)
+            static = basis.project(shift, GSAOI_DEGREE, GSAOI_DEGREE + 8)
+            detectors[str(k)] = Detector(size, layout=layout, static=static)
+        return cls("GSAOI", detectors)
+
+    @classmethod
+    def from_exposures(cls, exposures, *, name=None):
+        """Camera from the WCSs of the detectors of one exposure (see `legdistort.cameras.from_wcs`).
+
+        Parameters
+        ----------
+        exposures : dict or list of Exposure
+            ``{id: exposure}``, or images whose headers tell the detectors apart (``CCDCHIP``, ``DETECTOR``, ``EXTVER``
+            or ``EXTNAME``), as `legdistort.read_exposures` reads them. FITS WCSs and gwcs, with distortion or without.
+        name : str, optional
+            By default the instrument of the header.
+
+        Raises
+        ------
+        InputError
+            If the headers do not tell the detectors apart, or a WCS is missing or cannot be followed.
+        """
+        return camera_of(cls, exposures, name)
+
+    def plot(self, *, ax=None, scale=None):
+        """Draw detectors, gaps and distortion (`legdistort.plots.camera_plots.plot_camera`); returns the axes."""
+        from ..plots.camera_plots import plot_camera
+
+        return plot_camera(self, ax=ax, scale=scale)
+
+    def to_meta(self):
+        """The camera as plain numbers, lists and strings, for the header of a table file; see `from_meta`."""
+        return storage.to_tree(self, plain=True)
+
+    @classmethod
+    def from_meta(cls, meta):
+        """The camera that `to_meta` wrote."""
+        return storage.from_tree(meta, cls)
+
+    def write(self, path, *, overwrite=False):
+        """Write to an ASDF file of plain arrays, numbers and strings; returns the path."""
+        return storage.write_camera(self, Path(path), overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path):
+        """Read what `write` wrote.
+
+        Raises
+        ------
+        InputError
+            Naming the file: if it is no camera, or damaged.
+        """
+        return storage.read_camera(path, cls)
+
+
+def _shifted(detector, first):
+    """The detector in a focal plane whose origin lies at `first` of the one before."""
+    layout = similarity.compose(detector.layout, np.column_stack([np.eye(2), first]))
+    widths = {"layout_sigma": detector.layout_sigma, "static_sigma": detector.static_sigma}
+    return Detector(detector.shape, layout=layout, static=detector.static, **widths)
+
+
+def _within(outline, field):
+    return bool(np.all(outline >= -0.5 - 1e-6) and np.all(outline <= np.array(field[::-1]) - 0.5 + 1e-6))
+
+
+def _overlap(first, second):
+    """Larger share of one of two detectors that lies on the other."""
+    shares = []
+    t = (np.arange(_SIDE) + 0.5) / _SIDE * 2 - 1
+    for one, other in ((first, second), (second, first)):
+        f = one.to_focal_plane(basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), one.shape))
+        q = similarity.apply(other.layout, f)  # its distortion is no matter of percents, and means nothing far off
+        shares.append(np.mean(np.all((q > -0.5) & (q < np.array(other.shape[::-1]) - 0.5), axis=1)))
+    return float(max(shares))

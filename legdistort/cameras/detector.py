@@ -1,0 +1,145 @@
+"""One detector of a camera: its size, where it lies in the focal plane, and its static distortion."""
+
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..exceptions import InputError
+from ..geometry import basis, similarity
+from ..geometry.distortion import Distortion
+from .source import check_shape
+
+#: Points along an edge of its outline.
+_EDGE = 32
+
+
+def _widths(value, n, name):
+    """Standard deviations given as a number, per mode or per axis and mode, as (2, n); None as None."""
+    if value is None:
+        return None
+    try:
+        out = np.broadcast_to(np.asarray(value, dtype=float), (2, n)).copy()
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be a number, one per mode ({n},) or (2, {n}), got {value!r}") from None
+    if not (np.isfinite(out).all() and np.all(out >= 0)):
+        raise InputError(f"{name} must be finite and not negative (standard deviations in pixels), got {value!r}")
+    return out
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Detector:
+    """One detector: its size, where it lies in the focal plane, and its static distortion.
+
+    Parameters
+    ----------
+    shape : tuple
+        ``(ny, nx)``.
+    layout : array_like, shape (2, 3)
+        Affine map ``[M | t]``: focal-plane pixels -> undistorted pixels of the detector.
+    static : Prior or array_like, shape (2, n_modes), optional
+        Static distortion, normalised Legendre modes, x then y, pixels (undistorted -> detector). Orders 0 and 1 belong
+        to the layout: what is given there is moved into it.
+    layout_sigma : array_like, optional
+        Standard deviation of the layout, as that of modes of orders 0 and 1 over the detector (constant, x, y), pixels:
+        a number, (3,) or (2, 3). None takes it as exact.
+    static_sigma : array_like, optional
+        That of `static`, the same forms; that of the Prior if one is given. None takes it as exact.
+
+    Raises
+    ------
+    InputError
+        For arrays of another shape, not finite, a layout without area, or a Prior of a detector of another shape.
+    """
+
+    shape: tuple
+    _: KW_ONLY
+    layout: np.ndarray
+    static: np.ndarray | None = None
+    layout_sigma: np.ndarray | None = None
+    static_sigma: np.ndarray | None = None
+
+    def __post_init__(self):
+        shape = check_shape(self.shape)
+        layout = np.array(self.layout, dtype=float)
+        if layout.shape != (2, 3) or not np.isfinite(layout).all() or np.linalg.det(layout[:, :2]) == 0:
+            raise InputError(f"layout must be a finite (2, 3) array [M | t] with an area, got {self.layout!r}")
+        static, sigma = self.static, self.static_sigma
+        if hasattr(static, "static_sigma"):
+            if static.shape not in (None, shape):
+                raise InputError(f"the prior is for a detector of shape {static.shape}, this one has {shape} (ny, nx)")
+            static, sigma = static.mean, static.static_sigma if sigma is None else sigma
+        static = np.zeros((2, 1)) if static is None else Distortion(static, shape).coefficients
+        static, layout = _split(static, shape, layout)
+        given = {"shape": shape, "layout": layout, "static": static}
+        given["layout_sigma"] = _widths(self.layout_sigma, 3, "layout_sigma")
+        given["static_sigma"] = _widths(sigma, static.shape[1], "static_sigma")
+        for key, value in given.items():
+            object.__setattr__(self, key, value)
+
+    @cached_property
+    def distortion(self):
+        """The static `Distortion`: undistorted -> detector pixels."""
+        return Distortion(self.static, self.shape)
+
+    def to_pixels(self, f):
+        """Focal-plane pixels (n, 2) -> detector pixels (n, 2)."""
+        return self.distortion(similarity.apply(self.layout, f))
+
+    def to_focal_plane(self, xy, covariance=None):
+        """Detector pixels (n, 2) -> focal-plane pixels (n, 2), exact; with covariances (n, 2, 2) a tuple of both.
+
+        Raises
+        ------
+        FoldError
+            If the static distortion folds.
+        """
+        q = self.distortion.invert(xy)
+        f = similarity.apply(similarity.invert(self.layout), q)
+        if covariance is None:
+            return f
+        back = np.linalg.inv(self.distortion.jacobian(q) @ self.layout[:, :2])
+        return f, back @ covariance @ back.mT
+
+    @cached_property
+    def outline(self):
+        """Its edge in the focal plane, from corner to corner, shape (n, 2)."""
+        t = np.linspace(-1, 1, _EDGE)
+        one = np.ones(_EDGE)
+        sides = np.concatenate([np.stack(s, axis=1) for s in ((t, -one), (one, t), (-t, one), (-one, -t))])
+        return self.to_focal_plane(basis.denormalize(*sides.T, self.shape))
+
+    @property
+    def rms(self):
+        """Root mean square of the static distortion over the detector, both axes, pixels."""
+        return float(np.sqrt((self.static**2).sum()) / 2)
+
+    def __repr__(self):
+        return f"<Detector: {self.shape[1]} x {self.shape[0]} px, static distortion {self.rms:.3g} px rms>"
+
+
+def _split(static, shape, layout):
+    """Static distortion and layout with all of orders 0 and 1 in the layout; the map of both is the same.
+
+    With ``B(q) = q + (orders 0 and 1)`` and ``p = B(q)`` the rest is a polynomial of p of the same degree.
+    """
+    degree = basis.degree_of(static.shape[1])
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    for _ in range(20):
+        low = Distortion(basis.change_degree(static, min(degree, 1)), shape)
+        if np.abs(low.coefficients).max() < 1e-13:
+            break
+        origin, *ends = low(corners)
+        affine = np.column_stack([*(end - origin for end in ends), origin])
+        rest, back = (
+            Distortion(static - basis.change_degree(low.coefficients, degree), shape),
+            similarity.invert(affine),
+        )
+
+        def shift(u, v, rest=rest, back=back):
+            q = similarity.apply(back, basis.denormalize(u, v, rest.shape))
+            return (rest(q) - q).T
+
+        static, layout = basis.project(shift, degree), similarity.compose(affine, layout)
+    static[:, :3] = 0
+    return static, layout

@@ -1,0 +1,79 @@
+"""Cameras by the world coordinate systems of the detectors of one exposure: FITS WCSs and gwcs.
+
+Every WCS leads to the sky. Seen from one tangent point in their middle the detectors lie in one plane, that of the
+focus. Its pixels have the mean size of those of the detectors, and its axes their mean direction, so that nothing of
+where the telescope pointed is left but the side of the sky that is up.
+"""
+
+import numpy as np
+
+from ..exceptions import InputError
+from ..geometry import basis, similarity, tangent_plane
+from ..inputs.sky_wcs import to_icrs
+from .detector import Detector
+from .expansion import expand
+from .source import DIRECTIONS, Source
+
+#: The degree of the series of a distortion is raised to 9 at most until it leaves less than this out [pix].
+SAME, HIGHEST = 1e-4, 9
+#: Header keywords that tell detectors apart, in order of preference.
+KEYWORDS = ("CCDCHIP", "DETECTOR", "CHIP", "EXTVER", "EXTNAME")
+
+
+def camera_of(kind, exposures, name=None):
+    """Camera, the `kind`, from the WCSs of one exposure (see `legdistort.cameras.camera.Camera.from_exposures`)."""
+    named = exposures if isinstance(exposures, dict) else dict(zip(detector_ids(exposures), exposures, strict=True))
+    if not named:
+        raise InputError("a camera needs the exposure of one detector at least, got none")
+    for key, exposure in named.items():
+        if exposure.wcs is None:
+            raise InputError(f"{exposure.name} (detector {key}) has no celestial WCS that is to be believed")
+    first = next(iter(named.values()))
+    middles = [to_icrs(each.wcs, basis.denormalize(*np.zeros((2, 1)), each.shape))[:, 0] for each in named.values()]
+    lon, lat = np.radians(middles).T
+    centre = np.degrees(tangent_plane.angles(tangent_plane.directions(lon, lat).mean(axis=0)))
+    found = {key: _expanded(each, centre) for key, each in named.items()}
+    plane = _focal_plane([pose for _, pose in found.values()])
+    detectors = {
+        key: Detector(named[key].shape, layout=similarity.compose(pose, plane), static=static)
+        for key, (static, pose) in found.items()
+    }
+    return kind(name or str(first.header.get("INSTRUME", "camera")).strip() or "camera", detectors)
+
+
+def detector_ids(exposures):
+    """Ids of the detectors of one exposure by the first keyword that all headers have with values of their own."""
+    for keyword in KEYWORDS:
+        values = [each.header.get(keyword) for each in exposures]
+        if None not in values and len(set(values)) == len(values):
+            return [str(value).strip() for value in values]
+    raise InputError(
+        f"the headers of {', '.join(each.name for each in exposures)} do not tell their detectors apart by any of "
+        f"{', '.join(KEYWORDS)}: give a dict {{id: exposure}} of the detectors of one exposure"
+    )
+
+
+def _expanded(exposure, centre):
+    """Static distortion, and the similarity from the tangent plane [degrees] to undistorted pixels."""
+
+    def function(x, y):
+        x, y = np.broadcast_arrays(x, y)
+        sky = to_icrs(exposure.wcs, np.stack([x.ravel(), y.ravel()], axis=1))
+        return tuple(a.reshape(x.shape) for a in tangent_plane.gnomonic(*sky, *centre))
+
+    source = Source(exposure.name, "WCS", function, direction=DIRECTIONS[0], origin=0, shape=exposure.shape)
+    for degree in range(1, HIGHEST + 1):
+        static, pose, truncation = expand(source, degree)
+        if truncation < SAME:
+            break
+    return static, pose
+
+
+def _focal_plane(poses):
+    """Similarity from the focal plane to the tangent plane, in which the detectors lie as upright as they can."""
+    turned = np.mean([pose[:, :2] / np.sqrt(abs(np.linalg.det(pose[:, :2]))) for pose in poses], axis=0)
+    scale = np.mean([similarity.describe(pose)["scale"] for pose in poses])
+    parity = 1 if np.sum([np.sign(np.linalg.det(pose[:, :2])) for pose in poses]) >= 0 else -1
+    pose = similarity.similarity_of(np.zeros(2), np.zeros(2), turned, parity)
+    pose[:, :2] *= scale / similarity.describe(pose)["scale"]
+    return similarity.invert(pose)

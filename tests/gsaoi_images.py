@@ -1,0 +1,120 @@
+"""Positions on the four detectors of GSAOI, made with nothing but the published numbers.
+
+The polynomials are evaluated, and inverted by Newton's method, here; the distortion of an exposure is one of plain
+powers of angles. Neither the basis of the package nor its cameras take part.
+"""
+
+import json
+from importlib import resources
+
+import numpy as np
+from astropy.table import QTable
+from numpy.polynomial import polynomial
+
+SIZE = 2048
+#: Detectors and the ids that they have in files.
+CHIPS = {"1": 0, "2": 1, "3": 2, "4": 3}
+
+
+def published():
+    """Coefficients (4, 2, 4, 4): detector, axis, powers of the 1-based pixel x and y; arcsec."""
+    place = resources.files("legdistort").joinpath("data/gsaoi_static_distortion.json")
+    table = json.loads(place.read_text(encoding="utf-8"))
+    out = np.zeros((4, 2, 4, 4))
+    for part in ("linear", "nonlinear"):
+        for chip, axes in enumerate(table[part]):
+            for axis, letter in enumerate("xy"):
+                for name, value in axes[letter].items():
+                    i, j = (int(n) for n in name[1:].split("_"))
+                    out[chip, axis, i, j] += value
+    return out
+
+
+def to_arcsec(c, xy):
+    """Detector pixels (n, 2), 0-based -> arcsec in the focal plane, by coefficients c (2, 4, 4)."""
+    return np.stack([polynomial.polyval2d(*(np.asarray(xy) + 1).T, each) for each in c], axis=1)
+
+
+def to_pixels(c, arcsec):
+    """The opposite; NaN beyond the detector."""
+    linear = np.stack([[each[1, 0], each[0, 1]] for each in c])
+    xy = (arcsec - to_arcsec(c, np.full((1, 2), SIZE / 2))) @ np.linalg.inv(linear).T + SIZE / 2
+    near = np.all((xy > -200) & (xy < SIZE + 200), axis=1)
+    for _ in range(30):
+        here = to_arcsec(c, xy[near])
+        slope = np.stack([(to_arcsec(c, xy[near] + d) - to_arcsec(c, xy[near] - d)) / 2 for d in np.eye(2)], axis=2)
+        xy[near] += np.linalg.solve(slope, (arcsec[near] - here)[..., None])[..., 0]
+    near &= np.all((xy > -0.5) & (xy < SIZE - 0.5), axis=1)
+    xy[~near] = np.nan
+    return xy
+
+
+class Night:
+    """Exposures of a field of stars.
+
+    Attributes
+    ----------
+    sky : ndarray, shape (n_stars, 2)
+        True positions, arcsec.
+    focal : list of ndarray, shape (n_stars, 2)
+        Where they fall in the focal plane of each exposure, arcsec.
+    pixels : list of dict
+        ``{detector: (n_stars, 2)}``.
+    """
+
+    def __init__(self, *, n_exposures=11, n_stars=400, dither=4.0, turn=0.02, dynamic=0.4, degree=3, seed=1):
+        rng = np.random.default_rng(seed)
+        c = published()
+        middle = to_arcsec(c[1], [[SIZE + 70, SIZE + 70]])[0]
+        self.sky = middle + rng.uniform(-52, 52, (n_stars, 2))
+        self.focal, self.pixels = [], []
+        for _ in range(n_exposures):
+            angle, shift = rng.normal(0, turn), rng.uniform(-dither, dither, 2)
+            rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            place = (self.sky - middle) @ rotation.T + shift
+            powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i + j]
+            size = rng.normal(0, 1, (2, len(powers))) * 0.02 * dynamic / np.sqrt(len(powers)) * 2.5
+            bend = sum(
+                s[:, None] * (place[:, 0] / 45) ** i * (place[:, 1] / 45) ** j
+                for s, (i, j) in zip(size.T, powers, strict=True)
+            )
+            self.focal.append(middle + place + bend.T)
+            self.pixels.append({key: to_pixels(c[chip], self.focal[-1]) for key, chip in CHIPS.items()})
+
+    def table(self, *, sigma=0.01, seed=2, least=3):
+        """Measured positions of the stars that lie on a detector in so many exposures, as a QTable."""
+        rng, parts = np.random.default_rng(seed), []
+        for i, chips in enumerate(self.pixels):
+            for key, xy in chips.items():
+                star = np.flatnonzero(np.isfinite(xy[:, 0]))
+                x, y = (xy[star] + rng.normal(0, sigma, (len(star), 2))).T
+                parts.append((np.full(len(star), f"frame{i:02d}"), np.full(len(star), key), star, x, y))
+        names = ("exposure", "detector", "star", "x", "y")
+        table = QTable([np.concatenate(columns) for columns in zip(*parts, strict=True)], names=names)
+        table["x_err"] = table["y_err"] = np.full(len(table), sigma)
+        return table[np.bincount(table["star"])[table["star"]] >= least]
+
+
+def without_common_map(found, true, degree):
+    """Positions less the map of powers up to a degree of the true ones that fits them best."""
+    u = (true - true.mean(axis=0)) / np.ptp(true, axis=0)
+    powers = np.stack([u[:, 0] ** i * u[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+    return found - powers @ np.linalg.lstsq(powers, found, rcond=None)[0]
+
+
+def bound(star, exposure, place, true, sigma, degree):
+    """Cramer-Rao bound of star positions after a common map, rms over stars and axes, in units of sigma.
+
+    One axis: unknown are the position of each star, and for each exposure powers up to a degree of the place in it.
+    """
+    n_stars, n_exposures = star.max() + 1, exposure.max() + 1
+    u = place / np.abs(place).max()
+    powers = np.stack([u[:, 0] ** i * u[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+    k = powers.shape[1]
+    design = np.zeros((len(star), n_stars + n_exposures * k))
+    design[np.arange(len(star)), star] = 1
+    for m in range(k):
+        design[np.arange(len(star)), n_stars + exposure * k + m] = powers[:, m]
+    covariance = np.linalg.pinv(design.T @ design, rcond=1e-10, hermitian=True)[:n_stars, :n_stars] * sigma**2
+    centred = without_common_map(np.eye(n_stars), true, degree)
+    return float(np.sqrt(np.trace(centred @ covariance @ centred.T) / n_stars))

@@ -1,0 +1,408 @@
+"""Cameras of several detectors: value objects, the focal plane, solutions over all detectors."""
+
+import asdf
+import gsaoi_images
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+from astropy.wcs import WCS
+
+import legdistort
+from legdistort.cameras import camera as cameras
+from legdistort.cli.parser import main
+from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.inputs.exposures import Exposure
+from legdistort.wcs import storage
+
+SIGMA = 0.01
+
+
+@pytest.fixture(scope="module")
+def gsaoi():
+    return legdistort.Camera.gsaoi()
+
+
+@pytest.fixture(scope="module")
+def night():
+    return gsaoi_images.Night(n_exposures=8, n_stars=400)
+
+
+@pytest.fixture(scope="module")
+def table(night):
+    return night.table(sigma=SIGMA)
+
+
+@pytest.fixture(scope="module")
+def solution(table, gsaoi):
+    return legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi), degree=3)
+
+
+def pixels(n=12, size=gsaoi_images.SIZE):
+    t = np.linspace(-0.5, size - 0.5, n)
+    return np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
+
+
+def two_chips(**known):
+    """Two detectors of 1000 x 500 px side by side with a gap of 20 px; the second is turned and has a distortion."""
+    angle = np.radians(0.2)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    static = np.zeros((2, 10))
+    static[0, 4], static[1, 7] = 1.5, -0.8
+    layout = np.column_stack([turn, turn @ [-520.0, 3.0]])
+    left = legdistort.Detector((1000, 500), layout=np.eye(2, 3))
+    right = legdistort.Detector((1000, 500), layout=layout, static=static, **known)
+    return legdistort.Camera("two chips", {"a": left, "b": right})
+
+
+class TestCamera:
+    def test_gsaoi_is_as_published(self, gsaoi):
+        """All four detectors at once: one shift away from the published polynomials."""
+        away = []
+        for key, chip in gsaoi_images.CHIPS.items():
+            xy = pixels()
+            arcsec = gsaoi_images.to_arcsec(gsaoi_images.published()[chip], xy)
+            away.append(gsaoi[key].to_focal_plane(xy) - arcsec / cameras.GSAOI_SCALE)
+        away = np.concatenate(away)
+        assert np.abs(away - away.mean(axis=0)).max() < 1e-5
+
+    @pytest.mark.parametrize("key", ["a", "b"])
+    def test_there_and_back(self, key):
+        chip = two_chips()[key]
+        xy = basis_pixels(chip)
+        assert np.abs(chip.to_pixels(chip.to_focal_plane(xy)) - xy).max() < 1e-9
+
+    def test_orders_0_and_1_belong_to_the_layout(self):
+        """The same map, however it is divided between static distortion and layout."""
+        static = np.zeros((2, 10))
+        static[:, :3], static[0, 5], static[1, 8] = [[3.0, 2.0, -1.0], [-4.0, 0.5, 1.5]], 2.0, 1.0
+        layout = np.array([[1.01, 0.02, 5.0], [-0.03, 0.98, -7.0]])
+        detector = legdistort.Detector((300, 400), layout=layout, static=static)
+        assert not detector.static[:, :3].any()
+        f = basis_pixels(detector)
+        q = f @ layout[:, :2].T + layout[:, 2]
+        u, v = (q[:, 0] + 0.5) / 200 - 1, (q[:, 1] + 0.5) / 150 - 1
+        legendre = np.polynomial.legendre.legvander2d(u, v, (3, 3)).reshape(-1, 4, 4)
+        modes = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
+        norm = [np.sqrt((2 * i + 1) * (2 * j + 1)) / 2 for i, j in modes]
+        expected = q + sum(
+            s[None] * n * legendre[:, i, j, None] for s, n, (i, j) in zip(static.T, norm, modes, strict=True)
+        )
+        assert np.abs(detector.to_pixels(f) - expected).max() < 1e-9
+
+    def test_the_focal_plane_begins_at_pixel_0(self):
+        """Layouts in any coordinates give the same camera."""
+        camera, there = two_chips(), np.array([7000.0, -300.0])
+        moved = {
+            key: legdistort.Detector(
+                each.shape,
+                layout=np.column_stack([each.layout[:, :2], each.layout[:, 2] - each.layout[:, :2] @ there]),
+                static=each.static,
+            )
+            for key, each in camera.detectors.items()
+        }
+        again = legdistort.Camera("moved", moved)
+        assert again.field == camera.field
+        for key in "ab":
+            assert np.allclose(again[key].layout, camera[key].layout, atol=1e-8)
+
+    def test_prints(self, gsaoi):
+        assert repr(gsaoi) == "<Camera GSAOI: 4 detectors in a focal plane of 4301 x 4276 px>"
+        assert str(gsaoi).splitlines()[3].split() == ["2", "2048", "x", "2048", "1089.95", "1034.66", "-0.4787",
+                                                      "0.991644", "2.900"]  # fmt: skip
+
+    def test_file(self, gsaoi, tmp_path):
+        known = two_chips(layout_sigma=0.1, static_sigma=0.02)
+        for camera in (gsaoi, known):
+            path = camera.write(tmp_path / f"{camera.name}.asdf")
+            again = legdistort.Camera.read(path)
+            assert (again.name, again.field, list(again.detectors)) == (
+                camera.name,
+                camera.field,
+                list(camera.detectors),
+            )
+            for key, each in camera.detectors.items():
+                for name in ("layout", "static", "layout_sigma", "static_sigma"):
+                    assert np.array_equal(getattr(again[key], name), getattr(each, name)) or getattr(each, name) is None
+
+    def test_other_files_are_refused(self, tmp_path):
+        path = legdistort.Prior(np.zeros((2, 10))).write(tmp_path / "prior.asdf")
+        with pytest.raises(InputError, match=r"prior.asdf holds no legdistort camera"):
+            legdistort.Camera.read(path)
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            ({"layout": np.zeros((2, 3))}, "layout must be"),
+            ({"layout": np.eye(3)}, "layout must be"),
+            ({"shape": (1, 5)}, "shape must be"),
+            ({"static": np.full((2, 10), np.nan)}, "coefficients must be finite"),
+            ({"static_sigma": -1}, "static_sigma must be finite and not negative"),
+            ({"layout_sigma": [1, 2]}, "layout_sigma must be"),
+            ({"static": legdistort.Prior(np.zeros((2, 10)), shape=(9, 9))}, "prior is for a detector of shape"),
+        ],
+    )
+    def test_bad_detectors(self, change, words):
+        given = {"shape": (300, 400), "layout": np.eye(2, 3)} | change
+        with pytest.raises(InputError, match=words):
+            legdistort.Detector(given.pop("shape"), **given)
+
+    def test_bad_cameras(self):
+        one = legdistort.Detector((100, 100), layout=np.eye(2, 3))
+        near = legdistort.Detector((100, 100), layout=np.column_stack([np.eye(2), [-50, 0]]))
+        with pytest.raises(InputError, match=r"detectors 1 and 2 of camera c lie on each other by 50 % of their area"):
+            legdistort.Camera("c", {1: one, 2: near})
+        with pytest.raises(InputError, match=r"detector 1 of camera c lies outside of the focal plane"):
+            legdistort.Camera("c", {1: one}, field=(50, 200))
+        with pytest.raises(InputError, match="detectors must be a dict"):
+            legdistort.Camera("c", {})
+        with pytest.raises(InputError, match="camera c has no detector '7'; it has 1"):
+            legdistort.Camera("c", {1: one})["7"]
+
+    def test_picture(self, gsaoi):
+        ax = gsaoi.plot()
+        assert ax.get_title(loc="left") == "GSAOI: static distortion, up to 6.72 px, x 20"
+        ax.figure.clear()
+
+
+def basis_pixels(detector):
+    ny, nx = detector.shape
+    return pixels(size=1) * [nx, ny] + [(nx - 1) / 2, (ny - 1) / 2]
+
+
+class TestFromExposures:
+    """Headers written by hand, so that astropy is the judge of what they mean."""
+
+    def header(self, number, *, sip=False, rotation=20.0):
+        """A detector of 200 x 300 px, the second 210 px to the right of the first and turned by 1 degree more."""
+        turn = np.radians(rotation + (number == 2))
+        header = fits.Header({"NAXIS": 2, "NAXIS1": 200, "NAXIS2": 300, "EXTVER": number, "INSTRUME": "CAM"})
+        suffix = "-SIP" if sip else ""
+        header.update({"CTYPE1": f"RA---TAN{suffix}", "CTYPE2": f"DEC--TAN{suffix}", "CRVAL1": 10.0, "CRVAL2": 60.0})
+        header["CRPIX1"], header["CRPIX2"] = (211.0, 150.0) if number == 1 else (-2.0, 150.0)
+        scale = 0.02 / 3600
+        header["CD1_1"], header["CD1_2"] = -scale * np.cos(turn), scale * np.sin(turn)
+        header["CD2_1"], header["CD2_2"] = scale * np.sin(turn), scale * np.cos(turn)
+        if sip and number == 2:
+            header["A_ORDER"], header["B_ORDER"], header["A_2_0"], header["B_1_2"] = 2, 3, 1e-4, 2e-7
+        return header
+
+    @pytest.mark.parametrize("sip", [False, True])
+    def test_same_sky(self, sip):
+        headers = {k: self.header(k, sip=sip) for k in (1, 2)}
+        exposures = [
+            Exposure(f"f_{k}", np.zeros((300, 200)), wcs=WCS(header), header=header) for k, header in headers.items()
+        ]
+        camera = legdistort.Camera.from_exposures(exposures)
+        assert camera.name == "CAM"
+        assert list(camera.detectors) == ["1", "2"]
+        xy = {k: pixels(size=1) * [200, 300] + [99.5, 149.5] for k in headers}
+        f = np.concatenate([camera[k].to_focal_plane(xy[k]) for k in headers])
+        ra, dec = np.concatenate([WCS(headers[k]).all_pix2world(xy[k], 0) for k in headers]).T
+        plane = np.stack([(ra - 10) * np.cos(np.radians(dec)), dec - 60], axis=1) * 3600 / 0.02
+        design = np.column_stack(
+            [f, np.ones(len(f)), np.stack([f[:, 0] ** 2, f[:, 0] * f[:, 1], f[:, 1] ** 2], axis=1)]
+        )
+        left = plane - design @ np.linalg.lstsq(design, plane, rcond=None)[0]
+        assert np.abs(left).max() < 2e-4  # of one plane; the rest of second order is the curvature of the sky
+        assert abs(np.mean([np.linalg.det(each.layout[:, :2]) for each in camera.detectors.values()]) - 1) < 1e-2
+
+    def test_without_names_of_detectors(self):
+        header = self.header(1)
+        exposures = [Exposure(n, np.zeros((300, 200)), wcs=WCS(header), header=header) for n in ("f", "g")]
+        with pytest.raises(InputError, match="the headers of f, g do not tell their detectors apart by any of CCDCHIP"):
+            legdistort.Camera.from_exposures(exposures)
+
+    def test_without_wcs(self):
+        with pytest.raises(InputError, match=r"f \(detector 1\) has no celestial WCS"):
+            legdistort.Camera.from_exposures({1: Exposure("f", np.zeros((300, 200)))})
+
+
+class TestSolution:
+    def test_stars_are_at_the_bound(self, night, table, gsaoi):
+        """The Cramer-Rao bound by plain powers, and errors that are true, after a common map; four draws of noise."""
+        stars, numbers = np.unique(table["star"], return_inverse=True)
+        exposure = np.unique(table["exposure"], return_inverse=True)[1]
+        place = np.stack([night.focal[i][j] for i, j in zip(exposure, table["star"], strict=True)])
+        place = place - place.mean(axis=0)
+        best = gsaoi_images.bound(numbers, exposure, place, night.sky[stars], SIGMA, 3)
+        left, pulls, ratios = [], [], []
+        for seed in range(4):
+            drawn = night.table(sigma=SIGMA, seed=seed)
+            solution = legdistort.solve(legdistort.Matches.from_table(drawn, camera=gsaoi), degree=3)
+            left.append(gsaoi_images.without_common_map(solution.positions, night.sky[stars], 3))
+            errors = np.stack([solution.stars[name].value for name in ("x_err", "y_err")], axis=1)
+            pulls.append(left[-1] / errors)
+            ratios.append(solution.chi2 / solution.dof)
+        assert np.sqrt(np.mean(np.square(left))) < 1.05 * best
+        free = len(stars) / (len(stars) - 10)  # the map that is fitted here takes 10 of the stars' degrees of freedom
+        assert free * np.mean(np.square(pulls)) == pytest.approx(1, abs=0.1)
+        assert np.mean(ratios) == pytest.approx(1, abs=0.04)
+
+    def test_what_the_camera_knows_is_absolute(self, solution, night):
+        """Without any common map but shift, rotation and scale the error is that of the mean dynamic part."""
+        numbers = solution.star_names
+        absolute = np.stack([solution.stars[name].value for name in ("x_err_abs", "y_err_abs")], axis=1)
+        z, w = solution.positions @ [1, 1j], night.sky[numbers] @ [1, 1j]
+        design = np.stack([w, np.ones(len(w))], axis=1)
+        left = np.abs(z - design @ np.linalg.lstsq(design, z, rcond=None)[0])
+        assert np.isfinite(absolute).all()
+        assert 0.3 < np.sqrt(np.mean(left**2) / np.mean(absolute**2) / 2) < 1.6  # one draw of some ten modes
+
+    def test_a_detector_alone_knows_less(self, solution, night, table, gsaoi):
+        """The distortion of the whole field takes four times the stars for the same unknowns."""
+        rows = table[table["detector"] == "2"]
+        rows = rows[np.bincount(rows["star"])[rows["star"]] >= 3]
+        alone = legdistort.solve(legdistort.Matches.from_table(rows, camera=gsaoi), degree=3)
+        both = np.isin(solution.star_names, alone.star_names)
+        with_all = gsaoi_images.without_common_map(solution.positions[both], night.sky[solution.star_names[both]], 3)
+        by_itself = gsaoi_images.without_common_map(alone.positions, night.sky[alone.star_names], 3)
+        assert np.sqrt(np.mean(by_itself**2)) > 1.05 * np.sqrt(np.mean(with_all**2))
+
+    @pytest.mark.parametrize("key", ["1", "2", "3", "4"])
+    def test_wcs_of_a_detector(self, solution, night, key):
+        """True pixels of stars lead to their positions, through the gwcs and back."""
+        xy = night.pixels[0][key]
+        numbers = np.flatnonzero(np.isin(np.arange(len(xy)), solution.star_names) & np.isfinite(xy[:, 0]))
+        wcs = solution.wcs("frame00", key)
+        assert wcs.available_frames == ["detector", "undistorted", "focal_plane", "reference"]
+        found = np.stack(wcs(*xy[numbers].T), axis=1)
+        there = solution.positions[np.searchsorted(solution.star_names, numbers)]
+        assert np.sqrt(np.mean((found - there) ** 2)) < SIGMA
+        assert np.abs(np.stack(wcs.invert(*found.T), axis=1) - xy[numbers]).max() < 1e-5
+        assert np.allclose(solution.correct("frame00", xy[numbers], detector=key), found, atol=1e-5)
+        assert np.allclose(solution.distort("frame00", found, detector=key), xy[numbers], atol=1e-5)
+
+    def test_new_positions(self, solution, night, table):
+        """Errors of positions that took no part are those of the stars but for the mean over the exposures."""
+        xy = night.pixels[0]["3"]
+        xy = xy[np.isfinite(xy[:, 0])][:20]
+        there, relative, _ = solution.correct("frame00", xy, errors=np.full((20, 2), SIGMA), detector="3")
+        new = QTable({"exposure": ["frame00"] * 20, "detector": ["3"] * 20, "x": xy[:, 0], "y": xy[:, 1]})
+        new["x_err"] = new["y_err"] = np.full(20, SIGMA)
+        corrected = solution.correct_table(new)
+        assert np.allclose(np.stack([corrected["x"].value, corrected["y"].value], axis=1), there)
+        assert np.allclose(corrected["x_err"].value ** 2, relative[:, 0, 0])
+        assert np.all(corrected["x_err"].value > 0.97 * SIGMA)
+
+    def test_file(self, solution, tmp_path):
+        again = legdistort.Solution.read(solution.write(tmp_path / "solution.asdf"))
+        assert list(again.camera.detectors) == list(solution.camera.detectors)
+        xy = pixels(5)
+        assert np.array_equal(again.correct("frame01", xy, detector="4"), solution.correct("frame01", xy, detector="4"))
+
+    def test_matches_keep_the_camera(self, table, gsaoi):
+        matches = legdistort.Matches.from_table(table, camera=gsaoi)
+        fewer = matches.without({"frame03": "clouds"})
+        assert fewer.camera is gsaoi
+        rows = fewer.table["exposure"] == "frame00"
+        first = matches.table["exposure"] == "frame00"
+        assert np.array_equal(fewer.table["x"][rows], matches.table["x"][first])
+        assert np.array_equal(matches.table["x_detector"].value, table["x"])
+
+    def test_one_detector_without_static_is_no_camera(self, table):
+        """Identity layout and no static distortion: the usual solution."""
+        rows = table[table["detector"] == "1"]
+        rows = rows[np.bincount(rows["star"])[rows["star"]] >= 3]
+        size = (gsaoi_images.SIZE, gsaoi_images.SIZE)
+        camera = legdistort.Camera("one", {"1": legdistort.Detector(size, layout=np.eye(2, 3))})
+        one = legdistort.solve(legdistort.Matches.from_table(rows, camera=camera))
+        usual = legdistort.solve(
+            legdistort.Matches.from_table(rows, shape=size), prior=legdistort.Prior(np.zeros((2, 1)))
+        )
+        assert np.abs(one.positions - usual.positions).max() < 1e-9
+        assert np.allclose(one.stars["x_err"], usual.stars["x_err"], rtol=1e-9)
+
+    def test_uncertainties_of_the_camera_are_not_silent(self, table, gsaoi):
+        unsure = {
+            key: legdistort.Detector(each.shape, layout=each.layout, static=each.static, layout_sigma=0.1)
+            for key, each in gsaoi.detectors.items()
+        }
+        matches = legdistort.Matches.from_table(table, camera=legdistort.Camera("unsure", unsure))
+        with pytest.warns(AssumptionWarning, match="camera unsure are taken as exact"):
+            legdistort.solve(matches)
+
+
+class TestBadInput:
+    def test_tables(self, table, gsaoi):
+        with pytest.raises(InputError, match="has no column detector, which of 1, 2, 3, 4 of camera GSAOI"):
+            legdistort.Matches.from_table(table[[n for n in table.colnames if n != "detector"]], camera=gsaoi)
+        other = table.copy()
+        other["detector"] = np.char.add("CCD", np.asarray(table["detector"]))
+        with pytest.raises(InputError, match="camera GSAOI has no detector 'CCD1'"):
+            legdistort.Matches.from_table(other, camera=gsaoi)
+        with pytest.raises(InputError, match=r"frame00 has positions on several detectors, 1 and 2: give the camera"):
+            legdistort.solve(legdistort.Matches.from_table(table, shape=(2048, 2048)))
+        with pytest.raises(InputError, match=r"must be .* got None"):
+            legdistort.Matches.from_table(table)
+
+    def test_positions_beside_their_detector(self, table, gsaoi):
+        far = table.copy()
+        far["x"][5] = 9000
+        with pytest.warns(
+            AssumptionWarning, match=r"1 positions lie outside their detector and are left out.*frame00\[1\]"
+        ):
+            matches = legdistort.Matches.from_table(far, camera=gsaoi)
+        assert len(matches.table) == len(table) - 1
+
+    def test_what_is_known_of_detectors_is_for_the_camera(self, table, gsaoi):
+        matches = legdistort.Matches.from_table(table, camera=gsaoi)
+        for options in ({"static": "fit"}, {"prior": {"1": legdistort.Prior(np.zeros((2, 10)))}}):
+            with pytest.raises(InputError, match="are taken as known: leave static out"):
+                legdistort.solve(matches, **options)
+
+    def test_ids_are_for_cameras(self, table):
+        rows = table[table["detector"] == "1"]
+        rows = rows[np.bincount(rows["star"])[rows["star"]] >= 3]
+        solution = legdistort.solve(
+            legdistort.Matches.from_table(rows, shape=(2048, 2048)), prior=legdistort.Prior(np.zeros((2, 1)))
+        )
+        with pytest.raises(InputError, match="has no camera with several detectors"):
+            solution.wcs("frame00", "1")
+
+
+class TestFiles:
+    def test_from_tables_to_wcs_in_the_shell(self, night, table, gsaoi, tmp_path, monkeypatch):
+        """Lists without star numbers: matched over the gaps, solved, and a WCS for every detector of every exposure."""
+        monkeypatch.chdir(tmp_path)
+        for name in np.unique(table["exposure"]):
+            rows = table[table["exposure"] == name]
+            rows[["detector", "x", "y", "x_err", "y_err"]].write(f"{name}.ecsv")
+        lists = sorted(str(path) for path in tmp_path.glob("*.ecsv"))
+        gsaoi.write("camera.asdf")
+        assert main(["match", *lists, "--camera", "camera.asdf", "--out", "matched.ecsv", "--quiet"]) == 0
+        assert main(["solve", "matched.ecsv", "--out", "results", "--quiet"]) == 0
+        solution = legdistort.Solution.read("results/solution.asdf")
+        names = [f"{name}_{key}" for name in solution.names for key in gsaoi.detectors]
+        assert sorted(path.stem for path in (tmp_path / "results" / "wcs").iterdir()) == sorted(names)
+        assert len(solution.star_names) > 0.9 * len(np.unique(table["star"]))
+        xy = 0.99 * pixels(6) + 10
+        for key in gsaoi.detectors:
+            here = solution.wcs("frame02", key)
+            path = f"results/wcs/frame02_{key}.asdf"
+            with asdf.open(path) as file:
+                stock = file["meta"]["wcs"]
+                assert np.abs(np.array(stock(*xy.T)) - here(*xy.T)).max() < 1e-9
+            ours = legdistort.read_wcs(path)
+            assert np.abs(np.array(ours(*xy.T)) - here(*xy.T)).max() < 1e-9
+            assert np.abs(np.array(ours.invert(*here(*xy.T))) - xy.T).max() < 1e-5
+        assert "camera  GSAOI, detectors 1, 2, 3, 4" in str(solution)
+
+    def test_a_changed_wcs_is_refused(self, solution, tmp_path):
+        """The certificates of both distortions, of the detector and of the focal plane, are checked."""
+        tree = storage.wcs_tree(solution, "frame00", "1")
+        for part in (tree["meta"], tree["meta"]["focal_plane"]):
+            kept, part["inverse_error_px"] = part["inverse_error_px"], 9e-7
+            path = tmp_path / "frame00_1.asdf"
+            asdf.AsdfFile(tree).write_to(path)
+            with pytest.raises(InputError, match="was certified"):
+                legdistort.read_wcs(path)
+            part["inverse_error_px"] = kept
+
+    def test_bad_ids(self):
+        with pytest.raises(InputError, match=r"ids of detectors become part of file names.*'a/b'"):
+            legdistort.Camera("c", {"a/b": legdistort.Detector((100, 100), layout=np.eye(2, 3))})
+
+    def test_exposures_beside_a_camera(self, table, gsaoi):
+        with pytest.raises(InputError, match="leave exposures out"):
+            legdistort.match(table, camera=gsaoi, exposures=[Exposure("frame00", np.zeros((9, 9)))])
