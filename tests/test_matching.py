@@ -378,7 +378,7 @@ def test_options_are_the_arguments():
     parameters = inspect.signature(match).parameters
     options = {option.name: option.default for option in fields(MatchOptions)}
     assert options == {name: parameters[name].default for name in options}
-    assert parameters.keys() - options == {"detections", "exposures", "shape"}
+    assert parameters.keys() - options == {"detections", "exposures", "shape", "camera"}
 
 
 def test_candidates_hold_the_truth():
