@@ -578,6 +578,7 @@ def test_keck_lists_by_the_command_line(shared_data, tmp_path, capsys):
         assert np.sqrt(np.average(used[f"d{axis}"].value ** 2, weights=weight)) <= 0.22
 
 
+@pytest.mark.slow
 def test_microobservatory_frames(shared_data, tmp_path, capsys):
     """Twelve raw, undersampled frames without a WCS, with hot pixels and a drift of 273 px."""
     frames = sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fits.gz"))
