@@ -14,6 +14,7 @@ from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
 from .exceptions import InputError, MatchError
 from .inputs import exposure_files, table_files
+from .inputs.exposure_names import detector_name
 from .matching.matcher import match
 from .matching.options import MatchOptions
 from .measurement.options import MeasureOptions
@@ -69,6 +70,7 @@ def run(
     dq_good=None,
     degree=3,
     prior=None,
+    camera=None,
     min_exposures=4,
     clip=CLIP,
     psf="auto",
@@ -101,6 +103,8 @@ def run(
         Total degree of the distortion.
     prior : Prior, dict, "header" or HeaderPrior, optional
         Static distortion. "header": that of the headers, see `legdistort.Prior.from_headers`.
+    camera : Camera, optional
+        Where `ext` is the name of several extensions, the detectors of a camera; by default that of the headers.
     min_exposures : int
         Stars seen in fewer exposures are not used.
     clip : float or None
@@ -152,15 +156,15 @@ def run(
     with _timed(timings, "measure"):
         detections, psfs = measure_with_psfs(exposures, measuring, **share)
     with _timed(timings, "match"):
-        matches = _also_left_out(match(detections, exposures=exposures, **vars(matching)), bad)
+        matches = _also_left_out(match(detections, exposures=exposures, camera=camera, **vars(matching)), bad)
     with _timed(timings, "solve"):
         solution = solve(matches, **vars(solving), reference=reference, **tying)
         solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
     with _timed(timings, "coadd"):
-        kept = [exposure for exposure in exposures if exposure.name in solution.names]
+        kept = [exposure for exposure in exposures if (exposure.frame or exposure.name) in solution.names]
         mosaic = coadd(kept, solution, **vars(coadding), **share)
     with _timed(timings, "assess"):
-        quality = _if_possible(stack_quality.assess, mosaic, solution, exposures=kept)
+        quality = _if_possible(stack_quality.assess, mosaic, solution.by_detector, exposures=kept)
     comparison = stacks = None
     if compare:
         with _timed(timings, "compare"):
@@ -227,14 +231,14 @@ def _assessed(solution, quality, comparison, stacks):
 def write_results(solution, target, *, psfs=None):
     """Write ``solution.asdf``, ``stars.ecsv``, ``wcs/NAME.asdf`` and ``psf/NAME.fits`` into an existing folder.
 
-    Of a camera the WCSs are those of its detectors, ``wcs/NAME_DETECTOR.asdf``.
+    Of a camera the WCSs are those of its detectors, ``wcs/NAME-DETECTOR.asdf``.
     """
     solution.write(target / "solution.asdf")
     table_files.write_stars(solution, target / "stars.ecsv")
     (target / "wcs").mkdir()
     for name in solution.names:
         for detector in solution.camera.detectors if solution.camera else [None]:
-            file = f"{name}.asdf" if detector is None else f"{name}_{detector}.asdf"
+            file = f"{name}.asdf" if detector is None else f"{detector_name(name, detector)}.asdf"
             write_wcs(solution, name, target / "wcs" / file, detector=detector)
     write_psfs(psfs or {}, target / "psf")
 
@@ -294,23 +298,25 @@ def check_results(out, overwrite):
 
 def _check_exposures(exposures, min_exposures, bad):
     """There are enough, and all show one detector: a run on a mixture would co-add nonsense."""
-    if len(exposures) < 2:
+    n_frames = len({exposure.frame or exposure.name for exposure in exposures})
+    if n_frames < 2:
         raise MatchError(
-            f"only one exposure ({exposures[0].name}): the distortion is found from the differences between "
-            "exposures, give at least two of the same field"
+            f"only one exposure ({exposures[0].frame or exposures[0].name}): the distortion is found from the "
+            "differences between exposures, give at least two of the same field"
         )
-    first = exposures[0]
-    for exposure in exposures[1:]:
+    detectors = {}
+    for exposure in exposures:
+        first = detectors.setdefault(exposure.detector, exposure)
         if exposure.shape != first.shape:
             raise InputError(
                 f"exposure {exposure.name} has shape {exposure.shape}, {first.name} has {first.shape} (ny, nx): "
                 "give frames of one detector, or solve their tables with a shape for each"
             )
-    if min_exposures > len(exposures):
+    if min_exposures > n_frames:
         good = "usable exposures" if bad else "exposures"
         raise InputError(
-            f"min_exposures is {min_exposures}, but there are {len(exposures)} {good}: "
-            f"give min_exposures={len(exposures)} (--min-exposures) or less"
+            f"min_exposures is {min_exposures}, but there are {n_frames} {good}: "
+            f"give min_exposures={n_frames} (--min-exposures) or less"
         )
 
 

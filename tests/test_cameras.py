@@ -7,6 +7,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 from astropy.wcs import WCS
+from scipy import special
 
 import legdistort
 from legdistort.cameras import camera as cameras
@@ -373,13 +374,13 @@ class TestFiles:
         assert main(["match", *lists, "--camera", "camera.asdf", "--out", "matched.ecsv", "--quiet"]) == 0
         assert main(["solve", "matched.ecsv", "--out", "results", "--quiet"]) == 0
         solution = legdistort.Solution.read("results/solution.asdf")
-        names = [f"{name}_{key}" for name in solution.names for key in gsaoi.detectors]
+        names = [f"{name}-{key}" for name in solution.names for key in gsaoi.detectors]
         assert sorted(path.stem for path in (tmp_path / "results" / "wcs").iterdir()) == sorted(names)
         assert len(solution.star_names) > 0.9 * len(np.unique(table["star"]))
         xy = 0.99 * pixels(6) + 10
         for key in gsaoi.detectors:
             here = solution.wcs("frame02", key)
-            path = f"results/wcs/frame02_{key}.asdf"
+            path = f"results/wcs/frame02-{key}.asdf"
             with asdf.open(path) as file:
                 stock = file["meta"]["wcs"]
                 assert np.abs(np.array(stock(*xy.T)) - here(*xy.T)).max() < 1e-9
@@ -403,6 +404,146 @@ class TestFiles:
         with pytest.raises(InputError, match=r"ids of detectors become part of file names.*'a/b'"):
             legdistort.Camera("c", {"a/b": legdistort.Detector((100, 100), layout=np.eye(2, 3))})
 
-    def test_exposures_beside_a_camera(self, table, gsaoi):
-        with pytest.raises(InputError, match="leave exposures out"):
-            legdistort.match(table, camera=gsaoi, exposures=[Exposure("frame00", np.zeros((9, 9)))])
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """Six exposures of two detectors of 300 x 200 px, SCI, ERR and DQ of both in a file; the first lacks the second."""
+    folder, rng = tmp_path_factory.mktemp("frames"), np.random.default_rng(5)
+    camera = two_chips_small()
+    ny, nx = camera.field
+    sky, flux = rng.uniform(-20, [nx + 20, ny + 20], (90, 2)), 10 ** rng.uniform(3.5, 5, 90)
+    for i in range(6):
+        f = sky + rng.uniform(-40, 40, 2)
+        u, v = (f / [nx, ny] * 2 - 1).T
+        f = f + 0.2 * (np.outer(u**2, rng.normal(0, 1, 2)) + np.outer(u * v, rng.normal(0, 1, 2)))
+        hdus = [fits.PrimaryHDU(header=fits.Header({"INSTRUME": "TWO", "DATE-OBS": f"2024-01-0{i + 1}T00:00:00"}))]
+        for number, (key, chip) in enumerate(camera.detectors.items(), start=1):
+            if i == 0 and number == 2:
+                continue
+            xy = chip.to_pixels(f)
+            image = 100 + sum(s * gaussian(chip.shape, *at) for at, s in zip(xy, flux, strict=True))
+            image = rng.poisson(image).astype(np.float32)
+            header = sky_header(chip, f - sky, camera) | {"CCDCHIP": int(key), "EXTVER": number}
+            planes = {"SCI": image, "ERR": np.sqrt(np.maximum(image, 1)), "DQ": np.zeros(chip.shape, dtype=np.int16)}
+            planes["DQ"][50 + 10 * number, 60] = 4
+            planes["SCI"][50 + 10 * number, 60] = 60000
+            hdus += [fits.ImageHDU(plane, fits.Header(header), name=name) for name, plane in planes.items()]
+        fits.HDUList(hdus).writeto(folder / f"exp{i}.fits")
+    return folder, camera, sky
+
+
+def two_chips_small():
+    """Detectors 1 and 2 with a gap of 15 px between them, the second turned, both with a static distortion."""
+    angle, static = np.radians(0.4), np.zeros((2, 10))
+    static[0, 3], static[1, 5], static[0, 8] = 1.2, -0.7, 0.4
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return legdistort.Camera(
+        "TWO",
+        {
+            1: legdistort.Detector((300, 200), layout=np.eye(2, 3), static=static),
+            2: legdistort.Detector((300, 200), layout=np.column_stack([turn, turn @ [-215.0, 1.0]]), static=-static),
+        },
+    )
+
+
+def gaussian(shape, x, y, fwhm=2.6):
+    """Light of a star in every pixel, integrated over the pixels; zero far from it."""
+    scale = fwhm / 2.3548 * np.sqrt(2)
+    profiles = []
+    for n, centre in ((shape[0], y), (shape[1], x)):
+        edges = np.clip((np.arange(n + 1) - 0.5 - centre) / scale, -6, 6)
+        profiles.append(np.diff(special.erf(edges)) / 2)
+    return np.outer(*profiles)
+
+
+def sky_header(chip, shift, camera):
+    """A linear WCS that is right in the middle of a detector, to some pixels elsewhere: a start, no more."""
+    y0, x0 = (np.array(chip.shape) - 1) / 2
+    here = chip.to_focal_plane(np.array([[x0, y0]]))[0] - shift.mean(axis=0)
+    slope = np.linalg.inv(chip.layout[:, :2]) * 0.05 / 3600 * [[-1], [1]]
+    place = (here - np.array(camera.field[::-1]) / 2) * 0.05 / 3600 * [-1, 1]
+    return {
+        "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": x0 + 1, "CRPIX2": y0 + 1,
+        "CRVAL1": 30.0 + place[0], "CRVAL2": place[1],
+        "CD1_1": slope[0, 0], "CD1_2": slope[0, 1], "CD2_1": slope[1, 0], "CD2_2": slope[1, 1],
+    }  # fmt: skip
+
+
+class TestFrames:
+    def test_reading(self, frames):
+        folder, _, _ = frames
+        exposures = legdistort.read_exposures(f"{folder}/*.fits", ext="SCI")
+        assert [e.name for e in exposures[:4]] == ["exp0-1", "exp1-1", "exp1-2", "exp2-1"]
+        assert {(e.frame, e.detector) for e in exposures[:3]} == {("exp0", "1"), ("exp1", "1"), ("exp1", "2")}
+        for exposure in exposures[1:3]:  # the planes of its own detector
+            assert np.argwhere(exposure.mask).tolist() == [[50 + 10 * int(exposure.detector), 60]]
+            assert np.allclose(exposure.uncertainty**2, np.maximum(exposure.data, 1), rtol=1e-3, atol=6e4)
+        opened = legdistort.open_exposures(f"{folder}/*.fits", ext="SCI")
+        assert [e.name for e in opened] == [e.name for e in exposures]
+        assert np.array_equal(opened[2].read().data, exposures[2].data)
+        (one,) = legdistort.read_exposures(folder / "exp0.fits", ext=("SCI", 1))
+        assert (one.name, one.detector) == ("exp0_SCI1", None)
+
+    def test_run_to_mosaic_and_headers(self, frames, tmp_path):
+        """Frames to mosaic over the gap, and WCSs in all extensions; stars lie where they are."""
+        folder, camera, sky = frames
+        camera.write(tmp_path / "camera.asdf")
+        paths = sorted(map(str, folder.glob("*.fits")))
+        out = tmp_path / "out"
+        given = ["--ext", "SCI", "--camera", str(tmp_path / "camera.asdf"), "--degree", "2", "--min-exposures", "3"]
+        assert main(["run", *paths, *given, "--out", str(out), "--quiet"]) == 0
+        solution = legdistort.Solution.read(out / "solution.asdf")
+        assert solution.names == tuple(f"exp{i}" for i in range(6))
+        assert 0.8 < solution.chi2 / solution.dof < 1.25
+        left = to_nearest(solution.positions, sky)
+        assert len(left) > 50
+        assert np.sqrt(np.mean(left**2)) < 0.03
+        mosaic = fits.getdata(out / "mosaic.fits")
+        assert np.isfinite(mosaic[100:-100, 100:-100]).mean() > 0.97  # the gap of 15 px is filled
+        assert main(["attach", str(out / "solution.asdf"), *paths, "--out", str(tmp_path / "done"), "--quiet"]) == 0
+        view = solution.by_detector
+        xy = 0.9 * pixels(5, 200) + 5
+        for path in paths[:2]:
+            with fits.open(tmp_path / "done" / path.rpartition("/")[2]) as hdulist:
+                for hdu in hdulist:
+                    if hdu.name in ("SCI", "ERR", "DQ"):
+                        key = str(hdu.header["CCDCHIP"])
+                        name = path.rpartition("/")[2].removesuffix(".fits")
+                        found = WCS(hdu.header, hdulist).all_pix2world(xy, 0)
+                        true = np.stack(solution.wcs(name, key)(*xy.T), axis=1)
+                        assert np.abs((found - true) * 3600 / 0.05).max() < 2e-3
+                        assert np.abs(np.stack(view.wcs(f"{name}-{key}")(*xy.T), axis=1) - true).max() * 72000 < 1e-5
+
+    def test_layout_by_headers(self, frames):
+        """Without a camera the headers say how the detectors lie; here they know nothing of the distortion."""
+        folder, camera, _ = frames
+        exposures = legdistort.read_exposures(f"{folder}/*.fits", ext="SCI")
+        matches = legdistort.match(legdistort.measure(exposures), exposures=exposures, min_exposures=3)
+        found = matches.camera
+        assert list(found.detectors) == ["1", "2"]
+        middle = np.array([[99.5, 149.5]])
+        apart = found["2"].to_focal_plane(middle) - found["1"].to_focal_plane(middle)
+        true = camera["2"].to_focal_plane(middle) - camera["1"].to_focal_plane(middle)
+        assert np.abs(np.linalg.norm(apart) - np.linalg.norm(true)) < 1
+        assert matches.sky is not None
+
+    def test_a_camera_of_another_instrument(self, frames, gsaoi):
+        folder, _, _ = frames
+        exposures = legdistort.read_exposures(f"{folder}/*.fits", ext="SCI")
+        table = legdistort.measure(exposures[:3])
+        with pytest.raises(InputError, match="is it a camera of another instrument"):
+            legdistort.match(table, exposures=exposures[:3], camera=gsaoi, min_exposures=2)
+
+
+def to_nearest(found, true):
+    """Distances to the nearest true positions after a common similarity, of those that are close."""
+    found = found[np.isfinite(found[:, 0])]
+    for limit in (40, 3, 0.5):
+        near = np.argmin(np.hypot(*(found[:, None] - true[None]).transpose(2, 0, 1)), axis=1)
+        off = true[near] - found
+        good = np.hypot(*(off - np.median(off, axis=0)).T) < limit
+        z, w = found[good] @ [1, 1j], true[near][good] @ [1, 1j]
+        a, b = np.linalg.lstsq(np.stack([z, np.ones(len(z))], axis=1), w, rcond=None)[0]
+        moved = a * (found @ [1, 1j]) + b
+        found = np.stack([moved.real, moved.imag], axis=1)
+    return (true[near] - found)[good]

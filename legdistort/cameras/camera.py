@@ -187,6 +187,20 @@ class Camera:
         return cls("GSAOI", detectors)
 
     @classmethod
+    def of_frames(cls, exposures):
+        """Camera by the headers of that of several exposures which has most detectors, as `from_exposures`.
+
+        Parameters
+        ----------
+        exposures : list of Exposure
+            Of the same camera, with `frame` and `detector`.
+        """
+        frames = {}
+        for exposure in exposures:
+            frames.setdefault(exposure.frame, []).append(exposure)
+        return cls.from_exposures(max(frames.values(), key=len))
+
+    @classmethod
     def from_exposures(cls, exposures, *, name=None):
         """Camera from the WCSs of the detectors of one exposure (see `legdistort.cameras.from_wcs`).
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity, tangent_plane
+from ..inputs.detector_images import KEYWORDS, detector_ids
 from ..inputs.sky_wcs import to_icrs
 from .detector import Detector
 from .expansion import expand
@@ -16,13 +17,11 @@ from .source import DIRECTIONS, Source
 
 #: The degree of the series of a distortion is raised to 9 at most until it leaves less than this out [pix].
 SAME, HIGHEST = 1e-4, 9
-#: Header keywords that tell detectors apart, in order of preference.
-KEYWORDS = ("CCDCHIP", "DETECTOR", "CHIP", "EXTVER", "EXTNAME")
 
 
 def camera_of(kind, exposures, name=None):
     """Camera, the `kind`, from the WCSs of one exposure (see `legdistort.cameras.camera.Camera.from_exposures`)."""
-    named = exposures if isinstance(exposures, dict) else dict(zip(detector_ids(exposures), exposures, strict=True))
+    named = exposures if isinstance(exposures, dict) else _by_detector(list(exposures))
     if not named:
         raise InputError("a camera needs the exposure of one detector at least, got none")
     for key, exposure in named.items():
@@ -41,16 +40,17 @@ def camera_of(kind, exposures, name=None):
     return kind(name or str(first.header.get("INSTRUME", "camera")).strip() or "camera", detectors)
 
 
-def detector_ids(exposures):
-    """Ids of the detectors of one exposure by the first keyword that all headers have with values of their own."""
-    for keyword in KEYWORDS:
-        values = [each.header.get(keyword) for each in exposures]
-        if None not in values and len(set(values)) == len(values):
-            return [str(value).strip() for value in values]
-    raise InputError(
-        f"the headers of {', '.join(each.name for each in exposures)} do not tell their detectors apart by any of "
-        f"{', '.join(KEYWORDS)}: give a dict {{id: exposure}} of the detectors of one exposure"
-    )
+def _by_detector(exposures):
+    """``{id: exposure}`` of the detectors of one exposure."""
+    ids = [each.detector for each in exposures]
+    if None in ids or len(set(ids)) < len(ids):
+        ids = detector_ids([each.header for each in exposures])
+    if ids is None:
+        raise InputError(
+            f"the headers of {', '.join(each.name for each in exposures)} do not tell their detectors apart by any of "
+            f"{', '.join(KEYWORDS)}: give a dict {{id: exposure}} of the detectors of one exposure"
+        )
+    return dict(zip(ids, exposures, strict=True))
 
 
 def _expanded(exposure, centre):

@@ -114,7 +114,7 @@ INJECTING = {
 }
 CAMERA = {
     "camera": Option(
-        "several detectors in an exposure, by the column detector: a camera file, or gsaoi", metavar="CAMERA"
+        "of exposures with several detectors: a camera file, or gsaoi (default: by the headers)", metavar="CAMERA"
     )
 }
 MATCHING = {

@@ -119,7 +119,8 @@ def coadd(
         kernel=kernel,
         scratch=scratch,
     )
-    return _coadd(exposures, solution, options, partial(map_items, workers=workers, threads=True, progress=progress))
+    share = partial(map_items, workers=workers, threads=True, progress=progress)
+    return _coadd(exposures, solution.by_detector, options, share)
 
 
 def _coadd(exposures, solution, options, share):

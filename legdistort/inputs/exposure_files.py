@@ -20,7 +20,8 @@ from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, with
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.provenance import checksum
 from . import repetitions
-from .exposure_names import exposure_name, in_header
+from .detector_images import every_id, images_of_detectors, of_detector
+from .exposure_names import detector_name, exposure_name, in_header
 from .exposures import LEAVE_OUT, Exposure, known_from_header
 from .foreign_images import from_nddata, is_nddata, read_roman
 from .pixel_flags import bad_pixels, good_bits
@@ -55,7 +56,7 @@ class ExposureFile:
     Attributes
     ----------
     name, wcs, header, saturation, gain, read_noise, exposure_time, path
-        As those of the `Exposure`; so is `has_gwcs`.
+        As those of the `Exposure`; so are `has_gwcs`, `frame` and `detector`.
     shape : tuple
         ``(ny, nx)``.
     checksum, pixels : str
@@ -80,6 +81,8 @@ class ExposureFile:
     ext: object = None
     has_gwcs: bool = False
     dq_good: int | None = None
+    frame: str | None = None
+    detector: str | None = None
 
     def read(self):
         """The `Exposure` with its pixels; what else is known is not worked out again.
@@ -129,7 +132,9 @@ def read_exposures(paths, *, ext=None, dq_good=None, progress=False):
         A string with ``*`` or ``?`` is expanded if no file has that very name.
     ext : int, str or (str, int), optional
         Extension to read from every file; by default the image, ``SCI`` if one is named so. Planes beside it (``DQ``,
-        ``WHT`` and the like) do not count.
+        ``WHT`` and the like) do not count. A name that several extensions have stands for all of them, the detectors of
+        a camera: each becomes an `Exposure` ``NAME-ID`` with the ``frame`` NAME and the ``detector`` ID, which is
+        ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header.
     dq_good : int, str or sequence of int, optional
         Flags of the DQ plane that are no reason to leave a pixel out, a sum of bits or ``"64,32"``; all others are.
     progress : bool, optional
@@ -214,15 +219,18 @@ def _read_each(paths, read, ext, progress, bad=None, copies=None):
     there already goes into the dict `copies`, if there is one: ``{name: reason}``.
     """
     origins, exposures, images = {}, [], {}
-    for i, source in enumerate(tqdm(expand_paths(paths), desc="reading", unit="frame", disable=not progress)):
+    sources = expand_paths(paths)
+    parts = [(i, sources[i], *part) for i, each in enumerate(_parts(sources, ext)) for part in each]
+    for i, source, ext, key in tqdm(parts, desc="reading", unit="frame", disable=not progress):
         try:
             with _quiet():
                 exposure = read(source, f"exposure_{i}", ext)
+                exposure = exposure if key is None else of_detector(exposure, ext, key)
         except DamagedError as error:
             if bad is None:
                 raise
             file = Path(source).name if isinstance(source, (str, Path)) else f"exposure_{i}"
-            name = exposure_name(file, ext)
+            name = exposure_name(file, ext) if key is None else detector_name(exposure_name(file), key)
             reason = str(error).removeprefix(f"{source}: ").removeprefix(f"{name}: ").removesuffix(LEAVE_OUT)
             bad[name] = file, reason, error
             continue
@@ -273,6 +281,24 @@ def expand_paths(paths):
     if not sources:
         raise InputError("no exposures to read: paths is empty")
     return sources
+
+
+def _parts(sources, ext):
+    """``[(extension, id of the detector)]`` to read from every source; None where it is not one of several."""
+    if not isinstance(ext, str):
+        return [[(ext, None)] for _ in sources]
+    return images_of_detectors([_headers_of_images(source) for source in sources], ext)
+
+
+def _headers_of_images(source):
+    """The images of a FITS file, or none of what cannot be read: reading it will tell."""
+    if isinstance(source, fits.HDUList):
+        return [hdu for hdu in source if _is_image(hdu)]
+    try:
+        with _quiet(), _opened(Path(source)) as (_, hdulist):
+            return [hdu for hdu in hdulist if _is_image(hdu)]
+    except (InputError, TypeError):
+        return []
 
 
 def _read(source, default, ext, good=None):
@@ -413,10 +439,18 @@ def extension_names(hdulist, path):
     return names
 
 
+def detector_names(hdulist, path, ext=None):
+    """``{name of an exposure: extension}`` for every way to name the detectors of a file, of one extension or all."""
+    images = [hdu for hdu in hdulist if _is_image(hdu) and not _stands_beside(hdu.name)]
+    kinds = {hdu.name for hdu in images if hdu.name} if ext is None else {ext}
+    forms = [part for kind in kinds for part in every_id(images, kind)]
+    return {detector_name(exposure_name(path), key): form for form, key in forms}
+
+
 def named_images(hdulist, path):
     """``{name of an exposure, as headers hold it: HDU}`` for every name that an image of a file can have."""
     found = {}
-    for name, ext in extension_names(hdulist, path).items():
+    for name, ext in (extension_names(hdulist, path) | detector_names(hdulist, path)).items():
         with contextlib.suppress(InputError):
             found[in_header(name)] = find_image(hdulist, ext, str(path), of_several=True)
     return found

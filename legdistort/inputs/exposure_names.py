@@ -18,6 +18,11 @@ def exposure_name(path, ext=None):
     return name if ext is None else f"{name}_{''.join(map(str, parts))}"
 
 
+def detector_name(frame, detector):
+    """Name of the part of an exposure that one detector of a camera took; no name of an extension looks like it."""
+    return f"{frame}-{detector}"
+
+
 def in_header(name):
     """Name of an exposure as the value of a FITS card, which is ASCII: the rest as escapes."""
     return name.encode("ascii", "backslashreplace").decode().rstrip()

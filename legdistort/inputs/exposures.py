@@ -52,6 +52,8 @@ class Exposure:
     path : `~pathlib.Path` or None
     has_gwcs : bool
         Whether its file has an extension ``ASDF`` beside it, which may hold a gwcs.
+    frame, detector : str or None
+        Of a camera with several detectors: name of the exposure that they share, and id of the one that took this part.
 
     Raises
     ------
@@ -72,6 +74,8 @@ class Exposure:
     exposure_time: float | None = None
     path: Path | None = None
     has_gwcs: bool = False
+    frame: str | None = None
+    detector: str | None = None
 
     def __post_init__(self):
         check_exposure_name(self.name, self.path)

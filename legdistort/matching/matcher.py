@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 from astropy import units as u
 
+from ..cameras.camera import Camera
+from ..cameras.focal_planes import focal_planes
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..inputs import column_contract, repetitions
 from ..inputs.matches import Matches, in_focal_plane, shapes_by_exposure
@@ -56,7 +58,7 @@ def match(
         ``(ny, nx)``, or that by exposure, when there are no `exposures`.
     camera : `legdistort.Camera`, optional
         Where exposures have several detectors, told apart by the column ``detector``: they are matched as one, the
-        focal plane. `exposures` are not needed then.
+        focal plane. Without it the headers of `exposures` with several detectors say how these lie.
     min_exposures : int
         A star is kept when it was found in that many exposures.
     columns : dict, optional
@@ -95,10 +97,12 @@ def match(
         detections = column_contract.rename(detections, columns)
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
     table["exposure"] = table["exposure"].astype(str)
+    if camera is None and exposures is not None and any(e.detector is not None for e in exposures):
+        camera = Camera.of_frames(exposures)
+        log.info("layout of the detectors by the headers: %s", camera)
     if camera is not None:
-        if exposures is not None:
-            raise InputError("with a camera the focal plane is that of the camera: leave exposures out")
         table, shape = in_focal_plane(table, camera), camera.field
+        exposures = None if exposures is None else focal_planes(camera, exposures)
     named = None if exposures is None else {e.name: e for e in exposures}
     names = list(named or dict.fromkeys(table["exposure"].tolist()))
     _check_names(table, names, min_exposures)

@@ -210,9 +210,17 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
     verdicts = {name: one.verdict for name, one in zip(names, found, strict=True)}
     if options.psf == "effective" or any(v.psf == "effective" for v in verdicts.values()):
         warn_of_psf(verdicts)
-    filled = [one.table for one in found if len(one.table)]
+    filled = [_of_frame(one.table, e) for e, one in zip(exposures, found, strict=True) if len(one.table)]
     psfs = {name: one.psf for name, one in zip(names, found, strict=True) if one.psf is not None}
     return vstack(filled) if filled else _empty(), psfs
+
+
+def _of_frame(table, exposure):
+    """The table of a detector of a camera with the columns exposure and detector."""
+    if exposure.detector is not None:
+        table["exposure"] = np.full(len(table), exposure.frame)
+        table.add_column(np.full(len(table), exposure.detector), name="detector", index=1)
+    return table
 
 
 def warn_of_psf(verdicts):

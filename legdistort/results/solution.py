@@ -20,6 +20,7 @@ from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from . import absolute_errors, new_positions
 from .check import in_lines
+from .detector_view import by_detector
 from .diagnostics import Diagnostics
 from .gauge import Gauge
 from .settings import Settings
@@ -242,6 +243,15 @@ class Solution:
     def distortion(self, name):
         """The `Distortion` of an exposure: undistorted -> detector pixels, without the pose."""
         return self._distortions[self.index(name)]
+
+    @cached_property
+    def by_detector(self):
+        """Of a camera, the same with every detector of every exposure, ``NAME-DETECTOR``, as an exposure of its own.
+
+        For positions alone, without errors; a solution without a camera is its own. See
+        `legdistort.results.detector_view`.
+        """
+        return self if self.camera is None else by_detector(self)
 
     def _detector(self, detector):
         """The `Detector` of an id; `InputError` where there are none."""

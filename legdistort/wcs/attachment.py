@@ -125,7 +125,7 @@ def attach(
     targets = [path.resolve() for path in paths] if in_place else _targets(paths, Path(out), overwrite)
     plans = []
     for path, target in zip(tqdm(paths, desc="attaching", unit="frame", disable=not progress), targets, strict=True):
-        plan = _plan(solution, path, target, kind=kind, max_error=max_error, ext=ext, overwrite=overwrite)
+        plan = _plan(solution.by_detector, path, target, kind=kind, max_error=max_error, ext=ext, overwrite=overwrite)
         plans += [plan] if plan.headers else []
     if not plans:
         raise InputError("none of the frames is part of the solution; give those it was made from")
@@ -233,9 +233,10 @@ def _images(solution, hdulist, path, ext):
     candidates = {exposure_names.exposure_name(path, ext): ext}
     if ext is None:
         candidates = exposure_files.extension_names(hdulist, path)
+    candidates |= exposure_files.detector_names(hdulist, path, ext)
     found = {name: form for name, form in candidates.items() if name in solution.names}
     if not found:
-        return _nothing(solution, path, next(iter(candidates)))
+        return _nothing(solution, path, next((n for n in candidates if n in solution.left_out), next(iter(candidates))))
     images = {}
     for name, form in found.items():
         # of several images the first, if the solution knows the file by its name alone

@@ -1,0 +1,94 @@
+"""The exposures of a camera as those of one detector, its focal plane."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS
+
+from ..exceptions import InputError
+from ..geometry import basis, similarity, tangent_plane
+from ..inputs.sky_wcs import to_icrs
+
+_GRID = np.linspace(-1, 1, 5)
+
+
+@dataclass(frozen=True, eq=False)
+class FocalPlane:
+    """What is known of an exposure of a camera beside its pixels.
+
+    Attributes
+    ----------
+    name : str
+    shape : tuple
+        ``(ny, nx)`` of the focal plane.
+    wcs : `~astropy.wcs.WCS` or None
+        Linear, by the WCSs of the detectors.
+    header : `~astropy.io.fits.Header`
+        That of the first detector.
+    """
+
+    name: str
+    shape: tuple
+    wcs: WCS | None
+    header: fits.Header = field(default_factory=fits.Header)
+    has_gwcs = False
+
+
+def focal_planes(camera, exposures):
+    """The focal planes of exposures whose detectors are given, in the order in which they first appear.
+
+    Parameters
+    ----------
+    camera : Camera
+    exposures : list of Exposure
+        With `frame` and `detector`.
+
+    Returns
+    -------
+    list of FocalPlane
+
+    Raises
+    ------
+    InputError
+        For an exposure that does not tell its detector, a detector that the camera does not have, or one of another
+        shape.
+    """
+    frames = {}
+    for exposure in exposures:
+        if exposure.detector is None:
+            raise InputError(
+                f"{exposure.name} does not tell which detector of camera {camera.name} it is: read all extensions of "
+                "its file by their name (ext='SCI', --ext SCI)"
+            )
+        if exposure.shape != camera[exposure.detector].shape:
+            raise InputError(
+                f"{exposure.name} has shape {exposure.shape}, detector {exposure.detector} of camera {camera.name} "
+                f"{camera[exposure.detector].shape} (ny, nx): is it a camera of another instrument?"
+            )
+        frames.setdefault(exposure.frame, []).append(exposure)
+    return [FocalPlane(name, camera.field, _wcs(camera, parts), parts[0].header) for name, parts in frames.items()]
+
+
+def _wcs(camera, parts):
+    """The linear WCS of the focal plane that fits those of its detectors best, or None if they have none."""
+    places, sky = [], []
+    for part in parts:
+        if part.wcs is not None:
+            xy = basis.denormalize(*(a.ravel() for a in np.meshgrid(_GRID, _GRID)), part.shape)
+            places.append(camera[part.detector].to_focal_plane(xy))
+            sky.append(to_icrs(part.wcs, xy))
+    if not places:
+        return None
+    places, sky = np.concatenate(places), np.concatenate(sky, axis=1)
+    centre = np.degrees(tangent_plane.angles(tangent_plane.directions(*np.radians(sky)).mean(axis=0)))
+    pose = similarity.fit_similarity(places, np.stack(tangent_plane.gnomonic(*sky, *centre), axis=1))
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = "RA---TAN", "DEC--TAN"
+    wcs.wcs.cunit = "deg", "deg"
+    wcs.wcs.radesys = "ICRS"
+    wcs.wcs.crval = centre
+    wcs.wcs.crpix = similarity.invert(pose)[:, 2] + 1
+    wcs.wcs.cd = pose[:, :2]
+    wcs.wcs.set()
+    return wcs
