@@ -53,6 +53,11 @@ class StandIn:
     left_out: dict = field(default_factory=dict)
 
     @property
+    def by_detector(self):
+        """There is one detector."""
+        return self
+
+    @property
     def observations(self):
         """Stars at the corners of all detectors, and their width."""
         rows = [

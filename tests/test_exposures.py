@@ -115,7 +115,7 @@ def test_extensions_and_their_companions(tmp_path, data):
     assert second.name == "mef_SCI2"
     np.testing.assert_array_equal(second.uncertainty, 6.0)
     np.testing.assert_array_equal(np.argwhere(second.mask), [[2, 3], [5, 6]])
-    assert read_one(path, ext="SCI").name == "mef_SCI"
+    assert [each.name for each in read_exposures(path, ext="SCI")] == ["mef-1", "mef-2"]  # the detectors of a camera
     assert read_one(path, ext=5).name == "mef_5"
     np.testing.assert_array_equal(read_one(path, ext=5).data, data + 2)
     with pytest.raises(InputError, match=r"mef.fits: no extension 'B'; the file has 0 PRIMARY, 1 ERR"):
@@ -129,7 +129,7 @@ def test_extensions_and_their_companions(tmp_path, data):
 def test_do_not_use_bit(data):
     hdus = multi_extension(data)
     hdus[0].header["TELESCOP"] = "JWST"
-    np.testing.assert_array_equal(np.argwhere(read_one(hdus, ext="SCI").mask), [[1, 3]])
+    np.testing.assert_array_equal(np.argwhere(read_one(hdus, ext=("SCI", 1)).mask), [[1, 3]])
 
 
 def test_variance_extension(data):
