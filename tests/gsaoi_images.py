@@ -102,10 +102,10 @@ def without_common_map(found, true, degree):
     return found - powers @ np.linalg.lstsq(powers, found, rcond=None)[0]
 
 
-def bound(star, exposure, place, true, sigma, degree):
-    """Cramer-Rao bound of star positions after a common map, rms over stars and axes, in units of sigma.
+def covariance(star, exposure, place, sigma, degree):
+    """Covariance (n_stars, n_stars) of one coordinate of the stars that no unbiased estimate beats, up to a common map.
 
-    One axis: unknown are the position of each star, and for each exposure powers up to a degree of the place in it.
+    Unknown are the position of each star, and for each exposure powers up to a degree of the place in it.
     """
     n_stars, n_exposures = star.max() + 1, exposure.max() + 1
     u = place / np.abs(place).max()
@@ -115,6 +115,10 @@ def bound(star, exposure, place, true, sigma, degree):
     design[np.arange(len(star)), star] = 1
     for m in range(k):
         design[np.arange(len(star)), n_stars + exposure * k + m] = powers[:, m]
-    covariance = np.linalg.pinv(design.T @ design, rcond=1e-10, hermitian=True)[:n_stars, :n_stars] * sigma**2
-    centred = without_common_map(np.eye(n_stars), true, degree)
-    return float(np.sqrt(np.trace(centred @ covariance @ centred.T) / n_stars))
+    return np.linalg.pinv(design.T @ design, rcond=1e-10, hermitian=True)[:n_stars, :n_stars] * sigma**2
+
+
+def bound(star, exposure, place, true, sigma, degree):
+    """Cramer-Rao bound of star positions after a common map, rms over stars and axes, in units of sigma."""
+    centred = without_common_map(np.eye(star.max() + 1), true, degree)
+    return float(np.sqrt(np.trace(centred @ covariance(star, exposure, place, sigma, degree) @ centred.T) / len(true)))
