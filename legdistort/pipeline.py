@@ -104,7 +104,8 @@ def run(
     prior : Prior, dict, "header" or HeaderPrior, optional
         Static distortion. "header": that of the headers, see `legdistort.Prior.from_headers`.
     camera : Camera, optional
-        Where `ext` is the name of several extensions, the detectors of a camera; by default that of the headers.
+        Where exposures have several detectors: `ext` is the name of several extensions, or each detector has a file of
+        its own (`legdistort.Camera.of_detectors`). By default the headers say how the detectors of a file lie.
     min_exposures : int
         Stars seen in fewer exposures are not used.
     clip : float or None
@@ -151,7 +152,7 @@ def run(
     parallel.check_workers(workers)
     share, timings = {"workers": workers, "progress": progress}, {}
     with _timed(timings, "read"):
-        exposures, bad = _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress)
+        exposures, bad = _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress, camera)
         solving = replace(solving, prior=_known_prior(prior, exposures, degree))
     with _timed(timings, "measure"):
         detections, psfs = measure_with_psfs(exposures, measuring, **share)
@@ -182,11 +183,12 @@ def run(
     return Run(out, solution, mosaic, summary)
 
 
-def _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress):
+def _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress, camera):
     """Exposures that can be solved together, and the bad ones as ``{name: reason}``."""
     bad = {}
     options = {"ext": ext, "dq_good": dq_good, "stop_at_bad": stop_at_bad, "progress": progress}
     exposures = exposure_files.open_exposures(paths, left_out=bad, **options)
+    exposures = exposures if camera is None else camera.of_detectors(exposures)
     _check_exposures(exposures, min_exposures, bad)
     return exposures, bad
 

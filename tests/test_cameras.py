@@ -1,5 +1,7 @@
 """Cameras of several detectors: value objects, the focal plane, solutions over all detectors."""
 
+from dataclasses import replace
+
 import asdf
 import gsaoi_images
 import numpy as np
@@ -513,6 +515,25 @@ class TestFrames:
                         true = np.stack(solution.wcs(name, key)(*xy.T), axis=1)
                         assert np.abs((found - true) * 3600 / 0.05).max() < 2e-3
                         assert np.abs(np.stack(view.wcs(f"{name}-{key}")(*xy.T), axis=1) - true).max() * 72000 < 1e-5
+
+    def test_one_file_for_every_detector(self, frames, tmp_path):
+        """The same table of positions as from files with both."""
+        folder, camera, _ = frames
+        for path in folder.glob("*.fits"):
+            with fits.open(path) as hdulist:
+                for key in sorted({str(hdu.header["CCDCHIP"]) for hdu in hdulist[1:]}):
+                    mine = [hdu.copy() for hdu in hdulist[1:] if str(hdu.header["CCDCHIP"]) == key]
+                    fits.HDUList([hdulist[0].copy(), *mine]).writeto(tmp_path / f"{path.stem}_{key}_cal.fits")
+        together = legdistort.measure(legdistort.read_exposures(sorted(folder.glob("exp[01].fits")), ext="SCI"))
+        apart = legdistort.open_exposures(sorted(tmp_path.glob("exp[01]*.fits")))
+        parted = legdistort.measure(camera.of_detectors(apart))
+        assert set(parted["exposure"]) == {"exp0_cal", "exp1_cal"}
+        for name in ("detector", "x", "y", "x_err"):
+            assert np.array_equal(np.sort(parted[name]), np.sort(together[name]))
+        with pytest.raises(InputError, match="names none of the detectors A, B"):
+            legdistort.Camera("c", dict(zip("AB", camera.detectors.values(), strict=True))).of_detectors(apart)
+        with pytest.raises(InputError, match="is of detector 1, which its name does not say"):
+            camera.of_detectors([replace(apart[0], name="frame")])
 
     def test_layout_by_headers(self, frames):
         """Without a camera the headers say how the detectors lie; here they know nothing of the distortion."""

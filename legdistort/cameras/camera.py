@@ -16,6 +16,7 @@ from astropy import units as u
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.gsaoi import GSAOI_SIZE, GsaoiMap
+from ..inputs.detector_images import of_files
 from . import storage
 from .detector import Detector
 from .from_wcs import camera_of
@@ -185,6 +186,20 @@ class Camera:
             static = basis.project(shift, GSAOI_DEGREE, GSAOI_DEGREE + 8)
             detectors[str(k)] = Detector(size, layout=layout, static=static)
         return cls("GSAOI", detectors)
+
+    def of_detectors(self, exposures):
+        """Exposures whose detectors are in files of their own, with their `frame` and `detector`.
+
+        The detector is the one that the header names (``CCDCHIP``, ``DETECTOR``, ``CHIP``, ``EXTVER`` or ``EXTNAME``),
+        the frame the name of the file without it. Those read from one file by the name of its extensions are as they
+        were.
+
+        Raises
+        ------
+        InputError
+            If a header names no detector of the camera, or a file name does not have it.
+        """
+        return of_files(exposures, self.detectors)
 
     @classmethod
     def of_frames(cls, exposures):

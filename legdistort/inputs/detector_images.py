@@ -1,7 +1,9 @@
 """Several detectors in one file: which images belong to an exposure, and what the detectors are called."""
 
+import re
 from dataclasses import replace
 
+from ..exceptions import InputError
 from .exposure_names import detector_name
 
 #: Header keywords that tell detectors apart, in order of preference.
@@ -57,6 +59,46 @@ def every_id(images, ext):
     named = [hdu for hdu in images if isinstance(ext, str) and hdu.name == ext.strip().upper()]
     values = [((ext, hdu.ver), str(hdu.header.get(keyword, "")).strip()) for keyword in KEYWORDS for hdu in named]
     return [part for part in values if part[1]]
+
+
+def of_files(exposures, ids):
+    """Exposures whose detectors are in files of their own, with `frame` and `detector`.
+
+    The detector is that of `ids` which the header names (`KEYWORDS`), the frame the name of the file without it.
+
+    Parameters
+    ----------
+    exposures : list of Exposure
+    ids : iterable of str
+
+    Raises
+    ------
+    InputError
+        For a header that names none of the detectors, or a file name that does not have it.
+    """
+    known, out = {key.lower(): key for key in ids}, []
+    for exposure in exposures:
+        if exposure.detector is not None:
+            out.append(exposure)
+            continue
+        values = [str(exposure.header.get(keyword, "")).strip().lower() for keyword in KEYWORDS]
+        key = next((known[value] for value in values if value in known), None)
+        if key is None:
+            raise InputError(
+                f"the header of {exposure.name} names none of the detectors {', '.join(known.values())} "
+                f"({', '.join(KEYWORDS)}): read all extensions of a file by their name (ext='SCI', --ext SCI), or "
+                "correct the ids of the camera"
+            )
+        frame = re.sub(
+            rf"[-_.]?(?<![A-Za-z0-9]){re.escape(key)}(?![A-Za-z0-9])", "", exposure.name, flags=re.IGNORECASE
+        )
+        if frame in ("", exposure.name):
+            raise InputError(
+                f"{exposure.name} is of detector {key}, which its name does not say: files of one exposure are those "
+                f"with one name but for the detector, such as {exposure.name}_{key}; rename them"
+            )
+        out.append(replace(exposure, frame=frame, detector=key))
+    return out
 
 
 def of_detector(exposure, ext, key):
