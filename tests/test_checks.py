@@ -75,20 +75,31 @@ def test_score_of_the_next_degree_is_the_chi2_that_a_refit_gains(n_exposures):
     assert score.nu == pytest.approx(low.dof - high.dof, rel=0.01)
 
 
-def test_score_of_motions_has_the_mean_that_dense_algebra_gives():
-    times = np.array([0.0, 0.1, 1.0, 1.1, 2.5])
-    found = residuals(solved(simulated(n_exposures=5, n_stars=40).matches))
+@pytest.mark.parametrize("n_stars", [40, 150])  # with an exact trace, and by random combinations
+def test_score_of_motions_has_the_mean_that_dense_algebra_gives(n_stars):
+    times, turns = np.array([0.0, 0.1, 1.0, 1.1, 2.5]), [0, 90, 180, 10, 20]
+    found = residuals(solved(simulated(n_exposures=5, n_stars=n_stars, rotations=turns).matches))
     score = found.of_motion(times)
-    problem, t = found.problem, times[found.exposure]
-    off = t - np.bincount(problem.star, t)[problem.star] / np.bincount(problem.star)[problem.star]
-    n = len(t)
-    moved = np.zeros((2, n, 2, problem.n_stars))
-    for axis in (0, 1):
-        moved[axis, np.arange(n), axis, problem.star] = off
-    p = fitted(moved.reshape(2 * n, -1))
+    columns = design(found)
+    n, stars = len(columns) // 2, columns[:, : 2 * found.problem.n_stars]
+    moved = stars * np.tile(times[found.exposure], 2)[:, None]
+    p = fitted(moved - (q := fitted(stars)) @ (q.T @ moved))
     assert score.t == pytest.approx(np.sum((p.T @ found.residual.ravel() / SIGMA) ** 2), rel=1e-6)
-    free = p - (q := fitted(design(found))) @ (q.T @ p)
-    assert score.nu == pytest.approx(np.sum(free**2), rel=0.03)
+    known = np.concatenate([columns, found.released.reshape(2 * n, -1)], axis=1)
+    free = p - (q := fitted(known)) @ (q.T @ p)
+    assert score.nu == pytest.approx(np.sum(free**2), rel=1e-3 if n_stars == 40 else 0.02)
+
+
+def test_stars_that_move_are_seen_where_the_camera_is_turned():
+    simulation = simulated(1, n_exposures=8, n_stars=80, rotations=[0, 180] * 4)
+    table = simulation.matches.table.copy()
+    exposure, star = (np.unique(table[name], return_inverse=True)[1] for name in ("exposure", "star"))
+    v = 0.4 * SIGMA * np.random.default_rng(1).normal(size=(80, 2))[star] * np.where(exposure % 2, -1, 1)[:, None]
+    for axis, each in zip("xy", v.T, strict=True):
+        table[axis] += each * exposure * u.pix
+    moving, still = (solved(changed(simulation.matches, t)) for t in (table, simulation.matches.table))
+    assert states(moving)["time"] == "fail"
+    assert states(still)["time"] == "pass"
 
 
 def test_score_of_cells_is_the_chi2_that_a_dense_fit_gains():
@@ -277,6 +288,22 @@ def test_frames_with_stars_in_one_corner_are_called_extrapolated():
     check = next(c for c in solution.checks if c.name == "extrapolation")
     assert check.state == "warn"
     assert check.value > 0.8
+
+
+def test_dithers_that_leave_a_small_overlap_are_no_lack_of_stars():
+    simulation = simulated(3, n_exposures=4, n_stars=300, dither=600.0, min_exposures=4)
+    seen = np.unique(simulation.matches.table["star"], return_counts=True)[1]
+    assert (seen == 4).all()
+
+    def found(matches):
+        return next(c for c in solved(matches, degree=1).checks if c.name == "extrapolation")
+
+    everywhere = found(simulation.matches)
+    assert everywhere.state == "pass"
+    assert everywhere.value > 0.5
+    x = simulation.truth.positions[:, 0][simulation.matches.table["star"]]
+    half = simulation.matches.table[x < np.median(x)]
+    assert found(changed(simulation.matches, half)).state == "warn"
 
 
 def test_a_degree_too_high_is_said():

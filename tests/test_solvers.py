@@ -17,7 +17,7 @@ from legdistort.inputs.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.runtime.checks import options_from
-from legdistort.simulation.observations import simulate_matches
+from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 from legdistort.solving import start_values
 from legdistort.solving.equations import criterion, reduced_system
 from legdistort.solving.equations.problem import State, build_problem
@@ -334,3 +334,10 @@ def test_undetermined_problem_names_the_exposure():
     matches = Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses, allow_copies=True)
     with pytest.raises(SolveError, match="do not determine the distortion of degree 2"):
         solve(matches, degree=2)
+
+
+@pytest.mark.parametrize(("seed", "n_exposures"), [(10, 5), (46, 5), (57, 4)])
+def test_few_stars_and_a_large_distortion_that_nobody_knew(seed, n_exposures):
+    sim = simulate_gsaoi_matches(small=True, seed=seed, n_exposures=n_exposures, n_stars=45)
+    solution = solve(sim.matches, degree=3, clip=None)
+    assert solution.chi2 < 1.5 * solution.dof  # it is 9000 times as large where the constraints never settle

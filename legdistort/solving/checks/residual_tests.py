@@ -17,6 +17,7 @@ from ..equations import criterion, elimination
 from ..equations.leverage import leverages
 
 _DETERMINED = 1e-4  # information [1/px^2]: what is held wrong by some pixels shows where 100 px would be beyond doubt
+_PROBES = 200  # patterns up to which a trace is exact, and random combinations beyond: right to 1 %
 _RANK = 1e-3  # part of its variance without a fit that a combination must keep to count
 
 
@@ -113,6 +114,19 @@ class Residuals:
         x, y = displacement
         return np.stack([l00 * x + l01 * y, l11 * y])
 
+    def _gradient(self, whitened):
+        """L'p for what is p in units of errors, (2, n): how it pulls at the model positions."""
+        l00, l01, l11 = self._roots
+        x, y = whitened
+        return np.stack([l00 * x, l01 * x + l11 * y])
+
+    def _whitened_gradient(self, pulled):
+        """The inverse of `_gradient`; 0 where there is no weight."""
+        l00, l01, l11 = self._roots
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = pulled[0] / l00
+            return np.where(self.used, np.stack([x, (pulled[1] - l01 * x) / l11]), 0.0)
+
     @cached_property
     def whitened(self):
         """Residuals (2, n) with unit covariance, were nothing fitted."""
@@ -188,27 +202,59 @@ class Residuals:
         return basis.values(degree, (2 * q[0] + 1) / nx - 1, (2 * q[1] + 1) / ny - 1)
 
     def of_motion(self, times):
-        """`Score` of a motion of every star, linear in the times (n_exposures,)."""
-        problem, e = self.problem, self.whitened
-        t = np.asarray(times, dtype=float)[self.exposure]
-        total = nu = 0.0
-        for k in (0, 1):
-            w = problem.weight[k]
-            sums = np.bincount(problem.star, w, problem.n_stars)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                mean = np.nan_to_num(np.bincount(problem.star, w * t, problem.n_stars) / sums)
-            off = t - mean[problem.star]
-            size = np.bincount(problem.star, w * off**2, problem.n_stars)
-            moving = size > 1e-9 * max(size.max(initial=0), 1e-300)
-            patterns = np.column_stack([e[k], self.released[k]]).T
-            pulls = np.stack([np.bincount(problem.star, np.sqrt(w) * off * p, problem.n_stars) for p in patterns])
-            squares = np.sum(pulls[:, moving] ** 2 / size[moving], axis=1)
-            total += squares[0]
-            nu -= squares[1:].sum()
-            fitted = 1 - self.freedom / 2 / np.maximum(1 - self.star_share, 1e-9)  # by the exposure, its star known
-            by_star = np.bincount(problem.star, w * off**2 * fitted, problem.n_stars)
-            nu += np.sum(1 - by_star[moving] / size[moving])
-        return self.score(total, max(nu, 0.0))
+        """`Score` of a motion of every star in the reference plane, linear in the times (n_exposures,)."""
+        patterns, moving = self._motions(np.asarray(times, dtype=float)[self.exposure])
+        star, n_stars = self.problem.star, self.problem.n_stars
+
+        def squares(whitened):
+            pulls = np.stack([np.bincount(star, np.sum(p * whitened, axis=0), n_stars) for p in patterns])
+            return float(np.sum(pulls**2))
+
+        nu = 2.0 * np.count_nonzero(moving) - sum(squares(p) for p in np.moveaxis(self.released, 2, 0))
+        return self.score(squares(self.whitened), max(nu - self._taken_by_exposures(patterns, moving), 0.0))
+
+    def _motions(self, t):
+        """Orthonormal patterns of motion of the stars, and which stars (n_stars,) move enough to have any.
+
+        Two for every star, what its position takes up removed: shape (2, 2, n), the first axis counts them, the second
+        is that of the whitened residuals.
+        """
+        problem, star, t = self.problem, self.problem.star, t - t.mean()
+        columns = np.stack([self._whitened_gradient(f) for f in self.blocks.coupling])
+
+        def products(factor):
+            return np.stack(
+                [[np.bincount(star, factor * np.sum(a * b, axis=0), problem.n_stars) for b in columns] for a in columns]
+            ).transpose(2, 0, 1)
+
+        still, cross, square = products(np.ones(len(t))), products(t), products(t**2)
+        shift = np.linalg.pinv(still, hermitian=True) @ cross
+        left = square - cross @ shift
+        moving = np.linalg.eigvalsh(left)[:, 0] > 1e-9 * max(left.max(initial=0), 1e-300)
+        left[~moving] = np.eye(2)
+        turn = np.linalg.inv(np.linalg.cholesky(left)) * moving[:, None, None]
+        off = columns * t - np.einsum("nab,acn->bcn", shift[star], columns)
+        return np.einsum("nab,bcn->acn", turn[star], off), moving
+
+    def _taken_by_exposures(self, patterns, moving):
+        """Degrees of freedom that the distortions take up of patterns as those of `_motions`.
+
+        The trace is exact for few stars, else it is that of random combinations (Hutchinson 1990).
+        """
+        n = 2 * np.count_nonzero(moving)
+        if not n:
+            return 0.0
+        few = n <= _PROBES
+        probes = np.sqrt(n) * np.eye(n) if few else np.random.default_rng(0).choice([-1.0, 1.0], (n, _PROBES))
+        each = np.zeros((2, self.problem.n_stars, probes.shape[1]))
+        each[:, moving] = probes.reshape(2, -1, probes.shape[1])
+        pulled = np.stack([self._gradient(p) for p in patterns])
+        rest = np.empty((self.problem.n_exposures, 2 * self.problem.n_modes, probes.shape[1]))
+        for i in range(self.problem.n_exposures):
+            part = self.problem.part(i)
+            on_rows = np.einsum("akn,anm->knm", pulled[:, :, part], each[:, self.problem.star[part]], optimize=True)
+            rest[i] = (self.blocks.values[:, part] @ on_rows).reshape(-1, probes.shape[1])
+        return float(np.sum(rest * self.system.respond(rest))) / probes.shape[1]
 
     def of_cells(self, cells):
         """`Score` of a displacement common to all observations of a cell, for cells (n,) from 0."""
@@ -229,9 +275,7 @@ class Residuals:
 
     def _by_cell(self, cells, whitened, n):
         """What pulls at the displacements (2 n,) of cells, x first, in whitened residuals (2, n)."""
-        l00, l01, l11 = self._roots
-        pulls = l00 * whitened[0], l01 * whitened[0] + l11 * whitened[1]
-        return np.concatenate([np.bincount(cells, p, n) for p in pulls])
+        return np.concatenate([np.bincount(cells, p, n) for p in self._gradient(whitened)])
 
     def _followed(self, cells, n):
         """Gradients of the unknowns by displacements (2 n) of cells, the stars eliminated.

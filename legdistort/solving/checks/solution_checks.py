@@ -285,16 +285,35 @@ def extrapolation_check(residuals):
     for i, (ny, nx) in enumerate(problem.shapes):
         xy = problem.xy[:, problem.part(i)][:, residuals.used[problem.part(i)]].T
         shares[i], numbers[i] = 1 - enclosed_area(xy) / (nx * ny), len(xy)
-    worst = int(np.argmax(shares))
-    share, name, n = shares[worst], problem.names[worst], max(numbers[worst], 3)
     # Of n points spread evenly 8/3 ln n / n lies outside the hull in the mean (Renyi & Sulanke 1963); the scatter is
-    # that of simulated points. Dithers take more: half of a frame is too much in any case.
-    limit = max(_TOO_MUCH, min(0.95, 8 / 3 * np.log(n) / n + 5 / n**0.85))
+    # that of simulated points. Half of a frame is worth a word, if it is more than chance and dithers explain.
+    n = np.maximum(numbers, 3)
+    chance = np.minimum(0.95, 8 / 3 * np.log(n) / n + 5 / n**0.85)
+    limits = np.maximum(_TOO_MUCH, chance)
+    for i in np.flatnonzero(shares > limits):
+        limits[i] = max(_TOO_MUCH, 1 - (1 - chance[i]) * _within_reach(residuals, i))
+    worst = int(np.argmax(shares - limits)) if np.any(shares > limits) else int(np.argmax(shares))
+    share, limit, name = shares[worst], limits[worst], problem.names[worst]
     words = f"up to {share:.0%} of a frame lies outside its stars, where distortions are extrapolated ({name})"
     if share > limit:
         return Check("extrapolation", "warn", share, limit, words,
                      "fainter stars there (--threshold), or trust the correction only within the stars")  # fmt: skip
     return Check("extrapolation", "pass", share, limit, words)
+
+
+def _within_reach(residuals, i):
+    """Part of a frame that lies on as many exposures as every star must."""
+    problem, poses = residuals.problem, residuals.state.poses
+    fewest = np.bincount(problem.star, minlength=problem.n_stars).min()
+    ny, nx = problem.shapes[i]
+    step = (np.arange(64) + 0.5) / 64
+    xy = np.stack(np.meshgrid(step * nx, step * ny)).reshape(2, -1) - 0.5
+    plane = np.linalg.solve(poses[i, :, :2], xy - poses[i, :, 2:])
+    number = 0
+    for pose, (ny, nx) in zip(poses, problem.shapes, strict=True):
+        x, y = pose[:, :2] @ plane + pose[:, 2:]
+        number = number + ((x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5))
+    return np.mean(number >= fewest)
 
 
 def rejection_check(solution):
