@@ -150,6 +150,10 @@ class ErrorLaw:
         )
 
 
+#: Where a correlation of ``exp(-u)``, and one of ``(1 + u) exp(-u)``, is 1/e.
+FOLDING = (1.0, 2.146193220620583)
+
+
 @dataclass(frozen=True)
 class CorrelatedErrors:
     """Errors of a star that are alike in neighbouring exposures, found from the residuals of all stars.
@@ -171,6 +175,8 @@ class CorrelatedErrors:
         Of these: "exposures", "days", or "px".
     reason : str
         Why they could not be looked for.
+    smooth : bool
+        Whether they change smoothly, with a correlation of ``(1 + u) exp(-u)`` (Matern 3/2), or as ``exp(-u)``.
     """
 
     floor: float
@@ -181,6 +187,17 @@ class CorrelatedErrors:
     longest: float = 0.0
     unit: str = ""
     reason: str = ""
+    smooth: bool = False
+
+    @property
+    def scale(self):
+        """Distance at which u of the correlation is 1."""
+        return self.length / FOLDING[self.smooth]
+
+    def correlation(self, distance):
+        """Correlation of the errors of a star at some distances, in the unit of the length."""
+        u = np.abs(distance) / self.scale
+        return np.exp(-u) * (1 + u if self.smooth else 1)
 
     def __str__(self):
         constant = "what is the same in all exposures cannot be measured"

@@ -3,10 +3,11 @@
 Trails of charge, the place of a star on its pixel, refraction by its colour: an exposure errs in a star about as much
 as the one before, or as another one in which the star fell on the same place. Such errors do not average down with the
 number of exposures, and no error floor says so. Here every star has a random error of its own in each axis (random
-effects), of one variance for all stars, whose correlation falls exponentially along the time or along an axis of the
-detector. Beside it stand independent errors, the stated ones with a floor. The variances and the length of the
-correlation are those of the largest restricted likelihood (REML; Patterson & Thompson 1971): that of the residuals, in
-which nothing is left of what is the same in all exposures. That part is in the positions, and no data tell it.
+effects), of one variance for all stars, whose correlation falls along the time or along an axis of the detector:
+exponentially, or as that of a process that has a derivative (Matern 3/2, `CorrelatedErrors.smooth`). Beside it stand
+independent errors, the stated ones with a floor. The variances, the length and the form of the correlation are those of
+the largest restricted likelihood (REML; Patterson & Thompson 1971): that of the residuals, in which nothing is left of
+what is the same in all exposures. That part is in the positions, and no data tell it.
 """
 
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
-from ..results.diagnostics import CorrelatedErrors
+from ..results.diagnostics import FOLDING, CorrelatedErrors
 from . import single_fit
 from .equations.leverage import leverages
 
@@ -29,6 +30,7 @@ FOUND = 12.0
 MOST_STARS = 2000
 _ALONG = "time", "x", "y"
 _STARTS = 0.05, 0.3  # of the longest correlation length
+_ORDER = ["einsum_path", (0, 1), (0, 1)]
 
 
 def estimate_with_correlations(matches, options):
@@ -73,31 +75,35 @@ def measure(fit):
         reason = f"{n} exposures, {n_stars} stars seen twice; it takes {2 * BLOCKS} and {STARS}"
         return CorrelatedErrors(float(fit.options.error_floor), reason=reason)
     rows = _Rows.of(fit)
-    alone = minimize_scalar(lambda p: rows.along("time").deviance(p, 0.0, 0.0, 1.0), bounds=rows.bounds[0])
-    best, along, size = alone.fun, None, None
-    for name in _ALONG:
-        series = rows.along(name)
+    every = [rows.along(name) for name in _ALONG]
+    alone = minimize_scalar(lambda p: every[0].deviance(p, 0.0, 0.0, 1.0), bounds=rows.bounds[0])
+    best, along, found = alone.fun - FOUND, None, None
+    for series in every:
         if not series.longest > series.shortest > 0:
             continue
-        tried = min((_largest(series, rows.bounds, alone.x, part) for part in _STARTS), key=lambda each: each.fun)
-        if tried.fun < min(best, alone.fun - FOUND):
-            best, along, size = tried.fun, series, np.exp(tried.x)
+        for part in _STARTS:
+            tried = _largest(series, rows.bounds, [*[alone.x - 0.5] * 3, np.log(part * series.longest)])
+            if tried.fun < best:
+                best, along, found = tried.fun, series, tried
     if along is None:
         return CorrelatedErrors(float(np.exp(alone.x)))
-    floor, x, y, length = map(float, size)
-    return CorrelatedErrors(floor, x, y, along.name, length, along.longest, rows.unit if along.name == "time" else "px")
+    smooth = replace(along, smooth=True)
+    tried = _largest(smooth, rows.bounds, found.x)
+    if tried.fun < best:
+        along, found = smooth, tried
+    floor, x, y, length = map(float, np.exp(found.x))
+    unit = rows.unit if along.name == "time" else "px"
+    return CorrelatedErrors(floor, x, y, along.name, length, along.longest, unit, smooth=along.smooth)
 
 
-def _largest(series, bounds, floor, part):
-    """The largest likelihood of a series, from a correlation length on that is a part of the longest."""
-    lengths = np.log([series.shortest, series.longest])
-    start = [floor - 0.5, floor - 0.5, floor - 0.5, np.clip(np.log(part * series.longest), *lengths)]
-    start[:3] = np.clip(start[:3], *bounds[0])
+def _largest(series, bounds, start):
+    """The largest likelihood of a series, from logarithms of floor, x, y and correlation length on."""
+    bounds = [*bounds, tuple(np.log([series.shortest, series.longest]))]
     return minimize(
         lambda p: series.deviance(p[0], np.exp(p[1]), np.exp(p[2]), np.exp(p[3])),
-        start,
+        np.clip(start, *np.transpose(bounds)),
         method="L-BFGS-B",
-        bounds=[*bounds, lengths],
+        bounds=bounds,
         options={"maxiter": 40, "ftol": 1e-7},
     )
 
@@ -209,6 +215,8 @@ class _Series:
     free : ndarray, shape (n_stars,)
     shortest, longest : float
         Correlation lengths.
+    smooth : bool
+        As in `CorrelatedErrors`.
     """
 
     name: str
@@ -219,28 +227,43 @@ class _Series:
     free: np.ndarray
     shortest: float
     longest: float
+    smooth: bool = False
 
     def deviance(self, log_floor, x, y, length):
         """Minus twice the logarithm of the restricted likelihood, up to a constant.
 
         The innovations of a Kalman filter (Jones 1981, for series with gaps) stand for the inverse of the covariance of
-        a star; its mean is free. What the exposures take up counts as so many fewer stars.
+        a star; its mean is free. What the exposures take up counts as so many fewer stars. A smooth process is carried
+        on with its derivative, in units in which both have one variance.
         """
-        decay, there = np.exp(-self.place / length)[:, None], self.there[:, None]
-        spread = np.array([[x], [y]]) ** 2
+        there, spread = self.there[:, None], np.array([[x], [y]]) ** 2
         noise = self.variance + np.exp(2 * log_floor)
         new, variance = np.stack([np.ones_like(noise), self.residual], axis=1), np.empty_like(noise)
-        mean, known = np.zeros_like(new[0]), np.broadcast_to(spread, noise[0].shape)
-        for k, (step, here) in enumerate(zip(decay, there, strict=True)):
-            mean, known = mean * step, spread + step**2 * (known - spread)
-            new[k] -= mean
-            variance[k] = known + noise[k]
-            gain = here * known / variance[k]
-            mean, known = mean + gain * new[k], known * (1 - gain)
+        n_states = 1 + self.smooth
+        mean = np.zeros((n_states, *new[0].shape))
+        known = np.zeros((n_states, n_states, *noise[0].shape)) + np.eye(n_states)[:, :, None, None] * spread
+        steps = self._steps(FOLDING[self.smooth] * self.place / length)
+        for k, (step, here) in enumerate(zip(steps, there, strict=True)):
+            mean = np.einsum("abn,b...n->a...n", step, mean)
+            loss = np.eye(n_states)[:, :, None] - np.einsum("abn,cbn->acn", step, step)
+            known = np.einsum("abn,bckn,dcn->adkn", step, known, step, optimize=_ORDER) + loss[:, :, None] * spread
+            new[k] -= mean[0]
+            variance[k] = known[0, 0] + noise[k]
+            gain = here * known[0] / variance[k]
+            mean = mean + gain[:, None] * new[k]
+            known = known - gain[:, None] * known[0]
         weight, (one, r) = there / variance, new.swapaxes(0, 1)
         logs, ones = np.sum(there * np.log(variance), axis=0), np.sum(weight * one**2, axis=0)
         cross, own = np.sum(weight * one * r, axis=0), np.sum(weight * r**2, axis=0)
         return float(np.sum(self.free * (logs + np.log(ones)) + own - cross**2 / ones))
+
+    def _steps(self, u):
+        """How the states decay over distances (n_ranks, n_stars): (n_ranks, n_states, n_states, n_stars)."""
+        decay = np.exp(-u)
+        if not self.smooth:
+            return decay[:, None, None]
+        u = np.where(np.isfinite(u), u, 0)
+        return np.stack([np.stack([1 + u, u], axis=1), np.stack([-u, 1 - u], axis=1)], axis=1) * decay[:, None, None]
 
 
 def _of_stars(fit, found):
@@ -253,14 +276,15 @@ def _of_stars(fit, found):
     values = fit.matches.times[0][problem.exposure] if found.along == "time" else problem.xy["xy".index(found.along)]
     order, _, rank = _ranks(problem.star, values, problem.n_stars)
     star, part, values = problem.star[order], part[order], values[order]
-    behind, double, square, last = np.zeros((4, problem.n_stars))
-    for k in range(rank.max() + 1):  # behind: sum of the parts before, each as correlated as it is near
+    near, far, double, square, last = np.zeros((5, problem.n_stars))
+    for k in range(rank.max() + 1):  # near, far: sums of the parts before times exp(-u), and times u exp(-u)
         mine = np.flatnonzero(rank == k)
         j = star[mine]
-        behind[j] *= np.exp(-(values[mine] - last[j]) / found.length)
-        double[j] += 2 * part[mine] * behind[j]
+        u = (values[mine] - last[j]) / found.scale
+        near[j], far[j] = near[j] * np.exp(-u), (far[j] + u * near[j]) * np.exp(-u)
+        double[j] += 2 * part[mine] * (near[j] + found.smooth * far[j])
         square[j] += part[mine] ** 2
-        behind[j] += part[mine]
+        near[j] += part[mine]
         last[j] = values[mine]
     both = double + square
     mean = (found.x**2 + found.y**2) / 2

@@ -15,13 +15,17 @@ from pathlib import Path
 import numpy as np
 from astropy import units as u
 from astropy.table import vstack
-from calibration_table import simulated
+from astropy.wcs import WCS, Sip
+from calibration_table import SIZE, simulated
 from scipy.stats import beta
 
 import legdistort as ld
 from legdistort.exceptions import LegdistortWarning
+from legdistort.inputs.exposures import Exposure
 
 SIGMA = 0.02
+#: Pixels: the largest of the distortion in the headers that is not used.
+SIP = 1.0
 
 
 def limits(count, n):
@@ -37,14 +41,21 @@ def solved(matches, prior=None, **options):
 
 
 def clean(seed):
-    """A set in which nothing is wrong: 4 to 40 exposures, 20 to 1000 stars on a frame, with and without dithers."""
+    """A set in which nothing is wrong: 4 to 40 exposures, 20 to 1000 stars on a frame, with and without dithers.
+
+    Stars have errors from a third of `SIGMA` to three times as much.
+    """
     rng = np.random.default_rng(seed)
     n_exposures = int(np.exp(rng.uniform(np.log(4), np.log(40.99))))
     n_stars = int(np.exp(rng.uniform(np.log(20), np.log(1000))))
     matches, _, static = simulated(
-        seed, n_exposures=n_exposures, n_stars=n_stars, dither=rng.choice([0.0, 50.0, 150.0]), sigma=SIGMA
+        seed, n_exposures=n_exposures, n_stars=n_stars, dither=rng.choice([0.0, 50.0, 150.0]), sigma=1e-9
     )
-    return matches, static
+    table = matches.table.copy()
+    error = np.exp(rng.uniform(-np.log(3), np.log(3), table["star"].max() + 1))[table["star"]] * SIGMA
+    _moved(table, slice(None), rng.normal(size=(len(table), 2)) * error[:, None])
+    table["x_err"] = table["y_err"] = error * u.pix
+    return ld.Matches.from_table(table, shape=(SIZE, SIZE), poses=matches.poses), static
 
 
 def legendre(static):
@@ -94,7 +105,7 @@ def spoiled(kind, seed, *, n_exposures=11, n_stars=70):
         v[rng.permutation(len(stars))[: len(stars) // 2]] = 0
         _moved(table, slice(None), v[star] * (exposure * 3 // n_exposures)[:, None])
     elif kind == "degree too low":  # 3 errors of a star's mean position, of degree 4, drawn for every exposure
-        x, y = (2 * (table[k].value + 0.5) / 2048 - 1 for k in "xy")
+        x, y = (2 * (table[k].value + 0.5) / SIZE - 1 for k in "xy")
         modes = np.stack(
             [np.polynomial.chebyshev.chebval2d(x, y, np.eye(5)[:, [i]] * np.eye(5)[4 - i]) for i in range(5)]
         )
@@ -115,9 +126,28 @@ def spoiled(kind, seed, *, n_exposures=11, n_stars=70):
     elif kind == "an exposure with a third of its stars":
         rows = rng.permutation(np.flatnonzero(exposure == 5))
         table.remove_rows(rows[len(rows) // 3 :])
+    elif kind == "SIP of 1 px unused":
+        table.remove_column("star")
+        return ld.match(table, exposures=headers_with_sip(rng, matches.poses))
     poses = dict(matches.poses) | {"e99": matches.poses["e03"]}
     poses = {name: poses[name] for name in np.unique(table["exposure"])}
     return ld.Matches.from_table(table, shape=matches.shapes[matches.names[0]], poses=poses)
+
+
+def headers_with_sip(rng, poses):
+    """Exposures at these poses with one distortion of `SIP` pixels at most, of degree 3, in their headers."""
+    i, j = np.indices((4, 4))
+    a, b = rng.normal(size=(2, 4, 4)) * ((i + j > 1) & (i + j < 4)) / (SIZE / 2) ** (i + j)
+    x, y = np.meshgrid(*[np.linspace(-SIZE / 2, SIZE / 2, 33)] * 2)
+    largest = np.hypot(*(np.polynomial.polynomial.polyval2d(x, y, c) for c in (a, b))).max()
+    exposures = []
+    for name, pose in poses.items():
+        wcs, middle = WCS(naxis=2), pose @ [SIZE / 2, SIZE / 2, 1]
+        wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix = ["RA---TAN-SIP", "DEC--TAN-SIP"], [84.9, -69.1], middle + 1
+        wcs.wcs.cd = np.diag([-1e-5, 1e-5]) @ np.linalg.inv(pose[:, :2])
+        wcs.sip = Sip(a * SIP / largest, b * SIP / largest, None, None, wcs.wcs.crpix)
+        exposures.append(Exposure(name, np.zeros((SIZE, SIZE), dtype=np.float32), wcs=wcs))
+    return exposures
 
 
 #: What is wrong, and the check that should say so.
@@ -129,6 +159,7 @@ FAULTS = {
     "20 % mismatches": "rejection",
     "an exposure twice as noisy": "exposures",
     "an exposure with a third of its stars": "completeness",
+    "SIP of 1 px unused": "header distortion",
 }
 
 

@@ -116,20 +116,20 @@ def cubic(xy):
 
 
 def pulls(solution, sky):
-    """Squares of true errors (n, 2) after a common cubic, those reported, and which stars are bright."""
-    stars, true = solution.stars, sky[solution.star_names]
-    reported = np.stack([stars["x_err"].value, stars["y_err"].value], axis=1)
+    """Squares of true errors (n, 2) once a common cubic is taken off, those reported, and which stars are bright.
+
+    The cubic is weighted by the errors of the measurement, and taken off the covariance of all stars too: what is left
+    of that are errors without those of any convention.
+    """
+    stars, true, n = solution.stars, sky[solution.star_names], len(solution.star_names)
     offset = np.stack([stars["x"].value, stars["y"].value], axis=1) - true
-    out = np.empty_like(offset)
-    for k in (0, 1):
-        weight = 1 / reported[:, k]
-        maps = cubic(true) * weight[:, None]
-        hat = np.linalg.qr(maps)[0]
-        left = without(offset[:, k] * weight, maps)
-        out[:, k] = left**2 / np.maximum(1 - np.sum(hat**2, axis=1), 0.05) / weight**2
     index = np.searchsorted(solution.star_names, solution.observations["star"])
     sigma = np.bincount(index, solution.observations["x_err"].value) / np.bincount(index)
-    return out, reported**2, bright(sigma)
+    maps = np.linalg.qr(cubic(true) / sigma[:, None])[0]
+    project = (np.eye(n) - maps @ maps.T) * sigma[:, None] / sigma
+    blocks = [solution.uncertainty.star_matrix[first : first + n, first : first + n] for first in (0, n)]
+    reported = np.stack([np.einsum("jk,kl,jl->j", project, block, project, optimize=True) for block in blocks], axis=1)
+    return (project @ offset) ** 2, reported, bright(sigma)
 
 
 def systematics(n_sets):
