@@ -75,7 +75,7 @@ def test_score_of_the_next_degree_is_the_chi2_that_a_refit_gains(n_exposures):
     assert score.nu == pytest.approx(low.dof - high.dof, rel=0.01)
 
 
-@pytest.mark.parametrize("n_stars", [40, 150])  # with an exact trace, and by random combinations
+@pytest.mark.parametrize("n_stars", [30, 150])  # with an exact trace, and by random combinations
 def test_score_of_motions_has_the_mean_that_dense_algebra_gives(n_stars):
     times, turns = np.array([0.0, 0.1, 1.0, 1.1, 2.5]), [0, 90, 180, 10, 20]
     found = residuals(solved(simulated(n_exposures=5, n_stars=n_stars, rotations=turns).matches))
@@ -87,7 +87,7 @@ def test_score_of_motions_has_the_mean_that_dense_algebra_gives(n_stars):
     assert score.t == pytest.approx(np.sum((p.T @ found.residual.ravel() / SIGMA) ** 2), rel=1e-6)
     known = np.concatenate([columns, found.released.reshape(2 * n, -1)], axis=1)
     free = p - (q := fitted(known)) @ (q.T @ p)
-    assert score.nu == pytest.approx(np.sum(free**2), rel=1e-3 if n_stars == 40 else 0.02)
+    assert score.nu == pytest.approx(np.sum(free**2), rel=1e-3 if n_stars == 30 else 0.02)
 
 
 def test_stars_that_move_are_seen_where_the_camera_is_turned():

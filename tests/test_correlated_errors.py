@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy import units as u
+from scipy import optimize, special
 
 import legdistort as ld
 from legdistort.exceptions import InputError
@@ -149,19 +150,20 @@ def fit():
     return single_fit.estimate(ld.Matches.from_table(table, shape=(2048, 2048), poses=matches.poses), options)
 
 
-def correlation(place, length, smooth):
-    """Of a process exp(-u) or, with a derivative, (1 + u) exp(-u), by the distance at which it is 1/e."""
-    u = np.abs(np.subtract.outer(place, place)) / length
-    if not smooth:
-        return np.exp(-u)
-    u *= 2.146193220620583
-    assert (1 + 2.146193220620583) * np.exp(-2.146193220620583) == pytest.approx(np.exp(-1))
-    return (1 + u) * np.exp(-u)
+def correlation(place, length, derivatives):
+    """Of Matern processes, the Bessel functions written out, by the distance at which it is 1/e."""
+    nu, lag = derivatives + 0.5, np.abs(np.subtract.outer(place, place)) / length
+
+    def matern(u):
+        return 2 ** (1 - nu) / special.gamma(nu) * u**nu * special.kv(nu, u)
+
+    u = np.maximum(lag * optimize.brentq(lambda u: matern(u) - np.exp(-1), 0.1, 10), 1e-9)
+    return matern(u)
 
 
-@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("derivatives", [0, 1, 2])
 @pytest.mark.parametrize("name", ["time", "x"])
-def test_likelihood_is_that_of_dense_matrices(fit, name, smooth):
+def test_likelihood_is_that_of_dense_matrices(fit, name, derivatives):
     rows = correlated_errors._Rows.of(fit)
     floor, x, y, length = 0.004, 0.02, 0.007, {"time": 2.0, "x": 15.0}[name]
     expected = 0.0
@@ -170,20 +172,20 @@ def test_likelihood_is_that_of_dense_matrices(fit, name, smooth):
         place = rows.place[name][mine]
         for k, size in enumerate((x, y)):
             matrix = np.diag(rows.variance[k, mine] + floor**2)
-            matrix += size**2 * correlation(place, length, smooth)
+            matrix += size**2 * correlation(place, length, derivatives)
             inverse, r, one = np.linalg.inv(matrix), rows.residual[k, mine], np.ones(mine.sum())
             logs = np.linalg.slogdet(matrix)[1] + np.log(one @ inverse @ one)
             mean = one @ inverse @ r / (one @ inverse @ one)
             expected += rows.free[star] * logs + (r - mean) @ inverse @ (r - mean)
-    found = replace(rows.along(name), smooth=smooth).deviance(np.log(floor), x, y, length)
+    found = replace(rows.along(name), derivatives=derivatives).deviance(np.log(floor), x, y, length)
     assert found == pytest.approx(expected, rel=1e-9)
     assert rows.free.mean() == pytest.approx(1 - 3 * 9 / (len(rows.star)), rel=0.02)  # 3 modes of 9 exposures
 
 
-@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("derivatives", [0, 1, 2])
 @pytest.mark.parametrize("along", ["time", "y"])
-def test_covariance_of_stars_is_that_of_dense_matrices(fit, along, smooth):
-    found = ld.results.diagnostics.CorrelatedErrors(0.0, 0.02, 0.007, along, 3.0, smooth=smooth)
+def test_covariance_of_stars_is_that_of_dense_matrices(fit, along, derivatives):
+    found = ld.results.diagnostics.CorrelatedErrors(0.0, 0.02, 0.007, along, 3.0, derivatives=derivatives)
     shared = correlated_errors._of_stars(fit, found)
     problem = fit.problem
     exposure = np.repeat(np.arange(9), np.diff(problem.start))
@@ -192,7 +194,7 @@ def test_covariance_of_stars_is_that_of_dense_matrices(fit, along, smooth):
         mine = problem.star == star
         part = fit.weighted.weight[:2, mine].sum(axis=0)
         part /= part.sum()
-        alike = correlation(place[mine], 3.0, smooth)
+        alike = correlation(place[mine], 3.0, derivatives)
         assert found.correlation(np.subtract.outer(place[mine], place[mine])) == pytest.approx(alike)
         independent = (found.x**2 + found.y**2) / 2 * part @ part
         for k, size in enumerate((found.x, found.y)):

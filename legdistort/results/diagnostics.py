@@ -150,8 +150,9 @@ class ErrorLaw:
         )
 
 
-#: Where a correlation of ``exp(-u)``, and one of ``(1 + u) exp(-u)``, is 1/e.
-FOLDING = (1.0, 2.146193220620583)
+#: Polynomials that times ``exp(-u)`` are the correlation of processes with 0, 1 and 2 derivatives, and where it is 1/e.
+MATERN = (1.0,), (1.0, 1.0), (1.0, 1.0, 1 / 3)
+FOLDING = 1.0, 2.146193220620583, 2.904629975029914
 
 
 @dataclass(frozen=True)
@@ -175,8 +176,9 @@ class CorrelatedErrors:
         Of these: "exposures", "days", or "px".
     reason : str
         Why they could not be looked for.
-    smooth : bool
-        Whether they change smoothly, with a correlation of ``(1 + u) exp(-u)`` (Matern 3/2), or as ``exp(-u)``.
+    derivatives : {0, 1, 2}
+        How smoothly they change: with a correlation of ``exp(-u)``, ``(1 + u) exp(-u)`` or ``(1 + u + u^2/3) exp(-u)``
+        (Matern 1/2, 3/2, 5/2).
     """
 
     floor: float
@@ -187,17 +189,17 @@ class CorrelatedErrors:
     longest: float = 0.0
     unit: str = ""
     reason: str = ""
-    smooth: bool = False
+    derivatives: int = 0
 
     @property
     def scale(self):
         """Distance at which u of the correlation is 1."""
-        return self.length / FOLDING[self.smooth]
+        return self.length / FOLDING[self.derivatives]
 
     def correlation(self, distance):
         """Correlation of the errors of a star at some distances, in the unit of the length."""
         u = np.abs(distance) / self.scale
-        return np.exp(-u) * (1 + u if self.smooth else 1)
+        return np.exp(-u) * np.polynomial.polynomial.polyval(u, MATERN[self.derivatives])
 
     def __str__(self):
         constant = "what is the same in all exposures cannot be measured"

@@ -4,7 +4,7 @@ Trails of charge, the place of a star on its pixel, refraction by its colour: an
 as the one before, or as another one in which the star fell on the same place. Such errors do not average down with the
 number of exposures, and no error floor says so. Here every star has a random error of its own in each axis (random
 effects), of one variance for all stars, whose correlation falls along the time or along an axis of the detector:
-exponentially, or as that of a process that has a derivative (Matern 3/2, `CorrelatedErrors.smooth`). Beside it stand
+exponentially, or as that of a process that has one or two derivatives (`CorrelatedErrors.derivatives`). Beside it stand
 independent errors, the stated ones with a floor. The variances, the length and the form of the correlation are those of
 the largest restricted likelihood (REML; Patterson & Thompson 1971): that of the residuals, in which nothing is left of
 what is the same in all exposures. That part is in the positions, and no data tell it.
@@ -13,9 +13,10 @@ what is the same in all exposures. That part is in the positions, and no data te
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import linalg, special
 from scipy.optimize import minimize, minimize_scalar
 
-from ..results.diagnostics import FOLDING, CorrelatedErrors
+from ..results.diagnostics import FOLDING, MATERN, CorrelatedErrors
 from . import single_fit
 from .equations.leverage import leverages
 
@@ -30,7 +31,6 @@ FOUND = 12.0
 MOST_STARS = 2000
 _ALONG = "time", "x", "y"
 _STARTS = 0.05, 0.3  # of the longest correlation length
-_ORDER = ["einsum_path", (0, 1), (0, 1)]
 
 
 def estimate_with_correlations(matches, options):
@@ -87,13 +87,13 @@ def measure(fit):
                 best, along, found = tried.fun, series, tried
     if along is None:
         return CorrelatedErrors(float(np.exp(alone.x)))
-    smooth = replace(along, smooth=True)
-    tried = _largest(smooth, rows.bounds, found.x)
-    if tried.fun < best:
-        along, found = smooth, tried
+    for smoother in (replace(along, derivatives=n) for n in range(1, len(MATERN))):
+        tried = _largest(smoother, rows.bounds, found.x)
+        if tried.fun < best:
+            best, along, found = tried.fun, smoother, tried
     floor, x, y, length = map(float, np.exp(found.x))
     unit = rows.unit if along.name == "time" else "px"
-    return CorrelatedErrors(floor, x, y, along.name, length, along.longest, unit, smooth=along.smooth)
+    return CorrelatedErrors(floor, x, y, along.name, length, along.longest, unit, derivatives=along.derivatives)
 
 
 def _largest(series, bounds, start):
@@ -215,7 +215,7 @@ class _Series:
     free : ndarray, shape (n_stars,)
     shortest, longest : float
         Correlation lengths.
-    smooth : bool
+    derivatives : int
         As in `CorrelatedErrors`.
     """
 
@@ -227,26 +227,24 @@ class _Series:
     free: np.ndarray
     shortest: float
     longest: float
-    smooth: bool = False
+    derivatives: int = 0
 
     def deviance(self, log_floor, x, y, length):
         """Minus twice the logarithm of the restricted likelihood, up to a constant.
 
         The innovations of a Kalman filter (Jones 1981, for series with gaps) stand for the inverse of the covariance of
-        a star; its mean is free. What the exposures take up counts as so many fewer stars. A smooth process is carried
-        on with its derivative, in units in which both have one variance.
+        a star; its mean is free. What the exposures take up counts as so many fewer stars.
         """
         there, spread = self.there[:, None], np.array([[x], [y]]) ** 2
         noise = self.variance + np.exp(2 * log_floor)
         new, variance = np.stack([np.ones_like(noise), self.residual], axis=1), np.empty_like(noise)
-        n_states = 1 + self.smooth
-        mean = np.zeros((n_states, *new[0].shape))
-        known = np.zeros((n_states, n_states, *noise[0].shape)) + np.eye(n_states)[:, :, None, None] * spread
-        steps = self._steps(FOLDING[self.smooth] * self.place / length)
+        nilpotent, usual = _states(self.derivatives)
+        usual = usual[:, :, None, None]
+        mean, known = np.zeros((len(usual), *new[0].shape)), usual * np.broadcast_to(spread, noise[0].shape)
+        steps = _steps(nilpotent, FOLDING[self.derivatives] * self.place / length)
         for k, (step, here) in enumerate(zip(steps, there, strict=True)):
-            mean = np.einsum("abn,b...n->a...n", step, mean)
-            loss = np.eye(n_states)[:, :, None] - np.einsum("abn,cbn->acn", step, step)
-            known = np.einsum("abn,bckn,dcn->adkn", step, known, step, optimize=_ORDER) + loss[:, :, None] * spread
+            mean = np.einsum("abn,bykn->aykn", step, mean)
+            known = usual * spread + _both_sides(step, known - usual * spread)
             new[k] -= mean[0]
             variance[k] = known[0, 0] + noise[k]
             gain = here * known[0] / variance[k]
@@ -257,13 +255,31 @@ class _Series:
         cross, own = np.sum(weight * one * r, axis=0), np.sum(weight * r**2, axis=0)
         return float(np.sum(self.free * (logs + np.log(ones)) + own - cross**2 / ones))
 
-    def _steps(self, u):
-        """How the states decay over distances (n_ranks, n_stars): (n_ranks, n_states, n_states, n_stars)."""
-        decay = np.exp(-u)
-        if not self.smooth:
-            return decay[:, None, None]
-        u = np.where(np.isfinite(u), u, 0)
-        return np.stack([np.stack([1 + u, u], axis=1), np.stack([-u, 1 - u], axis=1)], axis=1) * decay[:, None, None]
+
+def _states(derivatives):
+    """A process and its derivatives: matrix N and covariance P, (n, n) each, for distances in units of the scale.
+
+    The process obeys ``(1 + d/du)^n f = white noise``, whose states decay as ``exp(-u) exp(N u)`` with ``N^n = 0``.
+    """
+    n = derivatives + 1
+    change = np.eye(n, k=1)
+    change[-1] -= special.binom(n, np.arange(n))
+    usual = linalg.solve_continuous_lyapunov(change, -np.outer(np.eye(n)[-1], np.eye(n)[-1]))
+    return change + np.eye(n), usual / usual[0, 0]
+
+
+def _steps(nilpotent, u):
+    """How states decay over distances (n_ranks, n_stars): shape (n_ranks, n, n, n_stars)."""
+    n = len(nilpotent)
+    powers = [np.linalg.matrix_power(nilpotent, k)[:, :, None] / special.factorial(k) for k in range(n)]
+    decay, u = np.exp(-u)[:, None, None], np.where(np.isfinite(u), u, 0)[:, None, None]
+    return decay * sum(power * u**k for k, power in enumerate(powers))
+
+
+def _both_sides(step, matrix):
+    """``F M F'`` for F (n, n, n_stars) and M (n, n, 2, n_stars)."""
+    half = np.einsum("abn,bcxn->acxn", step, matrix)
+    return np.einsum("acxn,dcn->adxn", half, step)
 
 
 def _of_stars(fit, found):
@@ -276,15 +292,19 @@ def _of_stars(fit, found):
     values = fit.matches.times[0][problem.exposure] if found.along == "time" else problem.xy["xy".index(found.along)]
     order, _, rank = _ranks(problem.star, values, problem.n_stars)
     star, part, values = problem.star[order], part[order], values[order]
-    near, far, double, square, last = np.zeros((5, problem.n_stars))
-    for k in range(rank.max() + 1):  # near, far: sums of the parts before times exp(-u), and times u exp(-u)
+    behind = np.zeros((len(MATERN), problem.n_stars))  # sums of the parts before times u^m exp(-u)
+    double, square, last = np.zeros((3, problem.n_stars))
+    for k in range(rank.max() + 1):
         mine = np.flatnonzero(rank == k)
         j = star[mine]
         u = (values[mine] - last[j]) / found.scale
-        near[j], far[j] = near[j] * np.exp(-u), (far[j] + u * near[j]) * np.exp(-u)
-        double[j] += 2 * part[mine] * (near[j] + found.smooth * far[j])
+        behind[:, j] = [
+            np.exp(-u) * sum(special.binom(m, i) * u ** (m - i) * behind[i, j] for i in range(m + 1))
+            for m in range(len(behind))
+        ]
+        double[j] += 2 * part[mine] * sum(c * b for c, b in zip(MATERN[found.derivatives], behind[:, j], strict=False))
         square[j] += part[mine] ** 2
-        near[j] += part[mine]
+        behind[0, j] += part[mine]
         last[j] = values[mine]
     both = double + square
     mean = (found.x**2 + found.y**2) / 2

@@ -26,9 +26,9 @@ LOSSES = ("linear", "huber", "cauchy")
 #: Iterations of the joint solver and sweeps of the alternating one at most, unless another number is given.
 MAX_ITERATIONS, MAX_SWEEPS = 50, 1000
 #: The constraints follow the state for so many iterations; then they are held. Those of a state that is not yet the
-#: solution may hold what the data tell and leave free what they do not: of 300 sets of 4 to 6 exposures and some 20 stars, with
-#: 15 px of static distortion that nobody knew, 21 never settled with 6, one with 12, none with 20. Not for ever: where few
-#: stars of a reference bend the plane by much, state and constraints may chase each other.
+#: solution may hold what the data tell and leave free what they do not: of 300 sets of 4 to 6 exposures and some 20
+#: stars, with 15 px of static distortion that nobody knew, 21 never settled with 6, one with 12, none with 20. Not for
+#: ever: where few stars of a reference bend the plane by much, state and constraints may chase each other.
 _MADE = 20
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
 

@@ -17,7 +17,7 @@ from ..equations import criterion, elimination
 from ..equations.leverage import leverages
 
 _DETERMINED = 1e-4  # information [1/px^2]: what is held wrong by some pixels shows where 100 px would be beyond doubt
-_PROBES = 200  # patterns up to which a trace is exact, and random combinations beyond: right to 1 %
+_PROBES = 64  # patterns up to which a trace is exact, and random combinations beyond: right to 2 %
 _RANK = 1e-3  # part of its variance without a fit that a combination must keep to count
 
 
@@ -187,12 +187,13 @@ class Residuals:
             for k in (0, 1):
                 root = np.sqrt(problem.weight[k, part])
                 own, more = root * blocks.values[:, part], root * values[problem.n_modes :]
-                own = np.linalg.qr(own.T)[0]
-                more = more.T - own @ (own.T @ more.T)
-                u, size, _ = np.linalg.svd(more, full_matrices=False)
-                u = u[:, size > _RANK * size.max(initial=1e-300)][:, : max(len(part) - problem.n_modes, 0)]
-                t += np.sum((u.T @ e[k, part]) ** 2)
-                nu += np.sum(u**2 * (1 - self.star_share[part])[:, None]) - np.sum((u.T @ self.released[k, part]) ** 2)
+                more = more - more @ own.T @ np.linalg.pinv(own @ own.T, hermitian=True) @ own
+                size, vectors = np.linalg.eigh(more @ more.T)
+                kept = size > _RANK**2 * max(size[-1], 1e-300)
+                kept[: max(len(size) - len(part) + problem.n_modes, 0)] = False
+                u = (vectors[:, kept] / np.sqrt(size[kept])).T @ more
+                t += np.sum((u @ e[k, part]) ** 2)
+                nu += np.sum(u**2 * (1 - self.star_share[part])) - np.sum((u @ self.released[k, part]) ** 2)
         return self.score(t, nu), degree
 
     def _values(self, i, part, degree):

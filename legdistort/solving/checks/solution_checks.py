@@ -60,7 +60,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
         absolute_check(solution),
         extrapolation_check(residuals),
         rejection_check(solution),
-        completeness_check(solution),
+        completeness_check(solution, residuals),
         duplicates_check(solution, residuals),
         header_check(header_distortion),
     ]
@@ -334,13 +334,10 @@ def rejection_check(solution):
     return Check("rejection", "pass", share, GROSS_ERRORS, words)
 
 
-def completeness_check(solution):
+def completeness_check(solution, residuals):
     """Does every exposure have the stars that lie on it?"""
-    table, names = solution.observations, solution.names
-    found, expected = np.zeros(len(names)), np.zeros(len(names))
-    index = {name: i for i, name in enumerate(names)}
-    number = np.array([index.get(name, -1) for name in table["exposure"]])
-    have = np.bincount(number[number >= 0], minlength=len(names))
+    names, found = solution.names, np.diff(residuals.problem.start)
+    expected = np.zeros(len(names))
     common = solution.positions[np.isfinite(solution.positions[:, 0])]
     for i, name in enumerate(names):
         ny, nx = solution.shapes[name]
@@ -348,7 +345,7 @@ def completeness_check(solution):
         q = common @ pose[:, :2].T + pose[:, 2]
         margin = 0.02 * max(nx, ny)
         inside = (q > margin).all(axis=1) & (q < np.array([nx, ny]) - margin).all(axis=1)
-        expected[i], found[i] = np.count_nonzero(inside), have[i]
+        expected[i] = np.count_nonzero(inside)
     share = np.minimum(found / np.maximum(expected, 1), 1)
     usual = np.median(share)
     p = stats.binom.cdf(np.minimum(found, expected), expected, usual) * len(names)
