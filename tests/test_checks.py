@@ -401,7 +401,7 @@ def test_a_run_is_asked_for_odd_frames_and_a_blurred_stack():
     assert [c.state for c in images] == ["warn", "warn", "pass"]
     assert "exp03 are more elongated" in images[0].sentence
     assert "1.2" in images[1].sentence
-    assert "exp05 are more wide" in image_check(quality(blurred)).sentence
+    assert "exp05 are wider" in image_check(quality(blurred)).sentence
     assert image_check(None).state == "unknown"
 
 

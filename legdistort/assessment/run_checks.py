@@ -40,14 +40,14 @@ def image_check(quality):
                      "whether one is unlike the others", "")  # fmt: skip
     names, values = list(found), np.array(list(found.values()))
     odd = [
-        (*_odd_one(np.log(values[:, 0])), WIDE, "wide", f"{np.median(values[:, 0]):.2f} px", values[:, 0]),
-        (*_odd_one(values[:, 1]), ELONGATED, "elongated", f"{np.median(values[:, 1]):.2f}", values[:, 1]),
+        (*_odd_one(np.log(values[:, 0])), WIDE, "wider", f"{np.median(values[:, 0]):.2f} px", values[:, 0]),
+        (*_odd_one(values[:, 1]), ELONGATED, "more elongated", f"{np.median(values[:, 1]):.2f}", values[:, 1]),
     ]
     p, i, excess, least, word, usual, value = max(odd, key=lambda each: each[2] / each[3])
     if p < ODD and excess > least:
-        what = "FWHM" if word == "wide" else "ellipticity"
+        what = "FWHM" if word == "wider" else "ellipticity"
         return Check("images", "warn", value[i], None,
-                     f"stars of {names[i]} are more {word} than those of the others ({what} {value[i]:.2f}, usually "
+                     f"stars of {names[i]} are {word} than those of the others ({what} {value[i]:.2f}, usually "
                      f"{usual})",
                      "look at the frame (trailed, out of focus), or leave it out")  # fmt: skip
     return Check("images", "pass", value[i], None, f"stars of all {len(names)} exposures are alike (FWHM {odd[0][5]})")
