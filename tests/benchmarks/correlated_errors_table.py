@@ -234,7 +234,7 @@ def _between(matches, parts, common, correlated, axis):
             floors.append(np.full(len(rows), floor**2))
             place.append([times[name] for name in rows["exposure"]] if along == "time" else rows[along].value)
         place, part, floors = map(np.concatenate, (place, part, floors))
-        matrix = size**2 * np.exp(-np.abs(np.subtract.outer(place, place)) / correlated.length)
+        matrix = size**2 * correlated.correlation(np.subtract.outer(place, place))
         out[j] = part @ (matrix - np.diag(floors - correlated.floor**2)) @ part
     return out
 
