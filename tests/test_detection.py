@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from scipy.ndimage import correlate
 from scipy.spatial import cKDTree
 from star_images import GAIN, ladder, observe, positions, scattered, usable
 from star_images import image as render
@@ -13,6 +14,7 @@ from legdistort.inputs.exposures import Exposure
 from legdistort.measurement.background import smooth_light
 from legdistort.measurement.crowding import is_isolated
 from legdistort.measurement.detection import detect, prepare
+from legdistort.measurement.filters import gaussian_sums
 from legdistort.measurement.positions import measure
 from legdistort.measurement.profiles import moffat
 from legdistort.measurement.profiles.location import locate_stars
@@ -151,3 +153,16 @@ def test_a_width_that_no_star_has_is_an_error_within_seconds():
     with pytest.raises(InputError, match=r"raw: no stars to be seen: .* has a FWHM of \d+ pixels. .*fwhm="):
         measure(Exposure("raw", data, gain=1.0))
     assert time.process_time() - start < 5
+
+
+@pytest.mark.parametrize("shape", [(150, 70), (3, 200), (64, 1)])
+@pytest.mark.parametrize("sigma", [0.1, 0.9, 2.5])
+def test_gaussian_sums_are_those_of_scipy(shape, sigma):
+    """Over more rows than are in the cache at a time, fewer than the weights reach, and a single column."""
+    image = np.random.default_rng(1).normal(size=shape)
+    x = np.arange(-int(3 * sigma + 0.5), int(3 * sigma + 0.5) + 1)
+    weight = np.exp(-0.5 * (x[:, None] ** 2 + x**2) / sigma**2)
+    powers = (0, 0), (1, 0), (0, 1), (1, 1), (0, 2)
+    for sums, (i, j) in zip(gaussian_sums(image, sigma, powers), powers, strict=True):
+        expected = correlate(image, weight / weight.sum() * x[:, None] ** i * x**j, mode="constant")
+        np.testing.assert_allclose(sums, expected, atol=1e-13)

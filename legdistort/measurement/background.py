@@ -2,13 +2,13 @@
 
 import logging
 import warnings
-from functools import partial
 
 import numpy as np
 from astropy.stats import SigmaClip
 from photutils.background import Background2D
 from scipy.interpolate import BSpline, make_interp_spline
-from scipy.ndimage import gaussian_filter, gaussian_filter1d
+
+from .filters import gaussian, gaussian_sums
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +21,7 @@ _ROUNDS = 5  # from a noise that is several times too high, in crowded fields
 _BRIGHT = 5.0  # standard deviations of a binned pixel above the light around it: part of a star
 _ENOUGH = 1_000_000  # pixels: of more every fourth serves
 _FEWEST = 50  # pixels of a mesh that tell its noise
-_ORDERS = (0, 0), (0, 1), (1, 0), (0, 2), (2, 0), (1, 1)  # of moments, by rows and columns
+_POWERS = (0, 0), (1, 0), (0, 1), (2, 0), (0, 2), (1, 1)  # of y and x, of the moments of a plane
 _STEPS = 12  # of light, for the photon noise
 
 
@@ -51,19 +51,15 @@ def sky_and_noise(data, mask, mesh, *, steep=False):
         for exclude in (50.0, 100.0):
             try:
                 found = Background2D(
-                    data,
-                    (high, box[1]),
-                    mask=mask,
-                    sigma_clip=clip,
-                    exclude_percentile=exclude,
-                    filter_size=1 if steep else 3,
+                    data, (high, box[1]), mask=mask, sigma_clip=clip, exclude_percentile=exclude, filter_size=1
                 )
             except ValueError:
                 log.debug("background: too few good pixels with exclude_percentile=%g", exclude)
             else:
-                rms = found.background_rms_mesh
-                sky = _enlarge(found.background_mesh, box, shape, degree=3 if steep else 2)
-                return sky, _enlarge(rms, box, shape).clip(rms.min())
+                sky, rms = found.background_mesh, found.background_rms_mesh
+                if not steep:  # photutils would filter it with a loop in Python
+                    sky, rms = _medians_around(sky), _medians_around(rms)
+                return _enlarge(sky, box, shape, degree=3 if steep else 2), _enlarge(rms, box, shape).clip(rms.min())
     values = clip(data[~mask] if not mask.all() else data.ravel(), masked=False)
     return tuple(np.full(shape, value, dtype=data.dtype) for value in (np.median(values), np.std(values)))
 
@@ -124,9 +120,8 @@ def smooth_light(signal, good, sigma, *, variance=None):
     step : int
         Pixels binned along each axis.
     """
-    step = max(1, int(sigma / 2))
-    n, total = _binned(good.astype(signal.dtype), step), _binned(np.where(good, signal, 0), step)
-    level, extrapolated = _planes(n, total, sigma / step, whole=good.all())
+    step, (n, total), whole = _counted(signal, good, sigma)
+    level, extrapolated = _planes(n, total, sigma / step, whole=whole)
     if variance is not None:
         faint = total - n * level < _BRIGHT * np.sqrt(n * variance[::step, ::step])
         level, extrapolated = _planes(n * faint, total * faint, sigma / step)
@@ -135,10 +130,29 @@ def smooth_light(signal, good, sigma, *, variance=None):
 
 def mean_light(signal, good, sigma):
     """Means around binned pixels, with Gaussian weights; and the pixels binned along each axis."""
-    step = max(1, int(sigma / 2))
-    smooth = partial(gaussian_filter, sigma=sigma / step, mode="constant", truncate=3.0)
-    total, n = (smooth(_binned(np.where(good, values, 0).astype(np.float32), step)) for values in (signal, 1))
-    return total / np.maximum(n, np.finfo(n.dtype).eps), step
+    step, (n, total), whole = _counted(signal, good, sigma)
+    (total,) = gaussian_sums(total, sigma / step)
+    weight = _moments(n, sigma / step, 0)[0] if whole else gaussian_sums(n, sigma / step)[0]
+    return total / np.maximum(weight, np.finfo(n.dtype).eps), step
+
+
+def _counted(signal, good, sigma):
+    """Pixels binned along each axis; number of good ones and their sum in these bins; whether all are good."""
+    step, whole = max(1, int(sigma / 2)), good.all()
+    if whole:
+        rows, columns = (np.add.reduceat(np.ones(n, signal.dtype), np.arange(0, n, step)) for n in signal.shape)
+        return step, (np.outer(rows, columns), _binned(signal, step)), whole
+    return step, (_binned(good.astype(signal.dtype), step), _binned(np.where(good, signal, 0), step)), whole
+
+
+def _moments(n, width, order):
+    """`gaussian_sums` of `n` up to an order, where `n` is a product of functions of y and of x."""
+    out = []
+    for part in (n[:, 0] / n[0, 0], n[0]):
+        weights = [gaussian(width, power) for power in range(order + 1)]
+        padded = np.pad(part, len(weights[0]) // 2)
+        out.append([np.correlate(padded, weight, "valid").astype(n.dtype) for weight in weights])
+    return [np.outer(out[0][i], out[1][j]) for i, j in _POWERS if i + j <= order]
 
 
 def _planes(n, total, width, *, whole=False):
@@ -154,28 +168,13 @@ def _planes(n, total, width, *, whole=False):
         Whether no measurement is missing; sums of `n` are then products.
     """
     area = width**2
-    along = partial(gaussian_filter1d, sigma=width, mode="constant", truncate=3.0)
-
-    def sums(image, orders):
-        """Sums of Gaussian weight * image * offset^order, but for a factor: by derivatives of the Gaussian."""
-        down = {i: along(image, axis=0, order=i) for i in sorted({order[0] for order in orders})}
-        return (along(down[i], axis=1, order=j) for i, j in orders)
-
-    if whole:
-        column, row = ([along(part, order=i) for i in range(3)] for part in (n[:, 0] / np.maximum(n[0, 0], 1), n[0]))
-        moments = (np.outer(column[i], row[j]) for i, j in _ORDERS)
-    else:
-        moments = sums(n, _ORDERS)
-    weight, in_x, in_y, in_xx, in_yy, in_xy = moments
-    weight += np.finfo(n.dtype).eps
-    scale = area / weight
-    mean, by_x, by_y = sums(total, _ORDERS[:3])
-    mean /= weight
-    x, y = scale * in_x, scale * in_y
+    weight, *moments = _moments(n, width, 2) if whole else gaussian_sums(n, width, _POWERS)
+    weight = 1 / (weight + np.finfo(n.dtype).eps)
+    mean, by_y, by_x = (sums * weight for sums in gaussian_sums(total, width, _POWERS[:3]))
+    y, x, yy, xx, xy = (moment * weight for moment in moments)
     # never narrower than a quarter of the Gaussian's width: what is left of a star beside a gap tells no slope
-    xx, yy = (np.maximum(area + area * scale * m - c**2, 0.06 * area) for m, c in ((in_xx, x), (in_yy, y)))
-    xy = area * scale * in_xy - x * y
-    by_x, by_y = scale * by_x - x * mean, scale * by_y - y * mean
+    xx, yy = np.maximum(xx - x**2, 0.06 * area), np.maximum(yy - y**2, 0.06 * area)
+    xy, by_x, by_y = xy - x * y, by_x - x * mean, by_y - y * mean
     determinant = np.maximum(xx * yy - xy**2, 0.02 * area**2)
     shift = ((yy * by_x - xy * by_y) * x + (xx * by_y - xy * by_x) * y) / determinant
     return mean - shift, np.abs(shift)
@@ -188,20 +187,21 @@ def _binned(image, step):
         return image
     if ny % step or nx % step:
         image = np.pad(image, ((0, -ny % step), (0, -nx % step)))
-    return sum(image[i::step, j::step] for i in range(step) for j in range(step))
+    rows = sum(image[i::step] for i in range(step))
+    return sum(rows[:, j::step] for j in range(step))
 
 
 def _spread(image, step, shape):
     """Binned pixels interpolated linearly to all pixels."""
-    for axis, n in enumerate(shape):
-        padded = np.pad(np.moveaxis(image, axis, 0), ((1, 1), (0, 0)), mode="edge")
-        out = np.empty((step * image.shape[axis], padded.shape[1]), dtype=image.dtype)
+    for n in shape[::-1]:
+        padded = np.pad(np.ascontiguousarray(image.T), ((1, 1), (0, 0)), mode="edge")
+        image = np.empty((step * (len(padded) - 2), padded.shape[1]), dtype=image.dtype)
         for i in range(step):
             off = (i + 0.5) / step - 0.5  # from the middle of the bin
             beside = padded[2:] if off > 0 else padded[:-2]
-            out[i::step] = (1 - abs(off)) * padded[1:-1] + abs(off) * beside
-        image = np.moveaxis(out[:n], 0, axis)
-    return np.ascontiguousarray(image)
+            image[i::step] = (1 - abs(off)) * padded[1:-1] + abs(off) * beside
+        image = image[:n]
+    return image
 
 
 def sky_variance(residual, filtered, light, good, *, start, noise, photon, mesh, floor):
@@ -271,11 +271,16 @@ def _means_of_meshes(image, use, mesh):
     if not told.any():
         return None
     mean = np.where(told, total / np.maximum(n, 1), np.nan)
-    padded = np.pad(mean, 1, constant_values=np.nan)
-    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*mean.shape, 9)
-    with warnings.catch_warnings(action="ignore"):  # of a mesh with nothing around it
-        smooth = np.nanmedian(around, axis=-1)
+    smooth = _medians_around(mean)
     return np.where(np.isfinite(smooth), smooth, np.median(mean[told]))
+
+
+def _medians_around(mesh):
+    """Median of every mesh and those around it, without NaN."""
+    padded = np.pad(mesh, 1, constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*mesh.shape, 9)
+    with warnings.catch_warnings(action="ignore"):  # of a mesh with nothing around it
+        return np.nanmedian(around, axis=-1)
 
 
 def _photon_slope(square, light):

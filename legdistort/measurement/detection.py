@@ -3,9 +3,10 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import binary_dilation, gaussian_filter
+from scipy.ndimage import binary_dilation
 
 from .background import is_steep, mean_light, sky_and_noise, sky_variance, smooth_light
+from .filters import gaussian, gaussian_sums
 from .sidelobes import side_light
 
 _CLIPPED = 0.986  # standard deviation of a unit normal after clipping at 3 sigma until nothing changes
@@ -86,9 +87,9 @@ def bright_peaks(frame, fwhm):
     """
     sigma = _kernel(fwhm)
     seen = frame.good & ~frame.saturated
-    signal = np.where(frame.good, frame.signal, np.float32(0))
+    signal = frame.signal if frame.good.all() else np.where(frame.good, frame.signal, np.float32(0))
     filtered, noise = _blur(signal, sigma), np.float32(_norm(sigma)) * frame.variance
-    y, x = np.nonzero((filtered > 0) & (filtered**2 > _STANDS_OUT**2 * noise))
+    y, x = _above(filtered, _STANDS_OUT * np.sqrt(noise))
     mean, step = mean_light(signal, seen, _LOCAL * sigma)
     ratio = (filtered[y, x] - mean[y // step, x // step]) / np.sqrt(noise[y, x])
     use = (ratio > _STANDS_OUT) & _is_highest(filtered, x, y, max(1, int(fwhm / 2)))
@@ -121,19 +122,20 @@ def detect(frame, fwhm, threshold):
     sigma = _kernel(fwhm)
     seen = frame.good & ~frame.saturated
     # The sky is put back: in crowded fields its map follows the halos, in steps that would pass for stars.
-    data = frame.signal + frame.sky
-    level, extrapolated, step = smooth_light(data, seen, _LOCAL * sigma, variance=frame.variance)
-    residual = np.where(frame.good, data - level, np.float32(0))
+    residual = frame.signal + frame.sky
+    light, extrapolated, step = smooth_light(residual, seen, _LOCAL * sigma, variance=frame.variance)
+    residual -= light
+    residual[~frame.good] = 0
+    light -= frame.sky
     filtered, norm = _blur(residual, sigma), np.float32(_norm(sigma))
     variance = frame.variance
     if not frame.noise_given:
-        light = frame.signal - residual
         variance, photon = sky_variance(
             residual, filtered, light, frame.good, start=variance, noise=norm, photon=frame.photon, mesh=MESH,
             floor=frame.floor,
         )  # fmt: skip
         frame = replace(frame, variance=variance)
-        variance = variance + np.float32(photon) * np.maximum(light, 0)
+        variance = variance + np.float32(photon) * np.maximum(light, 0, out=light)
     x, y, ratio = _peaks(residual, filtered, norm * variance, frame, (sigma, fwhm, threshold))
     # of the light of a peak, the part that is neither a side lobe nor an error of the light taken off
     spoilt = binary_dilation(frame.saturated, iterations=int(np.ceil(2 * sigma))) if frame.saturated.any() else None
@@ -161,7 +163,7 @@ def _peaks(residual, filtered, variance, frame, settings):
     sigma, fwhm, threshold = settings
     whole = frame.good.all() and not frame.noise_given  # a smooth map of the variance needs no smoothing
     image = filtered if whole else _weighted_ratio(residual, variance, frame, sigma)
-    y, x = np.nonzero((filtered > 0) & (filtered**2 > threshold**2 * variance) if whole else image > threshold)
+    y, x = _above(image, threshold * np.sqrt(variance) if whole else threshold)
     peak = _is_highest(image, x, y, max(1, int(fwhm / 2)))
     x, y = x[peak], y[peak]
     return x, y, filtered[y, x] / np.sqrt(variance[y, x]) if whole else image[y, x]
@@ -182,7 +184,12 @@ def _weighted_ratio(residual, variance, frame, sigma):
 
 
 def _blur(image, sigma):
-    return gaussian_filter(image, sigma, mode="constant", truncate=3.0)
+    return gaussian_sums(image, sigma)[0]
+
+
+def _above(image, limit):
+    """Pixels, y and x, in which an image exceeds a limit."""
+    return np.divmod(np.flatnonzero(image > limit), image.shape[1])  # ten times as fast as np.nonzero
 
 
 def _is_highest(image, x, y, reach):
