@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from .background import is_steep, mean_light, sky_and_noise, sky_variance, smooth_light
-from .filters import gaussian, gaussian_sums
+from .filters import gaussian_sums
 from .sidelobes import side_light
 
 _CLIPPED = 0.986  # standard deviation of a unit normal after clipping at 3 sigma until nothing changes

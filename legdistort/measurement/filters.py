@@ -56,4 +56,3 @@ def _correlate(shifted, weights, power, out, spare):
         combine(shifted[-1 - k], shifted[k], out=spare)
         spare *= weights[-1 - k]
         out += spare
-
