@@ -270,7 +270,7 @@ def test_own_error_is_that_of_the_joint_fit():
     size = built.corrections.n_amplitudes
     normal = np.diag(np.concatenate([np.zeros(4 * n), built.precision]))
     for i in range(n):
-        grid = built.corrections.reduced(terms[i][None, :, None] * flux[i] * raw[i].T[:, None, :])
+        grid = built.corrections.reduced(terms[i][None, :, None] * flux[i] * raw[i][:, None, :])
         jac = np.zeros((len(grid), 4 * n + size))
         jac[:, 4 * i : 4 * i + 4], jac[:, 4 * n :] = slopes[i].T, grid
         columns.append(jac)

@@ -26,14 +26,14 @@ STARS_NEEDED = 12
 DEGREE = 2
 
 _PER_FWHM = 4  # knots: cubic splines then follow a diffraction-limited core to 0.1 % of its peak
-_ITERATIONS = 4
-_ANEW = 3  # with other stars, from a PSF that is nearly right
+_ITERATIONS = 3
+_ANEW = 2  # with other stars, from a PSF that is nearly right
 _MOVE = 0.3  # FWHM, largest step of a star in one iteration
 _SETTLE = 2  # iterations of the stars alone
 _DEVIANT = 3.0  # times the median of chi2 / dof: such a star is no single one
 _SIZES = (0.01, 10.0)  # of corrections, relative to those expected: nothing less is told from none
 _EVEN = 0.02  # relative error that makes bright stars count alike in the mean of what is left
-_AT_ONCE = 16  # stars whose normal matrices are in memory
+_AT_ONCE = 32  # stars whose normal matrices are in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +188,7 @@ def improved(before, stars, *, iterations=_ANEW):
     grids, longest = base + corrections.grids(terms @ corrections.raw(amplitudes)), _MOVE * _PER_FWHM * spacing
     for k in range(iterations):
         linear = _linearise(stars, params, grids, spacing, misfit)
-        if k >= iterations - 2:  # what is left over is that of a PSF that follows the stars
+        if k == iterations - 1:  # what is left over is that of a PSF that follows the stars
             misfit = _misfit(_linearise(stars, params, grids, spacing, 0.0))
             linear = _linearise(stars, params, grids, spacing, misfit)
             used = _single(linear)
@@ -305,7 +305,7 @@ def _normal(stars, linear, params, corrections, spacing, terms, used):
 
     Returns too how the stars' parameters follow the raw corrections at their place, (n, 4, n_modes).
     """
-    n_terms, n_modes = terms.shape[1], len(corrections.modes)
+    n_terms, n_modes = terms.shape[1], corrections.modes.shape[-1]
     first, second = np.tril_indices(n_terms)
     pairs = np.zeros((len(first), n_modes, n_modes))
     right = np.zeros((n_terms, n_modes))
@@ -314,14 +314,13 @@ def _normal(stars, linear, params, corrections, spacing, terms, used):
     for part in np.array_split(rows, max(1, len(rows) // _AT_ONCE)):
         # single precision for the patterns: all that follows sees the same ones
         light = corrections.on_stamps(params[part, :2].astype(np.float32), stars.half, spacing).astype(float)
-        light *= params[part, 2, None, None]
-        weighted = light * linear.weights[part, None]
-        mixed = linear.slopes[part] @ weighted.swapaxes(1, 2)
-        followed[part] = linear.inverse[part] @ mixed
-        own = weighted @ light.swapaxes(1, 2) - mixed.swapaxes(1, 2) @ followed[part]
-        residual = linear.residual[part, :, None]
-        told = linear.slopes[part] @ (linear.weights[part, :, None] * residual)
-        rest = (weighted @ residual - followed[part].swapaxes(1, 2) @ told)[:, :, 0]
+        root = np.sqrt(linear.weights[part])[:, :, None]
+        light *= params[part, 2, None, None] * root
+        slopes, residual = linear.slopes[part] * root.swapaxes(1, 2), linear.residual[part, :, None] * root
+        followed[part] = linear.inverse[part] @ (slopes @ light)
+        light -= slopes.swapaxes(1, 2) @ followed[part]  # what the star's own parameters do not take up
+        across = light.swapaxes(1, 2)
+        own, rest = across @ light, (across @ residual)[:, :, 0]
         t = terms[part]
         pairs += np.tensordot(t[:, first] * t[:, second], own, (0, 0))
         right += t.T @ rest

@@ -27,12 +27,12 @@ class Corrections:
 
     Attributes
     ----------
-    modes : ndarray, shape (n_modes, k, k)
-        Raw patterns, as spline coefficients.
+    modes : ndarray, shape (k, k, n_modes)
+        Raw patterns, as spline coefficients by y and x.
     size : int
         Knots of the whole grid.
-    free : tuple of ndarray, shape (n_modes, n_free)
-        For every term of the field.
+    free : tuple of ndarray, shape (n, n_free)
+        For every term of the field, of the first n raw patterns.
     """
 
     modes: np.ndarray
@@ -67,18 +67,18 @@ class Corrections:
         j, i = j[order], i[order]
         block = base[np.ix_(inner, inner)]
         expected = block + _FLOOR * base.max() / (1 + (at[:, None] ** 2 + at**2) / fwhm**2)
-        modes = along.T[j][:, :, None] * along.T[i][:, None, :] * expected
-        modes *= np.sqrt(both[j, i])[:, None, None] * variance.max()
+        modes = along[:, None, j] * along[:, i] * expected[:, :, None]
+        modes *= np.sqrt(both[j, i]) * variance.max()
         light, core, first = moments(n, spacing, fwhm)[:, inner]
         edge = np.zeros_like(block)
         edge[0], edge[-1], edge[:, 0], edge[:, -1] = 1, 1, 1, 1
         taken = [np.outer(light, light), np.outer(core, first), np.outer(first, core), edge]
-        taken = np.tensordot(modes, np.stack(taken, axis=-1), 2).T
+        taken = np.tensordot(np.stack(taken), modes, 2)
         free = []
         for degree in (min(a + b, 2) for a, b in powers):
             m = np.count_nonzero(both[j, i] > _CUT[degree])
             kept = null_space(taken[:, :m] / np.linalg.norm(taken, axis=1, keepdims=True))
-            free.append(_SIZE[degree] * np.pad(kept, ((0, len(modes) - m), (0, 0))))
+            free.append(_SIZE[degree] * kept)
         return cls(modes, n, tuple(free))
 
     @property
@@ -92,17 +92,20 @@ class Corrections:
 
     @property
     def _inner(self):
-        edge = (self.size - self.modes.shape[1]) // 2
+        edge = (self.size - len(self.modes)) // 2
         return slice(edge, self.size - edge)
 
     def raw(self, amplitudes):
         """Amplitudes (n_amplitudes,) as sums of raw patterns, (n_terms, n_modes)."""
         ends = np.cumsum([f.shape[1] for f in self.free])[:-1]
-        return np.stack([f @ a for f, a in zip(self.free, np.split(amplitudes, ends), strict=True)])
+        out = np.zeros((len(self.free), self.modes.shape[-1]))
+        for row, f, a in zip(out, self.free, np.split(amplitudes, ends), strict=True):
+            row[: len(f)] = f @ a
+        return out
 
     def reduced(self, raw):
         """The adjoint of `raw`: (..., n_terms, n_modes) to (..., n_amplitudes)."""
-        return np.concatenate([raw[..., t, :] @ f for t, f in enumerate(self.free)], axis=-1)
+        return np.concatenate([raw[..., t, : len(f)] @ f for t, f in enumerate(self.free)], axis=-1)
 
     def normal(self, pairs):
         """Normal matrix of the amplitudes, its lower half, from those of the raw patterns for the pairs of terms.
@@ -112,23 +115,23 @@ class Corrections:
         ends = np.cumsum([0, *(f.shape[1] for f in self.free)])
         out = np.zeros((ends[-1], ends[-1]))
         for k, (t, u) in enumerate(zip(*np.tril_indices(len(self.free)), strict=True)):
-            block = self.free[t].T @ pairs[k] @ self.free[u]
+            left, right = self.free[t], self.free[u]
+            block = left.T @ pairs[k, : len(left), : len(right)] @ right
             out[ends[t] : ends[t + 1], ends[u] : ends[u + 1]] = block
         return out
 
     def grids(self, raw):
         """Whole grids (n, size, size) of sums of raw patterns (n, n_modes)."""
         out = np.zeros((len(raw), self.size, self.size))
-        out[:, self._inner, self._inner] = np.tensordot(raw, self.modes, 1)
+        out[:, self._inner, self._inner] = np.moveaxis(self.modes @ raw.T, -1, 0)
         return out
 
     def on_stamps(self, xy, half, spacing):
-        """Raw patterns on the stamps of stars, (n, n_modes, npix), in the precision of the places."""
+        """Raw patterns on the stamps of stars, (n, npix, n_modes), in the precision of the places."""
         x, y = self._bases(xy, half, spacing)
-        m, k, n, size = *self.modes.shape[:2], *x.shape[:2]
-        along = (self.modes.astype(xy.dtype).reshape(m * k, k) @ x.reshape(n * size, k).T).reshape(m, k, n, size)
-        across = y @ along.transpose(2, 1, 0, 3).reshape(n, k, m * size)
-        return across.reshape(n, size, m, size).swapaxes(1, 2).reshape(n, m, size**2)
+        k, _, m = self.modes.shape
+        along = y @ self.modes.astype(xy.dtype).reshape(k, -1)
+        return (x[:, None] @ along.reshape(*y.shape[:2], k, m)).reshape(len(xy), -1, m)
 
     def against(self, images, xy, half, spacing):
         """Products of images (n, a, npix) on the stamps of stars with the raw patterns there, (n, a, n_modes)."""
@@ -136,7 +139,7 @@ class Corrections:
         x, y = self._bases(xy, half, spacing)
         size = 2 * half + 1
         laid = y[:, None].swapaxes(2, 3) @ images.reshape(n, a, size, size) @ x[:, None]
-        return laid.reshape(n, a, -1) @ self.modes.reshape(len(self.modes), -1).T
+        return laid.reshape(n, a, -1) @ self.modes.reshape(-1, self.modes.shape[-1])
 
     def _bases(self, xy, half, spacing):
         pixels = np.arange(-half, half + 1, dtype=xy.dtype)
