@@ -10,7 +10,7 @@ class Flag(IntFlag):
     EDGE = 2  #: less than one FWHM from the edge of the image, or beside a gap: a third of its pixels are missing
     HOT = 4  #: much sharper than the stars of the frame: hot pixel or cosmic ray
     NOT_CONVERGED = 8  #: the fit found no position, or one far from the detection
-    INSIGNIFICANT = 16  #: the signal-to-noise ratio is below 3
+    INSIGNIFICANT = 16  #: the signal-to-noise ratio of the fit is below 3, or below the detection limit
     BLENDED = 32  #: another detection within two FWHM (fitted together with it, or its model was subtracted)
     MASKED = 64  #: bad or outlying pixels within one FWHM of the centre were left out of the fit
     SHARED_SHAPE = 128  #: too faint or disturbed for a shape of its own: fitted with that of the frame
@@ -19,3 +19,5 @@ class Flag(IntFlag):
 
 #: Flags that make a detection useless as a star position.
 UNUSABLE = Flag.SATURATED | Flag.EDGE | Flag.HOT | Flag.NOT_CONVERGED | Flag.INSIGNIFICANT
+#: Signal-to-noise ratio of a fit below which no star is significant.
+LEAST = 3.0

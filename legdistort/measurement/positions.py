@@ -19,7 +19,7 @@ from .crowding import crowding, is_deformed
 from .effective import frame_psf
 from .effective.building import STARS_NEEDED
 from .effective.model import EffectivePSF
-from .flags import UNUSABLE, Flag
+from .flags import LEAST, UNUSABLE, Flag
 from .injection import calibrate_frame
 from .options import MeasureOptions
 from .profiles import frame_fit, moffat
@@ -70,7 +70,8 @@ def measure(
     fwhm : float, optional
         Full width at half maximum of the stars [pix]; found in every frame if not given.
     threshold : float
-        Detection limit, signal-to-noise ratio of the filtered image.
+        Detection limit, signal-to-noise ratio of the filtered image; stars that do not reach it when fitted are
+        flagged ``INSIGNIFICANT``.
     max_stars : int, optional
         Keep the brightest so many usable detections of every frame, and no others.
     box : int, optional
@@ -329,7 +330,9 @@ def _measure_frame(exposure, options):
     usable = ((fitted.flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
     deformed = _is_deformed(stamps, fitted, usable)
     stars = _moffat_stars(fitted) if measured is None else _psf_stars(fitted, measured)
-    stars = stars._replace(flags=stars.flags | np.where(deformed, Flag.DEFORMED, 0))
+    faint = stars.snr < max(LEAST, options.threshold)  # what passed the limit with noise that the whole star lacks
+    flags = np.where(deformed, Flag.DEFORMED, 0) | np.where(faint, Flag.INSIGNIFICANT, 0)
+    stars = stars._replace(flags=stars.flags | flags)
     table = _table(name, stamps, stars)
     table = table[_distinct(table, fwhm)]
     table["crowding"] = crowding(table, fwhm)
@@ -377,7 +380,7 @@ def _psf_stars(fitted, measured):
     fit = measured.fit
     known = fitted.flags & ~(Flag.NOT_CONVERGED | Flag.INSIGNIFICANT | Flag.SHARED_SHAPE)
     lost = ~fit.converged | ~(fit.params[:, 2] > 0) | measured.astray
-    flags = known | np.where(lost, Flag.NOT_CONVERGED, 0) | np.where(measured.snr < 3, Flag.INSIGNIFICANT, 0)
+    flags = known | np.where(lost, Flag.NOT_CONVERGED, 0)
     flux_err = np.sqrt(np.maximum(fit.covariance[:, 2, 2], 0))
     width = moffat.fwhm(fitted.found.params)
     return _Stars(

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..flags import Flag
+from ..flags import LEAST, Flag
 from . import moffat
 from .blends import fit_groups, group_stars, partner_models
 from .first_fit import fit_once, point_chi2, started, weighted
@@ -123,7 +123,7 @@ def _flags(stamps, found, good, troubles, width):
         Flag.SHARED_SHAPE: wild,
         Flag.HOT: hot,
         Flag.NOT_CONVERGED: _is_wild(found, width),
-        Flag.INSIGNIFICANT: snr < 3,
+        Flag.INSIGNIFICANT: snr < LEAST,
         Flag.MASKED: (near & stamps.inside & ~good & ~stamps.saturated).any(axis=1),
         Flag.SATURATED: (near & stamps.saturated).any(axis=1),
         Flag.EDGE: (near & ~seen).sum(axis=1) > _GAP * near.sum(axis=1),
