@@ -32,6 +32,7 @@ _MOVE = 0.3  # FWHM, largest step of a star in one iteration
 _SETTLE = 2  # iterations of the stars alone
 _DEVIANT = 3.0  # times the median of chi2 / dof: such a star is no single one
 _SIZES = (0.01, 10.0)  # of corrections, relative to those expected: nothing less is told from none
+_VARIES = 0.1  # size at first of those that vary over the field: it grows in fewer iterations than it shrinks
 _EVEN = 0.02  # relative error that makes bright stars count alike in the mean of what is left
 _AT_ONCE = 32  # stars whose normal matrices are in memory
 
@@ -157,12 +158,15 @@ def build(stars, start, base):
     variation = Polynomial(DEGREE, ((nx - 1) / 2, (ny - 1) / 2), (nx / 2, ny / 2))
     corrections = Corrections.around(base.coefficients[0], base.spacing, variation.powers, stars.half)
     none = np.zeros(corrections.n_amplitudes)
+    degrees = corrections.by_term(np.array([i + j for i, j in variation.powers]))
+    precision = np.where(degrees > 0, _VARIES**-2.0, 1.0)
     psf = replace(
         base,
         coefficients=np.pad(base.coefficients, ((0, len(variation.powers) - 1), (0, 0), (0, 0))),
         variation=variation,
     )
-    first = Built(base.coefficients[0], psf, start, np.ones(len(start), dtype=bool), corrections, none, none + 1, ())
+    used = np.ones(len(start), dtype=bool)
+    first = Built(base.coefficients[0], psf, start, used, corrections, none, precision, ())
     return improved(first, stars, iterations=_ITERATIONS)
 
 
