@@ -131,7 +131,7 @@ def known_from_header(header, data, *, integer):
     elif re.fullmatch(r"(e-?|electrons?)(/s(ec)?|s-1|s\*\*-1)", unit):
         known["gain"] = known["exposure_time"]
     if known["saturation"] is None and integer:
-        known["saturation"] = _piled_up(data)
+        known["saturation"] = piled_up(data)
     return known
 
 
@@ -144,13 +144,15 @@ def _number(header, keywords):
     return None
 
 
-def _piled_up(data):
-    """Saturation level of integer data: a maximum more frequent than all of the 5 % below it together."""
+def piled_up(data):
+    """Saturation level: a maximum more frequent than all of the 5 % below it together, in pixels side by side."""
     top = np.nanmax(data) if np.isfinite(data).any() else np.nan
     if not top > 0:
         return None
-    at_top, below = np.count_nonzero(data == top), np.count_nonzero((data > 0.95 * top) & (data < top))
-    return float(top) if at_top >= 5 and at_top > below and at_top < 0.1 * data.size else None
+    flat = data == top
+    at_top, below = np.count_nonzero(flat), np.count_nonzero((data > 0.95 * top) & (data < top))
+    beside = max(np.count_nonzero(flat[1:] & flat[:-1]), np.count_nonzero(flat[:, 1:] & flat[:, :-1]))
+    return float(top) if max(5, below + 1) <= at_top < min(0.1 * data.size, 8 * beside + 1) else None
 
 
 def _as_float(data, name):

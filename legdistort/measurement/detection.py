@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from ..inputs.exposures import piled_up
 from .background import is_steep, mean_light, sky_and_noise, sky_variance, smooth_light
 from .filters import gaussian_sums
 from .sidelobes import side_light
@@ -55,6 +56,7 @@ def prepare(exposure, *, mesh=MESH):
     """An `Exposure` as a `Frame`; `mesh` is that of the sky [pix]."""
     gain, read_noise, saturation = exposure.gain, exposure.read_noise, exposure.saturation
     data = np.where(exposure.mask, 0, exposure.data).astype(np.float32)
+    saturation = saturation or piled_up(data)  # flat tops of which no header told
     saturated = (data >= saturation) & ~exposure.mask if saturation else np.zeros(data.shape, dtype=bool)
     bad = exposure.mask | saturated
     sky, rms = sky_and_noise(data, bad, mesh)
