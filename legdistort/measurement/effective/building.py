@@ -26,7 +26,7 @@ STARS_NEEDED = 12
 DEGREE = 2
 
 _PER_FWHM = 4  # knots: cubic splines then follow a diffraction-limited core to 0.1 % of its peak
-_ITERATIONS = 3
+_ITERATIONS = 4
 _ANEW = 2  # with other stars, from a PSF that is nearly right
 _MOVE = 0.3  # FWHM, largest step of a star in one iteration
 _SETTLE = 2  # iterations of the stars alone
