@@ -3,16 +3,19 @@
 For every PSF and third of brightness: rms deviation of positions from the truth over the Cramer-Rao bound of the true
 PSF, rms of deviation / error, false stars, completeness, and the part that `match` would keep. Positions are compared
 after the common polynomial of the PSF's field order, which the bounds and errors go through as well. Frames and what
-every method found in them are kept in FOLDER; ``--redo`` measures again.
+every method found in them are kept in FOLDER; ``--redo`` measures again. ``--crowded`` makes the table of crowded
+fields instead: rms of deviation / error of isolated stars with no other near, by signal-to-noise ratio.
 """
 
 import argparse
 import os
+import pickle
 import sys
 import warnings
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 import ao_images as ao
@@ -26,6 +29,8 @@ from legdistort.measurement.positions import measure
 #: Signal-to-noise ratios, flux over its bound, between the thirds.
 THIRDS = np.geomspace(10, 1000, 4)
 CELLS = [f"{kind}-{strehl:g}" for kind in ao.SHAPES for strehl in ao.STREHLS] + ["psfao-0"]
+#: Strehl ratios and numbers of stars of crowded fields, the edges between their columns, and how far the next star is.
+CROWDS, RATIOS, LONELY = [(0.1, 60), (0.3, 110), (0.6, 214), (0.1, 214)], [30, 100, 300], 10.0
 #: A row farther from all true stars than this is false; a star's own row is nearer than the other [pix].
 FALSE, OWN = 3.0, 2.0
 
@@ -140,16 +145,42 @@ def show(cell, name, folder, n_frames, redo):
     print(f"{cell:14s} {name:11s} {false} |", " | ".join(texts), f"| {np.mean(seconds):5.1f} s")
 
 
+def show_crowded(strehl, n, name, folder, n_frames, redo):
+    """One row of the table of crowded fields."""
+    parts = []
+    for seed in range(n_frames):
+        path = folder / f"crowd-{strehl:g}-{n}-{seed}.pickle"
+        if not path.exists():
+            path.write_bytes(pickle.dumps(ao.crowded_frame(strehl, seed, n=n)))
+        frame = pickle.loads(path.read_bytes())
+        found = found_in(folder, frame, name, redo)
+        rows = compare(frame, [part[found[3]] for part in found[:4]] + found[4:])[0]
+        lonely = cKDTree(frame.xy).query(frame.xy, k=2)[0][:, 1] > LONELY
+        rows[:, 0] = np.digitize(frame.snr, RATIOS)
+        parts.append(rows[lonely & (frame.snr > THIRDS[0]) & (rows[:, 1] > 0)])
+    table = np.concatenate(parts)
+    cells = (table[table[:, 0] == k] for k in range(len(RATIOS) + 1))
+    texts = (f"{rms(rows[:, 3:5]):5.2f} [{rms(rows[:, 5:7]):5.2f}] {len(rows):4d}" for rows in cells)
+    print(f"Strehl {strehl:g}, {n} stars, {name:11s}", " | ".join(texts))
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--psf", nargs="+", choices=CELLS, default=CELLS)
     parser.add_argument("--method", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--frames", type=int, default=10)
+    parser.add_argument("--crowded", action="store_true")
     parser.add_argument("--redo", action="store_true")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     warnings.simplefilter("ignore")  # of photutils: fits without convergence
+    if given.crowded:
+        print("rms / bound, [rms of deviation / error], stars; by signal-to-noise ratio: 10-30, 30-100, 100-300, above")
+        for strehl, n in CROWDS:
+            for name in given.method:
+                show_crowded(strehl, n, name, given.folder, min(given.frames, 4), given.redo)
+        sys.exit()
     print(
         "% false stars, % found that are brighter than all but 1 % of false ones; all stars, then thirds of "
         "brightness: rms / bound, the same by the median, [rms of deviation / error], % found, % kept by match"
