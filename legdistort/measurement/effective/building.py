@@ -192,7 +192,7 @@ def improved(before, stars, *, iterations=_ANEW):
     grids, longest = base + corrections.grids(terms @ corrections.raw(amplitudes)), _MOVE * _PER_FWHM * spacing
     for k in range(iterations):
         linear = _linearise(stars, params, grids, spacing, misfit)
-        if k == iterations - 1:  # what is left over is that of a PSF that follows the stars
+        if k >= iterations // 2:  # what is left over is that of a PSF that follows the stars
             misfit = _misfit(_linearise(stars, params, grids, spacing, 0.0))
             linear = _linearise(stars, params, grids, spacing, misfit)
             used = _single(linear)
