@@ -3,6 +3,7 @@
 import json
 import logging
 import time
+import uuid
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -30,8 +31,8 @@ from .wcs.storage import write_wcs
 
 log = logging.getLogger(__name__)
 
-#: What `run` and the command ``solve`` leave in their folder, and replace there.
-RESULTS = ("solution.asdf", "stars.ecsv", "wcs", "psf", "mosaic.fits", "report.html", "summary.json")
+#: What `run` and the command ``solve`` leave in their folder, and replace or remove there.
+RESULTS = ("solution.asdf", "stars.ecsv", "wcs/*.asdf", "psf/*.fits", "mosaic.fits", "report.html", "summary.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +142,6 @@ def run(
     LegdistortError
         With the file, exposure or argument at fault.
     """
-    out = Path(out)
     check_results(out, overwrite)
     measuring = _step_options(MeasureOptions, measuring, "measuring", psf=psf)
     matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures)
@@ -151,36 +151,35 @@ def run(
     reference, tying["epoch"] = check_reference(reference, **tying, method=solving.method)
     parallel.check_workers(workers)
     share, timings = {"workers": workers, "progress": progress}, {}
-    with _timed(timings, "read"):
-        exposures, bad = _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress, camera)
-        solving = replace(solving, prior=_known_prior(prior, exposures, degree))
-    with _timed(timings, "measure"):
-        detections, psfs = measure_with_psfs(exposures, measuring, **share)
-    with _timed(timings, "match"):
-        matches = _also_left_out(match(detections, exposures=exposures, camera=camera, **vars(matching)), bad)
-    with _timed(timings, "solve"):
-        solution = solve(matches, **vars(solving), reference=reference, **tying)
-        solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
-    with _timed(timings, "coadd"):
-        kept = [exposure for exposure in exposures if (exposure.frame or exposure.name) in solution.names]
-        mosaic = coadd(kept, solution, **vars(coadding), **share)
-    with _timed(timings, "assess"):
-        quality = _if_possible(stack_quality.assess, mosaic, solution.by_detector, exposures=kept)
-    comparison = stacks = None
-    if compare:
-        with _timed(timings, "compare"):
-            comparison = baselines.compare(matches, solution, prior=solving.prior)
-            if quality:
-                stacks = _if_possible(stack_quality.compare_stacks, kept, comparison, mosaic=mosaic, **vars(coadding))
-    with outputs.replacing_folder(out) as target:
+    with outputs.replacing_folder(out, former=RESULTS) as target:
+        check_results(out, overwrite)  # again: nobody else writes there any more
+        with _timed(timings, "read"):
+            exposures, bad = _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress, camera)
+            solving = replace(solving, prior=_known_prior(prior, exposures, degree))
+        with _timed(timings, "measure"):
+            detections, psfs = measure_with_psfs(exposures, measuring, **share)
+        with _timed(timings, "match"):
+            matches = _also_left_out(match(detections, exposures=exposures, camera=camera, **vars(matching)), bad)
+        with _timed(timings, "solve"):
+            solution = solve(matches, **vars(solving), reference=reference, **tying)
+            solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
+        with _timed(timings, "coadd"):
+            kept = [exposure for exposure in exposures if (exposure.frame or exposure.name) in solution.names]
+            mosaic = coadd(kept, solution, **vars(coadding), **share)
+        with _timed(timings, "assess"):
+            quality = _if_possible(stack_quality.assess, mosaic, solution.by_detector, exposures=kept)
+        comparison = stacks = None
+        if compare:
+            with _timed(timings, "compare"):
+                comparison, stacks = _compared(matches, solution, solving, quality and mosaic, kept, coadding)
         with _timed(timings, "write"):
             write_results(solution, target, psfs=psfs)
             mosaic.write(target / "mosaic.fits")
         summary = summarise(solution, timings=timings) | _assessed(solution, quality, comparison, stacks)
         shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks}
         write_report(target / "report.html", solution, summary=summary, **shown)
-        write_summary(target / "summary.json", summary)
-    return Run(out, solution, mosaic, summary)
+        write_summary(target / "summary.json", summary := summary | listed_files(target))
+    return Run(Path(out), solution, mosaic, summary)
 
 
 def _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress, camera):
@@ -245,6 +244,14 @@ def write_results(solution, target, *, psfs=None):
     write_psfs(psfs or {}, target / "psf")
 
 
+def listed_files(target):
+    """What the summary says of the files beside it: a word of its own for the run, and ``{name: SHA-256}``.
+
+    A program that finds a file with another checksum sees that results of two runs are mixed there.
+    """
+    return {"run": uuid.uuid4().hex, "files": outputs.contents(target)}
+
+
 def write_summary(path, summary):
     """Write figures as JSON, in the place of those that are there."""
     with outputs.replacing(path, overwrite=True) as file:
@@ -278,6 +285,13 @@ def summarise(solution, *, timings=None):
     }
 
 
+def _compared(matches, solution, solving, mosaic, kept, coadding):
+    """Other corrections, and the stacks that they make where that of the run could be judged."""
+    comparison = baselines.compare(matches, solution, prior=solving.prior)
+    stacks = mosaic and _if_possible(stack_quality.compare_stacks, kept, comparison, mosaic=mosaic, **vars(coadding))
+    return comparison, stacks
+
+
 def _if_possible(judge, *args, **kwargs):
     """What a judgement of the mosaic says, or None: a run does not fail because no star can be measured in it."""
     try:
@@ -290,7 +304,12 @@ def _if_possible(judge, *args, **kwargs):
 def check_results(out, overwrite):
     """Raise `InputError` if `out` cannot be a folder, or holds results and `overwrite` is false."""
     outputs.check_folder(out)
-    there = [name for name in RESULTS if (Path(out) / name).exists()]
+    out = Path(out)
+    outputs.settle(out)
+    there = [name for name in dict.fromkeys(Path(each).parts[0] for each in RESULTS) if (out / name).exists()]
+    for name in there:
+        if (out / name).is_dir() is not (name in ("wcs", "psf")):
+            raise InputError(f"{out / name} is in the place of a result: move it away, or give another folder")
     if there and not overwrite:
         raise InputError(
             f"{out} already holds {', '.join(there)}; give overwrite=True (--overwrite) to replace a run, or another "

@@ -76,7 +76,7 @@ def test_a_folder_is_filled_and_keeps_the_rest(tmp_path):
     (out / "wcs").mkdir(parents=True)
     for name in ("mine.txt", "report.html", "wcs/stale.asdf"):
         (out / name).write_text("old")
-    with replacing_folder(out) as temporary:
+    with replacing_folder(out, former=("report.html", "wcs/*.asdf")) as temporary:
         (temporary / "report.html").write_text("new")
         (temporary / "wcs").mkdir()
         (temporary / "wcs" / "a.asdf").write_text("new")
@@ -104,14 +104,21 @@ def test_a_new_folder_with_its_parents(tmp_path):
     assert names(tmp_path) == ["x", "x/y", "x/y/a"]
 
 
-def test_a_file_in_the_place_of_a_folder_and_the_reverse(tmp_path):
+def test_a_file_in_the_place_of_a_folder_and_the_reverse_are_refused(tmp_path):
     (tmp_path / "out" / "was_folder").mkdir(parents=True)
     (tmp_path / "out" / "was_file").write_text("old")
-    with replacing_folder(tmp_path / "out") as temporary:
+    before = names(tmp_path)
+    with (
+        pytest.raises(InputError, match=r"was_folder is a folder, in the place of a file: move it away"),
+        replacing_folder(tmp_path / "out") as temporary,
+    ):
         (temporary / "was_folder").write_text("new")
+    with (
+        pytest.raises(InputError, match=r"was_file is a file, in the place of a folder: move it away"),
+        replacing_folder(tmp_path / "out") as temporary,
+    ):
         (temporary / "was_file").mkdir()
-    assert (tmp_path / "out" / "was_folder").is_file()
-    assert (tmp_path / "out" / "was_file").is_dir()
+    assert names(tmp_path) == before
 
 
 # --- checks before any work ---------------------------------------------------------------------------------------

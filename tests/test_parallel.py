@@ -448,6 +448,7 @@ class TestMosaicInBlocks:
             raise OSError("Not enough space on disk: requested 9, available 6")
 
         monkeypatch.setattr("legdistort.coaddition.mosaic.forget", forget)
+        monkeypatch.setattr("legdistort.runtime.disk_errors.free_bytes", lambda folder: 100)
         with pytest.raises(DiskFullError, match=r"No space left on the disk for .*m.fits: nothing was replaced"):
             mosaic.write(path, overwrite=True)
         assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == before

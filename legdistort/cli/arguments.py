@@ -1,6 +1,7 @@
 """What an option of the command line is: value from text, way to a function, paths checked before any work."""
 
 import argparse
+from pathlib import Path
 
 from ..inputs.exposure_files import expand_paths
 from ..runtime.outputs import check_file, check_folder, check_not_read
@@ -112,7 +113,7 @@ def check_paths(arguments, groups):
     for folder in named["results"]:
         from ..pipeline import RESULTS
 
-        replaced += [folder / name for name in RESULTS]
+        replaced += [folder / Path(name).parts[0] for name in RESULTS]
     for path in replaced:
         check_not_read(path, inputs)
     for path in named["file"]:

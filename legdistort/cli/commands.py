@@ -225,24 +225,23 @@ def do_match(a):
 )
 def do_solve(a):
     """``legdistort solve``."""
-    from ..pipeline import check_results, summarise, write_results, write_summary
+    from ..pipeline import RESULTS, check_results, listed_files, summarise, write_results, write_summary
     from ..reporting.page import write_report
 
     check_results(a.out, a.overwrite)
-    table = _read_table(a.table, a)
-    shape = tuple(a.shape) if a.shape else table.meta.get("shapes")
-    camera = _camera(a.camera, table.meta.get("camera"))
-    if shape is None and camera is None:
-        raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
-    known = {"shape": shape, "camera": camera} | legdistort.Matches.read_meta(table.meta)
-    matches = legdistort.Matches.from_table(table, **known)
-    solution = provenance.with_inputs(legdistort.solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
-    summary = summarise(solution)
-    with outputs.replacing_folder(a.out) as target:
+    with outputs.replacing_folder(a.out, former=RESULTS) as target:  # a mosaic there does not belong to this solution
+        table = _read_table(a.table, a)
+        shape = tuple(a.shape) if a.shape else table.meta.get("shapes")
+        camera = _camera(a.camera, table.meta.get("camera"))
+        if shape is None and camera is None:
+            raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
+        known = {"shape": shape, "camera": camera} | legdistort.Matches.read_meta(table.meta)
+        matches = legdistort.Matches.from_table(table, **known)
+        solution = provenance.with_inputs(legdistort.solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
+        summary = summarise(solution)
         write_results(solution, target)
         write_report(target / "report.html", solution, summary=summary)
-        write_summary(target / "summary.json", summary)
-    (a.out / "mosaic.fits").unlink(missing_ok=True)  # of an earlier run: it does not belong to this solution
+        write_summary(target / "summary.json", summary := summary | listed_files(target))
     _report(a, solution, summary)
     return _status(a, summary)
 

@@ -27,9 +27,9 @@ FRAMES = {
 FLAGGED = {"dq_good": Option("flags that leave a pixel good: a sum, or 64,32", metavar="BITS")}
 STOPPING = {"stop_at_bad": Option("refuse blank and damaged frames, do not leave them out", action="store_true")}
 STRICT = {"strict": Option("exit status 3 if a check of the result fails", action="store_true")}
-NAMED_SOLUTION = {"solution": Option("solution.asdf", required=True, path="read")}
+NAMED_SOLUTION = {"solution": Option("solution.asdf, or the folder of the results with it", required=True, path="read")}
 SOLUTION = {
-    "solution": Option("solution.asdf", "solution", path="read"),
+    "solution": Option("solution.asdf, or the folder of the results with it", "solution", path="read"),
     "max_bytes": Option("accept arrays of so many bytes, unpacked (default 2147483648)", type=int),
 }
 COLUMNS = {

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, without_astropy_warnings
 from ..runtime.asdf_files import ARCHIVES, read_tree
+from ..runtime.outputs import settle_for
 from ..runtime.provenance import checksum
 from . import repetitions
 from .detector_images import every_id, images_of_detectors, of_detector
@@ -269,6 +270,8 @@ def expand_paths(paths):
     """The argument of `read_exposures` as a flat list of sources, patterns expanded."""
     if isinstance(paths, (str, Path, fits.HDUList)) or is_nddata(paths):
         paths = [paths]
+    paths = list(paths)
+    settle_for(*(path for path in paths if isinstance(path, (str, Path))))
     sources = []
     for source in paths:
         if isinstance(source, str) and any(c in source for c in "*?") and not Path(source).exists():

@@ -552,6 +552,7 @@ class Solution:
         Parameters
         ----------
         path : str or path
+            The file, or a folder of results with a ``solution.asdf``.
         max_bytes : int, optional
             Largest size of the arrays in the file, unpacked; 2 GiB if not given.
 

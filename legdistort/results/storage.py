@@ -111,7 +111,9 @@ def _exposure_tree(solution, name):
 
 
 def read_solution(path, kind, *, max_bytes=None):
-    """Read a solution of class `kind` from an ASDF file; see `Solution.read`."""
+    """Read a solution of class `kind` from an ASDF file or a folder of results; see `Solution.read`."""
+    path = Path(path)
+    path = path / "solution.asdf" if path.is_dir() else path
     tree = read_tree(path, max_bytes=MAX_BYTES if max_bytes is None else max_bytes).get("legdistort")
     if not isinstance(tree, dict) or "layout" not in tree:
         raise InputError(f"{path} holds no legdistort solution (no entry 'legdistort'); give a solution.asdf")

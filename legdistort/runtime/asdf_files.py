@@ -29,6 +29,7 @@ from asdf.tags.core.ndarray import asdf_datatype_to_numpy_dtype
 
 from ..exceptions import InputError
 from .checks import first_line
+from .outputs import settle_for
 
 #: Version of the ASDF standard that is written.
 ASDF_STANDARD = "1.5.0"
@@ -82,6 +83,8 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
     inside = content is not None
     if inside and b"fits:" in content:
         content = _without_fits_arrays(path, content)
+    if not inside:
+        settle_for(path)
     if not inside and not Path(path).exists():
         raise InputError(f"{path}: no such file")
     if not inside and not Path(path).is_file():

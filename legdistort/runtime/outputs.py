@@ -1,23 +1,32 @@
 """Outputs appear under their name only when they are complete, and replace nothing unless asked.
 
+A file is written in a hidden folder beside its place, and renamed. So is a folder that is new. The files of a folder
+that is there already are completed in a hidden folder inside it, ``.partial-RUN``, which becomes ``.commit-RUN``; from
+then on they are its content, and are moved to their places one by one. If that is interrupted, whatever of this package
+opens the folder next goes on with it (`settle`).
+
+An empty folder is not replaced by a new one: it may be the top of a disk, where somebody works just now, or have
+permissions of its own.
+
 Libraries that write are handed open files, never paths: some take parts of a path for those of a URL, or for a home
 folder, and would write elsewhere.
 """
 
+import hashlib
+import json
 import os
-import shutil
-import tempfile
-import uuid
-from contextlib import contextmanager
-from errno import EDQUOT, ENOSPC
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ..exceptions import DiskFullError, InputError
+from ..exceptions import InputError
+from . import locks
+from .disk_errors import told_when_full
+from .provenance import checksum
 
-
-def is_full(error):
-    """Whether an `OSError` is that of a full disk; writers do not always hand the number of it on."""
-    return error.errno in (ENOSPC, EDQUOT) or "space" in str(error) or "requested and" in str(error)
+_PARTIAL, _COMMIT = ".partial-", ".commit-"
+#: What a commit removes, beside its files.
+_PLAN = ".legdistort.json"
+_OURS = (locks.LOCK, _PLAN)
 
 
 def check_file(path, *, overwrite=False):
@@ -82,19 +91,6 @@ def check_not_read(path, inputs):
 
 
 @contextmanager
-def _told_when_full(path):
-    try:
-        yield
-    except OSError as error:
-        if not is_full(error):
-            raise
-        raise DiskFullError(
-            f"No space left on the disk for {path}: nothing was replaced or left half-written; make room, or write "
-            "elsewhere"
-        ) from None
-
-
-@contextmanager
 def replacing(path, *, overwrite=False):
     """An open binary file, to be written, that becomes `path` when the block ends well.
 
@@ -113,49 +109,257 @@ def replacing(path, *, overwrite=False):
     """
     path = Path(path)
     check_file(path, overwrite=overwrite)
-    # a name of its own, since a long one would become too long; absolute, since asdf takes ~x for somebody's home
-    temporary = path.absolute().with_name(f".partial-{uuid.uuid4().hex}")
-    try:
-        with _told_when_full(path):
-            with temporary.open("wb") as file:
-                yield file
-            os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    place = path.absolute()  # since asdf takes ~x for somebody's home
+    settle(place.parent)
+    with told_when_full(path, place.parent), locks.temporary_folder(place.parent, _PARTIAL) as (folder, _):
+        temporary = folder / "file"  # since a long name would become too long
+        with temporary.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, place)
+        _sync(place.parent)
 
 
 @contextmanager
-def replacing_folder(out):
-    """A temporary folder whose content moves into the folder `out` when the block ends well.
+def replacing_folder(out, *, former=()):
+    """A temporary folder whose content moves into the folder `out`, all or nothing, when the block ends well.
 
-    What stands in `out` under other names stays.
+    What stands in `out` under other names stays. As long as the block runs, `out` is locked against other writers.
 
     Parameters
     ----------
     out : str or path
         Made, with its parents, if it does not exist.
+    former : sequence of str
+        Patterns of names in `out`; files of earlier results that have no successor are removed. Of those in a
+        ``summary.json`` with a list of its files, only these.
+
+    Yields
+    ------
+    Path
+        The name of the folder ends in a word of its own.
 
     Raises
     ------
     InputError
-        As `check_folder` does.
+        As `check_folder` does; if another process writes there; if a folder stands in the place of a file, or the
+        reverse.
     DiskFullError
         If the disk is full.
     """
     out = Path(out)
     check_folder(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=out.parent, prefix=".partial-"))
+    place = out.absolute()
+    with told_when_full(out, place):
+        if place.exists():
+            with _locked(place, out):
+                _settle(place)
+                with locks.temporary_folder(place, _PARTIAL) as (folder, held):
+                    yield folder
+                    locks.before_renaming(held)
+                    _commit(folder, place, former)
+        else:
+            with _new_parents(place), _new_folder(place, out) as folder:
+                yield folder
+
+
+@contextmanager
+def _locked(place, out):
+    held = locks.lock(place)
+    if held is None:
+        raise InputError(f"another process is writing in {out}: wait until it has ended, or give another folder")
     try:
-        with _told_when_full(out):
-            yield temporary
-            out.mkdir(exist_ok=True)
-            for item in temporary.iterdir():
-                target = out / item.name
-                if target.is_dir() and not target.is_symlink():
-                    shutil.rmtree(target)
-                elif item.is_dir():
-                    target.unlink(missing_ok=True)
-                item.replace(target)
+        yield
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        locks.release(held, place)
+
+
+@contextmanager
+def _new_parents(place):
+    """Make the folders above a place; those that are empty after an error go again."""
+    made = [folder for folder in place.parents if not folder.exists()]
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
+
+
+@contextmanager
+def _new_folder(place, out):
+    """A folder beside a place that is renamed to it; two processes that want the same place want the same one."""
+    locks.remove_dead(place.parent, _PARTIAL)
+    folder = place.with_name(_PARTIAL + hashlib.sha256(os.fsencode(place.name)).hexdigest()[:32])
+    held = locks.make_locked(folder)
+    if held is None:
+        raise InputError(
+            f"another process is writing {out}: wait until it has ended, or give another folder (if there is none, "
+            f"remove {folder})"
+        )
+    where = folder
+    try:
+        yield folder
+        _sync_tree(folder)
+        locks.before_renaming(held)
+        try:
+            os.rename(folder, place)
+        except OSError as error:
+            if not os.path.lexists(place):
+                raise
+            raise InputError(f"{out} was made by somebody else meanwhile ({error.strerror}): give another") from None
+        where = place
+        _sync(place.parent)
+    finally:
+        if where is folder:
+            locks.remove(folder)
+        locks.release(held, where)
+
+
+def contents(folder):
+    """``{name: SHA-256}`` of the files in a folder and those below it."""
+    found = {}
+    for path in sorted(Path(folder).rglob("*")):
+        if path.is_file() and path.name not in _OURS:
+            with path.open("rb") as file:
+                found[path.relative_to(folder).as_posix()] = checksum(file)
+    return found
+
+
+def settle(*folders):
+    """Put in order what was interrupted in folders: finish a commit, remove what is incomplete.
+
+    Raises
+    ------
+    InputError
+        If a commit cannot be finished.
+    """
+    for folder in map(Path, folders):
+        if folder.is_dir() and os.access(folder, os.R_OK):
+            names = {name[: len(start)] for name in os.listdir(folder) for start in (_PARTIAL, _COMMIT)}
+            if _PARTIAL in names and os.access(folder, os.W_OK):
+                locks.remove_dead(folder, _PARTIAL)
+            if _COMMIT in names:
+                _settle_locked(folder)
+
+
+def settle_for(*paths):
+    """The same for the folders in which files lie that are about to be read, and those above them."""
+    parents = [Path(path).absolute().parent for path in paths]
+    settle(*dict.fromkeys(folder for parent in parents for folder in (parent, parent.parent)))
+
+
+def _settle_locked(folder):
+    """Finish commits, unless the one who made them is about to do it."""
+    try:
+        held = locks.lock(folder)
+        if held is not None:
+            try:
+                _settle(folder)
+            finally:
+                locks.release(held, folder)
+    except OSError as error:
+        raise InputError(
+            f"{folder} holds a complete result whose files are not all in their places, since its writer was stopped; "
+            f"they cannot be moved now ({error.strerror or error}): let somebody read it who may write there"
+        ) from None
+
+
+def _settle(folder):
+    locks.remove_dead(folder, _PARTIAL)
+    for commit in sorted(folder.glob(f"{_COMMIT}*")):
+        if (commit / _PLAN).is_file():
+            _finish(commit, folder)
+        elif (commit / locks.LOCK).is_file():  # finished but for its removal
+            locks.remove(commit)
+
+
+def _commit(folder, place, former):
+    """Make the content of a folder that of the place around it."""
+    items = [item.relative_to(folder) for item in sorted(folder.rglob("*")) if item.name not in _OURS]
+    _check_places(folder, place, items)
+    files = {item.as_posix() for item in items}
+    plan = {"remove": [name for name in former_files(place, former) if name not in files]}
+    (folder / _PLAN).write_text(json.dumps(plan), encoding="utf-8")
+    _sync_tree(folder)
+    commit = folder.with_name(_COMMIT + folder.name.removeprefix(_PARTIAL))
+    os.rename(folder, commit)
+    _sync(place)
+    _finish(commit, place)
+
+
+def _check_places(folder, place, items):
+    """Refuse what could not be moved once it is decided: then there is no way back."""
+    for item in items:
+        target = place / item
+        if target.is_dir() and not (folder / item).is_dir():
+            raise InputError(f"{target} is a folder, in the place of a file: move it away, or write elsewhere")
+        if (folder / item).is_dir() and os.path.lexists(target):
+            if not target.is_dir():
+                raise InputError(f"{target} is a file, in the place of a folder: move it away, or write elsewhere")
+            if target.stat().st_dev != place.stat().st_dev or not os.access(target, os.W_OK):
+                raise InputError(f"{target} is on another disk or cannot be written: move it away, or write elsewhere")
+
+
+def former_files(place, patterns):
+    """Names of the files of earlier results in a folder: of those with their names the ones that its summary lists.
+
+    Parameters
+    ----------
+    place : path
+    patterns : sequence of str
+
+    Returns
+    -------
+    list of str
+        All that have such names where there is no summary, or one of a version that does not list its files.
+    """
+    found = [path for pattern in patterns for path in place.glob(pattern) if not path.is_dir()]
+    names = [path.relative_to(place).as_posix() for path in found]
+    try:
+        listed = {"summary.json", *json.loads((place / "summary.json").read_text(encoding="utf-8"))["files"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        return names
+    return [name for name in names if name in listed]
+
+
+def _finish(commit, place):
+    """Move the files of a commit to their places; what was moved before, by whomever, is not there any more."""
+    remove = json.loads((commit / _PLAN).read_text(encoding="utf-8"))["remove"]
+    folders = {place}
+    for item in sorted(commit.rglob("*")):
+        target = place / item.relative_to(commit)
+        if item.is_dir():
+            target.mkdir(exist_ok=True)
+        elif item.name not in _OURS:
+            os.replace(item, target)
+        folders.add(target.parent)
+    for name in remove:
+        (place / name).unlink(missing_ok=True)
+        if "/" in name:
+            with suppress(OSError):  # others stand in it
+                (place / name).parent.rmdir()
+    for folder in folders:
+        _sync(folder)
+    (commit / _PLAN).unlink()
+    locks.remove(commit)
+
+
+def _sync_tree(folder):
+    """Have a folder with all that is in it on the disk, and not in the memory of the system only."""
+    for path in folder.rglob("*"):
+        _sync(path)
+    _sync(folder)
+
+
+def _sync(path):
+    if os.name != "nt" or path.is_file():  # folders cannot be opened on Windows
+        with suppress(FileNotFoundError, PermissionError):
+            descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)

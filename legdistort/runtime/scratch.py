@@ -1,16 +1,16 @@
 """Pixels on disk instead of in memory: those of exposures while a mosaic is being made, and the mosaic itself."""
 
 import mmap
-import shutil
 import tempfile
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..exceptions import DiskFullError, InputError
-from .outputs import is_full
+from . import locks
+from .disk_errors import free_bytes, is_full
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -55,24 +55,23 @@ def scratch_folder(parent, need, what="the pixels"):
     """
     place = Path(tempfile.gettempdir() if parent is None else parent)
     advice = "give another folder as scratch= (or in the environment, TMPDIR)"
-    try:
-        folder = tempfile.mkdtemp(prefix="legdistort-", dir=place)
-    except OSError as error:
-        raise InputError(f"no scratch folder can be made in {place} ({error.strerror}): {advice}") from None
-    try:
-        free = shutil.disk_usage(place).free
+    with ExitStack() as stack:
+        try:
+            folder, _ = stack.enter_context(locks.temporary_folder(place, "legdistort-", mode=0o700))
+        except OSError as error:
+            raise InputError(f"no scratch folder can be made in {place} ({error.strerror}): {advice}") from None
+        free = free_bytes(place)
         if free < need:
             raise DiskFullError(
                 f"{what} take {need / 2**30:,.2f} GB on disk while work goes on, {place} has {free / 2**30:,.2f} GB "
                 f"left: {advice}; if they should not be so many, look at the poses and at the grid"
             )
-        yield Path(folder)
-    except OSError as error:
-        if not is_full(error):
-            raise
-        raise DiskFullError(f"No space left on the disk of {place}: {advice}; no mosaic was made") from None
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        try:
+            yield folder
+        except OSError as error:
+            if isinstance(error, DiskFullError) or not is_full(error, place):
+                raise
+            raise DiskFullError(f"No space left on the disk of {place}: {advice}; no mosaic was made") from None
 
 
 def store(folder, planes):

@@ -326,6 +326,7 @@ class EffectivePSF:
         InputError
             If the file is none.
         """
+        outputs.settle_for(path)
         try:
             with fits.open(path) as hdus:
                 return cls.from_hdus(hdus, path)

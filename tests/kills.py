@@ -1,0 +1,402 @@
+"""SIGKILL at every operation on files: afterwards a folder of results is the old one or the new one, never a mixture.
+
+    python tests/kills.py --kills 200
+
+runs `solve`, `run`, `coadd` and `attach`, each into a new folder and over the results of an earlier call. Every
+rename, removal, making of a folder or file, every ``fsync`` and every write is one place to be killed at, a write in
+its middle. The process that works forks one child for every kill, as late as it can, so that the work itself is done
+once.
+
+After each kill the next reader (``legdistort show DIR`` where there is a solution) must succeed and leave a folder that
+is, byte for byte, the old one or the new one. Linux only.
+"""
+
+import argparse
+import builtins
+import contextlib
+import hashlib
+import io
+import json
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import fcntl
+
+from legdistort.cli.parser import main
+from legdistort.runtime import locks, outputs
+from legdistort.wcs import attachment
+
+#: What changes from call to call, the time aside: the word of a run and the seconds it took.
+VARYING = {"summary.json", "report.html"}
+_CHANGING = ("replace", "rename", "mkdir", "unlink", "remove", "rmdir", "fsync", "link", "symlink")
+
+
+class Operations:
+    """Counts what is done to files below a folder from the moment on it is armed; kills the process at one of them."""
+
+    def __init__(self, folder):
+        self.folder, self.count, self.killed_at, self.fork_at = str(folder), 0, None, None
+        self.first_write = None
+        self.armed = False
+
+    def install(self):
+        for name in _CHANGING:
+            setattr(os, name, self._counted(getattr(os, name)))
+        self.real_open = io.open
+        io.open = builtins.open = self._open
+
+    def _below(self, path, options):
+        descriptor = path if isinstance(path, int) else options.get("dir_fd")
+        path = os.path.abspath(os.fsdecode(path)) if descriptor is None else os.readlink(f"/proc/self/fd/{descriptor}")
+        return path.startswith(self.folder)
+
+    def _counted(self, function):
+        def counted(path, *args, **options):
+            if self.armed and self._below(path, options):
+                self.step()
+            return function(path, *args, **options)
+
+        return counted
+
+    def step(self, half=None):
+        """One operation; `half` does a part of it before the process dies."""
+        self.count += 1
+        if self.count == self.fork_at:
+            self.fork_at = None
+            self.serve()
+        if self.count == self.killed_at:
+            if half is not None:
+                half()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def _open(self, file, mode="r", *args, **options):
+        inside = isinstance(file, (str, os.PathLike)) and os.path.abspath(os.fspath(file)).startswith(self.folder)
+        if not (self.armed and inside and set(mode) & set("wxa")):
+            return self.real_open(file, mode, *args, **options)
+        self.step()
+        self.first_write = self.first_write or self.count
+        raw = _Raw(file, mode.replace("b", "").replace("t", ""), self)
+        buffered = io.BufferedWriter(raw)
+        if "b" in mode:
+            return buffered
+        return io.TextIOWrapper(buffered, encoding=options.get("encoding"), newline=options.get("newline"))
+
+
+class _Raw(io.FileIO):
+    def __init__(self, file, mode, operations):
+        super().__init__(file, mode)
+        self.operations = operations
+
+    def write(self, content):
+        content = memoryview(content).cast("B")
+        self.operations.step(lambda: super(_Raw, self).write(content[: len(content) // 2]))
+        return super().write(content)
+
+
+def state(folder):
+    """``{name: SHA-256}`` of all in a folder but the file of a lock; None without it."""
+    if not folder.exists():
+        return None
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.name == locks.LOCK:
+            continue
+        name = path.relative_to(folder).as_posix()
+        found[name] = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"
+    return found
+
+
+def in_child(function):
+    """Exit status of a function in a forked process; negative for the signal that killed it."""
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        status = 99
+        try:
+            status = function() or 0
+        except BaseException as error:
+            print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        finally:
+            sys.stderr.flush()
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def open_locks():
+    """Descriptors of files of locks in this process: ``{descriptor: path}``."""
+    found = {}
+    for name in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            path = os.readlink(f"/proc/self/fd/{name}")
+            if path.endswith(locks.LOCK):
+                found[int(name)] = path
+    return found
+
+
+class Case:
+    """A command whose output is a folder or a file, killed at some of its operations.
+
+    Parameters
+    ----------
+    name : str
+    arguments : list of str
+        Of the command line, without the output.
+    out : Path
+        Folder of results; the only thing in its own folder.
+    read : callable
+        What the next reader does with `out`; returns its exit status.
+    old : bool
+        Whether `out` holds the results of an earlier call.
+    """
+
+    def __init__(self, name, arguments, out, read, old):
+        self.name, self.arguments, self.out, self.read, self.old = name, arguments, out, read, old
+        self.root = out.parent
+        self.faults, self.kills, self.results = [], 0, {"old": 0, "new": 0}
+
+    def call(self):
+        return quietly([*self.arguments, *(["--overwrite"] if self.old else [])])
+
+    def run(self, n_kills):
+        """Kill it `n_kills` times at operations spread over all of them."""
+        self.before = state(self.out)
+        self.saved = Path(tempfile.mkdtemp(dir=self.root.parent)) / "saved"
+        shutil.copytree(self.root, self.saved, symlinks=True)
+        total, first = self._count()
+        self.after = None
+        places = sorted({round(1 + i * (total - 1) / max(n_kills - 1, 1)) for i in range(n_kills)})
+        self._restore(self.saved)
+        operations = Operations(self.root)
+        operations.fork_at = first
+        operations.serve = lambda: self._serve(operations, [k for k in places if k >= first])
+        for k in (k for k in places if k < first):
+            fresh = Operations(self.root)
+            fresh.killed_at = k
+            self._judge(k, in_child(lambda fresh=fresh: self._working(fresh)))
+            self._restore(self.saved)
+        reading, writing = os.pipe()
+
+        def server():
+            self._working(operations)
+
+        self._pipe = writing
+        status = in_child(server)
+        os.close(writing)
+        with os.fdopen(reading) as file:
+            for line in file:
+                k, verdict, fault = json.loads(line)
+                self._note(k, verdict, fault)
+        assert status == 0, f"{self.name}: the server ended with {status}"
+        return total
+
+    def _working(self, operations):
+        operations.install()
+        operations.armed = True
+        status = self.call()
+        operations.armed = False
+        return status
+
+    def _count(self):
+        """Number of operations of a whole call, and at which of them the first file is written."""
+        reading, writing = os.pipe()
+
+        def whole():
+            operations = Operations(self.root)
+            status = self._working(operations)
+            os.write(writing, json.dumps([operations.count, operations.first_write]).encode())
+            return status
+
+        status = in_child(whole)
+        os.close(writing)
+        assert status == 0, f"{self.name}: exit status {status}"
+        with os.fdopen(reading) as file:
+            return json.loads(file.read())
+
+    def _restore(self, saved):
+        shutil.rmtree(self.root)
+        shutil.copytree(saved, self.root, symlinks=True)
+
+    def _serve(self, operations, places):
+        """At the first write: one child for every kill, all from the same state of the disk. Only children return."""
+        operations.armed = False
+        here = self.saved.with_name("here")
+        shutil.copytree(self.root, here, symlinks=True)
+        held = open_locks()
+        for descriptor in held:
+            os.close(descriptor)  # shared with all children, or nobody would be dead
+        for k in [None, *places]:  # the first is not killed: its result is the new one
+            self._restore(here)
+            child = os.fork()
+            if child == 0:
+                for descriptor, path in held.items():
+                    again = os.open(path, os.O_RDWR)
+                    fcntl.flock(again, fcntl.LOCK_EX)
+                    os.dup2(again, descriptor)
+                    if again != descriptor:
+                        os.close(again)
+                operations.armed, operations.killed_at = True, k
+                return  # and the command goes on to its death
+            status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+            if k is None:
+                assert status == 0 == in_child(lambda: self.read(self.out))
+                self.after = state(self.out)
+                continue
+            verdict, fault = self._verdict(status)
+            os.write(self._pipe, (json.dumps([k, verdict, fault]) + "\n").encode())
+        os._exit(0)
+
+    def _judge(self, k, status):
+        self._note(k, *self._verdict(status))
+
+    def _note(self, k, verdict, fault):
+        self.kills += 1
+        if fault:
+            self.faults.append(f"{self.name}, operation {k}: {fault}")
+        else:
+            self.results[verdict] += 1
+
+    def _verdict(self, status):
+        if status != -signal.SIGKILL:
+            return None, f"it ended with {status}"
+        status = in_child(lambda: self.read(self.out))
+        found = state(self.out)
+        if self._like(found, self.after) and status == 0:
+            verdict = "new"
+        elif found == self.before and (status == 0 or not self.old):
+            verdict = "old"
+        else:
+            old, new = (each or {} for each in (self.before, self.after))
+            odd = {
+                k: ("old" if old.get(k) == v else "new" if new.get(k) == v else v[:8]) for k, v in (found or {}).items()
+            }
+            return None, f"neither old nor new (status of the reader {status}): {odd}"
+        outputs.settle(self.root)  # as the next writer beside it does
+        strays = [path.name for path in self.root.iterdir() if path != self.out]
+        return verdict, f"left behind: {strays}" if strays else None
+
+    def _like(self, found, wanted):
+        """Whether a folder is the new one; what changes from call to call must fit the list of the files."""
+        if found is None or wanted is None or found.keys() != wanted.keys():
+            return False
+        if any(found[name] != wanted[name] for name in wanted.keys() - VARYING):
+            return False
+        if "summary.json" not in found:
+            return True
+        listed = json.loads((self.out / "summary.json").read_text())["files"]
+        return all(found[name] == digest for name, digest in listed.items())
+
+
+def quietly(arguments):
+    """Exit status of a command, without a word of it unless it fails."""
+    told = io.StringIO()
+    with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+        status = main([*arguments, "--quiet"])
+    if status:
+        print(told.getvalue(), file=sys.stderr)
+    return status
+
+
+def show(out):
+    """The next reader of a folder with a solution."""
+    return quietly(["show", str(out)])
+
+
+def open_mosaic(out):
+    """The next reader of a folder with a mosaic."""
+    from astropy.io import fits
+
+    outputs.settle(out)
+    for path in out.glob("*.fits"):
+        with fits.open(path, checksum=True) as hdus:
+            assert [hdu.data for hdu in hdus]
+    return 0
+
+
+def open_frames(out):
+    """The next reader of a folder of frames."""
+    from legdistort import read_exposures
+
+    if out.exists():
+        read_exposures([str(path) for path in sorted(out.glob("*.fits"))])
+    return 0
+
+
+def cases(folder, only=None):
+    """The cases, prepared in a folder: every command into a new folder, and over the results of an earlier call."""
+    night = folder / "night"
+    quietly(["simulate", "--out", str(night), "--small"])
+    frames = [str(path) for path in sorted(night.glob("*.fits"))]
+    quietly(["measure", *frames, "--out", str(folder / "stars.ecsv")])
+    quietly(["match", str(folder / "stars.ecsv"), "--out", str(folder / "matched.ecsv")])
+    moffat = [*frames, "--psf", "moffat", "--degree", "1"]
+    quietly(["run", *moffat, "--out", str(folder / "run")])
+    solution = str(folder / "run" / "solution.asdf")
+    calls = {
+        "solve": (["solve", str(folder / "matched.ecsv"), "--degree", "2"], show, "."),
+        "run": (["run", *moffat], show, "."),
+        "coadd": (["coadd", *frames, "--solution", solution], open_mosaic, "mosaic.fits"),
+        "attach": (["attach", solution, *frames], open_frames, "."),
+    }
+    for name, (arguments, read, file) in calls.items():
+        if only not in (None, name):
+            continue
+        for old in (False, True):
+            out = folder / f"{name}-{'old' if old else 'new'}" / "room" / "out"
+            out.parent.mkdir(parents=True)
+            arguments_of = [*arguments, "--out", str(out / file)]
+            if old or name == "coadd":  # a file needs a folder
+                out.mkdir()
+                (out / "notes.txt").write_text("not ours")
+            if old:
+                earlier = arguments_of
+                if name == "solve":
+                    earlier = ["solve", str(folder / "matched.ecsv"), "--degree", "1", "--out", str(out)]
+                elif name == "run":  # with results that the next call has not
+                    earlier = ["run", *frames, "--psf", "effective", "--degree", "1", "--out", str(out)]
+                elif name == "coadd":
+                    earlier = [*arguments_of, "--combine", "median"]
+                elif name == "attach":
+                    earlier = [*arguments_of, "--asdf-only"]
+                assert quietly([*earlier]) == 0
+            yield Case(f"{name} {'over an earlier one' if old else 'into a new folder'}", arguments_of, out, read, old)
+
+
+def kill(n_kills, folder, only=None):
+    """Rows of the table, and the faults."""
+    attachment._now = lambda: "2026-01-01T00:00:00"
+    rows, faults = [], []
+    everything = list(cases(Path(folder), only))
+    for i, case in enumerate(everything):
+        share = n_kills * (i + 1) // len(everything) - n_kills * i // len(everything)
+        begin = time.perf_counter()
+        total = case.run(share)
+        rows.append((case.name, total, case.kills, case.results["old"], case.results["new"], len(case.faults),
+                     time.perf_counter() - begin))  # fmt: skip
+        faults += case.faults
+    return rows, faults
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--only", help="solve, run, coadd or attach")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        table, wrong = kill(given.kills, place, given.only)
+    print(f"{'command':28s} operations  kills   old   new  faults  seconds")
+    for name, total, kills, old, new, bad, seconds in table:
+        print(f"{name:28s} {total:10d} {kills:6d} {old:5d} {new:5d} {bad:7d} {seconds:8.1f}")
+    print(f"{'all':28s} {sum(r[1] for r in table):10d} {sum(r[2] for r in table):6d} {sum(r[3] for r in table):5d} "
+          f"{sum(r[4] for r in table):5d} {len(wrong):7d}")  # fmt: skip
+    print("\n".join(wrong))
+    sys.exit(bool(wrong))
