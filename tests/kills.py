@@ -38,6 +38,7 @@ from legdistort.wcs import attachment
 
 #: What changes from call to call, the time aside: the word of a run and the seconds it took.
 VARYING = {"summary.json", "report.html"}
+_LAST = 25
 _CHANGING = ("replace", "rename", "mkdir", "unlink", "remove", "rmdir", "fsync", "link", "symlink")
 
 
@@ -168,13 +169,17 @@ class Case:
         return quietly([*self.arguments, *(["--overwrite"] if self.old else [])])
 
     def run(self, n_kills):
-        """Kill it `n_kills` times at operations spread over all of them."""
+        """Kill it `n_kills` times; returns the number of operations."""
         self.before = state(self.out)
         self.saved = Path(tempfile.mkdtemp(dir=self.root.parent)) / "saved"
         shutil.copytree(self.root, self.saved, symlinks=True)
         total, first = self._count()
         self.after = None
-        places = sorted({round(1 + i * (total - 1) / max(n_kills - 1, 1)) for i in range(n_kills)})
+        spread = n_kills // 2  # over all operations; the others over the last, among which the commit is
+        places = {round(1 + i * (total - 1) / max(spread - 1, 1)) for i in range(spread)}
+        last = sorted(set(range(max(1, total - _LAST), total + 1)) - places)
+        n_last = min(n_kills - len(places), len(last))
+        places = sorted(places | {last[(2 * i + 1) * len(last) // (2 * n_last)] for i in range(n_last)})
         self._restore(self.saved)
         operations = Operations(self.root)
         operations.fork_at = first
@@ -369,6 +374,11 @@ def cases(folder, only=None):
                     earlier = [*arguments_of, "--asdf-only"]
                 assert quietly([*earlier]) == 0
             yield Case(f"{name} {'over an earlier one' if old else 'into a new folder'}", arguments_of, out, read, old)
+    if only in (None, "attach"):
+        out = folder / "attach-in-place" / "room" / "out"
+        shutil.copytree(night, out)
+        copies = [str(out / Path(frame).name) for frame in frames]
+        yield Case("attach in place", ["attach", solution, *copies, "--in-place"], out, open_frames, True)
 
 
 def kill(n_kills, folder, only=None):

@@ -25,13 +25,15 @@ from test_headers import detector, geometry  # noqa: F401  (a fixture)
 
 import legdistort
 from legdistort.cli.parser import main
-from legdistort.exceptions import ExportError, InputError
+from legdistort.exceptions import DiskFullError, ExportError, InputError, LegdistortError
 from legdistort.geometry import similarity
 from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.inputs.exposure_files import read_exposures
 from legdistort.results.solution import Solution
 from legdistort.runtime.fits_bytes import locate
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve
+from legdistort.wcs import attachment
 from legdistort.wcs.attachment import attach
 
 SHAPE = (60, 90)
@@ -660,3 +662,85 @@ def test_wrong_usage(options):
     with pytest.raises(SystemExit) as status:
         main(["attach", "solution.asdf", "frame.fits", *options])
     assert status.value.code == 2
+
+
+# --- all or nothing over a set ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def three(geometry, tmp_path):  # noqa: F811
+    """A solution of three frames, two of them in one folder and one in another; and these frames."""
+    solution = geometry(3, 2.0, shape=SHAPE, names=("a", "b", "c"))
+    folders = [tmp_path / "first", tmp_path / "first", tmp_path / "second"]
+    for folder in folders:
+        folder.mkdir(exist_ok=True)
+    return solution, [
+        write_frame(folder / f"{name}.fits") for folder, name in zip(folders, solution.names, strict=True)
+    ]
+
+
+def has_wcs(path):
+    with fits.open(path) as hdus:
+        return "ASDF" in hdus
+
+
+def everything(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("good", [0, 1, 2])
+def test_frames_are_changed_all_or_none(three, tmp_path, monkeypatch, good):
+    solution, paths = three
+    before, usual, written = everything(tmp_path), attachment._Plan.write, []
+
+    def write(plan, file):
+        if len(written) == good:
+            raise OSError(28, "No space left on device")
+        written.append(plan)
+        usual(plan, file)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(attachment._Plan, "write", write)
+        with pytest.raises(DiskFullError, match=r"No space left on the disk for .*: nothing was replaced"):
+            attach(solution, paths, in_place=True)
+    assert everything(tmp_path) == before
+    attach(solution, paths, in_place=True)
+    assert all(map(has_wcs, paths))
+    assert everything(tmp_path).keys() == before.keys()
+
+
+def test_what_has_changed_is_told_exactly(three, tmp_path, monkeypatch):
+    """A disk that fails between two folders, of which the last is the first to be done."""
+    solution, paths = three
+    before, usual = everything(tmp_path), os.rename
+
+    def rename(path, target):
+        if path.parent == paths[0].parent:
+            raise OSError(5, "Input/output error")
+        usual(path, target)
+
+    monkeypatch.setattr(os, "rename", rename)
+    with pytest.raises(LegdistortError, match=r"all of the files in \S*second were replaced, and none of the others"):
+        attach(solution, paths, in_place=True)
+    now = everything(tmp_path)
+    assert {path for path in now if now[path] != before.get(path)} == {paths[2]}
+
+
+def test_a_set_that_could_not_be_moved_is_moved_next_time(three, tmp_path, monkeypatch):
+    solution, paths = three
+    usual = os.replace
+
+    def replace(path, target):
+        if Path(target) == paths[1]:
+            raise OSError(5, "Input/output error")
+        usual(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", replace)
+        with pytest.raises(
+            LegdistortError, match=r"are complete, but lie in .*\.commit-.* in part.*Input/output error"
+        ):
+            attach(solution, paths[:2], in_place=True)
+    assert len(read_exposures(paths[:2], ext=0)) == 2
+    assert all(map(has_wcs, paths[:2]))
+    assert not [path for path in everything(tmp_path) if path not in paths]

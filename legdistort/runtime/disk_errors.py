@@ -4,7 +4,7 @@ import os
 from contextlib import contextmanager
 from errno import EDQUOT, EFBIG, ENOSPC
 
-from ..exceptions import DiskFullError
+from ..exceptions import DiskFullError, LegdistortError
 
 _SOME = 1 << 20  # bytes; a disk with less than these is full
 
@@ -51,7 +51,7 @@ def told_when_full(path, folder):
     """Errors of a full disk as `DiskFullError`, which names `path`; it is written in `folder`."""
     try:
         yield
-    except DiskFullError:
+    except LegdistortError:  # which says what it is
         raise
     except Exception as error:
         if not is_full(error, folder):

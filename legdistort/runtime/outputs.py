@@ -15,10 +15,10 @@ folder, and would write elsewhere.
 import hashlib
 import json
 import os
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from ..exceptions import InputError
+from ..exceptions import InputError, LegdistortError
 from . import locks
 from .disk_errors import told_when_full
 from .provenance import checksum
@@ -165,6 +165,40 @@ def replacing_folder(out, *, former=()):
 
 
 @contextmanager
+def replacing_folders(outs):
+    """`replacing_folder` of several folders at once; none changes unless the block ends well.
+
+    Parameters
+    ----------
+    outs : sequence of path
+
+    Yields
+    ------
+    dict
+        The temporary folder of each.
+
+    Raises
+    ------
+    LegdistortError
+        As `replacing_folder` does. If a disk fails between one and the next it says which have changed.
+    """
+    done = []
+    try:
+        with ExitStack() as stack:
+            folders = {}
+            for out in outs:
+                stack.push(lambda kind, *_, out=out: done.append(str(out)) if kind is None else None)
+                folders[out] = stack.enter_context(replacing_folder(out))
+            yield folders
+    except (LegdistortError, OSError) as error:
+        if not done:
+            raise
+        raise LegdistortError(
+            f"all of the files in {', '.join(done)} were replaced, and none of the others: {error}"
+        ) from error
+
+
+@contextmanager
 def _locked(place, out):
     held = locks.lock(place)
     if held is None:
@@ -288,7 +322,13 @@ def _commit(folder, place, former):
     commit = folder.with_name(_COMMIT + folder.name.removeprefix(_PARTIAL))
     os.rename(folder, commit)
     _sync(place)
-    _finish(commit, place)
+    try:
+        _finish(commit, place)
+    except OSError as error:
+        raise LegdistortError(
+            f"the results for {place} are complete, but lie in {commit} in part, since moving them to their places "
+            f"failed ({error.strerror or error}): the next command that reads or writes there goes on with it"
+        ) from error
 
 
 def _check_places(folder, place, items):

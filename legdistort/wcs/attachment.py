@@ -20,7 +20,7 @@ from ..exceptions import ExportError, InputError
 from ..inputs import exposure_files, exposure_names
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, splice
-from ..runtime.outputs import replacing, replacing_folder
+from ..runtime.outputs import replacing, replacing_folders
 from .storage import wcs_tree
 
 log = logging.getLogger(__name__)
@@ -94,7 +94,8 @@ def attach(
     out : str or path, optional
         Folder for the copies, made if it does not exist.
     in_place : bool
-        Change the files themselves, each in one step. Exactly one of `out` and `in_place` must be given.
+        Change the files themselves, all or none of a folder (see the page on files). Exactly one of `out` and
+        `in_place` must be given.
     kind : {"sip", "tpv", None}
         Form of the header; None leaves it alone and adds the ASDF extension only.
     max_error : float
@@ -129,15 +130,10 @@ def attach(
         plans += [plan] if plan.headers else []
     if not plans:
         raise InputError("none of the frames is part of the solution; give those it was made from")
-    if in_place:
+    with replacing_folders(dict.fromkeys(plan.target.parent for plan in plans)) as folders:
         for plan in plans:
-            with replacing(plan.target, overwrite=True) as file:
+            with replacing(folders[plan.target.parent] / plan.target.name) as file:
                 plan.write(file)
-    else:
-        with replacing_folder(out) as folder:
-            for plan in plans:
-                with replacing(folder / plan.target.name) as file:
-                    plan.write(file)
     return [Attachment(plan.target, *item) for plan in plans for item in plan.headers.items()]
 
 
