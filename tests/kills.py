@@ -301,19 +301,19 @@ class Case:
         return all(found[name] == digest for name, digest in listed.items())
 
 
-def quietly(arguments):
+def quietly(arguments, *, failing=False):
     """Exit status of a command, without a word of it unless it fails."""
     told = io.StringIO()
     with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
         status = main([*arguments, "--quiet"])
-    if status:
+    if status and not failing:
         print(told.getvalue(), file=sys.stderr)
     return status
 
 
 def show(out):
     """The next reader of a folder with a solution."""
-    return quietly(["show", str(out)])
+    return quietly(["show", str(out)], failing=True)
 
 
 def open_mosaic(out):

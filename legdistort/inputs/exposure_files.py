@@ -19,7 +19,7 @@ from tqdm import tqdm
 from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, without_astropy_warnings
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.outputs import settle_for
-from ..runtime.provenance import checksum
+from ..runtime.provenance import checksum, unchanged
 from . import repetitions
 from .detector_images import every_id, images_of_detectors, of_detector
 from .exposure_names import detector_name, exposure_name, in_header
@@ -62,6 +62,8 @@ class ExposureFile:
         ``(ny, nx)``.
     checksum, pixels : str
         SHA-256 of the file and of its image alone, in hexadecimal digits.
+    identity : tuple
+        Of the file as it was read then, see `legdistort.runtime.provenance.identity`.
     ext : int, str, (str, int) or None
         The extension asked for.
     dq_good : int or None
@@ -79,6 +81,7 @@ class ExposureFile:
     path: Path
     checksum: str
     pixels: str
+    identity: tuple
     ext: object = None
     has_gwcs: bool = False
     dq_good: int | None = None
@@ -91,19 +94,25 @@ class ExposureFile:
         Raises
         ------
         InputError
-            If the file is gone, or has become another one.
+            If the file is gone, or holds anything else than it did.
         """
-        if _is_asdf(self.path):
-            with _quiet(), _file(self.path) as file:
-                found = read_roman(file, str(self.path), self.path, self.dq_good)
-            planes = {name: getattr(found, name) for name in ("data", "mask", "uncertainty")}
-        else:
-            with _quiet(), _opened(self.path) as (_, hdulist), _told(f"{self.path}: {_DAMAGED}"):
-                planes = _planes(hdulist, find_image(hdulist, self.ext, self.path), self.dq_good)
-        shape = planes["data"].shape
-        if shape != self.shape:
-            raise InputError(f"{self.path} has changed: its image had shape {self.shape}, now {shape}")
+        with unchanged(self.path) as (found,):
+            if found != self.identity:
+                self._check_content()
+            if _is_asdf(self.path):
+                with _quiet(), _file(self.path) as file:
+                    image = read_roman(file, str(self.path), self.path, self.dq_good)
+                planes = {name: getattr(image, name) for name in ("data", "mask", "uncertainty")}
+            else:
+                with _quiet(), _opened(self.path) as (_, hdulist), _told(f"{self.path}: {_DAMAGED}"):
+                    planes = _planes(hdulist, find_image(hdulist, self.ext, self.path), self.dq_good)
         return Exposure(**{name: getattr(self, name) for name in _SHARED}, **planes)
+
+    def _check_content(self):
+        """The file may have been touched or moved, or be seen from another machine: what counts is its content."""
+        with _file(self.path) as file:
+            if checksum(file) != self.checksum:
+                raise InputError(f"{self.path} has changed since it was first read: its SHA-256 is another")
 
     def __repr__(self):
         return f"<ExposureFile {self.name!r}: {self.shape[1]} x {self.shape[0]} px in {self.path}>"
@@ -323,16 +332,18 @@ def _read(source, default, ext, good=None):
 
 
 def _open(source, default, ext, good=None, even_blank=True):
-    exposure = _read(source, default, ext, good)
-    exposure = exposure if even_blank else _not_blank(exposure)
     if not isinstance(source, (str, Path)):
-        return exposure
+        exposure = _read(source, default, ext, good)
+        return exposure if even_blank else _not_blank(exposure)
     path = Path(source)
-    with _file(path) as file:
-        digits = checksum(file)
+    with unchanged(path) as (identity,):
+        exposure = _read(source, default, ext, good)
+        exposure = exposure if even_blank else _not_blank(exposure)
+        with _file(path) as file:
+            digits = checksum(file)
     shared = {name: getattr(exposure, name) for name in _SHARED}
-    made = {"shape": exposure.shape, "checksum": digits, "pixels": _pixels(exposure), "ext": ext, "dq_good": good}
-    return ExposureFile(**shared, **made)
+    made = {"shape": exposure.shape, "checksum": digits, "pixels": _pixels(exposure), "identity": identity}
+    return ExposureFile(**shared, **made, ext=ext, dq_good=good)
 
 
 def _pixels(exposure):

@@ -61,14 +61,15 @@ def read_table(path, *, columns=None, origin=None, error=None):
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        found = formats.read(path)
+        with provenance.unchanged(path):
+            found, own = formats.read(path), provenance.checksums(path)
         parts = dict(enumerate(found, start=1)) if len(found) > 1 else dialects.chips(found[0]) or {None: found[0]}
         parts = {k: _understood(part, columns or {}, origin, error) for k, part in parts.items()}
     except InputError as fault:
         raise InputError(f"{path}: {fault}") from None
     table = _united(parts, path)
     inputs = table.meta.get("inputs")
-    table.meta["inputs"] = (inputs if isinstance(inputs, dict) else {}) | provenance.checksums(path)
+    table.meta["inputs"] = (inputs if isinstance(inputs, dict) else {}) | own
     return table
 
 

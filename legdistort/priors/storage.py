@@ -85,13 +85,15 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
         if given:
             raise InputError(f"{where} is a prior already: {', '.join(given)} cannot be chosen any more; leave it out")
         return dataclasses.replace(ready, **widths)
-    source = read_source(where, ext=ext, frame=frame)
-    try:
-        return kind.from_model(source, **options, **widths)
-    except InputError:
-        raise
-    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # its model had the say
-        raise InputError(f"{source.name}: the distortion cannot be evaluated ({error})") from None
+    files = where if isinstance(where, (list, tuple)) else [where]
+    with provenance.unchanged(*(path for path in files if isinstance(path, (str, Path)))):
+        source = read_source(where, ext=ext, frame=frame)
+        try:
+            return kind.from_model(source, **options, **widths)
+        except InputError:
+            raise
+        except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # its model had the say
+            raise InputError(f"{source.name}: the distortion cannot be evaluated ({error})") from None
 
 
 def _ready(where, kind):
@@ -113,5 +115,5 @@ def _of_solution(path, kind):
     shapes = {tuple(earlier.shapes[name]) for name in earlier.names}
     if len(shapes) > 1:
         raise InputError(f"{path} has detectors of several shapes, {sorted(shapes)}; it gives no single prior")
-    record = {"kind": "solution", "name": str(path), "files": provenance.checksums(path)}
+    record = {"kind": "solution", "name": str(path), "files": {Path(path).name: earlier.checksum}}
     return kind(earlier.coefficients.mean(axis=0), shape=shapes.pop(), source=record)

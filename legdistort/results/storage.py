@@ -24,7 +24,7 @@ from ..inputs import column_contract
 from ..inputs.plain_columns import plain, plain_columns, restored
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
-from ..runtime.provenance import checksums
+from ..runtime.provenance import checksums, unchanged
 from .catalogue_tie import Tie
 from .check import Check
 from .diagnostics import AliasedDegree, CorrelatedErrors, DegreeChoice, Diagnostics, ErrorLaw, UsedReference, Validation
@@ -114,13 +114,14 @@ def read_solution(path, kind, *, max_bytes=None):
     """Read a solution of class `kind` from an ASDF file or a folder of results; see `Solution.read`."""
     path = Path(path)
     path = path / "solution.asdf" if path.is_dir() else path
-    tree = read_tree(path, max_bytes=MAX_BYTES if max_bytes is None else max_bytes).get("legdistort")
+    with unchanged(path):
+        tree = read_tree(path, max_bytes=MAX_BYTES if max_bytes is None else max_bytes).get("legdistort")
+        (checksum,) = checksums(path).values()
     if not isinstance(tree, dict) or "layout" not in tree:
         raise InputError(f"{path} holds no legdistort solution (no entry 'legdistort'); give a solution.asdf")
     if tree["layout"] != LAYOUT:
         raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
     check_tree({"legdistort": tree}, "solution-1.0.0", path)
-    (checksum,) = checksums(path).values()
     return understood(path, partial(_from_tree, kind, checksum), tree)
 
 

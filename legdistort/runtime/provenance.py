@@ -2,10 +2,14 @@
 
 import datetime
 import hashlib
+import os
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+
+from ..exceptions import InputError
 
 PACKAGES = ("legdistort", "astropy", "gwcs", "asdf", "numpy", "scipy")
 
@@ -35,6 +39,36 @@ def checksums(*paths):
 def checksum(file):
     """SHA-256 of an open file from where it stands, in hexadecimal digits."""
     return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def identity(path):
+    """What tells one state of a file from another without reading it; None if there is no file."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+
+
+@contextmanager
+def unchanged(*paths):
+    """A block that reads files, and what it learns is of one state of them.
+
+    Yields
+    ------
+    list
+        The `identity` of each.
+
+    Raises
+    ------
+    InputError
+        If a file is another one in the end, by whatever of its identity.
+    """
+    before = [identity(path) for path in paths]
+    yield before
+    for path, known in zip(paths, before, strict=True):
+        if identity(path) != known:
+            raise InputError(f"{path} changed while it was read: wait until it is complete, and read it again")
 
 
 def with_inputs(solution, files):
