@@ -49,6 +49,11 @@ def main(argv=None):
             raise
         print(f"legdistort: {error} (nothing was left half-written)", file=sys.stderr)
         return 1
+    except MemoryError as error:
+        if arguments.debug:
+            raise
+        print(f"legdistort: not enough memory ({error}); nothing was left half-written", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("legdistort: interrupted; nothing was left half-written", file=sys.stderr)
         return 130

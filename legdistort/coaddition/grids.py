@@ -11,6 +11,7 @@ from astropy.wcs import WCS
 
 from ..exceptions import InputError, without_astropy_warnings
 from ..geometry.tangent_plane import TangentPlane
+from ..runtime.fits_bytes import open_fits
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +183,7 @@ def _check_pixels(wcs, name):
 
 def _of_image(path):
     first = None
-    with path.open("rb") as file, fits.open(file, memmap=False) as hdulist:
+    with path.open("rb") as file, open_fits(file, "the file") as hdulist:
         for hdu in hdulist:
             if hdu.is_image:
                 wcs = WCS(hdu.header, hdulist)

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, without_astropy_warnings
 from ..runtime.asdf_files import ARCHIVES, read_tree
+from ..runtime.fits_bytes import open_fits
 from ..runtime.outputs import settle_for
 from ..runtime.provenance import checksum, unchanged
 from . import repetitions
@@ -400,7 +401,7 @@ def _told(sentence):
 def _opened(path):
     """A FITS file, as it is and as an HDUList."""
     told = _told(f"{path}: cannot be read as FITS, damaged or something else")
-    with _file(path) as file, told, fits.open(file, memmap=False) as hdulist:
+    with _file(path) as file, told, open_fits(file, path) as hdulist:
         yield file, hdulist
 
 

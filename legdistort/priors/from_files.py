@@ -20,6 +20,7 @@ from ..geometry import basis
 from ..geometry.gsaoi import GSAOI_SIZE, gsaoi_static
 from ..inputs.exposure_files import read_exposures
 from ..runtime.asdf_files import ARCHIVES, read_tree
+from ..runtime.fits_bytes import open_fits
 from .from_objects import as_source, of_model
 
 #: Highest order of SIP polynomials in a header (the convention allows 9).
@@ -145,7 +146,7 @@ def _reference_model(model, tree, name):
 
 def _read_fits(path, ext, frame):
     try:
-        with path.open("rb") as file, fits.open(file, memmap=False) as hdulist:
+        with path.open("rb") as file, open_fits(file, path) as hdulist:
             if ext is None and "ASDF" in hdulist:
                 return _from_hdu(hdulist["ASDF"], frame, str(path))
             return _refuse(_from_hdulist(hdulist, ext, str(path)), frame=frame)

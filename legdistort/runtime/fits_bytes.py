@@ -1,4 +1,7 @@
-"""FITS files as bytes: some cards of a header change, HDUs are added, and every other byte stays as it is.
+"""FITS files as bytes: opened with their sizes bounded; and changed in some cards, every other byte as it is.
+
+A few kilobytes can unpack to any size, and a header can claim any. What is packed is unpacked here, up to a limit, and
+what a header claims must be in the file, or below it.
 
 Writing a file anew through astropy may reformat cards, scale integers or compress again; here none of that can happen.
 """
@@ -6,22 +9,31 @@ Writing a file anew through astropy may reformat cards, scale integers or compre
 import bz2
 import gzip
 import io
+import lzma
+import math
 import re
+import zipfile
 import zlib
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from astropy.io import fits
 
-from ..exceptions import InputError, without_astropy_warnings
+from ..exceptions import DamagedError, InputError, without_astropy_warnings
 
 BLOCK = 2880
 _CARD = 80
-_PACKED = {
-    b"\x1f\x8b": (gzip.decompress, lambda raw: gzip.compress(raw, mtime=0)),
-    b"BZ": (bz2.decompress, bz2.compress),
+#: Bytes that a packed file may unpack to, and that an image or table may claim beyond what is in its file.
+MAX_BYTES = 2 << 30
+_UNPACKERS = {
+    b"\x1f\x8b": gzip.open,
+    b"BZh": bz2.open,
+    b"\xfd7zXZ\0": lzma.open,
+    b"PK\x03\x04": lambda file: (archive := zipfile.ZipFile(file)).open(archive.infolist()[0]),
 }
+_PACKERS = {b"\x1f\x8b": lambda raw: gzip.compress(raw, mtime=0), b"BZh": bz2.compress}
 
 
 class Span(NamedTuple):
@@ -45,14 +57,88 @@ def read_bytes(path):
     if not path.is_file():
         raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
     raw = path.read_bytes()
-    unpack, pack = _PACKED.get(raw[:2], (bytes, bytes))
+    pack = next((packer for magic, packer in _PACKERS.items() if raw.startswith(magic)), bytes)
     try:
-        raw = unpack(raw)
-    except (OSError, EOFError, ValueError, zlib.error) as error:
+        raw = raw if pack is bytes else unpacked(io.BytesIO(raw), path).getvalue()
+    except OSError as error:
         raise InputError(f"{path}: cannot be unpacked, damaged ({error})") from None
     if not raw.startswith(b"SIMPLE  ="):
         raise InputError(f"{path}: not a FITS file, plain or packed with gzip or bzip2")
     return raw, pack
+
+
+def unpacked(file, name, max_bytes=None):
+    """An open file, or its content unpacked as a file in memory.
+
+    Parameters
+    ----------
+    file : binary file
+    name : str or path
+        For the message.
+    max_bytes : int, optional
+        `MAX_BYTES` if not given.
+
+    Raises
+    ------
+    InputError
+        If it would be larger.
+    OSError
+        If it cannot be unpacked.
+    """
+    most = MAX_BYTES if max_bytes is None else max_bytes
+    magic = file.read(6)
+    file.seek(0)
+    unpacker = next((unpacker for start, unpacker in _UNPACKERS.items() if magic.startswith(start)), None)
+    if unpacker is None:
+        return file
+    try:
+        with unpacker(file) as packed:
+            content = packed.read(most + 1)
+    except (EOFError, ValueError, IndexError, RuntimeError, zlib.error, lzma.LZMAError, zipfile.BadZipFile) as error:
+        raise OSError(f"it cannot be unpacked: {error}") from None
+    if len(content) > most:
+        raise InputError(f"{name} is refused: it unpacks to more than {most} bytes; if you trust it, unpack it first")
+    return io.BytesIO(content)
+
+
+@contextmanager
+def open_fits(file, name):
+    """An HDUList of an open file, unpacked if it is packed, in which nothing claims more than there may be.
+
+    Parameters
+    ----------
+    file : binary file
+    name : str or path
+        For messages.
+
+    Raises
+    ------
+    InputError
+        For a file that unpacks to more than `MAX_BYTES`.
+    DamagedError
+        For an image or table that claims more than these and more than the file has, and a compressed image that claims
+        more than these. What astropy raises comes as it is.
+    """
+    with unpacked(file, name) as content:
+        size = content.seek(0, io.SEEK_END)
+        content.seek(0)
+        with without_astropy_warnings():
+            hdulist = fits.open(content, memmap=False)
+            for i, hdu in enumerate(hdulist):
+                _check_claim(i, hdu, size, name)
+        with hdulist:
+            yield hdulist
+
+
+def _check_claim(i, hdu, size, name):
+    claimed, there = hdu.size, size - (hdu.fileinfo() or {"datLoc": 0})["datLoc"]
+    if isinstance(hdu, fits.CompImageHDU):
+        claimed, there = math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8, 0
+    if claimed > max(MAX_BYTES, there):
+        label = f"HDU {i} {hdu.name}".strip()
+        raise DamagedError(
+            f"{name} is refused: {label} claims {claimed} bytes, more than there are in the file and than {MAX_BYTES}"
+        )
 
 
 def open_bytes(raw, **options):

@@ -5,11 +5,8 @@ that (those of hst1pass fill 150 lines), so of the commented lines the last one 
 column.
 """
 
-import bz2
-import gzip
 import io
 import re
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +16,11 @@ from astropy.table import Table, vstack
 
 from ...exceptions import InputError
 from ...runtime import checks
+from ...runtime.fits_bytes import open_fits, unpacked
 
 #: What missing values look like: empty fields, and the "null" of the Gaia archive.
 _MISSING = [("", "0"), ("null", "0")]
-_PACKED = {b"\x1f\x8b": gzip.decompress, b"BZh": bz2.decompress}
+_PACKED = (b"\x1f\x8b", b"BZh")
 #: First words of the lists of DAOPHOT and ALLSTAR (Stetson), and the columns of ALLSTAR.
 _STETSON = ["NL", "NX", "NY"]
 _ALLSTAR = ("ID", "X", "Y", "MAG", "MERR", "SKY", "NITER", "CHI", "SHARP")
@@ -53,12 +51,12 @@ def read(path):
     """
     content = path.read_bytes()
     name = path
-    for magic, unpack in _PACKED.items():
-        if content.startswith(magic):
-            try:
-                content, name = unpack(content), Path(path.stem)
-            except (OSError, EOFError, ValueError, zlib.error) as error:
-                raise InputError(f"cannot be read as a table: damaged ({error})") from None
+    if content.startswith(_PACKED):
+        name = Path(path.stem)
+    try:
+        content = unpacked(io.BytesIO(content), "the file").getvalue()
+    except OSError as error:
+        raise InputError(f"cannot be read as a table: damaged ({error})") from None
     suffix = name.suffix.lower()
     try:
         if content.startswith(b"SIMPLE") or suffix in (".fits", ".fit", ".fts", ".ldac"):
@@ -168,7 +166,7 @@ def _is_dotted(line):
 
 def _read_fits(content):
     """The first table of a FITS file, or all detections of an LDAC file."""
-    with fits.open(io.BytesIO(content), memmap=False) as hdus:
+    with open_fits(io.BytesIO(content), "the file") as hdus:
         tables = [k for k, hdu in enumerate(hdus) if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU))]
         objects = [k for k in tables if hdus[k].name == "LDAC_OBJECTS"]
         if not tables:

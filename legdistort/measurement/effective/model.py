@@ -10,6 +10,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from ...exceptions import InputError
 from ...runtime import outputs
+from ...runtime.fits_bytes import open_fits
 from . import splines
 
 #: Extension of files that holds the coefficients.
@@ -328,7 +329,7 @@ class EffectivePSF:
         """
         outputs.settle_for(path)
         try:
-            with fits.open(path) as hdus:
+            with open(path, "rb") as file, open_fits(file, path) as hdus:
                 return cls.from_hdus(hdus, path)
         except OSError as error:
             raise InputError(f"{path}: no FITS file that could be read ({error})") from None

@@ -4,9 +4,9 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
 
 from ...exceptions import InputError
+from ...runtime.fits_bytes import open_fits
 from . import splines
 from .model import EXTENSION, EffectivePSF, Polynomial
 
@@ -95,7 +95,7 @@ def read_psf(path):
     """
     path = Path(path)
     try:
-        with fits.open(path) as hdus:
+        with path.open("rb") as file, open_fits(file, path) as hdus:
             names = [hdu.name for hdu in hdus]
             if EXTENSION in names:
                 return EffectivePSF.from_hdus(hdus, path)
