@@ -177,7 +177,8 @@ def read_grid(path):
 def _check_pixels(wcs, name):
     if not all(isinstance(n, int | np.integer) and n > 0 for n in wcs.array_shape or ()):
         raise InputError(f"{name}: NAXIS1 and NAXIS2 must be positive whole numbers, got {wcs.pixel_shape}")
-    if np.linalg.cond(wcs.pixel_scale_matrix) > _FLAT:
+    matrix = wcs.pixel_scale_matrix
+    if not np.isfinite(matrix).all() or np.linalg.cond(matrix) > _FLAT:
         raise InputError(f"{name}: the matrix of its WCS is singular: pixels have no area")
 
 

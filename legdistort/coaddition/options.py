@@ -60,7 +60,7 @@ class CoaddOptions:
         for name, allowed in choices.items():
             check_choice(getattr(self, name), allowed, name)
         order = ORDERS.get(self.order, self.order) if isinstance(self.order, str) else self.order
-        if isinstance(order, bool) or order not in range(6):
+        if isinstance(order, bool | np.ndarray) or order not in range(6):
             raise InputError(f"order must be an integer from 0 to 5 or one of {', '.join(ORDERS)}, got {order!r}")
         object.__setattr__(self, "order", int(order))
         for name, allowed in (("weights", WEIGHTS), ("scale", SCALES)):
@@ -97,7 +97,7 @@ def _choice_or_numbers(argument, given, allowed):
     """A choice as it is given, or a copy of the numbers by exposure; `InputError` for what is neither."""
     if isinstance(given, Mapping):
         return by_name(argument, given, given)
-    if given is not None and given not in allowed:
+    if isinstance(given, np.ndarray) or (given is not None and given not in allowed):
         raise InputError(
             f"{argument} must be one of {', '.join(map(repr, allowed))}, None or a dict by exposure, got {given!r}"
         )

@@ -5,6 +5,7 @@ from astropy import units as u
 from astropy.table import QTable, Table
 
 from ..exceptions import InputError
+from ..runtime import checks
 
 #: Columns of a table of matched positions: name -> (unit, required)
 MATCHED = {
@@ -127,7 +128,9 @@ def rename(table, columns):
     InputError
         Naming the column that is not there.
     """
-    table = Table(table, copy=False)
+    table = as_table(table, "the table")
+    if not isinstance(columns, dict):
+        raise InputError(f"columns must be a dict {{name expected: name in the table}}, got {columns!r}")
     for wanted, present in columns.items():
         if present not in table.colnames:
             raise InputError(f"no column {present!r} to use as {wanted!r}; the table has {', '.join(table.colnames)}")
@@ -147,6 +150,13 @@ _RULES = (
         lambda values: np.isfinite(values) & (values > 0),
         "not a positive finite number",
         "; errors are standard deviations in pixels: leave out rows without one, or give them one (--error PIXELS)",
+    ),
+    (("x", "y"), lambda values: np.abs(values) < checks.LARGEST, "beyond 1e30", "; these are no pixels"),
+    (
+        ("x_err", "y_err"),
+        lambda values: (values > 1 / checks.LARGEST) & (values < checks.LARGEST),
+        "not between 1e-30 and 1e30",
+        "; errors are standard deviations in pixels",
     ),
     (("xy_corr",), lambda values: np.abs(values) < 1, "not inside (-1, 1)", ""),
 )
@@ -171,6 +181,22 @@ def _check_values(table, what):
                 )
 
 
+def as_table(table, what):
+    """A `~astropy.table.Table` that shares the columns of whatever one can be made of.
+
+    Raises
+    ------
+    InputError
+        If none can be made of it; `what` is how the message calls it.
+    """
+    try:
+        made = Table(table, copy=False)
+        len(made)
+    except Exception as error:  # astropy and numpy raise what they like
+        raise InputError(f"{what} must be a table, got {type(table).__name__} ({checks.first_line(error)})") from None
+    return made
+
+
 def check(table, contract, what):
     """Check a table against a column contract and return it as a `~astropy.table.QTable`.
 
@@ -190,7 +216,7 @@ def check(table, contract, what):
     InputError
         Naming the column and the first row at fault.
     """
-    table = Table(table, copy=False)
+    table = as_table(table, what)
     missing = [name for name, (_, required) in contract.items() if required and name not in table.colnames]
     if missing:
         raise InputError(

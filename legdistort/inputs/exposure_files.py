@@ -269,7 +269,8 @@ def file_checksums(exposures):
 
 def listed(exposures, function):
     """One exposure or several as a list; `InputError` for what is none, naming the function that was called."""
-    exposures = [exposures] if isinstance(exposures, (Exposure, ExposureFile)) else list(exposures)
+    one = isinstance(exposures, (Exposure, ExposureFile)) or not np.iterable(exposures)
+    exposures = [exposures] if one else list(exposures)
     for exposure in exposures:
         if not isinstance(exposure, (Exposure, ExposureFile)):
             raise InputError(f"{function} takes exposures as read_exposures gives them, got {type(exposure).__name__}")
@@ -400,8 +401,7 @@ def _told(sentence):
 @contextlib.contextmanager
 def _opened(path):
     """A FITS file, as it is and as an HDUList."""
-    told = _told(f"{path}: cannot be read as FITS, damaged or something else")
-    with _file(path) as file, told, open_fits(file, path) as hdulist:
+    with _file(path) as file, open_fits(file, path) as hdulist:
         yield file, hdulist
 
 

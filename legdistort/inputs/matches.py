@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from ..exceptions import AssumptionWarning, InputError, MatchError, some_of, warn
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
+from ..runtime.checks import check_choice
 from . import column_contract, exposure_names, repetitions, start_poses
 
 #: Positions belong on their detector, give or take this part of its size: distortions move stars over its edge.
@@ -235,6 +236,9 @@ class Matches:
             Naming positions outside their detector, which are left out; more than a tenth of those of an exposure are
             an `InputError`.
         """
+        for name, given in (("poses", poses), ("columns", columns), ("left_out", left_out)):
+            if not isinstance(given, dict | None):
+                raise InputError(f"{name} must be a dict, got {type(given).__name__}")
         if columns:
             table = column_contract.rename(table, columns)
         table = column_contract.check(table, column_contract.MATCHED, "the table of matched positions")
@@ -242,6 +246,7 @@ class Matches:
         if camera is not None:
             table, shape = in_focal_plane(table, camera), camera.field
         seen, left_out = Observations.of(table), dict(left_out or {})
+        check_choice(allow_copies, (True, False), "allow_copies")
         if not allow_copies and (copies := repetitions.reasons(seen.names, seen.exposure, seen.xy)):
             table, left_out = table[~np.isin(table["exposure"], list(copies))], left_out | copies
             seen = Observations.of(table)
@@ -254,6 +259,7 @@ class Matches:
             seen = Observations.of(table)
         _check_duplicates(seen)
         _check_connected(seen)
+        _check_spread(seen)
         if poses is None:
             found = start_poses.estimate_poses(seen.exposure, seen.star, seen.xy, names=seen.names)
             poses = dict(zip(seen.names, found, strict=True))
@@ -282,6 +288,12 @@ def shapes_by_exposure(shape, names):
             raise InputError(f"shape of exposure {name!r} must be (ny, nx) in pixels, got {shape[name]!r}")
         out[name] = (ny, nx)
     return out
+
+
+def _check_spread(seen):
+    """Positions on one line tell nothing across it."""
+    if np.linalg.matrix_rank(seen.xy - seen.xy.mean(axis=0)) < 2:
+        raise InputError("all positions lie on one line: give stars all over the field, or look at the columns x, y")
 
 
 def _check_poses(given, names):

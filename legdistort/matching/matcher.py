@@ -10,6 +10,7 @@ from ..cameras.camera import Camera
 from ..cameras.focal_planes import focal_planes
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..inputs import column_contract, repetitions
+from ..inputs.exposure_files import listed
 from ..inputs.matches import Matches, in_focal_plane, shapes_by_exposure
 from ..inputs.reference_catalogue import header_epoch, mean_epoch
 from ..inputs.start_poses import estimate_poses
@@ -97,6 +98,7 @@ def match(
         detections = column_contract.rename(detections, columns)
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
     table["exposure"] = table["exposure"].astype(str)
+    exposures = None if exposures is None else listed(exposures, "match")
     if camera is None and exposures is not None and any(e.detector is not None for e in exposures):
         camera = Camera.of_frames(exposures)
         log.info("layout of the detectors by the headers: %s", camera)
@@ -104,7 +106,7 @@ def match(
         table, shape = in_focal_plane(table, camera), camera.field
         exposures = None if exposures is None else focal_planes(camera, exposures)
     named = None if exposures is None else {e.name: e for e in exposures}
-    names = list(named or dict.fromkeys(table["exposure"].tolist()))
+    names = list(dict.fromkeys(table["exposure"].tolist()) if named is None else named)
     _check_names(table, names, min_exposures)
     shapes = _shapes(table, names, named, shape)
     if "flags" in table.colnames:

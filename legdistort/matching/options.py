@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from numbers import Integral, Real
 
-import numpy as np
-
 from ..exceptions import InputError
 from ..measurement.crowding import LIMIT, check_isolation
 from ..measurement.flags import UNUSABLE
+from ..runtime.checks import LARGEST
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ class MatchOptions:
             raise InputError(f"min_exposures must be an integer of at least 2, got {least!r}")
         if not isinstance(self.columns, dict | None):
             raise InputError(f"columns must be a dict {{name expected: name in the table}}, got {self.columns!r}")
-        if self.tolerance is not None and not (isinstance(self.tolerance, Real) and 0 < self.tolerance < np.inf):
+        if self.tolerance is not None and not (isinstance(self.tolerance, Real) and 0 < self.tolerance < LARGEST):
             raise InputError(f"tolerance must be a positive number of pixels, got {self.tolerance!r}")
         if not isinstance(self.reject_flags, Integral):
             raise InputError(f"reject_flags must be an integer, whose bits are flags, got {self.reject_flags!r}")

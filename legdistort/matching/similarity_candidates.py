@@ -19,6 +19,8 @@ SHAPE_TOLERANCE = 0.04
 #: Lists longer than this take fewer neighbours, for speed.
 CROWDED = 3000
 
+_MOST_CELLS = 1e8  # of a vote, 800 MB
+
 
 def offset_candidates(source, target, *, size, n_best=3):
     """Shifts that carry many of the source points near a target point.
@@ -44,6 +46,8 @@ def offset_candidates(source, target, *, size, n_best=3):
     spans = [(np.maximum(np.ptp(target[:, k]), 1), np.maximum(np.ptp(source[:, k]), 1)) for k in (0, 1)]
     out = []
     for cell in (0.005 * size, 0.015 * size):
+        if np.prod((high - low) / cell + 3) > _MOST_CELLS:
+            continue  # of lists so unlike in extent no shift stands out
         bins = [np.arange(lo - cell, hi + 2 * cell, cell) for lo, hi in zip(low, high, strict=True)]
         cells = ((differences - [b[0] for b in bins]) / cell).astype(int)
         shape = [len(b) for b in bins]

@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 
 from ..exceptions import InputError
 from ..inputs.table_files import write_table
-from ..runtime.checks import check_choice
+from ..runtime.checks import check_choice, first_line
 
 #: Where the errors of `legdistort.measure` come from: the fit, the curve, or the fit scaled to the curve.
 SOURCES = ("fit", "injected", "scaled")
@@ -206,9 +206,14 @@ class NoiseCurves:
         try:
             with open(path, "rb") as file:
                 table = QTable.read(file, format="ascii.ecsv")
-        except (ValueError, OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{path} is no ECSV table: {error}") from error
-        return cls(table)
+        except Exception as error:  # astropy raises what it likes
+            raise InputError(f"{path} is no ECSV table: {first_line(error)}") from error
+        curves = cls(table)
+        try:
+            repr(curves)  # which takes all of it
+        except Exception as error:
+            raise InputError(f"{path} is damaged: {first_line(error)}") from error
+        return curves
 
 
 def _enough(levels):

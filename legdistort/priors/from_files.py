@@ -145,15 +145,10 @@ def _reference_model(model, tree, name):
 
 
 def _read_fits(path, ext, frame):
-    try:
-        with path.open("rb") as file, open_fits(file, path) as hdulist:
-            if ext is None and "ASDF" in hdulist:
-                return _from_hdu(hdulist["ASDF"], frame, str(path))
-            return _refuse(_from_hdulist(hdulist, ext, str(path)), frame=frame)
-    except InputError:
-        raise
-    except Exception as error:  # whatever a broken file provokes, in wcslib too
-        raise InputError(f"{path}: cannot be read as FITS, damaged or something else ({error})") from None
+    with path.open("rb") as file, open_fits(file, path) as hdulist:
+        if ext is None and "ASDF" in hdulist:
+            return _from_hdu(hdulist["ASDF"], frame, str(path))
+        return _refuse(_from_hdulist(hdulist, ext, str(path)), frame=frame)
 
 
 def _from_hdu(hdu, frame, name):
@@ -181,14 +176,14 @@ def _from_hdulist(hdulist, ext, name):
 
 def _from_header(header, name, hdulist=None):
     """The WCS of one header, with what it refers to in other extensions."""
-    for key in ("A_ORDER", "B_ORDER", "AP_ORDER", "BP_ORDER"):
-        order = header.get(key, 0)
-        if not isinstance(order, (int, float)) or not 0 <= order <= SIP_ORDER:
-            raise InputError(f"{name}: {key} = {order!r}; SIP polynomials have orders from 0 to 9")
-    header = header.copy()
-    if hdulist is None:
-        _leave_out_tables(header, name)
     try:
+        for key in ("A_ORDER", "B_ORDER", "AP_ORDER", "BP_ORDER"):
+            order = header.get(key, 0)
+            if not isinstance(order, (int, float)) or not 0 <= order <= SIP_ORDER:
+                raise InputError(f"{name}: {key} = {order!r}; SIP polynomials have orders from 0 to 9")
+        header = header.copy()
+        if hdulist is None:
+            _leave_out_tables(header, name)
         source = as_source(WCS(header, fobj=hdulist), name=name)
     except InputError:
         raise

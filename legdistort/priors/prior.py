@@ -24,7 +24,10 @@ def _per_mode(value, n, name):
     if isinstance(value, str):
         words = "widths in pixels" + (f", or {EVIDENCE!r}: found from the exposures" if name == "sigma" else "")
         raise InputError(f"{name} must be {words}, got {value!r}")
-    out = np.asarray(value, dtype=float)
+    try:
+        out = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be numbers, widths in pixels, got {value!r}") from None
     try:
         out = np.broadcast_to(out, (2, n)).copy()
     except ValueError:
@@ -100,7 +103,10 @@ class Prior:
         if self.mean is None:
             object.__setattr__(self, "static_sigma", _declared(self.sigma, self.static_sigma))
             return
-        mean = np.array(self.mean, dtype=float)
+        try:
+            mean = np.array(self.mean, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(f"mean must be numbers, pixels, in shape (2, n_modes), got {self.mean!r}") from None
         if mean.ndim != 2 or mean.shape[0] != 2:
             raise InputError(f"mean must have shape (2, n_modes), x then y, got {mean.shape}")
         if not np.all(np.isfinite(mean)):

@@ -14,7 +14,7 @@ from ..geometry.basis import check_degree
 from ..results.solution import Solution
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, check_tree, read_tree
-from ..runtime.outputs import replacing
+from ..runtime.outputs import replacing, settle_for
 from .from_files import read_source
 
 #: Version of the layout under ``legdistort_prior``.
@@ -86,7 +86,9 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
             raise InputError(f"{where} is a prior already: {', '.join(given)} cannot be chosen any more; leave it out")
         return dataclasses.replace(ready, **widths)
     files = where if isinstance(where, (list, tuple)) else [where]
-    with provenance.unchanged(*(path for path in files if isinstance(path, (str, Path)))):
+    files = [path for path in files if isinstance(path, (str, Path))]
+    settle_for(*files)
+    with provenance.unchanged(*files):
         source = read_source(where, ext=ext, frame=frame)
         try:
             return kind.from_model(source, **options, **widths)

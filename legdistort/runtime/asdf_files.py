@@ -54,6 +54,7 @@ _PLAIN = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool"
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _MAX_DEPTH = 100
+_MOST_AXES = 100
 _BYTES_PER_NODE = 2048  # what a node of YAML takes in memory while it is read, about
 _BLOCK = b"\xd3BLK"
 _HEADER = struct.Struct(">I4sQQQ16s")  # flags, compression, allocated, used, unpacked, checksum
@@ -136,7 +137,8 @@ def check_tree(tree, schema, path):
             asdf.AsdfFile(tree, custom_schema=f"{SCHEMAS}{schema}").validate()
     except asdf.exceptions.ValidationError as error:
         entry = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in error.absolute_path).lstrip(".")
-        meaning = "" if error.validator == "required" else error.schema.get("description", "")
+        known = isinstance(error.schema, dict) and error.validator != "required"
+        meaning = error.schema.get("description", "") if known else ""
         raise InputError(
             f"{path} is damaged: entry {entry or 'tree'}: {first_line(error)[:200]}"
             + (f"; it should be {meaning}" if meaning else "")
@@ -254,10 +256,19 @@ def _check_node(node, where, room):
         if "/core/ndarray-" in getattr(node, "_tag", "") and "data" not in node:
             _check_array(node, where, room)
         for key, value in node.items():
+            _check_count(key, value, where)
             _check_node(value, f"{where}.{key}" if where else str(key), room)
     elif isinstance(node, list):
         for k, value in enumerate(node):
             _check_node(value, f"{where}[{k}]", room)
+
+
+def _check_count(key, value, where):
+    """Refuse integers that no array can hold, and more axes than a model has: converters would count them all."""
+    most = _MOST_AXES if key in ("n_dims", "n_inputs", "n_outputs", "mapping") else 2**63
+    for each in value if isinstance(value, list) else [value]:
+        if isinstance(each, int) and not -(2**63) <= each < most:
+            raise ValueError(f"entry {where}.{key} has {each}, beyond what can be".replace("entry .", "entry "))
 
 
 def _check_array(node, where, room):

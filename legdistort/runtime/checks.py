@@ -6,10 +6,13 @@ import numpy as np
 
 from ..exceptions import InputError
 
+#: No number of pixels or standard errors is as large; squares of larger ones overflow.
+LARGEST = 1e30
+
 
 def check_choice(value, allowed, name):
     """Raise `InputError` naming the argument if `value` is not one of the words allowed."""
-    if value not in allowed:
+    if isinstance(value, np.ndarray) or value not in allowed:  # an array compares with each
         raise InputError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
 
 

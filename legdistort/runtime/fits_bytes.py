@@ -21,10 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from astropy.io import fits
 
-from ..exceptions import DamagedError, InputError, without_astropy_warnings
+from ..exceptions import DamagedError, InputError, LegdistortError, without_astropy_warnings
 
 BLOCK = 2880
 _CARD = 80
+_MOST_COUNTED = 999
+_LONGEST = 1 << 26  # bytes of a header
 #: Bytes that a packed file may unpack to, and that an image or table may claim beyond what is in its file.
 MAX_BYTES = 2 << 30
 _UNPACKERS = {
@@ -102,6 +104,19 @@ def unpacked(file, name, max_bytes=None):
 
 
 @contextmanager
+def readable(name):
+    """A block that reads FITS: whatever a damaged file provokes becomes a `DamagedError` that begins with its name."""
+    try:
+        yield
+    except (LegdistortError, MemoryError):
+        raise
+    except Exception as error:  # astropy and wcslib raise many kinds
+        raise DamagedError(
+            f"{name}: cannot be read as FITS, damaged or something else ({' '.join(str(error).split())})"
+        ) from None
+
+
+@contextmanager
 def open_fits(file, name):
     """An HDUList of an open file, unpacked if it is packed, in which nothing claims more than there may be.
 
@@ -117,10 +132,11 @@ def open_fits(file, name):
         For a file that unpacks to more than `MAX_BYTES`.
     DamagedError
         For an image or table that claims more than these and more than the file has, and a compressed image that claims
-        more than these. What astropy raises comes as it is.
+        more than these; and for whatever a damaged file provokes in the block.
     """
-    with unpacked(file, name) as content:
+    with readable(name), unpacked(file, name) as content:
         size = content.seek(0, io.SEEK_END)
+        _check_counts(content, size, name)
         content.seek(0)
         with without_astropy_warnings():
             hdulist = fits.open(content, memmap=False)
@@ -130,6 +146,35 @@ def open_fits(file, name):
             yield hdulist
 
 
+def _check_counts(content, size, name):
+    """Refuse headers with more axes or columns than FITS knows: astropy would count them all.
+
+    Where a header is not understood the rest is left to astropy.
+    """
+    place = 0
+    while 0 <= place < size:
+        content.seek(place)
+        header = b""
+        while not any(
+            header[k : k + _CARD].rstrip() == b"END" for k in range(max(len(header) - BLOCK, 0), len(header), _CARD)
+        ):
+            block = content.read(BLOCK)
+            header += block
+            if len(block) < BLOCK or len(header) > _LONGEST:
+                return
+        known = {}
+        for start in range(0, len(header), _CARD):
+            card = header[start : start + _CARD]
+            if found := re.match(rb"(BITPIX|Z?NAXIS\d*|TFIELDS|[PG]COUNT) *= +(-?\d+)", card):
+                known.setdefault(found[1].decode(), int(found[2]))
+        for key in ("NAXIS", "ZNAXIS", "TFIELDS"):
+            if not 0 <= known.get(key, 0) <= _MOST_COUNTED:
+                raise DamagedError(f"{name}: damaged, {key} = {known[key]} in a header; FITS has 0 to {_MOST_COUNTED}")
+        axes = [known.get(f"NAXIS{k}", 0) for k in range(1, known.get("NAXIS", 0) + 1)]
+        n = (known.get("PCOUNT", 0) + math.prod(axes)) * known.get("GCOUNT", 1) if axes else 0
+        place += len(header) + -(-n * abs(known.get("BITPIX", 8)) // 8 // BLOCK) * BLOCK
+
+
 def _check_claim(i, hdu, size, name):
     claimed, there = hdu.size, size - (hdu.fileinfo() or {"datLoc": 0})["datLoc"]
     if isinstance(hdu, fits.CompImageHDU):
@@ -137,7 +182,7 @@ def _check_claim(i, hdu, size, name):
     if claimed > max(MAX_BYTES, there):
         label = f"HDU {i} {hdu.name}".strip()
         raise DamagedError(
-            f"{name} is refused: {label} claims {claimed} bytes, more than there are in the file and than {MAX_BYTES}"
+            f"{name}: {label} claims {claimed} bytes, more than there are in the file and than {MAX_BYTES}"
         )
 
 
@@ -158,7 +203,8 @@ def locate(raw, path):
         If one is incomplete; `path` names the file.
     """
     spans = []
-    with open_bytes(raw, disable_image_compression=True) as hdulist:
+    _check_counts(io.BytesIO(raw), len(raw), path)
+    with readable(path), open_bytes(raw, disable_image_compression=True) as hdulist:
         for i, hdu in enumerate(hdulist):
             info = hdu.fileinfo()
             if info["datLoc"] + info["datSpan"] > len(raw):

@@ -9,7 +9,7 @@ from ..exceptions import InputError
 from ..geometry import basis, fitter
 from ..inputs.reference_catalogue import read_reference, year
 from ..results.settings import Settings
-from ..runtime.checks import check_choice
+from ..runtime.checks import LARGEST, check_choice
 from .choices.degree_choice import AUTO
 from .equations.problem import check_error_floor, check_prior
 from .gauge.constraints import KINDS
@@ -60,7 +60,7 @@ class SolveOptions(Settings):
             raise InputError("errors='by-brightness' finds the errors, their floor too: leave error_floor out")
         if self.max_iterations is not None and not (isinstance(self.max_iterations, int) and self.max_iterations > 0):
             raise InputError(f"max_iterations must be a positive integer, got {self.max_iterations!r}")
-        if self.clip is not None and not (isinstance(self.clip, Real) and self.clip > 1):
+        if self.clip is not None and not (isinstance(self.clip, Real) and 1 < self.clip < LARGEST):
             raise InputError(f"clip must be a number of standard errors above 1, got {self.clip!r}")
 
     def _check_distortion(self):

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from ..exceptions import ExportError, InputError
 from ..inputs import exposure_files, exposure_names
 from ..runtime.asdf_files import ASDF_STANDARD
-from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, splice
+from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, readable, splice
 from ..runtime.outputs import replacing, replacing_folders
 from .storage import wcs_tree
 
@@ -189,7 +189,7 @@ def _plan(solution, path, target, *, kind, max_error, ext, overwrite):
     raw, _ = read_bytes(path)
     spans = locate(raw, path)
     headers, edits = {}, []
-    with open_bytes(raw) as hdulist:
+    with readable(path), open_bytes(raw) as hdulist:
         images = _images(solution, hdulist, path, ext)
         for name, image in images.items():
             headers[name] = None

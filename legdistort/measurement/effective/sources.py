@@ -153,6 +153,8 @@ def _from_images(hdus, path):
     n = 1 if data.ndim == 2 else len(data)
     positions = None
     if "NXPSFS" in header and "IPSFX01" in header:
+        if header["NXPSFS"] * header["NYPSFS"] != n:
+            raise InputError(f"{path}: there are {n} images, not NXPSFS x NYPSFS")
         sizes = {"IPSFX": header["NXPSFS"], "JPSFY": header["NYPSFS"]}
         x, y = ([_needed(header, f"{key}{k:02d}", path) - 1 for k in range(1, m + 1)] for key, m in sizes.items())
         positions = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -10,6 +10,7 @@ from ...exceptions import InputError, SolveError
 from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis
 from ...priors.prior import Prior
+from ...runtime.checks import LARGEST
 from ...runtime.optional import has_fast
 from .unknowns import Unknowns
 
@@ -153,7 +154,7 @@ class State:
 
 def check_error_floor(error_floor):
     """Raise `InputError` if the floor is not a finite number of pixels, 0 or more."""
-    if not (isinstance(error_floor, Real) and np.isfinite(error_floor) and error_floor >= 0):
+    if not (isinstance(error_floor, Real) and 0 <= error_floor < LARGEST):
         raise InputError(f"error_floor must be a finite number of pixels, 0 or more, got {error_floor!r}")
 
 

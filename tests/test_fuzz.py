@@ -1,0 +1,46 @@
+"""Every reader and every argument: read, or refused by an error of the package; see `fuzz.py`."""
+
+import fuzz
+import pytest
+
+#: Inputs that once led to other errors, to endless counting or to a full memory.
+KNOWN = [32, 189, 208, 325, 965, 990, 993, 1058, 1082, 1171, 1194, 1303, 1336, 1379, 1603, 1658, 1812, 100696, 100723,
+         102542, 102706, 103667]  # fmt: skip
+
+
+def test_inputs_that_once_broke_something():
+    _, faults = fuzz.fuzz(KNOWN)
+    assert not faults
+
+
+@pytest.mark.slow
+def test_two_thousand_inputs():
+    counts, faults = fuzz.fuzz(range(2000))
+    assert counts.total() == 2000
+    assert counts.keys() == fuzz.READERS.keys()
+    assert not faults
+
+
+@pytest.mark.slow
+def test_nonsense_for_every_argument():
+    n, faults = fuzz.nonsense(list(fuzz.argument_calls()), fuzz.VALUES)
+    assert n > 2000
+    assert not faults
+
+
+@pytest.mark.slow
+def test_extreme_values_in_every_column():
+    n, faults = fuzz.nonsense(list(fuzz.value_calls()), [0.0, 1e-320, 1e300, 10**30])
+    assert n > 80
+    assert not faults
+
+
+def test_all_files_of_the_corpus_are_read():
+    """Undamaged they are no reason for an error, but for lists of a single exposure."""
+    for entry, (use, names) in fuzz.READERS.items():
+        for name in names:
+            if entry == "tables" and not name.startswith(("matched", "detected")):
+                with pytest.raises(fuzz.LegdistortError, match="only one exposure"):
+                    use(fuzz.source(name))
+            else:
+                use(fuzz.source(name))
