@@ -1,0 +1,188 @@
+"""Wherever it runs: any locale, no home, nothing that may be written but the output, another user, other processes."""
+
+import json
+import multiprocessing
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import legdistort as ld
+from legdistort.runtime.outputs import replacing_folder
+from legdistort.runtime.provenance import checksum
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving.estimation import solve
+
+ROOT = Path(ld.__file__).parents[1]
+NOBODY = 65534
+PIXELS = np.array([[10.0, 20.0], [50.0, 60.0]])
+
+
+@pytest.fixture(scope="module")
+def matches():
+    return simulate_matches(n_stars=12, n_exposures=4, degree=1, shape=(100, 100), dither=5.0, seed=1).matches
+
+
+@pytest.fixture(scope="module")
+def solution(matches):
+    return solve(matches, degree=1)
+
+
+@pytest.fixture
+def table(matches, tmp_path):
+    path = tmp_path / "matched.ecsv"
+    matches.table.write(path)
+    return path
+
+
+def command(table, out, *more):
+    return [sys.executable, "-m", "legdistort", "solve", str(table), "--shape", "100", "100", "--degree", "1",
+            "--out", str(out), "--quiet", *more]  # fmt: skip
+
+
+def whole(out):
+    """Whether the files of a folder are those that its summary lists."""
+    listed = json.loads((out / "summary.json").read_text())["files"]
+    for name, digest in listed.items():
+        with (out / name).open("rb") as file:
+            assert checksum(file) == digest
+    return {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()} == {*listed, "summary.json"}
+
+
+@pytest.mark.parametrize(
+    ("locale", "name"),
+    [
+        ("C", "with spaces, ünï ☆ 解"),
+        pytest.param("POSIX", "with spaces", marks=pytest.mark.slow),
+        pytest.param("C.UTF-8", "plain", marks=pytest.mark.slow),
+    ],
+)
+def test_locale_c_without_a_home(table, tmp_path, locale, name):
+    """Neither a home nor a place for compiled code or byte code is known."""
+    bare = {"LC_ALL": locale, "PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONDONTWRITEBYTECODE": "1", "NUMBA_CACHE_DIR": "/dev/null/none"}  # fmt: skip
+    run = subprocess.run(command(table, tmp_path / name), env=bare, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert whole(tmp_path / name)
+
+
+@pytest.fixture
+def place():
+    """A folder that another user can see, to be written by root alone."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    yield folder
+    shutil.rmtree(folder)
+
+
+def as_nobody(function):
+    """What a function returns, or the error it raises, as a sentence, when a user without rights calls it.
+
+    Root may write anywhere, so that tests as root would prove nothing.
+    """
+    if not hasattr(os, "geteuid") or os.geteuid() != 0:
+        pytest.skip("only root can become somebody else")
+    reading, writing = os.pipe()
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # threads of other tests sleep
+        child = os.fork()
+    if child == 0:
+        try:
+            os.setgroups([])
+            os.setgid(NOBODY)
+            os.setuid(NOBODY)
+            told = str(function())
+        except BaseException as error:
+            told = f"{type(error).__name__}: {error}"
+        os.write(writing, told.encode())
+        os._exit(0)
+    os.waitpid(child, 0)
+    os.close(writing)
+    with os.fdopen(reading) as file:
+        return file.read()
+
+
+def write(out):
+    with replacing_folder(out) as target:
+        (target / "a").write_text("new")
+    return "written"
+
+
+@pytest.mark.parametrize("existing", [True, False])
+def test_a_folder_that_another_user_cannot_write(place, existing):
+    out = place / "out"
+    if existing:
+        out.mkdir()
+    told = as_nobody(lambda: write(out))
+    assert told.startswith("InputError"), told
+    assert "out cannot be written: no permission in" in told
+    assert list(place.rglob("*")) == ([out] if existing else [])
+    if existing:
+        out.chmod(0o777)
+        assert as_nobody(lambda: write(out)) == "written"
+
+
+def test_readers_need_no_permission_to_write(place, solution):
+    solution.write(place / "solution.asdf")
+    (place / "solution.asdf").chmod(0o644)
+    ld.Solution.read(place)  # which loads what it needs
+    assert as_nobody(lambda: ld.Solution.read(place).chi2) == str(solution.chi2)
+    assert [path.name for path in place.iterdir()] == ["solution.asdf"]
+
+
+def test_a_reader_that_cannot_finish_a_commit_says_so(place, solution):
+    commit = place / ".commit-1"
+    commit.mkdir()
+    solution.write(commit / "solution.asdf")
+    (commit / ".legdistort.json").write_text('{"remove": []}')
+    told = as_nobody(lambda: ld.Solution.read(place))
+    assert told.startswith("InputError"), told
+    assert "complete result whose files are not all in their places" in told
+    assert ld.Solution.read(place).chi2 == solution.chi2
+    assert [path.name for path in place.iterdir()] == ["solution.asdf"]
+
+
+def test_two_commands_at_once(table, tmp_path):
+    """One works; the other is told, or finds the results of the first. Neither has a part of the other's."""
+    out, environment = tmp_path / "out", os.environ | {"PYTHONPATH": str(ROOT)}
+    processes = [
+        subprocess.Popen(command(table, out), stderr=subprocess.PIPE, text=True, env=environment) for _ in range(2)
+    ]
+    errors = [process.communicate()[1] for process in processes]
+    statuses = sorted(process.returncode for process in processes)
+    assert statuses == [0, 1], errors
+    assert sum("another process is writing" in e or "already holds" in e for e in errors) == 1
+    assert whole(out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["matched.ecsv", "out"]
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")  # of threads of other tests, which sleep
+def test_a_solution_in_another_process(solution, method):
+    if method not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"no {method} here")
+    name = solution.names[1]
+    with ProcessPoolExecutor(1, multiprocessing.get_context(method)) as pool:
+        corrected = pool.submit(solution.correct, name, PIXELS).result()
+        again = pool.submit(pickle.loads, pickle.dumps(solution)).result()
+    np.testing.assert_array_equal(corrected, solution.correct(name, PIXELS))
+    np.testing.assert_array_equal(again.wcs(name)(*PIXELS.T), solution.wcs(name)(*PIXELS.T))
+    assert str(again) == str(solution)
+
+
+@pytest.mark.slow
+def test_a_solution_on_a_cluster(solution):
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp"
+    )
+    with cluster, distributed.Client(cluster) as client:
+        corrected = client.submit(solution.correct, solution.names[0], PIXELS).result(timeout=60)
+    np.testing.assert_array_equal(corrected, solution.correct(solution.names[0], PIXELS))
