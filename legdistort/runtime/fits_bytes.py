@@ -172,6 +172,8 @@ def _check_counts(content, size, name):
                 raise DamagedError(f"{name}: damaged, {key} = {known[key]} in a header; FITS has 0 to {_MOST_COUNTED}")
         axes = [known.get(f"NAXIS{k}", 0) for k in range(1, known.get("NAXIS", 0) + 1)]
         n = (known.get("PCOUNT", 0) + math.prod(axes)) * known.get("GCOUNT", 1) if axes else 0
+        if n < 0:
+            return
         place += len(header) + -(-n * abs(known.get("BITPIX", 8)) // 8 // BLOCK) * BLOCK
 
 
