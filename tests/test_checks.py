@@ -234,7 +234,7 @@ def test_motions_go_with_the_times_where_they_are_known():
     dated = next(c for c in solved(changed(matches, table)).checks if c.name == "time")
     assert dated.state != "pass"
     assert "stars move with time" in dated.sentence
-    assert dated.cure == "solve the epochs apart, and compare their positions"
+    assert dated.cure == "fit the motions of the stars: --motion proper"
     table["epoch"] = 2018.0 + years / 3000
     assert (
         "in one night it is the measured places that drift"

@@ -17,9 +17,10 @@ from numpy.testing import assert_allclose
 
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.geometry.epochs import mean_epoch, year
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.matches import Matches
-from legdistort.inputs.reference_catalogue import mean_epoch, read_reference, year
+from legdistort.inputs.reference_catalogue import read_reference
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.results.solution import Solution

@@ -138,6 +138,11 @@ SOLVING = {
     "clip": Option("leave out what deviates by more sigma; 0: nothing (default 5)", type=float, none=0),
     "errors": Option("(default stated)", choices=ERRORS),
     "error_floor": Option("pixels, added in quadrature to every error", type=float),
+    "motion": Option("of the stars, fitted beside their positions", choices=("proper", "parallax", "auto")),
+    "motion_sigma": Option(
+        "scatter of proper motions, pixels a year; evidence: found", type=word_or(float, "evidence"), metavar="PX/YR"
+    ),
+    "motion_epoch": Option("year of the positions (default: mean)", type=float, metavar="YEAR"),
     "reference": Option("catalogue to tie the positions to, such as one of Gaia", metavar="TABLE", path="read"),
     "epoch": Option("of the exposures, for proper motions (default: header)", type=float, metavar="YEAR"),
     "pixel_scale": Option("helps to find the stars without a header WCS", type=float, metavar="ARCSEC"),
@@ -198,6 +203,7 @@ PREDICTING = {
     **KNOWN_STATIC,
     "dynamic": Option("rms of a coefficient from exposure to exposure, pixels", type=float),
     "spectrum": Option("the same by degree, beyond the fit too", type=spectrum, metavar="DEGREE=RMS,..."),
+    "epochs": Option("years of the exposures: motions are fitted too", type=float, nargs="+", metavar="YEAR"),
     "gauge": Option("see the docs (default minimal)", choices=KINDS),
     "seed": Option("of stars and shifts that are drawn (default 0)", type=int),
 }

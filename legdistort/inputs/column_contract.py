@@ -5,6 +5,7 @@ from astropy import units as u
 from astropy.table import QTable, Table
 
 from ..exceptions import InputError
+from ..geometry.epochs import years
 from ..runtime import checks
 
 #: Columns of a table of matched positions: name -> (unit, required)
@@ -19,6 +20,7 @@ MATCHED = {
     "detector": (None, False),
     "flux": (None, False),
     "mag": (None, False),
+    "epoch": (u.yr, False),
 }
 
 #: Columns of a table of detections.
@@ -63,12 +65,36 @@ STARS = {
     "dec_error_abs": ("stat.error;pos.eq.dec", "the same with the common map, pointing aside"),
 }
 
+#: The same where the motions of stars were fitted.
+MOTIONS = {
+    "vx": ("pos.cartesian.x;pos.pm", "proper motion along x of the reference plane"),
+    "vy": ("pos.cartesian.y;pos.pm", "proper motion along y of the reference plane"),
+    "vx_err": ("stat.error;pos.pm", "standard deviation after a common map is taken off"),
+    "vy_err": ("stat.error;pos.pm", "standard deviation after a common map is taken off"),
+    "vx_err_abs": ("stat.error;pos.pm", "the same with the common map, common rates aside"),
+    "vy_err_abs": ("stat.error;pos.pm", "the same with the common map, common rates aside"),
+    "vx_vy_corr": ("stat.correlation;pos.pm", "correlation of vx_err and vy_err"),
+    "pmra": ("pos.pm;pos.eq.ra", "proper motion in ra times cos(dec)"),
+    "pmdec": ("pos.pm;pos.eq.dec", "proper motion in dec"),
+    "pmra_error": ("stat.error;pos.pm;pos.eq.ra", "standard deviation after a common map is taken off"),
+    "pmdec_error": ("stat.error;pos.pm;pos.eq.dec", "standard deviation after a common map is taken off"),
+    "pmra_error_abs": ("stat.error;pos.pm;pos.eq.ra", "the same with the common map, common rates aside"),
+    "pmdec_error_abs": ("stat.error;pos.pm;pos.eq.dec", "the same with the common map, common rates aside"),
+    "pmra_pmdec_corr": ("stat.correlation;pos.pm", "correlation of pmra_error and pmdec_error"),
+    "parallax": ("pos.parallax", "parallax, up to a common value"),
+    "parallax_error": ("stat.error;pos.parallax", "standard deviation after a common map is taken off"),
+    "parallax_error_abs": ("stat.error;pos.parallax", "the same with the common map, the mean parallax aside"),
+    "chi2": ("stat.fit.chi2", "of the observations used"),
+    "n_epochs": ("meta.number;time.epoch", "epochs of the observations used, exposures within a day as one"),
+    "span": ("time.interval", "between the first and the last of them"),
+}
+
 
 def describe_stars(table):
-    """Give the columns of a table of stars their UCDs and meanings (`STARS`); returns the table."""
+    """Give the columns of a table of stars their UCDs and meanings (`STARS`, `MOTIONS`); returns the table."""
     for name in table.colnames:
-        if name in STARS:
-            ucd, table[name].info.description = STARS[name]
+        if name in STARS or name in MOTIONS:
+            ucd, table[name].info.description = (STARS | MOTIONS)[name]
             table[name].info.meta = {"ucd": ucd}
     return table
 
@@ -231,6 +257,8 @@ def check(table, contract, what):
         unit = contract[name][0] if name in contract else None
         if name in ("exposure", "star", "detector"):
             out[name] = labels(table, name)
+        elif name == "epoch" and name in contract:
+            out[name] = years(table[name])
         elif name in contract:
             column = values(table, name, unit)
             column = column if unit is None else u.Quantity(column, unit, copy=False)

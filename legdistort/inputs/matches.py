@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..exceptions import AssumptionWarning, InputError, MatchError, some_of, warn
 from ..geometry import similarity
+from ..geometry.epochs import exposure_years
 from ..geometry.tangent_plane import TangentPlane
 from ..runtime.checks import check_choice
 from . import column_contract, exposure_names, repetitions, start_poses
@@ -138,6 +139,22 @@ class Matches:
                 return u.yr.to(u.day) * (years - years.min()), "days"
         return np.arange(n, dtype=float), "exposures"
 
+    @cached_property
+    def epochs(self):
+        """Years (n_exposures,) of the exposures, by the column ``epoch``.
+
+        Raises
+        ------
+        InputError
+            If it is missing, for some of the exposures too, or cannot be the time of an exposure.
+        """
+        if "epoch" not in self.table.colnames:
+            raise InputError(
+                "when the exposures were taken is not known: give the column epoch (decimal years, MJD or Time), or "
+                "frames with DATE-OBS, MJD-OBS or EXPSTART in their headers"
+            )
+        return exposure_years(self.names, self.observations.exposure, column_contract.values(self.table, "epoch", u.yr))
+
     def without(self, reasons):
         """The same matches without some exposures, ``{name: reason}``, which join `left_out`.
 
@@ -203,7 +220,8 @@ class Matches:
         ----------
         table : `~astropy.table.Table`
             Columns ``exposure``, ``star`` (int or str), ``x``, ``y``, ``x_err``, ``y_err`` (pixels,
-            0-based, standard deviations), optional ``xy_corr``, ``detector``, ``flux`` or ``mag``.
+            0-based, standard deviations), optional ``xy_corr``, ``detector``, ``flux`` or ``mag``, and
+            ``epoch``, when the exposure was taken: decimal years, MJD, or `~astropy.time.Time`.
         shape : tuple or dict
             ``(ny, nx)``, or that by exposure; not needed with a camera.
         poses : dict, optional

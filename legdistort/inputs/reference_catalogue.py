@@ -5,7 +5,6 @@ the sky is taken.
 """
 
 from dataclasses import dataclass, replace
-from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from astropy.table import Table
 from astropy.time import Time
 
 from ..exceptions import AssumptionWarning, InputError, warn
+from ..geometry.epochs import year
 from ..geometry.tangent_plane import angles, compass, directions
 from . import column_contract
 from .table_files import read_table
@@ -107,11 +107,10 @@ class Reference:
         motion = np.where(known[:, None], self.motion, 0) * years[:, None] * _MAS
         place, east, north = _axes(self.sky)
         place = place + motion[:, :1] * east + motion[:, 1:] * north
-        step = np.hstack([np.eye(2), np.zeros((2, 2))]) + years[:, None, None] * np.hstack(
-            [np.zeros((2, 2)), np.eye(2)]
-        )
+        step = np.eye(4) + years[:, None, None] * np.eye(4, k=2)
         covariance = step @ np.where(np.isfinite(self.covariance), self.covariance, 0) @ step.transpose(0, 2, 1)
-        moved = replace(self, sky=_degrees(place), covariance=covariance, motion=None, epoch=np.full(len(self), epoch))
+        covariance[~known, 2:, 2:] = np.nan
+        moved = replace(self, sky=_degrees(place), covariance=covariance, epoch=np.full(len(self), float(epoch)))
         return moved.subset(known | still)
 
     def on_plane(self, plane):
@@ -126,6 +125,12 @@ class Reference:
         xy[far] = np.nan
         return xy, slope @ self.covariance[:, :2, :2] @ slope.transpose(0, 2, 1)
 
+    def motions_on_plane(self, plane):
+        """Proper motions (n, 2) and their covariances (n, 2, 2) in pixels of a tangent plane a year; NaN if unknown."""
+        slope = np.linalg.inv(plane.jacobian(plane.from_sky(SkyCoord(*self.sky.T * u.deg, frame="icrs")))) / 3.6e6
+        motion = np.einsum("jab,jb->ja", slope, self.motion)
+        return motion, slope @ self.covariance[:, 2:, 2:] @ slope.transpose(0, 2, 1)
+
 
 def _axes(sky):
     """Unit vectors (n, 3) to positions (n, 2) in degrees, and those to the east and to the north there."""
@@ -136,42 +141,6 @@ def _axes(sky):
 def _degrees(place):
     lon, lat = np.degrees(angles(place))
     return np.stack([lon % 360, lat], axis=1)
-
-
-def year(epoch):
-    """An epoch as a decimal Julian year, None as None.
-
-    Raises
-    ------
-    InputError
-        If it is neither an `~astropy.time.Time` nor a year from 1800 to 2200.
-    """
-    if epoch is None:
-        return None
-    value = epoch.jyear if isinstance(epoch, Time) else epoch
-    if isinstance(value, bool) or not isinstance(value, Real) or not 1800 <= value <= 2200:
-        raise InputError(f"epoch must be a decimal year, such as 2013.25, or one astropy Time, got {epoch!r}")
-    return float(value)
-
-
-def mean_epoch(headers):
-    """Mean epoch of exposures by their headers (MJD-AVG, MJD-OBS, DATE-AVG or DATE-OBS), a Julian year, or None."""
-    found = [value for value in map(header_epoch, headers) if value is not None]
-    return float(np.mean(found)) if found else None
-
-
-def header_epoch(header):
-    """Epoch of an exposure by its header, a Julian year, or None; of the day alone if that is all it tells."""
-    for key in ("MJD-AVG", "MJD-OBS", "DATE-AVG", "DATE-OBS"):
-        value = header.get(key)
-        try:
-            if isinstance(value, Real) and value > 1:
-                return year(Time(value, format="mjd"))
-            if isinstance(value, str):
-                return year(Time(value.strip(), scale="utc"))
-        except ValueError:  # a header that says nothing readable says nothing
-            continue
-    return None
 
 
 def read_reference(reference):

@@ -40,12 +40,16 @@ class Identified:
         Of these positions, px^2.
     sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
         As it was known, or as the reference gives it.
+    motion, motion_covariance : ndarray, shape (n, 2) and (n, 2, 2), or None
+        Proper motions of the reference, pixels of the reference plane a year; NaN for stars without one.
     """
 
     rows: np.ndarray
     xy: np.ndarray
     covariance: np.ndarray
     sky: TangentPlane | None
+    motion: np.ndarray | None = None
+    motion_covariance: np.ndarray | None = None
 
     def __repr__(self):
         return f"<Identified: {len(self.rows)} reference stars>"
@@ -97,7 +101,8 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
             sky = _tangent_plane(reference, positions[rows])
         xy, covariance = reference.on_plane(sky)
     _check_agreement(reference.label, positions[rows], xy, np.ptp(positions[solved], axis=0).max())
-    return Identified(rows, xy, covariance, sky)
+    motions = () if reference.motion is None else reference.motions_on_plane(sky)
+    return Identified(rows, xy, covariance, sky, *motions)
 
 
 def _by_name(reference, names):

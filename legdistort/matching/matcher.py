@@ -9,10 +9,10 @@ from astropy import units as u
 from ..cameras.camera import Camera
 from ..cameras.focal_planes import focal_planes
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
+from ..geometry.epochs import header_epoch, mean_epoch
 from ..inputs import column_contract, repetitions
 from ..inputs.exposure_files import listed
 from ..inputs.matches import Matches, in_focal_plane, shapes_by_exposure
-from ..inputs.reference_catalogue import header_epoch, mean_epoch
 from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
@@ -137,10 +137,11 @@ def match(
 
 
 def _add_epochs(table, named):
-    """Add the column ``epoch`` [yr] if the headers of all exposures tell it and the table does not."""
+    """Add the column ``epoch`` [yr] if headers tell it and the table does not; NaN where one does not."""
     epochs = {name: header_epoch(exposure.header) for name, exposure in named.items()}
-    if epochs and None not in epochs.values() and "epoch" not in table.colnames:
-        table["epoch"] = [epochs[name] for name in table["exposure"]] * u.yr
+    if any(epoch is not None for epoch in epochs.values()) and "epoch" not in table.colnames:
+        years = {name: np.nan if epoch is None else epoch for name, epoch in epochs.items()}
+        table["epoch"] = [years[name] for name in table["exposure"]] * u.yr
 
 
 def _without_repetitions(table):

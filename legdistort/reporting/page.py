@@ -11,7 +11,7 @@ import numpy as np
 from ..exceptions import FoldError
 from ..geometry import similarity
 from ..inputs import column_contract
-from ..plots import psf_plots, solution_plots, stack_plots
+from ..plots import motion_plots, psf_plots, solution_plots, stack_plots
 from ..runtime.outputs import replacing
 from .checks_table import verdict
 from .comparison import compared_corrections, compared_stacks, sharpness
@@ -136,6 +136,8 @@ def _facts_table(solution, facts):
     rows["Minimisation"] = escape(str(solution.status))
     rows["Gauge"] = escape(solution.gauge.sentence)
     rows |= {key.capitalize(): escape(sentence) for key, sentence in solution.diagnostics.in_words().items()}
+    if solution.motions is not None:
+        rows["Motions"] = escape(solution.motions.sentence)
     rows["Sky"] = escape(solution.sky_sentence)
     rows["Left out"] = (
         "<br>".join(f"{escape(str(n))}: {escape(str(r))}" for n, r in facts["left_out"].items()) or "none"
@@ -227,6 +229,7 @@ def _pictures(solution, mosaic, psfs):
     )
     figures = [f'<div class="pair">{residuals}{scatter}</div>', *_distortion_figures(solution), coefficients]
     figures += _error_figure(solution)
+    figures += _motion_figures(solution)
     for name, psf in list((psfs or {}).items())[:1]:
         figures.append(
             figure(
@@ -260,6 +263,23 @@ def _error_figure(solution):
         "correction is extrapolated. Absolute errors are those of the row Gauge above."
     )
     yield figure(solution_plots.plot_sigma_map(*drawn, ax=detached_figure(6.4, 5.4).subplots()), text)
+
+
+def _motion_figures(solution):
+    """Proper motions, where they were fitted."""
+    if solution.motions is None or not np.isfinite(solution.motions.values).any():
+        return
+    points = figure(
+        motion_plots.plot_motions(solution, ax=detached_figure(6.0, 6.0).subplots()),
+        "Proper motion of every star with its relative errors, relative to the mean of the stars: groups are stars "
+        "that belong together; single ones far off may be mismatched.",
+    )
+    errors = figure(
+        motion_plots.plot_motion_errors(solution, ax=detached_figure(6.4, 5.6).subplots()),
+        "Errors of the motions against brightness: stars far above the others are seen less often, or over a "
+        "shorter time.",
+    )
+    yield f'<div class="pair">{points}{errors}</div>'
 
 
 def _distortion_figures(solution):

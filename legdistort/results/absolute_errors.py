@@ -44,9 +44,16 @@ def relative_variance(gauge, uncertainty, xy):
         out[:, good] += _spread(gauge.directions[good], gauge.bend_errors(uncertainty.coefficients)[1])
     directions = _directions(gauge, xy)[good]
     plain = gauge.modes_at(xy[good], directions.shape[2] // 2).T
-    left = directions - np.einsum("jm,mac->jac", plain, np.einsum("mj,jac->mac", np.linalg.pinv(plain), directions))
-    out[:, good] += _spread(left, gauge.absolute_covariance)
+    out[:, good] += _spread(without_plain_map(directions, plain), gauge.absolute_covariance)
+    if gauge.drift is not None:
+        drifting = uncertainty.drift_directions[good][:, :2, 2 * gauge.n_modes :]
+        out[:, good] += _spread(without_plain_map(drifting, plain), gauge.drift.covariance)
     return out
+
+
+def without_plain_map(directions, plain):
+    """Displacements (n_stars, k, c) of stars without a map of modes (n_stars, n_modes), fitted to all of them."""
+    return directions - np.einsum("jm,mac->jac", plain, np.einsum("mj,jac->mac", np.linalg.pinv(plain), directions))
 
 
 def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):

@@ -222,13 +222,18 @@ def scatter(corrected):
 
 
 def corrected_positions(solution):
-    """Corrected positions (n_exposures, n_stars, 2) of the fitted stars (section 3.3), NaN where not used."""
+    """Corrected positions (n_exposures, n_stars, 2) of the fitted stars (section 3.3), NaN where not used.
+
+    Those of stars whose motions were fitted are carried to the epoch of the solution.
+    """
     table = solution.observations
     out = np.full((len(solution.names), len(solution.star_names), 2), np.nan)
     for i, name in enumerate(solution.names):
         rows = table[(table["exposure"] == name) & table["used"]]
         xy = np.column_stack([rows["x"].value, rows["y"].value])
         out[i, np.searchsorted(solution.star_names, rows["star"])] = solution.correct(name, xy)
+        if solution.motions is not None:
+            out[i] -= solution.motions.displacement(solution.motions.years[i], solution.sky)
     return out
 
 

@@ -4,6 +4,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+#: Twice the gain in the logarithm of the likelihood from which stars count as moving. Without motions it has the
+#: distribution of half a chi2 with one degree of freedom: 0.5 % of motionless sets exceed it
+#: (measured: none of 100, tests/benchmarks/motions_table.py).
+MOVING = 6.6
+
 
 @dataclass(frozen=True)
 class AliasedDegree:
@@ -156,6 +161,36 @@ FOLDING = 1.0, 2.146193220620583, 2.904629975029914
 
 
 @dataclass(frozen=True)
+class MotionScatter:
+    """Scatter of the proper motions of stars.
+
+    Attributes
+    ----------
+    sigma : float
+        Per axis, pixels a year.
+    gain : float
+        Twice the gain in the logarithm of the likelihood over stars that do not move.
+    n_stars : int
+        Whose motions are determined.
+    """
+
+    sigma: float
+    gain: float
+    n_stars: int
+
+    @property
+    def is_there(self):
+        """Whether stars move beyond doubt."""
+        return self.gain > MOVING
+
+    def __str__(self):
+        seen = f"{self.n_stars} stars, twice the gain in log-likelihood {self.gain:.3g}, {MOVING} needed"
+        if self.is_there:
+            return f"stars move: proper motions scatter by {self.sigma:.2g} px/yr per axis ({seen})"
+        return f"stars do not move beyond their errors ({seen})"
+
+
+@dataclass(frozen=True)
 class CorrelatedErrors:
     """Errors of a star that are alike in neighbouring exposures, found from the residuals of all stars.
 
@@ -256,6 +291,8 @@ class Diagnostics:
         Rms departure of the exposures from the mean of the prior against what its widths lead to expect.
     selection : DegreeChoice or None
     validation : Validation or None
+    motion_scatter : MotionScatter or None
+        Whether stars move, where the set was asked.
     """
 
     error_floor: float = 0.0
@@ -271,6 +308,7 @@ class Diagnostics:
     error_law: ErrorLaw | None = None
     epoch: float | None = None
     correlated: CorrelatedErrors | None = None
+    motion_scatter: MotionScatter | None = None
 
     def in_words(self):
         """Sentences on errors found, the widths of a prior, the degree chosen, and the stars that were kept out.
@@ -278,7 +316,8 @@ class Diagnostics:
         Returns
         -------
         dict
-            ``{"errors" | "widths" | "modes" | "degree" | "kept": sentence}``, those that there is something to say on.
+            ``{"errors" | "widths" | "modes" | "degree" | "motion" | "kept": sentence}``, those that there is something
+            to say on.
         """
         found = self.error_law or self.correlated
         words = {} if found is None else {"errors": str(found)}
@@ -297,6 +336,8 @@ class Diagnostics:
                 )
         if self.selection is not None:
             words["degree"] = self.selection.sentence
+        if self.motion_scatter is not None:
+            words["motion"] = str(self.motion_scatter)
         if self.validation is not None:
             words["kept"] = str(self.validation)
         return words
@@ -304,6 +345,7 @@ class Diagnostics:
     def summary(self):
         """What there is of it as plain numbers and strings by name, for summaries."""
         names = "widths", "effective_modes", "departure_ratio", "selection", "validation", "error_law", "correlated"
+        names += ("motion_scatter",)
         return {name: found for name, found in asdict(self).items() if name in names and found is not None}
 
 

@@ -10,7 +10,7 @@ the smallest dynamic part, ``R_i = N_i' W_i`` (gauge ``"minimal"``), or ``sum_i 
 which the paper's starting point implies for undithered exposures.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -76,6 +76,104 @@ class UnknownDirection:
 
 
 @dataclass(frozen=True, eq=False)
+class Drift:
+    """Common maps that change with time as the stars do by their motions and parallaxes, and so show in no residual.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Terms of the stars: "vx", "vy" [pix/yr], "parallax" [pix].
+    motion : ndarray, shape (n_exposures, 2 n_modes, q)
+        How modes of fields of those terms of which nothing is known beforehand change the coefficients of exposures,
+        n_modes for each of the q / n_modes terms.
+    covariance : ndarray, shape (q, q)
+        Of these maps, without the rates that the poses carry.
+    maps : ndarray, shape (m, q)
+        Orthonormal rows: those that constraints of the gauge hold.
+    rates : ndarray, shape (c, q)
+        The same that poses carry: common rates of shift, rotation and scale, and the mean parallax.
+    held : bool
+        Whether what is known of the motions of stars beforehand determined them, not the convention of the gauge.
+    n_tied : int
+        Stars of a reference whose proper motions tie them, the rates too; their covariance has these then.
+    shared : ndarray, shape (2, 2, n_stars), or None
+        What to add to the variances of relative motions and of maps that are tied, whose errors are partly the same.
+    """
+
+    names: tuple
+    motion: np.ndarray
+    covariance: np.ndarray
+    maps: np.ndarray
+    rates: np.ndarray
+    held: bool = False
+    n_tied: int = 0
+    shared: np.ndarray | None = None
+
+    @property
+    def n_constraints(self):
+        """Constraints of the gauge on maps and rates."""
+        return len(self.maps) + len(self.rates)
+
+    def determined(self, reach, information):
+        """The same where what is known of the motions of stars determines the maps, the rates with them.
+
+        Parameters
+        ----------
+        reach : ndarray, shape (n_constraints of the gauge, q)
+            The modes as values of the constraints.
+        information : ndarray, shape (n_constraints of the gauge,) squared
+            Of these values.
+        """
+        rows = np.concatenate([self.maps, self.rates])
+        moved = reach @ rows.T
+        covariance = np.linalg.inv(moved.T @ information @ moved)[: len(self.maps), : len(self.maps)]
+        return replace(self, covariance=self.maps.T @ covariance @ self.maps, held=True)
+
+    def variance(self, values):
+        """Variance and covariance (k, k, n_stars) that the maps add to the terms of stars, for modes (n_modes, n)."""
+        n, k = len(values), len(self.names)
+        free = self.covariance.shape[0] // n
+        blocks = self.covariance.reshape(free, n, free, n)
+        out = np.zeros((k, k, values.shape[1]))
+        out[k - free :, k - free :] = np.einsum("mj,ambn,nj->abj", values, blocks, values, optimize=True)
+        return out
+
+    def __str__(self):
+        errors = self.errors()
+        rate = np.sqrt(np.mean([error**2 for name, error in errors.items() if name != "parallax"])) if errors else 0.0
+        by = "the scatter of the motions of stars" if self.held else "the smallest dynamic part"
+        words = (
+            f"Motions. Maps that change with time as all stars may by their motions show in no residual either: "
+            f"{self.n_constraints} modes, held by {by}. Absolute error of a motion {rate:.2g} px/yr rms over the "
+            "field, per axis"
+        )
+        if "parallax" in errors:
+            words += f", of a parallax {errors['parallax']:.2g} px"
+        if self.n_tied:
+            words += f"; they are tied to the proper motions of {self.n_tied} stars of the reference"
+        unknown = [] if self.n_tied else ["common rates of shift, rotation and scale"]
+        unknown += ["the mean parallax"] if "parallax" in self.names else []
+        if not unknown:
+            return f"{words}."
+        are = "is" if unknown == ["the mean parallax"] else "are"
+        return f"{words}, after {' and '.join(unknown)}, which {are} not known without a reference."
+
+    def tied(self, covariance, n_tied, shared):
+        """The same where a reference determined the maps of motions with a covariance (2 n_modes,) squared."""
+        whole, size = self.covariance.copy(), len(covariance)
+        whole[:size], whole[:, :size] = 0, 0
+        whole[:size, :size] = covariance
+        return replace(self, covariance=whole, n_tied=n_tied, shared=shared)
+
+    def errors(self):
+        """Rms over the field [pix/yr per axis, pix] of what the maps add to motions and parallaxes, by name."""
+        n = self.motion.shape[1] // 2
+        free = self.names[len(self.names) - self.motion.shape[2] // n :]
+        power = np.diag(self.covariance).reshape(len(free), n).sum(axis=1) / 4  # b_m has mean square 1/4
+        return {name: float(np.sqrt(each)) for name, each in zip(free, power, strict=True)}
+
+
+@dataclass(frozen=True, eq=False)
 class Gauge:
     """What is known of a map common to all exposures, and the convention for the rest.
 
@@ -114,6 +212,8 @@ class Gauge:
         With ``directions``: see there.
     plane : str or None
         What the plane of a simpler correction is, in words. How far it is from the sky is not known then.
+    drift : Drift or None
+        Common maps that change with time, where the motions of stars are fitted.
     """
 
     kind: str
@@ -131,11 +231,30 @@ class Gauge:
     convention: np.ndarray | None = None
     responses: object = field(default=None, repr=False, compare=False)
     plane: str | None = None
+    drift: Drift | None = None
 
     @property
     def n_constraints(self):
-        """Number of directions that are fixed; 2 n_modes unless exposures have modes that are fixed or shared."""
+        """Number of directions that are fixed; 2 n_modes unless exposures have modes that are fixed or shared.
+
+        With those that change with time, where the motions of stars are fitted.
+        """
         return len(self.constraint)
+
+    @property
+    def n_maps(self):
+        """Number of directions among them that are the same at all times."""
+        return self.n_constraints - (0 if self.drift is None else self.drift.n_constraints)
+
+    @property
+    def drift_reach(self):
+        """Modes of maps that change with time -> values of the orthonormal constraints, (n_constraints, q)."""
+        return self.orthonormal @ self.drift.motion.reshape(self.orthonormal.shape[1], -1)
+
+    @property
+    def all_motion(self):
+        """`motion` with that of the maps that change with time, (n_exposures, 2 n_modes, 2 n_modes + q)."""
+        return self.motion if self.drift is None else np.concatenate([self.motion, self.drift.motion], axis=2)
 
     @property
     def n_modes(self):
@@ -171,7 +290,7 @@ class Gauge:
         if self.convention is None:
             return None
         rows = self.convention.reshape(len(self.convention), -1)
-        return np.linalg.pinv(rows @ self.motion.reshape(rows.shape[1], -1)) @ rows
+        return np.linalg.pinv(rows @ self.all_motion.reshape(rows.shape[1], -1))[: 2 * self.n_modes] @ rows
 
     def bend_errors(self, covariance):
         """Covariance of the bend to the convention with all coefficients, and its own, of theirs.
@@ -208,7 +327,8 @@ class Gauge:
     def common_map(self, departure):
         """The map (2 n_modes,) of the reference plane, similarities aside, to which departures A_i - A_0 amount."""
         similar = similarity_basis(2 * self.box[1, ::-1], self.n_modes)
-        out = -np.linalg.pinv(self.reach) @ self.orthonormal @ departure.ravel()
+        reach = self.reach if self.drift is None else self.orthonormal @ self.all_motion.reshape(departure.size, -1)
+        out = -np.linalg.pinv(reach)[: 2 * self.n_modes] @ self.orthonormal @ departure.ravel()
         return out - similar.T @ (similar @ out)
 
     @property
@@ -287,7 +407,7 @@ class Gauge:
         known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}"
         if after and error == 0:  # nothing of the common map is known
             known = "absolute positions are not known"
-        return f"{self.kind} ({_CONVENTIONS[self.kind]}), {self.n_constraints} modes of a common map; {known}"
+        return f"{self.kind} ({_CONVENTIONS[self.kind]}), {self.n_maps} modes of a common map; {known}"
 
     def __repr__(self):
         return f"<Gauge {self.kind!r}: {self.n_constraints} constraints, {len(self.motion)} exposures>"
@@ -299,7 +419,7 @@ class Gauge:
         degree = basis.degree_of(self.n_modes)
         lines = [
             f"Gauge {self.kind!r}. A map of the reference plane of degree {degree} that every exposure takes back "
-            f"changes nothing in the data: {self.n_constraints} modes, {min(6, self.n_constraints)} of them exactly.",
+            f"changes nothing in the data: {self.n_maps} modes, {min(6, self.n_maps)} of them exactly.",
             f"{'modes':24s} {'number':>6s} {'absolute error':>15s}  pinned by",
         ]
         measured = {} if self.tie is None else self.tie.words(convention)
@@ -317,6 +437,7 @@ class Gauge:
                 "second order; the absolute error is theirs."
             )
         lines += [self.warning[0].upper() + self.warning[1:] + "."] if self.warning else []
+        lines += [] if self.drift is None else [str(self.drift)]
         if self.static == "open":
             return "\n".join(lines)
         dynamic = np.sqrt(np.sum(self.scatter**2) / 8)

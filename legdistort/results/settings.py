@@ -23,6 +23,12 @@ class Settings:
     clip, validate : float or None
     error_floor : float
         As it was stated; for the one in force see `legdistort.results.diagnostics.Diagnostics`.
+    motion : {None, "proper", "parallax"}
+        What of the motions of stars was fitted; ``motion="auto"`` chose it.
+    motion_sigma : float or None
+        Scatter of proper motions per axis, pixels a year, that was in force.
+    motion_epoch : float or None
+        Year of the positions, as it was asked for.
     max_iterations : int or None
     """
 
@@ -37,5 +43,8 @@ class Settings:
     clip: float | None = None
     error_floor: float = 0.0
     errors: str = "stated"
+    motion: str | None = None
+    motion_sigma: float | str | None = None
+    motion_epoch: float | None = None
     max_iterations: int | None = None
     validate: float | None = None

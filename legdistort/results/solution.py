@@ -14,15 +14,18 @@ from astropy.wcs import WCS
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
+from ..geometry.epochs import year
 from ..geometry.models import exposure_model, like, outside, to_pixels
 from ..geometry.star_hull import support, supported
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from . import absolute_errors, new_positions
+from . import motions as star_motions
 from .check import in_lines
 from .detector_view import by_detector
 from .diagnostics import Diagnostics
 from .gauge import Gauge
+from .motions import StarMotions
 from .settings import Settings
 
 
@@ -82,6 +85,8 @@ class Solution:
         focal plane.
     checked : callable or tuple of Check
         The `checks`, or what makes them of the solution.
+    motions : StarMotions or None
+        What moves the stars, where that was fitted.
 
     Parameters
     ----------
@@ -114,6 +119,7 @@ class Solution:
     form: object = None
     camera: object = None
     checked: object = field(default=(), repr=False)
+    motions: StarMotions | None = None
     inverses: InitVar[dict | None] = None
     file_checksum: InitVar[str | None] = None
 
@@ -146,6 +152,12 @@ class Solution:
         ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue, and ``sky``, the same places as a
         `~astropy.coordinates.SkyCoord` (not in files). ``meta`` has ``frame``, ``epoch`` (a Julian year, if it is
         known), ``gauge``, ``degree``, ``prior`` and ``version``.
+
+        Where motions were fitted, positions are those of the epoch, and there are ``vx``, ``vy`` [pix/yr], with a sky
+        ``pmra`` (with cos(dec)), ``pmdec`` [mas/yr] and, if it was fitted, ``parallax`` [mas], all with relative and
+        absolute errors and with correlations named alike; ``chi2``, ``n_epochs`` and ``span`` [yr]. ``sky`` then has
+        the motions too. Absolute errors of motions leave out common rates of shift, rotation and scale, those of
+        parallaxes the mean parallax: nothing but a reference tells these. NaN where a star is seen at one epoch only.
         """
         table = QTable({"star": self.star_names, "x": self.positions[:, 0] * u.pix, "y": self.positions[:, 1] * u.pix})
         variance = absolute_errors.relative_variance(self.gauge, self.uncertainty, self.positions)
@@ -163,12 +175,25 @@ class Solution:
         if self.sky is not None:
             new_positions.add_sky(table, self.sky, self.positions, variance, absolute)
             table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=self._obstime)
+        if self.motions is not None:
+            errors = star_motions.covariances(self.gauge, self.uncertainty, self.positions)
+            star_motions.add_motions(table, self.motions, *errors, self.positions, self.sky)
+            if self.sky is not None:
+                table["sky"] = SkyCoord(
+                    table["ra"], table["dec"], pm_ra_cosdec=table["pmra"], pm_dec=table["pmdec"], frame="icrs",
+                    obstime=self._obstime,
+                )  # fmt: skip
         table.meta = self._stars_meta()
         return column_contract.describe_stars(table)
 
     @property
+    def epoch(self):
+        """Julian year of the positions, or None."""
+        return self.diagnostics.epoch if self.motions is None else self.motions.epoch
+
+    @property
     def _obstime(self):
-        return None if self.diagnostics.epoch is None else Time(self.diagnostics.epoch, format="jyear")
+        return None if self.epoch is None else Time(self.epoch, format="jyear")
 
     def _stars_meta(self):
         """What must be known of a table of stars by itself, in words and numbers that any file can hold."""
@@ -179,13 +204,32 @@ class Solution:
             prior = prior.get("name", "")
         meta = {
             "frame": "reference plane" if self.sky is None else "ICRS",
-            "epoch": self.diagnostics.epoch,
+            "epoch": self.epoch,
             "gauge": self.gauge.kind,
             "degree": self.degree,
             "prior": None if self.settings.prior is None else str(prior or "given"),
             "version": f"legdistort {self.provenance.get('versions', {}).get('legdistort', '')}".strip(),
         }
         return {key: value for key, value in meta.items() if value is not None}
+
+    def positions_at(self, epoch):
+        """Positions (n_stars, 2) of the stars in the reference plane at another time, pixels.
+
+        Stars without a motion stay where they are.
+
+        Parameters
+        ----------
+        epoch : float or `~astropy.time.Time`
+            A Julian year.
+
+        Raises
+        ------
+        InputError
+            If motions were not fitted.
+        """
+        if self.motions is None:
+            raise InputError("the motions of the stars were not fitted: call solve with motion='proper'")
+        return self.positions + self.motions.displacement(year(epoch), self.sky)
 
     @property
     def residuals(self):
@@ -519,6 +563,7 @@ class Solution:
             *self._static_in_words(),
             *_wrapped("gauge", self.gauge.sentence),
             f"sky     {self.sky_sentence}",
+            *(_wrapped("stars", self.motions.sentence) if self.motions is not None else []),
             f"rms     {self.rms[0]:.4f}, {self.rms[1]:.4f} px in x, y; "
             f"{np.count_nonzero(used)} of {len(used)} observations used",
             *(line for key, text in self.diagnostics.in_words().items() for line in _wrapped(key, text)),

@@ -27,8 +27,18 @@ from ..runtime.outputs import replacing, settle_for
 from ..runtime.provenance import checksums, unchanged
 from .catalogue_tie import Tie
 from .check import Check
-from .diagnostics import AliasedDegree, CorrelatedErrors, DegreeChoice, Diagnostics, ErrorLaw, UsedReference, Validation
-from .gauge import Gauge, UnknownDirection, UnknownMap
+from .diagnostics import (
+    AliasedDegree,
+    CorrelatedErrors,
+    DegreeChoice,
+    Diagnostics,
+    ErrorLaw,
+    MotionScatter,
+    UsedReference,
+    Validation,
+)
+from .gauge import Drift, Gauge, UnknownDirection, UnknownMap
+from .motions import StarMotions
 from .settings import Settings
 
 #: Version of the layout under ``legdistort``.
@@ -44,11 +54,15 @@ class StoredUncertainty:
     directions: np.ndarray
     weak: tuple
     bends: np.ndarray | None = None
+    star_unknowns: np.ndarray | None = None
+    drift_directions: np.ndarray | None = None
 
 
 def write_solution(solution, path, *, overwrite=False):
     """Write a `Solution`, its covariances included, to an ASDF file."""
     table = plain_columns(solution.observations)
+    covariances = ["coefficients", "stars", "directions", "bends"]
+    covariances += ["star_unknowns", "drift_directions"] if solution.motions is not None else []
     tree = {
         "layout": LAYOUT,
         "provenance": solution.provenance,
@@ -62,9 +76,8 @@ def write_solution(solution, path, *, overwrite=False):
         "stars": {"star": np.asarray(solution.star_names), "position": solution.positions},
         "columns": table.colnames,  # their order: that of a mapping is lost in files
         "observations": {name: plain(table[name]) for name in table.colnames},
-        "covariance": {
-            key: getattr(solution.uncertainty, key) for key in ("coefficients", "stars", "directions", "bends")
-        }
+        "motions": solution.motions and dataclasses.asdict(solution.motions),
+        "covariance": {key: getattr(solution.uncertainty, key) for key in covariances}
         | {"weak": [dataclasses.asdict(each) for each in solution.uncertainty.weak]},
         "gauge": _gauge_tree(solution.gauge),
         "sky": solution.sky and dataclasses.asdict(solution.sky),
@@ -85,6 +98,7 @@ def _gauge_tree(gauge):
     tree = {field.name: getattr(gauge, field.name) for field in fields if field.name != "responses"}
     return tree | {
         "tie": gauge.tie and dataclasses.asdict(gauge.tie),
+        "drift": gauge.drift and dataclasses.asdict(gauge.drift),
         "unknown_maps": [dataclasses.asdict(each) for each in gauge.unknown_maps],
     }
 
@@ -149,6 +163,7 @@ def _own(value):
 def _diagnostics(tree, names):
     """`Diagnostics`; with exposures in their order, which mappings in files do not keep."""
     parts = {"selection": DegreeChoice, "validation": Validation, "error_law": ErrorLaw, "correlated": CorrelatedErrors}
+    parts["motion_scatter"] = MotionScatter
     found = _made(Diagnostics, tree, reference=UsedReference, **parts)
     if (chosen := found.selection) is not None:
         degrees = tuple(AliasedDegree(**each) for each in chosen.aliasing)
@@ -162,7 +177,7 @@ def _from_tree(kind, checksum, tree):
     uncertainty = _made(StoredUncertainty, tree["covariance"])
     weak = tuple(UnknownDirection(**each) for each in uncertainty.weak)
     uncertainty = dataclasses.replace(uncertainty, weak=weak)
-    gauge = _made(Gauge, tree["gauge"], tie=Tie)
+    gauge = _made(Gauge, tree["gauge"], tie=Tie, drift=Drift)
     maps = tuple(UnknownMap(**each) for each in gauge.unknown_maps)
     gauge = dataclasses.replace(gauge, unknown_maps=maps, responses=uncertainty)
     table = QTable({name: restored(tree["observations"][name]) for name in tree["columns"]})
@@ -187,6 +202,7 @@ def _from_tree(kind, checksum, tree):
         left_out=dict(tree["left_out"]),
         provenance=dict(tree["provenance"]),
         camera=tree.get("camera") and cameras.from_tree(tree["camera"], Camera),
+        motions=_made(StarMotions, tree.get("motions")),
         checked=tuple(Check(**each) for each in tree.get("checks", ())),
         inverses={e["name"]: _inverse(e["inverse"]) for e in exposures if e["inverse"] is not None},
         file_checksum=checksum,
@@ -208,9 +224,12 @@ def _check_consistent(solution):
     for name, pose in solution.poses.items():
         if pose.shape != (2, 3) or not np.isfinite(pose).all() or np.linalg.det(pose[:, :2]) == 0:
             raise ValueError(f"the pose of {name} should be a finite, invertible array (2, 3)")
-    own, gauge = 2 * n_modes, solution.gauge
+    own, gauge, moving = 2 * n_modes, solution.gauge, solution.motions
+    if (gauge.drift is None) != (moving is None):
+        raise ValueError("motions of stars and the maps common to them come together")
+    k, q = (0, 0) if moving is None else (len(moving.names), gauge.drift.motion.shape[2])
     held, modes = gauge.n_constraints, gauge.motion.shape[1]  # those that exposures have for themselves
-    if modes != 2 * basis.n_modes(basis.degree_of(modes // 2)) or held > modes:
+    if modes != 2 * basis.n_modes(basis.degree_of(modes // 2)) or gauge.n_maps > modes:
         raise ValueError(f"the gauge cannot have {held} constraints on {modes} modes")
     for what, array, shape in (
         ("positions", solution.positions, (n_stars, 2)),
@@ -227,6 +246,16 @@ def _check_consistent(solution):
         ("gauge.covariance", gauge.covariance, (modes, modes)),
         *(("map of gauge.unknown_maps", each.map, (modes,)) for each in gauge.unknown_maps),
         ("gauge.values", gauge.values, (held,)),
+        ("motions", None if moving is None else moving.values, (n_stars, k)),
+        (
+            "covariance of the motions",
+            solution.uncertainty.star_unknowns if k else None,
+            ((2 + k) * (3 + k) // 2, n_stars),
+        ),
+        ("drift directions", solution.uncertainty.drift_directions if k else None, (n_stars, 2 + k, modes + q)),
+        ("gauge.drift.motion", None if gauge.drift is None else gauge.drift.motion, (n, modes, q)),
+        ("gauge.drift.covariance", None if gauge.drift is None else gauge.drift.covariance, (q, q)),
+        ("gauge.drift.shared", None if gauge.drift is None else gauge.drift.shared, (2, 2, n_stars)),
         ("gauge.tie.shared", None if gauge.tie is None else gauge.tie.shared, (3, n_stars)),
     ):
         if array is not None and array.shape != shape:

@@ -39,7 +39,8 @@ def noiseless_solution(matches, problem, layout, kind, scatter):
     State
     """
     positions = layout.positions[np.asarray(matches.stars)]
-    state = State(positions.T.copy(), problem.prior_mean.copy(), np.stack(list(layout.poses.values())))
+    stars = np.concatenate([positions.T, np.zeros((problem.terms.n, len(positions)))])
+    state = State(stars, problem.prior_mean.copy(), np.stack(list(layout.poses.values())))
     blocks = criterion.linearise(problem, state)
     gauge = _gauge(kind, problem, state, blocks, scatter, layout.sigma)
     exact = replace(blocks, residual=np.zeros_like(blocks.residual), chi2=0.0)

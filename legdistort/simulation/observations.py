@@ -93,6 +93,10 @@ def simulate_matches(
     pose_error=0.0,
     noise=1.0,
     corr=0.0,
+    motion=0.0,
+    parallax=0.0,
+    epochs=None,
+    sky=None,
     seed=0,
 ):
     """Catalogues of the same stars in several distorted exposures.
@@ -133,6 +137,14 @@ def simulate_matches(
         Factor on the noise drawn: 0 leaves the positions exact while their stated errors stay.
     corr : float
         Correlation of the errors in x and y, in (-1, 1).
+    motion : float or array_like, shape (n_stars, 2)
+        Proper motions, pixels a year: the scatter per axis of those drawn, or themselves.
+    parallax : float or array_like, shape (n_stars,)
+        Pixels: the scatter of those drawn, or themselves.
+    epochs : array_like, shape (n_exposures,), optional
+        When the exposures are taken, years; positions are those of their mean.
+    sky : `~legdistort.geometry.tangent_plane.TangentPlane`, optional
+        Where the field lies, which parallaxes need.
     seed : int
         The same seed gives the same simulation.
 
@@ -153,7 +165,8 @@ def simulate_matches(
             f"{seen=}, {corr=}, {dither=}, {noise=}"
         )
     sigma = position_errors(sigma, n_exposures, n_stars)
-    star_rng, map_rng, pose_rng, noise_rng = np.random.default_rng(seed).spawn(4)
+    star_rng, map_rng, pose_rng, noise_rng, motion_rng = np.random.default_rng(seed).spawn(5)
+    moving = _moving(motion_rng, n_stars, n_exposures, motion, parallax, epochs, sky)
     static = draw_coefficients(map_rng, static, degree, 1, "static")[0]
     dynamic = draw_coefficients(map_rng, dynamic, degree, n_exposures, "dynamic", zero_mean=zero_mean)
     names = exposure_names(n_exposures)
@@ -166,9 +179,35 @@ def simulate_matches(
 
     least = min(4, n_exposures) if min_exposures is None else min_exposures
     positions = draw_stars(star_rng, n_stars, footprint(true_poses.values(), shape), inside, least)
-    truth = Truth(names, tuple(shape), positions, None, static, dynamic, true_poses, nominal)
+    truth = Truth(names, tuple(shape), positions, None, static, dynamic, true_poses, nominal, sky=sky, **moving)
     observed = inside(positions) & (noise_rng.random((n_exposures, n_stars)) < seen)
-    return Simulation(matches_from(truth, observed, sigma, noise_rng, noise=noise, corr=corr), truth)
+    return Simulation(matches_from(truth, observed, sigma, noise_rng, noise=noise, corr=corr, sky=sky), truth)
+
+
+def _moving(rng, n_stars, n_exposures, motion, parallax, epochs, sky):
+    """Motions, parallaxes and times as `Truth` has them."""
+    still = not np.any(motion) and not np.any(parallax)
+    if epochs is None:
+        if still:
+            return {}
+        raise InputError("stars that move need epochs, the years of the exposures")
+    years = np.asarray(epochs, dtype=float)
+    if years.shape != (n_exposures,) or not np.isfinite(years).all():
+        raise InputError(f"epochs must be the years of the {n_exposures} exposures, got {epochs!r}")
+    made = {"years": years, "epoch": float(years.mean()), "motions": _drawn(rng, motion, (n_stars, 2), "motion")}
+    if np.any(parallax):
+        if sky is None:
+            raise InputError("parallaxes need sky, the place of the field")
+        made["parallaxes"] = _drawn(rng, parallax, (n_stars,), "parallax")
+    return made
+
+
+def _drawn(rng, given, shape, name):
+    """Values of a shape: those given, or drawn with the scatter given."""
+    given = np.asarray(given, dtype=float)
+    if given.shape not in ((), shape) or not np.isfinite(given).all():
+        raise InputError(f"{name} must be a number or an array of shape {shape}, got shape {given.shape}")
+    return given * rng.normal(size=shape) if given.ndim == 0 else given
 
 
 def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **settings):
@@ -255,7 +294,7 @@ def matches_from(truth, observed, sigma, rng, *, noise=1.0, corr=0.0, sky=None):
     """Matches from truth: `observed` (n_exposures, n_stars) bool, `sigma` (n_exposures, n_stars, 2) pixels."""
     drawn = rng.normal(size=sigma.shape)
     drawn[..., 1] = corr * drawn[..., 0] + np.sqrt(1 - corr**2) * drawn[..., 1]
-    xy = np.stack([truth.distort(name, truth.positions) for name in truth.names]) + noise * sigma * drawn
+    xy = np.stack([truth.distort(name, truth.place(name)) for name in truth.names]) + noise * sigma * drawn
     exposure, star = np.nonzero(observed)
     (x, y), (x_err, y_err) = (values[exposure, star].T * u.pix for values in (xy, sigma))
     names = np.array(truth.names)[exposure]
@@ -264,4 +303,6 @@ def matches_from(truth, observed, sigma, rng, *, noise=1.0, corr=0.0, sky=None):
         table["xy_corr"] = np.full(len(star), float(corr))
     if truth.flux is not None:
         table["flux"] = truth.flux[star]
+    if truth.years is not None:
+        table["epoch"] = truth.years[exposure] * u.yr
     return Matches.from_table(table, shape=truth.shape, poses=truth.nominal_poses, sky=sky, allow_copies=not noise)

@@ -5,10 +5,12 @@ from numbers import Real
 
 import numpy as np
 from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.table import Table
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity
+from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from ..priors.prior import Prior
 from ..runtime.checks import check_choice, check_counts
@@ -43,8 +45,11 @@ class Plan:
     min_exposures: int | None
     n_grid: int
     seed: int
+    epochs: object = None
+    field: object = None
 
     def __post_init__(self):
+        self._check_epochs()
         check_counts(n_grid=self.n_grid, n_exposures=self.n_exposures)
         object.__setattr__(self, "degree", basis.check_degree(self.degree))
         check_choice(self.gauge, KINDS, "gauge")
@@ -63,6 +68,32 @@ class Plan:
             check_counts(n_stars=self.n_stars)
         if self.density is not None and not (isinstance(self.density, Real) and 0 < self.density < np.inf):
             raise InputError(f"density must be a positive number of stars a detector, got {self.density!r}")
+
+    def _check_epochs(self):
+        """When the exposures will be taken, and where the field lies."""
+        if self.epochs is None:
+            if self.field is not None:
+                raise InputError("field, the place on the sky, is asked for parallaxes: give epochs too")
+            return
+        years = np.asarray(self.epochs, dtype=float)
+        if years.shape != (self.n_exposures,) or not np.isfinite(years).all():
+            raise InputError(f"epochs must be the years of the {self.n_exposures} exposures, got {self.epochs!r}")
+        if self.field is not None and not (isinstance(self.field, SkyCoord) and self.field.isscalar):
+            raise InputError(f"field must be the place on the sky as one SkyCoord, got {self.field!r}")
+
+    @property
+    def motion(self):
+        """What of the motions of stars will be fitted, or None."""
+        return None if self.epochs is None else "proper" if self.field is None else "parallax"
+
+    @property
+    def sky(self):
+        """The field on the sky, north up; the scale is of no matter."""
+        if self.field is None:
+            return None
+        place, pixel = self.field.icrs, 1e-5
+        matrix = pixel * np.array([[-1.0, 0, self.shape[1] / 2], [0, 1.0, -self.shape[0] / 2]])
+        return TangentPlane(place.ra.deg, place.dec.deg, matrix)
 
     @property
     def least(self):
@@ -89,6 +120,8 @@ class Layout:
         What will be measured: stars on the detector, if on enough exposures.
     errors : ndarray, shape (n_exposures, n_all, 2)
         Standard deviations, pixels.
+    years : ndarray, shape (n_exposures,), or None
+    sky : TangentPlane or None
     """
 
     positions: np.ndarray
@@ -96,6 +129,8 @@ class Layout:
     shape: tuple
     observed: np.ndarray
     errors: np.ndarray
+    years: np.ndarray | None = None
+    sky: TangentPlane | None = None
 
     @property
     def sigma(self):
@@ -105,10 +140,12 @@ class Layout:
     def matches(self, static):
         """The positions that will be matched, without noise, for a static distortion (2, n_modes)."""
         names = tuple(self.poses)
+        zero = np.zeros((len(names), 1, 1))
         plan = truth.Truth(
-            names, self.shape, self.positions, None, static, np.zeros((len(names), 1, 1)), self.poses, self.poses
+            names, self.shape, self.positions, None, static, zero, self.poses, self.poses, years=self.years
         )
-        return observations.matches_from(plan, self.observed, self.errors, np.random.default_rng(0), noise=0)
+        rng = np.random.default_rng(0)
+        return observations.matches_from(plan, self.observed, self.errors, rng, noise=0, sky=self.sky)
 
     def axes(self, n):
         """Coordinates x, y of a grid of the field, n points along its longer side, as centres of cells."""
@@ -147,7 +184,8 @@ def lay_out(plan):
             f"none of {len(positions)} stars lies on {plan.least} or more of the detectors; positions are pixels of "
             f"the reference plane, here from {region[0].round()} to {region[1].round()} (x, y)"
         )
-    return Layout(positions, pose_list, shape, observed, _errors(plan, len(positions)))
+    years = None if plan.epochs is None else np.asarray(plan.epochs, dtype=float)
+    return Layout(positions, pose_list, shape, observed, _errors(plan, len(positions)), years, plan.sky)
 
 
 def _poses(plan, rng):

@@ -11,9 +11,11 @@ from astropy.table import Table
 
 from ..exceptions import LegdistortError
 from ..geometry import basis
-from ..results import accuracy
+from ..results import accuracy, motions
 from ..results.solution import Solution
+from ..solving import star_motions
 from ..solving.equations.problem import build_problem
+from ..solving.options import SolveOptions
 from .aliasing import alias, assumed_spectra
 from .noiseless_solution import noiseless_solution
 from .plan import Plan, lay_out
@@ -128,12 +130,26 @@ class Prediction:
         n_im, n_star = n / self.n_stars, n / self.n_exposures
         return n_im**-0.5, float(np.sqrt((1 - 1 / n_im) * (1 + basis.n_modes(self.degree) / n_star)))
 
+    @property
+    def motion_errors(self):
+        """Expected errors of proper motions [pix/yr per axis] and parallaxes [pix], relative, rms over the stars.
+
+        ``{"motion" | "parallax": error}``, empty without epochs. ``solution.stars`` has them star by star.
+        """
+        if self.solution.motions is None:
+            return {}
+        relative = motions.covariances(self.solution.gauge, self.solution.uncertainty, self.solution.positions)[0]
+        variance = np.einsum("kkj->kj", relative)
+        out = {"motion": finite_rms(np.sqrt(variance[:2]))}
+        return out | ({"parallax": finite_rms(np.sqrt(variance[2]))} if len(variance) > 2 else {})
+
     def summary(self):
         """All figures as a dict of numbers."""
         counts = {"n_exposures": self.n_exposures, "n_stars": self.n_stars, "degree": self.degree}
         names = [f.name for f in fields(self) if f.type is float] + ["b_total", "sigma_total", "s_b", "s_sigma"]
         thumb = dict(zip(("thumb_b", "thumb_sigma"), self.thumb, strict=True))
-        return counts | {name: getattr(self, name) for name in names} | thumb
+        moving = {f"{name}_error": error for name, error in self.motion_errors.items()}
+        return counts | {name: getattr(self, name) for name in names} | moving | thumb
 
     def plot(self, *, ax=None):
         """Map of the expected scatter of new positions, aliasing included, with stars and contour; returns the axes.
@@ -165,7 +181,12 @@ class Prediction:
         """
         n, settings = self.n_exposures, self.settings
         changes = [{"degree": d} for d in (self.degree - 1, self.degree + 1) if 0 <= d <= basis.MAX_DEGREE]
-        if settings.poses is None and np.ndim(settings.dithers) == 0 and np.ndim(settings.sigma) < 2:
+        if (
+            settings.poses is None
+            and settings.epochs is None
+            and np.ndim(settings.dithers) == 0
+            and np.ndim(settings.sigma) < 2
+        ):
             least = settings.least / n  # the same part of them, for the same stars
             some = [m for m in (n // 2, 2 * n) if m > 1]
             changes += [{"n_exposures": m, "min_exposures": max(min(2, m), round(least * m))} for m in some]
@@ -210,6 +231,8 @@ def predict(
     spectrum=None,
     static_spectrum=None,
     min_exposures=None,
+    epochs=None,
+    field=None,
     n_grid=50,
     seed=0,
 ):
@@ -253,6 +276,10 @@ def predict(
         degree count (for the others see ``static_sigma`` of `Prior`).
     min_exposures : int, optional
         Stars on fewer exposures are left out; default 4, or all if there are fewer.
+    epochs : array_like, shape (n_exposures,), optional
+        Years of the exposures: proper motions are fitted too.
+    field : `~astropy.coordinates.SkyCoord`, optional
+        Where it lies: parallaxes are fitted too.
     n_grid : int
         Points of the maps along the longer side.
     seed : int
@@ -278,6 +305,7 @@ def predict(
         n_exposures=n_exposures, stars=stars, n_stars=n_stars, density=density, sigma=sigma, degree=degree,
         shape=shape, dithers=dithers, poses=poses, prior=prior, gauge=gauge, dynamic=dynamic, spectrum=spectrum,
         static_spectrum=static_spectrum, min_exposures=min_exposures, n_grid=n_grid, seed=seed,
+        epochs=epochs, field=field,
     )  # fmt: skip
     return _predict(plan)
 
@@ -287,7 +315,10 @@ def _predict(plan):
     independent, common = assumed_spectra(plan)
     layout = lay_out(plan)
     matches = layout.matches(np.zeros((2, 1)) if plan.prior is None or plan.prior.mean is None else plan.prior.mean)
-    problem = build_problem(matches, plan.degree, prior=plan.prior)
+    if plan.motion is not None:
+        star_motions.check_epochs(matches, plan.motion)
+    motion = star_motions.terms_of(SolveOptions(motion=plan.motion))
+    problem = build_problem(matches, plan.degree, prior=plan.prior, motion=motion)
     fitted = independent[:, : problem.n_modes]
     known = bool(np.isfinite(fitted).all())
     solution, state = noiseless_solution(matches, problem, layout, plan.gauge, fitted if known else None)

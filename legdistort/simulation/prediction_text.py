@@ -4,6 +4,8 @@ import textwrap
 
 import numpy as np
 
+_MOTIONS = {"motion": "proper motions, relative [px/yr]", "parallax": "parallaxes, relative [px]"}
+
 
 def decimals(prediction):
     """Decimal places that show three digits of errors like those of a `Prediction`."""
@@ -49,6 +51,7 @@ def describe(prediction):
             row(_absolute(prediction), prediction.b_abs),
             row("sigma, new positions inside the contour", *sigma, prediction.s_sigma, thumb_sigma),
             row("sigma, new positions over the whole field", prediction.sigma_field, finite_rms(prediction.alias_map)),
+            *(row(_MOTIONS[name], error) for name, error in prediction.motion_errors.items()),
             *textwrap.wrap(f"All but b, absolute, are relative: {_relative(prediction)}", 110),
             f"gauge {solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
         ]

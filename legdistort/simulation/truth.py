@@ -13,7 +13,7 @@ from astropy.table import QTable
 from numpy.polynomial import legendre
 
 from ..exceptions import InputError
-from ..geometry import similarity
+from ..geometry import parallax, similarity
 from ..geometry.gsaoi import GsaoiMap
 from ..geometry.tangent_plane import TangentPlane
 
@@ -43,6 +43,14 @@ class Truth:
     instrument : `~legdistort.geometry.gsaoi.GsaoiMap` or None
         The real static distortion.
     sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
+    years : ndarray, shape (n_exposures,), or None
+        When the exposures were taken.
+    epoch : float or None
+        Year of the positions.
+    motions : ndarray, shape (n_stars, 2), or None
+        Proper motions, pixels a year.
+    parallaxes : ndarray, shape (n_stars,), or None
+        Pixels.
     """
 
     names: tuple
@@ -55,6 +63,20 @@ class Truth:
     nominal_poses: dict
     instrument: GsaoiMap | None = None
     sky: TangentPlane | None = None
+    years: np.ndarray | None = None
+    epoch: float | None = None
+    motions: np.ndarray | None = None
+    parallaxes: np.ndarray | None = None
+
+    def place(self, name):
+        """True reference-plane positions (n_stars, 2) of the stars at the time of an exposure."""
+        if self.motions is None:
+            return self.positions
+        i = self.names.index(self._known(name))
+        out = self.positions + (self.years[i] - self.epoch) * self.motions
+        if self.parallaxes is not None:
+            out = out + self.parallaxes[:, None] * parallax.on_plane(self.sky, self.years[i : i + 1])
+        return out
 
     @property
     def coefficients(self):

@@ -7,10 +7,15 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
+from ..geometry.epochs import ONE_EPOCH
 from ..results.diagnostics import Diagnostics
+from ..results.motions import StarMotions
 from ..results.solution import Solution
 from ..runtime import provenance
 from .checks.solution_checks import check_solution
+from .equations import criterion
+from .equations.elimination import inverse_star_blocks
+from .equations.star_terms import packed
 
 
 def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, status, dof, chi2=None,
@@ -42,6 +47,7 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
     table = QTable(matches.table, copy=False)
     table["dx"], table["dy"] = problem.in_table_order(blocks.residual) * u.pix
     table["used"] = problem.in_table_order(problem.weight[0] > 0)
+    motions = _motions(problem, state, blocks) if problem.terms.n else None
     positions = state.positions.T.copy()
     positions[blocks.v[0] <= 0] = np.nan
     return Solution(
@@ -66,6 +72,7 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
         provenance=provenance.stamp(),
         form=form,
         camera=matches.camera,
+        motions=motions,
         checked=partial(
             check_solution,
             problem=problem,
@@ -75,4 +82,30 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
             times=matches.times,
             header_distortion=matches.header_distortion if np.all(np.isinf(problem.mean_sigma)) else None,
         ),
+    )
+
+
+def _motions(problem, state, blocks):
+    """The `StarMotions` of a state."""
+    terms, used = problem.terms, problem.weight[0] > 0
+    values = state.stars[2:].T.copy()
+    determined = inverse_star_blocks(blocks.v)[np.diag(packed(problem.n_star))[2:]].T > 0
+    values[~determined] = np.nan
+    years, star = terms.years[problem.exposure[used]], problem.star[used]
+    order = np.lexsort([years, star])
+    years, star = years[order], star[order]
+    new = np.diff(star, prepend=-1) != 0
+    first, last = np.flatnonzero(new), np.append(np.flatnonzero(new)[1:], len(star)) - 1
+    later = ~new & (np.diff(years, prepend=0.0) > ONE_EPOCH)
+    span = np.zeros(problem.n_stars)
+    span[star[first]] = years[last] - years[first]
+    return StarMotions(
+        names=terms.names,
+        values=values,
+        epoch=terms.epoch,
+        years=terms.years,
+        chi2=np.bincount(problem.star, criterion.squares(problem, blocks.residual), problem.n_stars),
+        n_epochs=np.bincount(star[first], minlength=problem.n_stars)
+        + np.bincount(star[later], minlength=problem.n_stars),
+        span=span,
     )

@@ -38,7 +38,7 @@ def is_explained(problem, result, *, clip):
         return False
     squares, n = criterion.squares(problem, result.blocks.residual), problem.xy.shape[1]
     hidden = 2 * basis.n_modes(problem.unknowns.gauge_degree)  # maps that the gauge holds are no unknowns
-    free = max(1 - (2 * problem.n_stars + problem.unknowns.size - hidden) / (2 * n), LEAST_FREE)
+    free = max(1 - (problem.n_star * problem.n_stars + problem.unknowns.size - hidden) / (2 * n), LEAST_FREE)
     scale2 = np.median(squares) / (2 * np.log(2) * free)
     if scale2 > SUSPECT**2:
         return False

@@ -20,6 +20,7 @@ from .choices.held_out import hold_out, only_rows, validation
 from .correlated_errors import estimate_with_correlations
 from .equations import effective_modes
 from .equations.covariances import Uncertainty
+from .motion_choice import resolve as resolve_motion
 from .options import CLIP, SolveOptions, check_reference
 
 log = logging.getLogger(__name__)
@@ -44,6 +45,9 @@ def solve(
     errors="stated",
     max_iterations=None,
     validate=None,
+    motion=None,
+    motion_sigma=None,
+    motion_epoch=None,
     reference=None,
     epoch=None,
     pixel_scale=None,
@@ -101,6 +105,14 @@ def solve(
     validate : float, optional
         Keep this fraction of the stars, 0 to 0.5, out of everything, and report their scatter beside the one to be
         expected: ``diagnostics.validation``. They are not in the tables of the solution.
+    motion : {None, "proper", "parallax", "auto"}
+        Fit a proper motion of every star beside its position, a parallax too, or decide by the evidence of the set
+        whether stars move. When exposures were taken is known from their headers or the column ``epoch``.
+    motion_sigma : float or "evidence", optional
+        Scatter of the proper motions of stars around their mean, per axis, pixels a year: known, or found from the set.
+        None: nothing is known of them.
+    motion_epoch : float or `~astropy.time.Time`, optional
+        Of the positions in ``stars``; by default the mean of the observations, where they are most precise.
     reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord` or path, optional
         Positions with errors that tie shift, rotation and scale, and the maps that the exposures do not tell; relative
         positions stay as precise as they are. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error`` [mas]
@@ -133,7 +145,7 @@ def solve(
     asked = SolveOptions(
         degree=degree, prior=prior, model=model, static=static, exposure_degree=exposure_degree, gauge=gauge,
         method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors, max_iterations=max_iterations,
-        validate=validate,
+        validate=validate, motion=motion, motion_sigma=motion_sigma, motion_epoch=motion_epoch,
     )  # fmt: skip
     catalogue, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
     if model is None:
@@ -147,10 +159,11 @@ def solve(
         if options.chooses_degree:
             selection = _choose_degree(given, options)
             options = replace(options, degree=selection.degree)
+        options, scatter = resolve_motion(given, options)
         fit, errors_found = _estimate(given, options)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
-        diagnostics = replace(_diagnostics(fit, prior, scale, selection), **errors_found)
+        diagnostics = replace(_diagnostics(fit, prior, scale, selection), motion_scatter=scatter, **errors_found)
         if catalogue is not None:
             fit = reference_tie.tie_to(fit, catalogue, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
     epoch = given.epoch if epoch is None else epoch
@@ -292,7 +305,8 @@ def _settings(asked, options, form):
     """
     made = {field.name: getattr(asked, field.name) for field in fields(Settings)}
     made |= {"degree": int(options.degree), "exposure_degree": options.own_degree}
-    for name in ("clip", "error_floor", "validate"):
+    made |= {name: getattr(options, name) for name in ("motion", "motion_sigma")}
+    for name in ("clip", "error_floor", "validate", "motion_sigma"):
         made[name] = None if made[name] is None else float(made[name])
     prior = asked.prior
     if isinstance(prior, dict):

@@ -76,7 +76,9 @@ def loss_factors(squares, loss):
     return 1 / np.maximum(1, np.sqrt(s)) if loss == "huber" else 1 / (1 + s)
 
 
-def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", max_iterations=None, tolerance=5e-5):
+def solve_joint(
+    problem, state, *, gauge="minimal", common=None, hold=False, loss="linear", max_iterations=None, tolerance=5e-5
+):
     """Gauss-Newton on all unknowns under the constraints of the gauge.
 
     Parameters
@@ -88,6 +90,8 @@ def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", 
     common : ndarray, shape (2 n_modes,), optional
         Map of the reference plane at which to hold what the data do not tell, see
         `legdistort.solving.gauge.constraints.make`.
+    hold : bool
+        Hold the plane, and what changes it with time, where the start values have it.
     loss : {"linear", "huber", "cauchy"}
     max_iterations : int, optional
         50 if not given.
@@ -106,7 +110,7 @@ def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", 
     check_choice(loss, LOSSES, "loss")
     max_iterations = MAX_ITERATIONS if max_iterations is None else max_iterations
     state, _ = constraints.absorb_similarities(problem, state)
-    run = _Descent(problem, state, _Rules(gauge, common, loss))
+    run = _Descent(problem, state, _Rules(gauge, common, loss, hold))
     run.descend(max_iterations, tolerance)
     while run.converged and (freer := run.freer()) is not None:
         with contextlib.suppress(SolveError):
@@ -114,7 +118,8 @@ def solve_joint(problem, state, *, gauge="minimal", common=None, loss="linear", 
         if not (freer.converged and is_explained(freer.blocks.chi2, run.system)):
             break
         run = freer
-    convention = run.convention if run.released is None else run.declared()
+    held = run.released is None and not problem.terms.is_held
+    convention = run.convention if held else run.declared()
     status = f"converged after {len(run.steps)} iterations"
     if not run.converged:
         status = (
@@ -134,6 +139,7 @@ class _Rules:
     gauge: str
     common: np.ndarray | None
     loss: str
+    hold: bool
 
 
 class _Descent:
@@ -160,6 +166,9 @@ class _Descent:
             how = {"released": self.released, "common": self.rules.common}
             self.convention = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks, **how)
             self.n_made += 1
+            if self.rules.hold:
+                here = self.convention.violation(_departure(self.problem, self.state))
+                self.convention = replace(self.convention, values=here)
         self.system = reduced_system.reduced_system(self.weighted, self.blocks, self.convention)
 
     def descend(self, max_iterations, tolerance):
@@ -185,7 +194,7 @@ class _Descent:
 
     def freer(self):
         """The same with further unknown maps left to the residuals; None if these determine none."""
-        if self.rules.common is not None:
+        if self.rules.common is not None or self.rules.hold:
             return None
         more = determined_by_residuals(self.system, self.convention)
         if not more.shape[1]:
@@ -197,18 +206,25 @@ class _Descent:
     def declared(self):
         """The gauge with all maps held where they are, so that errors relative to it stay relative.
 
-        What the residuals determine of the released ones becomes the absolute error.
+        What the residuals determine of the released ones, and what is known of the motions of stars of common maps that
+        change with time, becomes the absolute error.
         """
-        whole = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks)
+        whole = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks, all_drifts=True)
         information = reduced_system.reduced_system(self.weighted, self.blocks, whole).information
-        moved = whole.reach @ self.released
-        error = self.released @ np.linalg.inv(moved.T @ information @ moved) @ self.released.T
+        covariance, drift = self.convention.covariance, whole.drift
+        if self.released is not None:
+            moved = whole.reach @ self.released
+            error = self.released @ np.linalg.inv(moved.T @ information @ moved) @ self.released.T
+            covariance = covariance + error
+        if self.problem.terms.is_held:
+            drift = drift.determined(whole.drift_reach, information)
         return replace(
             whole,
             values=whole.violation(_departure(self.problem, self.state)),
             released=self.released,
-            covariance=self.convention.covariance + error,
+            covariance=covariance,
             unknown_maps=self.convention.unknown_maps,
+            drift=drift,
         )
 
 
@@ -232,7 +248,7 @@ def _advance(problem, state, cost, d_star, d_exposure):
         factor = 0.5**halving
         coefficients = state.coefficients.copy()
         coefficients[:, :, :n_modes] += factor * d_exposure.reshape(-1, 2, n_modes)
-        tried = State(state.positions + factor * d_star, coefficients, state.poses)
+        tried = State(state.stars + factor * d_star, coefficients, state.poses)
         tried, _ = constraints.absorb_similarities(problem, tried)
         new = criterion.linearise(problem, tried)
         # the constraints may cost a little J along directions that are only nearly free
@@ -273,14 +289,14 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
         before = state
         for _ in range(3):  # stars given A: a few Newton steps, each star by itself
             step = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
-            state = State(state.positions + step, state.coefficients, state.poses)
+            state = State(state.stars + step, state.coefficients, state.poses)
             blocks = criterion.linearise(problem, state)
             if np.abs(step).max() < 1e-9:
                 break
         coefficients = state.coefficients.copy()  # coefficients given X: linear, each exposure by itself
         change = np.linalg.solve(blocks.u, blocks.g_exposure[..., None])[..., 0]
         coefficients[:, :, :n_modes] += change.reshape(-1, 2, n_modes)
-        state = State(state.positions, coefficients, state.poses)
+        state = State(state.stars, coefficients, state.poses)
         blocks = criterion.linearise(problem, state)
         c_a = _relative_change(before.coefficients, state.coefficients)
         c_x = _relative_change(before.positions, state.positions)

@@ -7,9 +7,11 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis, fitter
-from ..inputs.reference_catalogue import read_reference, year
+from ..geometry.epochs import year
+from ..inputs.reference_catalogue import read_reference
 from ..results.settings import Settings
 from ..runtime.checks import LARGEST, check_choice
+from . import star_motions
 from .choices.degree_choice import AUTO
 from .equations.problem import check_error_floor, check_prior
 from .gauge.constraints import KINDS
@@ -40,6 +42,7 @@ class SolveOptions(Settings):
     clip: float | None = CLIP
 
     def __post_init__(self):
+        object.__setattr__(self, "motion_epoch", year(self.motion_epoch))
         self._check_distortion()
         check_choice(self.gauge, KINDS, "gauge")
         check_error_floor(self.error_floor)
@@ -60,8 +63,30 @@ class SolveOptions(Settings):
             raise InputError("errors='by-brightness' finds the errors, their floor too: leave error_floor out")
         if self.max_iterations is not None and not (isinstance(self.max_iterations, int) and self.max_iterations > 0):
             raise InputError(f"max_iterations must be a positive integer, got {self.max_iterations!r}")
+        self._check_motion()
         if self.clip is not None and not (isinstance(self.clip, Real) and 1 < self.clip < LARGEST):
             raise InputError(f"clip must be a number of standard errors above 1, got {self.clip!r}")
+
+    def _check_motion(self):
+        """What is sought of the motions of stars, and what is known of them beforehand."""
+        check_choice(self.motion, (None, *star_motions.KINDS), "motion")
+        sigma = self.motion_sigma
+        real = isinstance(sigma, Real) and not isinstance(sigma, bool)
+        named = isinstance(sigma, str) and sigma == "evidence"
+        if sigma is not None and not named and not (real and 0 < sigma < LARGEST):
+            raise InputError(f"motion_sigma must be a positive number of pixels a year, or 'evidence', got {sigma!r}")
+        if self.motion is None:
+            if sigma is not None or self.motion_epoch is not None:
+                raise InputError("motion_sigma and motion_epoch belong to motion='proper', 'parallax' or 'auto'")
+            return
+        for word, excluded in (
+            ("method='alternating'", self.method == "alternating"),
+            ("errors='correlated'", self.errors == "correlated"),
+            ("degree='auto'", self.chooses_degree),
+            ("validate", self.validate is not None),
+        ):
+            if excluded:
+                raise InputError(f"motion={self.motion!r} does not go with {word}, for which stars stay where they are")
 
     def _check_distortion(self):
         """The degree, what is shared, what is known, what is kept out, and a model that says it all."""

@@ -22,7 +22,8 @@ from . import minimisers
 from .equations import criterion
 from .equations.covariances import Uncertainty
 from .equations.problem import State
-from .gauge import catalogue_map, hierarchy
+from .equations.star_terms import unpacked
+from .gauge import catalogue_map, catalogue_rates, hierarchy
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,8 @@ _SETTLED = 0.01
 _HARMLESS = 0.3
 #: Offsets larger than expected by this factor in chi2 are told.
 _LARGE = 2.0
+#: A map of the motions of stars moves the solution to first order; what is left is told by another round.
+_RATE_ROUNDS = 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -116,6 +119,58 @@ class ReferenceTie:
             result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds{rest}")
         return replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown))
 
+    def tie_rates(self, problem, result):
+        """The `Problem` and the `Result` with the motions of stars as those of the reference are on average.
+
+        Motions move by a map of the reference plane, coefficients by what takes it back; the same residuals but for
+        what is of second order, so that all is solved again where this leads.
+        """
+        gauge, rows = result.gauge, self.identified.rows
+        good = np.isfinite(self.identified.motion_covariance).all(axis=(1, 2)) & result.gauge.tie.used
+        size = 2 * gauge.n_modes
+        centre, total = np.zeros(size), np.zeros(size)
+        for _ in range(_RATE_ROUNDS):
+            errors = self._errors(problem, result)
+            own = unpacked(errors.star_unknowns)[rows][:, 2:4, 2:4]
+            seen = good & np.isfinite(own).all(axis=(1, 2))
+            positions = result.state.positions.T
+            offsets = self.identified.motion - result.state.stars[2:4].T[rows]
+            modes = gauge.modes_at(positions[rows[seen]])
+            step, covariance, used, gain, scale = catalogue_rates.estimate(
+                offsets[seen],
+                (own + self.identified.motion_covariance)[seen],
+                modes,
+                gauge.drift,
+                centre=centre - total,
+                label=self.label,
+            )
+            total = total + step
+            problem, state = _drifted(problem, result, step)
+            status, result = result.status, self.solve(problem, state, hold=True)
+        log.info("motions are tied to those of %d stars of %s", np.count_nonzero(used), self.label)
+        if scale > np.sqrt(_LARGE):
+            warn(
+                f"the proper motions of {self.label} differ from those of the stars by {scale:.1f} times what the "
+                "errors of both say; the absolute errors of motions rest on the stated ones",
+                AssumptionWarning,
+            )
+        design = np.kron(np.eye(2), modes.T).reshape(2, -1, len(step)).transpose(1, 0, 2)
+        follows = own[seen] @ gain.transpose(0, 2, 1) @ design.transpose(0, 2, 1)
+        shared = np.zeros((2, 2, len(self.names)))
+        shared[:, :, rows[seen]] = -np.moveaxis(follows + follows.transpose(0, 2, 1), 0, -1)
+        drift = result.gauge.drift.tied(covariance, int(np.count_nonzero(used)), shared)
+        tied = replace(result.gauge, tie=gauge.tie, unknown_maps=gauge.unknown_maps, drift=drift)
+        result = replace(result, gauge=tied, status=status if result.converged else result.status)
+        return problem, self._tied_anew(problem, result)
+
+    def _tied_anew(self, problem, result):
+        """The same with the `Tie` of a solution that has changed a little since it was made."""
+        errors = self._errors(problem, result)
+        directions = self._directions(result.gauge, errors, result.state.positions.T)
+        equations = self._equations(result, directions, errors, self._prior(result.gauge, directions))
+        _, made = catalogue_map.estimate(equations, result.gauge.tie.used, self.names)
+        return replace(result, gauge=replace(result.gauge, tie=made))
+
     def _warn(self, made):
         """Tell what makes the absolute errors too small."""
         n = np.count_nonzero(made.used)
@@ -190,6 +245,23 @@ def _common(problem, result, step):
     return gauge.common_map(departure) + step
 
 
+def _drifted(problem, result, step):
+    """The `Problem` and the `State` whose motions are moved by a map (2 n_modes,), to first order."""
+    gauge, state = result.gauge, result.state
+    modes = gauge.modes_at(state.positions.T)
+    moved = step.reshape(2, -1) @ modes
+    stars, coefficients = state.stars.copy(), state.coefficients.copy()
+    stars[2:4] += moved
+    change = gauge.drift.motion[:, :, : len(step)] @ step
+    coefficients[:, :, : gauge.n_modes] -= change.reshape(len(change), 2, -1)
+    terms = problem.terms
+    if terms.is_held:
+        mean = np.zeros((terms.n, problem.n_stars)) + terms.mean
+        mean[:2] += moved
+        problem = replace(problem, moving=replace(terms, mean=mean))
+    return problem, State(stars, coefficients, state.poses)
+
+
 def _pose(gauge, shift):
     """The similarity X -> X + phi(X) g of modes g (2 k,) without anything else, as a pose."""
     corners = gauge.box[0] + gauge.box[1] * np.array([[0.0, 0], [1, 0], [0, 1]])
@@ -202,7 +274,12 @@ def _moved(state, pose):
     """The same solution in a plane moved by a pose: exactly as good."""
     back = similarity.invert(pose)
     moved = np.stack([similarity.compose(own, back) for own in state.poses])
-    return State(similarity.apply(pose, state.positions.T).T, state.coefficients, moved)
+    stars = state.stars.copy()
+    stars[:2] = similarity.apply(pose, state.positions.T).T
+    if len(stars) > 2:
+        stars[2:4] = pose[:, :2] @ state.stars[2:4]  # motions turn with the plane
+        stars[4:] *= np.sqrt(np.linalg.det(pose[:, :2]))
+    return State(stars, state.coefficients, moved)
 
 
 def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
@@ -231,6 +308,8 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         `legdistort.solving.gauge.catalogue_map.accepted`.
     """
     matches, result = fit.matches, fit.result
+    if fit.problem.terms.n:  # positions are those of this epoch, whatever the mean of the exposures is
+        epoch = fit.problem.terms.epoch
     epoch = matches.epoch if epoch is None else epoch
     identified = identify(
         reference.at(epoch),
@@ -250,7 +329,11 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         solve=partial(minimisers.solve_joint, gauge=of.gauge, loss=of.loss, max_iterations=of.max_iterations),
         shared_errors=fit.shared_errors,
     )
-    result = tying.tie(fit.problem.scaled(fit.used.astype(float)), result)
+    problem = fit.problem.scaled(fit.used.astype(float))
+    result = tying.tie(problem, result)
+    if problem.terms.n and identified.motion is not None:
+        problem, result = tying.tie_rates(problem, result)
+        fit = replace(fit, problem=replace(fit.problem, moving=problem.moving))
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
 
 

@@ -12,9 +12,9 @@ from scipy.optimize import brentq
 from ..exceptions import ConvergenceWarning, LegdistortError, SolveError, warn
 from ..inputs.matches import Matches
 from ..runtime import parallel
-from . import agreement, clipping, minimisers, start_values
+from . import agreement, clipping, minimisers, star_motions, start_values
 from .choices import prior_widths
-from .equations import criterion, effective_modes
+from .equations import criterion, effective_modes, elimination
 from .equations.covariances import Uncertainty
 from .equations.problem import Problem, build_problem, uses_compiled_loops
 
@@ -95,7 +95,7 @@ class Fit:
     def dof(self):
         """Degrees of freedom: the directions fixed by the gauge are no unknowns, and a prior does part of the work."""
         problem = self.problem
-        n_free = 2 * np.count_nonzero(self.blocks.v[0] > 0) + self.effective_modes.sum()
+        n_free = elimination.star_freedom(self.weighted, self.blocks) + self.effective_modes.sum()
         if problem.unknowns.shared:
             priors = problem, replace(problem, static_sigma=None)
             by_prior, by_widths = (effective_modes.done_by_prior(p, self.uncertainty).sum() for p in priors)
@@ -154,6 +154,7 @@ def minimise(matches, options, *, judged=True):
         prior=options.prior,
         error_floor=options.error_floor,
         own_degree=options.own_degree,
+        motion=star_motions.terms_of(options),
     )
     nominal = np.stack([matches.poses[name] for name in matches.names])
     start, typical = start_values.start(problem, nominal, robust=options.loss != "linear")

@@ -5,7 +5,9 @@ import numpy as np
 from ..exceptions import FoldError, SolveError
 from ..geometry import similarity
 from ..geometry.distortion import Distortion
+from .equations.elimination import inverse_star_blocks
 from .equations.problem import State
+from .equations.star_terms import outer_packed, packed, symmetric_times
 
 
 def start(problem, nominal, *, robust=False):
@@ -46,8 +48,11 @@ def start(problem, nominal, *, robust=False):
     typical = np.array([np.sqrt(np.median(distance2[problem.part(i)])) for i in range(problem.n_exposures)])
     common = _common_similarity(problem, nominal, current, misplaced(problem, typical))
     current = np.stack([similarity.compose(pose, common) for pose in current])
-    positions = similarity.apply(similarity.invert(common), positions.T).T
-    return State(positions, problem.prior_mean.copy(), current), typical
+    if problem.terms.n:
+        stars = moving_stars(problem, current, q, weight)
+    else:
+        stars = similarity.apply(similarity.invert(common), positions.T).T
+    return State(stars, problem.prior_mean.copy(), current), typical
 
 
 def _check_prior(problem):
@@ -141,6 +146,22 @@ def distances(problem, pose_list, q, positions):
         off = q[:, part].T - similarity.apply(pose, positions[:, problem.star[part]].T)
         distance2[part] = (off**2).sum(axis=1)
     return distance2
+
+
+def moving_stars(problem, pose_list, q, weight):
+    """Unknowns (2 + k, n_stars) of stars that move, each fitted to its undistorted positions carried back."""
+    n = problem.n_star
+    v, g = np.zeros((n * (n + 1) // 2, problem.n_stars)), np.zeros((n, problem.n_stars))
+    for i, pose in enumerate(pose_list):
+        part, inverse = problem.part(i), similarity.invert(pose)
+        back = inverse[:, :2] @ q[:, part] + inverse[:, 2:]
+        place = np.concatenate([np.eye(2), problem.terms.columns[i]], axis=1)
+        star, w = problem.star[part], weight[part]
+        v[:, star] += sum(outer_packed(row)[:, None] for row in place) * w
+        g[:, star] += problem.terms.pull(i, w * back)
+    diagonal = np.diag(packed(n))[2:]
+    v[diagonal] += problem.terms.precision
+    return symmetric_times(inverse_star_blocks(v), g)
 
 
 def mean_positions(problem, pose_list, q, weight):

@@ -88,7 +88,7 @@ class Residuals:
         out = np.zeros((2, len(self.used), along.shape[1]))
         w, f = problem.weight, blocks.coupling
         for k, d in enumerate(along.T @ system.moves[: len(values)]):
-            moved = np.einsum("akn,an->kn", f, system.follow(d)[:, problem.star])  # W J dX
+            moved = np.einsum("akn,an->kn", f, problem.placed(system.follow(d)))  # W J dX
             with np.errstate(divide="ignore", invalid="ignore"):
                 moved = np.stack([w[1] * moved[0] - w[2] * moved[1], w[0] * moved[1] - w[2] * moved[0]])
                 moved = moved / (w[0] * w[1] - w[2] ** 2)
@@ -199,7 +199,7 @@ class Residuals:
     def _values(self, i, part, degree):
         problem, pose = self.problem, self.state.poses[i]
         ny, nx = problem.shapes[i]
-        q = pose[:, :2] @ self.state.positions[:, problem.star[part]] + pose[:, 2:]
+        q = pose[:, :2] @ problem.terms.place(i, self.state.stars[:, problem.star[part]]) + pose[:, 2:]
         return basis.values(degree, (2 * q[0] + 1) / nx - 1, (2 * q[1] + 1) / ny - 1)
 
     def of_motion(self, times):
@@ -283,21 +283,23 @@ class Residuals:
 
         Returns
         -------
-        stars, moved : ndarray, shape (2, n_stars, 2 n)
+        stars, moved : ndarray, shape (2 + k, n_stars, 2 n)
             Gradient of the stars, and how they follow with the coefficients held.
         rest : ndarray, shape (n_exposures, 2 n_modes, 2 n)
             What is left for the coefficients.
         """
         problem, blocks, w = self.problem, self.blocks, self.problem.weight
         index = problem.star * n + cells
-        stars = np.stack([[np.bincount(index, f, problem.n_stars * n) for f in row] for row in blocks.coupling])
-        stars = stars.reshape(2, 2, problem.n_stars, n).transpose(0, 2, 1, 3).reshape(2, problem.n_stars, 2 * n)
+        pulled = problem.pulled(blocks.coupling)
+        stars = np.stack([[np.bincount(index, f, problem.n_stars * n) for f in row] for row in pulled])
+        stars = stars.reshape(-1, 2, problem.n_stars, n).transpose(0, 2, 1, 3).reshape(-1, problem.n_stars, 2 * n)
         inverse = elimination.inverse_star_blocks(blocks.v)[:, :, None]
         moved = elimination.symmetric_times(inverse, stars)
         rest = np.empty((problem.n_exposures, 2 * problem.n_modes, 2 * n))
         for i in range(problem.n_exposures):
             part = problem.part(i)
-            f, b, y = blocks.coupling[:, :, part, None], blocks.values[:, part], moved[:, problem.star[part]]
+            f, b = blocks.coupling[:, :, part, None], blocks.values[:, part]
+            y = problem.terms.place(i, moved[:, problem.star[part]])
             cell = np.zeros((b.shape[1], n))
             cell[np.arange(b.shape[1]), cells[part]] = 1
             for k, row in enumerate(((w[0], w[2]), (w[2], w[1]))):

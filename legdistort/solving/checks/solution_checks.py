@@ -201,13 +201,15 @@ def place_check(residuals):
 
 
 def time_check(residuals, times):
-    """Do stars move through the set?"""
+    """Do stars move through the set? Not asked where their motions are fitted."""
+    if residuals.problem.terms.n:
+        return None
     times, unit = times
     how = "with time" if unit == "days" else "in the order of the exposures"
-    cure = "solve the epochs apart, and compare their positions"
+    cure = "fit the motions of the stars: --motion proper"
     if unit != "days" or np.ptp(times) < 1:
         within = "in one night it is the measured places that drift, and --errors correlated counts that"
-        cure = within if unit == "days" else f"{within}; over years, {cure}"
+        cure = within if unit == "days" else f"{within}; where years lie between, {cure}"
     score = residuals.of_motion(times)
     error = _star_error(residuals)
     state, little = _pattern_state(score, residuals)

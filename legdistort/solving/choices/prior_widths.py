@@ -118,7 +118,7 @@ def find_widths(fit, prior, degree, unit, *, scale=False):
     for _ in range(MAX_ROUNDS if degree else 0):
         done, caught = fitted()
         labels = _labels(widths, by_exposure(done.matches, prior))
-        seen = evidence(*_sample(done.weighted, done.result.state, labels, done.result.gauge.motion))
+        seen = evidence(*_sample(done.weighted, done.result.state, labels, done.result.gauge.all_motion))
         before, found = widths.values, seen.best(widths.values.size, bounds, scale=scale).reshape(-1, degree)
         log.debug("widths by degree: %s px", found)
         if np.all(np.abs(found - before) <= TOLERANCE * np.maximum(found, unit)):
@@ -164,8 +164,9 @@ def _sample(problem, state, labels, motion):
         prior_mean=problem.prior_mean[keep],
         prior_sigma=problem.prior_sigma[keep],
         group=group,
+        moving=None if problem.moving is None else problem.moving.subset(keep),
     )
-    state = State(state.positions[:, stars], state.coefficients[keep], state.poses[keep])
+    state = State(state.stars[:, stars], state.coefficients[keep], state.poses[keep])
     return part, state, labels[keep], motion[keep]
 
 
@@ -301,7 +302,7 @@ def evidence(problem, state, labels, motion):
     curvature = rows @ matrix @ rows.T - across @ solved[:, :-1]
     slope = rows @ pull - across @ solved[:, -1]
     chi2 = blocks.cost - (moved * blocks.g_star).sum() - others @ pull @ solved[:, -1]
-    n_free = 2 * np.count_nonzero(blocks.v[0] > 0) + len(others) - 4
+    n_free = elimination.star_freedom(problem, blocks) + len(others) - 4
     return Evidence(
         curvature=(curvature + curvature.T) / 2,
         pull=slope + curvature @ origin,

@@ -93,12 +93,29 @@ def _dots(b, x, out):
         out[m] += total
 
 
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _terms(row, n_block, phi, f, j, r):
+    """Add to the sums of a star what an observation says of the terms beside its position, phi (2, n_terms)."""
+    mxx, myy, mxy = f[0] * j[0] + f[1] * j[2], f[2] * j[1] + f[3] * j[3], f[0] * j[1] + f[1] * j[3]
+    px, py = f[0] * r[0] + f[1] * r[1], f[2] * r[0] + f[3] * r[1]
+    place = 3
+    for t in range(phi.shape[1]):
+        mx, my = mxx * phi[0, t] + mxy * phi[1, t], mxy * phi[0, t] + myy * phi[1, t]
+        row[place] += mx
+        row[place + 1] += my
+        for other in range(t + 1):
+            row[place + 2 + other] += phi[0, other] * mx + phi[1, other] * my
+        row[n_block + 2 + t] += phi[0, t] * px + phi[1, t] * py
+        place += 3 + t
+
+
 @njit(cache=True, parallel=True, fastmath=_FAST)
-def _linearise(n_chunks, start, star, xy, weight, unequal, positions, coefficients, poses, sizes, orders, n_modes):
-    n_exposures, n, n_all = len(start) - 1, len(star), orders.shape[1]
+def _linearise(n_chunks, start, star, xy, weight, unequal, moving, coefficients, poses, sizes, orders, n_modes):
+    n_exposures, n, n_all, n_terms = len(start) - 1, len(star), orders.shape[1], moving[1].shape[2]
+    (stars, columns), residual = moving, np.empty((2, n))
+    n_block = (2 + n_terms) * (3 + n_terms) // 2
     values, coupling = np.empty((n_modes, n), np.float32), np.empty((2, 2, n), np.float32)
-    residual = np.empty((2, n))
-    sums = np.zeros((n_chunks, positions.shape[1], 5))
+    sums = np.zeros((n_chunks, stars.shape[1], n_block + 2 + n_terms))
     u_blocks, gradient = np.zeros((n_exposures, 3, n_modes, n_modes)), np.zeros((n_exposures, 2, n_modes))
     chi2 = np.zeros(n_chunks)
     bounds, top = _bounds(start, n_chunks), orders.max() + 1
@@ -107,19 +124,21 @@ def _linearise(n_chunks, start, star, xy, weight, unequal, positions, coefficien
         legendre_, b_, g_ = np.empty((4, top, _BATCH)), np.empty((n_all, _BATCH)), np.empty((4, _BATCH))
         mine = sums[c]
         for i in range(bounds[c], bounds[c + 1]):
-            pose = poses[i]
+            pose, phi = poses[i], columns[i]
             r00, r01, r10, r11 = pose[0, 0], pose[0, 1], pose[1, 0], pose[1, 1]
             for first in range(start[i], start[i + 1], _BATCH):
-                last = min(first + _BATCH, start[i + 1])
-                size = last - first
+                size = min(_BATCH, start[i + 1] - first)
                 q, wr, b, g = q_[:, :size], wr_[:, :size], b_[:, :size], g_[:, :size]
                 for o in range(size):
-                    x, y = positions[0, star[first + o]], positions[1, star[first + o]]
+                    x, y = stars[0, star[first + o]], stars[1, star[first + o]]
+                    for t in range(n_terms):
+                        x += phi[0, t] * stars[2 + t, star[first + o]]
+                        y += phi[1, t] * stars[2 + t, star[first + o]]
                     q[0, o] = r00 * x + r01 * y + pose[0, 2]
                     q[1, o] = r10 * x + r11 * y + pose[1, 2]
                 work = (legendre_[0], legendre_[1], legendre_[2], legendre_[3], b, g)
                 _model(coefficients[i], orders, sizes[i], q, work)
-                w = weight[:, first:last]
+                w = weight[:, first : first + size]
                 total = 0.0
                 for o in range(size):
                     k = first + o
@@ -137,8 +156,10 @@ def _linearise(n_chunks, start, star, xy, weight, unequal, positions, coefficien
                     row[0] += fxx * jxx + fxy * jyx
                     row[1] += fyx * jxy + fyy * jyy
                     row[2] += fxx * jxy + fxy * jyy
-                    row[3] += fxx * rx + fxy * ry
-                    row[4] += fyx * rx + fyy * ry
+                    row[n_block] += fxx * rx + fxy * ry
+                    row[n_block + 1] += fyx * rx + fyy * ry
+                    if n_terms:
+                        _terms(row, n_block, phi, (fxx, fxy, fyx, fyy), (jxx, jxy, jyx, jyy), (rx, ry))
                 chi2[c] += total
                 for m in range(n_modes):
                     for o in range(size):
@@ -153,8 +174,9 @@ def _linearise(n_chunks, start, star, xy, weight, unequal, positions, coefficien
 
 
 @njit(cache=True, parallel=True, fastmath=_FAST)
-def _to_stars(n_chunks, start, star, values, coupling, a, n_stars):
-    sums = np.zeros((n_chunks, n_stars, 2))
+def _to_stars(n_chunks, start, star, values, coupling, columns, a, n_stars):
+    n_terms = columns.shape[2]
+    sums = np.zeros((n_chunks, n_stars, 2 + n_terms))
     bounds, n_modes = _bounds(start, n_chunks), len(values)
     for c in prange(n_chunks):
         x, y = np.empty(_BATCH), np.empty(_BATCH)
@@ -169,14 +191,18 @@ def _to_stars(n_chunks, start, star, values, coupling, a, n_stars):
                         y[o] += ay * row[o]
                 for o in range(size):
                     k = first + o
-                    sums[c, star[k], 0] += coupling[0, 0, k] * x[o] + coupling[0, 1, k] * y[o]
-                    sums[c, star[k], 1] += coupling[1, 0, k] * x[o] + coupling[1, 1, k] * y[o]
+                    px = coupling[0, 0, k] * x[o] + coupling[0, 1, k] * y[o]
+                    py = coupling[1, 0, k] * x[o] + coupling[1, 1, k] * y[o]
+                    sums[c, star[k], 0] += px
+                    sums[c, star[k], 1] += py
+                    for t in range(n_terms):
+                        sums[c, star[k], 2 + t] += columns[i, 0, t] * px + columns[i, 1, t] * py
     return sums
 
 
 @njit(cache=True, parallel=True, fastmath=_FAST)
-def _to_exposures(n_chunks, start, star, values, coupling, stars):
-    n_modes = len(values)
+def _to_exposures(n_chunks, start, star, values, coupling, columns, stars):
+    n_modes, n_terms = len(values), columns.shape[2]
     out = np.zeros((len(start) - 1, 2, n_modes))
     bounds = _bounds(start, n_chunks)
     for c in prange(n_chunks):
@@ -187,6 +213,9 @@ def _to_exposures(n_chunks, start, star, values, coupling, stars):
                 for o in range(size):
                     k = first + o
                     sx, sy = stars[0, star[k]], stars[1, star[k]]
+                    for t in range(n_terms):
+                        sx += columns[i, 0, t] * stars[2 + t, star[k]]
+                        sy += columns[i, 1, t] * stars[2 + t, star[k]]
                     x[o] = coupling[0, 0, k] * sx + coupling[1, 0, k] * sy
                     y[o] = coupling[0, 1, k] * sx + coupling[1, 1, k] * sy
                 for m in range(n_modes):
@@ -248,7 +277,7 @@ def linearise(problem, state):
         problem.xy,
         problem.weight,
         problem.unequal,
-        np.ascontiguousarray(state.positions),
+        (np.ascontiguousarray(state.stars), problem.terms.columns),
         state.coefficients,
         state.poses,
         np.array(problem.shapes, dtype=float),
@@ -258,20 +287,22 @@ def linearise(problem, state):
     sums = sums.sum(axis=0).T
     xx, yy, xy = (parts + np.tril(parts, -1).swapaxes(2, 3)).swapaxes(0, 1)
     u = np.block([[xx, xy], [xy, yy if problem.unequal else xx]])
-    return values, coupling, residual, sums[:3].copy(), sums[3:].copy(), u, gradient.reshape(len(u), -1), chi2
+    n_star = problem.n_star
+    v, g_star = sums[:-n_star].copy(), sums[-n_star:].copy()
+    return values, coupling, residual, v, g_star, u, gradient.reshape(len(u), -1), chi2
 
 
 def to_stars(problem, blocks, a):
     """Twin of `legdistort.solving.equations.elimination.to_stars`."""
-    sums = _to_stars(get_num_threads(), problem.start, problem.star, blocks.values, blocks.coupling, a, problem.n_stars)
+    terms = blocks.values, blocks.coupling, problem.terms.columns
+    sums = _to_stars(get_num_threads(), problem.start, problem.star, *terms, a, problem.n_stars)
     return sums.sum(axis=0).T.copy()
 
 
 def to_exposures(problem, blocks, y):
     """Twin of `legdistort.solving.equations.elimination.to_exposures`."""
-    out = _to_exposures(
-        get_num_threads(), problem.start, problem.star, blocks.values, blocks.coupling, np.ascontiguousarray(y)
-    )
+    terms = blocks.values, blocks.coupling, problem.terms.columns
+    out = _to_exposures(get_num_threads(), problem.start, problem.star, *terms, np.ascontiguousarray(y))
     return out.reshape(len(out), -1)
 
 

@@ -8,6 +8,7 @@ from ...exceptions import AssumptionWarning, warn
 from ...results.gauge import UnknownDirection
 from . import criterion, elimination, reduced_system
 from .problem import State
+from .star_terms import packed, size_of
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
 DENSE_LIMIT = 8000
@@ -59,17 +60,28 @@ class Uncertainty:
     @cached_property
     def stars(self):
         """Covariance xx, yy, xy of every star's position in the gauge, shape (3, n_stars), px^2."""
-        problem, blocks = self._problem, self._blocks
-        inverse = elimination.inverse_star_blocks(blocks.v)
-        l00, l10, l11 = elimination.star_roots(inverse)
-        inner = np.concatenate(
-            [_block_diagonal(factor, self.coefficients) for factor in elimination.star_factors(problem, blocks)], axis=1
-        )
-        c00, c11, c01 = inner / self._scale**2
-        extra_xx = l00**2 * c00
-        extra_xy = l00 * (l10 * c00 + l11 * c01)
-        extra_yy = l10**2 * c00 + 2 * l10 * l11 * c01 + l11**2 * c11
-        out = self._scale**2 * (inverse + np.stack([extra_xx, extra_yy, extra_xy])) + self._shared
+        return self.star_unknowns[:3] + self._shared
+
+    @cached_property
+    def star_unknowns(self):
+        """Covariance of the unknowns of every star in the gauge, packed: position [px^2] and what moves it.
+
+        Shape (m, n_stars). NaN for what the observations of a star do not determine.
+        """
+        problem, blocks, n_star = self._problem, self._blocks, self._problem.n_star
+        inverse, roots = elimination.inverse_star_blocks(blocks.v), elimination.star_roots(blocks.v)
+        factors = elimination.star_factors(problem, blocks)
+        inner = np.concatenate([_block_diagonal(each, self.coefficients, n_star) for each in factors], axis=2)
+        spread = np.einsum("apj,pqj,bqj->abj", roots, inner / self._scale**2, roots, optimize=True)
+        index = packed(n_star)
+        out = inverse.copy()
+        for a in range(n_star):
+            for b in range(a + 1):
+                out[index[a, b]] += spread[b, a]
+        out = self._scale**2 * out
+        for row, diagonal in zip(index, np.diag(index), strict=True):
+            lost = np.flatnonzero(inverse[diagonal] <= 0)
+            out[row[:, None], lost] = np.nan
         out[:, blocks.v[0] <= 0] = np.nan
         return out
 
@@ -85,8 +97,19 @@ class Uncertainty:
 
     def _directions(self, system):
         gauge = self._gauge
-        moved = np.stack([system.follow(d) for d in system.moves[: gauge.n_constraints]], axis=2)
+        moved = np.stack([system.follow(d)[:2] for d in system.moves[: gauge.n_constraints]], axis=2)
         return -(moved @ gauge.reach).transpose(1, 0, 2)
+
+    @cached_property
+    def drift_directions(self):
+        """How modes of the common map and of `Drift` change the unknowns of the stars, (n_stars, 2 + k, 2 n_modes + q).
+
+        See `directions`. A map that stays the same changes motions in second order, by its gradient, and one that
+        changes with time the positions of stars that move.
+        """
+        gauge, system = self._gauge, self.system
+        moved = np.stack([system.follow(d) for d in system.moves[: gauge.n_constraints]], axis=2)
+        return -(moved @ np.hstack([gauge.reach, gauge.drift_reach])).transpose(1, 0, 2)
 
     def unknown_at(self, positions, coefficients, poses):
         """How the directions of `Gauge.unknown` move the stars where the solution has moved to: (2 n_stars, m).
@@ -100,7 +123,8 @@ class Uncertainty:
         here, there = self.system.moves[n:], system.moves[n:]
         if self.weak:
             columns += [
-                system.follow(d).ravel() / self._unit(self.system.follow(h)) for h, d in zip(here, there, strict=True)
+                system.follow(d)[:2].ravel() / self._unit(self.system.follow(h)[:2])
+                for h, d in zip(here, there, strict=True)
             ]
         return np.stack(columns, axis=1)
 
@@ -111,7 +135,8 @@ class Uncertainty:
 
     def _system_at(self, positions, coefficients, poses):
         """The reduced system there, with the same constraints."""
-        blocks = criterion.linearise(self._problem, State(positions.T, coefficients, poses))
+        stars = np.concatenate([positions.T, self._blocks.motions])
+        blocks = criterion.linearise(self._problem, State(stars, coefficients, poses))
         rows = self.system.rows[self._gauge.n_constraints :]
         return reduced_system.reduced_system(self._problem, blocks, self._gauge, rows)
 
@@ -132,7 +157,7 @@ class Uncertainty:
         inverse, moved = elimination.inverse_star_blocks(blocks.v), []
         for errors in self._gauge.bend_errors(self.coefficients)[0].T:
             on_stars = elimination.to_stars(problem, blocks, errors.reshape(problem.n_exposures, -1))
-            moved.append(-elimination.symmetric_times(inverse, on_stars))
+            moved.append(-elimination.symmetric_times(inverse, on_stars)[:2])
         return np.stack(moved, axis=2).transpose(1, 0, 2)
 
     @cached_property
@@ -144,7 +169,7 @@ class Uncertainty:
         system = self.system
         made = []
         for d in system.moves[self._gauge.n_constraints :]:
-            stars, coefficients = system.follow(d), problem.unknowns.spread(d)
+            stars, coefficients = system.follow(d)[:2], problem.unknowns.spread(d)
             unit = self._unit(stars)
             made.append(
                 UnknownDirection("static", stars.T / unit, (coefficients / unit).reshape(len(coefficients), 2, -1))
@@ -158,25 +183,23 @@ class Uncertainty:
         inverse = elimination.inverse_star_blocks(blocks.v)
         n = problem.n_stars
         alone = _star_blocks(inverse)
-        coupling = np.zeros((2, n, problem.n_exposures, 2 * problem.n_modes))
+        coupling = np.zeros((problem.n_star, n, problem.n_exposures, 2 * problem.n_modes))
         for i in range(problem.n_exposures):
             part = problem.part(i)
             f, b = blocks.coupling[:, :, part], blocks.values[:, part]
-            coupling[:, problem.star[part], i] = np.einsum("can,mn->cnam", f, b).reshape(2, b.shape[1], -1)
-        spread = alone @ coupling.reshape(2 * n, -1)
-        shared = _star_blocks(np.broadcast_to(self._shared, inverse.shape))
-        return self._scale**2 * alone + shared + spread @ self.coefficients @ spread.T
+            pulled = problem.terms.pull(i, np.einsum("can,mn->camn", f, b))
+            coupling[:, problem.star[part], i] = np.moveaxis(pulled, 3, 1).reshape(problem.n_star, b.shape[1], -1)
+        spread = alone[: 2 * n] @ coupling.reshape(problem.n_star * n, -1)
+        shared = _star_blocks(np.broadcast_to(self._shared, (3, n)))
+        return self._scale**2 * alone[: 2 * n, : 2 * n] + shared + spread @ self.coefficients @ spread.T
 
 
-def _star_blocks(block):
-    """Symmetric 2 x 2 blocks (3, n) of the stars as one matrix (2 n, 2 n), all x first."""
-    return np.block([[np.diag(block[0]), np.diag(block[2])], [np.diag(block[2]), np.diag(block[1])]])
+def _star_blocks(blocks):
+    """Symmetric packed blocks (m, n) of the stars as one matrix, all x first, then all y and so on."""
+    return np.block([[np.diag(blocks[k]) for k in row] for row in packed(size_of(blocks))])
 
 
-def _block_diagonal(factor, covariance):
-    """2 x 2 diagonal blocks xx, yy, xy of ``factor' C factor`` for factors (n, 2 n_stars), shape (3, n_stars)."""
-    half = factor.shape[1] // 2
-    product = covariance @ factor
-    x, y = factor[:, :half], factor[:, half:]
-    cx, cy = product[:, :half], product[:, half:]
-    return np.stack([np.einsum("nj,nj->j", a, b) for a, b in ((x, cx), (y, cy), (x, cy))])
+def _block_diagonal(factor, covariance, n_star):
+    """Diagonal blocks (k, k, n_stars) of ``factor' C factor`` for factors (n, k n_stars)."""
+    product = (covariance @ factor).reshape(len(factor), n_star, -1)
+    return np.einsum("naj,nbj->abj", factor.reshape(product.shape), product)

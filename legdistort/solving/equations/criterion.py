@@ -9,6 +9,9 @@ contributes to the normal equations::
     U_i  += W (x) b b'       exposure block (2 n_modes, 2 n_modes)
     E_ij  = (J' W) (x) b     coupling, kept as its factors F = J' W and b
 
+Where stars move, by Phi (2, 2 + k) from their unknowns to their place in exposure i, they become Phi' V Phi and
+Phi' E (`legdistort.solving.equations.star_terms`).
+
 Arrays are ordered by exposure, coordinates first, so that every sweep reads memory once and in order.
 """
 
@@ -17,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...geometry import basis, detector_modes
+from .star_terms import packed, symmetric_times
 
 #: Weight on steps along directions that are fixed, relative to that of the data.
 _HOLD = 1e4
@@ -35,20 +39,24 @@ class Blocks:
     penalty : float
         Prior part of J.
     residual : ndarray, shape (2, n)
-    v : ndarray, shape (3, n_stars)
-        Star blocks xx, yy, xy.
-    g_star : ndarray, shape (2, n_stars)
+    v : ndarray, shape (m, n_stars)
+        Star blocks, packed: xx, yy, xy, and what further terms add (`legdistort.solving.equations.star_terms.packed`).
+    g_star : ndarray, shape (2 + k, n_stars)
     u : ndarray, shape (n_exposures, 2 n_modes, 2 n_modes)
         Exposure blocks with the prior, x modes first.
     u_data : ndarray
         The same without the prior.
     g_exposure : ndarray, shape (n_exposures, 2 n_modes)
     coupling : ndarray, shape (2, 2, n)
-        F = J' W, star coordinate first.
+        F = J' W, coordinate of the star's place in that exposure first.
     values : ndarray, shape (n_modes, n)
         Basis at every observation.
     unknowns : Unknowns
         The tangents at this state.
+    motions : ndarray, shape (k, n_stars)
+        Unknowns of the stars beside their positions, at this state.
+    held : float
+        Part of J by what is known beforehand of the motions of stars.
     """
 
     chi2: float
@@ -62,11 +70,13 @@ class Blocks:
     coupling: np.ndarray
     values: np.ndarray
     unknowns: object
+    motions: np.ndarray
+    held: float = 0.0
 
     @property
     def cost(self):
         """J: data and prior."""
-        return self.chi2 + self.penalty
+        return self.chi2 + self.penalty + self.held
 
 
 def prior_precision(problem, i):
@@ -104,7 +114,7 @@ def predict(problem, state, i, *, derivative=True):
     """
     ny, nx = problem.shapes[i]
     pose, a = state.poses[i], state.coefficients[i]
-    q = pose[:, :2] @ state.positions[:, problem.star[problem.part(i)]] + pose[:, 2:]
+    q = pose[:, :2] @ problem.terms.place(i, state.stars[:, problem.star[problem.part(i)]]) + pose[:, 2:]
     u, v = (2 * q[0] + 1) / nx - 1, (2 * q[1] + 1) / ny - 1
     degree = basis.degree_of(a.shape[1])
     if not derivative:
@@ -143,7 +153,7 @@ def linearise(problem, state):
     else:
         values, coupling, residual, v, g_star, u, g_exposure = _sums(problem, state)
         chi2 = float(squares(problem, residual).sum())
-    u_data, penalty = u, 0.0
+    u_data, penalty, held = u, 0.0, 0.0
     if problem.has_prior:
         u = u.copy()
         for i in range(problem.n_exposures):
@@ -156,15 +166,29 @@ def linearise(problem, state):
                 rows = problem.fixed[i]
                 u[i] += _HOLD * np.trace(u_data[i]) / len(departure) * rows.T @ rows
                 g_exposure[i] -= rows.T @ (rows @ g_exposure[i])
+    if problem.terms.is_held:
+        held = _hold_motions(problem.terms, state.stars[2:], v, g_star)
     tangents = problem.unknowns.at(state.coefficients)
-    return Blocks(chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values, tangents)
+    return Blocks(
+        chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values, tangents, state.stars[2:], held
+    )
+
+
+def _hold_motions(terms, values, v, g_star):
+    """Add what is known beforehand of the terms of the stars, at values (k, n_stars); the part of J."""
+    values = values - terms.mean
+    for k, place in enumerate(np.diag(packed(2 + terms.n))[2:]):
+        v[place] += terms.precision[k]
+        g_star[2 + k] -= terms.precision[k] * values[k]
+    return float((terms.precision * values**2).sum())
 
 
 def _sums(problem, state):
     """The plain twin of `legdistort.solving.equations.compiled.linearise`."""
     n_modes, n_exposures, n = problem.n_modes, problem.n_exposures, problem.xy.shape[1]
     residual, values, coupling = np.empty((2, n)), np.empty((n_modes, n)), np.empty((2, 2, n))
-    v, g_star = np.zeros((3, problem.n_stars)), np.zeros((2, problem.n_stars))
+    terms, n_star = problem.terms, problem.n_star
+    v, g_star = np.zeros((n_star * (n_star + 1) // 2, problem.n_stars)), np.zeros((n_star, problem.n_stars))
     u = np.empty((n_exposures, 2 * n_modes, 2 * n_modes))
     g_exposure = np.empty((n_exposures, 2 * n_modes))
     for i in range(n_exposures):
@@ -176,10 +200,17 @@ def _sums(problem, state):
         f = coupling[:, :, part]
         f[:, 0], f[:, 1] = jac[0] * w[0] + jac[1] * w[2], jac[0] * w[2] + jac[1] * w[1]
         # a star stands once in an exposure, so plain indexed addition is right
-        v[0, star] += f[0, 0] * jac[0, 0] + f[0, 1] * jac[1, 0]
-        v[1, star] += f[1, 0] * jac[0, 1] + f[1, 1] * jac[1, 1]
-        v[2, star] += f[0, 0] * jac[0, 1] + f[0, 1] * jac[1, 1]
-        g_star[:, star] += f[:, 0] * r[0] + f[:, 1] * r[1]
+        m = np.stack([
+            f[0, 0] * jac[0, 0] + f[0, 1] * jac[1, 0],
+            f[1, 0] * jac[0, 1] + f[1, 1] * jac[1, 1],
+            f[0, 0] * jac[0, 1] + f[0, 1] * jac[1, 1],
+        ])  # fmt: skip
+        v[:3, star] += m
+        for k, column in enumerate(terms.columns[i].T):
+            moved = terms.pull(i, symmetric_times(m, column[:, None]))[: 3 + k]
+            first = (2 + k) * (3 + k) // 2
+            v[first : first + 3 + k, star] += moved
+        g_star[:, star] += terms.pull(i, f[:, 0] * r[0] + f[:, 1] * r[1])
         wr = np.stack([w[0] * r[0] + w[2] * r[1], w[2] * r[0] + w[1] * r[1]])
         g_exposure[i] = (wr @ b.T).ravel()
         u[i, :n_modes, :n_modes] = (b * w[0]) @ b.T

@@ -2,9 +2,32 @@
 
 import numpy as np
 
+from .star_terms import outer_packed, packed, size_of, symmetric_times
+
+#: Curvature of an unknown, the others fitted, below this part of its own is rounding: it is not determined.
+_ROUNDING = 1e-11
+
 
 def inverse_star_blocks(v):
-    """Inverse (3, n_stars) of symmetric 2 x 2 blocks; zero for a star without observations."""
+    """Inverse of symmetric packed blocks (m, n_stars); zero for what the observations of a star do not determine."""
+    return _inverted(v)[0]
+
+
+def star_roots(v):
+    """L of ``L L' = V^-1``, (2 + k, 2 + k, n_stars), from the blocks V."""
+    inverse, columns = _inverted(v)
+    out = np.zeros((size_of(v), size_of(v), v.shape[1]))
+    position = inverse if not columns else _inverse_of_positions(v)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out[0, 0] = np.sqrt(position[0])
+        out[1, 0] = np.where(out[0, 0] > 0, position[2] / out[0, 0], 0)
+        out[1, 1] = np.sqrt(np.maximum(position[1] - out[1, 0] ** 2, 0))
+    for column in columns:
+        out[: len(column), len(column) - 1] = column
+    return out
+
+
+def _inverse_of_positions(v):
     determinant = v[0] * v[1] - v[2] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         out = np.stack([v[1], v[0], -v[2]]) / determinant
@@ -12,29 +35,54 @@ def inverse_star_blocks(v):
     return out
 
 
-def symmetric_times(block, x):
-    """Symmetric 2 x 2 blocks (3, n) times vectors (2, n)."""
-    return np.stack([block[0] * x[0] + block[2] * x[1], block[2] * x[0] + block[1] * x[1]])
+def _inverted(v):
+    """Inverse of packed blocks, and what each unknown after the position adds to it: columns c of ``c c'``.
+
+    A block A is bordered by one unknown after another, ``[A b; b' d]^-1 = [A^-1 0; 0 0] + c c'`` with
+    ``c = (-A^-1 b, 1) / sqrt(d - b' A^-1 b)``. What is not determined given those before is held where it is.
+    """
+    out, columns = _inverse_of_positions(v), []
+    for k in range(2, size_of(v)):
+        first = k * (k + 1) // 2
+        b, d = v[first : first + k], v[first + k]
+        moved = symmetric_times(out, b)
+        left = d - (b * moved).sum(axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            unit = np.where(left > _ROUNDING * d, 1 / np.sqrt(left), 0.0)
+        column = np.concatenate([-moved, np.ones((1, len(d)))]) * unit
+        out = np.concatenate([out, np.zeros((k + 1, len(d)))]) + outer_packed(column)
+        columns.append(column)
+    return out, columns
+
+
+def star_freedom(problem, blocks):
+    """Number of star unknowns that the observations determine, what is known of them beforehand counted out."""
+    inverse, places = inverse_star_blocks(blocks.v), np.diag(packed(problem.n_star))
+    number = 2 * int(np.count_nonzero(blocks.v[0] > 0))
+    if not problem.terms.n:
+        return number
+    held = (problem.terms.precision * inverse[places[2:]]).sum()
+    return number + np.count_nonzero(inverse[places[2:]] > 0) - float(held)
 
 
 def to_stars(problem, blocks, a):
-    """E a: coefficients (n_exposures, 2 n_modes) -> stars (2, n_stars)."""
+    """E a: coefficients (n_exposures, 2 n_modes) -> stars (2 + k, n_stars)."""
     if problem.uses_compiled_loops:
         from . import compiled
 
         return compiled.to_stars(problem, blocks, a)
-    out = np.zeros((2, problem.n_stars))
+    out = np.zeros((problem.n_star, problem.n_stars))
     n_modes = problem.n_modes
     for i in range(problem.n_exposures):
         part = problem.part(i)
         t = a[i].reshape(2, n_modes) @ blocks.values[:, part]
         f = blocks.coupling[:, :, part]
-        out[:, problem.star[part]] += f[:, 0] * t[0] + f[:, 1] * t[1]
+        out[:, problem.star[part]] += problem.terms.pull(i, f[:, 0] * t[0] + f[:, 1] * t[1])
     return out
 
 
 def to_exposures(problem, blocks, y):
-    """E' y: stars (2, n_stars) -> coefficients (n_exposures, 2 n_modes)."""
+    """E' y: stars (2 + k, n_stars) -> coefficients (n_exposures, 2 n_modes)."""
     if problem.uses_compiled_loops:
         from . import compiled
 
@@ -42,7 +90,7 @@ def to_exposures(problem, blocks, y):
     out = np.empty((problem.n_exposures, 2 * problem.n_modes))
     for i in range(problem.n_exposures):
         part = problem.part(i)
-        z, f = y[:, problem.star[part]], blocks.coupling[:, :, part]
+        z, f = problem.terms.place(i, y[:, problem.star[part]]), blocks.coupling[:, :, part]
         out[i] = ((f[0] * z[0] + f[1] * z[1]) @ blocks.values[:, part].T).ravel()
     return out
 
@@ -60,25 +108,18 @@ def reduced_matrix(problem, blocks):
     return out
 
 
-def star_roots(inverse):
-    """L of ``L L' = V^-1``, lower triangles: l00, l10, l11, each (n_stars,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        l00 = np.sqrt(inverse[0])
-        l10 = np.where(l00 > 0, inverse[2] / l00, 0)
-        return l00, l10, np.sqrt(np.maximum(inverse[1] - l10**2, 0))
-
-
 def star_factors(problem, blocks, *, n_block=512):
-    """Yield ``E' L`` for blocks of stars, with ``L L' = V^-1``: arrays (n_unknowns, 2 n_block)."""
-    size = 2 * problem.n_modes
-    l00, l10, l11 = star_roots(inverse_star_blocks(blocks.v))
+    """Yield ``E' L`` for blocks of stars, with ``L L' = V^-1``: arrays (n_unknowns, (2 + k) n_block)."""
+    size, n_star = 2 * problem.n_modes, problem.n_star
+    roots = star_roots(blocks.v)
     for first in range(0, problem.n_stars, n_block):
         last = min(first + n_block, problem.n_stars)
-        factor = np.zeros((problem.n_exposures * size, 2, last - first))
+        factor = np.zeros((problem.n_exposures * size, n_star, last - first))
         for i in range(problem.n_exposures):
             lo, hi = problem.start[i] + np.searchsorted(problem.star[problem.part(i)], [first, last])
             star, f, b = problem.star[lo:hi], blocks.coupling[:, :, lo:hi], blocks.values[:, lo:hi]
-            column = [f[0] * l00[star] + f[1] * l10[star], f[1] * l11[star]]  # each (axis, n)
-            for k in (0, 1):
-                factor[i * size : (i + 1) * size, k, star - first] = (column[k][:, None, :] * b).reshape(size, -1)
+            for k in range(n_star):
+                z = problem.terms.place(i, roots[:, k, star])
+                column = f[0] * z[0] + f[1] * z[1]  # (axis, n)
+                factor[i * size : (i + 1) * size, k, star - first] = (column[:, None, :] * b).reshape(size, -1)
         yield factor.reshape(len(factor), -1)

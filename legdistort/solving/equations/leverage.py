@@ -34,7 +34,7 @@ def leverages(problem, blocks, *, at=None, rows=slice(None)):
     for i, (low, high) in enumerate(np.searchsorted(every, np.stack([problem.start[:-1], problem.start[1:]], axis=1))):
         mine = every[low:high]
         w, f, b = problem.weight[:, mine], full.coupling[:, :, mine], full.values[:, mine]
-        s = stars[:, problem.star[mine]]
+        s = problem.terms.place_covariance(i, stars[:, problem.star[mine]])
         for k in (0, 1):
             share = f[0, k] ** 2 * s[0] + f[1, k] ** 2 * s[1] + 2 * f[0, k] * f[1, k] * s[2]
             of_star[low:high] += np.divide(share, w[k], out=np.zeros(len(mine)), where=w[k] > 0) / 2

@@ -12,6 +12,7 @@ from ...geometry.detector_modes import dynamic_basis
 from ...priors.prior import Prior
 from ...runtime.checks import LARGEST
 from ...runtime.optional import has_fast
+from .star_terms import StarTerms
 from .unknowns import Unknowns
 
 #: Number of observations from which compiled loops are used, if numba is installed.
@@ -54,6 +55,8 @@ class Problem:
         Up to this degree exposures have modes of their own; None: nothing is shared. See `Unknowns`.
     group : ndarray of int, shape (n_exposures,)
         Detector of every exposure; exposures of one share what is not their own.
+    moving : StarTerms or None
+        How stars move from exposure to exposure; None: they do not.
     """
 
     degree: int
@@ -71,6 +74,7 @@ class Problem:
     mean_sigma: np.ndarray | None = None
     own_degree: int | None = None
     group: np.ndarray | int = 0
+    moving: StarTerms | None = None
 
     @cached_property
     def unequal(self):
@@ -86,6 +90,28 @@ class Problem:
     def n_exposures(self):
         """Number of exposures."""
         return len(self.shapes)
+
+    @cached_property
+    def terms(self):
+        """The terms of the stars beside their position, perhaps none."""
+        return StarTerms.none(self.n_exposures) if self.moving is None else self.moving
+
+    @property
+    def n_star(self):
+        """Unknowns of a star."""
+        return 2 + self.terms.n
+
+    def placed(self, stars):
+        """Values (2, n) at every observation of fields of the reference plane with star unknowns (2 + k, n_stars)."""
+        seen = (self.terms.place(i, stars[:, self.star[self.part(i)]]) for i in range(self.n_exposures))
+        return np.concatenate(list(seen), axis=1)
+
+    def pulled(self, values):
+        """Gradients (2, ..., n) by the place of a star at every observation -> by its unknowns, (2 + k, ..., n)."""
+        if not self.terms.n:
+            return values
+        columns = np.moveaxis(self.terms.columns[self.exposure], 0, -1)
+        return np.concatenate([values, np.einsum("akn,a...n->k...n", columns, values)])
 
     @cached_property
     def exposure(self):
@@ -145,11 +171,19 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The unknowns: positions (2, n_stars), coefficients (n_exposures, 2, n_all), poses (n_exposures, 2, 3)."""
+    """The unknowns: stars (2 + k, n_stars), coefficients (n_exposures, 2, n_all), poses (n_exposures, 2, 3).
 
-    positions: np.ndarray
+    Stars have their positions first, then what `StarTerms` adds.
+    """
+
+    stars: np.ndarray
     coefficients: np.ndarray
     poses: np.ndarray
+
+    @property
+    def positions(self):
+        """Positions (2, n_stars) at the reference epoch."""
+        return self.stars[:2]
 
 
 def check_error_floor(error_floor):
@@ -164,7 +198,7 @@ def check_prior(prior):
         raise InputError(f"prior must be a Prior or a dict of them, got {type(prior).__name__}")
 
 
-def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=None):
+def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=None, motion=None):
     """The problem posed by `legdistort.inputs.matches.Matches`.
 
     Parameters
@@ -178,6 +212,9 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
     own_degree : int, optional
         Exposures have modes of their own only up to this degree (0: a similarity alone); the rest is common to
         those of a detector.
+    motion : callable, optional
+        ``motion(matches, weight)`` gives the `StarTerms` for weights (n,) in the order of the table; None: stars do not
+        move.
 
     Raises
     ------
@@ -225,7 +262,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
                 f"lower the degree (at most {_highest_degree(count)} here), give a prior with sigma, "
                 "or leave the exposure out"
             )
-    return Problem(
+    problem = Problem(
         degree=degree,
         names=matches.names,
         shapes=[matches.shapes[name] for name in matches.names],
@@ -242,6 +279,9 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         own_degree=own_degree,
         group=_groups(matches),
     )
+    if motion is None:
+        return problem
+    return replace(problem, moving=motion(matches, problem.in_table_order(weight[:2].mean(axis=0))))
 
 
 def _groups(matches):

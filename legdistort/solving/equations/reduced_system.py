@@ -60,7 +60,7 @@ class _Reduced:
         return self.problem.unknowns.gather(rows.transpose(1, 2, 0)).T
 
     def _couple(self, d):
-        """E d, shape (2, n_stars)."""
+        """E d, shape (2 + k, n_stars)."""
         return elimination.to_stars(self.problem, self.blocks, self.unknowns.spread(d))
 
     def _gradient(self, own, stars):
@@ -82,14 +82,14 @@ class _Reduced:
         return self._gradient(self.blocks.g_exposure, self.blocks.g_star)
 
     def follow(self, d):
-        """How the stars (2, n_stars) follow a change (n,) of the unknowns."""
+        """How the stars (2 + k, n_stars) follow a change (n,) of the unknowns."""
         return -self._stars(self._couple(d))
 
     @property
     def dof(self):
         """Degrees of freedom under the gauge; widths of a prior not allowed for."""
-        n_stars = np.count_nonzero(self.blocks.v[0] > 0)
-        return 2 * np.count_nonzero(self.problem.weight[0]) - 2 * n_stars - self.unknowns.size + len(self.rows)
+        n_free = elimination.star_freedom(self.problem, self.blocks)
+        return 2 * np.count_nonzero(self.problem.weight[0]) - n_free - self.unknowns.size + len(self.rows)
 
 
 class Direct(_Reduced):
@@ -192,7 +192,7 @@ class Direct(_Reduced):
 
         Returns
         -------
-        d_star : ndarray, shape (2, n_stars)
+        d_star : ndarray, shape (2 + k, n_stars)
         d_exposure : ndarray, shape (n_exposures, 2 n_modes)
         """
         d = self.solve(self.rhs, target)
@@ -274,7 +274,7 @@ class Iterative(_Reduced):
         return stars, self.unknowns.spread(d)
 
     def _solve(self, g_exposure, g_star, rows, target, tolerance, *, max_iterations=1000):
-        """Star step (2, n_stars) and step of the unknown coefficients for gradients, with rows d = target."""
+        """Star step (2 + k, n_stars) and step of the unknown coefficients for gradients, with rows d = target."""
         lifted = np.stack([self._block_solve(row) for row in rows], axis=1)
         border = np.linalg.inv(rows @ lifted)
 

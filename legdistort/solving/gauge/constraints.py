@@ -7,7 +7,7 @@ import numpy as np
 from ...exceptions import SolveError
 from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis, similarity_basis, similarity_part
-from ...results.gauge import Gauge
+from ...results.gauge import Drift, Gauge
 from ...runtime.checks import check_choice
 from ..equations.criterion import complement
 from ..equations.problem import State
@@ -21,7 +21,7 @@ _SETTLED = 0.01  # of a map that an exposure cannot take back: less, and the dat
 _CORNERS = np.array([[-1, 1, 1, -1.0], [-1, -1, 1, 1.0]])
 
 
-def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=None):
+def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=None, all_drifts=False):
     """The gauge at a state, its weights from the blocks of the criterion and the scatter seen there.
 
     Parameters
@@ -36,6 +36,8 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         Map at which the plane is held, from where the constraints by themselves would have it.
     dynamic : ndarray, shape (n_exposures, 2 n_modes, 2 n_modes), optional
         Covariance of single exposures; estimated if not given.
+    all_drifts : bool
+        Hold those maps that change with time, too, that what is known of the motions of stars determines.
 
     Raises
     ------
@@ -65,26 +67,74 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     positions = state.positions.T[used]
     values = basis.values(problem.degree, *((positions - box[0]) / box[1]).T)
     power = values @ values.T / values.shape[1]
-    hierarchy = Hierarchy(motion, others, dynamic, weight, group, static, maps, tuple(2 * box[1, ::-1]), power)
+    drifting, drifts, rates = _drifts(problem, motion, others, shared_shears, all_drifts)
+    size = tuple(2 * box[1, ::-1])
+    hierarchy = Hierarchy(motion, others, dynamic, weight, group, static, maps, size, power, drifting @ drifts.T)
     poses = _pose_rows(kind, motion, error, similar, box)
+    if len(rates):
+        carried = influence(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
+        poses = np.concatenate([poses, (rates @ drifting.transpose(0, 2, 1) @ carried).transpose(1, 0, 2)])
     known = hierarchy.solve(kind, released)
     rows = np.concatenate([known.rows, poses])
+    covariance, drift_covariance = hierarchy.covariance(known, poses, drifting @ rates.T)
     made = Gauge(
         kind,
         constraint=rows,
         motion=motion,
         dynamic=dynamic,
         box=box,
-        covariance=hierarchy.covariance(known, poses),
+        covariance=covariance,
         unknown_maps=known.unknown,
         static=_in_a_word(static, shared),
         prior=bool(held.any()),
         convention=np.concatenate([hierarchy.convention(kind), poses]) if static.any() else None,
+        drift=Drift(problem.terms.names, drifting, drifts.T @ drift_covariance @ drifts, drifts, rates)
+        if problem.terms.n
+        else None,
     )
     if common is None:
         return made
     moved = np.einsum("ika,ikb,ibc,c->ia", others, others, motion, common, optimize=True)  # poses take the rest
     return replace(made, values=-made.orthonormal @ moved.ravel())
+
+
+def _drifts(problem, motion, others, shared_shears, all_drifts):
+    """Common maps that change from exposure to exposure as the terms of the stars do, and that all can take back.
+
+    Where something is known of the motions of stars beforehand, that determines the maps, and none is left here unless
+    all are wanted.
+
+    Returns
+    -------
+    drifting : ndarray, shape (n_exposures, 2 n, q)
+        How the modes of fields of these terms change the coefficients.
+    drifts : ndarray, shape (m, q)
+        Orthonormal rows: the maps.
+    rates : ndarray, shape (c, q)
+        Those that the poses carry: a common shift, rotation and expansion with time, the mean parallax.
+    """
+    terms, n = problem.terms, problem.n_modes
+    free = np.flatnonzero(all_drifts | ~np.any(terms.precision, axis=1))
+    lift = terms.lift(n)[:, :, 2 * n :].reshape(problem.n_exposures, 2 * n, terms.n, n)
+    drifting = motion @ lift[:, :, free].reshape(problem.n_exposures, 2 * n, -1)
+    if not len(free):
+        return drifting, np.zeros((0, 0)), np.zeros((0, 0))
+    possible = np.eye(drifting.shape[2])
+    if problem.fixed is not None:
+        moved = np.concatenate([rows @ each for rows, each in zip(problem.fixed, drifting, strict=True)])
+        possible = _null_space(moved, _SETTLED)
+    carried = _null_space((others @ drifting @ possible.T).reshape(-1, len(possible)), 1e-6) @ possible
+    if shared_shears:
+        return drifting, np.zeros((0, drifting.shape[2])), carried
+    inside = complement(carried @ possible.T) @ possible
+    return drifting, inside, carried
+
+
+def _null_space(matrix, tolerance):
+    """Orthonormal rows (k, n) that a matrix (m, n) sends to nothing, to a part of its largest singular value."""
+    matrix = np.concatenate([matrix, np.zeros((matrix.shape[1], matrix.shape[1]))])
+    _, size, rows = np.linalg.svd(matrix, full_matrices=False)
+    return rows[size <= tolerance * size.max(initial=1e-300)]
 
 
 def _taken_back(problem, motion, box, shared_shears):
@@ -154,7 +204,7 @@ def own_part(problem, state, blocks):
         group=None,
     )
     inner = replace(blocks, u=blocks.u[:, rows[:, None], rows], u_data=blocks.u_data[:, rows[:, None], rows])
-    return own, State(state.positions, state.coefficients[:, :, :n], state.poses), inner
+    return own, State(state.stars, state.coefficients[:, :, :n], state.poses), inner
 
 
 def reference_box(problem, state):
@@ -243,7 +293,7 @@ def absorb_similarities(problem, state):
         for a, mean, rows in zip(coefficients, problem.prior_mean, problem.fixed, strict=True):
             departure = (a - mean)[:, :n_modes].ravel()
             a[:, :n_modes] -= (rows.T @ (rows @ departure)).reshape(2, -1)
-    return State(state.positions, coefficients, pose_list), largest
+    return State(state.stars, coefficients, pose_list), largest
 
 
 def _apply(pose_list, xy):

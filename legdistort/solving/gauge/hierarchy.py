@@ -67,6 +67,8 @@ class Hierarchy:
         ``(ny, nx)`` of the box of the reference plane on which the modes are defined, pixels.
     power : ndarray, shape (n, n)
         Mean products of the modes of the reference plane, over the stars.
+    drifts : ndarray, shape (n_exposures, 2 n, m')
+        How the m' common maps that change with time, motions and parallaxes of all stars, change the coefficients.
     """
 
     motion: np.ndarray
@@ -78,10 +80,17 @@ class Hierarchy:
     maps: np.ndarray
     size: tuple
     power: np.ndarray
+    drifts: np.ndarray
 
     def rows(self, static):
-        """Rows M' (D + 1 S 1')^-1 of the constraints, (m, n_exposures, 2 n), for a variance (n_groups, K) of A_0."""
-        weighted = self.weight @ (self.others @ self.motion @ self.maps.T)
+        """Rows M' (D + 1 S 1')^-1 of the constraints, (m + m', n_exposures, 2 n), for a variance (n_groups, K) of A_0.
+
+        Those of the maps that change with time come last.
+        """
+        moved = self.others @ self.motion @ self.maps.T
+        if self.drifts.shape[2]:
+            moved = np.concatenate([moved, self.others @ self.drifts], axis=2)
+        weighted = self.weight @ moved
         for g, variance in enumerate(static):
             mine = self.group == g
             if not (variance.any() and mine.any()):
@@ -95,10 +104,12 @@ class Hierarchy:
         return np.einsum("ika,ikb->bia", self.others, weighted, optimize=True)
 
     def convention(self, kind):
-        """Rows (m, n_exposures, 2 n) of a convention by itself: A_0 at the prior mean."""
+        """Rows (m + m', n_exposures, 2 n) of a convention by itself: A_0 at the prior mean."""
+        smallest = self.rows(np.zeros_like(self.static))
         if kind == "mean":
-            return np.einsum("bc,ikc,ika->bia", self.maps, self.others, self.others, optimize=True)
-        return self.rows(np.zeros_like(self.static))
+            mean = np.einsum("bc,ikc,ika->bia", self.maps, self.others, self.others, optimize=True)
+            return np.concatenate([mean, smallest[len(mean) :]])
+        return smallest
 
     @cached_property
     def _pointed(self):
@@ -122,8 +133,12 @@ class Hierarchy:
         held = self.convention(kind)
         if not (self.static.any() and len(self.maps)):  # exact: the convention is the posterior mean
             return Constraints(held, self.maps.T, ())
-        rows = self.rows(self.static)
-        information = np.einsum("bia,iac,dc->bd", rows, self.motion, self.maps, optimize=True)
+        rows, n = self.rows(self.static), len(self.maps)
+        information = np.einsum("bia,iac,dc->bd", rows[:n], self.motion, self.maps, optimize=True)
+        if self.drifts.shape[2]:  # with those that change with time fitted as well
+            reached = np.concatenate([self.motion @ self.maps.T, self.drifts], axis=2)
+            full = np.einsum("bia,iac->bc", rows, reached, optimize=True)
+            information = information - full[:n, n:] @ np.linalg.solve(full[n:, n:], full[n:, :n])
         metric = self.maps @ self.metric @ self.maps.T
         metric += _RIDGE * np.trace(metric) / len(metric) * np.eye(len(metric))
         curvature, vectors = eigh((information + information.T) / 2, metric)
@@ -132,31 +147,37 @@ class Hierarchy:
         if released is not None and unknown.shape[1]:
             inside = np.linalg.qr(unknown.T @ metric @ self.maps @ released)[0]
             unknown = unknown @ complement(inside.T).T
-        rows = np.concatenate([np.tensordot(known.T, rows, 1), np.tensordot(unknown.T, held, 1)])
+        rows = np.concatenate([np.tensordot(known.T, rows[:n], 1), np.tensordot(unknown.T, held[:n], 1), rows[n:]])
         return Constraints(
             rows, self.maps.T @ known, _named(self.maps.T @ unknown, self._pointed, self.metric, self.size)
         )
 
-    def covariance(self, known, poses):
-        """Covariance (2 n, 2 n) of what is known of the common map, under its constraints.
+    def covariance(self, known, poses, rates):
+        """Covariance (2 n, 2 n) of what is known of the common map under its constraints, and that (m', m') of drifts.
 
         Parameters
         ----------
         known : Constraints
-        poses : ndarray, shape (4, n_exposures, 2 n)
-            Constraints that hold the similarities.
+        poses : ndarray, shape (4 + c, n_exposures, 2 n)
+            Constraints that hold the similarities and what changes them with time.
+        rates : ndarray, shape (n_exposures, 2 n, c)
+            How the latter changes the coefficients.
         """
         rows, similar = np.concatenate([known.rows, poses]), similarity_basis(self.size, len(self.power)).T
         maps = np.hstack([known.known, *(each.map[:, None] for each in known.unknown), similar])
-        n = known.known.shape[1]
+        n, m = known.known.shape[1], self.drifts.shape[2]
         inside = np.einsum("bia,iac,dic->bd", rows, self.dynamic, rows, optimize=True)
         on_modes = np.einsum("bia,ika->bik", rows, self.others, optimize=True)
         for g, variance in enumerate(self.static):
             common = on_modes[:, self.group == g].sum(axis=1)
             inside += common * np.where(np.isfinite(variance), variance, 0) @ common.T
         reach = np.einsum("bia,iac,cd->bd", rows, self.motion, maps, optimize=True)
-        back = self._pointed @ maps[:, :n] @ np.linalg.inv(reach)[:n]
-        return back @ inside @ back.T
+        if m or rates.shape[2]:
+            also = np.einsum("bia,iac->bc", rows, np.concatenate([self.drifts, rates], axis=2), optimize=True)
+            reach = np.concatenate([reach, also], axis=1)
+        inverse = np.linalg.inv(reach)
+        back, drifting = self._pointed @ maps[:, :n] @ inverse[:n], inverse[maps.shape[1] :][:m]
+        return back @ inside @ back.T, drifting @ inside @ drifting.T
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,91 @@
+"""Whether the stars of a set move, and by how much their motions scatter, by the evidence of the set itself.
+
+A fit in which nothing is known of the motions gives one for every star, ``v_j``, with its covariance C_j. A map that
+all stars have in common, of the degree of the distortion, is no motion that could be told from the distortions, and
+is fitted too. What is left has the likelihood of ``N(0, s^2 + C_j)``, marginal over that map (restricted maximum
+likelihood, Patterson & Thompson 1971), whose maximum is the scatter s of the motions. Their errors are taken at the
+observed scale where that is larger than the stated one.
+"""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from ..exceptions import SolveError
+from ..results.diagnostics import MotionScatter
+from . import single_fit, star_motions
+from .equations.star_terms import unpacked
+
+log = logging.getLogger(__name__)
+
+
+def resolve(matches, options):
+    """Options with motions as they are to be fitted, and the `MotionScatter` that was asked for, or None.
+
+    Raises
+    ------
+    InputError
+        If the epochs do not tell what was asked for.
+    """
+    if options.motion is None:
+        return options, None
+    star_motions.check_epochs(matches, options.motion)
+    if options.motion != "auto" and options.motion_sigma != "evidence":
+        return options, None
+    flat = single_fit.estimate(
+        matches, replace(options, motion="proper", motion_sigma=None, errors="stated", error_floor=options.error_floor)
+    )
+    found = scatter(flat)
+    log.info("%s", found)
+    motion = options.motion
+    if motion == "auto":
+        motion = "proper" if found.is_there else None
+    sigma = options.motion_sigma
+    if sigma == "evidence":
+        sigma = max(found.sigma, 1e-3 * flat_error(flat)) if motion else None
+    return replace(options, motion=motion, motion_sigma=sigma), found
+
+
+def flat_error(fit):
+    """Typical error of a proper motion, pixels a year."""
+    variance = unpacked(fit.uncertainty.star_unknowns)[:, [2, 3], [2, 3]]
+    return float(np.sqrt(np.nanmedian(variance)))
+
+
+def scatter(fit):
+    """The `MotionScatter` of the motions in a fit in which nothing was known of them.
+
+    Raises
+    ------
+    SolveError
+        If too few stars have one.
+    """
+    covariance = unpacked(fit.uncertainty.star_unknowns)[:, 2:4, 2:4]
+    good = np.isfinite(covariance).all(axis=(1, 2))
+    gauge, state = fit.result.gauge, fit.result.state
+    values = gauge.modes_at(state.positions.T[good])
+    n, m = int(np.count_nonzero(good)), 2 * len(values)
+    if 2 * n <= m:
+        raise SolveError(
+            f"the scatter of motions cannot be found from the {n} stars seen at several epochs, {m // 2 + 1} at least "
+            "are needed at this degree: give motion_sigma"
+        )
+    scale2 = max(1.0, fit.chi2 / fit.dof) if fit.dof > 0 else 1.0
+    v, c = state.stars[2:4, good].T, scale2 * covariance[good]
+    design = np.kron(np.eye(2), values.T).reshape(2, n, m).transpose(1, 0, 2)
+
+    def deviance(sigma):
+        precision = np.linalg.inv(c + sigma**2 * np.eye(2))
+        weighted = precision @ design
+        normal = np.einsum("jam,jan->mn", design, weighted)
+        pull = np.einsum("jam,ja->m", weighted, v)
+        squares = np.einsum("ja,jab,jb->", v, precision, v) - pull @ np.linalg.solve(normal, pull)
+        return squares - np.linalg.slogdet(precision)[1].sum() + np.linalg.slogdet(normal)[1]
+
+    size = np.sqrt(np.median(np.einsum("jaa->ja", c)))
+    top = np.log(10 * np.sqrt(np.mean(v**2)) / size + 10)
+    found = minimize_scalar(lambda log_s: deviance(size * np.exp(log_s)), bounds=(-6, top), method="bounded")
+    gain = max(deviance(0.0) - found.fun, 0.0)
+    return MotionScatter(float(size * np.exp(found.x)) if gain > 0 else 0.0, float(gain), n)
