@@ -500,7 +500,7 @@ def test_bad_arrays_and_files_say_what_is_wrong(tmp_path):
     write_psfex(tmp_path / "degree.psf", np.stack([good, good]), POLDEG1=3)
     write_psfex(tmp_path / "step.psf", np.stack([good, good]), PSF_SAMP=None)
     for name, words in (
-        ("text.psf", "text.psf: no FITS file"),
+        ("text.psf", "text.psf: cannot be read as FITS"),
         ("bare.fits", "bare.fits: the keyword OVERSAMP is missing"),
         ("empty.fits", "neither an image nor a table PSF_DATA"),
         ("colour.psf", "depends on MAG_AUTO; only places in the image"),

@@ -325,9 +325,9 @@ def test_undetermined_problem_names_the_exposure():
     sim = simulate_matches(n_stars=12, degree=1, seed=1)
     table = table_of(sim)
     first = table["exposure"] == "exp00"
-    # all stars of one exposure on a line: its quadratic and linear modes across it are not told
-    table["x"][first] = table["star"][first] * 100.0 * u.pix
-    table["y"][first] = table["star"][first] * 50.0 * u.pix
+    # all stars on a circle: a quadratic mode is constant there
+    angle = 2 * np.pi * np.asarray(table["star"][first]) / 12
+    table["x"][first], table["y"][first] = (1000 + 800 * np.array([np.cos(angle), np.sin(angle)])) * u.pix
     for i in range(1, 10):
         on = table["exposure"] == f"exp{i:02d}"
         table["x"][on], table["y"][on] = table["x"][first], table["y"][first]
