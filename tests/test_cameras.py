@@ -316,6 +316,26 @@ class TestSolution:
         assert np.abs(one.positions - usual.positions).max() < 1e-9
         assert np.allclose(one.stars["x_err"], usual.stars["x_err"], rtol=1e-9)
 
+    def test_stars_that_move(self, night, table, gsaoi):
+        """Proper motions over all detectors, after a common map, with true errors."""
+        exposure = np.array([int(name.removeprefix("frame")) for name in table["exposure"]])
+        years = 2010 + 2 * (exposure % 3) + 0.004 * exposure
+        motion = np.random.default_rng(3).normal(0, 0.02, (len(night.sky), 2))
+        moving = table.copy()
+        moving["x"] += motion[table["star"], 0] * (years - 2012)
+        moving["y"] += motion[table["star"], 1] * (years - 2012)
+        moving["epoch"] = years
+        solution = legdistort.solve(legdistort.Matches.from_table(moving, camera=gsaoi), motion="proper")
+        found, errors = (
+            np.stack([solution.stars[f"v{axis}{suffix}"].value for axis in "xy"], axis=1) for suffix in ("", "_err")
+        )
+        good = np.all(errors < 0.02, axis=1)
+        assert good.sum() > 200
+        left = gsaoi_images.without_common_map(
+            found[good] - motion[solution.star_names][good], night.sky[solution.star_names][good], 3
+        )
+        assert np.sqrt(np.mean((left / errors[good]) ** 2)) == pytest.approx(1, abs=0.12)
+
     def test_uncertainties_of_the_camera_are_not_silent(self, table, gsaoi):
         unsure = {
             key: legdistort.Detector(each.shape, layout=each.layout, static=each.static, layout_sigma=0.1)
