@@ -130,6 +130,8 @@ def test_a_folder_that_another_user_cannot_write(place, existing):
 
 
 def test_readers_need_no_permission_to_write(place, solution):
+    if as_nobody(lambda: os.access(Path(ld.__file__).parent / "data" / "schemas", os.R_OK)) != "True":
+        pytest.skip("the package lies where other users may not read it")
     solution.write(place / "solution.asdf")
     (place / "solution.asdf").chmod(0o644)
     ld.Solution.read(place)  # which loads what it needs
