@@ -102,10 +102,11 @@ def without_common_map(found, true, degree):
     return found - powers @ np.linalg.lstsq(powers, found, rcond=None)[0]
 
 
-def covariance(star, exposure, place, sigma, degree):
+def covariance(star, exposure, place, sigma, degree, detector=None):
     """Covariance (n_stars, n_stars) of one coordinate of the stars that no unbiased estimate beats, up to a common map.
 
-    Unknown are the position of each star, and for each exposure powers up to a degree of the place in it.
+    Unknown are the position of each star, for each exposure powers up to a degree of the place in it, and with the
+    detectors of the observations for each of these an affine map of the place.
     """
     n_stars, n_exposures = star.max() + 1, exposure.max() + 1
     u = place / np.abs(place).max()
@@ -115,10 +116,16 @@ def covariance(star, exposure, place, sigma, degree):
     design[np.arange(len(star)), star] = 1
     for m in range(k):
         design[np.arange(len(star)), n_stars + exposure * k + m] = powers[:, m]
+    if detector is not None:
+        affine = np.zeros((len(star), 3 * (detector.max() + 1)))
+        for m, column in enumerate((np.ones(len(star)), *u.T)):
+            affine[np.arange(len(star)), 3 * detector + m] = column
+        design = np.hstack([design, affine])
     return np.linalg.pinv(design.T @ design, rcond=1e-10, hermitian=True)[:n_stars, :n_stars] * sigma**2
 
 
-def bound(star, exposure, place, true, sigma, degree):
+def bound(star, exposure, place, true, sigma, degree, detector=None):
     """Cramer-Rao bound of star positions after a common map, rms over stars and axes, in units of sigma."""
     centred = without_common_map(np.eye(star.max() + 1), true, degree)
-    return float(np.sqrt(np.trace(centred @ covariance(star, exposure, place, sigma, degree) @ centred.T) / len(true)))
+    best = covariance(star, exposure, place, sigma, degree, detector)
+    return float(np.sqrt(np.trace(centred @ best @ centred.T) / len(true)))

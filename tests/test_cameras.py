@@ -336,14 +336,105 @@ class TestSolution:
         )
         assert np.sqrt(np.mean((left / errors[good]) ** 2)) == pytest.approx(1, abs=0.12)
 
-    def test_uncertainties_of_the_camera_are_not_silent(self, table, gsaoi):
-        unsure = {
-            key: legdistort.Detector(each.shape, layout=each.layout, static=each.static, layout_sigma=0.1)
-            for key, each in gsaoi.detectors.items()
-        }
-        matches = legdistort.Matches.from_table(table, camera=legdistort.Camera("unsure", unsure))
-        with pytest.warns(AssumptionWarning, match="camera unsure are taken as exact"):
-            legdistort.solve(matches)
+
+def misplaced(camera, *, shift, turn, seed=4, **known):
+    """The camera with layouts wrong by up to so many pixels and degrees."""
+    rng, detectors = np.random.default_rng(seed), {}
+    for key, each in camera.detectors.items():
+        angle, middle = np.radians(turn) * rng.uniform(-1, 1), (np.array(each.shape[::-1]) - 1) / 2
+        rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        moved = rotation @ (each.layout[:, 2] - middle) + middle + rng.uniform(-shift, shift, 2)
+        layout = np.column_stack([rotation @ each.layout[:, :2], moved])
+        detectors[key] = legdistort.Detector(each.shape, layout=layout, static=each.static, **known)
+    return legdistort.Camera(camera.name, detectors)
+
+
+def apart(found, true):
+    """Distances [pix] in the focal planes of two cameras, over all detectors, after one affine map."""
+    xy = pixels(7)
+    here, there = (np.concatenate([c[key].to_focal_plane(xy) for key in true.detectors]) for c in (found, true))
+    design = np.column_stack([here, np.ones(len(here))])
+    return np.hypot(*(there - design @ np.linalg.lstsq(design, there, rcond=None)[0]).T)
+
+
+class TestFittedCamera:
+    def test_layouts_that_are_wrong_by_10_px(self, gsaoi):
+        """Stars at the bound with free layouts, true errors, and the layout as published, after one affine map."""
+        night = gsaoi_images.Night(n_stars=470, dither=6.0)
+        camera, left, pulls, layouts = misplaced(gsaoi, shift=10, turn=0.1), [], [], []
+        for seed in range(3):
+            table = night.table(sigma=SIGMA, seed=seed)
+            solution = legdistort.solve(legdistort.Matches.from_table(table, camera=camera), layout="fit")
+            left.append(gsaoi_images.without_common_map(solution.positions, night.sky[solution.star_names], 3))
+            errors = np.stack([solution.stars[name].value for name in ("x_err", "y_err")], axis=1)
+            pulls.append(left[-1] / errors)
+            layouts.append(apart(solution.camera, gsaoi))
+            assert solution.chi2 == pytest.approx(solution.dof, rel=0.06)
+        stars, number = np.unique(table["star"], return_inverse=True)
+        exposure = np.array([int(name.removeprefix("frame")) for name in table["exposure"]])
+        place = np.stack([night.focal[i][j] for i, j in zip(exposure, table["star"], strict=True)])
+        place, detector = place - place.mean(axis=0), np.asarray(table["detector"]).astype(int) - 1
+        best = gsaoi_images.bound(number, exposure, place, night.sky[stars], SIGMA, 3, detector=detector)
+        assert np.sqrt(np.mean(np.square(left))) < 1.05 * best
+        free = len(stars) / (len(stars) - 10)
+        assert free * np.mean(np.square(pulls)) == pytest.approx(1, abs=0.12)
+        sigma = np.mean([each.layout_sigma**2 for each in solution.camera.detectors.values()]) ** 0.5
+        assert np.sqrt(np.mean(np.square(layouts))) < 3 * sigma  # of a mode over a detector, of which there are three
+        z, w = solution.positions @ [1, 1j], night.sky[solution.star_names] @ [1, 1j]
+        design = np.stack([w, np.ones(len(w))], axis=1)
+        true = np.abs(z - design @ np.linalg.lstsq(design, z, rcond=None)[0])
+        told = np.stack([solution.stars[name].value for name in ("x_err_abs", "y_err_abs")], axis=1)
+        assert 0.3 < np.sqrt(np.mean(true**2) / 2 / np.mean(told**2)) < 3  # shears of the layout are hardly known
+
+    def test_what_was_known_helps(self, gsaoi):
+        """Uncertainties of layout and static are used without being asked for, and get smaller."""
+        night = gsaoi_images.Night(n_exposures=6, n_stars=400, dither=6.0)
+        camera = misplaced(gsaoi, shift=1, turn=0.01, layout_sigma=2.0, static_sigma=0.05)
+        solution = legdistort.solve(legdistort.Matches.from_table(night.table(sigma=SIGMA), camera=camera))
+        assert solution.chi2 == pytest.approx(solution.dof, rel=0.08)
+        found = np.stack([each.layout_sigma for each in solution.camera.detectors.values()])
+        assert np.all(found > 0)
+        assert np.all(found <= 2.0)
+        assert np.median(apart(solution.camera, gsaoi)) < 0.1
+        again = legdistort.Camera.read(solution.camera.write("camera.asdf", overwrite=True))
+        assert np.array_equal(again["1"].layout_sigma, solution.camera["1"].layout_sigma)
+
+    @pytest.fixture(autouse=True)
+    def _here(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+
+    def test_detectors_that_share_no_star(self, gsaoi):
+        """Without dithers over the gap, and without rolls, nothing tells how the detectors lie: a warning says so."""
+        rows = gsaoi_images.Night(n_exposures=6, turn=0.0).table(sigma=SIGMA)
+        first = {star: detector for detector, star in zip(rows["detector"], rows["star"], strict=True)}
+        kept = rows[[first[star] == detector for detector, star in zip(rows["detector"], rows["star"], strict=True)]]
+        kept = kept[np.bincount(kept["star"])[kept["star"]] >= 3]
+        pair = kept[np.isin(kept["detector"], ["1", "3"])]
+        matches = legdistort.Matches.from_table(pair, camera=gsaoi)
+        with pytest.warns(AssumptionWarning, match="2 unknowns of camera GSAOI are not determined by these exposures"):
+            legdistort.solve(matches, layout="fit")
+
+    def test_a_mismatch_does_not_move_the_camera(self, gsaoi):
+        night = gsaoi_images.Night(n_stars=400, dither=6.0)
+        table = night.table(sigma=SIGMA)
+        table["x"][::60] += 3.0
+        solution = legdistort.solve(
+            legdistort.Matches.from_table(table, camera=misplaced(gsaoi, shift=5, turn=0.05)), layout="fit"
+        )
+        assert apart(solution.camera, gsaoi).max() < 0.05
+        assert np.count_nonzero(~solution.residuals["used"]) < 0.03 * len(table)
+
+    @pytest.mark.slow
+    def test_static_distortions_from_nothing(self, gsaoi):
+        """Self-calibration of a camera by large dithers and rolls; stars after a common map as if all were known."""
+        night = gsaoi_images.Night(n_exposures=16, n_stars=600, dither=15.0, turn=0.8)
+        bare = {key: legdistort.Detector(each.shape, layout=each.layout) for key, each in gsaoi.detectors.items()}
+        matches = legdistort.Matches.from_table(night.table(sigma=SIGMA), camera=legdistort.Camera("bare", bare))
+        solution = legdistort.solve(matches, degree=5, layout="fit", static="fit")
+        assert solution.chi2 == pytest.approx(solution.dof, rel=0.06)
+        left = gsaoi_images.without_common_map(solution.positions, night.sky[solution.star_names], 5)
+        errors = np.stack([solution.stars[name].value for name in ("x_err", "y_err")], axis=1)
+        assert np.mean((left / errors) ** 2) == pytest.approx(1, abs=0.15)
 
 
 class TestBadInput:
@@ -370,9 +461,12 @@ class TestBadInput:
 
     def test_what_is_known_of_detectors_is_for_the_camera(self, table, gsaoi):
         matches = legdistort.Matches.from_table(table, camera=gsaoi)
-        for options in ({"static": "fit"}, {"prior": {"1": legdistort.Prior(np.zeros((2, 10)))}}):
-            with pytest.raises(InputError, match="are taken as known: leave static out"):
-                legdistort.solve(matches, **options)
+        with pytest.raises(InputError, match="give what is known of its detectors to the camera"):
+            legdistort.solve(matches, prior={"1": legdistort.Prior(np.zeros((2, 10)))})
+        with pytest.raises(InputError, match=r"layout='prior' needs the uncertainty of every detector"):
+            legdistort.solve(matches, layout="prior")
+        with pytest.raises(InputError, match="layout must be"):
+            legdistort.solve(matches, layout="free")
 
     def test_ids_are_for_cameras(self, table):
         rows = table[table["detector"] == "1"]
@@ -382,6 +476,8 @@ class TestBadInput:
         )
         with pytest.raises(InputError, match="has no camera with several detectors"):
             solution.wcs("frame00", "1")
+        with pytest.raises(InputError, match="layout is for exposures with several detectors"):
+            legdistort.solve(legdistort.Matches.from_table(rows, shape=(2048, 2048)), layout="fit")
 
 
 class TestFiles:

@@ -9,8 +9,9 @@ from scipy import optimize, special
 
 import legdistort as ld
 from legdistort.exceptions import InputError
-from legdistort.solving import correlated_errors, single_fit
+from legdistort.solving import single_fit
 from legdistort.solving.options import SolveOptions
+from legdistort.solving.residual_errors import correlated as correlated_errors
 
 SIZE, NOISE = 0.01, 0.01
 

@@ -28,6 +28,8 @@ OVERLAP = 0.05
 GSAOI_DEGREE = 6
 #: Size of a pixel of the focal plane of GSAOI [arcsec], about that of its detectors.
 GSAOI_SCALE = 0.0197
+#: They may stick out of the field by this part of it: layouts that were fitted do, by some pixels.
+MARGIN = 0.02
 _SIDE = 32  # points along a side of a detector that are sought on others
 
 
@@ -133,6 +135,23 @@ class Camera:
         table["x"], table["y"] = xy.T * u.pix
         table["x_err"], table["y_err"] = np.sqrt(covariance[:, [0, 1], [0, 1]]).T * u.pix
         table["xy_corr"] = covariance[:, 0, 1] / np.sqrt(covariance[:, 0, 0] * covariance[:, 1, 1])
+        return table
+
+    def on_detectors(self, table):
+        """A table that `in_focal_plane` made, as it was before."""
+        table, detector = table.copy(), self.ids(table)
+        f = np.stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)], axis=1)
+        x_err, y_err = table["x_err"].to_value(u.pix), table["y_err"].to_value(u.pix)
+        both = np.asarray(table["xy_corr"]) * x_err * y_err
+        covariance = np.moveaxis(np.array([[x_err**2, both], [both, y_err**2]]), 2, 0)
+        for key in np.unique(detector):
+            rows = detector == key
+            slope = self[key].slope(f[rows])
+            covariance[rows] = slope @ covariance[rows] @ slope.mT
+        table["x"], table["y"] = table["x_detector"], table["y_detector"]
+        table["x_err"], table["y_err"] = np.sqrt(covariance[:, [0, 1], [0, 1]]).T * u.pix
+        table["xy_corr"] = covariance[:, 0, 1] / np.sqrt(covariance[:, 0, 0] * covariance[:, 1, 1])
+        table.remove_columns(["x_detector", "y_detector"])
         return table
 
     def ids(self, table):
@@ -273,7 +292,8 @@ def _shifted(detector, first):
 
 
 def _within(outline, field):
-    return bool(np.all(outline >= -0.5 - 1e-6) and np.all(outline <= np.array(field[::-1]) - 0.5 + 1e-6))
+    size = np.array(field[::-1])
+    return bool(np.all(outline >= -MARGIN * size - 0.5) and np.all(outline <= (1 + MARGIN) * size - 0.5))
 
 
 def _overlap(first, second):

@@ -94,12 +94,15 @@ class Detector:
         FoldError
             If the static distortion folds.
         """
-        q = self.distortion.invert(xy)
-        f = similarity.apply(similarity.invert(self.layout), q)
+        f = similarity.apply(similarity.invert(self.layout), self.distortion.invert(xy))
         if covariance is None:
             return f
-        back = np.linalg.inv(self.distortion.jacobian(q) @ self.layout[:, :2])
+        back = np.linalg.inv(self.slope(f))
         return f, back @ covariance @ back.mT
+
+    def slope(self, f):
+        """Derivative (n, 2, 2) of the detector pixels by the focal-plane pixels f (n, 2)."""
+        return self.distortion.jacobian(similarity.apply(self.layout, f)) @ self.layout[:, :2]
 
     @cached_property
     def outline(self):
@@ -118,23 +121,26 @@ class Detector:
         return f"<Detector: {self.shape[1]} x {self.shape[0]} px, static distortion {self.rms:.3g} px rms>"
 
 
+def affine_of(modes, shape):
+    """Affine map (2, 3) of undistorted pixels of which modes (2, 3) of orders 0 and 1 are the change."""
+    low = Distortion(modes, shape)
+    origin, *ends = low(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    return np.column_stack([*(end - origin for end in ends), origin])
+
+
 def _split(static, shape, layout):
     """Static distortion and layout with all of orders 0 and 1 in the layout; the map of both is the same.
 
     With ``B(q) = q + (orders 0 and 1)`` and ``p = B(q)`` the rest is a polynomial of p of the same degree.
     """
     degree = basis.degree_of(static.shape[1])
-    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     for _ in range(20):
-        low = Distortion(basis.change_degree(static, min(degree, 1)), shape)
-        if np.abs(low.coefficients).max() < 1e-13:
+        low = basis.change_degree(static, 1)
+        if np.abs(low).max() < 1e-13:
             break
-        origin, *ends = low(corners)
-        affine = np.column_stack([*(end - origin for end in ends), origin])
-        rest, back = (
-            Distortion(static - basis.change_degree(low.coefficients, degree), shape),
-            similarity.invert(affine),
-        )
+        affine = affine_of(low, shape)
+        rest = Distortion(static - basis.change_degree(low, max(degree, 1))[:, : static.shape[1]], shape)
+        back = similarity.invert(affine)
 
         def shift(u, v, rest=rest, back=back):
             q = similarity.apply(back, basis.denormalize(u, v, rest.shape))

@@ -6,6 +6,7 @@ from ..cameras.source import DIRECTIONS
 from ..coaddition.options import ALGORITHMS, CONSERVE, EXTRAPOLATED, ORDERS, SCALES, WEIGHTS
 from ..coaddition.options import METHODS as COMBINATIONS
 from ..coaddition.resampling.drizzling import KERNELS
+from ..solving.camera_fit import KINDS as LAYOUTS
 from ..solving.gauge.constraints import KINDS
 from ..solving.minimisers import LOSSES
 from ..solving.options import ERRORS, METHODS
@@ -130,7 +131,10 @@ SOLVING = {
         "scatter of exposures around it; evidence: found from them", type=word_or(float, "evidence"), metavar="PIXELS"
     ),
     "validate": Option("of the stars, kept out to test the errors", type=float, metavar="FRACTION"),
-    "static": Option("fit one static distortion for all exposures of a detector", choices=("fit",)),
+    "static": Option(
+        "fit one static distortion for all exposures of a detector; of a camera also hold, prior", choices=LAYOUTS
+    ),
+    "layout": Option("the same for where the detectors of a camera lie", choices=LAYOUTS),
     "exposure_degree": Option("with --static fit: what every exposure adds (default 1)", type=int),
     "gauge": Option("see the docs (default minimal)", choices=KINDS),
     "method": Option("(default joint)", choices=METHODS),

@@ -535,7 +535,9 @@ class Solution:
             return []
         ny, nx = self.camera.field
         ids = ", ".join(self.camera.detectors)
-        return [f"camera  {self.camera.name}, detectors {ids}; positions in its focal plane, {nx} x {ny} px"]
+        known = [each.layout_sigma for each in self.camera.detectors.values() if each.layout_sigma is not None]
+        place = f"; layout to {np.sqrt(np.mean(np.square(known))):.2g} px a mode" if known else ""
+        return [f"camera  {self.camera.name}, detectors {ids}; positions in its focal plane, {nx} x {ny} px{place}"]
 
     def _static_in_words(self):
         if self.settings.static != "fit":

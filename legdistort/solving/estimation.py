@@ -3,7 +3,7 @@
 import logging
 import warnings
 from dataclasses import fields, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -14,14 +14,15 @@ from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
 from . import model_forms, reference_tie, single_fit
 from .assembly import assemble
-from .brightness_errors import estimate_by_brightness
+from .camera_fit import CameraFit, Sought
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, only_rows, validation
-from .correlated_errors import estimate_with_correlations
 from .equations import effective_modes
 from .equations.covariances import Uncertainty
 from .motion_choice import resolve as resolve_motion
 from .options import CLIP, SolveOptions, check_reference
+from .residual_errors.by_brightness import estimate_by_brightness
+from .residual_errors.correlated import estimate_with_correlations
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +37,7 @@ def solve(
     prior=None,
     model=None,
     static=None,
+    layout=None,
     exposure_degree=None,
     gauge="minimal",
     method="joint",
@@ -73,11 +75,15 @@ def solve(
         static distortion from which exposures depart. `Solution.model` then gives it back fitted. A similarity in
         front is replaced by the pose of each exposure. Poses also carry shift, rotation and scale: their part of the
         coefficients c0_0, c1_0 and c0_1 stays as given.
-    static : {None, "fit"}
+    static : {None, "fit"}, with a camera also {"hold", "prior"}
         "fit": one static distortion for all exposures of a detector (column ``detector``, else all of one shape), and
         for each exposure its pose and the modes up to `exposure_degree` alone: the self-calibration of a camera from
         its own dithers and rolls (Anderson & King 2003). A prior is where it starts, and with ``static_sigma``
         what holds it.
+        With a camera: fit the static distortion of every detector, common to all exposures, from what is known of it
+        on ("prior"; the default where uncertainties are given) or from nothing ("fit", up to `degree`); or "hold" it.
+    layout : {None, "hold", "prior", "fit"}
+        The same for where the detectors of a camera lie. What was found is in ``solution.camera``, with its errors.
     exposure_degree : int, optional
         With ``static="fit"``: 0 leaves an exposure shift, rotation and scale, 1 (default) an affine map, and so on.
     gauge : {"minimal", "mean"}
@@ -97,9 +103,9 @@ def solve(
     errors : {"stated", "scale", "floor", "by-brightness", "correlated"}
         Take the stated errors as they are; or scale the reported errors by sqrt(chi2/dof); or find the error floor
         that makes chi2 its degrees of freedom (zero if it is smaller already); or let a smooth law of brightness, found
-        from the residuals, take the place of the stated ones (`legdistort.solving.brightness_errors`; needs fluxes);
-        or find the floor, and the errors that a star has in common in neighbouring exposures and that do not average
-        down (`legdistort.solving.correlated_errors`; 8 exposures and 50 stars at least).
+        from the residuals, take the place of the stated ones (`legdistort.solving.residual_errors.by_brightness`; needs
+        fluxes); or find the floor, and the errors that a star has in common in neighbouring exposures and that do not
+        average down (`legdistort.solving.residual_errors.correlated`; 8 exposures and 50 stars at least).
         What was found is in ``diagnostics``.
     max_iterations : int, optional
     validate : float, optional
@@ -141,7 +147,8 @@ def solve(
         raise InputError(
             f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
         )
-    prior = _of_camera(matches.camera, prior, static, model)
+    sought, prior = _of_camera(matches, prior, model, degree, layout, static)
+    static = static if matches.camera is None else None
     asked = SolveOptions(
         degree=degree, prior=prior, model=model, static=static, exposure_degree=exposure_degree, gauge=gauge,
         method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors, max_iterations=max_iterations,
@@ -150,20 +157,16 @@ def solve(
     catalogue, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
     if model is None:
         _warn_of_header(matches, prior)
-    options, form, selection = asked, None, None
+    options, form = asked, None
     if model is not None:
         form = model_forms.read(model, matches, degree=degree, gauge=gauge)
         options = replace(asked, degree=form.degree, model=None, prior=form.prior())
     given, kept_out = (matches, None) if validate is None else hold_out(matches, validate)
     with single_fit.threads(given):
-        if options.chooses_degree:
-            selection = _choose_degree(given, options)
-            options = replace(options, degree=selection.degree)
-        options, scatter = resolve_motion(given, options)
-        fit, errors_found = _estimate(given, options)
+        fit, options, chosen = _fitted(given, options, sought)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
-        diagnostics = replace(_diagnostics(fit, prior, scale, selection), motion_scatter=scatter, **errors_found)
+        diagnostics = replace(_diagnostics(fit, prior, scale), **chosen)
         if catalogue is not None:
             fit = reference_tie.tie_to(fit, catalogue, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
     epoch = given.epoch if epoch is None else epoch
@@ -174,32 +177,61 @@ def solve(
         log.warning("%s", solution.gauge.warning)
     if kept_out is None:
         return solution
+    if sought is not None:
+        kept_out = solution.camera.in_focal_plane(matches.camera.on_detectors(kept_out))
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
 
 
-def _of_camera(camera, prior, static, model):
-    """The prior where positions are those in the focal plane of a camera: no distortion, for its detectors have theirs.
+def _of_camera(matches, prior, model, degree, layout, static):
+    """What is sought of a camera, if anything, and the prior where positions are those in its focal plane.
+
+    That has no distortion of its own: its detectors have theirs, and what is not known of them.
 
     Raises
     ------
     InputError
-        For what is known of single detectors: the camera has it.
+        For what is known of single detectors: the camera has it; for a layout without a camera.
     """
+    camera = matches.camera
     if camera is None:
-        return prior
-    if static is not None or isinstance(prior, dict):
+        if layout is not None:
+            raise InputError("layout is for exposures with several detectors: give the matches a camera")
+        return None, prior
+    if isinstance(prior, dict):
         raise InputError(
-            "with a camera, layout and static distortion of its detectors are taken as known: leave static out, and "
-            "give what is known of the detectors to the camera (Detector(..., static=)), not as prior"
+            "with a camera, give what is known of its detectors to the camera (Detector(..., static=)), not as prior"
         )
-    if any(w is not None for each in camera.detectors.values() for w in (each.layout_sigma, each.static_sigma)):
-        warn(
-            f"layout and static distortion of camera {camera.name} are taken as exact: their uncertainties are not in "
-            "the errors",
-            AssumptionWarning,
-        )
-    stated = prior is not None or model is not None
-    return prior if stated else Prior(np.zeros((2, 1)), source=f"camera {camera.name}")
+    sought = Sought.of(matches, layout, static, 3 if isinstance(degree, str) else degree)
+    if prior is not None or model is not None:
+        return sought, prior
+    known = {"source": f"camera {camera.name}"}
+    if sought is None:
+        return None, Prior(np.zeros((2, 1)), **known)
+    widths = sought.of_common_map
+    return sought, Prior(np.zeros_like(widths), static_sigma=widths, **known)
+
+
+def _fitted(matches, options, sought):
+    """The fit, its options, and what was chosen and found for the `Diagnostics`; with the camera that is `sought`."""
+    camera, selection = None if sought is None else CameraFit(sought), None
+    if camera is not None:  # to a layout that is wrong by pixels all observations seem to deviate
+        matches = camera.settle(matches, partial(single_fit.estimate, options=_plain(options)))
+    if options.chooses_degree:
+        selection = _choose_degree(matches, options)
+        options = replace(options, degree=selection.degree)
+    options, scatter = resolve_motion(matches, options)
+    if camera is not None:
+        matches = camera.settle(matches, lambda part: _estimate(part, options)[0])
+    fit, errors_found = _estimate(matches, options)
+    fit = fit if camera is None else camera.finished(fit)
+    return fit, options, {"selection": selection, "motion_scatter": scatter, **errors_found}
+
+
+def _plain(options):
+    """Options that leave nothing out, choose nothing and let no star move."""
+    degree = 3 if options.chooses_degree else options.degree
+    known = {"motion": None, "motion_sigma": None, "motion_epoch": None}
+    return replace(options, degree=degree, clip=None, loss="linear", errors="stated", **known)
 
 
 def _estimate(matches, options):
@@ -284,7 +316,7 @@ def _tell_lost_stars(fit):
     )
 
 
-def _diagnostics(fit, prior, scale, selection):
+def _diagnostics(fit, prior, scale):
     """What was found before a reference is asked."""
     each = prior.values() if isinstance(prior, dict) else [prior]
     return Diagnostics(
@@ -294,7 +326,6 @@ def _diagnostics(fit, prior, scale, selection):
         prior_has_widths=any(p is not None and p.sigma is not None for p in each),
         effective_modes=dict(zip(fit.problem.names, fit.effective_modes.round(3).tolist(), strict=True)),
         departure_ratio=effective_modes.departure_ratio(fit.problem, fit.result.gauge, fit.blocks, fit.uncertainty),
-        selection=selection,
     )
 
 

@@ -51,6 +51,8 @@ class Fit:
         ``{exposure: reason}`` of exposures that the fit cannot follow, if it was not judged.
     shared_errors : ndarray, shape (3, n_stars), or None
         See `Uncertainty`.
+    shared_unknowns : float
+        Number of unknowns of a camera that were fitted and that the data determine.
     """
 
     matches: Matches
@@ -61,6 +63,7 @@ class Fit:
     widths: prior_widths.Widths | None = None
     unfollowed: dict = field(default_factory=dict)
     shared_errors: np.ndarray | None = None
+    shared_unknowns: float = 0.0
 
     @cached_property
     def weighted(self):
@@ -96,6 +99,7 @@ class Fit:
         """Degrees of freedom: the directions fixed by the gauge are no unknowns, and a prior does part of the work."""
         problem = self.problem
         n_free = elimination.star_freedom(self.weighted, self.blocks) + self.effective_modes.sum()
+        n_free += self.shared_unknowns
         if problem.unknowns.shared:
             priors = problem, replace(problem, static_sigma=None)
             by_prior, by_widths = (effective_modes.done_by_prior(p, self.uncertainty).sum() for p in priors)

@@ -198,6 +198,17 @@ class Direct(_Reduced):
         d = self.solve(self.rhs, target)
         return self._stars(self.blocks.g_star - self._couple(d)), self.problem.unknowns.spread(d)
 
+    def settle(self, own, stars):
+        """What stars (2 + k, n_stars) and coefficients (n_exposures, 2 n_modes) do about gradients, in the gauge.
+
+        Parameters
+        ----------
+        own : ndarray, shape (n_exposures, 2 n_modes)
+        stars : ndarray, shape (2 + k, n_stars)
+        """
+        d = self.solve(self._gradient(own, stars), np.zeros(self.gauge.n_constraints))
+        return self._stars(stars - self._couple(d)), self.problem.unknowns.spread(d)
+
     def respond(self, gradients):
         """C g, with the covariance C of the coefficients in the gauge, for gradients g (n_exposures, 2 n_modes, k)."""
         free = self._apply_inverse(self.unknowns.gather(gradients))
@@ -244,6 +255,11 @@ class Iterative(_Reduced):
 
     def _block_solve(self, r):
         return np.einsum("iab,ib->ia", self._block_inverses, r.reshape(self.blocks.g_exposure.shape)).ravel()
+
+    def settle(self, own, stars):
+        """As for `Direct`."""
+        stars, d = self._solve(own, stars, self.rows, np.zeros(len(self.rows)), 1e-8)
+        return stars, self.unknowns.spread(d)
 
     def respond(self, gradients):
         """As for `Direct`, the positions of the stars taken as known."""

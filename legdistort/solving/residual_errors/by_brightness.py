@@ -11,9 +11,9 @@ import numpy as np
 from astropy import units as u
 from scipy.optimize import nnls
 
-from ..exceptions import InputError
-from ..results.diagnostics import ErrorLaw
-from . import clipping, single_fit
+from ...exceptions import InputError
+from ...results.diagnostics import ErrorLaw
+from .. import clipping, single_fit
 
 #: Fits one after the other: the law of each gives the weights of the next. They settle in two or three.
 ROUNDS = 4

@@ -16,9 +16,9 @@ import numpy as np
 from scipy import linalg, special
 from scipy.optimize import minimize, minimize_scalar
 
-from ..results.diagnostics import FOLDING, MATERN, CorrelatedErrors
-from . import single_fit
-from .equations.leverage import leverages
+from ...results.diagnostics import FOLDING, MATERN, CorrelatedErrors
+from .. import single_fit
+from ..equations.leverage import leverages
 
 #: Blocks of two exposures that are needed, and stars.
 BLOCKS, STARS = 4, 50

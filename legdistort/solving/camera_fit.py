@@ -1,0 +1,311 @@
+"""Layouts and static distortions of the detectors of a camera, fitted together with stars and exposures.
+
+To first order a change ``ds_c`` of the series of detector c moves what was measured on it by ``-M_c^-1 b ds_c`` in the
+focal plane, M_c the linear part of its layout; modes of orders 0 and 1 are its layout. The fit with the camera as it is
+gives the normal equations of these changes with stars and exposures eliminated, ``H = P' W P - G' C G``: P are the
+displacements by a unit of each, G their gradients, C what the fit makes of a gradient. They are solved, the positions
+are carried to the focal plane anew, and so on until nothing changes.
+
+A map of the focal plane can be exchanged between detectors and exposures: directions that H does not determine stay
+where they are, which keeps the change of the camera as small as it can be.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..cameras.camera import Camera
+from ..cameras.detector import Detector, affine_of
+from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, warn
+from ..geometry import basis, similarity
+from ..results.absolute_errors import without_plain_map
+from ..runtime.checks import check_choice
+
+#: Part of what the data would tell of a direction alone below which it is not determined beside all else: what
+#: detectors and exposures can exchange is so to first order, and by the gradient of one times the other beyond.
+_WEAK = 1e-5
+#: Steps at most, and their length in standard errors at which they end.
+_STEPS, _SMALL = 10, 0.01
+#: What is done about layouts and static distortions.
+KINDS = "hold", "prior", "fit"
+#: Size [pix] of what nothing is known of, in the prior of the common map.
+UNKNOWN = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class CameraStep:
+    """One step of the camera.
+
+    Attributes
+    ----------
+    change : ndarray, shape (n_detectors, 2, n_modes)
+        Of the series of the detectors, pixels.
+    covariance : ndarray, shape (k, k)
+        Of those that are fitted.
+    free : ndarray of bool, shape (n_detectors, 2, n_modes)
+    spread : ndarray, shape (2, n_stars, k)
+        How the stars follow.
+    freedom : float
+        Number of changes that the data determine rather than what was known.
+    weak : ndarray, shape (m, k)
+        Directions that are not determined.
+    """
+
+    change: np.ndarray
+    covariance: np.ndarray
+    free: np.ndarray
+    spread: np.ndarray
+    freedom: float
+    weak: np.ndarray
+
+    @property
+    def errors(self):
+        """Standard deviations (n_detectors, 2, n_modes) of the changes; zero for what is held."""
+        out = np.zeros(self.free.shape)
+        out[self.free] = np.sqrt(np.diag(self.covariance))
+        return out
+
+    @property
+    def length(self):
+        """Largest change in units of its error."""
+        errors = self.errors[self.free]
+        return float(np.max(np.abs(self.change[self.free]) / np.where(errors > 0, errors, np.inf), initial=0))
+
+
+@dataclass(frozen=True, eq=False)
+class Sought:
+    """What is sought of a camera.
+
+    Attributes
+    ----------
+    free : ndarray of bool, shape (n_detectors, 2, n_modes)
+        Modes that are fitted; those of orders 0 and 1 are the layout.
+    prior : ndarray, same shape
+        Standard deviations beforehand; infinite where nothing is known.
+    """
+
+    free: np.ndarray
+    prior: np.ndarray
+
+    @classmethod
+    def of(cls, matches, layout, static, degree):
+        """By what `legdistort.solve` was told; None where the camera is held. Detectors without a position are held.
+
+        Raises
+        ------
+        InputError
+            For a prior without uncertainties.
+        """
+        camera = matches.camera
+        seen, each = np.isin(list(camera.detectors), camera.ids(matches.table)), list(camera.detectors.values())
+        top = max([degree, *(basis.degree_of(detector.static.shape[1]) for detector in each)])
+        modes = basis.n_modes(top)
+        free, prior = np.zeros((len(each), 2, modes), dtype=bool), np.full((len(each), 2, modes), np.inf)
+        for kind, part, name in ((layout, slice(0, 3), "layout"), (static, slice(3, modes), "static")):
+            widths = [getattr(detector, f"{name}_sigma") for detector in each]
+            known = any(w is not None for w in widths)
+            kind = kind or ("prior" if known else "hold")
+            check_choice(kind, KINDS, name)
+            if kind == "hold":
+                continue
+            if kind == "prior" and not known:
+                raise InputError(
+                    f"{name}='prior' needs the uncertainty of every detector (Detector(..., {name}_sigma=)): give it, "
+                    f"or {name}='fit'"
+                )
+            fitted = slice(part.start, basis.n_modes(degree)) if name == "static" and kind == "fit" else part
+            free[:, :, fitted] = True
+            if kind == "prior":
+                for k, w in enumerate(widths):
+                    padded = np.zeros((2, modes)) if w is None else basis.change_degree(w, top)
+                    prior[k, :, fitted] = padded[:, fitted]
+            free[:, :, fitted] &= prior[:, :, fitted] > 0
+        free[~seen] = False
+        return cls(free, prior) if free.any() else None
+
+    @property
+    def of_common_map(self):
+        """Uncertainty (2, n_modes) of the mean distortion of the focal plane, which detectors and exposures share."""
+        widths = np.where(self.free, np.minimum(self.prior, UNKNOWN), 0.0)
+        flat = (widths >= UNKNOWN).any(axis=0)
+        number = np.maximum(self.free.any(axis=(1, 2)).sum(), 1)
+        return np.where(flat, UNKNOWN, np.sqrt(np.sum(widths**2, axis=0)) / number)
+
+
+class CameraFit:
+    """The way to the camera that exposures call for.
+
+    Parameters
+    ----------
+    sought : Sought
+    """
+
+    def __init__(self, sought):
+        self.sought, self.step, self._departure = sought, None, np.zeros(sought.free.shape)
+
+    def settle(self, matches, estimate):
+        """Matches with the camera with which `estimate`, ``estimate(matches)``, gives a fit that calls for no other."""
+        for _ in range(_STEPS):
+            fit = estimate(matches)
+            self.step = camera_step(fit, self.sought, self._departure)
+            self._departure = self._departure + self.step.change
+            matches = in_camera(fit.matches, changed(fit.matches.camera, self.step.change))
+            if self.step.length < _SMALL:
+                break
+        return matches
+
+    def finished(self, fit):
+        """The fit with the settled camera, with the errors of that: in the camera, and in those of the stars.
+
+        Warns
+        -----
+        ConvergenceWarning
+            If the camera did not settle.
+        AssumptionWarning
+            Naming detectors whose place these exposures do not tell.
+        """
+        step = self.step
+        if step.length >= _SMALL:
+            warn(f"the camera has not settled in {_STEPS} steps; give better layouts", ConvergenceWarning)
+        _tell_weak(fit.matches.camera, step)
+        shared = _of_stars(fit, step) + (0.0 if fit.shared_errors is None else fit.shared_errors)
+        camera = changed(fit.matches.camera, np.zeros_like(step.change), step.errors)
+        matches = replace(fit.matches, camera=camera)
+        return replace(fit, matches=matches, shared_errors=shared, shared_unknowns=step.freedom)
+
+
+def _of_stars(fit, step):
+    """Covariance xx, yy, xy (3, n_stars) of star positions by that of the camera, less a common map."""
+    good, modes = fit.blocks.v[0] > 0, fit.problem.n_modes
+    xy = fit.result.state.positions.T
+    plain = fit.result.gauge.modes_at(xy[good], modes).T
+    spread = step.spread[:, good].transpose(1, 0, 2)
+    left = without_plain_map(spread, plain)
+    out = np.zeros((3, len(good)))
+    moved = left @ step.covariance @ left.transpose(0, 2, 1)
+    out[:, good] = moved[:, 0, 0], moved[:, 1, 1], moved[:, 0, 1]
+    return out
+
+
+def _tell_weak(camera, step):
+    """Warn of what is not determined beyond maps that detectors and exposures can exchange."""
+    modes = step.free.any(axis=(0, 1))
+    exchanged = 2 * np.count_nonzero(modes) if modes[:3].all() else 0
+    extra = len(step.weak) - exchanged
+    if extra <= 0:
+        return
+    energy = np.zeros(step.free.shape)
+    energy[step.free] = (step.weak**2).sum(axis=0)
+    keys = np.array(list(camera.detectors))
+    named = keys[np.argsort(-energy.sum(axis=(1, 2)), kind="stable")][:4]
+    warn(
+        f"{extra} unknowns of camera {camera.name} are not determined by these exposures and stay where they were, "
+        f"above all of detector {', '.join(named)}: stars that one detector sees in one exposure and another in the "
+        "next tell how these lie; dither over the gaps, or give uncertainties (layout_sigma)",
+        AssumptionWarning,
+    )
+
+
+def in_camera(matches, camera):
+    """The same matches with positions in the focal plane of another camera with the same detectors."""
+    table = camera.in_focal_plane(matches.camera.on_detectors(matches.table))
+    return replace(matches, table=table, camera=camera, observations=None)
+
+
+def camera_step(fit, sought, departure):
+    """The `CameraStep` that a `Fit` calls for.
+
+    Parameters
+    ----------
+    fit : Fit
+    sought : Sought
+    departure : ndarray, shape (n_detectors, 2, n_modes)
+        Of the camera from where it was beforehand.
+    """
+    free, prior = sought.free, sought.prior
+    problem, blocks, camera = fit.weighted, fit.blocks, fit.matches.camera
+    system = fit.uncertainty.system
+    patterns = _patterns(fit.matches, camera, problem, free)
+    moved = _weighted(problem, patterns)
+    k = patterns.shape[2]
+    responses, normal = np.empty((2, problem.n_stars, k)), np.einsum("ank,anl->kl", patterns, moved)
+    alone = np.diag(normal).copy()
+    gradients = [_gradient(problem, blocks, patterns[:, :, j], moved[:, :, j]) for j in range(k)]
+    for j, (own, stars) in enumerate(gradients):
+        star_response, response = system.settle(own, stars)
+        responses[:, :, j] = star_response[:2]
+        for m, (other_own, other_stars) in enumerate(gradients):
+            normal[m, j] -= np.sum(other_own * response) + np.sum(other_stars * star_response)
+    normal = (normal + normal.T) / 2
+    precision = 1 / prior[free] ** 2
+    pull = -np.einsum("ank,an->k", moved, blocks.residual) - precision * departure[free]
+    covariance, weak = _inverse(normal, precision, alone)
+    change = np.zeros(free.shape)
+    change[free] = covariance @ pull
+    return CameraStep(change, covariance, free, -responses, float(np.sum(covariance * normal)), weak)
+
+
+def _patterns(matches, camera, problem, free):
+    """Displacements (2, n, k) of what was measured, in the focal plane, by a unit of each free mode."""
+    keys = list(camera.detectors)
+    detector = camera.ids(matches.table)[problem.order]
+    xy = np.stack([matches.table[f"{axis}_detector"].value[problem.order] for axis in "xy"], axis=1)
+    degree, out = basis.degree_of(free.shape[2]), np.zeros((2, len(xy), np.count_nonzero(free)))
+    places = np.argwhere(free)
+    for c, key in enumerate(keys):
+        rows, mine = detector == key, np.flatnonzero(places[:, 0] == c)
+        chip = camera[key]
+        back = -np.linalg.inv(chip.layout[:, :2])
+        values = basis.values(degree, *basis.normalize(chip.distortion.invert(xy[rows]), chip.shape))
+        for k in mine:
+            _, axis, mode = places[k]
+            out[:, rows, k] = np.outer(back[:, axis], values[mode])
+    return out
+
+
+def _weighted(problem, patterns):
+    """W p."""
+    w = problem.weight[:, :, None]
+    return np.stack([w[0] * patterns[0] + w[2] * patterns[1], w[2] * patterns[0] + w[1] * patterns[1]])
+
+
+def _gradient(problem, blocks, pattern, weighted):
+    """Gradients of exposures and stars, were the displacements (2, n) the residuals."""
+    own, stars = np.zeros_like(blocks.g_exposure), np.zeros_like(blocks.g_star)
+    for i in range(problem.n_exposures):
+        part = problem.part(i)
+        f = blocks.coupling[:, :, part]
+        pulled = problem.terms.pull(i, f[:, 0] * pattern[0, part] + f[:, 1] * pattern[1, part])
+        stars[:, problem.star[part]] += pulled
+        own[i] = (weighted[:, part] @ blocks.values[:, part].T).ravel()
+    return own, stars
+
+
+def _inverse(normal, precision, alone):
+    """Inverse of the sum, on what data or prior determine, and the directions (m, k) that neither does.
+
+    `alone` (k,) is what the data would tell of each unknown if all others were known.
+    """
+    unit = 1 / np.sqrt(alone)
+    values, vectors = np.linalg.eigh(normal * np.outer(unit, unit) + np.diag(precision > 0))
+    good = values > _WEAK
+    known = vectors[:, good] * unit[:, None]
+    inner = np.linalg.inv(known.T @ (normal + np.diag(precision)) @ known)
+    return known @ inner @ known.T, (vectors[:, ~good] * unit[:, None]).T
+
+
+def changed(camera, change, errors=None):
+    """The camera with changes (n_detectors, 2, n_modes) of the series of its detectors, and with their errors."""
+    detectors = {}
+    for k, (key, each) in enumerate(camera.detectors.items()):
+        degree = basis.degree_of(change.shape[2])
+        top = max(degree, basis.degree_of(each.static.shape[1]))
+        low = affine_of(change[k, :, :3], each.shape)
+        static = basis.change_degree(each.static, top) + basis.change_degree(change[k], top)
+        static[:, :3] = 0.0  # the layout, which moves the static distortion along
+        sigma = {}
+        if errors is not None:
+            widths = basis.change_degree(errors[k], top)
+            sigma = {"layout_sigma": widths[:, :3], "static_sigma": np.where(np.arange(widths.shape[1]) < 3, 0, widths)}
+        detectors[key] = Detector(each.shape, layout=similarity.compose(low, each.layout), static=static, **sigma)
+    return Camera(camera.name, detectors, camera.field)
