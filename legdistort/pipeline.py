@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from .assessment import baselines, run_checks, stack_quality
+from .cameras.camera import Camera
 from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
 from .exceptions import InputError, MatchError
@@ -150,6 +151,8 @@ def run(
     tying = {"epoch": epoch, "pixel_scale": pixel_scale}
     reference, tying["epoch"] = check_reference(reference, **tying, method=solving.method)
     parallel.check_workers(workers)
+    if camera is not None and not isinstance(camera, Camera):
+        raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
     share, timings = {"workers": workers, "progress": progress}, {}
     with outputs.replacing_folder(out, former=RESULTS) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more

@@ -408,5 +408,6 @@ if __name__ == "__main__":
         print(f"{name:28s} {total:10d} {kills:6d} {old:5d} {new:5d} {bad:7d} {seconds:8.1f}")
     print(f"{'all':28s} {sum(r[1] for r in table):10d} {sum(r[2] for r in table):6d} {sum(r[3] for r in table):5d} "
           f"{sum(r[4] for r in table):5d} {len(wrong):7d}")  # fmt: skip
-    print("\n".join(wrong))
+    if wrong:
+        print("\n".join(wrong))
     sys.exit(bool(wrong))

@@ -262,7 +262,8 @@ class Matches:
         table = column_contract.check(table, column_contract.MATCHED, "the table of matched positions")
         table["exposure"] = table["exposure"].astype(str)
         if camera is not None:
-            table, shape = in_focal_plane(table, camera), camera.field
+            table = in_focal_plane(table, camera)
+            shape = camera.field
         seen, left_out = Observations.of(table), dict(left_out or {})
         check_choice(allow_copies, (True, False), "allow_copies")
         if not allow_copies and (copies := repetitions.reasons(seen.names, seen.exposure, seen.xy)):
@@ -394,6 +395,8 @@ def _inside(seen, shapes):
 
 def in_focal_plane(table, camera):
     """The table with positions in the focal plane of a camera, without those outside of their detector (`_inside`)."""
+    if not hasattr(camera, "in_focal_plane"):
+        raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
     if "x_detector" not in table.colnames:
         detector, part = camera.ids(table), QTable(table, copy=False)
         if "star" not in table.colnames:

@@ -103,7 +103,8 @@ def match(
         camera = Camera.of_frames(exposures)
         log.info("layout of the detectors by the headers: %s", camera)
     if camera is not None:
-        table, shape = in_focal_plane(table, camera), camera.field
+        table = in_focal_plane(table, camera)
+        shape = camera.field
         exposures = None if exposures is None else focal_planes(camera, exposures)
     named = None if exposures is None else {e.name: e for e in exposures}
     names = list(dict.fromkeys(table["exposure"].tolist()) if named is None else named)
