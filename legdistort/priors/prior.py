@@ -34,8 +34,8 @@ def _per_mode(value, n, name):
         raise InputError(
             f"{name} must be a number, one per mode ({n},) or per axis and mode (2, {n}), got shape {out.shape}"
         ) from None
-    if not np.all(out >= 0) or (name != "sigma" and not np.all(np.isfinite(out))):
-        raise InputError(f"{name} must be finite and not negative (a standard deviation in pixels), got {value!r}")
+    if not np.all(out >= 0):
+        raise InputError(f"{name} must not be negative, nor NaN (a standard deviation in pixels), got {value!r}")
     return out
 
 
@@ -68,9 +68,10 @@ class Prior:
         (`legdistort.solving.choices.prior_widths`).
     static_sigma : array_like, optional
         Uncertainty of the mean itself, same forms. It is common to all exposures and does not average down. None takes
-        the mean as exact. Without a mean, a number s: every coefficient of the degree d that is fitted is about that
-        large, in pixels, either sign. This makes ``s sqrt(((d + 1) (d + 2) - 4) / 8)`` px of distortion, rms per axis
-        over the detector, shift, rotation and scale aside: s at degree 2, 1.4 s at 3, 1.8 s at 4, 2.2 s at 5.
+        the mean as exact, infinity says that nothing is known of a mode. Without a mean, a number s: every coefficient
+        of the degree d that is fitted is about that large, in pixels, either sign. This makes
+        ``s sqrt(((d + 1) (d + 2) - 4) / 8)`` px of distortion, rms per axis over the detector, shift, rotation and
+        scale aside: s at degree 2, 1.4 s at 3, 1.8 s at 4, 2.2 s at 5.
     shape : tuple, optional
         ``(ny, nx)`` of the detector it belongs to; solving exposures of another shape with it is then an error.
     source : str or dict, optional

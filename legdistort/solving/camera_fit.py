@@ -28,8 +28,6 @@ _WEAK = 1e-5
 _STEPS, _SMALL = 10, 0.01
 #: What is done about layouts and static distortions.
 KINDS = "hold", "prior", "fit"
-#: Size [pix] of what nothing is known of, in the prior of the common map.
-UNKNOWN = 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +124,8 @@ class Sought:
     @property
     def of_common_map(self):
         """Uncertainty (2, n_modes) of the mean distortion of the focal plane, which detectors and exposures share."""
-        widths = np.where(self.free, np.minimum(self.prior, UNKNOWN), 0.0)
-        flat = (widths >= UNKNOWN).any(axis=0)
-        number = np.maximum(self.free.any(axis=(1, 2)).sum(), 1)
-        return np.where(flat, UNKNOWN, np.sqrt(np.sum(widths**2, axis=0)) / number)
+        widths = np.where(self.free, self.prior, 0.0)
+        return np.sqrt(np.sum(widths**2, axis=0)) / np.count_nonzero(self.free.any(axis=(1, 2)))
 
 
 class CameraFit:

@@ -117,6 +117,9 @@ class SolveOptions(Settings):
             if self.exposure_degree is not None:
                 raise InputError("exposure_degree belongs to static='fit', where exposures share the modes above it")
             return
+        each = self.prior.values() if isinstance(self.prior, dict) else [self.prior]
+        if any(p is not None and p.static_sigma is not None and np.isinf(p.static_sigma).any() for p in each):
+            raise InputError("static='fit' holds what a prior's static_sigma says: make it finite, or leave it out")
         if self.method != "joint":
             raise InputError("static='fit' needs method='joint'")
         if self.exposure_degree is not None:
