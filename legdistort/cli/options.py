@@ -6,9 +6,9 @@ from ..cameras.source import DIRECTIONS
 from ..coaddition.options import ALGORITHMS, CONSERVE, EXTRAPOLATED, ORDERS, SCALES, WEIGHTS
 from ..coaddition.options import METHODS as COMBINATIONS
 from ..coaddition.resampling.drizzling import KERNELS
-from ..solving.camera_fit import KINDS as LAYOUTS
 from ..solving.gauge.constraints import KINDS
 from ..solving.minimisers import LOSSES
+from ..solving.options import CAMERA as LAYOUTS
 from ..solving.options import ERRORS, METHODS
 from .arguments import Option, columns, extension, number_or_name, spectrum, word_or
 

@@ -14,7 +14,7 @@ class Settings:
     prior, model : dict or None
         What they were: see `Prior.describe` (by detector or exposure, if they were given so), and ``parts``,
         ``fixed``, ``n_free`` of the model.
-    static : str or None
+    static, layout : str or None
     exposure_degree : int or None
         With ``static="fit"``: up to which exposures have modes of their own.
     gauge, loss, errors : str
@@ -36,6 +36,7 @@ class Settings:
     prior: object = None
     model: object = None
     static: str | None = None
+    layout: str | None = None
     exposure_degree: int | None = None
     gauge: str = "minimal"
     method: str = "joint"

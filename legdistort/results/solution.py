@@ -540,7 +540,7 @@ class Solution:
         return [f"camera  {self.camera.name}, detectors {ids}; positions in its focal plane, {nx} x {ny} px{place}"]
 
     def _static_in_words(self):
-        if self.settings.static != "fit":
+        if self.settings.static != "fit" or self.camera is not None:
             return []
         own = self.settings.exposure_degree
         mine = f"modes up to degree {own}" if own else "its pose alone"

@@ -20,14 +20,13 @@ from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, warn
 from ..geometry import basis, similarity
 from ..results.absolute_errors import without_plain_map
 from ..runtime.checks import check_choice
+from .options import CAMERA
 
 #: Part of what the data would tell of a direction alone below which it is not determined beside all else: what
 #: detectors and exposures can exchange is so to first order, and by the gradient of one times the other beyond.
 _WEAK = 1e-5
 #: Steps at most, and their length in standard errors at which they end.
 _STEPS, _SMALL = 10, 0.01
-#: What is done about layouts and static distortions.
-KINDS = "hold", "prior", "fit"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +102,7 @@ class Sought:
             widths = [getattr(detector, f"{name}_sigma") for detector in each]
             known = any(w is not None for w in widths)
             kind = kind or ("prior" if known else "hold")
-            check_choice(kind, KINDS, name)
+            check_choice(kind, CAMERA, name)
             if kind == "hold":
                 continue
             if kind == "prior" and not known:

@@ -12,6 +12,7 @@ from ..inputs.matches import Matches
 from ..priors.prior import Prior, tells
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
+from ..runtime.checks import check_choice
 from . import model_forms, reference_tie, single_fit
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought
@@ -20,7 +21,7 @@ from .choices.held_out import hold_out, only_rows, validation
 from .equations import effective_modes
 from .equations.covariances import Uncertainty
 from .motion_choice import resolve as resolve_motion
-from .options import CLIP, SolveOptions, check_reference
+from .options import CAMERA, CLIP, SolveOptions, check_reference
 from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
 
@@ -148,19 +149,19 @@ def solve(
             f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
         )
     sought, prior = _of_camera(matches, prior, model, degree, layout, static)
-    static = static if matches.camera is None else None
     asked = SolveOptions(
-        degree=degree, prior=prior, model=model, static=static, exposure_degree=exposure_degree, gauge=gauge,
-        method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors, max_iterations=max_iterations,
-        validate=validate, motion=motion, motion_sigma=motion_sigma, motion_epoch=motion_epoch,
+        degree=degree, prior=prior, model=model, static=static, layout=layout, exposure_degree=exposure_degree,
+        gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
+        max_iterations=max_iterations, validate=validate, motion=motion, motion_sigma=motion_sigma,
+        motion_epoch=motion_epoch,
     )  # fmt: skip
     catalogue, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
     if model is None:
         _warn_of_header(matches, prior)
-    options, form = asked, None
+    options, form = asked if matches.camera is None else replace(asked, static=None, layout=None), None
     if model is not None:
         form = model_forms.read(model, matches, degree=degree, gauge=gauge)
-        options = replace(asked, degree=form.degree, model=None, prior=form.prior())
+        options = replace(options, degree=form.degree, model=None, prior=form.prior())
     given, kept_out = (matches, None) if validate is None else hold_out(matches, validate)
     with single_fit.threads(given):
         fit, options, chosen = _fitted(given, options, sought)
@@ -193,9 +194,16 @@ def _of_camera(matches, prior, model, degree, layout, static):
         For what is known of single detectors: the camera has it; for a layout without a camera.
     """
     camera = matches.camera
+    for name, value in (("layout", layout), ("static", static)):
+        check_choice(value, (None, *CAMERA), name)
     if camera is None:
-        if layout is not None:
-            raise InputError("layout is for exposures with several detectors: give the matches a camera")
+        if layout is not None or static in ("hold", "prior"):
+            raise InputError(
+                "layout, and static='hold' or 'prior', are for exposures with several detectors: matches need a camera"
+            )
+        each = prior.values() if isinstance(prior, dict) else [prior]
+        if static == "fit" and any(_knows_nothing_of_a_mode(p) for p in each):
+            raise InputError("static='fit' holds what static_sigma of a prior says: make it finite, or leave it out")
         return None, prior
     if isinstance(prior, dict):
         raise InputError(
@@ -209,6 +217,11 @@ def _of_camera(matches, prior, model, degree, layout, static):
         return None, Prior(np.zeros((2, 1)), **known)
     widths = sought.of_common_map
     return sought, Prior(np.zeros_like(widths), static_sigma=widths, **known)
+
+
+def _knows_nothing_of_a_mode(prior):
+    sigma = getattr(prior, "static_sigma", None)
+    return sigma is not None and not isinstance(sigma, str) and bool(np.isinf(sigma).any())
 
 
 def _fitted(matches, options, sought):

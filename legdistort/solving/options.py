@@ -18,6 +18,8 @@ from .gauge.constraints import KINDS
 from .minimisers import LOSSES
 
 METHODS = ("joint", "alternating")
+#: What is done about layouts and static distortions of a camera; without one a static distortion can only be fitted.
+CAMERA = ("hold", "prior", "fit")
 ERRORS = ("stated", "scale", "floor", "by-brightness", "correlated")
 
 
@@ -112,14 +114,12 @@ class SolveOptions(Settings):
         fitter.free_coefficients(self.model)  # refuses what is no map of the plane, ties and bounds
 
     def _check_static(self):
-        check_choice(self.static, (None, "fit"), "static")
-        if self.static is None:
+        check_choice(self.static, (None, *CAMERA), "static")
+        check_choice(self.layout, (None, *CAMERA), "layout")
+        if self.static != "fit":
             if self.exposure_degree is not None:
                 raise InputError("exposure_degree belongs to static='fit', where exposures share the modes above it")
             return
-        each = self.prior.values() if isinstance(self.prior, dict) else [self.prior]
-        if any(p is not None and p.static_sigma is not None and np.isinf(p.static_sigma).any() for p in each):
-            raise InputError("static='fit' holds what a prior's static_sigma says: make it finite, or leave it out")
         if self.method != "joint":
             raise InputError("static='fit' needs method='joint'")
         if self.exposure_degree is not None:
@@ -138,7 +138,7 @@ class SolveOptions(Settings):
     @property
     def own_degree(self):
         """Up to which degree exposures have modes of their own; None if they share nothing."""
-        if self.static is None:
+        if self.static != "fit":
             return None
         return 1 if self.exposure_degree is None else int(self.exposure_degree)
 
