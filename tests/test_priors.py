@@ -158,8 +158,8 @@ def test_repr_has_no_arrays():
         ({"mean": np.zeros(10)}, r"mean must have shape \(2, n_modes\), x then y, got \(10,\)"),
         ({"mean": np.zeros((2, 7))}, "n = 7 is not a number of modes"),
         ({"mean": np.full((2, 3), np.nan)}, "mean has values that are not finite"),
-        ({"mean": np.zeros((2, 3)), "sigma": -1}, "sigma must not be negative"),
-        ({"mean": np.zeros((2, 3)), "static_sigma": np.nan}, "static_sigma must not be negative, nor NaN"),
+        ({"mean": np.zeros((2, 3)), "sigma": -1}, "sigma must be 0 or more"),
+        ({"mean": np.zeros((2, 3)), "static_sigma": np.nan}, "static_sigma must be 0 or more"),
         ({"mean": np.zeros((2, 3)), "sigma": [1, 2]}, r"sigma must be a number, one per mode \(3,\).*got shape \(2,\)"),
     ],
 )

@@ -35,7 +35,7 @@ def _per_mode(value, n, name):
             f"{name} must be a number, one per mode ({n},) or per axis and mode (2, {n}), got shape {out.shape}"
         ) from None
     if not np.all(out >= 0):
-        raise InputError(f"{name} must not be negative, nor NaN (a standard deviation in pixels), got {value!r}")
+        raise InputError(f"{name} must be 0 or more (a standard deviation in pixels), got {value!r}")
     return out
 
 
