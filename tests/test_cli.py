@@ -6,9 +6,9 @@ import os
 import re
 import runpy
 import signal
+import subprocess
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import asdf
@@ -20,15 +20,13 @@ from astropy.wcs import WCS
 
 import legdistort
 from legdistort import Prior, Solution, calibrate_noise, coadd, match, measure, open_exposures, predict, solve
-from legdistort.cli import options, parser
+from legdistort.cli import commands, options, parser
 from legdistort.cli.arguments import given
-from legdistort.cli.commands import COMMANDS
 from legdistort.cli.parser import main
+from legdistort.cli.usage import COMMANDS
 from legdistort.coaddition import preparation
 from legdistort.demo import run_demo
 from legdistort.exceptions import InputError
-from legdistort.measurement.noise_curves import SOURCES
-from legdistort.measurement.profiles.frame_fit import BLENDS, PROFILES
 from legdistort.simulation.observations import simulate_exposures
 from legdistort.simulation.pupil import PupilPSF
 from legdistort.wcs.attachment import attach
@@ -361,9 +359,22 @@ def test_options_have_the_names_of_arguments(function, groups):
     assert {name for group in groups for name in group if name not in known} <= own
 
 
-def test_words_of_measuring():
-    choices = {name: option.settings.get("choices") for name, option in options.MEASURING.items()}
-    assert (choices["profile"], choices["blends"], choices["errors"]) == (PROFILES, BLENDS, SOURCES)
+def test_every_command_has_its_function():
+    functions = [name.removeprefix("do_") for name in vars(commands) if name.startswith("do_")]
+    assert sorted(functions) == sorted(COMMANDS)
+
+
+@pytest.mark.parametrize("words", ["--help", "--version", "run --help", "run --degre 3"])
+def test_help_loads_nothing(words):
+    """So that it is there at once: numpy and astropy alone take half a second."""
+    code = (
+        "import sys\nfrom legdistort.cli import main\n"
+        f"try:\n    main({words.split()})\nexcept SystemExit:\n    pass\n"
+        "assert not {'numpy', 'astropy', 'tqdm'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "legdistort" in done.stdout + done.stderr
+    assert (done.returncode, done.stderr.splitlines()[1:]) == (0, [])
 
 
 def test_what_stands_for_none():
@@ -492,8 +503,7 @@ FOLDERS = {
 def _ready(monkeypatch, line, *, read, out):
     """The words of a command whose work would be a failure."""
     words = [{"IN": str(read), "OUT": str(out)}.get(word, word) for word in line.split()]
-    command = replace(COMMANDS[words[0]], function=lambda a: pytest.fail("the work began"))
-    monkeypatch.setitem(COMMANDS, words[0], command)
+    monkeypatch.setattr(commands, f"do_{words[0]}", lambda a: pytest.fail("the work began"))
     return [*words, "--quiet"]
 
 

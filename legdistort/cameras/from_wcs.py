@@ -11,9 +11,10 @@ from ..exceptions import InputError
 from ..geometry import basis, similarity, tangent_plane
 from ..inputs.detector_images import KEYWORDS, detector_ids
 from ..inputs.sky_wcs import to_icrs
+from ..runtime.words import DIRECTIONS
 from .detector import Detector
 from .expansion import expand
-from .source import DIRECTIONS, Source
+from .source import Source
 
 #: The degree of the series of a distortion is raised to 9 at most until it leaves less than this out [pix].
 SAME, HIGHEST = 1e-4, 9

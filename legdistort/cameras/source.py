@@ -13,8 +13,8 @@ from scipy.interpolate import NdBSpline, make_interp_spline
 from ..exceptions import InputError
 from ..geometry import basis, tangent_plane
 from ..runtime.provenance import checksums
+from ..runtime.words import DIRECTIONS
 
-DIRECTIONS = ("detector_to_reference", "reference_to_detector")
 #: A map whose cells shrink below this part of the median cell counts as folded.
 FOLD = 0.1
 

@@ -1,10 +1,8 @@
 """What an option of the command line is: value from text, way to a function, paths checked before any work."""
 
 import argparse
+import sys
 from pathlib import Path
-
-from ..inputs.exposure_files import expand_paths
-from ..runtime.outputs import check_file, check_folder, check_not_read
 
 # -- values from their text
 
@@ -103,6 +101,9 @@ def given(arguments, *groups):
 
 def check_paths(arguments, groups):
     """Raise `InputError` if an output of a command cannot be written, or would replace what is read."""
+    from ..inputs.exposure_files import expand_paths
+    from ..runtime.outputs import check_file, check_folder, check_not_read
+
     named = {"read": [], "file": [], "folder": [], "results": []}
     for _, _, dest, option in _flagged(groups):
         value = getattr(arguments, dest)
@@ -120,3 +121,8 @@ def check_paths(arguments, groups):
         check_file(path, overwrite=arguments.overwrite)
     for folder in named["folder"] + named["results"]:
         check_folder(folder)
+
+
+def wants_progress(arguments):
+    """Whether progress bars are shown: on a terminal, unless told to be quiet."""
+    return not arguments.quiet and sys.stderr.isatty()

@@ -1,12 +1,11 @@
-"""The commands: what each does, an example, its options, and the function that does it with the parsed command line.
+"""What the commands do: a function for each, of the parsed command line, which returns the exit status if it is not 0.
 
 The verbs are taken from the package itself, which loads each when it is called.
 """
 
 import json
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import legdistort
@@ -23,44 +22,9 @@ from ..results.check import Check, worst
 from ..runtime import outputs, parallel, provenance
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from . import options
-from .arguments import given
+from .arguments import given, wants_progress
 
 
-@dataclass(frozen=True)
-class Command:
-    """A command: what it does, an example of its arguments, its groups of options, its function."""
-
-    what: str
-    example: str
-    groups: tuple
-    function: Callable
-
-
-#: The commands by name, in the order of the help.
-COMMANDS = {}
-
-
-def command(what, example, *groups):
-    """Make a function ``do_NAME`` the command NAME."""
-
-    def register(function):
-        COMMANDS[function.__name__.removeprefix("do_")] = Command(what, example, (options.COMMON, *groups), function)
-        return function
-
-    return register
-
-
-def wants_progress(a):
-    """Whether progress bars are shown: on a terminal, unless told to be quiet."""
-    return not a.quiet and sys.stderr.isatty()
-
-
-@command(
-    "simulate a night, solve it, compare with the truth",
-    "--out demo",
-    options.out("folder for frames and results", path="folder"),
-    options.NIGHT,
-)
 def do_demo(a):
     """``legdistort demo``."""
     from ..demo import run_demo
@@ -80,22 +44,6 @@ def do_demo(a):
         )
 
 
-@command(
-    "frames to WCS, mosaic and report",
-    "frames/*.fits --out results --degree 3",
-    options.FRAMES,
-    options.FLAGGED,
-    options.STOPPING,
-    options.STRICT,
-    options.out("folder for the results", path="results"),
-    options.CAMERA,
-    options.MEASURING,
-    options.MATCHING,
-    options.SOLVING,
-    options.COADDING,
-    options.WORKERS,
-    options.COMPARING,
-)
 def do_run(a):
     """``legdistort run``."""
     measuring, matching, solving = (
@@ -127,17 +75,6 @@ def do_run(a):
     return _status(a, result.summary)
 
 
-@command(
-    "frames to a table of positions",
-    "frames/*.fits --out stars.ecsv",
-    options.FRAMES,
-    options.FLAGGED,
-    options.STOPPING,
-    options.out("table (ECSV) of detections"),
-    options.MEASURING,
-    options.PSF_FILES,
-    options.WORKERS,
-)
 def do_measure(a):
     """``legdistort measure``."""
     from ..measurement.options import MeasureOptions
@@ -157,17 +94,6 @@ def do_measure(a):
     )
 
 
-@command(
-    "error of a position against flux, by injected stars",
-    "frames/a.fits --out noise.ecsv",
-    options.FRAMES,
-    options.FLAGGED,
-    options.out("table (ECSV) of errors against flux"),
-    options.INJECTING,
-    options.picture("picture of the curves"),
-    options.DETECTOR,
-    options.WORKERS,
-)
 def do_noise(a):
     """``legdistort noise``."""
     from ..measurement.noise_calibration import check_injection
@@ -182,15 +108,6 @@ def do_noise(a):
     _say(a, curves, {"laws": _records(curves.laws), "out": str(a.out)})
 
 
-@command(
-    "tables of positions to matched stars",
-    "A.lis B.lis C.lis --columns x_err=xe,y_err=ye --shape 1024 1024 --out matched.ecsv",
-    options.TABLES,
-    options.out("table (ECSV) of matched positions"),
-    options.TABLE,
-    options.CAMERA,
-    options.MATCHING,
-)
 def do_match(a):
     """``legdistort match``."""
     tables = [_read_table(path, a) for path in a.tables]
@@ -213,16 +130,6 @@ def do_match(a):
     _say(a, repr(matches)[1:-1], figures | {"left_out": matches.left_out})
 
 
-@command(
-    "matched positions to distortions",
-    "matched.ecsv --degree 2 --out results",
-    options.MATCHED,
-    options.STRICT,
-    options.out("folder for the results", path="results"),
-    options.TABLE,
-    options.CAMERA,
-    options.SOLVING,
-)
 def do_solve(a):
     """``legdistort solve``."""
     from ..pipeline import RESULTS, check_results, listed_files, summarise, write_results, write_summary
@@ -246,12 +153,6 @@ def do_solve(a):
     return _status(a, summary)
 
 
-@command(
-    "a known static distortion as a file for --prior",
-    "x.fits y.fits --out prior.asdf",
-    options.out("prior (ASDF)"),
-    options.EXPANDING,
-)
 def do_prior(a):
     """``legdistort prior``."""
     prior = legdistort.Prior.from_file(**given(a, options.EXPANDING))
@@ -268,17 +169,6 @@ def do_prior(a):
     _say(a, f"{words}; the distortion is {rms_x:.3g} px rms in x, {rms_y:.3g} in y; {a.out}", figures)
 
 
-@command(
-    "frames and a solution to a mosaic",
-    "frames/*.fits --solution results/solution.asdf --out mosaic.fits",
-    options.FRAMES,
-    options.FLAGGED,
-    options.SOLUTION | options.NAMED_SOLUTION,
-    options.out("mosaic (.fits, .fits.gz or .asdf)"),
-    options.GRID,
-    options.COADDING,
-    options.WORKERS,
-)
 def do_coadd(a):
     """``legdistort coadd``."""
     check_ending(a.out)
@@ -291,13 +181,6 @@ def do_coadd(a):
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
 
 
-@command(
-    "the WCS of a solution into its frames",
-    "results/solution.asdf frames/*.fits --out calibrated",
-    options.SOLUTION,
-    options.FRAMES,
-    options.ATTACHING,
-)
 def do_attach(a):
     """``legdistort attach``."""
     from ..wcs.attachment import attach
@@ -310,14 +193,6 @@ def do_attach(a):
     _say(a, "\n".join(repr(item)[1:-1].partition(": ")[2] for item in done), errors)
 
 
-@command(
-    "expected errors of a planned set of exposures",
-    "--n-exposures 11 --n-stars 80 --sigma 0.02 --degree 3",
-    options.PREDICTING,
-    options.picture("map of the error over the field"),
-    options.REPLACING,
-    options.TABLE,
-)
 def do_predict(a):
     """``legdistort predict``."""
     from ..simulation.prediction_text import describe_plans
@@ -336,13 +211,6 @@ def do_predict(a):
     _say(a, f"{prediction}\n\n{describe_plans(plans)}", own | {"failed": plans.meta["failed"]})
 
 
-@command(
-    "frames of a simulated night with their truth",
-    "--out night --small",
-    options.out("folder for the frames", path="folder"),
-    options.NIGHT,
-    options.OPTICS,
-)
 def do_simulate(a):
     """``legdistort simulate``."""
     from ..simulation.pupil import PupilPSF
@@ -356,7 +224,6 @@ def do_simulate(a):
     _say(a, f"{len(paths)} frames and truth.ecsv in {a.out}", {"frames": [path.name for path in paths]})
 
 
-@command("print a solution", "results/solution.asdf", options.SOLUTION, options.STRICT)
 def do_show(a):
     """``legdistort show``."""
     from ..pipeline import summarise
@@ -367,12 +234,6 @@ def do_show(a):
     return _status(a, summary)
 
 
-@command(
-    "the stars of a solution as a table",
-    "results/solution.asdf --out stars.fits",
-    options.SOLUTION,
-    options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
-)
 def do_stars(a):
     """``legdistort stars``."""
     solution = _solution(a)
@@ -380,14 +241,6 @@ def do_stars(a):
     _say(a, f"{len(solution.star_names)} stars in {a.out}", {"n_stars": len(solution.star_names), "out": str(a.out)})
 
 
-@command(
-    "positions measured elsewhere in its exposures to the reference plane and the sky, with errors",
-    "results/solution.asdf faint.ecsv --out corrected.ecsv",
-    options.SOLUTION,
-    options.POSITIONS,
-    options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
-    options.COLUMNS,
-)
 def do_correct(a):
     """``legdistort correct``."""
     from ..inputs.table_files import write_by_ending
@@ -397,9 +250,6 @@ def do_correct(a):
     _say(a, f"{len(table)} positions in {a.out}", {"n_positions": len(table), "out": str(a.out)})
 
 
-@command(
-    "HTML page of a solution", "results/solution.asdf --out report.html", options.SOLUTION, options.out("page (HTML)")
-)
 def do_report(a):
     """``legdistort report``."""
     from ..pipeline import summarise

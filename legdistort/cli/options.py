@@ -2,14 +2,7 @@
 
 from pathlib import Path
 
-from ..cameras.source import DIRECTIONS
-from ..coaddition.options import ALGORITHMS, CONSERVE, EXTRAPOLATED, ORDERS, SCALES, WEIGHTS
-from ..coaddition.options import METHODS as COMBINATIONS
-from ..coaddition.resampling.drizzling import KERNELS
-from ..solving.gauge.constraints import KINDS
-from ..solving.minimisers import LOSSES
-from ..solving.options import CAMERA as LAYOUTS
-from ..solving.options import ERRORS, METHODS
+from ..runtime import words
 from .arguments import Option, columns, extension, number_or_name, spectrum, word_or
 
 # -- options that several commands have
@@ -93,17 +86,16 @@ DETECTOR = {
     "read_noise": Option("electrons (default: header)", type=float),
     "saturation": Option("ADU (default: header, or a piled-up maximum)", type=float),
 }
-#: Words are repeated here: the modules that know them load photutils and scipy.optimize, which take 0.3 s.
 MEASURING = {
     "fwhm": Option("of the stars, pixels (default: found)", type=float),
     **DETECTOR,
-    "profile": Option("shape: of a star, or the whole frame", choices=("own", "shared", "linear")),
+    "profile": Option("shape: of a star, or the whole frame", choices=words.PROFILES),
     "psf": Option("auto (default), moffat, effective, or a file or folder with PSFs", path="read"),
-    "blends": Option("how stars that touch are fitted (default together)", choices=("together", "alone")),
+    "blends": Option("how stars that touch are fitted (default together)", choices=words.BLENDS),
     "errors": Option(
         "of the fit, or by stars of known position put into the frame (default fit)",
         "--position-errors",
-        choices=("fit", "injected", "scaled"),
+        choices=words.POSITION_ERRORS,
     ),
 }
 PSF_FILES = {"write_psf": Option("folder for the effective PSF of every exposure", type=Path, path="folder")}
@@ -132,17 +124,17 @@ SOLVING = {
     ),
     "validate": Option("of the stars, kept out to test the errors", type=float, metavar="FRACTION"),
     "static": Option(
-        "fit one static distortion for all exposures of a detector; of a camera also hold, prior", choices=LAYOUTS
+        "fit one static distortion for all exposures of a detector; of a camera also hold, prior", choices=words.CAMERA
     ),
-    "layout": Option("the same for where the detectors of a camera lie", choices=LAYOUTS),
+    "layout": Option("the same for where the detectors of a camera lie", choices=words.CAMERA),
     "exposure_degree": Option("with --static fit: what every exposure adds (default 1)", type=int),
-    "gauge": Option("see the docs (default minimal)", choices=KINDS),
-    "method": Option("(default joint)", choices=METHODS),
-    "loss": Option("(default linear)", choices=LOSSES),
+    "gauge": Option("see the docs (default minimal)", choices=words.GAUGES),
+    "method": Option("(default joint)", choices=words.METHODS),
+    "loss": Option("(default linear)", choices=words.LOSSES),
     "clip": Option("leave out what deviates by more sigma; 0: nothing (default 5)", type=float, none=0),
-    "errors": Option("(default stated)", choices=ERRORS),
+    "errors": Option("(default stated)", choices=words.ERRORS),
     "error_floor": Option("pixels, added in quadrature to every error", type=float),
-    "motion": Option("of the stars, fitted beside their positions", choices=("proper", "parallax", "auto")),
+    "motion": Option("of the stars, fitted beside their positions", choices=words.MOTIONS),
     "motion_sigma": Option(
         "scatter of proper motions, pixels a year; evidence: found", type=word_or(float, "evidence"), metavar="PX/YR"
     ),
@@ -152,18 +144,18 @@ SOLVING = {
     "pixel_scale": Option("helps to find the stars without a header WCS", type=float, metavar="ARCSEC"),
 }
 COADDING = {
-    "method": Option("(default clipped)", "--combine", choices=COMBINATIONS, default="clipped"),
-    "order": Option("of the spline (default 3)", type=number_or_name, choices=(*range(6), *ORDERS)),
-    "algorithm": Option("of resampling (default interp)", choices=ALGORITHMS),
+    "method": Option("(default clipped)", "--combine", choices=words.COMBINATIONS, default="clipped"),
+    "order": Option("of the spline (default 3)", type=number_or_name, choices=(*range(6), *words.ORDERS)),
+    "algorithm": Option("of resampling (default interp)", choices=words.ALGORITHMS),
     "pixfrac": Option("with drizzle: side of the drops (default 1)", type=float),
-    "kernel": Option("with drizzle: shape of the drops (default square)", choices=KERNELS),
-    "conserve": Option("when pixels change size (default flux)", choices=CONSERVE),
+    "kernel": Option("with drizzle: shape of the drops (default square)", choices=words.KERNELS),
+    "conserve": Option("when pixels change size (default flux)", choices=words.CONSERVE),
     "match_background": Option(
         "leave the levels of the sky as they are", "--no-match-background", action="store_false"
     ),
-    "weights": Option("of exposures (default noise)", choices=(*WEIGHTS, "equal"), none="equal"),
-    "scale": Option("of fluxes (default auto)", choices=(*SCALES, "none"), none="none"),
-    "extrapolated": Option("pixels outside the stars used (default flag)", choices=EXTRAPOLATED),
+    "weights": Option("of exposures (default noise)", choices=(*words.WEIGHTS, "equal"), none="equal"),
+    "scale": Option("of fluxes (default auto)", choices=(*words.SCALES, "none"), none="none"),
+    "extrapolated": Option("pixels outside the stars used (default flag)", choices=words.EXTRAPOLATED),
     "scratch": Option("for pixels while work goes on (default: system's)", type=Path, metavar="FOLDER"),
 }
 GRID = {"grid": Option("image or header text whose grid is taken", type=Path, metavar="FILE", path="read")}
@@ -174,7 +166,7 @@ EXPANDING = {
     ),
     "shape": Option("of the detector, where it is not told", type=int, nargs=2, metavar=("NY", "NX")),
     "degree": Option("total degree of the Legendre series (default 5)", type=int),
-    "direction": Option("what the source does, where it is not told", choices=DIRECTIONS),
+    "direction": Option("what the source does, where it is not told", choices=words.DIRECTIONS),
     "origin": Option("coordinate of the first pixel (default 0)", type=int, choices=(0, 1)),
     "ext": Option("extension of FITS files, header of a text, or place in an ASDF tree", type=extension),
     "frame": Option("where to end: frame of a gwcs, or idl or tel of an aperture"),
@@ -208,6 +200,6 @@ PREDICTING = {
     "dynamic": Option("rms of a coefficient from exposure to exposure, pixels", type=float),
     "spectrum": Option("the same by degree, beyond the fit too", type=spectrum, metavar="DEGREE=RMS,..."),
     "epochs": Option("years of the exposures: motions are fitted too", type=float, nargs="+", metavar="YEAR"),
-    "gauge": Option("see the docs (default minimal)", choices=KINDS),
+    "gauge": Option("see the docs (default minimal)", choices=words.GAUGES),
     "seed": Option("of stars and shifts that are drawn (default 0)", type=int),
 }

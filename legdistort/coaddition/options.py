@@ -9,17 +9,9 @@ from astropy.wcs import WCS
 
 from ..exceptions import InputError
 from ..runtime.checks import check_choice
+from ..runtime.words import ALGORITHMS, COMBINATIONS, CONSERVE, EXTRAPOLATED, KERNELS, ORDERS, SCALES, WEIGHTS
 from .grids import checked_wcs
-from .resampling.drizzling import KERNELS
 from .resampling.engines import Resampling, uses_compiled_splines
-
-METHODS = ("mean", "median", "clipped")
-ALGORITHMS = ("interp", "adaptive", "exact", "drizzle")
-ORDERS = {"nearest-neighbor": 0, "bilinear": 1, "biquadratic": 2, "bicubic": 3}  # of splines, as reproject names them
-CONSERVE = ("flux", "surface_brightness")
-WEIGHTS = ("noise", "variance", "exptime", "seeing", "sigma_map")
-SCALES = ("auto", "exptime", "stars")
-EXTRAPOLATED = ("flag", "mask", "keep")
 
 
 @dataclass(frozen=True)
@@ -56,7 +48,7 @@ class CoaddOptions:
     scratch: object = None
 
     def __post_init__(self):
-        choices = {"method": METHODS, "algorithm": ALGORITHMS, "conserve": CONSERVE, "extrapolated": EXTRAPOLATED}
+        choices = {"method": COMBINATIONS, "algorithm": ALGORITHMS, "conserve": CONSERVE, "extrapolated": EXTRAPOLATED}
         for name, allowed in choices.items():
             check_choice(getattr(self, name), allowed, name)
         order = ORDERS.get(self.order, self.order) if isinstance(self.order, str) else self.order

@@ -16,9 +16,9 @@ from scipy.optimize import nnls
 from ..exceptions import InputError
 from ..inputs.table_files import write_table
 from ..runtime.checks import check_choice, first_line
+from ..runtime.words import POSITION_ERRORS
 
 #: Where the errors of `legdistort.measure` come from: the fit, the curve, or the fit scaled to the curve.
-SOURCES = ("fit", "injected", "scaled")
 #: A level of flux counts if this part of its stars was found, and so many.
 ENOUGH, FEWEST = 0.5, 10
 
@@ -163,7 +163,7 @@ class NoiseCurves:
         `~astropy.table.QTable`
             A copy. Rows without a positive flux keep their errors.
         """
-        check_choice(source, SOURCES, "errors")
+        check_choice(source, POSITION_ERRORS, "errors")
         table = table.copy()
         if source == "fit":
             return table

@@ -7,9 +7,8 @@ import numpy as np
 
 from ..exceptions import InputError, some_of
 from ..runtime.checks import check_choice
+from ..runtime.words import BLENDS, POSITION_ERRORS, PROFILES
 from .effective.sources import psf_from
-from .noise_curves import SOURCES
-from .profiles.frame_fit import BLENDS, PROFILES
 
 _DETECTOR = ("gain", "read_noise", "saturation")
 
@@ -45,7 +44,7 @@ class MeasureOptions:
             raise InputError(f"max_stars must be at least 1, and an integer, got {self.max_stars!r}")
         if self.box is not None and not (isinstance(self.box, Integral) and self.box >= 5 and self.box % 2 == 1):
             raise InputError(f"box must be an odd number of pixels, at least 5, got {self.box!r}")
-        check_choice(self.errors, SOURCES, "errors")
+        check_choice(self.errors, POSITION_ERRORS, "errors")
         check_choice(self.profile, PROFILES, "profile")
         check_choice(self.blends, BLENDS, "blends")
         object.__setattr__(self, "psf", psf_from(self.psf))

@@ -14,13 +14,14 @@ from astropy.io import fits
 from astropy.modeling import Model
 from astropy.wcs import WCS
 
-from ..cameras.source import DIRECTIONS, of_maps, of_powers
+from ..cameras.source import of_maps, of_powers
 from ..exceptions import AssumptionWarning, InputError, warn, without_astropy_warnings
 from ..geometry import basis
 from ..geometry.gsaoi import GSAOI_SIZE, gsaoi_static
 from ..inputs.exposure_files import read_exposures
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.fits_bytes import open_fits
+from ..runtime.words import DIRECTIONS
 from .from_objects import as_source, of_model
 
 #: Highest order of SIP polynomials in a header (the convention allows 9).

@@ -9,9 +9,10 @@ from astropy import wcs as fits_wcs
 from astropy.modeling import Model, models
 from gwcs import coordinate_frames as cf
 
-from ..cameras.source import DIRECTIONS, Source, check_shape
+from ..cameras.source import Source, check_shape
 from ..exceptions import InputError
 from ..geometry.tangent_plane import gnomonic
+from ..runtime.words import DIRECTIONS
 
 #: Frames of a gwcs where the distortion ends and pointing has not begun, in order of preference.
 PLANES = ("undistorted", "v2v3")

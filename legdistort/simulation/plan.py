@@ -14,7 +14,7 @@ from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from ..priors.prior import Prior
 from ..runtime.checks import check_choice, check_counts
-from ..solving.gauge.constraints import KINDS
+from ..runtime.words import GAUGES
 from . import observations, truth
 
 
@@ -52,7 +52,7 @@ class Plan:
         self._check_epochs()
         check_counts(n_grid=self.n_grid, n_exposures=self.n_exposures)
         object.__setattr__(self, "degree", basis.check_degree(self.degree))
-        check_choice(self.gauge, KINDS, "gauge")
+        check_choice(self.gauge, GAUGES, "gauge")
         if not isinstance(self.prior, Prior | None):
             raise InputError(f"prior must be a Prior, got {type(self.prior).__name__}")
         if np.shape(self.shape) != (2,):

@@ -20,7 +20,7 @@ from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, warn
 from ..geometry import basis, similarity
 from ..results.absolute_errors import without_plain_map
 from ..runtime.checks import check_choice
-from .options import CAMERA
+from ..runtime.words import CAMERA
 
 #: Part of what the data would tell of a direction alone below which it is not determined beside all else: what
 #: detectors and exposures can exchange is so to first order, and by the gradient of one times the other beyond.

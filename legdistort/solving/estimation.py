@@ -13,6 +13,7 @@ from ..priors.prior import Prior, tells
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
 from ..runtime.checks import check_choice
+from ..runtime.words import CAMERA
 from . import model_forms, reference_tie, single_fit
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought
@@ -21,7 +22,7 @@ from .choices.held_out import hold_out, only_rows, validation
 from .equations import effective_modes
 from .equations.covariances import Uncertainty
 from .motion_choice import resolve as resolve_motion
-from .options import CAMERA, CLIP, SolveOptions, check_reference
+from .options import CLIP, SolveOptions, check_reference
 from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
 

@@ -15,6 +15,7 @@ from ..exceptions import ConvergenceWarning, SolveError, warn
 from ..geometry import basis
 from ..results.gauge import Gauge
 from ..runtime.checks import check_choice
+from ..runtime.words import LOSSES
 from .equations import criterion, elimination, reduced_system
 from .equations.problem import State
 from .gauge import constraints
@@ -22,7 +23,6 @@ from .gauge.hierarchy import determined_by_residuals, is_explained
 
 log = logging.getLogger(__name__)
 
-LOSSES = ("linear", "huber", "cauchy")
 #: Iterations of the joint solver and sweeps of the alternating one at most, unless another number is given.
 MAX_ITERATIONS, MAX_SWEEPS = 50, 1000
 #: The constraints follow the state for so many iterations; then they are held. Those of a state that is not yet the

@@ -11,16 +11,9 @@ from ..geometry.epochs import year
 from ..inputs.reference_catalogue import read_reference
 from ..results.settings import Settings
 from ..runtime.checks import LARGEST, check_choice
-from . import star_motions
+from ..runtime.words import CAMERA, ERRORS, GAUGES, LOSSES, METHODS, MOTIONS
 from .choices.degree_choice import AUTO
 from .equations.problem import check_error_floor, check_prior
-from .gauge.constraints import KINDS
-from .minimisers import LOSSES
-
-METHODS = ("joint", "alternating")
-#: What is done about layouts and static distortions of a camera; without one a static distortion can only be fitted.
-CAMERA = ("hold", "prior", "fit")
-ERRORS = ("stated", "scale", "floor", "by-brightness", "correlated")
 
 
 class Unasked(float):
@@ -46,7 +39,7 @@ class SolveOptions(Settings):
     def __post_init__(self):
         object.__setattr__(self, "motion_epoch", year(self.motion_epoch))
         self._check_distortion()
-        check_choice(self.gauge, KINDS, "gauge")
+        check_choice(self.gauge, GAUGES, "gauge")
         check_error_floor(self.error_floor)
         check_choice(self.method, METHODS, "method")
         if self.method == "alternating" and isinstance(self.clip, Unasked):
@@ -71,7 +64,7 @@ class SolveOptions(Settings):
 
     def _check_motion(self):
         """What is sought of the motions of stars, and what is known of them beforehand."""
-        check_choice(self.motion, (None, *star_motions.KINDS), "motion")
+        check_choice(self.motion, (None, *MOTIONS), "motion")
         sigma = self.motion_sigma
         real = isinstance(sigma, Real) and not isinstance(sigma, bool)
         named = isinstance(sigma, str) and sigma == "evidence"

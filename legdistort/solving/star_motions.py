@@ -9,7 +9,6 @@ from ..geometry import parallax
 from ..geometry.epochs import ONE_EPOCH
 from .equations.star_terms import StarTerms
 
-KINDS = ("proper", "parallax", "auto")
 #: A parallax that the other unknowns take up to all but this part is not determined.
 _DEGENERATE = 1e-6
 #: ... and is told to be badly determined beyond this condition number: its error is so much larger than it need be.

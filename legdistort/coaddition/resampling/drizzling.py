@@ -2,7 +2,6 @@
 
 import numpy as np
 
-KERNELS = ("square", "turbo", "point")  # those that conserve flux
 _EMPTY = 1e-3  # share of a drop with which an output pixel counts as empty: its value would be noise
 
 

@@ -15,7 +15,6 @@ from .pixel_noise import pixel_noise
 from .shape_field import shape_field
 
 #: Shapes of stars, and ways to fit those that touch: see `fit_stars`.
-PROFILES, BLENDS = ("own", "shared", "linear"), ("together", "alone")
 
 _DEVIATES = 0.2  # fraction of a star by which pixels may deviate from a Moffat profile
 #: Limits of the passes after the first: the second prepares the last.

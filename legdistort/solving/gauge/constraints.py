@@ -9,12 +9,12 @@ from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis, similarity_basis, similarity_part
 from ...results.gauge import Drift, Gauge
 from ...runtime.checks import check_choice
+from ...runtime.words import GAUGES
 from ..equations.criterion import complement
 from ..equations.problem import State
 from .dynamic_scatter import conditional_errors, dynamic_covariance, influence
 from .hierarchy import Hierarchy
 
-KINDS = ("minimal", "mean")
 #: Below this the constraints of the "mean" gauge leave a direction free.
 _MEAN_LIMIT = 1e-3
 _SETTLED = 0.01  # of a map that an exposure cannot take back: less, and the data hardly depend on it
@@ -46,7 +46,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     SolveError
         If the "mean" gauge leaves a direction free, as for rolls that cancel.
     """
-    check_choice(kind, KINDS, "gauge")
+    check_choice(kind, GAUGES, "gauge")
     used = blocks.v[0] > 0
     shared, shared_shears = problem.unknowns.shared, problem.own_degree == 0
     group = np.broadcast_to(problem.group, problem.n_exposures)

@@ -1,0 +1,82 @@
+"""A command while it runs: its log, its signals, what becomes of its errors."""
+
+import logging
+import signal
+import sys
+import threading
+import warnings
+from contextlib import contextmanager, nullcontext
+
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from ..exceptions import LegdistortError, LegdistortWarning
+from . import commands
+from .arguments import check_paths, wants_progress
+
+log = logging.getLogger("legdistort")
+
+
+def run_command(arguments):
+    """Run a command of a parsed command line; returns the exit status."""
+    try:
+        with _stopping(), _logging(arguments), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of other packages
+            warnings.simplefilter("default", LegdistortWarning)
+            warnings.showwarning = lambda message, *_, **__: log.warning("%s", message)
+            with logging_redirect_tqdm([log]) if wants_progress(arguments) else nullcontext():  # bars stay whole
+                check_paths(arguments, arguments.groups)
+                status = getattr(commands, f"do_{arguments.command}")(arguments)
+    except LegdistortError as error:
+        if arguments.debug:
+            raise
+        print(f"legdistort: {error}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:  # the reader of our output has left, as in ``legdistort show FILE | head``
+        sys.stdout = None
+        return 0
+    except OSError as error:
+        if arguments.debug:
+            raise
+        print(f"legdistort: {error} (nothing was left half-written)", file=sys.stderr)
+        return 1
+    except MemoryError as error:
+        if arguments.debug:
+            raise
+        print(f"legdistort: not enough memory ({error}); nothing was left half-written", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("legdistort: interrupted; nothing was left half-written", file=sys.stderr)
+        return 130
+    return status or 0
+
+
+@contextmanager
+def _stopping():
+    """While a command runs, SIGTERM and SIGHUP (batch systems, lost terminals) are as Ctrl-C: temporary files go."""
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [n for n in numbers if signal.getsignal(n) is signal.SIG_DFL]  # as nohup ignores it, so do we
+    if threading.current_thread() is not threading.main_thread():  # where signals do not arrive
+        numbers = []
+    for n in numbers:
+        signal.signal(n, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for n in numbers:
+            signal.signal(n, signal.SIG_DFL)
+
+
+@contextmanager
+def _logging(arguments):
+    """The log of the package on stderr while a command runs; afterwards as it was, for callers of `main`."""
+    before = log.handlers[:], log.propagate, log.level
+    level = logging.WARNING if arguments.quiet else logging.INFO
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    log.handlers[:], log.propagate = [handler], False
+    log.setLevel(logging.DEBUG if arguments.debug else level)
+    try:
+        yield
+    finally:
+        log.handlers[:], log.propagate = before[:2]
+        log.setLevel(before[2])

@@ -1,0 +1,149 @@
+"""The commands as the command line tells them: what each does, an example, its options.
+
+`commands` has the functions that do it; it is not loaded before one is called for.
+"""
+
+from dataclasses import dataclass
+
+from . import options
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: what it does, an example of its arguments, its groups of options."""
+
+    what: str
+    example: str
+    groups: tuple
+
+
+def _command(what, example, *groups):
+    return Command(what, example, (options.COMMON, *groups))
+
+
+#: The commands by name, in the order of the help.
+COMMANDS = {
+    "demo": _command(
+        "simulate a night, solve it, compare with the truth",
+        "--out demo",
+        options.out("folder for frames and results", path="folder"),
+        options.NIGHT,
+    ),
+    "run": _command(
+        "frames to WCS, mosaic and report",
+        "frames/*.fits --out results --degree 3",
+        options.FRAMES,
+        options.FLAGGED,
+        options.STOPPING,
+        options.STRICT,
+        options.out("folder for the results", path="results"),
+        options.CAMERA,
+        options.MEASURING,
+        options.MATCHING,
+        options.SOLVING,
+        options.COADDING,
+        options.WORKERS,
+        options.COMPARING,
+    ),
+    "measure": _command(
+        "frames to a table of positions",
+        "frames/*.fits --out stars.ecsv",
+        options.FRAMES,
+        options.FLAGGED,
+        options.STOPPING,
+        options.out("table (ECSV) of detections"),
+        options.MEASURING,
+        options.PSF_FILES,
+        options.WORKERS,
+    ),
+    "noise": _command(
+        "error of a position against flux, by injected stars",
+        "frames/a.fits --out noise.ecsv",
+        options.FRAMES,
+        options.FLAGGED,
+        options.out("table (ECSV) of errors against flux"),
+        options.INJECTING,
+        options.picture("picture of the curves"),
+        options.DETECTOR,
+        options.WORKERS,
+    ),
+    "match": _command(
+        "tables of positions to matched stars",
+        "A.lis B.lis C.lis --columns x_err=xe,y_err=ye --shape 1024 1024 --out matched.ecsv",
+        options.TABLES,
+        options.out("table (ECSV) of matched positions"),
+        options.TABLE,
+        options.CAMERA,
+        options.MATCHING,
+    ),
+    "solve": _command(
+        "matched positions to distortions",
+        "matched.ecsv --degree 2 --out results",
+        options.MATCHED,
+        options.STRICT,
+        options.out("folder for the results", path="results"),
+        options.TABLE,
+        options.CAMERA,
+        options.SOLVING,
+    ),
+    "prior": _command(
+        "a known static distortion as a file for --prior",
+        "x.fits y.fits --out prior.asdf",
+        options.out("prior (ASDF)"),
+        options.EXPANDING,
+    ),
+    "coadd": _command(
+        "frames and a solution to a mosaic",
+        "frames/*.fits --solution results/solution.asdf --out mosaic.fits",
+        options.FRAMES,
+        options.FLAGGED,
+        options.SOLUTION | options.NAMED_SOLUTION,
+        options.out("mosaic (.fits, .fits.gz or .asdf)"),
+        options.GRID,
+        options.COADDING,
+        options.WORKERS,
+    ),
+    "attach": _command(
+        "the WCS of a solution into its frames",
+        "results/solution.asdf frames/*.fits --out calibrated",
+        options.SOLUTION,
+        options.FRAMES,
+        options.ATTACHING,
+    ),
+    "predict": _command(
+        "expected errors of a planned set of exposures",
+        "--n-exposures 11 --n-stars 80 --sigma 0.02 --degree 3",
+        options.PREDICTING,
+        options.picture("map of the error over the field"),
+        options.REPLACING,
+        options.TABLE,
+    ),
+    "simulate": _command(
+        "frames of a simulated night with their truth",
+        "--out night --small",
+        options.out("folder for the frames", path="folder"),
+        options.NIGHT,
+        options.OPTICS,
+    ),
+    "show": _command("print a solution", "results/solution.asdf", options.SOLUTION, options.STRICT),
+    "stars": _command(
+        "the stars of a solution as a table",
+        "results/solution.asdf --out stars.fits",
+        options.SOLUTION,
+        options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
+    ),
+    "correct": _command(
+        "positions measured elsewhere in its exposures to the reference plane and the sky, with errors",
+        "results/solution.asdf faint.ecsv --out corrected.ecsv",
+        options.SOLUTION,
+        options.POSITIONS,
+        options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
+        options.COLUMNS,
+    ),
+    "report": _command(
+        "HTML page of a solution",
+        "results/solution.asdf --out report.html",
+        options.SOLUTION,
+        options.out("page (HTML)"),
+    ),
+}

@@ -1,0 +1,31 @@
+"""The words that arguments can take.
+
+They stand apart from the functions that act on them, so that the command line can list them without loading those.
+"""
+
+# -- priors
+DIRECTIONS = ("detector_to_reference", "reference_to_detector")
+
+# -- measuring
+PROFILES = ("own", "shared", "linear")
+BLENDS = ("together", "alone")
+POSITION_ERRORS = ("fit", "injected", "scaled")
+
+# -- solving
+METHODS = ("joint", "alternating")
+GAUGES = ("minimal", "mean")
+LOSSES = ("linear", "huber", "cauchy")
+ERRORS = ("stated", "scale", "floor", "by-brightness", "correlated")
+MOTIONS = ("proper", "parallax", "auto")
+#: What is done about layouts and static distortions of a camera; without one a static distortion can only be fitted.
+CAMERA = ("hold", "prior", "fit")
+
+# -- co-adding
+COMBINATIONS = ("mean", "median", "clipped")
+ALGORITHMS = ("interp", "adaptive", "exact", "drizzle")
+ORDERS = {"nearest-neighbor": 0, "bilinear": 1, "biquadratic": 2, "bicubic": 3}  # of splines, as reproject names them
+KERNELS = ("square", "turbo", "point")  # of drizzle, those that conserve flux
+CONSERVE = ("flux", "surface_brightness")
+WEIGHTS = ("noise", "variance", "exptime", "seeing", "sigma_map")
+SCALES = ("auto", "exptime", "stars")
+EXTRAPOLATED = ("flag", "mask", "keep")
