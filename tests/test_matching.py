@@ -395,7 +395,7 @@ def test_candidates_hold_the_truth():
 def test_contradictory_pairs_are_taken_apart():
     def paired(source, target, distance):
         warp = Warp.from_pose(similarity.identity(), SHAPE)
-        return Registration(np.array(source), np.array(target), np.array(distance), warp, 1.0, 99.0)
+        return Registration(np.array(source), np.array(target), np.array(distance), warp, 1.0, 99.0, 1.0)
 
     # detections 0 of three exposures are one star, detections 1 another; one bad pair joins the two
     good = {
@@ -417,7 +417,7 @@ def test_exposure_tied_by_mistake_is_found_out():
     lists = [StarList(xy, np.full(len(xy), 0.1), SHAPE) for xy in [*positions, rng.uniform(0, 2047, (90, 2))]]
     (group,) = link(lists[:6], lambda i, j: None)
     false = Registration(
-        np.arange(30), np.arange(30), np.zeros(30), Warp.from_pose(similarity.identity(), SHAPE), 1.0, 99.0
+        np.arange(30), np.arange(30), np.zeros(30), Warp.from_pose(similarity.identity(), SHAPE), 1.0, 99.0, 1.0
     )
     tied = Group({**group.poses, 6: similarity.identity()}, {**group.registrations, (0, 6): false})
     registrations, misfits = interlink(lists, tied)

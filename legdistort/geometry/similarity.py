@@ -9,6 +9,8 @@ import numpy as np
 
 from ..exceptions import InputError
 
+_COMPLEX = np.array([1, 1j])  # x + iy of positions
+
 
 def identity():
     """The pose that changes nothing, shape (2, 3)."""
@@ -83,31 +85,36 @@ def fit_similarity(source, target, *, weights=None, parity=None):
         raise InputError(f"a similarity needs at least two points, got {np.count_nonzero(w)}")
     w = w / w.sum()
     mean_s, mean_t = w @ source, w @ target
-    ds, dt = source - mean_s, target - mean_t
-    power = w @ (ds**2).sum(axis=1)
+    ds, dt = (source - mean_s) @ _COMPLEX, (target - mean_t) @ _COMPLEX
+    power = w @ (ds.real**2 + ds.imag**2)
     if power == 0:
         raise InputError("a similarity needs at least two distinct points, all are at the same place")
-    cross = (w[:, None] * dt).T @ ds / power  # M = argmin |dt - M ds|^2 within the similarities
-    keep, flip = (np.hypot(*part) for part in _turns(cross))
+    dt *= w / power
+    keep, flip = np.vdot(ds, dt), ds @ dt  # scale and rotation that leave least of dt, without and with a flip of y
     if parity is None:
-        parity = 1 if keep >= flip else -1
-    return similarity_of(mean_s, mean_t, cross, parity)
+        parity = 1 if abs(keep) >= abs(flip) else -1
+    turn = keep if parity > 0 else flip
+    m = np.array([[turn.real, -turn.imag * parity], [turn.imag, turn.real * parity]])
+    return np.column_stack([m, mean_t - m @ mean_s])
 
 
 def robust_similarity(source, target, *, weights=None, n_iterations=10):
     """Similarity by iteratively reweighted least squares with Cauchy weights at the observed scale.
 
-    Parameters as for `fit_similarity`. The scale is the median residual.
+    Parameters as for `fit_similarity`. The scale is the median residual; when it
+    stands to 1e-4 of its square the weights do.
     """
     base = np.ones(len(source)) if weights is None else weights
-    w = base
+    w, before = base, np.inf
     for _ in range(n_iterations):
         pose = fit_similarity(source, target, weights=w)
         r2 = ((apply(pose, source) - target) ** 2).sum(axis=1)
         scale2 = np.median(r2)
         if scale2 <= 1e-20 * np.ptp(target, axis=0).max() ** 2:
             break
-        w = base / (1 + r2 / (2 * scale2))
+        if abs(scale2 - before) < 1e-4 * scale2:
+            break
+        w, before = base / (1 + r2 / (2 * scale2)), scale2
     return pose
 
 

@@ -7,10 +7,11 @@ Two exposures of few stars, half of them false, may have too little in common to
 several exposures share are more complete and hardly ever false: groups are laid on one another by these (`unite`).
 """
 
+from collections import defaultdict
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
+from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from ..geometry import similarity
@@ -21,7 +22,7 @@ from .star_lists import StarList, Warp, allowed_degree, fit_warp
 #: Exposures of a group with which a stray one is compared at any rotation.
 BLIND_TRIES = 8
 #: Pairs of an exposure registered at most, those of largest overlap first.
-PARTNERS = 10
+PARTNERS = 6
 #: Stars that two exposures ought to share before a failure to register counts against them.
 TELLING = 25
 #: A pair is registered anew when it holds less than this part of the stars that the exposures share by all other pairs.
@@ -111,16 +112,40 @@ def standing(lists, group, *, radius=0.6, moved=1.5):
     list of ndarray of bool
     """
     out = [np.zeros(len(stars), bool) for stars in lists]
-    for i in group.poses:
+    members = sorted(group.poses)
+    if len(members) < 3:
+        return out
+    poses = np.array([group.poses[i] for i in members])
+    whose = np.repeat(np.arange(len(members)), [len(lists[i]) for i in members])
+    tree = cKDTree(np.concatenate([lists[i].xy for i in members]))
+    for i in members:
         xy = lists[i].xy
-        shifted, same = np.zeros(len(xy)), np.zeros(len(xy))
-        for j in group.poses:
-            step = similarity.compose(group.poses[j], similarity.invert(group.poses[i]))
-            away = np.linalg.norm(similarity.apply(step, xy) - xy, axis=1) > moved
-            shifted += away
-            same += away & (lists[j].tree.query(xy, distance_upper_bound=radius)[0] < radius)
-        out[i] = (same >= 3) & (same >= 0.5 * shifted)
+        away = np.linalg.norm(_carried(poses, group.poses[i], xy) - xy, axis=2) > moved
+        near = tree.query_ball_point(xy, radius)
+        star = np.repeat(np.arange(len(xy)), [len(rows) for rows in near])
+        here = np.zeros((len(members), len(xy)), bool)
+        here[whose[np.concatenate(near).astype(int)], star] = True
+        same = np.count_nonzero(here & away, axis=0)
+        out[i] = (same >= 3) & (same >= 0.5 * np.count_nonzero(away, axis=0))
     return out
+
+
+def without(group, dropped):
+    """The group where some detections of its lists are no more (list of ndarray of bool, by exposure)."""
+    serial = [np.cumsum(~mask) - 1 for mask in dropped]
+    registrations = {}
+    for (i, j), r in group.registrations.items():
+        keep = ~dropped[i][r.source] & ~dropped[j][r.target]
+        registrations[i, j] = replace(
+            r, source=serial[i][r.source[keep]], target=serial[j][r.target[keep]], distance=r.distance[keep]
+        )
+    return replace(group, registrations=registrations)
+
+
+def _carried(poses, own, xy):
+    """Positions (n, 2) of an exposure of pose `own` in exposures of several `poses`, (n_poses, n, 2)."""
+    plane = similarity.apply(similarity.invert(own), xy)
+    return plane @ poses[:, :, :2].swapaxes(1, 2) + poses[:, None, :, 2]
 
 
 def interlink(lists, group, *, tolerance=None, progress=False):
@@ -169,20 +194,27 @@ def _register_again(source, target, rows, columns, step, tolerance):
 
 def _overlaps(lists, rough):
     """Number of stars that the poses let two exposures share at most, for every pair of them."""
-    out = {}
-    for i, j in combinations(sorted(rough), 2):
-        there = similarity.apply(similarity.compose(rough[j], similarity.invert(rough[i])), lists[i].xy)
-        part = np.count_nonzero(lists[j].on_detector(there)) / len(lists[i])
-        out[i, j] = part * min(len(lists[i]), len(lists[j]))
+    out, members = {}, sorted(rough)
+    poses = np.array([rough[i] for i in members])
+    sizes = np.array([lists[i].shape[::-1] for i in members])[:, None]
+    stars = np.array([len(lists[i]) for i in members])
+    for k, i in enumerate(members[:-1]):
+        there = _carried(poses[k + 1 :], rough[i], lists[i].xy)
+        part = np.mean(np.all((there > -0.5) & (there < sizes[k + 1 :] - 0.5), axis=2), axis=1)
+        shared = part * np.minimum(stars[k], stars[k + 1 :])
+        out.update(zip(((i, j) for j in members[k + 1 :]), shared.tolist(), strict=True))
     return out
 
 
 def _partners(overlaps):
     """The pairs worth registering: for every exposure those of largest overlap."""
+    of_exposure = defaultdict(list)
+    for pair, stars in overlaps.items():
+        for exposure in pair if stars >= 3 else ():
+            of_exposure[exposure].append(pair)
     chosen = set()
-    for exposure in {i for pair in overlaps for i in pair}:
-        mine = sorted((p for p, stars in overlaps.items() if exposure in p and stars >= 3), key=lambda p: -overlaps[p])
-        chosen.update(mine[:PARTNERS])
+    for pairs in of_exposure.values():
+        chosen.update(sorted(pairs, key=lambda pair: -overlaps[pair])[:PARTNERS])
     return sorted(chosen)
 
 
@@ -192,7 +224,10 @@ def _misfits(known, telling):
     pairs = [frozenset(pair) for pair in telling]
     out = {}
     while True:
-        votes = {i: [pair in made for pair in pairs if i in pair] for pair in pairs for i in pair}
+        votes = defaultdict(list)
+        for pair in pairs:
+            for i in pair:
+                votes[i].append(pair in made)
         shares = {i: np.mean(v) for i, v in votes.items() if len(v) >= 2}
         worst = min(shares, key=shares.get, default=None)
         if worst is None or shares[worst] >= 0.5:
@@ -303,7 +338,7 @@ def _united(main, view, other, other_view, guess, tolerance):
                 warp = Warp.from_pose(similarity.compose(placed[j], similarity.invert(main.poses[i])), view.stars.shape)
                 pairs = (mine[a], theirs[b]) if i < j else (theirs[b], mine[a])
                 registrations[min(i, j), max(i, j)] = Registration(
-                    *pairs, distance[shared], warp, found.tolerance, found.strength
+                    *pairs, distance[shared], warp, found.tolerance, found.strength, found.share
                 )
     return Group(main.poses | placed, registrations)
 

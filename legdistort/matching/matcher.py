@@ -17,7 +17,7 @@ from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
 from ..priors.from_headers import describe, header_distortions
-from .exposure_groups import interlink, link, standing, unite
+from .exposure_groups import interlink, link, standing, unite, without
 from .header_poses import HeaderPoses
 from .options import MatchOptions
 from .star_labels import label_stars
@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 
 #: Fewest detections with which an exposure can take part.
 FEWEST = 5
+#: With a smaller part of hot pixels among the detections of every exposure these are not linked anew without them.
+FEW_HOT = 0.05
 
 
 def match(
@@ -214,7 +216,8 @@ def _associate(lists, names, headers, left_out, options):
     if any(h.any() for h in hot):
         log.info("%d detections stand still while the sky moves: hot pixels, not used", sum(h.sum() for h in hot))
         lists = [stars.subset(~h) for stars, h in zip(lists, hot, strict=True)]
-        groups = grouped(lists)
+        few = max(h.mean() for h in hot) < FEW_HOT  # they have not led the registrations astray
+        groups = [without(group, hot) for group in groups] if few else grouped(lists)
     _check_groups(groups, lists, names, left_out)
     registrations, misfits = interlink(lists, groups[0], tolerance=tolerance, progress=progress)
     left_out.update({names[i]: reason for i, reason in misfits.items()})

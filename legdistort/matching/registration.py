@@ -21,6 +21,8 @@ from .star_lists import Warp, allowed_degree, fit_warp
 MIN_STRENGTH = 18.0
 #: Part of the shorter list, within the overlap, that must be paired: a map that holds in a corner only is no match.
 MIN_SHARE = 0.15
+#: Where so large a part of it is paired nothing is left to be looked for.
+COMPLETE_SHARE = 0.97
 #: Stars in the first round of the growth, and most that take part in a round.
 FIRST, MOST = 100, 2000
 #: Largest degree of the map by the round of the growth (0: similarity); see also `star_lists.NEEDED`.
@@ -44,6 +46,8 @@ class Registration:
         Pixels.
     strength : float
         How far above chance the number of pairs is (see `MIN_STRENGTH`).
+    share : float
+        Part of the shorter list, within the overlap, that is paired.
     """
 
     source: np.ndarray
@@ -52,6 +56,12 @@ class Registration:
     warp: Warp
     tolerance: float
     strength: float
+    share: float
+
+    @property
+    def is_complete(self):
+        """Whether hardly a star that both lists can share is left over."""
+        return self.share >= COMPLETE_SHARE
 
     def __repr__(self):
         return f"<Registration: {len(self.source)} pairs within {self.tolerance:.2f} pix, strength {self.strength:.0f}>"
@@ -101,7 +111,7 @@ def _first(source, target, seeds, tolerance):
 
 def _spread(source, target, found, tolerance):
     """Grow again from the pairs while that brings more: a seed some degrees off holds in part of the field only."""
-    while True:
+    while not found.is_complete:
         p = source.xy[found.source]
         if len(p) > MOST / 2 and np.all(
             p.std(axis=0) > 0.95 * source.xy[target.on_detector(found.warp(source.xy))].std(axis=0)
@@ -115,7 +125,8 @@ def _spread(source, target, found, tolerance):
         enough = len(again.source) < 1.05 * len(found.source)
         found = again
         if enough:
-            return found
+            break
+    return found
 
 
 def continue_from_pose(source, target, pose, order=None, *, tolerance=None):
@@ -134,6 +145,9 @@ def continue_from_pose(source, target, pose, order=None, *, tolerance=None):
     -------
     Registration or None
     """
+    at_once = settle(source, target, Warp.from_pose(pose, source.shape), np.inf, tolerance=tolerance)
+    if at_once is not None and at_once.is_complete:
+        return at_once
     grown = grow(source, target, pose, order)
     return None if grown is None else settle(source, target, *grown, tolerance=tolerance)
 
@@ -155,13 +169,19 @@ def continue_from_pairs(source, target, rows, columns, *, tolerance=None):
     """
     p, q = source.xy[rows], target.xy[columns]
     parity = np.sign(np.linalg.det(similarity.fit_similarity(p, q)[:, :2]))
-    weights, degree = np.ones(len(p)), min(allowed_degree(len(p)), 3)
+    weights, degree, scatter = np.ones(len(p)), min(allowed_degree(len(p)), 3), np.inf
     for _ in range(4):
         warp = fit_warp(p, q, source.shape, degree, weights=weights, width=1.0, parity=parity)
         distance = np.linalg.norm(warp(p) - q, axis=1)
-        scatter = np.median(distance) / 1.18 + 1e-6
+        before, scatter = scatter, np.median(distance) / 1.18 + 1e-6
+        if abs(scatter - before) < 0.1 * scatter:
+            break
         weights = 1 / (1 + (distance / (2 * scatter)) ** 2)
-    return settle(source, target, warp, max(5 * scatter, 1.0), tolerance=tolerance)
+    reach = 5 * scatter
+    at_once = _judged(source, target, warp, min(max(reach, 0.5), _farthest(target)), tolerance)
+    if at_once is not None and at_once.is_complete:
+        return at_once
+    return settle(source, target, warp, max(reach, 1.0), tolerance=tolerance)
 
 
 def _moving(source, target, radius=0.6):
@@ -322,14 +342,20 @@ def settle(source, target, warp, reach, *, tolerance=None):
     -------
     Registration or None
     """
-    most = np.sqrt(0.03 * target.area / (np.pi * len(target)))
+    most = _farthest(target)
     some = _thinned(source)
-    n = len(_mutual(warp, some, target, min(reach, most), most)[0])
-    highest = allowed_degree(n)
+    limit = min(reach, most)
+    pairs = _mutual(warp, some, target, limit, most)
+    highest = allowed_degree(len(pairs[0]))
+    found = []
     # with few pairs a lower degree can be the more significant one
-    degrees = {0: (0,), 1: (0, 1), 2: (1, 2), 3: (2, 3)}.get(highest, (highest,))
-    found = [_settle(source, target, warp, min(reach, most), tolerance, degree) for degree in degrees]
-    return max((f for f in found if f is not None), key=lambda f: (len(f.source), f.strength), default=None)
+    for degree in {0: (0,), 1: (1, 0), 2: (2, 1), 3: (3, 2)}.get(highest, (highest,)):
+        settled = _settle(source, target, some, warp, pairs, limit, tolerance, degree)
+        if settled is not None:
+            found.append(settled)
+            if settled.is_complete:
+                break
+    return max(found, key=lambda f: (len(f.source), f.strength), default=None)
 
 
 def _thinned(stars):
@@ -337,12 +363,12 @@ def _thinned(stars):
     return stars if step == 1 else stars.subset(np.arange(len(stars)) % step == 0)
 
 
-def _settle(source, target, warp, limit, tolerance, degree):
-    most = np.sqrt(0.03 * target.area / (np.pi * len(target)))
+def _settle(source, target, some, warp, pairs, limit, tolerance, degree):
+    """Registration by a map of one degree, from the pairs of some stars under a first one; None if it is none."""
+    most = _farthest(target)
     parity = np.sign(np.linalg.det(np.diff(warp(np.array([[0.0, 0], [1, 0], [0, 1]])), axis=0)))
-    some = _thinned(source)
-    for _ in range(4):
-        i, j, distance = _mutual(warp, some, target, limit, most)
+    for sweep in range(4):
+        i, j, distance = _mutual(warp, some, target, limit, most) if sweep else pairs
         if len(i) < 3 or allowed_degree(len(i)) < degree:
             return None
         scatter = np.median(distance) / 1.18  # the median distance is 1.18 times the scatter per axis
@@ -351,14 +377,24 @@ def _settle(source, target, warp, limit, tolerance, degree):
         before, limit = limit, min(max(5 * scatter, 0.5), most, 1.5 * limit)
         if abs(limit - before) < 0.1 * limit:
             break
+    return _judged(source, target, warp, limit, tolerance)
+
+
+def _farthest(target):
+    """Distance within which a position by chance finds a star of a list with a probability of 3 per cent."""
+    return np.sqrt(0.03 * target.area / (np.pi * len(target)))
+
+
+def _judged(source, target, warp, limit, tolerance):
+    """Registration of all stars by a map, the limit replaced by a tolerance that is given; None if it is none."""
     limit = limit if tolerance is None else tolerance
     predicted = warp(source.xy)
-    i, j, distance = _mutual(warp, source, target, limit, max(most, limit), lone=True)
+    i, j, distance = _mutual(warp, source, target, limit, max(_farthest(target), limit), lone=True)
     strength = _strength(predicted, target.tree, limit, len(warp.coefficients))
     possible = np.mean(target.on_detector(predicted)) * min(len(source), len(target))
     if strength < MIN_STRENGTH or len(i) < max(5, MIN_SHARE * possible):
         return None
-    return Registration(i, j, distance, warp, float(limit), float(strength))
+    return Registration(i, j, distance, warp, float(limit), float(strength), len(i) / possible)
 
 
 def _mutual(warp, source, target, limit, most, lone=False):

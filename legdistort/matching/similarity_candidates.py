@@ -39,30 +39,40 @@ def offset_candidates(source, target, *, size, n_best=3):
 
     Returns
     -------
-    list of ndarray, each (2,)
+    iterator of ndarray, each (2,)
     """
     differences = (target[None] - source[:, None]).reshape(-1, 2)
     low, high = differences.min(axis=0), differences.max(axis=0)
     spans = [(np.maximum(np.ptp(target[:, k]), 1), np.maximum(np.ptp(source[:, k]), 1)) for k in (0, 1)]
-    out = []
     for cell in (0.005 * size, 0.015 * size):
         if np.prod((high - low) / cell + 3) > _MOST_CELLS:
             continue  # of lists so unlike in extent no shift stands out
         bins = [np.arange(lo - cell, hi + 2 * cell, cell) for lo, hi in zip(low, high, strict=True)]
         cells = ((differences - [b[0] for b in bins]) / cell).astype(int)
         shape = [len(b) for b in bins]
-        votes = np.bincount(np.ravel_multi_index(cells.T, shape), minlength=shape[0] * shape[1])
-        votes = 9 * uniform_filter(votes.reshape(shape).astype(float), 3, mode="constant")
+        held = np.bincount(np.ravel_multi_index(cells.T, shape), minlength=shape[0] * shape[1]).reshape(shape)
+        i, j = np.nonzero(held)
+        votes = sum(held[i + a, j + b] for a in (-1, 0, 1) for b in (-1, 0, 1))
         # the difference of two uniform variables has a trapezium as its density
         profiles = [_trapezium(b + cell / 2, b_lo, *s) for b, b_lo, s in zip(bins, low, spans, strict=True)]
-        expected = 9 * cell**2 * len(differences) * profiles[0][:, None] * profiles[1][None]
+        expected = 9 * cell**2 * len(differences) * profiles[0][i] * profiles[1][j]
         contrast = (votes - expected) / np.sqrt(expected + 1)
-        peaks = np.argwhere(maximum_filter(contrast, 3) == contrast)
-        for i, j in peaks[np.argsort(-contrast[tuple(peaks.T)], kind="stable")[:n_best]]:
-            near = np.all(np.abs(differences - [bins[0][i] + cell / 2, bins[1][j] + cell / 2]) <= 1.5 * cell, axis=1)
+        order = np.argsort(-contrast, kind="stable")
+        for k, m in _peaks(np.column_stack([i, j])[order], n_best):
+            near = np.all(np.abs(differences - [bins[0][k] + cell / 2, bins[1][m] + cell / 2]) <= 1.5 * cell, axis=1)
             if near.sum() >= 3:
-                out.append(np.median(differences[near], axis=0))
-    return out
+                yield np.median(differences[near], axis=0)
+
+
+def _peaks(cells, n_best):
+    """The first of some cells (n, 2), in order of preference, that have no preferred one beside them."""
+    found = []
+    for k, cell in enumerate(cells):
+        if len(found) == n_best:
+            break
+        if np.all(np.abs(cells[:k] - cell).max(axis=1) > 1):
+            found.append(cell)
+    return found
 
 
 def _trapezium(x, low, wide, narrow):
