@@ -19,6 +19,7 @@ from .inputs import exposure_files, table_files
 from .inputs.exposure_names import detector_name
 from .matching.matcher import match
 from .matching.options import MatchOptions
+from .measurement.earlier import EarlierRun, write_detections
 from .measurement.options import MeasureOptions
 from .measurement.positions import measure_with_psfs, write_psfs
 from .priors.prior import HEADER, HeaderPrior
@@ -33,7 +34,10 @@ from .wcs.storage import write_wcs
 log = logging.getLogger(__name__)
 
 #: What `run` and the command ``solve`` leave in their folder, and replace or remove there.
-RESULTS = ("solution.asdf", "stars.ecsv", "wcs/*.asdf", "psf/*.fits", "mosaic.fits", "report.html", "summary.json")
+RESULTS = (
+    "solution.asdf", "stars.ecsv", "wcs/*.asdf", "psf/*.fits", "mosaic.fits", "report.html", "summary.json",
+    "detections.ecsv", "matched.ecsv",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +69,10 @@ class Run:
 
 
 def run(
-    paths,
+    paths=None,
     *,
     out,
+    earlier=None,
     ext=None,
     dq_good=None,
     degree=3,
@@ -94,9 +99,12 @@ def run(
     Parameters
     ----------
     paths : str, path, HDUList, NDData or a sequence of them
-        See `legdistort.read_exposures`.
+        See `legdistort.read_exposures`. By default the frames of an `earlier` run.
     out : str or path
         Folder for the results; made if it does not exist. Nothing is left there if the run fails.
+    earlier : str or path, optional
+        Folder of the results of a run whose measured positions are taken: it goes on from there, with other options of
+        all steps but reading and measuring. Its frames, or those of them that are given, must be as they were.
     ext : int, str or (str, int), optional
         Extension to read from every file.
     dq_good : int, str or sequence of int, optional
@@ -148,23 +156,22 @@ def run(
     matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures)
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
-    tying = {"epoch": epoch, "pixel_scale": pixel_scale}
-    reference, tying["epoch"] = check_reference(reference, **tying, method=solving.method)
+    tying = _tying(reference, epoch, pixel_scale, solving)
     parallel.check_workers(workers)
-    if camera is not None and not isinstance(camera, Camera):
-        raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
+    paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
     share, timings = {"workers": workers, "progress": progress}, {}
     with outputs.replacing_folder(out, former=RESULTS) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
         with _timed(timings, "read"):
-            exposures, bad = _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress, camera)
+            exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, **reading)
             solving = replace(solving, prior=_known_prior(prior, exposures, degree))
         with _timed(timings, "measure"):
-            detections, psfs = measure_with_psfs(exposures, measuring, **share)
+            detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, measuring, **share)
         with _timed(timings, "match"):
-            matches = _also_left_out(match(detections, exposures=exposures, camera=camera, **vars(matching)), bad)
+            matches = match(detections, exposures=exposures, camera=reading["camera"], **vars(matching))
+            matches = replace(matches, left_out=bad | matches.left_out)
         with _timed(timings, "solve"):
-            solution = solve(matches, **vars(solving), reference=reference, **tying)
+            solution = solve(matches, **vars(solving), **tying)
             solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
         with _timed(timings, "coadd"):
             kept = [exposure for exposure in exposures if (exposure.frame or exposure.name) in solution.names]
@@ -176,8 +183,9 @@ def run(
             with _timed(timings, "compare"):
                 comparison, stacks = _compared(matches, solution, solving, quality and mosaic, kept, coadding)
         with _timed(timings, "write"):
-            write_results(solution, target, psfs=psfs)
-            mosaic.write(target / "mosaic.fits")
+            write_results(solution, target, psfs=psfs, mosaic=mosaic)
+            write_detections(target / "detections.ecsv", detections, exposures, Path(out), **reading)
+            write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
         summary = summarise(solution, timings=timings) | _assessed(solution, quality, comparison, stacks)
         shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks}
         write_report(target / "report.html", solution, summary=summary, **shown)
@@ -185,7 +193,7 @@ def run(
     return Run(Path(out), solution, mosaic, summary)
 
 
-def _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress, camera):
+def _open_frames(paths, min_exposures, stop_at_bad, progress, *, ext, dq_good, camera):
     """Exposures that can be solved together, and the bad ones as ``{name: reason}``."""
     bad = {}
     options = {"ext": ext, "dq_good": dq_good, "stop_at_bad": stop_at_bad, "progress": progress}
@@ -195,6 +203,31 @@ def _open_frames(paths, min_exposures, ext, dq_good, stop_at_bad, progress, came
     return exposures, bad
 
 
+def _where_to_begin(paths, earlier, measuring, **reading):
+    """Frames, how they are read, and the earlier run that has measured them, or None."""
+    camera = reading["camera"]
+    if camera is not None and not isinstance(camera, Camera):
+        raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
+    if earlier is None and paths is None:
+        raise InputError("give frames, or the folder of an earlier run to go on from (earlier=, --from)")
+    if earlier is None:
+        return paths, reading, None
+    usual = dict.fromkeys(reading) | vars(MeasureOptions())
+    for name, value in (reading | vars(measuring)).items():
+        if value is not usual[name] and value != usual[name]:
+            raise InputError(
+                f"{name} is not to be given with an earlier run: that of {earlier} holds, or measure the frames again"
+            )
+    before = EarlierRun.read(earlier)
+    return before.frames if paths is None else paths, before.reading | {"camera": before.camera}, before
+
+
+def _tying(reference, epoch, pixel_scale, solving):
+    """What ties the solution to the sky, as arguments of `solve`."""
+    reference, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=solving.method)
+    return {"reference": reference, "epoch": epoch, "pixel_scale": pixel_scale}
+
+
 def _known_prior(prior, exposures=None, degree=3):
     """The prior; that of the headers is read from the exposures, or has a stand-in for checks before there are any."""
     if isinstance(prior, str) and prior == HEADER:
@@ -202,10 +235,6 @@ def _known_prior(prior, exposures=None, degree=3):
     if not isinstance(prior, HeaderPrior):
         return prior
     return prior.stand_in if exposures is None else prior.read(exposures, degree)
-
-
-def _also_left_out(matches, bad):
-    return replace(matches, left_out=bad | matches.left_out)
 
 
 def _step_options(kind, given, argument, *, defaults=None, **own):
@@ -232,8 +261,15 @@ def _assessed(solution, quality, comparison, stacks):
     return figures
 
 
-def write_results(solution, target, *, psfs=None):
-    """Write ``solution.asdf``, ``stars.ecsv``, ``wcs/NAME.asdf`` and ``psf/NAME.fits`` into an existing folder.
+def write_matched(path, matches, inputs, *, overwrite=False):
+    """Write matches with all that is known of their exposures, and the checksums of what they were made from."""
+    table = matches.table.copy()
+    table.meta = matches.to_meta() | {"inputs": inputs}
+    table_files.write_table(table, path, overwrite=overwrite)
+
+
+def write_results(solution, target, *, psfs=None, mosaic=None):
+    """Write ``solution.asdf``, ``stars.ecsv``, ``wcs/NAME.asdf``, ``psf/NAME.fits``, ``mosaic.fits`` into a folder.
 
     Of a camera the WCSs are those of its detectors, ``wcs/NAME-DETECTOR.asdf``.
     """
@@ -245,6 +281,8 @@ def write_results(solution, target, *, psfs=None):
             file = f"{name}.asdf" if detector is None else f"{detector_name(name, detector)}.asdf"
             write_wcs(solution, name, target / "wcs" / file, detector=detector)
     write_psfs(psfs or {}, target / "psf")
+    if mosaic is not None:
+        mosaic.write(target / "mosaic.fits")
 
 
 def listed_files(target):

@@ -19,7 +19,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 import legdistort
-from legdistort import Prior, Solution, calibrate_noise, coadd, match, measure, open_exposures, predict, solve
+from legdistort import Prior, Solution, calibrate_noise, coadd, match, measure, open_exposures, pipeline, predict, solve
 from legdistort.cli import commands, options, parser
 from legdistort.cli.arguments import given
 from legdistort.cli.parser import main
@@ -31,7 +31,7 @@ from legdistort.simulation.observations import simulate_exposures
 from legdistort.simulation.pupil import PupilPSF
 from legdistort.wcs.attachment import attach
 
-RESULTS = {"solution.asdf", "stars.ecsv", "wcs", "mosaic.fits", "report.html", "summary.json"}
+RESULTS = {path.split("/")[0] for path in pipeline.RESULTS} - {"psf"}
 
 
 @pytest.fixture(scope="module")
@@ -339,7 +339,7 @@ def test_help_has_an_example(command, capsys):
         (run_demo, [options.NIGHT]),
         (simulate_exposures, [options.NIGHT]),
         (PupilPSF, [options.OPTICS]),
-        (legdistort.run, [options.FRAMES, options.WORKERS, options.COMPARING]),
+        (legdistort.run, [options.RUN_FRAMES, options.WORKERS, options.COMPARING]),
         (measure, [options.MEASURING, options.WORKERS]),
         (calibrate_noise, [options.INJECTING, options.WORKERS]),
         (match, [options.MATCHING]),
@@ -546,9 +546,9 @@ def test_inputs_in_the_folder_of_results(name, tmp_path, capsys, monkeypatch):
         (tmp_path / result).write_text("precious")
         words = [*_ready(monkeypatch, FOLDERS[name], read=tmp_path / result, out=tmp_path), "--overwrite"]
         failed(capsys, main(words), f"{result} is read, and would be replaced")
-    (tmp_path / "matched.ecsv").write_text("")
+    (tmp_path / "positions.ecsv").write_text("")
     with pytest.raises(pytest.fail.Exception, match="the work began"):  # what stands under other names stays
-        main([*_ready(monkeypatch, FOLDERS[name], read=tmp_path / "matched.ecsv", out=tmp_path), "--overwrite"])
+        main([*_ready(monkeypatch, FOLDERS[name], read=tmp_path / "positions.ecsv", out=tmp_path), "--overwrite"])
 
 
 def test_copies_of_frames_may_go_beside_the_solution(tmp_path, monkeypatch):

@@ -107,7 +107,7 @@ def check_paths(arguments, groups):
     named = {"read": [], "file": [], "folder": [], "results": []}
     for _, _, dest, option in _flagged(groups):
         value = getattr(arguments, dest)
-        if option.path is not None and value is not None:
+        if option.path is not None and value not in (None, option.none):
             named[option.path].append(value)
     inputs = [path for value in named["read"] for path in expand_paths(value)]
     replaced = [path for path in named["file"] if not path.is_dir()]

@@ -53,7 +53,7 @@ def do_run(a):
     )
     own = ("psf", "degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
     result = legdistort.run(
-        **given(a, options.FRAMES, options.FLAGGED, options.STOPPING),
+        **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING),
         out=a.out,
         **{name: group.pop(name) for group in (measuring, matching, solving) for name in own if name in group},
         measuring=measuring,
@@ -110,6 +110,8 @@ def do_noise(a):
 
 def do_match(a):
     """``legdistort match``."""
+    from ..pipeline import write_matched
+
     tables = [_read_table(path, a) for path in a.tables]
     names = [name for table in tables for name in dict.fromkeys(table["exposure"])]
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -122,11 +124,9 @@ def do_match(a):
     bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
     bad = {name: reason for name, reason in bad.items() if name not in names}
     matches = replace(matches, left_out=bad | matches.left_out | empty)
-    made = matches.table.copy()
     inputs = {name: checksum for each in tables for name, checksum in each.meta["inputs"].items()}
-    made.meta = matches.to_meta() | {"inputs": inputs}
-    write_table(made, a.out, overwrite=a.overwrite)
-    figures = {"n_exposures": len(matches.names), "n_stars": len(matches.stars), "n_observations": len(made)}
+    write_matched(a.out, matches, inputs, overwrite=a.overwrite)
+    figures = {"n_exposures": len(matches.names), "n_stars": len(matches.stars), "n_observations": len(matches.table)}
     _say(a, repr(matches)[1:-1], figures | {"left_out": matches.left_out})
 
 

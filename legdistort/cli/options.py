@@ -18,6 +18,15 @@ FRAMES = {
     ),
     "ext": Option("extension: number, name, or NAME,VERSION", type=extension),
 }
+RUN_FRAMES = {
+    "paths": Option(
+        "as of measure; none with --from: its frames", "frames", none=[], nargs="*", metavar="FRAME", path="read"
+    ),
+    "ext": FRAMES["ext"],
+    "earlier": Option(
+        "results of an earlier run: its positions are taken, not measured again", "--from", metavar="FOLDER"
+    ),
+}
 FLAGGED = {"dq_good": Option("flags that leave a pixel good: a sum, or 64,32", metavar="BITS")}
 STOPPING = {"stop_at_bad": Option("refuse blank and damaged frames, do not leave them out", action="store_true")}
 STRICT = {"strict": Option("exit status 3 if a check of the result fails", action="store_true")}

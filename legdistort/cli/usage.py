@@ -32,7 +32,7 @@ COMMANDS = {
     "run": _command(
         "frames to WCS, mosaic and report",
         "frames/*.fits --out results --degree 3",
-        options.FRAMES,
+        options.RUN_FRAMES,
         options.FLAGGED,
         options.STOPPING,
         options.STRICT,

@@ -1,0 +1,128 @@
+"""Positions that an earlier run measured, so that another one goes on from there."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+
+from ..cameras.camera import Camera
+from ..exceptions import InputError, some_of
+from ..inputs.exposure_files import ExposureFile, file_checksums
+from ..inputs.table_files import read_table, write_table
+from .effective.model import EffectivePSF
+
+#: Files of a run that have what it measured.
+DETECTIONS, PSFS = "detections.ecsv", "psf"
+
+
+@dataclass(frozen=True, eq=False)
+class EarlierRun:
+    """What a run measured.
+
+    Attributes
+    ----------
+    folder : Path
+    table : Table
+        Detections of all its exposures, as `legdistort.measure` gives them.
+    """
+
+    folder: Path
+    table: Table
+
+    @classmethod
+    def read(cls, folder):
+        """What the run that left this folder measured.
+
+        Raises
+        ------
+        InputError
+            Where there is no such folder, or no run has left its positions there.
+        """
+        folder = Path(folder)
+        if not (folder / DETECTIONS).is_file():
+            raise InputError(f"{folder} has no {DETECTIONS}: give the folder of the results of a run")
+        table = read_table(folder / DETECTIONS)
+        if not {"exposure", "x", "y", "x_err", "y_err"} <= set(table.colnames) or "frames" not in table.meta:
+            raise InputError(f"{folder / DETECTIONS} is not what a run has left: measure the frames again")
+        return cls(folder, table)
+
+    @property
+    def frames(self):
+        """Paths of the frames that were measured, from the folder of the results."""
+        return [Path(os.path.normpath(self.folder / path)) for path in self.table.meta["frames"]]
+
+    @property
+    def reading(self):
+        """Arguments ``ext`` and ``dq_good`` with which the frames were read."""
+        ext = self.table.meta.get("ext")
+        return {"ext": tuple(ext) if isinstance(ext, list) else ext, "dq_good": self.table.meta.get("dq_good")}
+
+    @property
+    def camera(self):
+        """The camera that was given; None if none was."""
+        meta = self.table.meta.get("camera")
+        return None if meta is None else Camera.from_meta(meta)
+
+    def of(self, exposures):
+        """Detections and effective PSFs of some exposures, which must be those that were measured.
+
+        Parameters
+        ----------
+        exposures : list of ExposureFile
+
+        Returns
+        -------
+        detections : Table
+        psfs : dict of str to EffectivePSF
+
+        Raises
+        ------
+        InputError
+            Naming a frame that was not measured, that has changed, or that is in no file.
+        """
+        without = [exposure.name for exposure in exposures if not isinstance(exposure, ExposureFile)]
+        if without:
+            raise InputError(f"{without[0]} is not in a file: nothing tells that it is what was measured; give files")
+        measured = self.table.meta["inputs"]
+        for file, checksum in file_checksums(exposures).items():
+            if file not in measured:
+                raise InputError(
+                    f"{file} was not measured in {self.folder}, whose frames are {some_of(list(measured), 3)}: give "
+                    "frames of that run, or measure all of them together"
+                )
+            if measured[file] != checksum:
+                raise InputError(f"{file} is not as it was measured in {self.folder}: measure the frames again")
+        names = [exposure.frame or exposure.name for exposure in exposures]
+        table = self.table[np.isin(self.table["exposure"], names)]
+        table.meta = {}
+        files = {exposure.name: self.folder / PSFS / f"{exposure.name}.fits" for exposure in exposures}
+        return table, {name: EffectivePSF.read(file) for name, file in files.items() if file.is_file()}
+
+
+def write_detections(path, detections, exposures, out, *, ext=None, dq_good=None, camera=None):
+    """Write what a run has measured, for `EarlierRun`.
+
+    Parameters
+    ----------
+    path : Path
+    detections : Table
+    exposures : list of Exposure
+        Those that are not in files cannot be gone on from.
+    out : Path
+        Where the file will be found: paths of frames are told from there.
+    ext, dq_good, camera
+        As given to `legdistort.run`.
+    """
+    table = detections.copy()
+    files = list(dict.fromkeys(exposure.path for exposure in exposures if exposure.path is not None))
+    table.meta |= {
+        "inputs": file_checksums(exposures),
+        "frames": [os.path.relpath(file, out) for file in files],
+        "shapes": {exposure.name: list(exposure.shape) for exposure in exposures},
+        "ext": list(ext) if isinstance(ext, tuple) else ext,
+        "dq_good": dq_good,
+        "camera": None if camera is None else camera.to_meta(),
+    }
+    write_table(table, path)

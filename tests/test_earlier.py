@@ -1,0 +1,108 @@
+"""A run that goes on from what an earlier one has measured."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+import legdistort
+from legdistort import Solution
+from legdistort.cli.parser import main
+from legdistort.exceptions import InputError
+from legdistort.measurement import positions
+
+pytestmark = pytest.mark.filterwarnings("ignore::legdistort.LegdistortWarning")
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory):
+    """A folder with frames, and the results of a run at degree 2 in ``first``, with effective PSFs."""
+    folder = tmp_path_factory.mktemp("night")
+    paths = legdistort.simulate_exposures(small=True).write(folder / "frames")[:4]
+    legdistort.run(paths, out=folder / "first", degree=2, psf="effective")
+    return folder
+
+
+@pytest.fixture
+def unmeasured(monkeypatch):
+    """Nothing is measured."""
+    monkeypatch.setattr("legdistort.pipeline.measure_with_psfs", lambda *_, **__: pytest.fail("measured again"))
+
+
+@pytest.mark.usefixtures("unmeasured")
+def test_the_same_is_the_same(night, tmp_path):
+    again = legdistort.run(out=tmp_path / "again", earlier=night / "first", degree=2)
+    first = Solution.read(night / "first")
+    assert np.array_equal(again.solution.positions, first.positions, equal_nan=True)
+    for name in ("mosaic.fits", "psf/exp00.fits"):
+        ours, theirs = (fits.getdata(folder / name) for folder in (again.out, night / "first"))
+        assert np.array_equal(ours, theirs, equal_nan=True)
+    assert (again.out / "matched.ecsv").read_text() == (night / "first" / "matched.ecsv").read_text()
+    assert again.solution.provenance["inputs"] == first.provenance["inputs"]
+
+
+@pytest.mark.usefixtures("unmeasured")
+def test_other_options_and_fewer_frames(night, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(night, "night")  # results may be moved with their frames, and replaced by what goes on from them
+    shutil.rmtree("night/first/psf")
+    frames = [f"night/frames/exp0{i}.fits" for i in (0, 2, 3)]
+    words = ["run", *frames, "--from", "night/first", "--min-exposures", "3", "--degree", "1", "--out", "night/first"]
+    assert main([*words, "--quiet"]) == 1  # they are not replaced without being asked for
+    assert main([*words, "--quiet", "--overwrite"]) == 0
+    three = Solution.read("night/first")
+    assert (three.names, three.degree) == (("exp00", "exp02", "exp03"), 1)
+    assert set(Table.read("night/first/detections.ecsv")["exposure"]) == {"exp00", "exp02", "exp03"}
+    assert not Path("night/first/psf").exists()
+    assert main(["solve", "night/first/matched.ecsv", "--degree", "1", "--out", "solved", "--quiet"]) == 0
+    solved = Solution.read("solved")
+    np.testing.assert_allclose(three.positions, solved.positions, atol=1e-9)
+    assert None not in (three.sky, solved.sky)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"psf": "moffat"}, "psf is not to be given with an earlier run"),
+        ({"measuring": {"threshold": 4}}, "threshold is not to be given with an earlier run"),
+        ({"ext": 1}, "ext is not to be given with an earlier run"),
+        ({"earlier": "frames"}, "frames has no detections.ecsv: give the folder of the results of a run"),
+        ({"earlier": None}, "give frames, or the folder of an earlier run"),
+        ({"paths": ["frames/exp00.fits", "frames/other.fits"]}, "other.fits was not measured in .*first, whose frames"),
+    ],
+)
+def test_what_is_refused(night, given, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(night)
+    if not (night / "frames" / "other.fits").exists():
+        with fits.open(night / "frames" / "exp00.fits") as hdulist:
+            hdulist[0].data[:5] += 1
+            hdulist.writeto(night / "frames" / "other.fits")
+    with pytest.raises(InputError, match=words):
+        legdistort.run(**{"out": tmp_path / "out", "earlier": night / "first", "min_exposures": 2} | given)
+    assert not (tmp_path / "out").exists()
+
+
+def test_frames_that_have_changed(night, tmp_path):
+    shutil.copytree(night, tmp_path / "night")
+    with fits.open(tmp_path / "night" / "frames" / "exp01.fits", mode="update") as hdulist:
+        hdulist[0].data[7, 7] += 1
+    with pytest.raises(InputError, match=r"exp01\.fits is not as it was measured in .*first: measure the frames again"):
+        legdistort.run(out=tmp_path / "out", earlier=tmp_path / "night" / "first")
+    paths = sorted((night / "frames").glob("exp*.fits"))
+    exposures = [fits.HDUList([fits.PrimaryHDU(fits.getdata(path))]) for path in paths]
+    with pytest.raises(InputError, match="is not in a file"):
+        legdistort.run(exposures, out=tmp_path / "out", earlier=night / "first")
+    (tmp_path / "night" / "frames" / "exp02.fits").unlink()
+    with pytest.raises(InputError, match=r"exp02\.fits"):
+        legdistort.run(out=tmp_path / "out", earlier=tmp_path / "night" / "first")
+
+
+def test_a_table_of_somebody_else(night, tmp_path):
+    (tmp_path / "results").mkdir()
+    table = positions.measure(legdistort.read_exposures(night / "frames" / "exp00.fits"))
+    table.write(tmp_path / "results" / "detections.ecsv")
+    with pytest.raises(InputError, match=r"detections.ecsv is not what a run has left"):
+        legdistort.run(out=tmp_path / "out", earlier=tmp_path / "results")
