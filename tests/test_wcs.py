@@ -99,6 +99,21 @@ def test_whole_chain_backward_without_the_box(solution):
         assert_allclose(np.column_stack(wcs.backward_transform(*sky)), p, rtol=0, atol=2e-6)
 
 
+def test_many_positions_are_as_few(solution, blind):
+    """They are evaluated in pieces; numbers, shapes and NaN outside the detector are those of the stock class."""
+    ny, nx = np.indices((1300, 290)) - 5.0
+    for wcs in (solution.wcs(solution.names[1]), blind.wcs(blind.names[0])):
+        there = wcs.pixel_to_world_values(nx, ny)
+        expected = wcs.stock().pixel_to_world_values(nx, ny)
+        assert_array_equal(there, expected)
+        assert there[0].shape == nx.shape
+        back = wcs.world_to_pixel_values(*there)
+        inside = np.isfinite(there[0])
+        assert_allclose(np.array(back)[:, inside], np.array([nx, ny])[:, inside], rtol=0, atol=1e-6)
+        row = wcs.pixel_to_world_values(np.arange(100_000) % 290, 17.0)  # shapes that go together
+        assert_array_equal(row[0][:290], wcs.pixel_to_world_values(np.arange(290), 17.0)[0])
+
+
 def test_outside_is_nan(solution):
     for name in solution.names:
         wcs = solution.wcs(name)

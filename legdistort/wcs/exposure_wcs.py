@@ -1,11 +1,15 @@
 """The gwcs of an exposure, made of stock parts."""
 
 import gwcs
+import numpy as np
 from astropy import units as u
 from astropy.coordinates import ICRS
 from gwcs import coordinate_frames as cf
 
 from ..geometry import models, similarity
+
+#: Positions that are evaluated at once: what is worked out on the way stays in the cache of a processor.
+_PIECE = 1 << 15
 
 
 class ExposureWCS(gwcs.WCS):
@@ -21,9 +25,34 @@ class ExposureWCS(gwcs.WCS):
         """World coordinates as they are: the bounding box of the pixels, and the models, say what is outside."""
         return world_arrays
 
+    def pixel_to_world_values(self, *pixel_arrays):
+        """As the stock class; many positions piece by piece, which need less memory and time."""
+        return _piecewise(super().pixel_to_world_values, pixel_arrays)
+
+    def world_to_pixel_values(self, *world_arrays):
+        """As the stock class; many positions piece by piece, which need less memory and time."""
+        return _piecewise(super().world_to_pixel_values, world_arrays)
+
     def stock(self):
         """The same WCS as a plain `gwcs.WCS`."""
         return rebuilt(gwcs.WCS, self)
+
+
+def _piecewise(function, arrays):
+    """What a function of coordinates says of arrays, `_PIECE` positions at a time."""
+    if any(isinstance(array, u.Quantity) for array in arrays):
+        return function(*arrays)
+    if len({np.shape(array) for array in arrays}) > 1:  # which the stock class does not take
+        arrays = np.broadcast_arrays(*arrays)
+    if np.size(arrays[0]) <= _PIECE:
+        return function(*arrays)
+    arrays = [np.asarray(array) for array in arrays]
+    flat = [array.reshape(-1) for array in arrays]
+    out = np.empty((len(arrays), flat[0].size))
+    for begin in range(0, flat[0].size, _PIECE):
+        part = slice(begin, begin + _PIECE)
+        out[:, part] = function(*(array[part] for array in flat))
+    return tuple(out.reshape(-1, *arrays[0].shape))
 
 
 def rebuilt(kind, wcs):
