@@ -37,6 +37,7 @@ from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.exposure_files import read_exposures
 from legdistort.inputs.exposures import Exposure
 from legdistort.runtime.checks import options_from
+from legdistort.runtime.words import PLANES
 
 SHAPE = (300, 400)
 SIGMA = 1.4  # of the Gaussian stars, px
@@ -498,6 +499,29 @@ class TestFile:
         np.testing.assert_array_equal(back.data, mosaic.data)
         assert np.median(mosaic.variance[mosaic.footprint == 4]) == pytest.approx(0.7, abs=0.3)
         np.testing.assert_allclose(back.uncertainty**2, mosaic.variance, rtol=1e-5)
+
+    @pytest.mark.parametrize("planes", [(), ("UNCERT", "MASK"), ["CONTEXT"], "WEIGHT"])
+    def test_planes_that_are_asked_for(self, planes, tmp_path):
+        solution, _, _, exposures, _ = plain()
+        mosaic = coadd(exposures, solution, planes=planes)
+        whole = coadd(exposures, solution)
+        wanted = {planes} if isinstance(planes, str) else set(planes)
+        mosaic.write(tmp_path / "m.fits")
+        with fits.open(tmp_path / "m.fits", checksum=True) as hdulist:
+            assert {hdu.name for hdu in hdulist} == {"SCI"} | wanted
+            expected = whole.to_hdulist()
+            for hdu in hdulist:
+                np.testing.assert_array_equal(hdu.data, expected[hdu.name].data)
+        mosaic.write(tmp_path / "m.asdf")
+        with asdf.open(tmp_path / "m.asdf") as file:
+            others = {"data", "wcs", "exposures", "left_out", "offset", "header"}
+            assert set(file["mosaic"]) - others == {PLANES[name] for name in wanted} - {"mask"}
+
+    @pytest.mark.parametrize("planes", ["VARIANCE", ("UNCERT", "uncert"), [1]])
+    def test_planes_that_there_are_not(self, planes):
+        solution, _, _, exposures, _ = plain()
+        with pytest.raises(InputError, match="planes must be one of 'UNCERT', 'MASK'"):
+            coadd(exposures, solution, planes=planes)
 
     def test_the_file_is_that_of_the_hdulist(self, tmp_path):
         *_, mosaic = plain()

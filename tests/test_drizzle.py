@@ -9,11 +9,11 @@ from test_coaddition import SHAPE, StandIn, check_stars, covered, expose, fit_st
 from legdistort.coaddition import block_stack
 from legdistort.coaddition.mosaicking import coadd
 from legdistort.coaddition.options import CoaddOptions
-from legdistort.coaddition.resampling.drizzling import KERNELS
 from legdistort.exceptions import InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.distortion import Distortion
 from legdistort.inputs.exposures import Exposure
+from legdistort.runtime.words import KERNELS
 
 drizzle = pytest.importorskip("drizzle")
 

@@ -15,6 +15,11 @@ def columns(text):
     return pairs
 
 
+def planes(text):
+    """Names of planes of a mosaic, ``UNCERT,WEIGHT``, in any case; none of them for ``none``."""
+    return () if text == "none" else tuple(text.upper().split(","))
+
+
 def spectrum(text):
     """``degree=rms,...`` as a dict."""
     try:

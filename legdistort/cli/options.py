@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ..runtime import words
-from .arguments import Option, columns, extension, number_or_name, spectrum, word_or
+from .arguments import Option, columns, extension, number_or_name, planes, spectrum, word_or
 
 # -- options that several commands have
 
@@ -165,6 +165,7 @@ COADDING = {
     "weights": Option("of exposures (default noise)", choices=(*words.WEIGHTS, "equal"), none="equal"),
     "scale": Option("of fluxes (default auto)", choices=(*words.SCALES, "none"), none="none"),
     "extrapolated": Option("pixels outside the stars used (default flag)", choices=words.EXTRAPOLATED),
+    "planes": Option("beside the image in the file (default all); none: nothing", type=planes, metavar="UNCERT,..."),
     "scratch": Option("for pixels while work goes on (default: system's)", type=Path, metavar="FOLDER"),
 }
 GRID = {"grid": Option("image or header text whose grid is taken", type=Path, metavar="FILE", path="read")}

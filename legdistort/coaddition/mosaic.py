@@ -17,6 +17,7 @@ from ..exceptions import InputError
 from ..runtime.fits_bytes import BLOCK, sum32, with_checksum
 from ..runtime.outputs import replacing
 from ..runtime.scratch import forget
+from ..runtime.words import PLANES
 from .combination import PixelFlag
 
 _ENDING = re.compile(r"\.(?:(?P<asdf>asdf)|(?:fits|fit|fts)(?P<packed>\.gz|\.bz2)?)$", re.IGNORECASE)
@@ -62,6 +63,8 @@ class Mosaic:
     extrapolated, rejected : ndarray of uint8, shape (ny, nx), or None
         Of how many exposures the flags 1 and 4 tell: per cent of those that contribute, and of those that are there,
         rounded up.
+    planes : tuple of str
+        What `write` puts beside the image, see `to_hdulist`.
     """
 
     data: np.ndarray
@@ -77,6 +80,7 @@ class Mosaic:
     header: fits.Header = field(default_factory=fits.Header)
     extrapolated: np.ndarray | None = None
     rejected: np.ndarray | None = None
+    planes: tuple = tuple(PLANES)
 
     @property
     def mask(self):
@@ -133,9 +137,10 @@ class Mosaic:
     def to_hdulist(self):
         """The FITS file: image (primary HDU, ``SCI``), ``UNCERT``, ``MASK``, ``WEIGHT``, ``FOOTPRINT`` and the others.
 
-        These are ``FLAGS``, ``EXTRAPOLATED``, ``REJECTED`` and ``CONTEXT``. ``CCDData.read`` finds the variances
-        (``UTYPE`` of ``UNCERT``) and the mask. Each has the WCS. ``CONTEXT`` has a third axis where there are more than
-        32 exposures; a bit counts them in the order of the keywords ``IMCMB001``, ``IMCMB002``, ...
+        These are ``FLAGS``, ``EXTRAPOLATED``, ``REJECTED`` and ``CONTEXT``, as far as `planes` names them.
+        ``CCDData.read`` finds the variances (``UTYPE`` of ``UNCERT``) and the mask. Each has the WCS. ``CONTEXT`` has
+        a third axis where there are more than 32 exposures; a bit counts them in the order of the keywords
+        ``IMCMB001``, ``IMCMB002``, ...
         """
         header = self.header.copy()
         header.update(self.wcs.to_header(relax=True))
@@ -147,7 +152,7 @@ class Mosaic:
         planes = {
             "SCI": self.data,
             "UNCERT": self.variance,
-            "MASK": self.mask.view(np.uint8),
+            "MASK": self.mask.view(np.uint8) if "MASK" in self.planes else None,
             "WEIGHT": self.weight,
             "FOOTPRINT": self.footprint,
             "FLAGS": self.flags,
@@ -157,15 +162,16 @@ class Mosaic:
         }
         hdulist = fits.HDUList()
         for name, plane in planes.items():
-            if plane is None:
+            if plane is None or name not in ("SCI", *self.planes):
                 continue
             hdu = (fits.ImageHDU if hdulist else fits.PrimaryHDU)(plane, header)
             hdu.name = name
             hdulist.append(hdu)
         unit = header.get("BUNIT")
-        if unit:
-            hdulist["UNCERT"].header["BUNIT"] = f"({unit})**2"
-        hdulist["UNCERT"].header["UTYPE"] = ("VarianceUncertainty", "class of astropy.nddata")
+        if "UNCERT" in hdulist:
+            if unit:
+                hdulist["UNCERT"].header["BUNIT"] = f"({unit})**2"
+            hdulist["UNCERT"].header["UTYPE"] = ("VarianceUncertainty", "class of astropy.nddata")
         for name, meaning in (
             ("MASK", "1: no value, or saturated"),
             ("WEIGHT", "sum of weights"),
@@ -213,7 +219,8 @@ class Mosaic:
             _append(file, hdu)
 
     def _tree(self):
-        tree = {each.name: getattr(self, each.name) for each in fields(self)}
+        dropped = {"planes"} | {PLANES[name] for name in PLANES if name not in self.planes}
+        tree = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in dropped}
         tree["exposures"], tree["offset"] = list(self.exposures), self.offset and list(self.offset)
         return tree | {"header": {k: v for k, v in self.header.items() if k not in ("HISTORY", "COMMENT", "")}}
 

@@ -9,6 +9,7 @@ from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.star_hull import support
 from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
+from ..runtime.words import PLANES
 from .background import match_backgrounds
 from .block_stack import Layer, Recipe, assemble, n_bytes
 from .flux_scales import flux_scales
@@ -41,6 +42,7 @@ def coadd(
     kernel="square",
     workers=None,
     scratch=None,
+    planes=None,
     progress=False,
 ):
     """Co-add exposures on the distortion-free reference plane, or on any celestial WCS.
@@ -90,6 +92,9 @@ def coadd(
         Folder for the pixels of the exposures while work goes on, 4 to 11 bytes for each (17 in double precision), and
         for those of the mosaic, 21 or more, as long as it is in use; the workers of a cluster must see it. The default
         is that of the system (``TMPDIR``), which some systems keep in memory.
+    planes : sequence of str, optional
+        What `Mosaic.write` puts beside the image: of ``"UNCERT"``, ``"MASK"``, ``"WEIGHT"``, ``"FOOTPRINT"``,
+        ``"FLAGS"``, ``"EXTRAPOLATED"``, ``"REJECTED"``, ``"CONTEXT"``; an empty one for nothing. None = all.
     progress : bool
         Show progress bars.
 
@@ -118,6 +123,7 @@ def coadd(
         pixfrac=pixfrac,
         kernel=kernel,
         scratch=scratch,
+        planes=planes,
     )
     share = partial(map_items, workers=workers, threads=True, progress=progress)
     return _coadd(exposures, solution.by_detector, options, share)
@@ -156,6 +162,7 @@ def _coadd(exposures, solution, options, share):
     names = tuple(f.name for f in frames)
     *planes, extrapolated, rejected = planes
     made = {"exposures": names, "left_out": left_out, "offset": output.offset, "header": header}
+    made["planes"] = tuple(PLANES) if options.planes is None else options.planes
     return Mosaic(*planes, wcs=output.wcs, **made, extrapolated=extrapolated, rejected=rejected)
 
 

@@ -9,7 +9,7 @@ from astropy.wcs import WCS
 
 from ..exceptions import InputError
 from ..runtime.checks import check_choice
-from ..runtime.words import ALGORITHMS, COMBINATIONS, CONSERVE, EXTRAPOLATED, KERNELS, ORDERS, SCALES, WEIGHTS
+from ..runtime.words import ALGORITHMS, COMBINATIONS, CONSERVE, EXTRAPOLATED, KERNELS, ORDERS, PLANES, SCALES, WEIGHTS
 from .grids import checked_wcs
 from .resampling.engines import Resampling, uses_compiled_splines
 
@@ -27,6 +27,8 @@ class CoaddOptions:
     grid : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or None
     weights, scale : str, None or dict
         A dict by exposure has positive numbers; whether it has the right names only the exposures tell.
+    planes : tuple of str or None
+        Keys of `legdistort.runtime.words.PLANES`.
 
     Raises
     ------
@@ -46,6 +48,7 @@ class CoaddOptions:
     pixfrac: float = 1.0
     kernel: str = "square"
     scratch: object = None
+    planes: tuple | None = None
 
     def __post_init__(self):
         choices = {"method": COMBINATIONS, "algorithm": ALGORITHMS, "conserve": CONSERVE, "extrapolated": EXTRAPOLATED}
@@ -57,6 +60,11 @@ class CoaddOptions:
         object.__setattr__(self, "order", int(order))
         for name, allowed in (("weights", WEIGHTS), ("scale", SCALES)):
             object.__setattr__(self, name, _choice_or_numbers(name, getattr(self, name), allowed))
+        if self.planes is not None:
+            planes = [self.planes] if isinstance(self.planes, str) else list(self.planes)
+            for plane in planes:
+                check_choice(plane, PLANES, "planes")
+            object.__setattr__(self, "planes", tuple(planes))
         if self.grid is not None:
             checked_wcs(self.grid)
         if self.algorithm == "drizzle":

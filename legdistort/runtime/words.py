@@ -28,4 +28,9 @@ KERNELS = ("square", "turbo", "point")  # of drizzle, those that conserve flux
 CONSERVE = ("flux", "surface_brightness")
 WEIGHTS = ("noise", "variance", "exptime", "seeing", "sigma_map")
 SCALES = ("auto", "exptime", "stars")
+#: What a file can have beside the image, and the attribute of a mosaic that each is.
+PLANES = {
+    "UNCERT": "variance", "MASK": "mask", "WEIGHT": "weight", "FOOTPRINT": "footprint", "FLAGS": "flags",
+    "EXTRAPOLATED": "extrapolated", "REJECTED": "rejected", "CONTEXT": "context",
+}  # fmt: skip
 EXTRAPOLATED = ("flag", "mask", "keep")
