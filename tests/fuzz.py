@@ -4,9 +4,9 @@
 
 draws inputs from the small files of ``tests/corpus`` and ``tests/written`` (``python tests/fuzz.py --corpus`` makes the
 former), does some damage, and hands them to the reader. A fault is any error that is not a `LegdistortError`, an input
-that was changed, a file that was left behind, or half a minute of work (ten minutes without an answer end it all). What was read is used as well: a table is
-matched or solved, a solution printed and evaluated. Seeds are numbers, so that a fault can be made again:
-``python tests/fuzz.py --seed 1234``.
+that was changed, a file that was left behind, or half a minute of work; ten minutes in compiled code end the command.
+What was read is used as well: a table is matched or solved, a solution printed and evaluated. Seeds are numbers, so
+that a fault can be made again: ``python tests/fuzz.py --seed 1234``.
 """
 
 import argparse

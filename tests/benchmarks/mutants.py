@@ -1,6 +1,7 @@
 """Mutation testing of the numerical core: would the tests see it if a sign, an operator or a number were another?
 
     python tests/benchmarks/mutants.py
+    python tests/benchmarks/mutants.py --again      (those that were not killed)
 
 makes small changes in the modules of `MODULES`, one at a time and in a copy of the tree, and runs those tests on each
 that are quick and near it. A mutant is *killed* if a test fails, *equivalent* if ``equivalent_mutants.csv`` gives the
@@ -19,9 +20,11 @@ written into the changed source; the command ends with an error if that is anoth
 
 import argparse
 import ast
+import compileall
 import copy
 import csv
 import hashlib
+import importlib
 import json
 import os
 import resource
@@ -57,6 +60,11 @@ MODULES = {
 }
 #: Tests that are not tried: of commands, files and pictures, and of many realisations.
 _LEFT_OUT = ["command", "shell", "report", "picture", "file", "calibrated", "decides_by_evidence", "another_field"]
+#: What the tests need of other packages.
+LIBRARIES = (
+    "asdf", "astropy.coordinates", "astropy.io.fits", "astropy.modeling", "astropy.table", "astropy.wcs", "gwcs",
+    "matplotlib", "numba", "photutils.detection", "pytest", "reproject", "scipy.optimize",
+)  # fmt: skip
 LIMIT = 3  # times the processor time of the unchanged module, and five seconds
 
 _EXCHANGED = {
@@ -118,12 +126,11 @@ class Sites(ast.NodeVisitor):
     def _statement(self, node):
         if isinstance(node, ast.AugAssign) and type(node.op) in _EXCHANGED:
             self.add(node, "operator", lambda n: _set(n, op=_EXCHANGED[type(n.op)]()))
-        again = isinstance(node, ast.Assign) and any(
-            isinstance(part, ast.Subscript)
-            or (isinstance(part, ast.Name) and part.id in {n.id for n in ast.walk(node.value) if isinstance(n, ast.Name)})
-            for target in node.targets
-            for part in getattr(target, "elts", [target])
-        )
+        again = False
+        if isinstance(node, ast.Assign):  # of a part, or of what has a value already
+            used = {part.id for part in ast.walk(node.value) if isinstance(part, ast.Name)}
+            parts = [part for target in node.targets for part in getattr(target, "elts", [target])]
+            again = any(isinstance(part, ast.Subscript) or getattr(part, "id", None) in used for part in parts)
         call = isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
         if self.function and (again or call or isinstance(node, (ast.AugAssign, ast.Break, ast.Continue))):
             self.add(node, "left out", lambda n: ast.Pass())
@@ -169,7 +176,7 @@ def _tells(node):
 
 def _is_text(node):
     parts = [getattr(node, "left", None), getattr(node, "right", None)]
-    return any(isinstance(p, ast.JoinedStr) or (isinstance(p, ast.Constant) and isinstance(p.value, str)) for p in parts)
+    return any(isinstance(part, ast.JoinedStr) or isinstance(getattr(part, "value", None), str) for part in parts)
 
 
 class _Replace(ast.NodeTransformer):
@@ -212,18 +219,20 @@ def mutants(path, seed):
     return sorted(made, key=lambda mutant: mutant["round"])
 
 
-def mutated(path, place):
-    """The source of a module with the change at this place among its `Sites`."""
+def mutated(path, place=None):
+    """The source of a module with the change at this place among its `Sites`, or none."""
     tree, sites = ast.parse(path.read_text()), Sites()
+    if place is None:
+        return ast.unparse(tree)
     sites.visit(tree)
     node, change = sites.found[place][2], sites.found[place][4]
     return ast.unparse(ast.fix_missing_locations(_Replace(node, change(copy.copy(node))).visit(tree)))
 
 
-def drawn(number, seed, only=None):
+def drawn(package, number, seed, only=None):
     """So many mutants, as evenly over the modules as they allow: ``{module: list}``."""
     modules = [name for name in MODULES if only is None or Path(name).stem in only]
-    everything = {name: mutants(ROOT / "legdistort" / name, seed) for name in modules}
+    everything = {name: mutants(package / name, seed) for name in modules}
     share = dict.fromkeys(modules, 0)
     for k in range(number):
         name = modules[k % len(modules)]
@@ -280,11 +289,13 @@ class Bench:
         for name in ("legdistort", "tests"):
             shutil.copytree(ROOT / name, self.tree / name, ignore=left_out)
         shutil.copy2(ROOT / "pyproject.toml", self.tree)
+        compileall.compile_dir(self.tree, quiet=2)
+        self.package = self.tree / "legdistort"
         self.told, self.output = folder / "told.json", folder / "output.txt"
 
     def run(self, name, source, mark, limit):
         """``(result, by, seconds)`` of the tests of a module with another source; `limit` s of the processor."""
-        path = self.tree / "legdistort" / name
+        path = self.package / name
         original = path.read_text()
         self.told.unlink(missing_ok=True)
         shutil.rmtree(self.tree / ".hypothesis", ignore_errors=True)
@@ -351,55 +362,61 @@ class Bench:
 def warm():
     """Import what all tests need of other packages, once, and nothing of ours."""
     sys.modules["legdistort"] = None  # astropy would load what we offer it
-    import asdf
-    import astropy.coordinates
-    import astropy.io.fits
-    import astropy.modeling
-    import astropy.table
-    import astropy.wcs
-    import gwcs
-    import matplotlib as mpl
-    import numba
-    import photutils.detection
-    import pytest
-    import reproject
-    import scipy.optimize  # noqa: F401
-
-    mpl.use("Agg")
+    with warnings.catch_warnings(action="ignore"):
+        for name in LIBRARIES:
+            importlib.import_module(name)
     del sys.modules["legdistort"]
+    assert not [name for name in sys.modules if name.partition(".")[0] == "legdistort"]
 
 
 def main(given):
     """Run the mutants; the rows of the table."""
     os.environ.update(PYTHONPATH="", OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
+    os.environ.update(MPLBACKEND="Agg")
     os.environ.pop("LEGDISTORT_DATA", None)
     sys.path[:] = [each for each in sys.path if Path(each or ".").resolve() not in (ROOT, HERE, HERE.parent)]
-    with warnings.catch_warnings(action="ignore"):
-        warm()
-    assert not [name for name in sys.modules if name.partition(".")[0] == "legdistort"]
+    warm()
     with EQUIVALENT.open(newline="") as file:
         reasons = {row["id"]: row["reason"] for row in csv.DictReader(file)}
-    chosen, rows = drawn(given.mutants, given.seed, given.only), []
-    if given.id:
-        chosen = {name: [m for m in mutants(ROOT / "legdistort" / name, given.seed) if m["id"] in given.id] for name in chosen}
-        chosen = {name: some for name, some in chosen.items() if some}
-    begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        bench = Bench(Path(folder).resolve())
-        for name, some in chosen.items():
-            plain = ast.unparse(ast.parse((ROOT / "legdistort" / name).read_text()))
-            result, by, seconds = bench.run(name, plain, f"control {name}", 600)
+        bench, rows = Bench(Path(folder).resolve()), []
+        for name, some in chosen(given, bench.package).items():
+            result, by, seconds = bench.run(name, mutated(bench.package / name), f"control {name}", 600)
             if result != "survived":
                 raise SystemExit(f"{name}: unchanged, {by} fails\n{bench.output.read_text()[-3000:]}")
             print(f"control {name}: {seconds:.1f} s", flush=True)
             for mutant in some:
-                result, by, took = bench.run(name, mutated(ROOT / "legdistort" / name, mutant["place"]), mutant["id"], LIMIT * seconds + 5)
+                source = mutated(bench.package / name, mutant["place"])
+                result, by, took = bench.run(name, source, mutant["id"], LIMIT * seconds + 5)
                 if result == "survived" and mutant["id"] in reasons:
                     result, by = "equivalent", reasons[mutant["id"]]
                 rows.append({**mutant, "result": result, "by": by})
-                print(f"{result:10s} {mutant['id']} line {mutant['line']}, {mutant['function']}: {mutant['change']} [{by}] {took:.1f} s", flush=True)
-    print(f"{len(rows)} mutants in {time.perf_counter() - begin:.0f} s")
+                where = f"{mutant['id']} line {mutant['line']}, {mutant['function']}"
+                print(f"{result:10s} {where}: {mutant['change']} [{by}] {took:.1f} s", flush=True)
     return rows
+
+
+def chosen(given, package):
+    """The mutants that are asked for, by module; with ``--again`` those of the table that were not killed."""
+    drawn_ones = drawn(package, given.mutants, given.seed, given.only)
+    if given.again:
+        left = {row["id"] for row in read_table() if row["result"] != "killed"}
+        drawn_ones = {name: [m for m in some if m["id"] in left] for name, some in drawn_ones.items()}
+    return {name: some for name, some in drawn_ones.items() if some}
+
+
+def read_table():
+    """The rows of the table."""
+    with TABLE.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write_table(rows):
+    """Write the table."""
+    with TABLE.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 if __name__ == "__main__":
@@ -407,23 +424,23 @@ if __name__ == "__main__":
     parser.add_argument("--mutants", type=int, default=208)
     parser.add_argument("--seed", type=int, default=2017)
     parser.add_argument("--only", nargs="+", help="modules, such as criterion")
-    parser.add_argument("--id", nargs="+", help="single mutants")
+    parser.add_argument("--again", action="store_true", help="those of the table that were not killed")
     parser.add_argument("--list", action="store_true", help="show the mutants, run nothing")
     given = parser.parse_args()
     if given.list:
-        for name, some in drawn(given.mutants, given.seed, given.only).items():
-            print(f"{name}: {len(mutants(ROOT / 'legdistort' / name, given.seed))} possible")
+        for name, some in chosen(given, ROOT / "legdistort").items():
             for mutant in some:
-                print(f"  {mutant['id']} line {mutant['line']}, {mutant['function']}: {mutant['change']}")
+                print(f"{name}: {mutant['id']} line {mutant['line']}, {mutant['function']}: {mutant['change']}")
         sys.exit()
+    begin = time.perf_counter()
     table = main(given)
-    print(f"{'module':24s} mutants  killed  survived  equivalent")
+    if given.again:
+        fresh = {row["id"]: row for row in table}
+        table = [fresh.get(row["id"], row) for row in read_table()]
+    print(f"{'module':24s} mutants  killed  survived  equivalent   in {time.perf_counter() - begin:.0f} s")
     for module in [*dict.fromkeys(row["module"] for row in table), "all"]:
         found = Counter(row["result"] for row in table if module in (row["module"], "all"))
         print(f"{module:24s} {found.total():7d} {found['killed']:7d} {found['survived']:9d} {found['equivalent']:11d}")
-    if not (given.only or given.id):
-        with TABLE.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(table)
+    if given.again or not given.only:
+        write_table(table)
     sys.exit(any(row["result"] == "survived" for row in table))
