@@ -44,11 +44,26 @@ TABLE, EQUIVALENT = HERE / "mutants.csv", HERE / "equivalent_mutants.csv"
 COLUMNS = ("module", "id", "line", "function", "change", "result", "by")
 #: Module -> its tests, the ones that fail soonest first.
 MODULES = {
-    "solving/equations/criterion.py": ["solvers", "motions", "selfcalibration", "errors"],
-    "solving/equations/elimination.py": ["solvers", "motions", "kernels"],
-    "solving/equations/reduced_system.py": ["solvers", "selfcalibration", "errors", "kernels", "motions"],
-    "solving/gauge/constraints.py": ["hierarchy", "solvers", "selfcalibration", "poses", "forms", "motions"],
-    "solving/gauge/hierarchy.py": ["hierarchy", "solvers", "reference", "motions"],
+    "solving/equations/criterion.py": ["normal_equations", "solvers", "motions", "selfcalibration", "errors"],
+    "solving/equations/elimination.py": ["normal_equations", "solvers", "motions", "kernels"],
+    "solving/equations/reduced_system.py": [
+        "normal_equations",
+        "solvers",
+        "selfcalibration",
+        "errors",
+        "kernels",
+        "motions",
+    ],
+    "solving/gauge/constraints.py": [
+        "hierarchy",
+        "gauge_laws",
+        "solvers",
+        "selfcalibration",
+        "poses",
+        "forms",
+        "motions",
+    ],
+    "solving/gauge/hierarchy.py": ["hierarchy", "gauge_laws", "solvers", "reference", "motions"],
     "solving/gauge/catalogue_map.py": ["reference", "hierarchy"],
     "solving/reference_tie.py": ["reference", "motions"],
     "geometry/distortion.py": ["distortion", "headers"],
