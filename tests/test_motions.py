@@ -467,6 +467,16 @@ def test_absolute_motions_tied_to_a_catalogue_are_calibrated(n, accuracy, sigma)
     assert np.sqrt(np.mean(true)) < 0.1  # the exposures by themselves: 0.08 after the common motion of 0.2
 
 
+def test_motions_are_tied_to_a_catalogue_with_parallaxes_too():
+    """The mean motion is that of the catalogue, whether or not parallaxes are fitted beside it."""
+    sim = field(60, FIVE, parallax=0.02, sigma=0.02)
+    gaia = catalogue(sim, np.random.default_rng(3), rate=np.array([0.2, -0.1]))
+    solution = solve(sim.matches, motion="parallax", reference=gaia, clip=None)
+    assert solution.gauge.drift.n_tied == 30
+    off = (solution.motions.values[:, :2] - sim.truth.motions).mean(axis=0)
+    assert_allclose(off, [0.2, -0.1], atol=0.05)
+
+
 def test_motions_of_a_catalogue_that_disagree():
     sim = field(60)
     gaia = catalogue(sim, RNG)

@@ -68,8 +68,8 @@ MODULES = {
     "geometry/distortion.py": ["distortion", "headers"],
     "coaddition/resampling/pixel_maps.py": ["coaddition", "spline_kernels"],
     "coaddition/combination.py": ["combination", "coaddition"],
-    "priors/prior.py": ["priors", "declared_size", "sources"],
-    "priors/from_headers.py": ["foreign_images", "sources"],
+    "priors/prior.py": ["priors", "image_files", "declared_size", "sources"],
+    "priors/from_headers.py": ["image_files", "foreign_images", "sources"],
     "wcs/fits_headers.py": ["headers"],
 }
 #: Tests that are not tried: of commands, files and pictures, and of many realisations.
