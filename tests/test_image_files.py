@@ -1,7 +1,7 @@
 """Files as people have them: several images in one, blank and truncated ones among good, distortions in headers."""
 
-import re
 import json
+import re
 import warnings
 
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData
 from astropy.table import Table, vstack
-from astropy.wcs import WCS
+from astropy.wcs import WCS, DistortionLookupTable
 from caller_warnings import warns_here
 
 import legdistort as ld
@@ -290,6 +290,11 @@ def test_the_kind_of_a_distortion_is_named():
     told = describe(header_distortions([Exposure("a", pixels(), wcs=WCS(tpv)), exposure(0, sip=None)]))
     assert re.fullmatch(r"TPV, up to \d.* px over the detector", told)
     assert describe(header_distortions([exposure(0)])).startswith("SIP, up to")
+    table = WCS(header(0, sip=None))
+    shifts = np.zeros((3, 3), "f4")
+    shifts[1, 1] = 2.0
+    table.cpdis1 = DistortionLookupTable(shifts, (1, 1), (1, 1), (SHAPE[1] / 2, SHAPE[0] / 2))
+    assert describe(header_distortions([Exposure("a", pixels(), wcs=table)])).startswith("look-up tables, up to")
 
 
 def test_headers_that_differ_give_each_its_own():

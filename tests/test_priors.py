@@ -227,9 +227,9 @@ def test_a_scatter_given_anew_keeps_the_rest():
 
 def test_words_for_widths():
     assert Prior(np.zeros((2, 3)), sigma="evidence").sigma == "evidence"
-    for given in ({"sigma": "some"}, {"static_sigma": "evidence"}):
+    for words in ({"sigma": "some"}, {"static_sigma": "evidence"}):
         with pytest.raises(InputError, match=r"must be widths in pixels.*, got '"):
-            Prior(np.zeros((2, 3)), **given)
+            Prior(np.zeros((2, 3)), **words)
     assert Prior(None, static_sigma=0.01).static_sigma == 0.01
     for size in (0.0, -1.0, np.inf, np.nan, None, True, "x"):
         with pytest.raises(InputError, match="without a mean, static_sigma must be a positive number"):

@@ -411,11 +411,11 @@ def main(given):
 
 
 def chosen(given, package):
-    """The mutants that are asked for, by module; with ``--again`` those of the table that were not killed."""
+    """The mutants that are asked for, by module; with ``--again`` those that the table does not have as killed."""
     drawn_ones = drawn(package, given.mutants, given.seed, given.only)
     if given.again:
-        left = {row["id"] for row in read_table() if row["result"] != "killed"}
-        drawn_ones = {name: [m for m in some if m["id"] in left] for name, some in drawn_ones.items()}
+        killed = {row["id"] for row in read_table() if row["result"] == "killed"}
+        drawn_ones = {name: [m for m in some if m["id"] not in killed] for name, some in drawn_ones.items()}
     return {name: some for name, some in drawn_ones.items() if some}
 
 
@@ -438,7 +438,7 @@ if __name__ == "__main__":
     parser.add_argument("--mutants", type=int, default=208)
     parser.add_argument("--seed", type=int, default=2017)
     parser.add_argument("--only", nargs="+", help="modules, such as criterion")
-    parser.add_argument("--again", action="store_true", help="those of the table that were not killed")
+    parser.add_argument("--again", action="store_true", help="those that the table does not have as killed")
     parser.add_argument("--list", action="store_true", help="show the mutants, run nothing")
     given = parser.parse_args()
     if given.list:
@@ -449,8 +449,9 @@ if __name__ == "__main__":
     begin = time.perf_counter()
     table = main(given)
     if given.again:
-        fresh = {row["id"]: row for row in table}
-        table = [fresh.get(row["id"], row) for row in read_table()]
+        known = {row["id"]: row for row in [*read_table(), *table]}
+        everything = drawn(ROOT / "legdistort", given.mutants, given.seed).values()
+        table = [known[mutant["id"]] | {"line": mutant["line"]} for some in everything for mutant in some]
     print(f"{'module':24s} mutants  killed  survived  equivalent   in {time.perf_counter() - begin:.0f} s")
     for module in [*dict.fromkeys(row["module"] for row in table), "all"]:
         found = Counter(row["result"] for row in table if module in (row["module"], "all"))
