@@ -63,7 +63,7 @@ def ramp(k, fwhm=2.5, ratio=1.3):
     return fwhm * np.linspace(1, ratio, k)
 
 
-def test_flags_of_pixels_are_what_files_of_mosaics_say():
+def test_flags_of_pixels_are_what_mosaics_say():
     assert {flag.name: flag.value for flag in PixelFlag} == {"EXTRAPOLATED": 1, "SATURATED": 2, "REJECTED": 4}
 
 

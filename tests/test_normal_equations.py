@@ -1,6 +1,7 @@
 """Normal equations and reduced system against dense matrices from a numerical Jacobian: no step of theirs in common."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import oracle
@@ -282,3 +283,14 @@ def test_what_exposures_share_is_held_where_they_do_not_tell_it(monkeypatch):
     close(d, bordered.solve(rhs, np.concatenate([target, np.zeros(len(weak))])))
     moves = np.stack([bordered.solve(0 * rhs, unit) for unit in np.eye(len(bordered.rows))])[: len(own)]
     close(found.information, moves @ bordered.s @ moves.T, 2e-3)
+
+
+def test_the_exposures_to_blame_are_named_the_worst_first():
+    """Four of six exposures have a part in what is not determined, one of them less than a tenth."""
+    parts = np.sqrt([0.0, 0.15, 0.5, 0.05, 0.0, 0.3])
+    direction = np.outer(parts, np.ones(4) / 2).ravel()
+    problem = SimpleNamespace(
+        names=tuple("abcdef"), degree=2, unknowns=SimpleNamespace(spread=lambda vector: vector.reshape(6, 4))
+    )
+    told = reduced_system._singular_message(problem, np.eye(24) - np.outer(direction, direction))
+    assert "above all in exposure c, f, b: lower the degree" in told

@@ -73,7 +73,18 @@ MODULES = {
     "wcs/fits_headers.py": ["headers"],
 }
 #: Tests that are not tried: of commands, files and pictures, and of many realisations.
-_LEFT_OUT = ["command", "shell", "report", "picture", "file", "calibrated", "decides_by_evidence", "another_field"]
+_LEFT_OUT = [
+    "command",
+    "shell",
+    "report",
+    "picture",
+    "files_keep",
+    "a_file",
+    "TestFile",
+    "calibrated",
+    "decides_by_evidence",
+    "another_field",
+]
 #: What the tests need of other packages.
 LIBRARIES = (
     "asdf", "astropy.coordinates", "astropy.io.fits", "astropy.modeling", "astropy.table", "astropy.wcs", "gwcs",
@@ -243,15 +254,14 @@ def mutated(path, place=None):
     return ast.unparse(ast.fix_missing_locations(_Replace(node, change(copy.copy(node))).visit(tree)))
 
 
-def drawn(package, number, seed, only=None):
+def drawn(package, number, seed):
     """So many mutants, as evenly over the modules as they allow: ``{module: list}``."""
-    modules = [name for name in MODULES if only is None or Path(name).stem in only]
-    everything = {name: mutants(package / name, seed) for name in modules}
-    share = dict.fromkeys(modules, 0)
+    everything = {name: mutants(package / name, seed) for name in MODULES}
+    share, names = Counter(), list(MODULES)
     for k in range(number):
-        name = modules[k % len(modules)]
+        name = names[k % len(names)]
         share[name] += share[name] < len(everything[name])
-    return {name: everything[name][: share[name]] for name in modules}
+    return {name: some[: share[name]] for name, some in everything.items()}
 
 
 # --- running ------------------------------------------------------------------------------------------------------
@@ -295,9 +305,12 @@ class Bench:
     ----------
     folder : Path
         For the copy.
+    words : str, optional
+        Of the names of the tests that are tried.
     """
 
-    def __init__(self, folder):
+    def __init__(self, folder, words=None):
+        self.words = f"({words}) and " * bool(words) + "not (" + " or ".join(_LEFT_OUT) + ")"
         self.tree = folder / "tree"
         left_out = shutil.ignore_patterns(".hypothesis", ".pytest_cache", ".benchmarks")
         for name in ("legdistort", "tests"):
@@ -368,8 +381,7 @@ class Bench:
         sys.dont_write_bytecode = True
         witness = Witness("legdistort." + name.removesuffix(".py").replace("/", "."), self.told)
         tests = [f"tests/test_{each}.py" for each in MODULES[name]]
-        words = "not (" + " or ".join(_LEFT_OUT) + ")"
-        options = ["-x", "-q", "-k", words, "-p", "no:cacheprovider", "-p", "no:xdist", "--hypothesis-seed=0"]
+        options = ["-x", "-q", "-k", self.words, "-p", "no:cacheprovider", "-p", "no:xdist", "--hypothesis-seed=0"]
         return int(pytest.main([*options, *tests], plugins=[witness]))
 
 
@@ -390,10 +402,8 @@ def main(given):
     os.environ.pop("LEGDISTORT_DATA", None)
     sys.path[:] = [each for each in sys.path if Path(each or ".").resolve() not in (ROOT, HERE, HERE.parent)]
     warm()
-    with EQUIVALENT.open(newline="") as file:
-        reasons = {row["id"]: row["reason"] for row in csv.DictReader(file)}
     with tempfile.TemporaryDirectory() as folder:
-        bench, rows = Bench(Path(folder).resolve()), []
+        bench, rows = Bench(Path(folder).resolve(), given.words), []
         for name, some in chosen(given, bench.package).items():
             result, by, seconds = bench.run(name, mutated(bench.package / name), f"control {name}", 600)
             if result != "survived":
@@ -402,21 +412,33 @@ def main(given):
             for mutant in some:
                 source = mutated(bench.package / name, mutant["place"])
                 result, by, took = bench.run(name, source, mutant["id"], LIMIT * seconds + 5)
-                if result == "survived" and mutant["id"] in reasons:
-                    result, by = "equivalent", reasons[mutant["id"]]
-                rows.append({**mutant, "result": result, "by": by})
+                rows += judged([{**mutant, "result": result, "by": by}])
+                result, by = rows[-1]["result"], rows[-1]["by"]
                 where = f"{mutant['id']} line {mutant['line']}, {mutant['function']}"
                 print(f"{result:10s} {where}: {mutant['change']} [{by}] {took:.1f} s", flush=True)
     return rows
 
 
 def chosen(given, package):
-    """The mutants that are asked for, by module; with ``--again`` those that the table does not have as killed."""
-    drawn_ones = drawn(package, given.mutants, given.seed, given.only)
+    """The mutants that are asked for, by module; with ``--again`` those that the table lacks, or has as survived."""
+    drawn_ones = drawn(package, given.mutants, given.seed)
     if given.again:
-        killed = {row["id"] for row in read_table() if row["result"] == "killed"}
-        drawn_ones = {name: [m for m in some if m["id"] not in killed] for name, some in drawn_ones.items()}
-    return {name: some for name, some in drawn_ones.items() if some}
+        done = {row["id"] for row in judged(read_table()) if row["result"] != "survived"}
+        drawn_ones = {name: [m for m in some if m["id"] not in done] for name, some in drawn_ones.items()}
+    wanted = given.only or [Path(name).stem for name in MODULES]
+    return {name: some for name, some in drawn_ones.items() if some and Path(name).stem in wanted}
+
+
+def judged(rows):
+    """The same rows, those that survived and have a reason as equivalent."""
+    with EQUIVALENT.open(newline="") as file:
+        reasons = {row["id"]: row["reason"] for row in csv.DictReader(file)}
+    return [
+        row | {"result": "equivalent", "by": reasons[row["id"]]}
+        if row["result"] == "survived" and row["id"] in reasons
+        else row
+        for row in rows
+    ]
 
 
 def read_table():
@@ -438,7 +460,8 @@ if __name__ == "__main__":
     parser.add_argument("--mutants", type=int, default=208)
     parser.add_argument("--seed", type=int, default=2017)
     parser.add_argument("--only", nargs="+", help="modules, such as criterion")
-    parser.add_argument("--again", action="store_true", help="those that the table does not have as killed")
+    parser.add_argument("--again", action="store_true", help="those that the table has not, or as survived")
+    parser.add_argument("--words", help="of the names of the tests that are tried, as of pytest -k")
     parser.add_argument("--list", action="store_true", help="show the mutants, run nothing")
     given = parser.parse_args()
     if given.list:
@@ -449,9 +472,10 @@ if __name__ == "__main__":
     begin = time.perf_counter()
     table = main(given)
     if given.again:
-        known = {row["id"]: row for row in [*read_table(), *table]}
+        known = {row["id"]: row for row in judged([*read_table(), *table])}
         everything = drawn(ROOT / "legdistort", given.mutants, given.seed).values()
-        table = [known[mutant["id"]] | {"line": mutant["line"]} for some in everything for mutant in some]
+        drawn_ones = [mutant for some in everything for mutant in some if mutant["id"] in known]
+        table = [known[mutant["id"]] | {"line": mutant["line"]} for mutant in drawn_ones]
     print(f"{'module':24s} mutants  killed  survived  equivalent   in {time.perf_counter() - begin:.0f} s")
     for module in [*dict.fromkeys(row["module"] for row in table), "all"]:
         found = Counter(row["result"] for row in table if module in (row["module"], "all"))
