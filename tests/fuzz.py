@@ -4,19 +4,21 @@
 
 draws inputs from the small files of ``tests/corpus`` and ``tests/written`` (``python tests/fuzz.py --corpus`` makes the
 former), does some damage, and hands them to the reader. A fault is any error that is not a `LegdistortError`, an input
-that was changed, a file that was left behind, or half a minute of work. What was read is used as well: a table is
-matched or solved, a solution printed and evaluated. Seeds are numbers, so that a fault can be made again:
-``python tests/fuzz.py --seed 1234``.
+that was changed, a file that was left behind, or half a minute of work; ten minutes in compiled code end the command.
+What was read is used as well: a table is matched or solved, a solution printed and evaluated. Seeds are numbers, so
+that a fault can be made again: ``python tests/fuzz.py --seed 1234``.
 """
 
 import argparse
 import gzip
 import inspect
 import io
+import os
 import re
 import signal
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import warnings
@@ -210,8 +212,23 @@ def _ring(*_):
     raise Slow
 
 
+def _give_up(seed):
+    print(f"seed {seed}: no answer in {20 * TIME} s, in compiled code, which no signal reaches", flush=True)
+    os._exit(1)
+
+
 def attempt(seed, folder):
     """The entry point, the fault or None, and the traceback, for one input."""
+    watch = threading.Timer(20 * TIME, _give_up, [seed])
+    watch.daemon = True
+    watch.start()
+    try:
+        return _attempt(seed, folder)
+    finally:
+        watch.cancel()
+
+
+def _attempt(seed, folder):
     rng = np.random.default_rng(seed)
     entry = list(READERS)[rng.integers(len(READERS))]
     use, names = READERS[entry]

@@ -2,13 +2,14 @@
 
     python tests/kills.py --kills 200
 
-runs `solve`, `run`, `coadd` and `attach`, each into a new folder and over the results of an earlier call. Every
-rename, removal, making of a folder or file, every ``fsync`` and every write is one place to be killed at, a write in
-its middle. The process that works forks one child for every kill, as late as it can, so that the work itself is done
-once.
+runs `solve`, `run`, `coadd`, `attach`, `simulate` and `measure --write-psf`, each into a new folder and over the
+results of an earlier call. Every rename, removal, making of a folder or file, every ``fsync`` and every write is one
+place to be killed at, a write in its middle. The process that works forks one child for every kill, as late as it can,
+so that the work itself is done once.
 
 After each kill the next reader (``legdistort show DIR`` where there is a solution) must succeed and leave a folder that
-is, byte for byte, the old one or the new one. Linux only.
+is, byte for byte, the old one or the new one. `measure` has two results, a folder of PSFs and then a table: between
+them the PSFs are new and the table is not, which the checksums in the table tell. Linux only.
 """
 
 import argparse
@@ -38,6 +39,8 @@ from legdistort.wcs import attachment
 
 #: What changes from call to call, the time aside: the word of a run and the seconds it took.
 VARYING = {"summary.json", "report.html"}
+#: Of `measure`, beside the PSFs.
+TABLE = "stars.ecsv"
 _LAST = 25
 _CHANGING = ("replace", "rename", "mkdir", "unlink", "remove", "rmdir", "fsync", "link", "symlink")
 
@@ -158,12 +161,15 @@ class Case:
         What the next reader does with `out`; returns its exit status.
     old : bool
         Whether `out` holds the results of an earlier call.
+    between : callable
+        Whether what is found, as `state` gives it, is between two results of a command, and tells so.
     """
 
-    def __init__(self, name, arguments, out, read, old):
+    def __init__(self, name, arguments, out, read, old, between=None):
         self.name, self.arguments, self.out, self.read, self.old = name, arguments, out, read, old
+        self.between = between
         self.root = out.parent
-        self.faults, self.kills, self.results = [], 0, {"old": 0, "new": 0}
+        self.faults, self.kills, self.results = [], 0, {"old": 0, "new": 0, "between": 0}
 
     def call(self):
         return quietly([*self.arguments, *(["--overwrite"] if self.old else [])])
@@ -279,6 +285,8 @@ class Case:
             verdict = "new"
         elif found == self.before and (status == 0 or not self.old):
             verdict = "old"
+        elif self.between and status == 0 and self.between(self, found):
+            verdict = "between"
         else:
             old, new = (each or {} for each in (self.before, self.after))
             odd = {
@@ -336,6 +344,32 @@ def open_frames(out):
     return 0
 
 
+def open_measured(out):
+    """The next reader of a folder with a table of detections and their PSFs."""
+    from legdistort.inputs.table_files import read_table
+    from legdistort.measurement.effective.model import EffectivePSF
+
+    outputs.settle(out, out / "psf")
+    for path in sorted((out / "psf").glob("*.fits")):
+        EffectivePSF.read(path)
+    if (out / TABLE).exists():
+        read_table(out / TABLE)
+    return 0
+
+
+def psfs_before_the_table(case, found):
+    """Whether the PSFs are the new ones, and the table is the old one, which has the checksums of others, or none."""
+    from astropy.table import Table
+
+    if any(found.get(name) != digest for name, digest in case.after.items() if name != TABLE):
+        return False
+    if found.keys() - {TABLE} != case.after.keys() - {TABLE} or found.get(TABLE) != case.before.get(TABLE):
+        return False
+    return TABLE not in found or any(
+        found[f"psf/{name}"] != digest for name, digest in Table.read(case.out / TABLE).meta["psf_files"].items()
+    )
+
+
 def cases(folder, only=None):
     """The cases, prepared in a folder: every command into a new folder, and over the results of an earlier call."""
     night = folder / "night"
@@ -351,6 +385,8 @@ def cases(folder, only=None):
         "run": (["run", *moffat], show, "."),
         "coadd": (["coadd", *frames, "--solution", solution], open_mosaic, "mosaic.fits"),
         "attach": (["attach", solution, *frames], open_frames, "."),
+        "simulate": (["simulate", "--small", "--seed", "1"], open_frames, "."),
+        "measure": (["measure", *frames, "--psf", "effective", "--write-psf", "{out}/psf"], open_measured, TABLE),
     }
     for name, (arguments, read, file) in calls.items():
         if only not in (None, name):
@@ -358,8 +394,8 @@ def cases(folder, only=None):
         for old in (False, True):
             out = folder / f"{name}-{'old' if old else 'new'}" / "room" / "out"
             out.parent.mkdir(parents=True)
-            arguments_of = [*arguments, "--out", str(out / file)]
-            if old or name == "coadd":  # a file needs a folder
+            arguments_of = [each.replace("{out}", str(out)) for each in [*arguments, "--out", str(out / file)]]
+            if old or name in ("coadd", "measure"):  # a file needs a folder
                 out.mkdir()
                 (out / "notes.txt").write_text("not ours")
             if old:
@@ -372,8 +408,13 @@ def cases(folder, only=None):
                     earlier = [*arguments_of, "--combine", "median"]
                 elif name == "attach":
                     earlier = [*arguments_of, "--asdf-only"]
+                elif name == "simulate":
+                    earlier = [*arguments_of[:-3], "2", *arguments_of[-2:]]
+                elif name == "measure":
+                    earlier = [*arguments_of, "--gain", "3"]
                 assert quietly([*earlier]) == 0
-            yield Case(f"{name} {'over an earlier one' if old else 'into a new folder'}", arguments_of, out, read, old)
+            what = f"{name} {'over an earlier one' if old else 'into a new folder'}"
+            yield Case(what, arguments_of, out, read, old, psfs_before_the_table if name == "measure" else None)
     if only in (None, "attach"):
         out = folder / "attach-in-place" / "room" / "out"
         shutil.copytree(night, out)
@@ -390,7 +431,7 @@ def kill(n_kills, folder, only=None):
         share = n_kills * (i + 1) // len(everything) - n_kills * i // len(everything)
         begin = time.perf_counter()
         total = case.run(share)
-        rows.append((case.name, total, case.kills, case.results["old"], case.results["new"], len(case.faults),
+        rows.append((case.name, total, case.kills, *case.results.values(), len(case.faults),
                      time.perf_counter() - begin))  # fmt: skip
         faults += case.faults
     return rows, faults
@@ -399,15 +440,15 @@ def kill(n_kills, folder, only=None):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--only", help="solve, run, coadd or attach")
+    parser.add_argument("--only", help="solve, run, coadd, attach, simulate or measure")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         table, wrong = kill(given.kills, place, given.only)
-    print(f"{'command':28s} operations  kills   old   new  faults  seconds")
-    for name, total, kills, old, new, bad, seconds in table:
-        print(f"{name:28s} {total:10d} {kills:6d} {old:5d} {new:5d} {bad:7d} {seconds:8.1f}")
-    print(f"{'all':28s} {sum(r[1] for r in table):10d} {sum(r[2] for r in table):6d} {sum(r[3] for r in table):5d} "
-          f"{sum(r[4] for r in table):5d} {len(wrong):7d}")  # fmt: skip
+    print(f"{'command':28s} operations  kills   old   new  between  faults  seconds")
+    for name, total, kills, old, new, between, bad, seconds in table:
+        print(f"{name:28s} {total:10d} {kills:6d} {old:5d} {new:5d} {between:8d} {bad:7d} {seconds:8.1f}")
+    total, kills, old, new, between = (sum(row[k] for row in table) for k in range(1, 6))
+    print(f"{'all':28s} {total:10d} {kills:6d} {old:5d} {new:5d} {between:8d} {len(wrong):7d}")
     if wrong:
         print("\n".join(wrong))
     sys.exit(bool(wrong))

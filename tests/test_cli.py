@@ -143,6 +143,13 @@ def test_steps_one_by_one(night, tmp_path, capsys):
     assert (tmp_path / "r.html").exists()
 
 
+def test_simulate_replaces_no_frames_of_somebody_else(tmp_path, capsys):
+    (tmp_path / "exp03.fits").write_text("precious")
+    failed(capsys, main(["simulate", "--small", "--out", str(tmp_path), "--quiet"]), "exp03.fits exists", "--overwrite")
+    assert [path.name for path in tmp_path.iterdir()] == ["exp03.fits"]
+    assert (tmp_path / "exp03.fits").read_text() == "precious"
+
+
 def test_simulate_writes_frames_and_truth(tmp_path, capsys):
     assert main(["simulate", "--small", "--out", str(tmp_path / "n"), "--quiet"]) == 0
     assert len(list((tmp_path / "n").glob("*.fits"))) == 6

@@ -27,7 +27,7 @@ from legdistort.coaddition.grids import read_grid, reference_grid
 from legdistort.coaddition.mosaicking import coadd
 from legdistort.coaddition.options import CoaddOptions
 from legdistort.coaddition.preparation import fill_bad
-from legdistort.coaddition.resampling.pixel_maps import tabulate, trace
+from legdistort.coaddition.resampling.pixel_maps import map_exposure, tabulate, trace
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.basis import from_tensor
@@ -329,6 +329,49 @@ class TestSky:
             ok = np.isfinite(dx + dy).all(axis=1)
             area = np.abs(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0])
             np.testing.assert_allclose(exact[ok, 4], area[ok], rtol=1e-6)
+
+    def test_tables_are_as_large_as_the_function_needs(self):
+        def function(p):
+            x, y = (p[:, 0] - 100) / 200, (p[:, 1] - 40) / 50
+            return np.stack([x**5 + y, 3 + 0 * x], 1)
+
+        table = tabulate(function, (3, 5), (80, 300))
+        assert table.coefficients.shape == (2, 2, 6)  # degrees 1 in y, 5 in x
+        y, x = np.mgrid[5:85, 3:303]
+        exact = function(np.stack([x.ravel(), y.ravel()], 1)).T.reshape(2, 80, 300)
+        np.testing.assert_allclose(table(slice(5, 85), slice(3, 303)), exact, atol=1e-11)
+        along = table.along_edge(slice(10, 14), slice(20, 25))
+        inner = exact[:, 5:9, 17:22]
+        edge = [inner[:, [0, -1]].reshape(2, -1), inner[:, :, [0, -1]].reshape(2, -1)]
+        np.testing.assert_allclose(along, np.concatenate(edge, axis=1), atol=1e-11)
+
+    @pytest.mark.parametrize("axis", [0, 1])
+    def test_pieces_know_which_pixels_lie_on_the_detector(self, axis):
+        """Also where the distortion, beyond where it is valid, folds back onto the detector, a long and narrow one."""
+        shape, far = ((120, 400), 200) if axis else ((400, 120), -200)
+        tensor = np.zeros((2, 4, 4))
+        orders = (0, [1, 3]) if axis else ([1, 3], 0)
+        tensor[axis][orders] = np.array([0.06, -0.06]) * shape[1 - axis] / 2
+        distortion = Distortion(from_tensor(tensor), shape)
+        turn = np.array([[1, -1], [1, 1]]) / np.sqrt(2)
+        poses = {name: np.column_stack([turn, [shift, -shift]]) for name, shift in (("a", 0), ("b", far))}
+        solution = StandIn(poses, dict.fromkeys(poses, distortion))
+        grid = reference_grid(list(poses), solution)
+        whole = map_exposure("a", solution, grid)
+        assert whole.corners is None
+        y, x = np.mgrid[: grid.shape[0], : grid.shape[1]]
+        planes = trace(np.stack([x.ravel(), y.ravel()], 1).astype(float), "a", solution, grid).T.reshape(5, *grid.shape)
+        on_it = ~outside((-1e-6, shape[1] - 1 + 1e-6, -1e-6, shape[0] - 1 + 1e-6), *planes[:2])
+        assert np.count_nonzero(on_it & outside(whole.valid, *planes[2:4])) > 100  # ghosts
+        seen = np.zeros(grid.shape, dtype=bool)
+        for row, column in itertools.product(range(0, grid.shape[0], 16), range(0, grid.shape[1], 16)):
+            found = whole.piece((slice(row, row + 16), slice(column, column + 16)), margin=2)
+            if found is not None:
+                piece, (rows, columns) = found
+                seen[piece.window] = piece.inside
+                xy = piece.xy + np.array([columns.start, rows.start]).reshape(2, 1, 1)
+                np.testing.assert_allclose(xy, planes[:2][:, *piece.window], atol=1e-6)
+        np.testing.assert_array_equal(seen, on_it & ~outside(whole.valid, *planes[2:4]))
 
     def test_a_rough_function_is_evaluated_everywhere(self):
         def rough(p):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from legdistort.coaddition.combination import combine, confirmed, margin
+from legdistort.coaddition.combination import PixelFlag, combine, confirmed, margin
 from legdistort.coaddition.resampling.engines import Resampling, resample_exposure
 from legdistort.coaddition.resampling.pixel_maps import PixelMap
 
@@ -61,6 +61,10 @@ def aperture(image, xy, r):
 
 def ramp(k, fwhm=2.5, ratio=1.3):
     return fwhm * np.linspace(1, ratio, k)
+
+
+def test_flags_of_pixels_are_what_mosaics_say():
+    assert {flag.name: flag.value for flag in PixelFlag} == {"EXTRAPOLATED": 1, "SATURATED": 2, "REJECTED": 4}
 
 
 class TestClipping:

@@ -162,6 +162,14 @@ def test_a_hidden_fold_in_the_middle_is_found():
         Distortion(a, (300, 300)).check_fold()
 
 
+def test_an_inverse_beyond_degree_30_is_refused():
+    """1.275 v - 0.275 v^3 along one axis: its inverse is steep at the edge."""
+    tensor = np.zeros((2, 4, 4))
+    tensor[1, 0, [1, 3]] = [16.5, -16.5]
+    with pytest.raises(FoldError, match=r"no inverse .*exp7 up to degree 30 is better than"):
+        _ = Distortion(basis.from_tensor(tensor), (300, 400), "exp7").inverse
+
+
 def test_a_point_that_nothing_is_mapped_on():
     d = folded()
     with pytest.raises(FoldError, match=r"exp7 cannot be inverted near pixel \(700, 200\)"):

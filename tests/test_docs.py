@@ -1,5 +1,6 @@
 """The README and the documentation say what is so: their Python runs, their commands are the ones checked."""
 
+import ast
 import re
 import shlex
 import tomllib
@@ -131,3 +132,18 @@ def test_pictures_are_small():
     for picture in (ROOT / "docs" / "images").rglob("*.*"):
         assert picture.suffix == ".png"
         assert picture.stat().st_size < 200_000
+
+
+def test_messages_on_the_page_of_messages_are_printed():
+    """Each heading is part of a text in the code, between what is put into it."""
+    texts = []
+    for path in (ROOT / "legdistort").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.append(node.value)
+    headings = re.findall(
+        r"^## (.*)$", (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    quoted = [part for heading in headings for part in re.findall("`(.*?)`", heading)]
+    assert len(quoted) >= len(headings) > 10
+    assert [part for part in quoted if not any(part in text for text in texts)] == []

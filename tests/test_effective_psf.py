@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from hashlib import sha256
 
 import numpy as np
 import pytest
@@ -461,9 +462,23 @@ def test_a_psf_for_every_exposure(psf, tmp_path):
     table = ld.measure(night()[0], psf="effective", write_psf=tmp_path / "out")
     again = ld.measure(night()[0], psf=tmp_path / "out")
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["night0.fits"]
+    digest = sha256((tmp_path / "out" / "night0.fits").read_bytes()).hexdigest()
+    assert table.meta["psf_files"] == {"night0.fits": digest}
+    ld.measure(night()[0], psf="effective", write_psf=tmp_path / "out")  # PSFs of an earlier call are replaced
     assert np.median(np.abs((again["x"] - table["x"]) / table["x_err"])) < 0.1
     with pytest.raises(InputError, match="no PSF for exposure moffats: it has those of night0"):
         ld.measure(moffat_exposure(), psf={"night0": psf})
+
+
+def test_frames_are_not_replaced_by_their_psfs(tmp_path, psf):
+    """A PSF has the name of its frame: beside it, it would take its place."""
+    frame = tmp_path / "night0.fits"
+    fits.PrimaryHDU(night()[0].data).writeto(frame)
+    before = frame.read_bytes()
+    with pytest.raises(InputError, match=r"night0\.fits is no effective PSF, and would be replaced by one"):
+        ld.measure(ld.read_exposures(frame), write_psf=tmp_path)
+    assert frame.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [frame]
 
 
 BAD = {

@@ -5,7 +5,7 @@ import pytest
 
 #: Inputs that once led to other errors, to endless counting or to a full memory.
 KNOWN = [32, 189, 208, 325, 965, 990, 993, 1058, 1082, 1171, 1194, 1303, 1336, 1379, 1603, 1658, 1812, 100696, 100723,
-         101935, 102542, 102706, 103667]  # fmt: skip
+         101935, 102542, 102706, 103667, 203697]  # fmt: skip
 
 
 def test_inputs_that_once_broke_something():

@@ -90,6 +90,14 @@ def test_headers_without_sense(tmp_path, header, changes, words):
         given_grid(header, solution)
 
 
+def test_a_reference_pixel_that_is_no_number(header):
+    """A header cannot tell it, a text (1E400) and a WCS can."""
+    wcs = WCS(header)
+    wcs.wcs.crpix = [np.inf, 140.5]
+    with pytest.raises(InputError, match=r"grid: CRPIX and CRVAL of its WCS must be finite, got \[ *inf 140.5\] and"):
+        given_grid(wcs, None)
+
+
 @pytest.mark.parametrize(
     "content", [b"", b"some words\nand more\n", b"\x89PNG\r\n\0\0", b"SIMPLE  = nonsense", b"\x1f\x8b"]
 )

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 
 from legdistort.exceptions import SolveError
 from legdistort.geometry.detector_modes import dynamic_basis, dynamic_degrees
+from legdistort.inputs.matches import Matches
 from legdistort.results.gauge import UnknownMap
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve
@@ -149,6 +150,18 @@ def test_residuals_with_another_cause_determine_nothing():
     assert [released(20000.0, (9000.0, gain)) for gain in (8900.0, 9100.0)] == [0, 2]
 
 
+def test_residuals_determine_maps_however_they_are_turned():
+    """Two of three maps that are told, in a basis in which none of them is one of the maps that are listed."""
+    turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
+    information = np.diag([400.0, 100.0, 1e-4, 1.0, 1.0, 1.0])
+    pull = np.sqrt(np.diag(information)) * [20.0, 15.0, 10.0, 0, 0, 0]
+    system = SimpleNamespace(dof=400, blocks=SimpleNamespace(chi2=1200.0), information=information, pull=pull)
+    maps = tuple(UnknownMap("degree 2", 2, np.concatenate([row, np.zeros(3)])) for row in turn)
+    gauge = SimpleNamespace(unknown_maps=maps, reach=np.eye(6), n_modes=3)
+    found = hierarchy.determined_by_residuals(system, gauge)
+    assert_allclose(found @ found.T, np.diag([1, 1, 0, 0, 0, 0]), atol=1e-9)
+
+
 # --- names of unknown maps, and constraints ----------------------------------------------------------------------
 
 
@@ -168,6 +181,26 @@ def test_a_map_has_the_name_of_what_it_mostly_is(share, name):
     across /= np.sqrt(across @ metric @ across)
     maps = (np.sqrt(share) * along + np.sqrt(1 - share) * across)[:, None]
     assert [each.name for each in hierarchy._named(maps, pointed, metric, size)] == [name]
+
+
+def test_patterns_have_the_degree_of_their_name():
+    told = [(name, degree) for name, degree, _ in hierarchy._patterns(10, (1000, 1000))]
+    assert told == [("shear", 1)] * 2 + [("z^2", 2), ("i z^2", 2), ("z^3", 3), ("i z^3", 3)]
+
+
+def test_the_origin_of_the_plane_is_of_no_matter():
+    """Absolute errors and what is unknown are the same where the positions lie far from the origin."""
+    sim = simulate_matches(n_exposures=5, n_stars=40, degree=2, dither=150.0, rotations=[0, 20, 40, 60, 80], seed=1)
+    shift = np.array([40_000.0, -30_000.0])
+    moved = {name: np.column_stack([pose[:, :2], pose[:, 2] - pose[:, :2] @ shift])
+             for name, pose in sim.matches.poses.items()}  # fmt: skip
+    far = Matches.from_table(sim.matches.table, shape=(2048, 2048), poses=moved)
+    one, other = (solve(matches, degree=2, clip=None) for matches in (sim.matches, far))
+    assert one.gauge.unknown_names == other.gauge.unknown_names
+    assert_allclose(other.positions, one.positions + shift, atol=1e-4)
+    for a, b in ((one, other), (other, one)):
+        covariance = a.absolute_covariance(without_unknown=True)
+        assert_allclose(b.absolute_covariance(without_unknown=True), covariance, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize(("degrees", "refused"), [(3.0, True), (4.5, False)])
@@ -212,6 +245,15 @@ def offsets(pulls):
     made = catalogue_map.Offsets(np.arange(n), np.column_stack([pulls, np.zeros(n)]), np.stack([np.eye(2)] * n))
     prior = catalogue_map.MapPrior(np.zeros((6, 6)), np.zeros(6), (2, 2))
     return catalogue_map.MapEquations(made, directions, 1e-6 * np.eye(2 * n), prior)
+
+
+def test_mismatches_are_judged_by_the_scatter_that_is_seen():
+    """The median of the lengths of offsets in a plane is sqrt(2 ln 2) of their scatter along an axis: 3.4 here."""
+    for pull, fair in ((16.0, True), (19.0, False)):
+        pulls = 4.0 * np.random.default_rng(2).permutation(np.tile([-1, 1], 100))
+        pulls[7] = pull
+        used = catalogue_map.accepted(offsets(pulls), "a catalogue")
+        assert used.tolist() == [fair or k != 7 for k in range(200)]
 
 
 def test_a_star_of_a_reference_is_a_mismatch_from_five_standard_errors():

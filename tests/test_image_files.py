@@ -1,6 +1,7 @@
 """Files as people have them: several images in one, blank and truncated ones among good, distortions in headers."""
 
 import json
+import re
 import warnings
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData
 from astropy.table import Table, vstack
-from astropy.wcs import WCS
+from astropy.wcs import WCS, DistortionLookupTable
 from caller_warnings import warns_here
 
 import legdistort as ld
@@ -264,6 +265,36 @@ def test_the_prior_of_headers_is_that_of_the_file(tmp_path):
     np.testing.assert_allclose(prior.mean, same.mean, atol=1e-9)
     (read,) = ld.open_exposures(tmp_path / "e0.fits")
     np.testing.assert_allclose(ld.Prior.from_headers([read]).mean, same.mean, atol=1e-9)
+
+
+def test_the_degree_of_a_series_from_headers():
+    """Three at least, unless another is asked for; a fit may leave it open by a word."""
+    weak = [exposure(0, sip={"A_ORDER": 2, "B_ORDER": 2, "A_2_0": 1e-7, "B_0_2": 1e-7})]
+    assert ld.Prior.from_headers(weak).degree == 3
+    assert HeaderPrior().read(weak, "auto").degree == 3
+    assert [HeaderPrior(sigma=0.1).read(weak, degree).degree for degree in (2, 4)] == [2, 4]
+
+
+def test_a_distortion_of_a_hundredth_of_a_pixel_is_one():
+    def found(a_2_0):
+        return header_distortions([exposure(0, sip={"A_ORDER": 2, "B_ORDER": 2, "A_2_0": a_2_0})])
+
+    rate = found(1e-4)["e0"].size / 1e-4
+    assert found(0.008 / rate) == {}
+    assert found(0.013 / rate)["e0"].size == pytest.approx(0.013, rel=0.02)
+
+
+def test_the_kind_of_a_distortion_is_named():
+    tpv = header(0, sip=None)
+    tpv.update({"CTYPE1": "RA---TPV", "CTYPE2": "DEC--TPV", "PV1_1": 1.0, "PV2_1": 1.0, "PV1_4": 100.0})
+    told = describe(header_distortions([Exposure("a", pixels(), wcs=WCS(tpv)), exposure(0, sip=None)]))
+    assert re.fullmatch(r"TPV, up to \d.* px over the detector", told)
+    assert describe(header_distortions([exposure(0)])).startswith("SIP, up to")
+    table = WCS(header(0, sip=None))
+    shifts = np.zeros((3, 3), "f4")
+    shifts[1, 1] = 2.0
+    table.cpdis1 = DistortionLookupTable(shifts, (1, 1), (1, 1), (SHAPE[1] / 2, SHAPE[0] / 2))
+    assert describe(header_distortions([Exposure("a", pixels(), wcs=table)])).startswith("look-up tables, up to")
 
 
 def test_headers_that_differ_give_each_its_own():

@@ -11,11 +11,16 @@ import time
 import warnings
 from contextlib import contextmanager
 from errno import EACCES, EDQUOT, EFBIG, EIO, ENOSPC
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import legdistort as ld
 from legdistort.exceptions import DiskFullError, InputError
+from legdistort.inputs.table_files import write_stars
+from legdistort.reporting.page import write_report
 from legdistort.runtime import disk_errors, locks, outputs
 from legdistort.runtime.outputs import replacing, replacing_folder, settle
 
@@ -113,6 +118,17 @@ def test_what_is_incomplete_is_dropped_and_what_is_not_ours_stays(out, tmp_path)
     assert content(out) == OLD | {".partial-of-somebody/a": "half"}
 
 
+def test_what_is_left_of_a_finished_commit_goes(out):
+    """Its files and its plan are gone: it is empty but for the file of its lock, or wholly."""
+    for k, name in enumerate(["of-somebody", "0" * 32, "1" * 32]):
+        (out / f".commit-{name}").mkdir()
+        if k == 1:
+            (out / f".commit-{name}" / locks.LOCK).touch()
+    settle(out)
+    assert content(out) == OLD
+    assert [path.name for path in out.glob(".commit-*")] == [".commit-of-somebody"]
+
+
 def test_what_is_being_written_is_left_alone(out):
     with replacing_folder(out) as target:
         fill(target, "new", "a")
@@ -152,6 +168,32 @@ def test_a_place_on_another_disk_is_refused_before_the_commit(out, tmp_path, mon
         assert content(other / "out") == {"a": "newer"}
     finally:
         shutil.rmtree(other)
+
+
+def test_devices_and_pipes_are_not_replaced(tmp_path):
+    """A rename would put a file in the place of ``/dev/null``."""
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/null")):
+        kind = path.stat().st_mode
+        with (
+            pytest.raises(InputError, match=f"{path} is a device or a pipe; give the name of a file"),
+            replacing(path, overwrite=True),
+        ):
+            pytest.fail("the block must not run")
+        assert path.stat().st_mode == kind
+    assert list(tmp_path.iterdir()) == [tmp_path / "pipe"]
+
+
+def test_a_folder_may_replace_nothing(out):
+    with (
+        pytest.raises(InputError, match=r"out/a exists already; give --overwrite to replace it, or another folder"),
+        replacing_folder(out, overwrite=False) as target,
+    ):
+        fill(target, "new", "a", "c")
+    assert content(out) == OLD
+    with replacing_folder(out, overwrite=False) as target:
+        fill(target, "new", "c")
+    assert content(out) == OLD | {"c": "new"}
 
 
 # --- one writer ---------------------------------------------------------------------------------------------------
@@ -305,6 +347,43 @@ def test_a_limit_of_the_size_of_files(tmp_path):
     assert content(tmp_path) == {"a": "old"}
 
 
+def written_by(kind):
+    """A function of a path that writes what people write."""
+    sim = ld.simulate_matches(n_stars=12, n_exposures=4, degree=1, shape=(100, 100), dither=5.0, seed=1)
+    solution = ld.solve(sim.matches, degree=1)
+    grid = np.exp(-(np.add.outer(np.arange(-12, 13) ** 2, np.arange(-12, 13) ** 2)) / 200)
+    return {
+        "solution": solution.write,
+        "stars": partial(write_stars, solution),
+        "report": partial(write_report, solution=solution),
+        "prior": ld.Prior(np.zeros((2, 3))).write,
+        "camera": ld.Camera.gsaoi().write,
+        "psf": ld.EffectivePSF.from_array(grid, oversampling=4).write,
+    }[kind]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+@pytest.mark.parametrize("kind", ["solution", "stars", "report", "prior", "camera", "psf"])
+def test_a_disk_that_takes_nothing(tmp_path, monkeypatch, kind):
+    """What is written goes to ``/dev/full``, which says ENOSPC itself."""
+    write_to, usual = written_by(kind), locks.temporary_folder
+
+    @contextmanager
+    def on_a_full_disk(parent, prefix, mode=0o777):
+        with usual(parent, prefix, mode) as (folder, held):
+            (folder / "file").symlink_to("/dev/full")
+            yield folder, held
+
+    monkeypatch.setattr(locks, "temporary_folder", on_a_full_disk)
+    monkeypatch.setattr(disk_errors, "free_bytes", lambda folder: 0)
+    path = tmp_path / {"stars": "a.ecsv", "report": "a.html", "psf": "a.fits"}.get(kind, "a.asdf")
+    for before in ({}, {path.name: "old"}):
+        with pytest.raises(DiskFullError, match=f"No space left on the disk for {path}: nothing was replaced"):
+            write_to(path, overwrite=True)
+        assert content(tmp_path) == before
+        path.write_text("old")
+
+
 def test_the_disk_is_asked(tmp_path):
     found = os.statvfs(tmp_path)
     assert abs(disk_errors.free_bytes(tmp_path / "not" / "yet") - found.f_bavail * found.f_frsize) < 1 << 32
@@ -317,7 +396,7 @@ def test_the_disk_is_asked(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="kills.py is for Linux")
 def test_forty_kills():
-    """See `kills.py`: eight calls, forty kills."""
+    """See `kills.py`: thirteen calls, forty kills."""
     run = subprocess.run(
         [sys.executable, HERE / "kills.py", "--kills", "40"], capture_output=True, text=True, check=False
     )

@@ -17,6 +17,7 @@ from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry.parallax import on_plane, parallax_factors
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.plots import motion_plots
+from legdistort.priors.prior import Prior
 from legdistort.reporting.page import write_report
 from legdistort.results import accuracy
 from legdistort.results.solution import Solution
@@ -114,6 +115,17 @@ def test_rows_of_zero_motion_change_nothing():
     held = solve(sim.matches, clip=None, motion="proper", motion_sigma=1e-7)
     assert np.abs(held.motions.values).max() < 1e-7
     assert held.chi2 == pytest.approx(plain.chi2, rel=1e-4)
+
+
+def test_rates_that_fixed_modes_cannot_take_back_are_found():
+    """With all of degree 2 fixed at the truth, a drift of degree 2 of all stars shows in the residuals."""
+    sim = field(60, np.repeat([2015.0, 2017.0, 2019.0], 4), degree=2, dynamic=0.0, zero_mean=False)
+    sigma = np.where(np.arange(6) < 3, np.inf, 0.0)
+    fixed, free = (solve(sim.matches, degree=2, motion="proper", clip=None, prior=Prior(sim.truth.static, sigma=width))
+                   for width in (sigma, None))  # fmt: skip
+    assert_allclose(fixed.coefficients[:, :, 3:], np.broadcast_to(sim.truth.static[:, 3:], (12, 2, 3)), atol=1e-9)
+    assert fixed.gauge.drift.maps.shape[0] < free.gauge.drift.maps.shape[0]
+    assert fixed.chi2 / fixed.dof == pytest.approx(1, abs=0.2)
 
 
 @pytest.mark.parametrize("kind", ["proper", "parallax"])
@@ -453,6 +465,16 @@ def test_absolute_motions_tied_to_a_catalogue_are_calibrated(n, accuracy, sigma)
     assert np.sqrt(np.mean(true) / np.mean(stated)) == pytest.approx(1, abs=accuracy)
     assert "tied to the proper motions of 30 stars of the reference." in str(solution.gauge)
     assert np.sqrt(np.mean(true)) < 0.1  # the exposures by themselves: 0.08 after the common motion of 0.2
+
+
+def test_motions_are_tied_to_a_catalogue_with_parallaxes_too():
+    """The mean motion is that of the catalogue, whether or not parallaxes are fitted beside it."""
+    sim = field(60, FIVE, parallax=0.02, sigma=0.02)
+    gaia = catalogue(sim, np.random.default_rng(3), rate=np.array([0.2, -0.1]))
+    solution = solve(sim.matches, motion="parallax", reference=gaia, clip=None)
+    assert solution.gauge.drift.n_tied == 30
+    off = (solution.motions.values[:, :2] - sim.truth.motions).mean(axis=0)
+    assert_allclose(off, [0.2, -0.1], atol=0.05)
 
 
 def test_motions_of_a_catalogue_that_disagree():

@@ -206,3 +206,31 @@ def test_similarity_part_is_the_best_similarity(shape, degree):
         assert_allclose(similarity_part(a, shape), similarity.fit_similarity(q, target, weights=w, parity=1), atol=1e-9)
     else:
         assert_allclose(similarity_part(a, shape), [[1, 0, a[0, 0] / 2], [0, 1, a[1, 0] / 2]])
+
+
+def test_a_scatter_given_anew_keeps_the_rest():
+    """Of modes that are not given nothing is known; the mean is zero where it has none."""
+    prior = Prior(np.arange(6.0).reshape(2, 3) + 1, static_sigma=[0.1, 0.2, 0.3])
+    for sigma in ([1.0, 2.0, 3.0], [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]):
+        made = prior.with_sigma(sigma, degree=2)
+        assert made.degree == 2
+        assert_allclose(made.mean, np.pad(prior.mean, ((0, 0), (0, 3))))
+        assert_allclose(made.sigma[:, :3], np.broadcast_to(sigma, (2, 3)))
+        assert np.isinf(made.sigma[:, 3:]).all()
+        assert_allclose(made.static_sigma, np.pad(prior.static_sigma, ((0, 0), (0, 3))))
+        assert prior.with_sigma(sigma).degree == 1
+    longer = prior.with_sigma(np.arange(6.0) + 1)  # only those of its own degree count
+    assert_allclose(longer.sigma, [[1, 2, 3]] * 2)
+    assert prior.with_sigma(0.5, degree=0).degree == 1
+    assert Prior(None, static_sigma=2.0).with_sigma(None, degree=2).static_sigma == 2.0
+
+
+def test_words_for_widths():
+    assert Prior(np.zeros((2, 3)), sigma="evidence").sigma == "evidence"
+    for words in ({"sigma": "some"}, {"static_sigma": "evidence"}):
+        with pytest.raises(InputError, match=r"must be widths in pixels.*, got '"):
+            Prior(np.zeros((2, 3)), **words)
+    assert Prior(None, static_sigma=0.01).static_sigma == 0.01
+    for size in (0.0, -1.0, np.inf, np.nan, None, True, "x"):
+        with pytest.raises(InputError, match="without a mean, static_sigma must be a positive number"):
+            Prior(None, static_sigma=size)

@@ -193,6 +193,18 @@ def test_a_prior_stands_in_for_what_is_not_told():
     assert_allclose(solution.coefficients[0][:, 3:], sim.truth.static[:, 3:], atol=1e-3)
 
 
+def test_a_mean_without_widths_is_where_the_fit_begins():
+    """It is not taken as exact: the distortion that is shared is fitted, and the absolute errors say so."""
+    sim = camera()
+    solution = solve(sim.matches, degree=3, static="fit", exposure_degree=1, prior=Prior(sim.truth.static + 0.1))
+    assert solution.gauge.static == "fitted"
+    assert (
+        solution.gauge.unknown_names
+        == solve(sim.matches, degree=3, static="fit", exposure_degree=1).gauge.unknown_names
+    )
+    assert solution.chi2 / solution.dof == pytest.approx(1, abs=0.15)
+
+
 def test_says_that_it_cannot_without_dithers():
     with pytest.raises(SolveError, match=r"cannot tell a distortion that they share .* dither"):
         solve(camera(rolls=None, dither=0.0).matches, static="fit")

@@ -75,6 +75,63 @@ def test_locale_c_without_a_home(table, tmp_path, locale, name):
 
 
 @pytest.fixture
+def read_only(tmp_path):
+    """A copy of the package that nobody may write, without byte code and compiled loops."""
+    folder = tmp_path / "site-packages"
+    shutil.copytree(ROOT / "legdistort", folder / "legdistort", ignore=shutil.ignore_patterns("__pycache__"))
+    items = [folder, *folder.rglob("*")]
+    for item in items:
+        item.chmod(item.stat().st_mode & 0o555)
+    yield folder
+    for item in items:
+        item.chmod(item.stat().st_mode | 0o200)
+
+
+def unprivileged():
+    """Begin of a command that may write only what its user may: root gives up all that makes it more than a user."""
+    if not hasattr(os, "geteuid") or os.geteuid() != 0:
+        return []
+    if shutil.which("setpriv") is None:
+        pytest.skip("root may write anywhere, and there is no setpriv")
+    return ["setpriv", "--bounding-set=-all", "--inh-caps=-all"]
+
+
+WITHOUT_WRITING = """
+import sys
+from pathlib import Path
+import legdistort
+from legdistort.cli import main
+from legdistort.solving.equations import problem
+
+package = Path(legdistort.__file__).parent
+try:
+    (package / "new").touch()
+except OSError:
+    problem.COMPILED_FROM = int(sys.argv[1])
+    status = main(sys.argv[2:])
+    compiled = "legdistort.solving.equations.compiled" in sys.modules
+    sys.exit(status or compiled is not (problem.COMPILED_FROM == 1))
+sys.exit(f"{package} can be written")
+"""
+
+
+@pytest.mark.parametrize("compiled_from", [10**9, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_package_that_cannot_be_written(table, tmp_path, read_only, compiled_from):
+    """Nor is there a home: compiled loops are made without a place to keep them."""
+    if compiled_from == 1:
+        pytest.importorskip("numba")
+    bare = {"PATH": os.environ["PATH"], "PYTHONPATH": str(read_only), "OPENBLAS_NUM_THREADS": "1", "HOME": "/none"}
+    arguments = [str(compiled_from), *command(table, tmp_path / "out")[3:]]
+    run = subprocess.run(
+        [*unprivileged(), sys.executable, "-c", WITHOUT_WRITING, *arguments],
+        cwd=tmp_path, env=bare, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stdout + run.stderr
+    assert whole(tmp_path / "out")
+    assert not list(read_only.rglob("__pycache__"))
+
+
+@pytest.fixture
 def place():
     """A folder that another user can see, to be written by root alone."""
     folder = Path(tempfile.mkdtemp())

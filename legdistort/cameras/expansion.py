@@ -174,6 +174,8 @@ class _Plane:
                 raise InputError(f"{self._name} cannot be inverted near the origin of its plane; check direction")
             matrix, shift = np.linalg.inv(affine[:2]), affine[2]
             plane = (centre + spread * extent * (corners - 1 / 3) - shift) @ matrix
+            if not np.isfinite(plane).all():
+                raise InputError(f"{self._name} is not finite near the detector; check direction")
         return matrix, shift, np.sqrt(abs(np.linalg.det(matrix)))
 
     def _call(self, xy):

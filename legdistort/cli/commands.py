@@ -219,7 +219,7 @@ def do_simulate(a):
         raise InputError(f"{a.out} already holds a simulated night; give --overwrite or another folder")
     optics = {"psf": PupilPSF(**optics)} if (optics := given(a, options.OPTICS)) else {}
     night = legdistort.simulate_exposures(**given(a, options.NIGHT), **optics, progress=wants_progress(a))
-    with outputs.replacing_folder(a.out) as target:
+    with outputs.replacing_folder(a.out, overwrite=a.overwrite) as target:
         paths = night.write(target)
     _say(a, f"{len(paths)} frames and truth.ecsv in {a.out}", {"frames": [path.name for path in paths]})
 

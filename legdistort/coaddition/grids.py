@@ -177,6 +177,8 @@ def read_grid(path):
 def _check_pixels(wcs, name):
     if not all(isinstance(n, int | np.integer) and n > 0 for n in wcs.array_shape or ()):
         raise InputError(f"{name}: NAXIS1 and NAXIS2 must be positive whole numbers, got {wcs.pixel_shape}")
+    if not np.isfinite([*wcs.wcs.crpix, *wcs.wcs.crval]).all():
+        raise InputError(f"{name}: CRPIX and CRVAL of its WCS must be finite, got {wcs.wcs.crpix} and {wcs.wcs.crval}")
     matrix = wcs.pixel_scale_matrix
     if not np.isfinite(matrix).all() or np.linalg.cond(matrix) > _FLAT:
         raise InputError(f"{name}: the matrix of its WCS is singular: pixels have no area")

@@ -3,6 +3,7 @@
 import logging
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -97,7 +98,8 @@ def measure(
         profiles. Positions are those of the core-weighted centre with all PSFs but the Moffat profiles. Exposures with
         too few stars for a PSF of their own are measured with Moffat profiles, and named in a warning.
     write_psf : str or path, optional
-        Folder for the PSF of every exposure that has one, ``NAME.fits``.
+        Folder for the PSF of every exposure that has one, ``NAME.fits``. PSFs of an earlier call are replaced, files of
+        another kind are not. ``meta["psf_files"]`` of the table has their checksums (SHA-256).
     workers : int, optional
         Processes that share the frames. None = the current ``dask.distributed.Client`` if there is one, else this
         process. The table is the same.
@@ -117,7 +119,8 @@ def measure(
     Raises
     ------
     InputError
-        For arguments out of range, and PSFs that are none.
+        For arguments out of range, and PSFs that are none; if a file that is no such PSF, a frame say, stands where one
+        would be written.
 
     Warns
     -----
@@ -132,12 +135,27 @@ def measure(
         read_noise=read_noise, saturation=saturation, errors=errors, psf=psf,
     )  # fmt: skip
     if write_psf is not None:
-        outputs.check_folder(write_psf)
+        _check_psf_folder(Path(write_psf), exposures)
     table, psfs = measure_with_psfs(exposures, options, workers=workers, progress=progress)
     if write_psf is not None:
         with outputs.replacing_folder(write_psf) as folder:
             write_psfs(psfs, folder)
+            table.meta["psf_files"] = outputs.contents(folder)
     return table
+
+
+def _check_psf_folder(folder, exposures):
+    """Refuse a folder for PSFs in which something else would be replaced."""
+    outputs.check_folder(folder)
+    for path in (folder / f"{exposure.name}.fits" for exposure in exposures):
+        if path.exists():
+            try:
+                EffectivePSF.read(path)
+            except InputError:
+                raise InputError(
+                    f"{path} is no effective PSF, and would be replaced by one: give another folder as write_psf= "
+                    "(--write-psf)"
+                ) from None
 
 
 def effective_psf(exposure, *, fwhm=None, threshold=5.0, box=None, gain=None, read_noise=None, saturation=None):

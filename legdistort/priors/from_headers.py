@@ -109,7 +109,7 @@ def _kind(wcs):
         return "gwcs" if isinstance(wcs, gwcs.WCS) else "WCS"
     kinds = ["SIP"] * (wcs.sip is not None)
     kinds += ["look-up tables"] * any(t is not None for t in (wcs.cpdis1, wcs.cpdis2, wcs.det2im1, wcs.det2im2))
-    return " and ".join(kinds) or wcs.wcs.ctype[0][-3:]
+    return " and ".join(kinds) or wcs.to_header()[f"CTYPE{wcs.wcs.lng + 1}"][-3:]  # once set, WCSLIB calls TPV a TAN
 
 
 @dataclass(frozen=True, eq=False)

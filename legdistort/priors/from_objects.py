@@ -154,6 +154,8 @@ def _check_distorted(function, centre, place, shape, name):
     t = [np.linspace(-0.5, 0.5, 5) * (n - 1) for n in shape[::-1]]
     grid = np.stack(np.meshgrid(*t), axis=-1).reshape(-1, 2) + centre
     linear = np.column_stack([grid, np.ones(len(grid))])
+    if not np.isfinite(linear).all():  # LAPACK would never end
+        raise InputError(f"{name}: the reference pixel of its WCS (CRPIX1, CRPIX2) must be finite numbers")
     with np.errstate(all="ignore"):
         sky = np.column_stack(gnomonic(*function(*grid.T), *place))
         matrix = np.linalg.lstsq(linear, np.nan_to_num(sky), rcond=None)[0]

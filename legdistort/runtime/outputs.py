@@ -35,11 +35,14 @@ def check_file(path, *, overwrite=False):
     Raises
     ------
     InputError
-        If `path` is a folder, or exists and `overwrite` is false, or its folder does not exist or cannot be written.
+        If `path` is a folder, a device or a pipe, or exists and `overwrite` is false, or its folder does not exist or
+        cannot be written.
     """
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path} is a folder; give the name of a file")
+    if path.exists() and not path.is_file():  # it would be replaced, not written to
+        raise InputError(f"{path} is a device or a pipe; give the name of a file")
     if path.exists() and not overwrite:
         raise InputError(f"{path} exists already; give overwrite=True (--overwrite) to replace it, or another name")
     if not path.parent.is_dir():
@@ -122,7 +125,7 @@ def replacing(path, *, overwrite=False):
 
 
 @contextmanager
-def replacing_folder(out, *, former=()):
+def replacing_folder(out, *, former=(), overwrite=True):
     """A temporary folder whose content moves into the folder `out`, all or nothing, when the block ends well.
 
     What stands in `out` under other names stays. As long as the block runs, `out` is locked against other writers.
@@ -134,6 +137,8 @@ def replacing_folder(out, *, former=()):
     former : sequence of str
         Patterns of names in `out`; files of earlier results that have no successor are removed. Of those in a
         ``summary.json`` with a list of its files, only these.
+    overwrite : bool
+        Replace files that exist.
 
     Yields
     ------
@@ -144,7 +149,7 @@ def replacing_folder(out, *, former=()):
     ------
     InputError
         As `check_folder` does; if another process writes there; if a folder stands in the place of a file, or the
-        reverse.
+        reverse; if a file exists that is not to be replaced.
     DiskFullError
         If the disk is full.
     """
@@ -158,7 +163,7 @@ def replacing_folder(out, *, former=()):
                 with locks.temporary_folder(place, _PARTIAL) as (folder, held):
                     yield folder
                     locks.before_renaming(held)
-                    _commit(folder, place, former)
+                    _commit(folder, place, former, overwrite)
         else:
             with _new_parents(place), _new_folder(place, out) as folder:
                 yield folder
@@ -307,14 +312,13 @@ def _settle(folder):
     for commit in sorted(folder.glob(f"{_COMMIT}*")):
         if (commit / _PLAN).is_file():
             _finish(commit, folder)
-        elif (commit / locks.LOCK).is_file():  # finished but for its removal
-            locks.remove(commit)
+    locks.remove_dead(folder, _COMMIT)  # those that are finished but for their removal
 
 
-def _commit(folder, place, former):
+def _commit(folder, place, former, overwrite):
     """Make the content of a folder that of the place around it."""
     items = [item.relative_to(folder) for item in sorted(folder.rglob("*")) if item.name not in _OURS]
-    _check_places(folder, place, items)
+    _check_places(folder, place, items, overwrite)
     files = {item.as_posix() for item in items}
     plan = {"remove": [name for name in former_files(place, former) if name not in files]}
     (folder / _PLAN).write_text(json.dumps(plan), encoding="utf-8")
@@ -331,10 +335,12 @@ def _commit(folder, place, former):
         ) from error
 
 
-def _check_places(folder, place, items):
+def _check_places(folder, place, items, overwrite):
     """Refuse what could not be moved once it is decided: then there is no way back."""
     for item in items:
         target = place / item
+        if not overwrite and target.is_file():
+            raise InputError(f"{target} exists already; give --overwrite to replace it, or another folder")
         if target.is_dir() and not (folder / item).is_dir():
             raise InputError(f"{target} is a folder, in the place of a file: move it away, or write elsewhere")
         if (folder / item).is_dir() and os.path.lexists(target):

@@ -1,0 +1,296 @@
+"""Normal equations and reduced system against dense matrices from a numerical Jacobian: no step of theirs in common."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import oracle
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import null_space
+
+from legdistort.geometry.detector_modes import similarity_basis
+from legdistort.priors.prior import Prior
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving import start_values
+from legdistort.solving.equations import criterion, elimination, reduced_system
+from legdistort.solving.equations.problem import State, build_problem
+from legdistort.solving.equations.reduced_system import Direct, Iterative
+from legdistort.solving.equations.star_terms import StarTerms, symmetric_times, unpacked
+from legdistort.solving.gauge import constraints
+
+N, M, DEGREE, K = 6, 16, 2, 6  # exposures, stars, degree, modes
+RNG = np.random.default_rng(5)
+YEARS = np.linspace(2010, 2015, N)
+
+
+def make(*, widths=False, moving=False, shared=False):
+    """A problem with unequal, correlated errors, away from its minimum."""
+    rng = np.random.default_rng(5)
+    sim = simulate_matches(
+        n_stars=M, n_exposures=N, degree=DEGREE, sigma=rng.uniform(0.05, 0.2, (N, M, 2)), corr=0.4, shape=(300, 500),
+        dither=120.0, rotations=rng.uniform(-40, 40, N), seen=1.0 if shared else 0.9, static=0.5, dynamic=0.2, seed=3,
+    )  # fmt: skip
+    prior = Prior(np.pad(sim.truth.static, ((0, 0), (0, 4))))  # its highest modes stay as they are
+    if widths:
+        sigma = rng.uniform(0.1, 0.4, (2, 10))
+        sigma[:, 4] = 0.0
+        prior = replace(prior, sigma=sigma)
+
+    def motion(matches, weight):
+        terms = StarTerms.of_motion("proper", YEARS, 2012.2, sigma=0.05)
+        return replace(terms, mean=rng.normal(0, 0.03, (2, M)))
+
+    own = {"own_degree": 1} if shared else {}
+    problem = build_problem(sim.matches, DEGREE, prior=prior, motion=motion if moving else None, **own)
+    state, _ = start_values.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
+    stars = state.stars.copy()
+    stars[2:] += rng.normal(0, 0.04, stars[2:].shape)
+    coefficients = state.coefficients.copy()
+    coefficients[:, :, :K] += rng.normal(0, 0.1, (2, K) if shared else (N, 2, K))
+    return problem, State(stars, coefficients, state.poses)
+
+
+def residuals(problem, state, x):
+    """Residuals (n, 2) at changes (stars first, then coefficients of the exposures) from a state, by the formula."""
+    n_star = problem.n_star
+    stars = state.stars + x[: n_star * M].reshape(n_star, M)
+    change = x[n_star * M :].reshape(N, 2, K)
+    out = []
+    for i in range(N):
+        on = problem.part(i)
+        at = stars[:2] + (np.zeros((2, M)) if n_star == 2 else (YEARS[i] - 2012.2) * stars[2:])
+        coefficients = state.coefficients[i].copy()
+        coefficients[:, :K] += change[i]
+        found = oracle.predict(at[:, problem.star[on]].T, coefficients, state.poses[i], problem.shapes[i])
+        out.append(problem.xy[:, on].T - found)
+    return np.concatenate(out)
+
+
+def dense(problem, state):
+    """Residuals, weights (n, 2, 2) and the derivatives (n, 2, all unknowns) of what is predicted."""
+    size = problem.n_star * M + N * 2 * K
+    steps = 1e-3 * np.eye(size)
+    jacobian = np.stack([residuals(problem, state, -e) - residuals(problem, state, e) for e in steps], axis=-1) / 2e-3
+    w = problem.weight
+    weight = np.moveaxis(np.array([[w[0], w[2]], [w[2], w[1]]]), -1, 0)
+    return residuals(problem, state, np.zeros(size)), weight, jacobian
+
+
+def split(matrix, n_star):
+    """Star part (n_star M), ordered by unknown then star, and the rest."""
+    return matrix[: n_star * M], matrix[n_star * M :]
+
+
+SETTINGS = [{}, {"widths": True}, {"moving": True}]
+
+
+@pytest.fixture(params=SETTINGS, ids=lambda settings: ", ".join(settings) or "plain")
+def case(request):
+    problem, state = make(**request.param)
+    return problem, state, criterion.linearise(problem, state), dense(problem, state)
+
+
+def test_sums_over_the_observations(case):
+    problem, state, blocks, (r, weight, jacobian) = case
+    normal = np.einsum("nap,nab,nbq->pq", jacobian, weight, jacobian)
+    gradient = np.einsum("nap,nab,nb->p", jacobian, weight, r)
+    assert blocks.chi2 == pytest.approx(np.einsum("na,nab,nb->", r, weight, r), rel=1e-9)
+    assert_allclose(blocks.residual.T, r, atol=1e-9)
+    assert_allclose(criterion.residuals(problem, state).T, r, atol=1e-9)
+    n = problem.n_star
+    stars, rest = normal[: n * M, : n * M].reshape(n, M, n, M), normal[n * M :, n * M :].reshape(N, 2 * K, N, 2 * K)
+    held = np.zeros((M, n, n))
+    if n > 2:
+        held[:, [2, 3], [2, 3]] = 1 / 0.05**2
+    assert_allclose(unpacked(blocks.v), np.einsum("ajbj->jab", stars) + held, rtol=1e-6, atol=1e-6 * normal.max())
+    assert_allclose(blocks.u_data, np.einsum("iaib->iab", rest), rtol=1e-6, atol=1e-6 * rest.max())
+    departure = state.stars[2:] - problem.terms.mean
+    mine = gradient[: n * M].reshape(n, M)
+    mine[2:] -= departure / 0.05**2
+    assert_allclose(blocks.g_star, mine, rtol=1e-6, atol=1e-6 * np.abs(mine).max())
+    assert blocks.held == pytest.approx((departure**2).sum() / 0.05**2, abs=1e-12)
+    assert blocks.cost == pytest.approx(blocks.chi2 + blocks.penalty + blocks.held, rel=1e-14)
+    if not problem.has_prior:
+        assert blocks.penalty == 0
+        assert_allclose(blocks.g_exposure.ravel(), gradient[n * M :], rtol=1e-6, atol=1e-6 * np.abs(gradient).max())
+
+
+def test_what_a_prior_adds():
+    """``d' C^-1 d`` on the directions that are neither similarities nor fixed; nothing moves those that are fixed."""
+    problem, state = make(widths=True)
+    r, weight, jacobian = dense(problem, state)
+    gradient = np.einsum("nap,nab,nb->p", jacobian, weight, r)[2 * M :].reshape(N, 2 * K)
+    blocks, penalty = criterion.linearise(problem, state), 0.0
+    for i in range(N):
+        sigma = problem.prior_sigma[i].ravel()
+        similar = similarity_basis(problem.shapes[i], K)
+        held = np.eye(2 * K)[sigma == 0]
+        free = null_space(np.concatenate([similar, held])).T
+        precision = free.T @ np.linalg.inv(free * sigma**2 @ free.T) @ free
+        departure = (state.coefficients[i] - problem.prior_mean[i])[:, :K].ravel()
+        penalty += departure @ precision @ departure
+        assert_allclose(criterion.prior_precision(problem, i), precision, atol=1e-9 * precision.max())
+        mine = gradient[i] - precision @ departure
+        mine -= held.T @ held @ mine
+        assert_allclose(blocks.g_exposure[i], mine, atol=2e-6 * np.abs(gradient).max())
+        added = blocks.u[i] - blocks.u_data[i] - precision
+        assert np.linalg.matrix_rank(added, tol=1e-6 * np.abs(added).max()) == len(held)
+        assert_allclose(held.T @ held @ added, added, atol=1e-6 * np.abs(added).max())
+        assert np.trace(added) > 1e3 * np.trace(blocks.u_data[i])
+    assert blocks.penalty == pytest.approx(penalty, rel=1e-9)
+
+
+def test_elimination_of_stars(case):
+    problem, _, blocks, (_, weight, jacobian) = case
+    n = problem.n_star
+    normal = np.einsum("nap,nab,nbq->pq", jacobian, weight, jacobian)
+    coupling = normal[: n * M, n * M :]
+    a, y = RNG.normal(size=(N, 2 * K)), RNG.normal(size=(n, M))
+    scale = np.abs(coupling).max()
+    assert_allclose(elimination.to_stars(problem, blocks, a).ravel(), coupling @ a.ravel(), atol=1e-5 * scale)
+    assert_allclose(elimination.to_exposures(problem, blocks, y).ravel(), y.ravel() @ coupling, atol=1e-5 * scale)
+    inverse = unpacked(elimination.inverse_star_blocks(blocks.v))
+    assert_allclose(inverse @ unpacked(blocks.v), np.broadcast_to(np.eye(n), (M, n, n)), atol=1e-9)
+    roots = np.moveaxis(elimination.star_roots(blocks.v), -1, 0)
+    assert_allclose(roots @ roots.mT, inverse, rtol=1e-9, atol=1e-12 * np.abs(inverse).max())
+    between = np.zeros((n * M, n * M))
+    for j, block in enumerate(inverse):
+        between[np.ix_(np.arange(n) * M + j, np.arange(n) * M + j)] = block
+    moved = coupling.T @ between @ coupling
+    for size in (512, 5):  # stars at a time
+        factors = list(elimination.star_factors(problem, blocks, n_block=size))
+        assert sum(factor.shape[1] for factor in factors) == n * M
+        found = sum(factor @ factor.T for factor in factors)
+        assert_allclose(found, moved, rtol=1e-5, atol=1e-6 * np.abs(moved).max())
+    reduced = elimination.reduced_matrix(problem, blocks)
+    whole = np.zeros_like(reduced)
+    for i, block in enumerate(blocks.u):
+        whole[i * 2 * K : (i + 1) * 2 * K, i * 2 * K : (i + 1) * 2 * K] = block
+    assert_allclose(reduced, whole - moved, rtol=1e-5, atol=1e-6 * np.abs(moved).max())
+    freedom = elimination.star_freedom(problem, blocks)
+    told = np.einsum("jaa->", inverse[:, 2:, 2:]) / 0.05**2 if n > 2 else 0.0
+    assert freedom == pytest.approx(n * M - told)
+
+
+class Bordered:
+    """The reduced system with its constraints as one dense matrix."""
+
+    def __init__(self, problem, blocks, rows):
+        self.problem, self.blocks, self.rows = problem, blocks, rows
+        s = elimination.reduced_matrix(problem, blocks)
+        n = len(s)
+        zero = np.zeros((len(rows), len(rows)))
+        self.inverse, self.n = np.linalg.inv(np.block([[s, rows.T], [rows, zero]])), n
+        self.s = s
+
+    def solve(self, rhs, target):
+        return (self.inverse @ np.concatenate([rhs, target]))[: self.n]
+
+    def rhs(self, own, stars):
+        inverse = elimination.inverse_star_blocks(self.blocks.v)
+        moved = elimination.to_exposures(self.problem, self.blocks, symmetric_times(inverse, stars))
+        return self.problem.unknowns.gather(own - moved)
+
+    def stars(self, stars, d):
+        inverse = elimination.inverse_star_blocks(self.blocks.v)
+        spread = self.blocks.unknowns.spread(d)
+        return symmetric_times(inverse, stars - elimination.to_stars(self.problem, self.blocks, spread))
+
+
+def close(found, expected, tolerance=1e-6):
+    assert_allclose(found, expected, rtol=0, atol=tolerance * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("way", [Direct, Iterative])
+def test_reduced_system_under_constraints(case, way):
+    problem, state, blocks, _ = case
+    gauge = constraints.make("minimal", problem, state, blocks)
+    system, bordered = way(problem, blocks, gauge), Bordered(problem, blocks, gauge.orthonormal)
+    target = RNG.normal(0, 0.01, len(gauge.orthonormal))
+    rhs = bordered.rhs(blocks.g_exposure, blocks.g_star)
+    close(system.rhs, rhs)
+    d = bordered.solve(rhs, target)
+    stars, coefficients = system.step(target, 1e-9)
+    close(coefficients.ravel(), d)
+    close(stars, bordered.stars(blocks.g_star, d))
+    d = RNG.normal(size=bordered.n)
+    close(system.follow(d), bordered.stars(np.zeros_like(blocks.g_star), d))
+    own, pulls = RNG.normal(size=blocks.g_exposure.shape), RNG.normal(size=blocks.g_star.shape)
+    d = bordered.solve(bordered.rhs(own, pulls), np.zeros(len(target)))
+    stars, coefficients = system.settle(own, pulls)
+    close(coefficients.ravel(), d, 1e-4)
+    close(stars, bordered.stars(pulls, d), 1e-4)
+    n_free = elimination.star_freedom(problem, blocks) + N * 2 * K - len(gauge.orthonormal)
+    assert system.dof == pytest.approx(2 * problem.xy.shape[1] - n_free)
+    nothing = np.zeros(bordered.n)
+    moves = np.stack([bordered.solve(nothing, unit) for unit in np.eye(len(target))])
+    close(system.moves, moves, 1e-3)
+    curvature = moves @ bordered.s @ moves.T
+    close(system.information, curvature, 1e-3)
+    close(system.pull, moves @ rhs, 1e-6 if way is Direct else 0.05)
+    if way is Direct:
+        gradients = RNG.normal(size=(N, 2 * K, 3))
+        covariance = bordered.inverse[: bordered.n, : bordered.n]
+        close(system.respond(gradients), (covariance @ gradients.reshape(-1, 3)).reshape(gradients.shape))
+        close(system.covariance(), covariance)
+
+
+def test_conjugate_gradients_stop_where_they_are_told():
+    """An accuracy that is not asked for costs steps."""
+    problem, state = make()
+    blocks = criterion.linearise(problem, state)
+    gauge = constraints.make("minimal", problem, state, blocks)
+    system, counts = Iterative(problem, blocks, gauge), []
+    target = np.zeros(len(gauge.orthonormal))
+    exact = Direct(problem, blocks, gauge).step(target, 0.0)[1]
+    for accuracy in (0.1, 1e-3, 1e-6):
+        system._couple = count = Counted(Iterative(problem, blocks, gauge)._couple)
+        found = system.step(target, accuracy)[1]
+        counts.append(count.n)
+        assert np.abs(found - exact).max() < 30 * accuracy * np.abs(exact).max()
+    assert counts[0] < counts[1] < counts[2] <= 2 * problem.unknowns.size
+
+
+class Counted:
+    """A function that counts its calls."""
+
+    def __init__(self, function):
+        self.function, self.n = function, 0
+
+    def __call__(self, *arguments):
+        self.n += 1
+        return self.function(*arguments)
+
+
+def test_what_exposures_share_is_held_where_they_do_not_tell_it(monkeypatch):
+    """The rows found, given again, hold the same directions: the answer stays, and none of them moves."""
+    problem, state = make(shared=True)
+    blocks = criterion.linearise(problem, state)
+    gauge = constraints.make("minimal", problem, state, blocks)
+    monkeypatch.setattr(reduced_system, "_WEAK", 0.002)
+    found = Direct(problem, blocks, gauge)
+    assert 0 < found.n_weak < problem.unknowns.n_common
+    weak = found.rows[-found.n_weak :]
+    again = Direct(problem, blocks, gauge, weak)
+    target = RNG.normal(0, 0.01, gauge.n_constraints)
+    rhs = RNG.normal(size=found.unknowns.size)
+    d = found.solve(rhs, target)
+    close(again.solve(rhs, target), d)
+    close(weak @ d + 1.0, np.ones(len(weak)), 1e-8)
+    own = found._on_unknowns(gauge)
+    bordered = Bordered(problem, blocks, np.concatenate([own, weak]))
+    close(d, bordered.solve(rhs, np.concatenate([target, np.zeros(len(weak))])))
+    moves = np.stack([bordered.solve(0 * rhs, unit) for unit in np.eye(len(bordered.rows))])[: len(own)]
+    close(found.information, moves @ bordered.s @ moves.T, 2e-3)
+
+
+def test_the_exposures_to_blame_are_named_the_worst_first():
+    """Four of six exposures have a part in what is not determined, one of them less than a tenth."""
+    parts = np.sqrt([0.0, 0.15, 0.5, 0.05, 0.0, 0.3])
+    direction = np.outer(parts, np.ones(4) / 2).ravel()
+    problem = SimpleNamespace(
+        names=tuple("abcdef"), degree=2, unknowns=SimpleNamespace(spread=lambda vector: vector.reshape(6, 4))
+    )
+    told = reduced_system._singular_message(problem, np.eye(24) - np.outer(direction, direction))
+    assert "above all in exposure c, f, b: lower the degree" in told
