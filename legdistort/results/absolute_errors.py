@@ -42,12 +42,12 @@ def relative_variance(gauge, uncertainty, xy):
         both = shared + shared.transpose(0, 2, 1)
         out[:, good] += np.stack([both[:, 0, 0], both[:, 1, 1], both[:, 0, 1]])
         out[:, good] += _spread(gauge.directions[good], gauge.bend_errors(uncertainty.coefficients)[1])
-    directions = _directions(gauge, xy)[good]
-    plain = gauge.modes_at(xy[good], directions.shape[2] // 2).T
-    out[:, good] += _spread(without_plain_map(directions, plain), gauge.absolute_covariance)
-    if gauge.drift is not None:
-        drifting = uncertainty.drift_directions[good][:, :2, 2 * gauge.n_modes :]
-        out[:, good] += _spread(without_plain_map(drifting, plain), gauge.drift.covariance)
+    if gauge.drift is None:
+        directions, hidden = _directions(gauge, xy)[good], gauge.absolute_covariance
+    else:
+        directions, hidden = uncertainty.drift_directions[good][:, :2], gauge.joint_covariance
+    plain = gauge.modes_at(xy[good], gauge.n_modes if gauge.drift is not None else directions.shape[2] // 2).T
+    out[:, good] += _spread(without_plain_map(directions, plain), hidden)
     return out
 
 
@@ -64,9 +64,11 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
     """
     if gauge.plane is not None:
         return np.full_like(uncertainty.stars, np.nan)
-    out = np.where(np.isfinite(xy[:, 0]), uncertainty.stars, np.nan) + _spread(
-        _directions(gauge, xy), gauge.absolute_covariance
-    )
+    out = np.where(np.isfinite(xy[:, 0]), uncertainty.stars, np.nan)
+    if gauge.drift is not None and gauge.drift.joint is not None:
+        out = out + _spread(uncertainty.drift_directions[:, :2], gauge.drift.joint)
+    else:
+        out = out + _spread(_directions(gauge, xy), gauge.absolute_covariance)
     if gauge.tie is not None:
         out = out + gauge.tie.shared
     if not without_unknown:

@@ -1,11 +1,13 @@
 """Proper motions and parallaxes of the stars of a solution, with their errors."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from astropy import units as u
 
 from ..geometry import parallax
+from ..inputs.column_contract import correlation
 from .absolute_errors import without_plain_map
 
 #: Units of the terms of stars in the reference plane and on the sky, and their names there.
@@ -74,34 +76,29 @@ class StarMotions:
 
 
 def covariances(gauge, uncertainty, xy):
-    """Relative and absolute covariance of the terms of the stars, (k, k, n_stars) each, for positions (n_stars, 2).
+    """Relative and absolute covariance of the unknowns of the stars, (2 + k, 2 + k, n_stars) each.
 
-    Relative motions are those once a common map of the fitted degree is taken off. Absolute ones have the error of the
-    common maps that change with time, after a common rate of shift, rotation and scale and a mean parallax, which
-    nothing but a reference determines.
+    Relative ones are those once a common map of the fitted degree is taken off, and for motions one that changes with
+    time. Absolute ones have the errors of these maps, after a common rate of shift, rotation and scale and a mean
+    parallax, which nothing but a reference determines. For stars at positions `xy` (n_stars, 2).
     """
-    k = len(gauge.drift.names)
-    index = np.add.outer(np.zeros(k, int), np.zeros(k, int))
-    for a in range(k):
-        for b in range(k):
-            low, high = min(a, b) + 2, max(a, b) + 2
-            index[a, b] = high * (high + 1) // 2 + low
-    own = uncertainty.star_unknowns[index]
+    size = 2 + len(gauge.drift.names)
+    own = np.moveaxis(_unpacked(uncertainty.star_unknowns, size), 0, -1)
     good = np.isfinite(xy[:, 0])
-    directions = uncertainty.drift_directions[good, 2:]
-    q, n = gauge.drift.motion.shape[2], gauge.n_modes
-    hidden = np.zeros((2 * n + q, 2 * n + q))
-    tied = gauge.absolute_covariance
-    hidden[: 2 * n, : 2 * n] = tied if len(tied) == 2 * n else gauge.covariance
-    hidden[2 * n :, 2 * n :] = gauge.drift.covariance
-    plain = gauge.modes_at(xy[good]).T
-    left = without_plain_map(directions, plain)
+    directions, hidden = uncertainty.drift_directions[good], gauge.joint_covariance
+    left = without_plain_map(directions, gauge.modes_at(xy[good]).T)
     relative, absolute = own.copy(), own.copy()
     for out, through in ((relative, left), (absolute, directions)):
         out[:, :, good] += np.moveaxis(through @ hidden @ through.transpose(0, 2, 1), 0, -1)
-    if gauge.drift.shared is not None:
-        absolute[:2, :2] += gauge.drift.shared
     return relative, absolute
+
+
+def _unpacked(blocks, size):
+    """Symmetric blocks (m, n), packed as `legdistort.solving.equations.star_terms.packed` says, as (n, size, size)."""
+    low, high = np.sort(np.indices((size, size)), axis=0)
+    index = high * (high + 1) // 2 + low
+    index[:2, :2] = [[0, 2], [2, 1]]
+    return np.moveaxis(blocks[index], -1, 0)
 
 
 def add_motions(table, motions, relative, absolute, xy, sky):
@@ -111,28 +108,39 @@ def add_motions(table, motions, relative, absolute, xy, sky):
     ----------
     table : `~astropy.table.QTable`
     motions : StarMotions
-    relative, absolute : ndarray, shape (k, k, n_stars)
+    relative, absolute : ndarray, shape (2 + k, 2 + k, n_stars)
     xy : ndarray, shape (n_stars, 2)
     sky : TangentPlane or None
     """
-    for k, name in enumerate(motions.names[:2]):
-        table[name] = motions.values[:, k] * UNITS[name]
-        table[f"{name}_err"] = np.sqrt(relative[k, k]) * UNITS[name]
-        table[f"{name}_err_abs"] = np.sqrt(absolute[k, k]) * UNITS[name]
-    table["vx_vy_corr"] = relative[0, 1] / np.sqrt(relative[0, 0] * relative[1, 1])
-    if sky is not None:
-        slope = sky.jacobian(np.nan_to_num(xy)) * u.deg.to(u.mas)
-        on_sky = np.einsum("jab,jb->ja", slope, motions.values[:, :2]) * u.mas / u.yr
-        table["pmra"], table["pmdec"] = on_sky.T
-        for suffix, each in (("error", relative), ("error_abs", absolute)):
-            moved = np.einsum("jab,bcj,jdc->jad", slope, each[:2, :2], slope)
-            for k, name in enumerate(("pmra", "pmdec")):
-                table[f"{name}_{suffix}"] = np.sqrt(moved[:, k, k]) * u.mas / u.yr
-            if suffix == "error":
-                table["pmra_pmdec_corr"] = moved[:, 0, 1] / np.sqrt(moved[:, 0, 0] * moved[:, 1, 1])
-    if motions.kind == "parallax":
-        mas = sky.pixel_scale * 1000 * u.mas
-        table["parallax"] = motions.values[:, 2] * mas
-        table["parallax_error"] = np.sqrt(relative[2, 2]) * mas
-        table["parallax_error_abs"] = np.sqrt(absolute[2, 2]) * mas
+    k = motions.values.shape[1]
+    _add(table, ("vx", "vy"), [UNITS["vx"]] * 2, ("err", "err_abs"), motions.values, relative, absolute)
+    _add_correlations(table, ("x", "y", *motions.names), relative)
     table["chi2"], table["n_epochs"], table["span"] = motions.chi2, motions.n_epochs, motions.span * u.yr
+    if sky is None:
+        return
+    mas = sky.pixel_scale * 1000
+    turn = np.zeros((len(xy), 2 + k, 2 + k))
+    turn[:, :2, :2] = turn[:, 2:4, 2:4] = sky.jacobian(np.nan_to_num(xy)) * u.deg.to(u.mas)
+    turn[:, 4:, 4:] = mas
+    values = np.einsum("jab,jb->ja", turn[:, 2:4, 2:4], motions.values[:, :2])
+    values = np.hstack([values, mas * motions.values[:, 2:]])
+    relative, absolute = (np.einsum("jab,bcj,jdc->adj", turn, each, turn) for each in (relative, absolute))
+    names = ("pmra", "pmdec", "parallax")[:k]
+    _add(table, names, [u.mas / u.yr] * 2 + [u.mas], ("error", "error_abs"), values, relative, absolute)
+    _add_correlations(table, ("ra", "dec", *names), relative)
+
+
+def _add(table, names, units, suffixes, values, relative, absolute):
+    """Columns of values (n_stars, k) with their relative and absolute errors."""
+    for k, (name, unit) in enumerate(zip(names, units, strict=False)):
+        table[name] = values[:, k] * unit
+        for suffix, each in zip(suffixes, (relative, absolute), strict=True):
+            table[f"{name}_{suffix}"] = np.sqrt(each[2 + k, 2 + k]) * unit
+
+
+def _add_correlations(table, names, covariance):
+    """Columns of the correlations of unknowns, those of the position aside."""
+    error = np.sqrt(np.einsum("aaj->aj", covariance))
+    for a, b in combinations(range(len(names)), 2):
+        if b > 1:
+            table[correlation(names[a], names[b])] = covariance[a, b] / (error[a] * error[b])

@@ -140,8 +140,8 @@ class Prediction:
             return {}
         relative = motions.covariances(self.solution.gauge, self.solution.uncertainty, self.solution.positions)[0]
         variance = np.einsum("kkj->kj", relative)
-        out = {"motion": finite_rms(np.sqrt(variance[:2]))}
-        return out | ({"parallax": finite_rms(np.sqrt(variance[2]))} if len(variance) > 2 else {})
+        out = {"motion": finite_rms(np.sqrt(variance[2:4]))}
+        return out | ({"parallax": finite_rms(np.sqrt(variance[4]))} if len(variance) > 4 else {})
 
     def summary(self):
         """All figures as a dict of numbers."""
