@@ -51,6 +51,11 @@ class Identified:
     sky: TangentPlane | None
     motion: np.ndarray | None = None
 
+    def subset(self, these):
+        """The same with some of its stars."""
+        motion = None if self.motion is None else self.motion[these]
+        return Identified(self.rows[these], self.xy[these], self.covariance[these], self.sky, motion)
+
     def __repr__(self):
         return f"<Identified: {len(self.rows)} reference stars>"
 

@@ -47,13 +47,24 @@ def relative_variance(gauge, uncertainty, xy):
     else:
         directions, hidden = uncertainty.drift_directions[good][:, :2], gauge.joint_covariance
     plain = gauge.modes_at(xy[good], gauge.n_modes if gauge.drift is not None else directions.shape[2] // 2).T
-    out[:, good] += _spread(without_plain_map(directions, plain), hidden)
+    own = uncertainty.stars[:2, good].T if gauge.drift is not None and gauge.drift.joint is not None else None
+    out[:, good] += _spread(without_plain_map(directions, plain, own), hidden)
     return out
 
 
-def without_plain_map(directions, plain):
-    """Displacements (n_stars, k, c) of stars without a map of modes (n_stars, n_modes), fitted to all of them."""
-    return directions - np.einsum("jm,mac->jac", plain, np.einsum("mj,jac->mac", np.linalg.pinv(plain), directions))
+def without_plain_map(directions, plain, variance=None):
+    """Displacements (n_stars, k, c) of stars without a map of modes (n_stars, n_modes), fitted to all of them.
+
+    With their variances (n_stars, k), NaN for unknown, it is fitted with these weights: where a reference holds single
+    stars, they follow a map less than the others.
+    """
+    if variance is None:
+        return directions - np.einsum("jm,mac->jac", plain, np.einsum("mj,jac->mac", np.linalg.pinv(plain), directions))
+    out = directions.copy()
+    for k, each in enumerate(variance.T):
+        root = np.where(np.isfinite(each), 1 / np.sqrt(each), 0.0)[:, None]
+        out[:, k] -= plain @ (np.linalg.pinv(root * plain) @ (root * directions[:, k]))
+    return out
 
 
 def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):

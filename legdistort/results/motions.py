@@ -86,7 +86,8 @@ def covariances(gauge, uncertainty, xy):
     own = np.moveaxis(_unpacked(uncertainty.star_unknowns, size), 0, -1)
     good = np.isfinite(xy[:, 0])
     directions, hidden = uncertainty.drift_directions[good], gauge.joint_covariance
-    left = without_plain_map(directions, gauge.modes_at(xy[good]).T)
+    variance = None if gauge.drift.joint is None else np.einsum("aaj->ja", own[:, :, good])
+    left = without_plain_map(directions, gauge.modes_at(xy[good]).T, variance)
     relative, absolute = own.copy(), own.copy()
     for out, through in ((relative, left), (absolute, directions)):
         out[:, :, good] += np.moveaxis(through @ hidden @ through.transpose(0, 2, 1), 0, -1)

@@ -26,10 +26,10 @@ from ..matching.cross_identification import identify
 from ..results.absolute_errors import plain_directions
 from ..results.diagnostics import UsedReference
 from . import minimisers
-from .equations import criterion
+from .equations import criterion, elimination
 from .equations.covariances import Uncertainty
 from .equations.problem import State
-from .equations.star_terms import StarPrior, unpacked
+from .equations.star_terms import StarPrior, packed, unpacked
 from .gauge import catalogue_map, catalogue_motions, hierarchy
 
 log = logging.getLogger(__name__)
@@ -52,6 +52,9 @@ class ReferenceTie:
     Attributes
     ----------
     identified : `legdistort.matching.cross_identification.Identified`
+        Those stars alone whose motions the exposures determine, where stars move.
+    others : `legdistort.matching.cross_identification.Identified`
+        The others, which tell nothing of common maps.
     label : str
         How messages call the reference.
     names : ndarray, shape (n_stars,)
@@ -64,6 +67,7 @@ class ReferenceTie:
     """
 
     identified: object
+    others: object
     label: str
     names: np.ndarray
     scale: float
@@ -154,7 +158,7 @@ class ReferenceTie:
                 f"motions are tied to {self.label} at degree 1 or more: raise the degree, or leave out one of the two"
             )
         size, before = 2 * gauge.n_modes, gauge.drift
-        values, covariance = self._offered(problem.terms.n)
+        values, covariance = self._offered(self.identified, problem.terms.n)
         information = block_diag(prior.information, catalogue_motions.drift_information(before))
         centre = np.concatenate([prior.centre, np.zeros(len(before.covariance))])
         used, step = gauge.tie.used, np.zeros(len(centre))
@@ -169,7 +173,13 @@ class ReferenceTie:
         log.info("stars are held at what %s knows of %d of them", self.label, np.count_nonzero(used))
         rows = self.identified.rows
         offsets = self.identified.xy - result.state.positions.T[rows]
-        catalogue = StarPrior.of(len(self.names), rows[used], values[used], covariance[used] / scale2)
+        more, more_covariance = self._offered(self.others, problem.terms.n)
+        catalogue = StarPrior.of(
+            len(self.names),
+            np.concatenate([rows[used], self.others.rows]),
+            np.concatenate([values[used], more]),
+            np.concatenate([covariance[used], more_covariance]) / scale2,
+        )
         problem, state = _drifted(problem, result, step)
         problem = replace(problem, moving=replace(problem.terms, catalogue=catalogue))
         result = self._kept(self.solve(problem, state, hold=True), gauge, before)
@@ -182,9 +192,10 @@ class ReferenceTie:
         result = replace(result, gauge=replace(result.gauge, tie=tie, drift=drift))
         return problem, replace(result, status=status if result.converged else result.status)
 
-    def _offered(self, k):
-        """What the reference knows of its stars: values (n, 2 + k) and covariances, NaN for what it does not."""
-        found, n = self.identified, len(self.identified.rows)
+    @staticmethod
+    def _offered(found, k):
+        """What a reference knows of its stars: values (n, 2 + k) and covariances, NaN for what it does not."""
+        n = len(found.rows)
         values, covariance = np.full((n, 2 + k), np.nan), np.full((n, 2 + k, 2 + k), np.nan)
         known = found.xy if found.motion is None else np.hstack([found.xy, found.motion])
         m = min(known.shape[1], 2 + k)
@@ -383,8 +394,12 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     )
     log.info("%d of the %d stars of %s are in the exposures", len(identified.rows), len(reference), reference.label)
     of = fit.options
+    known = np.all(elimination.inverse_star_blocks(fit.blocks.v)[np.diag(packed(fit.problem.n_star))] > 0, axis=0)
+    if not known[identified.rows].any():
+        raise InputError(f"no star of {reference.label} is seen at several epochs: leave out motion, or the reference")
     tying = ReferenceTie(
-        identified,
+        identified.subset(known[identified.rows]),
+        identified.subset(~known[identified.rows]),
         reference.label,
         matches.stars,
         scale=scale,
