@@ -123,6 +123,7 @@ COMMANDS = {
         "--out night --small",
         options.out("folder for the frames", path="folder"),
         options.NIGHT,
+        options.MOVING,
         options.OPTICS,
     ),
     "show": _command("print a solution", "results/solution.asdf", options.SOLUTION, options.STRICT),
