@@ -78,3 +78,17 @@ def test_headers_of_hst_tell_the_time():
     assert header_epoch(fits.Header({"EXPSTART": 0.0, "DATE-OBS": "2015-07-01"})) == pytest.approx(
         2000 + (57204 - 51544.5) / 365.25
     )
+
+
+@pytest.mark.parametrize(
+    ("epochs", "unit", "days"),
+    [
+        ([2015.5, 2015.5, 2018.5], "days", [0, 0, 3 * 365.25]),  # two exposures of one epoch, another years later
+        ([2015.5, 2015.5, 2015.5 + 1 / 365.25], "days", [0, 0, 1]),
+        ([2015.5, 2015.5, 2015.5], "exposures", [0, 1, 2]),  # of one night, by their dates
+    ],
+)
+def test_times_of_exposures_that_share_an_epoch(epochs, unit, days):
+    times, found = Matches.from_table(table(np.array(epochs)), shape=(1000, 1000)).times
+    assert found == unit
+    np.testing.assert_allclose(times, days, atol=1e-3)
