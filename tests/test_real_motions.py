@@ -119,5 +119,5 @@ def test_positions_beyond_the_shape_are_left_out_by_name(shared_data):
     inside = matches.table["exposure"] == "19apr17"
     assert np.count_nonzero(inside) > 200
     assert matches.table["x"][inside].value.max() < 1129
-    solution = solve(matches.without({name: "" for name in matches.names[:4]}), degree=2, motion="proper")
+    solution = solve(matches.without(dict.fromkeys(matches.names[:4], "")), degree=2, motion="proper")
     assert "19apr17" in solution.names

@@ -1,4 +1,4 @@
-"""Simulated nights of several epochs."""
+"""Nights of several epochs: simulated, solved, and seen at another time."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,14 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose
+from test_motions import FIVE, field, without_a_map
+from test_reference_motions import gaia
 
 from legdistort.cli.parser import main
+from legdistort.coaddition.mosaicking import coadd
 from legdistort.exceptions import InputError
 from legdistort.geometry.epochs import header_epoch
+from legdistort.inputs.exposures import Exposure
 from legdistort.simulation.observations import simulate_exposures, simulate_gsaoi_matches
 from legdistort.solving.estimation import solve
 
@@ -67,3 +71,48 @@ def test_a_night_in_the_shell_with_its_truth(tmp_path, capsys):
 def test_nights_that_cannot_be(settings, message):
     with pytest.raises(InputError, match=message):
         simulate_exposures(small=True, n_stars=20, **settings)
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_stars_at_another_time_are_those_of_a_solution_of_that_time(tied):
+    """Positions and errors carried to a year are those of a solution whose positions are of that year, but for the gauge."""
+    sim = field(60, FIVE, parallax=0.1)
+    reference = {"reference": gaia(sim, np.random.default_rng(1))[0]} if tied else {}
+    solution = solve(sim.matches, motion="parallax", clip=None, **reference)
+    direct = solve(sim.matches, motion="parallax", clip=None, motion_epoch=2018.0, **reference)
+    there, again = solution.stars_at(2018.0), direct.stars_at(2018.0)
+    off = solution.positions_at(2018.0) - direct.positions_at(2018.0)
+    left = off if tied else without_a_map(off, sim.truth.positions)[0]
+    assert np.abs(left).max() < 0.25 * there["x_err"].value.min()
+    for name in ("x_err", "y_err_abs", "ra_error", "dec_error_abs"):
+        assert_allclose(there[name].value, again[name].value, rtol=0.12, err_msg=name)
+    assert there["sky"].obstime.jyear == pytest.approx(2018.0)
+    assert there.meta["epoch"] == 2018.0
+
+
+def test_stars_at_another_time_need_motions():
+    with pytest.raises(InputError, match="motions of the stars were not fitted"):
+        solve(field(40).matches).stars_at(2018.0)
+
+
+def test_a_stack_of_one_epoch_shows_the_stars_of_that_time():
+    """Of the exposures of 2019 alone; where stars are then, not at the epoch of the solution."""
+    settings = {"small": True, "n_stars": 80, "motion": 1.5, "epochs": SIX, "dynamic_rms": 0.1}
+    images = simulate_exposures(**settings)
+    solution = solve(simulate_gsaoi_matches(**settings).matches, degree=2, motion="proper")
+    late = [Exposure(name, images.hdus[name][0].data.astype(float)) for name in images.truth.names[4:]]
+    mosaic = coadd(late, solution)
+    there, offsets = solution.stars_at(2019.2), []
+    for row in np.argsort(-there["x_err"].value)[::-1][:20]:
+        x, y = np.array([there["x"].value[row], there["y"].value[row]]) - mosaic.offset
+        k, j = round(x), round(y)
+        patch = np.array(mosaic.data[j - 5 : j + 6, k - 5 : k + 6])
+        if patch.shape != (11, 11) or not np.isfinite(patch).all():
+            continue
+        weight = np.clip(patch - np.median(patch) - 0.3 * np.ptp(patch), 0, None)
+        v, u_ = np.indices(patch.shape) - 5
+        offsets.append([(weight * u_).sum() / weight.sum() + k - x, (weight * v).sum() / weight.sum() + j - y])
+    assert len(offsets) >= 10
+    assert np.median(np.hypot(*np.transpose(offsets))) < 0.15
+    moved = solution.positions_at(2019.2) - solution.positions
+    assert np.median(np.hypot(*moved.T)) > 2

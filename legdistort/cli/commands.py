@@ -240,7 +240,7 @@ def do_show(a):
 def do_stars(a):
     """``legdistort stars``."""
     solution = _solution(a)
-    write_stars(solution, a.out, overwrite=a.overwrite)
+    write_stars(solution, a.out, epoch=a.epoch, overwrite=a.overwrite)
     _say(a, f"{len(solution.star_names)} stars in {a.out}", {"n_stars": len(solution.star_names), "out": str(a.out)})
 
 

@@ -132,6 +132,7 @@ COMMANDS = {
         "results/solution.asdf --out stars.fits",
         options.SOLUTION,
         options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
+        options.AT_EPOCH,
     ),
     "correct": _command(
         "positions measured elsewhere in its exposures to the reference plane and the sky, with errors",

@@ -8,7 +8,6 @@ from astropy import units as u
 
 from ..geometry import parallax
 from ..inputs.column_contract import correlation
-from .absolute_errors import without_plain_map
 
 #: Units of the terms of stars in the reference plane and on the sky, and their names there.
 UNITS = {"vx": u.pix / u.yr, "vy": u.pix / u.yr, "parallax": u.pix}
@@ -57,6 +56,14 @@ class StarMotions:
             out = out + known[:, 2:3] * parallax.on_plane(sky, [years])
         return out
 
+    def carried(self, covariance, years, sky=None):
+        """Covariance xx, yy, xy (3, n_stars) [pix^2] of positions at another year from that (n_stars, 2 + k, 2 + k)."""
+        rows = np.hstack([np.eye(2), (years - self.epoch) * np.eye(2)])
+        if self.kind == "parallax" and sky is not None:
+            rows = np.hstack([rows, parallax.on_plane(sky, [years]).T])
+        moved = rows @ covariance @ rows.T
+        return np.stack([moved[:, 0, 0], moved[:, 1, 1], moved[:, 0, 1]])
+
     def __repr__(self):
         n = int(np.isfinite(self.values[:, 0]).sum())
         return f"<StarMotions: {self.kind}, {n} of {len(self.values)} stars, positions of {self.epoch:.3f}>"
@@ -75,33 +82,6 @@ class StarMotions:
         return words
 
 
-def covariances(gauge, uncertainty, xy):
-    """Relative and absolute covariance of the unknowns of the stars, (2 + k, 2 + k, n_stars) each.
-
-    Relative ones are those once a common map of the fitted degree is taken off, and for motions one that changes with
-    time. Absolute ones have the errors of these maps, after a common rate of shift, rotation and scale and a mean
-    parallax, which nothing but a reference determines. For stars at positions `xy` (n_stars, 2).
-    """
-    size = 2 + len(gauge.drift.names)
-    own = np.moveaxis(_unpacked(uncertainty.star_unknowns, size), 0, -1)
-    good = np.isfinite(xy[:, 0])
-    directions, hidden = uncertainty.drift_directions[good], gauge.joint_covariance
-    variance = None if gauge.drift.joint is None else np.einsum("aaj->ja", own[:, :, good])
-    left = without_plain_map(directions, gauge.modes_at(xy[good]).T, variance)
-    relative, absolute = own.copy(), own.copy()
-    for out, through in ((relative, left), (absolute, directions)):
-        out[:, :, good] += np.moveaxis(through @ hidden @ through.transpose(0, 2, 1), 0, -1)
-    return relative, absolute
-
-
-def _unpacked(blocks, size):
-    """Symmetric blocks (m, n), packed as `legdistort.solving.equations.star_terms.packed` says, as (n, size, size)."""
-    low, high = np.sort(np.indices((size, size)), axis=0)
-    index = high * (high + 1) // 2 + low
-    index[:2, :2] = [[0, 2], [2, 1]]
-    return np.moveaxis(blocks[index], -1, 0)
-
-
 def add_motions(table, motions, relative, absolute, xy, sky):
     """Add the columns of motions to a table of stars; on the sky, if that is known, named as in the Gaia catalogue.
 
@@ -109,7 +89,8 @@ def add_motions(table, motions, relative, absolute, xy, sky):
     ----------
     table : `~astropy.table.QTable`
     motions : StarMotions
-    relative, absolute : ndarray, shape (2 + k, 2 + k, n_stars)
+    relative, absolute : ndarray, shape (n_stars, 2 + k, 2 + k)
+        Covariances of the unknowns of the stars, `legdistort.results.absolute_errors`.
     xy : ndarray, shape (n_stars, 2)
     sky : TangentPlane or None
     """
@@ -125,7 +106,7 @@ def add_motions(table, motions, relative, absolute, xy, sky):
     turn[:, 4:, 4:] = mas
     values = np.einsum("jab,jb->ja", turn[:, 2:4, 2:4], motions.values[:, :2])
     values = np.hstack([values, mas * motions.values[:, 2:]])
-    relative, absolute = (np.einsum("jab,bcj,jdc->adj", turn, each, turn) for each in (relative, absolute))
+    relative, absolute = (turn @ each @ turn.transpose(0, 2, 1) for each in (relative, absolute))
     names = ("pmra", "pmdec", "parallax")[:k]
     _add(table, names, [u.mas / u.yr] * 2 + [u.mas], ("error", "error_abs"), values, relative, absolute)
     _add_correlations(table, ("ra", "dec", *names), relative)
@@ -136,12 +117,12 @@ def _add(table, names, units, suffixes, values, relative, absolute):
     for k, (name, unit) in enumerate(zip(names, units, strict=False)):
         table[name] = values[:, k] * unit
         for suffix, each in zip(suffixes, (relative, absolute), strict=True):
-            table[f"{name}_{suffix}"] = np.sqrt(each[2 + k, 2 + k]) * unit
+            table[f"{name}_{suffix}"] = np.sqrt(each[:, 2 + k, 2 + k]) * unit
 
 
 def _add_correlations(table, names, covariance):
     """Columns of the correlations of unknowns, those of the position aside."""
-    error = np.sqrt(np.einsum("aaj->aj", covariance))
+    error = np.sqrt(np.einsum("jaa->aj", covariance))
     for a, b in combinations(range(len(names)), 2):
         if b > 1:
-            table[correlation(names[a], names[b])] = covariance[a, b] / (error[a] * error[b])
+            table[correlation(names[a], names[b])] = covariance[:, a, b] / (error[a] * error[b])

@@ -237,7 +237,11 @@ def _check_consistent(solution):
         ("covariance of the coefficients", solution.uncertainty.coefficients, (n * own, n * own)),
         ("covariance of the stars", solution.uncertainty.stars, (3, n_stars)),
         ("directions", solution.uncertainty.directions, (n_stars, 2, modes)),
-        ("covariance of the stars with the bend to the convention", solution.uncertainty.bends, (n_stars, 2, modes)),
+        (
+            "covariance of the stars with the bend to the convention",
+            solution.uncertainty.bends,
+            (n_stars, 2 + k, modes),
+        ),
         ("gauge.constraint", gauge.constraint, (held, n, modes)),
         ("gauge.convention", gauge.convention, (held, n, modes)),
         ("gauge.motion", gauge.motion, (n, modes, modes)),

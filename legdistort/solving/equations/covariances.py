@@ -154,7 +154,7 @@ class Uncertainty:
 
     @cached_property
     def bends(self):
-        """Covariance of star positions with the bend that leads to the convention, (n_stars, 2, 2 n_modes), px^2.
+        """Covariance of the unknowns of stars with the bend to the convention, (n_stars, 2 + k, 2 n_modes).
 
         See `legdistort.results.gauge.Gauge.to_convention`; None where the convention holds, or the covariance of the
         coefficients is approximated.
@@ -165,7 +165,7 @@ class Uncertainty:
         inverse, moved = elimination.inverse_star_blocks(blocks.v), []
         for errors in self._gauge.bend_errors(self.coefficients)[0].T:
             on_stars = elimination.to_stars(problem, blocks, errors.reshape(problem.n_exposures, -1))
-            moved.append(-elimination.symmetric_times(inverse, on_stars)[:2])
+            moved.append(-elimination.symmetric_times(inverse, on_stars))
         return np.stack(moved, axis=2).transpose(1, 0, 2)
 
     @cached_property
