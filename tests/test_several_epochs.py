@@ -75,7 +75,7 @@ def test_nights_that_cannot_be(settings, message):
 
 @pytest.mark.parametrize("tied", [False, True])
 def test_stars_at_another_time_are_those_of_a_solution_of_that_time(tied):
-    """Positions and errors carried to a year are those of a solution whose positions are of that year, but for the gauge."""
+    """As of a solution whose positions are of that time, but for the gauge."""
     sim = field(60, FIVE, parallax=0.1)
     reference = {"reference": gaia(sim, np.random.default_rng(1))[0]} if tied else {}
     solution = solve(sim.matches, motion="parallax", clip=None, **reference)
