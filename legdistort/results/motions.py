@@ -50,17 +50,19 @@ class StarMotions:
 
     def displacement(self, years, sky=None):
         """Displacements (n_stars, 2) [pix] from the epoch to another year; zero for stars without a motion."""
-        known = np.nan_to_num(self.values)
-        out = (years - self.epoch) * known[:, :2]
+        return np.nan_to_num(self.values) @ self.columns([years], sky)[0].T
+
+    def columns(self, years, sky=None):
+        """Displacements (n, 2, k) [pix] at years (n,) for a unit of each term; zero for parallaxes without a sky."""
+        years = np.asarray(years, dtype=float)
+        out = (years - self.epoch)[:, None, None] * np.eye(2, len(self.names))
         if self.kind == "parallax" and sky is not None:
-            out = out + known[:, 2:3] * parallax.on_plane(sky, [years])
+            out[:, :, 2] = parallax.on_plane(sky, years)
         return out
 
     def carried(self, covariance, years, sky=None):
         """Covariance xx, yy, xy (3, n_stars) [pix^2] of positions at another year from that (n_stars, 2 + k, 2 + k)."""
-        rows = np.hstack([np.eye(2), (years - self.epoch) * np.eye(2)])
-        if self.kind == "parallax" and sky is not None:
-            rows = np.hstack([rows, parallax.on_plane(sky, [years]).T])
+        rows = np.hstack([np.eye(2), self.columns([years], sky)[0]])
         moved = rows @ covariance @ rows.T
         return np.stack([moved[:, 0, 0], moved[:, 1, 1], moved[:, 0, 1]])
 

@@ -14,7 +14,7 @@ from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
-from . import model_forms, reference_tie, single_fit
+from . import model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought
 from .choices.degree_choice import choose_degree
@@ -274,6 +274,10 @@ def _warn_of_header(matches, prior):
 
 def _choose_degree(matches, options):
     """The `DegreeChoice`; an alarm is told."""
+    if options.motion is not None:  # motions, if there are any, are taken off the stars that are kept out
+        star_motions.check_epochs(matches, options.motion)
+        kind = "parallax" if options.motion == "parallax" else "proper"
+        options = replace(options, motion=kind, motion_sigma=None)
 
     def fit(part, degree):
         trial = single_fit.estimate(part, replace(options, degree=degree, clip=None))
