@@ -52,6 +52,7 @@ def test_the_column_epoch_of_every_kind(column):
         (None, "DATE-OBS, MJD-OBS or EXPSTART"),
         (np.array([2015.5, np.nan, 2019.0]), r"no value for 1 of 3 exposures \(b\)"),
         (np.array([2015.5, 20111.0, 2019.0]), r"1800 to 2200, MJD or Time, got b: 20111"),
+        (np.array([20111.0, 20113.0, 20119.0]), r"1800 to 2200, MJD or Time, got a: 20111, b: 20113, c: 20119"),
     ],
 )
 def test_epochs_that_are_missing_or_cannot_be(epoch, message):

