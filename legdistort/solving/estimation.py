@@ -124,10 +124,12 @@ def solve(
     reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord` or path, optional
         Positions with errors that tie shift, rotation and scale, and the maps that the exposures do not tell; relative
         positions stay as precise as they are. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error`` [mas]
-        and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``ref_epoch`` [yr] and correlations,
-        as in the Gaia catalogue; or ``x``, ``y``, ``x_err``, ``y_err`` in pixels of the reference plane; and perhaps
-        ``star``, the stars of the matches, which are otherwise found by their positions. A column that holds a
-        `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch.
+        and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``parallax``, ``parallax_error``
+        [mas], ``ref_epoch`` [yr] and correlations, as in the Gaia catalogue; or ``x``, ``y``, ``x_err``, ``y_err`` in
+        pixels of the reference plane, perhaps with ``vx``, ``vy`` and their errors; and perhaps ``star``, the stars of
+        the matches, which are otherwise found by their positions. A column that holds a
+        `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch. With `motion` it is more, a prior on
+        the positions, motions and parallaxes of its stars.
     epoch : float or `~astropy.time.Time`, optional
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
