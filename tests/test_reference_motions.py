@@ -163,6 +163,15 @@ def test_stars_of_the_catalogue_have_what_it_knows_of_them():
     assert np.median(ratio) == pytest.approx(1, abs=0.05)
 
 
+def test_a_tie_settles_where_the_scatter_of_motions_is_known():
+    """The map of the positions is not mixed with those that change with time, which the motions of stars then tell."""
+    sim = field(60)
+    table = gaia(sim, np.random.default_rng(1), parallax=False, errors=np.full(5, 1.0))[0]
+    solution = solve(sim.matches, motion="proper", motion_sigma=0.3, reference=table, clip=None)
+    assert "tied to the reference in" in solution.status
+    assert "not settled" not in solution.status
+
+
 def test_a_table_of_stars_is_a_prior_of_its_motions():
     """Columns of motions in pixels, with their correlations, serve as those on the sky do."""
     sim = field(60, sky=None)
