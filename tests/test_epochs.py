@@ -52,6 +52,7 @@ def test_the_column_epoch_of_every_kind(column):
         (None, "DATE-OBS, MJD-OBS or EXPSTART"),
         (np.array([2015.5, np.nan, 2019.0]), r"no value for 1 of 3 exposures \(b\)"),
         (np.array([2015.5, 20111.0, 2019.0]), r"1800 to 2200, MJD or Time, got b: 20111"),
+        (np.array([20111.0, 20113.0, 20119.0]), r"1800 to 2200, MJD or Time, got a: 20111, b: 20113, c: 20119"),
     ],
 )
 def test_epochs_that_are_missing_or_cannot_be(epoch, message):
@@ -78,3 +79,17 @@ def test_headers_of_hst_tell_the_time():
     assert header_epoch(fits.Header({"EXPSTART": 0.0, "DATE-OBS": "2015-07-01"})) == pytest.approx(
         2000 + (57204 - 51544.5) / 365.25
     )
+
+
+@pytest.mark.parametrize(
+    ("epochs", "unit", "days"),
+    [
+        ([2015.5, 2015.5, 2018.5], "days", [0, 0, 3 * 365.25]),  # two exposures of one epoch, another years later
+        ([2015.5, 2015.5, 2015.5 + 1 / 365.25], "days", [0, 0, 1]),
+        ([2015.5, 2015.5, 2015.5], "exposures", [0, 1, 2]),  # of one night, by their dates
+    ],
+)
+def test_times_of_exposures_that_share_an_epoch(epochs, unit, days):
+    times, found = Matches.from_table(table(np.array(epochs)), shape=(1000, 1000)).times
+    assert found == unit
+    np.testing.assert_allclose(times, days, atol=1e-3)

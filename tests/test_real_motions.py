@@ -20,19 +20,24 @@ def solve(matches, **settings):
         return estimation.solve(matches, **settings)
 
 
-@pytest.fixture(scope="module")
-def epochs(shared_data):
-    """Stars brighter than K = 17.5, with 0.02 px added to their errors, some of which are zero."""
+def read_lists(shared_data, faintest):
+    """All lists, with 0.02 px added to their errors, some of which are zero."""
     lists = []
     for path in sorted((shared_data / "keck_nirc2_ob150029").glob("*.lis")):
         table = read_table(path)
         table["exposure"] = [path.stem[3:10]] * len(table)
         table.meta = {}
-        lists.append(table[np.asarray(table["mag"]) < 17.5])
+        lists.append(table[np.asarray(table["mag"]) < faintest])
     table = vstack(lists)
     for name in ("x_err", "y_err"):
         table[name] = np.hypot(table[name], 0.02)
-    return match(table, shape=(1024, 1024), min_exposures=3)
+    return table
+
+
+@pytest.fixture(scope="module")
+def epochs(shared_data):
+    """Stars brighter than K = 17.5."""
+    return match(read_lists(shared_data, faintest=17.5), shape=(1024, 1024), min_exposures=3)
 
 
 @pytest.fixture(scope="module")
@@ -102,14 +107,17 @@ def test_an_epoch_kept_out_is_predicted(epochs):
     assert offsets["still"] > 3 * offsets["moved"]
 
 
-def test_positions_beyond_the_shape_are_named(shared_data, epochs):
-    """Three of all stars lie outside 1024 pixels and their margin; the other lists are solved."""
-    table = vstack(
-        [read_table(p) for p in sorted((shared_data / "keck_nirc2_ob150029").glob("*.lis"))],
-        metadata_conflicts="silent",
-    )
-    assert np.count_nonzero((table["x"] > 1126) | (table["y"] > 1126)) > 0
-    one = epochs.table.copy()
-    one["x"][0] = 1200 * one["x"].unit
-    with pytest.warns(AssumptionWarning, match="1 positions lie outside their detector and are left out: star"):
-        type(epochs).from_table(one, shape=(1024, 1024), poses=epochs.poses)
+def test_positions_beyond_the_shape_are_left_out_by_name(shared_data):
+    """Three of all stars lie outside 1024 pixels and their margin, all in the last list, which is used for all that."""
+    with pytest.warns(AssumptionWarning, match="3 positions lie outside their detector and are left out: star") as told:
+        matches = match(read_lists(shared_data, faintest=99), shape=(1024, 1024), min_exposures=3)
+    words = next(str(each.message) for each in told if "outside" in str(each.message))
+    assert words.count("of exposure 19apr17 at (") == 3
+    assert "(1131, 215)" in words
+    assert not matches.left_out
+    assert len(matches.names) == 9
+    inside = matches.table["exposure"] == "19apr17"
+    assert np.count_nonzero(inside) > 200
+    assert matches.table["x"][inside].value.max() < 1129
+    solution = solve(matches.without(dict.fromkeys(matches.names[:4], "")), degree=2, motion="proper")
+    assert "19apr17" in solution.names

@@ -29,7 +29,7 @@ def check_run(solution, quality=None):
     -------
     tuple of Check
     """
-    return (image_check(quality), stack_check(quality), inverse_check(solution))
+    return (image_check(quality), stack_check(quality, moving=solution.motions is not None), inverse_check(solution))
 
 
 def image_check(quality):
@@ -65,15 +65,17 @@ def _odd_one(values):
     return best
 
 
-def stack_check(quality):
-    """Is the stack as sharp as its frames?"""
+def stack_check(quality, *, moving=False):
+    """Is the stack as sharp as its frames? It cannot be where stars are `moving` between them."""
     ratio = quality.fwhm_ratio if quality else np.nan
     if not np.isfinite(ratio):
         return Check("sharpness", "unknown", None, BLURRED, "no star could be measured in stack and frames alike", "")
     words = f"stars of the stack are {ratio:.3f} times as wide as those of single exposures"
     if ratio > BLURRED:
-        return Check("sharpness", "warn", ratio, BLURRED, words,
-                     "a higher --degree, or leave out exposures with large residuals")  # fmt: skip
+        cure = "a higher --degree, or leave out exposures with large residuals"
+        if moving:
+            cure = "stars move from epoch to epoch: stack the exposures of one epoch by themselves"
+        return Check("sharpness", "warn", ratio, BLURRED, words, cure)
     return Check("sharpness", "pass", ratio, BLURRED, words)
 
 

@@ -218,7 +218,10 @@ def do_simulate(a):
     if Path(a.out, "truth.ecsv").exists() and not a.overwrite:
         raise InputError(f"{a.out} already holds a simulated night; give --overwrite or another folder")
     optics = {"psf": PupilPSF(**optics)} if (optics := given(a, options.OPTICS)) else {}
-    night = legdistort.simulate_exposures(**given(a, options.NIGHT), **optics, progress=wants_progress(a))
+    moving = given(a, options.MOVING)
+    if "epochs" in moving:
+        moving["n_exposures"] = len(moving["epochs"])
+    night = legdistort.simulate_exposures(**given(a, options.NIGHT), **moving, **optics, progress=wants_progress(a))
     with outputs.replacing_folder(a.out, overwrite=a.overwrite) as target:
         paths = night.write(target)
     _say(a, f"{len(paths)} frames and truth.ecsv in {a.out}", {"frames": [path.name for path in paths]})
@@ -237,7 +240,7 @@ def do_show(a):
 def do_stars(a):
     """``legdistort stars``."""
     solution = _solution(a)
-    write_stars(solution, a.out, overwrite=a.overwrite)
+    write_stars(solution, a.out, epoch=a.epoch, overwrite=a.overwrite)
     _say(a, f"{len(solution.star_names)} stars in {a.out}", {"n_stars": len(solution.star_names), "out": str(a.out)})
 
 

@@ -86,6 +86,12 @@ NIGHT = {
     "small": Option("six frames of 512 x 512 instead of eleven of 2048 x 2048", action="store_true"),
     "seed": Option("of the random numbers (default 0)", type=int),
 }
+AT_EPOCH = {"epoch": Option("where they are at another time: a decimal year (default: of the solution)", type=float)}
+MOVING = {
+    "epochs": Option("years, one for each frame; stars then move", type=float, nargs="+"),
+    "motion": Option("scatter of the proper motions per axis, pixels a year", type=float),
+    "parallax": Option("scatter of the parallaxes, pixels", type=float),
+}
 OPTICS = {
     "strehl": Option("adaptive optics: Strehl ratio of a core in a seeing halo (default: Moffat profiles)", type=float),
 }

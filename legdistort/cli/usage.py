@@ -123,6 +123,7 @@ COMMANDS = {
         "--out night --small",
         options.out("folder for the frames", path="folder"),
         options.NIGHT,
+        options.MOVING,
         options.OPTICS,
     ),
     "show": _command("print a solution", "results/solution.asdf", options.SOLUTION, options.STRICT),
@@ -131,6 +132,7 @@ COMMANDS = {
         "results/solution.asdf --out stars.fits",
         options.SOLUTION,
         options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
+        options.AT_EPOCH,
     ),
     "correct": _command(
         "positions measured elsewhere in its exposures to the reference plane and the sky, with errors",

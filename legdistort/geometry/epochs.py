@@ -10,8 +10,8 @@ from ..exceptions import InputError, some_of
 
 #: Keywords of headers that tell it, the middle of the exposure before its beginning; those of HST are MJD too.
 KEYWORDS = ("MJD-AVG", "MJD-MID", "MJD-OBS", "MJD-BEG", "EXPSTART", "DATE-AVG", "DATE-OBS")
-#: Numbers between these are modified Julian dates (the years 1899 to 2132), as years they would be absurd.
-_MJD = 15000.0, 100000.0
+#: Numbers between these are modified Julian dates (the years 1949 to 2132), as years they would be absurd.
+_MJD = 33000.0, 100000.0
 _FIRST, _LAST = 1800, 2200
 #: Exposures that are nearer in time than this were taken at one epoch, years: a day.
 ONE_EPOCH = 1 / 365.25

@@ -1,5 +1,7 @@
 """The column contract of every table that enters or leaves, checked in one place."""
 
+from itertools import combinations
+
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable, Table
@@ -90,11 +92,30 @@ MOTIONS = {
 }
 
 
+#: In this order the names of two columns make that of their correlation, as in the Gaia catalogue.
+_ORDER = ("x", "y", "ra", "dec", "parallax", "vx", "vy", "pmra", "pmdec")
+
+
+def correlation(first, second):
+    """Name of the column with the correlation of two others: ``ra_pmra_corr``, ``x_vx_corr`` and so on."""
+    first, second = sorted((first, second), key=_ORDER.index)
+    return "xy_corr" if (first, second) == ("x", "y") else f"{first}_{second}_corr"
+
+
+#: The correlations of positions with motions and parallaxes, and of these.
+CORRELATIONS = {
+    correlation(*pair): ("stat.correlation", f"correlation of the relative errors of {pair[0]} and {pair[1]}")
+    for names in (("x", "y", "vx", "vy", "parallax"), ("ra", "dec", "pmra", "pmdec", "parallax"))
+    for pair in combinations(names, 2)
+}
+
+
 def describe_stars(table):
     """Give the columns of a table of stars their UCDs and meanings (`STARS`, `MOTIONS`); returns the table."""
+    known = CORRELATIONS | STARS | MOTIONS
     for name in table.colnames:
-        if name in STARS or name in MOTIONS:
-            ucd, table[name].info.description = (STARS | MOTIONS)[name]
+        if name in known:
+            ucd, table[name].info.description = known[name]
             table[name].info.meta = {"ucd": ucd}
     return table
 

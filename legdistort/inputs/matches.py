@@ -23,6 +23,10 @@ STRAY = 0.1
 _MOST_NAMED = 6
 
 
+#: Days: exposures whose headers have no more than the date of one night may have two.
+_NIGHT = 1.5
+
+
 @dataclass(frozen=True, eq=False)
 class Observations:
     """The plain arrays behind `Matches`, one row an observation.
@@ -129,14 +133,15 @@ class Matches:
     def times(self):
         """Times (n_exposures,) from the first exposure on, and their unit, by the column ``epoch``.
 
-        In "days"; in "exposures", their order, where it does not tell all of them apart.
+        In "days"; in "exposures", their order, where it is of one night and tells no more than half of them apart.
         """
         n = len(self.names)
         if "epoch" in self.table.colnames:
             first = np.unique(self.observations.exposure, return_index=True)[1]
             years = column_contract.values(self.table, "epoch", u.yr)[first]
-            if np.isfinite(years).all() and len(np.unique(years)) == n:
-                return u.yr.to(u.day) * (years - years.min()), "days"
+            days = u.yr.to(u.day) * (years - years.min())
+            if np.isfinite(years).all() and (2 * len(np.unique(years)) > n or np.ptp(days) > _NIGHT):
+                return days, "days"
         return np.arange(n, dtype=float), "exposures"
 
     @cached_property

@@ -1,10 +1,11 @@
 """A reference catalogue: positions with errors that the star positions are to be tied to.
 
-Columns are those of Gaia (also as VizieR writes them), or ``x``, ``y`` in the reference plane. Where a table has both,
-the sky is taken.
+Columns are those of Gaia (also as VizieR writes them), or ``x``, ``y`` in the reference plane, named as in the tables
+of stars of solutions. Where a table has both, the sky is taken.
 """
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +25,14 @@ VIZIER = {
     "ra_icrs": "ra", "de_icrs": "dec", "e_ra_icrs": "ra_error", "e_de_icrs": "dec_error", "pmde": "pmdec",
     "e_pmra": "pmra_error", "e_pmde": "pmdec_error", "radecor": "ra_dec_corr", "rapmracor": "ra_pmra_corr",
     "rapmdecor": "ra_pmdec_corr", "depmracor": "dec_pmra_corr", "depmdecor": "dec_pmdec_corr",
-    "pmrapmdecor": "pmra_pmdec_corr", "gmag": "phot_g_mean_mag",
+    "pmrapmdecor": "pmra_pmdec_corr", "gmag": "phot_g_mean_mag", "plx": "parallax", "e_plx": "parallax_error",
+    "raplxcor": "ra_parallax_corr", "deplxcor": "dec_parallax_corr", "plxpmracor": "parallax_pmra_corr",
+    "plxpmdecor": "parallax_pmdec_corr",
 }  # fmt: skip
-_PARAMETERS = ("ra", "dec", "pmra", "pmdec")
+#: Columns of errors that are not called NAME_error.
+_ERRORS = {"x": "x_err", "y": "y_err", "vx": "vx_err", "vy": "vy_err"}
 _UNITS = dict.fromkeys(("ra", "dec"), u.deg) | dict.fromkeys(("pmra", "pmdec"), u.mas / u.yr)
+_UNITS |= dict.fromkeys(("vx", "vy"), u.pix / u.yr) | {"parallax": u.mas}
 _MAS = np.radians(1 / 3.6e6)
 #: Error of what is taken as exact: mas, and mas a year.
 EXACT = 1e-3
@@ -51,10 +56,10 @@ class Reference:
         ICRS right ascension and declination, degrees.
     xy : ndarray, shape (n, 2), or None
         Instead: positions in the reference plane, pixels.
-    covariance : ndarray, shape (n, 2, 2) or (n, 4, 4)
-        Of the position, pixels squared; or of ra, dec (and pmra, pmdec) along east and north, mas and years.
-    motion : ndarray, shape (n, 2), or None
-        Proper motions to the east and north, mas a year.
+    covariance : ndarray, shape (n, 2 + k, 2 + k)
+        Of ra, dec along east and north and of `motion`, mas and years; or of x, y and `motion`, pixels and years.
+    motion : ndarray, shape (n, k), or None
+        Proper motions to the east and north, mas a year, or along x and y, pixels a year; perhaps parallaxes, mas.
     epoch : ndarray, shape (n,), or None
         Years of the positions.
     """
@@ -74,7 +79,8 @@ class Reference:
     def __repr__(self):
         kind = "sky" if self.xy is None else "reference-plane"
         motion = ", with proper motions" if self.motion is not None else ""
-        return f"<Reference: {len(self)} stars, {kind} positions{motion}>"
+        parallax = " and parallaxes" if self.motion is not None and self.motion.shape[1] > 2 else ""
+        return f"<Reference: {len(self)} stars, {kind} positions{motion}{parallax}>"
 
     def subset(self, rows):
         """The same with some of its stars."""
@@ -97,24 +103,35 @@ class Reference:
                 "in their headers): give epoch=, a decimal year or an astropy Time (--epoch)"
             )
         years = epoch - self.epoch
-        known = np.isfinite(self.motion).all(axis=1) & np.isfinite(self.covariance).all(axis=(1, 2))
+        known = np.isfinite(self.motion[:, :2]).all(axis=1) & np.isfinite(self.covariance[:, :4, :4]).all(axis=(1, 2))
         still = ~known & (np.abs(years) < _SAME_TIME)
         if not (known | still).any():
             raise InputError(
                 f"no star of {self.label} has a proper motion with errors, and its epoch is not that of the exposures "
                 f"({epoch:.2f}): leave the columns out to take the positions as they are"
             )
-        motion = np.where(known[:, None], self.motion, 0) * years[:, None] * _MAS
-        place, east, north = _axes(self.sky)
-        place = place + motion[:, :1] * east + motion[:, 1:] * north
-        step = np.eye(4) + years[:, None, None] * np.eye(4, k=2)
-        covariance = step @ np.where(np.isfinite(self.covariance), self.covariance, 0) @ step.transpose(0, 2, 1)
+        motion = np.where(known[:, None], self.motion[:, :2], 0) * years[:, None]
+        size = self.covariance.shape[1]
+        step = np.tile(np.eye(size), (len(self), 1, 1))
+        step[:, 0, 2] = step[:, 1, 3] = years
+        lost = np.isnan(self.covariance)
+        covariance = step @ np.where(lost, 0, self.covariance) @ step.transpose(0, 2, 1)
+        covariance[lost] = np.nan
         covariance[~known, 2:, 2:] = np.nan
-        moved = replace(self, sky=_degrees(place), covariance=covariance, epoch=np.full(len(self), float(epoch)))
-        return moved.subset(known | still)
+        moved = replace(self, covariance=covariance, epoch=np.full(len(self), float(epoch)))
+        if self.xy is not None:
+            return replace(moved, xy=self.xy + motion).subset(known | still)
+        place, east, north = _axes(self.sky)
+        place = place + _MAS * (motion[:, :1] * east + motion[:, 1:] * north)
+        return replace(moved, sky=_degrees(place)).subset(known | still)
 
     def on_plane(self, plane):
-        """Positions (n, 2) and covariances (n, 2, 2) in pixels of a tangent plane; NaN far off its tangent point."""
+        """Positions (n, 2), motions (n, k) and covariances (n, 2 + k, 2 + k) in pixels of a tangent plane.
+
+        NaN far off its tangent point. Motions are None where there are none; parallaxes are in pixels too.
+        """
+        if self.xy is not None:
+            return self.xy, self.motion, self.covariance
         place, east, north = _axes(self.sky)
         middle = directions(*np.radians([plane.lon, plane.lat]))
         far = place @ middle < 0.5  # beyond 60 degrees; the projection ends at 90
@@ -123,13 +140,18 @@ class Reference:
         xy, x_east, x_north = map(plane.from_sky, near)
         slope = np.stack([x_east - xy, x_north - xy], axis=-1) * _MAS / step
         xy[far] = np.nan
-        return xy, slope @ self.covariance[:, :2, :2] @ slope.transpose(0, 2, 1)
-
-    def motions_on_plane(self, plane):
-        """Proper motions (n, 2) and their covariances (n, 2, 2) in pixels of a tangent plane a year; NaN if unknown."""
-        slope = np.linalg.inv(plane.jacobian(plane.from_sky(SkyCoord(*self.sky.T * u.deg, frame="icrs")))) / 3.6e6
-        motion = np.einsum("jab,jb->ja", slope, self.motion)
-        return motion, slope @ self.covariance[:, 2:, 2:] @ slope.transpose(0, 2, 1)
+        size = self.covariance.shape[1]
+        turn = np.tile(np.eye(size) / (1000 * plane.pixel_scale), (len(self), 1, 1))
+        for first in range(0, size - 1, 2):
+            turn[:, first : first + 2, first : first + 2] = slope
+        lost = np.isnan(self.covariance)
+        covariance = turn @ np.where(lost, 0, self.covariance) @ turn.transpose(0, 2, 1)
+        covariance[lost] = np.nan
+        if self.motion is None:
+            return xy, None, covariance
+        inner = turn[:, 2:, 2:]
+        moved = np.einsum("jab,jb->ja", inner, np.nan_to_num(self.motion))
+        return xy, np.where(np.isnan(self.motion), np.nan, moved), covariance
 
 
 def _axes(sky):
@@ -238,45 +260,49 @@ def _named(table):
         wanted = VIZIER.get(small, small)
         if wanted != name and wanted not in table.colnames:
             table.rename_column(name, wanted)
-    for name in ("x_err", "y_err", "ra_error", "dec_error"):  # a table of stars of a solution
-        if f"{name}_abs" in table.colnames:
-            table[name] = table[f"{name}_abs"]
+    for name in [name for name in table.colnames if name.endswith("_abs")]:  # a table of stars of a solution
+        table[name.removesuffix("_abs")] = table[name]
     return table
 
 
 def _planar(table, label):
     xy = np.column_stack([column_contract.values(table, name, u.pix) for name in ("x", "y")])
-    errors = _errors(table, ("x_err", "y_err"), u.pix, label)
-    return Reference(label, _star(table), _flux(table), None, xy, _covariance(table, errors, [("x", "y", "xy_corr")]))
+    motion, epoch, covariance = _moving(table, ("x", "y"), ("vx", "vy"), u.pix, label)
+    return Reference(label, _star(table), _flux(table), None, xy, covariance, motion, epoch)
+
+
+def _moving(table, places, motions, unit, label):
+    """Motions (n, k) and epochs (n,) of a table, None if it has none, and covariances with those of its places."""
+    moving = [name in table.colnames for name in motions]
+    if not any(moving):
+        return None, None, _covariance(table, _errors(table, places, unit, label), places)
+    if not all(moving):
+        raise InputError(f"one of {motions[0]}, {motions[1]} is missing")
+    if places[0] == "ra" and {"parallax", "parallax_error"} <= set(table.colnames):
+        motions = (*motions, "parallax")
+    motion = np.column_stack([column_contract.values(table, name, _UNITS[name]) for name in motions])
+    epoch = _epochs(table, label)
+    parts = ((places, unit), (motions[:2], unit / u.yr), (motions[2:], unit))
+    errors = np.hstack([_errors(table, names, of, label) for names, of in parts if names])
+    return motion, epoch, _covariance(table, errors, (*places, *motions))
 
 
 def _celestial(table, label):
     sky = np.column_stack([column_contract.values(table, name, u.deg) for name in ("ra", "dec")])
     if np.any(np.abs(sky[:, 1]) > 90):
         raise InputError(f"dec must lie in -90 ... 90 degrees, got {sky[np.argmax(np.abs(sky[:, 1])), 1]:g}")
-    moving = [name in table.colnames for name in ("pmra", "pmdec")]
-    motion = epoch = None
-    columns = ["ra_error", "dec_error"]
-    if any(moving):
-        if not all(moving):
-            raise InputError("one of pmra, pmdec is missing")
-        motion = np.column_stack([column_contract.values(table, name, _UNITS[name]) for name in ("pmra", "pmdec")])
-        epoch = _epochs(table, label)
-        columns += ["pmra_error", "pmdec_error"]
-    errors = _errors(table, columns[:2], u.mas, label)
-    if motion is not None:
-        errors = np.hstack([errors, _errors(table, columns[2:], u.mas / u.yr, label)])
-    names = _PARAMETERS[: len(columns)]
-    pairs = [(a, b, f"{a}_{b}_corr") for i, a in enumerate(names) for b in names[i + 1 :]]
-    covariance = _covariance(table, errors, pairs, names)
+    motion, epoch, covariance = _moving(table, ("ra", "dec"), ("pmra", "pmdec"), u.mas, label)
     return Reference(label, _star(table), _flux(table), sky, None, covariance, motion, epoch)
 
 
-def _errors(table, names, unit, label):
+def _errors(table, values, unit, label):
+    """Errors (n, k) of columns called `values`."""
+    names = [_ERRORS.get(name, f"{name}_error") for name in values]
     missing = [name for name in names if name not in table.colnames]
     if missing:
+        of = "positions" if values[0] in ("x", "ra") else "motions"
         raise InputError(
-            f"{label} lacks {' and '.join(missing)}, errors of its {'motions' if 'pm' in missing[0] else 'positions'} "
+            f"{label} lacks {' and '.join(missing)}, errors of its {of} "
             f"({unit}, standard deviations); it has {', '.join(table.colnames)}"
         )
     out = np.column_stack([column_contract.values(table, name, unit) for name in names])
@@ -287,13 +313,13 @@ def _errors(table, names, unit, label):
     return out
 
 
-def _covariance(table, errors, pairs, names=("x", "y")):
-    """Covariances (n, k, k) from errors (n, k) and the columns of correlations that there are."""
+def _covariance(table, errors, names):
+    """Covariances (n, k, k) of columns from their errors (n, k) and the correlations that there are."""
     out = np.zeros((*errors.shape, errors.shape[1]))
     diagonal = np.arange(errors.shape[1])
     out[:, diagonal, diagonal] = errors**2
-    for first, second, name in pairs:
-        if name in table.colnames:
+    for first, second in combinations(names, 2):
+        if (name := column_contract.correlation(first, second)) in table.colnames:
             corr = np.nan_to_num(column_contract.values(table, name))
             if np.any(np.abs(corr) > 1):
                 raise InputError(f"{name} must lie in -1 ... 1, got {corr[np.argmax(np.abs(corr))]:g}")
@@ -303,6 +329,8 @@ def _covariance(table, errors, pairs, names=("x", "y")):
 
 
 def _epochs(table, label):
+    if "ref_epoch" not in table.colnames and "epoch" in table.meta:  # a table of stars of a solution
+        return np.full(len(table), year(table.meta["epoch"]))
     if "ref_epoch" not in table.colnames and "ref_epoch" not in table.meta:
         raise InputError(
             f"{label} has proper motions but no column ref_epoch, the year of its positions (2016.0 for Gaia DR3): "

@@ -122,7 +122,7 @@ def _fill_errors(table, error):
     log.info("%d of %d positions come without an error; it is taken as %g pixels", filled.sum(), len(table), error)
 
 
-def write_stars(solution, path, *, overwrite=False):
+def write_stars(solution, path, *, epoch=None, overwrite=False):
     """Write the stars of a solution as ECSV, FITS, VOTable or CSV, by the suffix.
 
     Names, units and UCDs follow the Virtual Observatory (`legdistort.inputs.column_contract.STARS`).
@@ -132,6 +132,8 @@ def write_stars(solution, path, *, overwrite=False):
     solution : Solution
     path : str or path
         Ending in ``.ecsv``, ``.fits``, ``.vot``, ``.xml`` or ``.csv`` (without units).
+    epoch : float or `~astropy.time.Time`, optional
+        Where they are at this time instead: `Solution.stars_at`.
     overwrite : bool
 
     Returns
@@ -141,9 +143,10 @@ def write_stars(solution, path, *, overwrite=False):
     Raises
     ------
     InputError
-        For another ending, or a file that exists.
+        For another ending, a file that exists, or an epoch where motions were not fitted.
     """
-    write_by_ending(QTable(solution.stars), path, overwrite=overwrite)
+    stars = solution.stars if epoch is None else solution.stars_at(epoch)
+    write_by_ending(QTable(stars), path, overwrite=overwrite)
     return Path(path)
 
 

@@ -36,12 +36,13 @@ class Identified:
         Stars of the solution.
     xy : ndarray, shape (n, 2)
         Where the reference puts them, reference-plane pixels.
-    covariance : ndarray, shape (n, 2, 2)
-        Of these positions, px^2.
+    covariance : ndarray, shape (n, 2 + k, 2 + k)
+        Of these positions and of `motion`, pixels and years; NaN for what is not known.
     sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
         As it was known, or as the reference gives it.
-    motion, motion_covariance : ndarray, shape (n, 2) and (n, 2, 2), or None
-        Proper motions of the reference, pixels of the reference plane a year; NaN for stars without one.
+    motion : ndarray, shape (n, k), or None
+        Proper motions of the reference, pixels of the reference plane a year, and perhaps parallaxes, pixels; NaN for
+        stars without one.
     """
 
     rows: np.ndarray
@@ -49,7 +50,11 @@ class Identified:
     covariance: np.ndarray
     sky: TangentPlane | None
     motion: np.ndarray | None = None
-    motion_covariance: np.ndarray | None = None
+
+    def subset(self, these):
+        """The same with some of its stars."""
+        motion = None if self.motion is None else self.motion[these]
+        return Identified(self.rows[these], self.xy[these], self.covariance[these], self.sky, motion)
 
     def __repr__(self):
         return f"<Identified: {len(self.rows)} reference stars>"
@@ -94,15 +99,11 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
         plane = reference.xy if reference.xy is not None else reference.on_plane(sky)[0]
         mine, theirs = _on_plane(reference, plane, positions[rows], flux)
     rows, reference = rows[mine], reference.subset(theirs)
-    if reference.xy is not None:
-        xy, covariance = reference.xy, reference.covariance
-    else:
-        if sky is None:
-            sky = _tangent_plane(reference, positions[rows])
-        xy, covariance = reference.on_plane(sky)
+    if reference.xy is None and sky is None:
+        sky = _tangent_plane(reference, positions[rows])
+    xy, motion, covariance = reference.on_plane(sky)
     _check_agreement(reference.label, positions[rows], xy, np.ptp(positions[solved], axis=0).max())
-    motions = () if reference.motion is None else reference.motions_on_plane(sky)
-    return Identified(rows, xy, covariance, sky, *motions)
+    return Identified(rows, xy, covariance, sky, motion)
 
 
 def _by_name(reference, names):

@@ -269,9 +269,10 @@ def _motion_figures(solution):
     """Proper motions, where they were fitted."""
     if solution.motions is None or not np.isfinite(solution.motions.values).any():
         return
+    origin = "tied to those of the reference" if solution.gauge.drift.n_tied else "relative to the mean of the stars"
     points = figure(
         motion_plots.plot_motions(solution, ax=detached_figure(6.0, 6.0).subplots()),
-        "Proper motion of every star with its relative errors, relative to the mean of the stars: groups are stars "
+        f"Proper motion of every star with its relative errors, {origin}: groups are stars "
         "that belong together; single ones far off may be mismatched.",
     )
     errors = figure(

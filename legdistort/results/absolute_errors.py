@@ -22,38 +22,77 @@ def _directions(gauge, xy):
     return gauge.directions if n == gauge.n_modes else plain_directions(gauge, xy, n)
 
 
-def _spread(directions, covariance):
-    """Covariance xx, yy, xy (3, n_stars) of displacements (n_stars, 2, k) by coefficients."""
-    blocks = directions @ covariance @ directions.transpose(0, 2, 1)
-    return np.stack([blocks[:, 0, 0], blocks[:, 1, 1], blocks[:, 0, 1]])
-
-
 def relative_variance(gauge, uncertainty, xy):
     """Covariance xx, yy, xy (3, n_stars) of positions (n_stars, 2) once a common map of the fitted degree is taken off.
 
     That under the convention of the gauge, and the part of the common map that is of second order.
     """
+    blocks = relative_blocks(gauge, uncertainty, xy)
+    return np.stack([blocks[:, 0, 0], blocks[:, 1, 1], blocks[:, 0, 1]])
+
+
+def relative_blocks(gauge, uncertainty, xy):
+    """The same of all unknowns of the stars, (n_stars, 2 + k, 2 + k), maps that change with time taken off too."""
     good = np.isfinite(xy[:, 0]) & np.isfinite(uncertainty.stars[0])
-    out = np.where(np.isfinite(xy[:, 0]), uncertainty.stars, np.nan)
+    out = _own(gauge, uncertainty)
+    out[~np.isfinite(xy[:, 0])] = np.nan
     if gauge.plane is not None or not np.count_nonzero(good):
         return out
+    directions, hidden = (each if k else each[good] for k, each in enumerate(_common(gauge, uncertainty, xy)))
+    own = None
+    if gauge.drift is not None and gauge.drift.joint is not None:
+        own = np.einsum("jaa->ja", out[good])
     if uncertainty.bends is not None:
-        shared = uncertainty.bends[good] @ gauge.directions[good].transpose(0, 2, 1)
-        both = shared + shared.transpose(0, 2, 1)
-        out[:, good] += np.stack([both[:, 0, 0], both[:, 1, 1], both[:, 0, 1]])
-        out[:, good] += _spread(gauge.directions[good], gauge.bend_errors(uncertainty.coefficients)[1])
-    directions = _directions(gauge, xy)[good]
-    plain = gauge.modes_at(xy[good], directions.shape[2] // 2).T
-    out[:, good] += _spread(without_plain_map(directions, plain), gauge.absolute_covariance)
-    if gauge.drift is not None:
-        drifting = uncertainty.drift_directions[good][:, :2, 2 * gauge.n_modes :]
-        out[:, good] += _spread(without_plain_map(drifting, plain), gauge.drift.covariance)
+        bent = directions[:, :, : 2 * gauge.n_modes] if gauge.drift is not None else gauge.directions[good]
+        shared = uncertainty.bends[good] @ bent.transpose(0, 2, 1)
+        out[good] += shared + shared.transpose(0, 2, 1)
+        out[good] += bent @ gauge.bend_errors(uncertainty.coefficients)[1] @ bent.transpose(0, 2, 1)
+    n = gauge.n_modes if gauge.drift is not None else directions.shape[2] // 2
+    left = without_plain_map(directions, gauge.modes_at(xy[good], n).T, own)
+    out[good] += left @ hidden @ left.transpose(0, 2, 1)
     return out
 
 
-def without_plain_map(directions, plain):
-    """Displacements (n_stars, k, c) of stars without a map of modes (n_stars, n_modes), fitted to all of them."""
-    return directions - np.einsum("jm,mac->jac", plain, np.einsum("mj,jac->mac", np.linalg.pinv(plain), directions))
+def absolute_blocks(gauge, uncertainty, xy):
+    """Covariance (n_stars, 2 + k, 2 + k) of all unknowns of the stars with that of common maps, unknown ones aside."""
+    directions, hidden = _common(gauge, uncertainty, xy)
+    out = _own(gauge, uncertainty) + directions @ hidden @ directions.transpose(0, 2, 1)
+    out[~np.isfinite(xy[:, 0])] = np.nan
+    return out
+
+
+def _common(gauge, uncertainty, xy):
+    """How common maps move the unknowns of the stars, (n_stars, 2 + k, c), and the covariance (c, c) of these maps."""
+    if gauge.drift is None:
+        return _directions(gauge, xy), gauge.absolute_covariance
+    return uncertainty.drift_directions, gauge.joint_covariance
+
+
+def _own(gauge, uncertainty):
+    """Covariance (n_stars, 2 + k, 2 + k) of the unknowns of the stars in the gauge."""
+    blocks = uncertainty.stars if gauge.drift is None else uncertainty.star_unknowns
+    size = 2 if gauge.drift is None else 2 + len(gauge.drift.names)
+    low, high = np.sort(np.indices((size, size)), axis=0)  # `legdistort.solving.equations.star_terms.packed`
+    index = high * (high + 1) // 2 + low
+    index[:2, :2] = [[0, 2], [2, 1]]
+    out = np.moveaxis(blocks[index], -1, 0).copy()
+    out[:, :2, :2] = np.moveaxis(uncertainty.stars[index[:2, :2]], -1, 0)
+    return out
+
+
+def without_plain_map(directions, plain, variance=None):
+    """Displacements (n_stars, k, c) of stars without a map of modes (n_stars, n_modes), fitted to all of them.
+
+    With their variances (n_stars, k), NaN for unknown, it is fitted with these weights: where a reference holds single
+    stars, they follow a map less than the others.
+    """
+    if variance is None:
+        return directions - np.einsum("jm,mac->jac", plain, np.einsum("mj,jac->mac", np.linalg.pinv(plain), directions))
+    out = directions.copy()
+    for k, each in enumerate(variance.T):
+        root = np.where(np.isfinite(each), 1 / np.sqrt(each), 0.0)[:, None]
+        out[:, k] -= plain @ (np.linalg.pinv(root * plain) @ (root * directions[:, k]))
+    return out
 
 
 def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
@@ -64,9 +103,8 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
     """
     if gauge.plane is not None:
         return np.full_like(uncertainty.stars, np.nan)
-    out = np.where(np.isfinite(xy[:, 0]), uncertainty.stars, np.nan) + _spread(
-        _directions(gauge, xy), gauge.absolute_covariance
-    )
+    blocks = absolute_blocks(gauge, uncertainty, xy)
+    out = np.stack([blocks[:, 0, 0], blocks[:, 1, 1], blocks[:, 0, 1]])
     if gauge.tie is not None:
         out = out + gauge.tie.shared
     if not without_unknown:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ..geometry import basis
 from ..geometry.detector_modes import similarity_basis
@@ -96,8 +97,10 @@ class Drift:
         Whether what is known of the motions of stars beforehand determined them, not the convention of the gauge.
     n_tied : int
         Stars of a reference whose proper motions tie them, the rates too; their covariance has these then.
-    shared : ndarray, shape (2, 2, n_stars), or None
-        What to add to the variances of relative motions and of maps that are tied, whose errors are partly the same.
+    tells_parallax : bool
+        Whether the parallaxes of these stars tie the mean parallax.
+    joint : ndarray, shape (2 n_modes + q, 2 n_modes + q), or None
+        Covariance of the common map and these, where a reference determined them together.
     """
 
     names: tuple
@@ -107,7 +110,8 @@ class Drift:
     rates: np.ndarray
     held: bool = False
     n_tied: int = 0
-    shared: np.ndarray | None = None
+    tells_parallax: bool = False
+    joint: np.ndarray | None = None
 
     @property
     def n_constraints(self):
@@ -150,20 +154,19 @@ class Drift:
         if "parallax" in errors:
             words += f", of a parallax {errors['parallax']:.2g} px"
         if self.n_tied:
-            words += f"; they are tied to the proper motions of {self.n_tied} stars of the reference"
+            what = "proper motions and parallaxes" if self.tells_parallax else "proper motions"
+            words += f"; they are tied to the {what} of {self.n_tied} stars of the reference"
         unknown = [] if self.n_tied else ["common rates of shift, rotation and scale"]
-        unknown += ["the mean parallax"] if "parallax" in self.names else []
+        unknown += ["the mean parallax"] if "parallax" in self.names and not self.tells_parallax else []
         if not unknown:
             return f"{words}."
         are = "is" if unknown == ["the mean parallax"] else "are"
         return f"{words}, after {' and '.join(unknown)}, which {are} not known without a reference."
 
-    def tied(self, covariance, n_tied, shared):
-        """The same where a reference determined the maps of motions with a covariance (2 n_modes,) squared."""
-        whole, size = self.covariance.copy(), len(covariance)
-        whole[:size], whole[:, :size] = 0, 0
-        whole[:size, :size] = covariance
-        return replace(self, covariance=whole, n_tied=n_tied, shared=shared)
+    def tied(self, joint, n_tied, tells_parallax):
+        """The same where a reference determined the maps, with the `joint` covariance."""
+        size = len(joint) - len(self.covariance)
+        return replace(self, covariance=joint[size:, size:], joint=joint, n_tied=n_tied, tells_parallax=tells_parallax)
 
     def errors(self):
         """Rms over the field [pix/yr per axis, pix] of what the maps add to motions and parallaxes, by name."""
@@ -361,6 +364,14 @@ class Gauge:
         open, similarities included, in three modes at least.
         """
         return self.covariance if self.tie is None else self.tie.covariance
+
+    @property
+    def joint_covariance(self):
+        """Covariance of the modes of the common map and of `Drift`, (2 n_modes + q) squared."""
+        if self.drift.joint is not None:
+            return self.drift.joint
+        tied = self.absolute_covariance  # in more modes than the drift has where the fitted degree is 0
+        return block_diag(tied if len(tied) == 2 * self.n_modes else self.covariance, self.drift.covariance)
 
     def absolute_errors(self):
         """Absolute error by degree of the common map: rms over the field and axis, pixels, without what is unknown.

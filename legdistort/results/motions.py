@@ -1,12 +1,13 @@
 """Proper motions and parallaxes of the stars of a solution, with their errors."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from astropy import units as u
 
 from ..geometry import parallax
-from .absolute_errors import without_plain_map
+from ..inputs.column_contract import correlation
 
 #: Units of the terms of stars in the reference plane and on the sky, and their names there.
 UNITS = {"vx": u.pix / u.yr, "vy": u.pix / u.yr, "parallax": u.pix}
@@ -49,11 +50,21 @@ class StarMotions:
 
     def displacement(self, years, sky=None):
         """Displacements (n_stars, 2) [pix] from the epoch to another year; zero for stars without a motion."""
-        known = np.nan_to_num(self.values)
-        out = (years - self.epoch) * known[:, :2]
+        return np.nan_to_num(self.values) @ self.columns([years], sky)[0].T
+
+    def columns(self, years, sky=None):
+        """Displacements (n, 2, k) [pix] at years (n,) for a unit of each term; zero for parallaxes without a sky."""
+        years = np.asarray(years, dtype=float)
+        out = (years - self.epoch)[:, None, None] * np.eye(2, len(self.names))
         if self.kind == "parallax" and sky is not None:
-            out = out + known[:, 2:3] * parallax.on_plane(sky, [years])
+            out[:, :, 2] = parallax.on_plane(sky, years)
         return out
+
+    def carried(self, covariance, years, sky=None):
+        """Covariance xx, yy, xy (3, n_stars) [pix^2] of positions at another year from that (n_stars, 2 + k, 2 + k)."""
+        rows = np.hstack([np.eye(2), self.columns([years], sky)[0]])
+        moved = rows @ covariance @ rows.T
+        return np.stack([moved[:, 0, 0], moved[:, 1, 1], moved[:, 0, 1]])
 
     def __repr__(self):
         n = int(np.isfinite(self.values[:, 0]).sum())
@@ -73,37 +84,6 @@ class StarMotions:
         return words
 
 
-def covariances(gauge, uncertainty, xy):
-    """Relative and absolute covariance of the terms of the stars, (k, k, n_stars) each, for positions (n_stars, 2).
-
-    Relative motions are those once a common map of the fitted degree is taken off. Absolute ones have the error of the
-    common maps that change with time, after a common rate of shift, rotation and scale and a mean parallax, which
-    nothing but a reference determines.
-    """
-    k = len(gauge.drift.names)
-    index = np.add.outer(np.zeros(k, int), np.zeros(k, int))
-    for a in range(k):
-        for b in range(k):
-            low, high = min(a, b) + 2, max(a, b) + 2
-            index[a, b] = high * (high + 1) // 2 + low
-    own = uncertainty.star_unknowns[index]
-    good = np.isfinite(xy[:, 0])
-    directions = uncertainty.drift_directions[good, 2:]
-    q, n = gauge.drift.motion.shape[2], gauge.n_modes
-    hidden = np.zeros((2 * n + q, 2 * n + q))
-    tied = gauge.absolute_covariance
-    hidden[: 2 * n, : 2 * n] = tied if len(tied) == 2 * n else gauge.covariance
-    hidden[2 * n :, 2 * n :] = gauge.drift.covariance
-    plain = gauge.modes_at(xy[good]).T
-    left = without_plain_map(directions, plain)
-    relative, absolute = own.copy(), own.copy()
-    for out, through in ((relative, left), (absolute, directions)):
-        out[:, :, good] += np.moveaxis(through @ hidden @ through.transpose(0, 2, 1), 0, -1)
-    if gauge.drift.shared is not None:
-        absolute[:2, :2] += gauge.drift.shared
-    return relative, absolute
-
-
 def add_motions(table, motions, relative, absolute, xy, sky):
     """Add the columns of motions to a table of stars; on the sky, if that is known, named as in the Gaia catalogue.
 
@@ -111,28 +91,40 @@ def add_motions(table, motions, relative, absolute, xy, sky):
     ----------
     table : `~astropy.table.QTable`
     motions : StarMotions
-    relative, absolute : ndarray, shape (k, k, n_stars)
+    relative, absolute : ndarray, shape (n_stars, 2 + k, 2 + k)
+        Covariances of the unknowns of the stars, `legdistort.results.absolute_errors`.
     xy : ndarray, shape (n_stars, 2)
     sky : TangentPlane or None
     """
-    for k, name in enumerate(motions.names[:2]):
-        table[name] = motions.values[:, k] * UNITS[name]
-        table[f"{name}_err"] = np.sqrt(relative[k, k]) * UNITS[name]
-        table[f"{name}_err_abs"] = np.sqrt(absolute[k, k]) * UNITS[name]
-    table["vx_vy_corr"] = relative[0, 1] / np.sqrt(relative[0, 0] * relative[1, 1])
-    if sky is not None:
-        slope = sky.jacobian(np.nan_to_num(xy)) * u.deg.to(u.mas)
-        on_sky = np.einsum("jab,jb->ja", slope, motions.values[:, :2]) * u.mas / u.yr
-        table["pmra"], table["pmdec"] = on_sky.T
-        for suffix, each in (("error", relative), ("error_abs", absolute)):
-            moved = np.einsum("jab,bcj,jdc->jad", slope, each[:2, :2], slope)
-            for k, name in enumerate(("pmra", "pmdec")):
-                table[f"{name}_{suffix}"] = np.sqrt(moved[:, k, k]) * u.mas / u.yr
-            if suffix == "error":
-                table["pmra_pmdec_corr"] = moved[:, 0, 1] / np.sqrt(moved[:, 0, 0] * moved[:, 1, 1])
-    if motions.kind == "parallax":
-        mas = sky.pixel_scale * 1000 * u.mas
-        table["parallax"] = motions.values[:, 2] * mas
-        table["parallax_error"] = np.sqrt(relative[2, 2]) * mas
-        table["parallax_error_abs"] = np.sqrt(absolute[2, 2]) * mas
+    k = motions.values.shape[1]
+    _add(table, ("vx", "vy"), [UNITS["vx"]] * 2, ("err", "err_abs"), motions.values, relative, absolute)
+    _add_correlations(table, ("x", "y", *motions.names), relative)
     table["chi2"], table["n_epochs"], table["span"] = motions.chi2, motions.n_epochs, motions.span * u.yr
+    if sky is None:
+        return
+    mas = sky.pixel_scale * 1000
+    turn = np.zeros((len(xy), 2 + k, 2 + k))
+    turn[:, :2, :2] = turn[:, 2:4, 2:4] = sky.jacobian(np.nan_to_num(xy)) * u.deg.to(u.mas)
+    turn[:, 4:, 4:] = mas
+    values = np.einsum("jab,jb->ja", turn[:, 2:4, 2:4], motions.values[:, :2])
+    values = np.hstack([values, mas * motions.values[:, 2:]])
+    relative, absolute = (turn @ each @ turn.transpose(0, 2, 1) for each in (relative, absolute))
+    names = ("pmra", "pmdec", "parallax")[:k]
+    _add(table, names, [u.mas / u.yr] * 2 + [u.mas], ("error", "error_abs"), values, relative, absolute)
+    _add_correlations(table, ("ra", "dec", *names), relative)
+
+
+def _add(table, names, units, suffixes, values, relative, absolute):
+    """Columns of values (n_stars, k) with their relative and absolute errors."""
+    for k, (name, unit) in enumerate(zip(names, units, strict=False)):
+        table[name] = values[:, k] * unit
+        for suffix, each in zip(suffixes, (relative, absolute), strict=True):
+            table[f"{name}_{suffix}"] = np.sqrt(each[:, 2 + k, 2 + k]) * unit
+
+
+def _add_correlations(table, names, covariance):
+    """Columns of the correlations of unknowns, those of the position aside."""
+    error = np.sqrt(np.einsum("jaa->aj", covariance))
+    for a, b in combinations(range(len(names)), 2):
+        if b > 1:
+            table[correlation(names[a], names[b])] = covariance[:, a, b] / (error[a] * error[b])

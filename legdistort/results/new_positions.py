@@ -113,6 +113,8 @@ def covariances(solution, name, q, measured):
     if len(hidden) == 2 * gauge.n_modes:
         directions = by_modes @ widened(gauge.motion[i], solution.degree)
         relative = relative + carried(directions - plain @ _taken_off(gauge, solution.positions), hidden)
+    if gauge.drift is not None and len(hidden) == 2 * gauge.n_modes:  # at the time of this exposure
+        directions, hidden = by_modes @ widened(gauge.all_motion[i], solution.degree), gauge.joint_covariance
     absolute = own + carried(directions, hidden)
     for each in gauge.unknown:
         moved = by_modes @ widened(each.coefficients[i].reshape(-1, 1), solution.degree)

@@ -176,8 +176,7 @@ class Solution:
             new_positions.add_sky(table, self.sky, self.positions, variance, absolute)
             table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=self._obstime)
         if self.motions is not None:
-            errors = star_motions.covariances(self.gauge, self.uncertainty, self.positions)
-            star_motions.add_motions(table, self.motions, *errors, self.positions, self.sky)
+            star_motions.add_motions(table, self.motions, *self._unknowns, self.positions, self.sky)
             if self.sky is not None:
                 table["sky"] = SkyCoord(
                     table["ra"], table["dec"], pm_ra_cosdec=table["pmra"], pm_dec=table["pmdec"], frame="icrs",
@@ -231,6 +230,41 @@ class Solution:
             raise InputError("the motions of the stars were not fitted: call solve with motion='proper'")
         return self.positions + self.motions.displacement(year(epoch), self.sky)
 
+    def stars_at(self, epoch):
+        """The stars where they are at another time, with their errors then, as a table.
+
+        Parameters
+        ----------
+        epoch : float or `~astropy.time.Time`
+            A Julian year.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``star``, ``x``, ``y``, ``x_err``, ``y_err``, ``x_err_abs``, ``y_err_abs`` [pix], ``xy_corr`` and, with a
+            sky, ``ra``, ``dec`` [deg], their errors [mas] and correlation and ``sky``, named as in `stars`. Parallaxes
+            are in the positions. Stars without a motion stay where they are, with errors that are not known.
+
+        Raises
+        ------
+        InputError
+            If motions were not fitted.
+        """
+        xy, epoch = self.positions_at(epoch), year(epoch)
+        moved = [self.motions.carried(each, epoch, self.sky) for each in self._unknowns]
+        moved[1][:, np.isnan(self._absolute(False)[0])] = np.nan
+        table = QTable({"star": self.star_names, "x": xy[:, 0] * u.pix, "y": xy[:, 1] * u.pix})
+        for suffix, each in zip(("err", "err_abs"), moved, strict=True):
+            for k, axis in enumerate("xy"):
+                table[f"{axis}_{suffix}"] = np.sqrt(each[k]) * u.pix
+        table["xy_corr"] = moved[0][2] / np.sqrt(moved[0][0] * moved[0][1])
+        if self.sky is not None:
+            new_positions.add_sky(table, self.sky, xy, *moved)
+            obstime = Time(epoch, format="jyear")
+            table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=obstime)
+        table.meta = self._stars_meta() | {"epoch": epoch}
+        return column_contract.describe_stars(table)
+
     @property
     def residuals(self):
         """One row an observation, as given: ``exposure``, ``star``, ``dx``, ``dy`` [pix], ``used`` and more.
@@ -243,6 +277,12 @@ class Solution:
         return absolute_errors.absolute_variance(
             self.gauge, self.uncertainty, self.positions, without_unknown=without_unknown
         )
+
+    @property
+    def _unknowns(self):
+        """Relative and absolute covariance (n_stars, 2 + k, 2 + k) of positions, motions and parallaxes."""
+        known = self.gauge, self.uncertainty, self.positions
+        return absolute_errors.relative_blocks(*known), absolute_errors.absolute_blocks(*known)
 
     def absolute_covariance(self, *, without_unknown=False):
         """Covariance (n_stars, 2, 2) [pix^2] of every star position with the error of the common map.

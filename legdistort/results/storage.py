@@ -237,7 +237,11 @@ def _check_consistent(solution):
         ("covariance of the coefficients", solution.uncertainty.coefficients, (n * own, n * own)),
         ("covariance of the stars", solution.uncertainty.stars, (3, n_stars)),
         ("directions", solution.uncertainty.directions, (n_stars, 2, modes)),
-        ("covariance of the stars with the bend to the convention", solution.uncertainty.bends, (n_stars, 2, modes)),
+        (
+            "covariance of the stars with the bend to the convention",
+            solution.uncertainty.bends,
+            (n_stars, 2 + k, modes),
+        ),
         ("gauge.constraint", gauge.constraint, (held, n, modes)),
         ("gauge.convention", gauge.convention, (held, n, modes)),
         ("gauge.motion", gauge.motion, (n, modes, modes)),
@@ -255,7 +259,7 @@ def _check_consistent(solution):
         ("drift directions", solution.uncertainty.drift_directions if k else None, (n_stars, 2 + k, modes + q)),
         ("gauge.drift.motion", None if gauge.drift is None else gauge.drift.motion, (n, modes, q)),
         ("gauge.drift.covariance", None if gauge.drift is None else gauge.drift.covariance, (q, q)),
-        ("gauge.drift.shared", None if gauge.drift is None else gauge.drift.shared, (2, 2, n_stars)),
+        ("gauge.drift.joint", None if gauge.drift is None else gauge.drift.joint, (modes + q, modes + q)),
         ("gauge.tie.shared", None if gauge.tie is None else gauge.tie.shared, (3, n_stars)),
     ):
         if array is not None and array.shape != shape:

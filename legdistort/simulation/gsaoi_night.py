@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from astropy.io import fits
+from astropy.time import Time
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity
@@ -16,7 +17,9 @@ from . import rendering
 from .pupil import PupilPSF
 from .truth import (
     Truth,
+    checked_epochs,
     draw_coefficients,
+    draw_motions,
     draw_poses,
     draw_stars,
     exposure_names,
@@ -26,6 +29,8 @@ from .truth import (
     shifted,
     within,
 )
+
+_YEAR = 365.25 * 86400  # seconds
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,12 @@ class Night:
         Electrons per ADU, electrons, ADU.
     exptime : float
         Seconds; for the header only.
+    motion : float or array_like, shape (n_stars, 2)
+        Proper motions, pixels a year: the scatter per axis of those drawn, or themselves.
+    parallax : float or array_like, shape (n_stars,)
+        Pixels: the scatter of those drawn, or themselves.
+    epochs : sequence of float, optional
+        Years of the exposures; those of one year follow each other as in a night. None: one night.
     """
 
     n_exposures: int = 11
@@ -87,6 +98,9 @@ class Night:
     read_noise: float = 15.0
     saturation: float = 50000.0
     exptime: float = 60.0
+    motion: float = 0.0
+    parallax: float = 0.0
+    epochs: tuple | None = None
 
     def __post_init__(self):
         check_counts(n_stars=self.n_stars, n_exposures=self.n_exposures, size=self.size)
@@ -99,6 +113,11 @@ class Night:
             raise InputError(f"psf lists {len(self.psf)} for {self.n_exposures} exposures")
         if self.psf is not None:
             object.__setattr__(self, "fwhm", self._middle.fwhm)
+
+    @property
+    def cadence(self):
+        """Seconds from exposure to exposure."""
+        return self.exptime + 20
 
     def psf_of(self, exposure, rng=None):
         """What renders one exposure, by its number; what scatters from exposure to exposure is drawn from `rng`."""
@@ -148,11 +167,16 @@ def draw_night(night, seed):
     truth : `~legdistort.simulation.truth.Truth`
     rng : `~numpy.random.Generator`
     """
-    star_rng, map_rng, pose_rng, noise_rng = np.random.default_rng(seed).spawn(4)
+    star_rng, map_rng, pose_rng, noise_rng, motion_rng = np.random.default_rng(seed).spawn(5)
     instrument = GsaoiMap(night.detector, night.size)
     shape, names = (night.size, night.size), exposure_names(night.n_exposures)
     true_poses = draw_poses(pose_rng, names, shape, night.dither)
     dynamic = _draw_dynamic(map_rng, night)
+    sky = _sky(instrument, night.size)
+    epochs = night.epochs
+    if epochs is not None:
+        epochs = checked_epochs(epochs, night.n_exposures) + np.arange(night.n_exposures) * night.cadence / _YEAR
+    moving = draw_motions(motion_rng, night.n_stars, night.n_exposures, night.motion, night.parallax, epochs, sky)
     truth = Truth(
         names=names,
         shape=shape,
@@ -163,7 +187,8 @@ def draw_night(night, seed):
         poses=true_poses,
         nominal_poses=_point_wrongly(pose_rng, true_poses, night.pointing_error / instrument.pixel_scale),
         instrument=instrument,
-        sky=_sky(instrument, night.size),
+        sky=sky,
+        **moving,
     )
     positions = draw_stars(
         star_rng,
@@ -227,7 +252,9 @@ def header(truth, name, night, index):
     sky, pose = truth.sky, truth.nominal_poses[name]
     tangent = similarity.apply(pose, similarity.invert(sky.matrix)[:, 2])
     cd = sky.matrix[:, :2] @ np.linalg.inv(pose[:, :2])
-    start = datetime(2014, 12, 8, 3) + index * timedelta(seconds=night.exptime + 20)
+    start = datetime(2014, 12, 8, 3) + index * timedelta(seconds=night.cadence)
+    if truth.years is not None:
+        start = Time(truth.years[index], format="jyear", scale="utc").to_datetime()
     return fits.Header(
         [
             ("FILENAME", f"{name}.fits"),

@@ -21,6 +21,7 @@ from . import gsaoi_night, rendering
 from .truth import (
     Truth,
     draw_coefficients,
+    draw_motions,
     draw_poses,
     draw_stars,
     exposure_names,
@@ -166,7 +167,7 @@ def simulate_matches(
         )
     sigma = position_errors(sigma, n_exposures, n_stars)
     star_rng, map_rng, pose_rng, noise_rng, motion_rng = np.random.default_rng(seed).spawn(5)
-    moving = _moving(motion_rng, n_stars, n_exposures, motion, parallax, epochs, sky)
+    moving = draw_motions(motion_rng, n_stars, n_exposures, motion, parallax, epochs, sky)
     static = draw_coefficients(map_rng, static, degree, 1, "static")[0]
     dynamic = draw_coefficients(map_rng, dynamic, degree, n_exposures, "dynamic", zero_mean=zero_mean)
     names = exposure_names(n_exposures)
@@ -184,36 +185,11 @@ def simulate_matches(
     return Simulation(matches_from(truth, observed, sigma, noise_rng, noise=noise, corr=corr, sky=sky), truth)
 
 
-def _moving(rng, n_stars, n_exposures, motion, parallax, epochs, sky):
-    """Motions, parallaxes and times as `Truth` has them."""
-    still = not np.any(motion) and not np.any(parallax)
-    if epochs is None:
-        if still:
-            return {}
-        raise InputError("stars that move need epochs, the years of the exposures")
-    years = np.asarray(epochs, dtype=float)
-    if years.shape != (n_exposures,) or not np.isfinite(years).all():
-        raise InputError(f"epochs must be the years of the {n_exposures} exposures, got {epochs!r}")
-    made = {"years": years, "epoch": float(years.mean()), "motions": _drawn(rng, motion, (n_stars, 2), "motion")}
-    if np.any(parallax):
-        if sky is None:
-            raise InputError("parallaxes need sky, the place of the field")
-        made["parallaxes"] = _drawn(rng, parallax, (n_stars,), "parallax")
-    return made
-
-
-def _drawn(rng, given, shape, name):
-    """Values of a shape: those given, or drawn with the scatter given."""
-    given = np.asarray(given, dtype=float)
-    if given.shape not in ((), shape) or not np.isfinite(given).all():
-        raise InputError(f"{name} must be a number or an array of shape {shape}, got shape {given.shape}")
-    return given * rng.normal(size=shape) if given.ndim == 0 else given
-
-
 def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **settings):
     """Images of a simulated GSAOI night.
 
-    Stars are drawn with at least 10 FWHM between them. Their true pixels are ``D(q) + d_i(q)``: the published static
+    Stars are drawn with at least 10 FWHM between them; with ``motion`` and ``epochs`` they move, and the headers tell
+    when. Their true pixels are ``D(q) + d_i(q)``: the published static
     distortion D of the real detector, inverted by Newton's method, and a dynamic Legendre part.
 
     Parameters
@@ -245,7 +221,7 @@ def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **set
     hdus, psfs = {}, {}
     for i, name in enumerate(tqdm(truth.names, desc="simulate", disable=not progress)):
         psfs[name] = psf = night.psf_of(i, rng)
-        xy = truth.distort(name, truth.positions)
+        xy = truth.distort(name, truth.place(name))
         image = rendering.render(truth.shape, xy, truth.flux, psf=psf, sky=night.sky)
         if noise:
             image = rendering.add_noise(image, rng, gain=night.gain, read_noise=night.read_noise)

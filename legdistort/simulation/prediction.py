@@ -11,7 +11,8 @@ from astropy.table import Table
 
 from ..exceptions import LegdistortError
 from ..geometry import basis
-from ..results import accuracy, motions
+from ..results import accuracy
+from ..results.absolute_errors import relative_blocks
 from ..results.solution import Solution
 from ..solving import star_motions
 from ..solving.equations.problem import build_problem
@@ -138,10 +139,10 @@ class Prediction:
         """
         if self.solution.motions is None:
             return {}
-        relative = motions.covariances(self.solution.gauge, self.solution.uncertainty, self.solution.positions)[0]
-        variance = np.einsum("kkj->kj", relative)
-        out = {"motion": finite_rms(np.sqrt(variance[:2]))}
-        return out | ({"parallax": finite_rms(np.sqrt(variance[2]))} if len(variance) > 2 else {})
+        relative = relative_blocks(self.solution.gauge, self.solution.uncertainty, self.solution.positions)
+        variance = np.einsum("jkk->kj", relative)
+        out = {"motion": finite_rms(np.sqrt(variance[2:4]))}
+        return out | ({"parallax": finite_rms(np.sqrt(variance[4]))} if len(variance) > 4 else {})
 
     def summary(self):
         """All figures as a dict of numbers."""

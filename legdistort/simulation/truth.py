@@ -101,7 +101,11 @@ class Truth:
         return similarity.apply(similarity.invert(self.poses[self._known(name)]), q)
 
     def table(self):
-        """Stars as a QTable (``star``, ``x``, ``y``, ``flux``, and ``ra``, ``dec`` if known); the rest in its meta."""
+        """Stars as a QTable; the rest in its meta.
+
+        Columns ``star``, ``x``, ``y``, ``flux``; ``ra``, ``dec`` if known; of stars that move ``vx``, ``vy``,
+        ``pmra``, ``pmdec`` and ``parallax``, at the year ``epoch`` of the meta.
+        """
         x, y = self.positions.T * u.pix
         out = QTable({"star": np.arange(len(x)), "x": x, "y": y})
         if self.flux is not None:
@@ -109,11 +113,25 @@ class Truth:
         if self.sky is not None:
             sky = self.sky.to_sky(self.positions)
             out["ra"], out["dec"] = sky.ra, sky.dec
+        if self.motions is not None:
+            self._add_motions(out)
         out.meta |= {"shape": list(self.shape), "static": self.static.tolist()} | {
             name: {"pose": self.poses[name].tolist(), "coefficients": coefficients.tolist()}
             for name, coefficients in zip(self.names, self.coefficients, strict=True)
         }
+        if self.years is not None:
+            for name, value in zip(self.names, self.years, strict=True):
+                out.meta[name]["epoch"] = float(value)
         return out
+
+    def _add_motions(self, table):
+        table["vx"], table["vy"] = self.motions.T * u.pix / u.yr
+        if self.sky is not None:
+            slope = self.sky.jacobian(self.positions) * u.deg.to(u.mas)
+            table["pmra"], table["pmdec"] = np.einsum("jab,jb->aj", slope, self.motions) * u.mas / u.yr
+        if self.parallaxes is not None:
+            table["parallax"] = self.parallaxes * self.sky.pixel_scale * 1000 * u.mas
+        table.meta["epoch"] = self.epoch
 
     def _known(self, name):
         if name not in self.poses:
@@ -186,6 +204,38 @@ def draw_poses(rng, names, shape, dither, *, rotations=None, flips=None):
         matrix = np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if flip else 1.0, 1.0])
         out[name] = np.column_stack([matrix, middle - matrix @ middle + shift])
     return out
+
+
+def draw_motions(rng, n_stars, n_exposures, motion, parallax, epochs, sky):
+    """Motions, parallaxes and times as `Truth` has them."""
+    still = not np.any(motion) and not np.any(parallax)
+    if epochs is None:
+        if still:
+            return {}
+        raise InputError("stars that move need epochs, the years of the exposures")
+    years = checked_epochs(epochs, n_exposures)
+    made = {"years": years, "epoch": float(years.mean()), "motions": _drawn(rng, motion, (n_stars, 2), "motion")}
+    if np.any(parallax):
+        if sky is None:
+            raise InputError("parallaxes need sky, the place of the field")
+        made["parallaxes"] = _drawn(rng, parallax, (n_stars,), "parallax")
+    return made
+
+
+def checked_epochs(epochs, n_exposures):
+    """Years (n_exposures,) of exposures; `InputError` if they are not."""
+    years = np.asarray(epochs, dtype=float)
+    if years.shape != (n_exposures,) or not np.all((years > 1800) & (years < 2200)):
+        raise InputError(f"epochs must be the years of the {n_exposures} exposures, 1800 to 2200, got {epochs!r}")
+    return years
+
+
+def _drawn(rng, given, shape, name):
+    """Values of a shape: those given, or drawn with the scatter given."""
+    given = np.asarray(given, dtype=float)
+    if given.shape not in ((), shape) or not np.isfinite(given).all():
+        raise InputError(f"{name} must be a number or an array of shape {shape}, got shape {given.shape}")
+    return given * rng.normal(size=shape) if given.ndim == 0 else given
 
 
 def draw_stars(rng, n, region, inside, least, *, separation=0.0):

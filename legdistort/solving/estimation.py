@@ -14,7 +14,7 @@ from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
-from . import model_forms, reference_tie, single_fit
+from . import model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought
 from .choices.degree_choice import choose_degree
@@ -124,10 +124,12 @@ def solve(
     reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord` or path, optional
         Positions with errors that tie shift, rotation and scale, and the maps that the exposures do not tell; relative
         positions stay as precise as they are. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error`` [mas]
-        and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``ref_epoch`` [yr] and correlations,
-        as in the Gaia catalogue; or ``x``, ``y``, ``x_err``, ``y_err`` in pixels of the reference plane; and perhaps
-        ``star``, the stars of the matches, which are otherwise found by their positions. A column that holds a
-        `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch.
+        and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``parallax``, ``parallax_error``
+        [mas], ``ref_epoch`` [yr] and correlations, as in the Gaia catalogue; or ``x``, ``y``, ``x_err``, ``y_err`` in
+        pixels of the reference plane, perhaps with ``vx``, ``vy`` and their errors; and perhaps ``star``, the stars of
+        the matches, which are otherwise found by their positions. A column that holds a
+        `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch. With `motion` it is more, a prior on
+        the positions, motions and parallaxes of its stars.
     epoch : float or `~astropy.time.Time`, optional
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
@@ -274,6 +276,10 @@ def _warn_of_header(matches, prior):
 
 def _choose_degree(matches, options):
     """The `DegreeChoice`; an alarm is told."""
+    if options.motion is not None:  # motions, if there are any, are taken off the stars that are kept out
+        star_motions.check_epochs(matches, options.motion)
+        kind = "parallax" if options.motion == "parallax" else "proper"
+        options = replace(options, motion=kind, motion_sigma=None)
 
     def fit(part, degree):
         trial = single_fit.estimate(part, replace(options, degree=degree, clip=None))

@@ -118,8 +118,8 @@ def solve_joint(
         if not (freer.converged and is_explained(freer.blocks.chi2, run.system)):
             break
         run = freer
-    held = run.released is None and not problem.terms.is_held
-    convention = run.convention if held else run.declared()
+    declared = hold or (run.released is None and not problem.terms.is_held)
+    convention = run.convention if declared else run.declared()
     status = f"converged after {len(run.steps)} iterations"
     if not run.converged:
         status = (
@@ -163,7 +163,7 @@ class _Descent:
     def _prepare(self):
         """The gauge and the reduced system at the current state."""
         if self.n_made < _MADE:
-            how = {"released": self.released, "common": self.rules.common}
+            how = {"released": self.released, "common": self.rules.common, "all_drifts": self.rules.hold}
             self.convention = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks, **how)
             self.n_made += 1
             if self.rules.hold:

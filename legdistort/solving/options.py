@@ -77,7 +77,6 @@ class SolveOptions(Settings):
         for word, excluded in (
             ("method='alternating'", self.method == "alternating"),
             ("errors='correlated'", self.errors == "correlated"),
-            ("degree='auto'", self.chooses_degree),
             ("validate", self.validate is not None),
         ):
             if excluded:

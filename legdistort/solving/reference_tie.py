@@ -1,7 +1,13 @@
-"""A converged solution tied to a reference catalogue: its gauge alone moves, never the relative positions.
+"""A converged solution tied to a reference catalogue: its gauge alone moves, not the relative positions.
 
 What the reference says about shift, rotation and scale moves positions and poses exactly; what it says about the other
 modes of a common map becomes the value at which the constraints of the gauge are held.
+
+Where the motions of stars are fitted, the reference is a prior on the stars that it has: on positions, motions and
+parallaxes with their full covariance. It comes in two steps that are the posterior together, so that nothing counts
+twice: the common maps g from the offsets of the reference, all else integrated out, p(g | data, reference); then the
+stars with these maps held, p(stars | g, data, reference), in which the reference stands in the normal equations of its
+stars. The covariance is that of the second step and, through the directions in which the stars follow g, that of g.
 """
 
 import logging
@@ -9,8 +15,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from ..exceptions import AssumptionWarning, warn
+from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import similarity
 from ..geometry.detector_modes import similarity_basis
 from ..geometry.similarity import robust_similarity
@@ -19,11 +26,11 @@ from ..matching.cross_identification import identify
 from ..results.absolute_errors import plain_directions
 from ..results.diagnostics import UsedReference
 from . import minimisers
-from .equations import criterion
+from .equations import criterion, elimination
 from .equations.covariances import Uncertainty
 from .equations.problem import State
-from .equations.star_terms import unpacked
-from .gauge import catalogue_map, catalogue_rates, hierarchy
+from .equations.star_terms import StarPrior, packed, unpacked
+from .gauge import catalogue_map, catalogue_motions, hierarchy
 
 log = logging.getLogger(__name__)
 
@@ -34,8 +41,8 @@ _SETTLED = 0.01
 _HARMLESS = 0.3
 #: Offsets larger than expected by this factor in chi2 are told.
 _LARGE = 2.0
-#: A map of the motions of stars moves the solution to first order; what is left is told by another round.
-_RATE_ROUNDS = 2
+#: A map moves the solution to first order; what is left is told by another round.
+_MAP_ROUNDS = 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,6 +52,9 @@ class ReferenceTie:
     Attributes
     ----------
     identified : `legdistort.matching.cross_identification.Identified`
+        Those stars alone whose motions the exposures determine, where stars move.
+    others : `legdistort.matching.cross_identification.Identified`
+        The others, which tell nothing of common maps.
     label : str
         How messages call the reference.
     names : ndarray, shape (n_stars,)
@@ -57,6 +67,7 @@ class ReferenceTie:
     """
 
     identified: object
+    others: object
     label: str
     names: np.ndarray
     scale: float
@@ -64,7 +75,7 @@ class ReferenceTie:
     shared_errors: object = None
 
     def tie(self, problem, result):
-        """The `Result` with the plane where the reference puts it, and the `Tie` in its gauge.
+        """The `Result` with the plane where the reference puts it and the `Tie` in its gauge, and the `MapPrior` there.
 
         Parameters
         ----------
@@ -100,6 +111,11 @@ class ReferenceTie:
             common = _common(problem, result, step)
             if common is None:
                 result = replace(result, state=state, blocks=criterion.linearise(problem.scaled(result.robust), state))
+            elif problem.terms.n:  # what changes with time stays where it is
+                gauge = result.gauge
+                step = np.pad(step, (0, len(gauge.drift.covariance)))
+                state = _drifted(problem, replace(result, state=state), step)[1]
+                result = self._kept(self.solve(problem, state, hold=True), gauge, gauge.drift)
             else:
                 result = self.solve(problem, state, common=common)
         else:
@@ -117,59 +133,119 @@ class ReferenceTie:
         log.info("%s", made.sentence)
         if result.converged:
             result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds{rest}")
-        return replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown))
+        return replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown)), prior
 
-    def tie_rates(self, problem, result):
-        """The `Problem` and the `Result` with the motions of stars as those of the reference are on average.
+    def hold_stars(self, problem, result, prior):
+        """The `Problem` and the `Result` with the stars of the reference at what it knows of them.
 
-        Motions move by a map of the reference plane, coefficients by what takes it back; the same residuals but for
-        what is of second order, so that all is solved again where this leads.
+        Parameters
+        ----------
+        problem : Problem
+            In which stars move.
+        result : Result
+            Of `tie`.
+        prior : `legdistort.solving.gauge.catalogue_map.MapPrior`
+            Of the common map, at this result.
+
+        Raises
+        ------
+        InputError
+            At degree 0, and if most motions deviate.
         """
-        gauge, rows = result.gauge, self.identified.rows
-        good = np.isfinite(self.identified.motion_covariance).all(axis=(1, 2)) & result.gauge.tie.used
-        size = 2 * gauge.n_modes
-        centre, total = np.zeros(size), np.zeros(size)
-        for _ in range(_RATE_ROUNDS):
-            errors = self._errors(problem, result)
-            own = unpacked(errors.star_unknowns)[rows][:, 2:4, 2:4]
-            seen = good & np.isfinite(own).all(axis=(1, 2))
-            positions = result.state.positions.T
-            offsets = self.identified.motion - result.state.stars[2:4].T[rows]
-            modes = gauge.modes_at(positions[rows[seen]])
-            step, covariance, used, gain, scale = catalogue_rates.estimate(
-                offsets[seen],
-                (own + self.identified.motion_covariance)[seen],
-                modes,
-                gauge.drift,
-                centre=centre - total,
-                label=self.label,
+        gauge, status, scale2 = result.gauge, result.status, self.scale**2
+        if gauge.n_modes < 3:
+            raise InputError(
+                f"motions are tied to {self.label} at degree 1 or more: raise the degree, or leave out one of the two"
             )
-            total = total + step
+        size, before = 2 * gauge.n_modes, gauge.drift
+        values, covariance = self._offered(self.identified, problem.terms.n)
+        information = block_diag(prior.information, catalogue_motions.drift_information(before))
+        centre = np.concatenate([prior.centre, np.zeros(len(before.covariance))])
+        used, step = gauge.tie.used, np.zeros(len(centre))
+        if np.isfinite(values[used, 2:4]).all(axis=1).any():
+            rates, used = self._rates(problem, result, values, covariance)
+            step[size : 2 * size] = rates
+        for _ in range(_MAP_ROUNDS):
             problem, state = _drifted(problem, result, step)
-            status, result = result.status, self.solve(problem, state, hold=True)
-        log.info("motions are tied to those of %d stars of %s", np.count_nonzero(used), self.label)
+            centre = centre - step
+            result = self._kept(self.solve(problem, state, hold=True), gauge, before)
+            step, joint = self._whole_map(problem, result, values, covariance, used, information, centre)
+        log.info("stars are held at what %s knows of %d of them", self.label, np.count_nonzero(used))
+        rows = self.identified.rows
+        offsets = self.identified.xy - result.state.positions.T[rows]
+        more, more_covariance = self._offered(self.others, problem.terms.n)
+        catalogue = StarPrior.of(
+            len(self.names),
+            np.concatenate([rows[used], self.others.rows]),
+            np.concatenate([values[used], more]),
+            np.concatenate([covariance[used], more_covariance]) / scale2,
+        )
+        problem, state = _drifted(problem, result, step)
+        problem = replace(problem, moving=replace(problem.terms, catalogue=catalogue))
+        result = self._kept(self.solve(problem, state, hold=True), gauge, before)
+        n_tied = int(np.count_nonzero(np.isfinite(values[used, 2])))
+        parallax = values.shape[1] > 4 and bool(np.isfinite(values[used, 4]).any())
+        drift = result.gauge.drift.tied(joint, n_tied, parallax)
+        tie = replace(
+            gauge.tie, covariance=joint[:size, :size], shared=0 * gauge.tie.shared, offsets=offsets, used=used
+        )
+        result = replace(result, gauge=replace(result.gauge, tie=tie, drift=drift))
+        return problem, replace(result, status=status if result.converged else result.status)
+
+    @staticmethod
+    def _offered(found, k):
+        """What a reference knows of its stars: values (n, 2 + k) and covariances, NaN for what it does not."""
+        n = len(found.rows)
+        values, covariance = np.full((n, 2 + k), np.nan), np.full((n, 2 + k, 2 + k), np.nan)
+        known = found.xy if found.motion is None else np.hstack([found.xy, found.motion])
+        m = min(known.shape[1], 2 + k)
+        values[:, :m], covariance[:, :m, :m] = known[:, :m], found.covariance[:, :m, :m]
+        values[~np.isfinite(np.einsum("jaa->ja", covariance))] = np.nan
+        return values, covariance
+
+    def _kept(self, result, gauge, drift):
+        """A result with what an earlier `gauge` knew of the common map, and `drift` of those that change with time."""
+        kept = replace(result.gauge.drift, covariance=drift.covariance, held=drift.held)
+        return replace(result, gauge=replace(result.gauge, tie=gauge.tie, unknown_maps=gauge.unknown_maps, drift=kept))
+
+    def _rates(self, problem, result, values, covariance):
+        """A map (2 n_modes,) of the motions to those of the reference, and the stars that agree with it."""
+        gauge, rows = result.gauge, self.identified.rows
+        own = unpacked(self._errors(problem, result).star_unknowns)[rows][:, 2:4, 2:4]
+        offsets, both = values[:, 2:4] - result.state.stars[2:4].T[rows], own + covariance[:, 2:4, 2:4]
+        seen = gauge.tie.used & np.isfinite(offsets).all(axis=1) & np.isfinite(both).all(axis=(1, 2))
+        modes = gauge.modes_at(result.state.positions.T[rows[seen]])
+        rates, good, scale = catalogue_motions.accepted(offsets[seen], both[seen], modes, gauge.drift, label=self.label)
         if scale > np.sqrt(_LARGE):
             warn(
                 f"the proper motions of {self.label} differ from those of the stars by {scale:.1f} times what the "
                 "errors of both say; the absolute errors of motions rest on the stated ones",
                 AssumptionWarning,
             )
-        design = np.kron(np.eye(2), modes.T).reshape(2, -1, len(step)).transpose(1, 0, 2)
-        follows = own[seen] @ gain.transpose(0, 2, 1) @ design.transpose(0, 2, 1)
-        shared = np.zeros((2, 2, len(self.names)))
-        shared[:, :, rows[seen]] = -np.moveaxis(follows + follows.transpose(0, 2, 1), 0, -1)
-        drift = result.gauge.drift.tied(covariance, int(np.count_nonzero(used)), shared)
-        tied = replace(result.gauge, tie=gauge.tie, unknown_maps=gauge.unknown_maps, drift=drift)
-        result = replace(result, gauge=tied, status=status if result.converged else result.status)
-        return problem, self._tied_anew(problem, result)
+        used = gauge.tie.used.copy()
+        used[seen] = good
+        return rates, used
 
-    def _tied_anew(self, problem, result):
-        """The same with the `Tie` of a solution that has changed a little since it was made."""
-        errors = self._errors(problem, result)
-        directions = self._directions(result.gauge, errors, result.state.positions.T)
-        equations = self._equations(result, directions, errors, self._prior(result.gauge, directions))
-        _, made = catalogue_map.estimate(equations, result.gauge.tie.used, self.names)
-        return replace(result, gauge=replace(result.gauge, tie=made))
+    def _whole_map(self, problem, result, values, covariance, used, information, centre):
+        """By how much the common map and those that change with time are off, and their covariance."""
+        gauge, rows = result.gauge, self.identified.rows
+        tied = replace(gauge.drift, n_tied=1)
+        errors = self._errors(problem, replace(result, gauge=replace(gauge, tie=None, drift=tied)))
+        directions = errors.drift_directions
+        own = unpacked(errors.star_unknowns)
+        seen = used & np.isfinite(own[rows]).all(axis=(1, 2))
+        stars, size = rows[seen], 2 * gauge.n_modes
+        equations = self._equations(result, errors.directions, errors, self._prior(gauge, errors.directions))
+        return catalogue_motions.estimate(
+            values[seen] - result.state.stars.T[stars],
+            errors.covariance_between(stars, len(own[0])) if len(stars) <= catalogue_map.DENSE else own[stars],
+            covariance[seen],
+            directions[stars],
+            maps=np.linalg.qr(equations.determined(used)[0])[0][:size],
+            drift=gauge.drift,
+            information=information,
+            centre=centre,
+        )
 
     def _warn(self, made):
         """Tell what makes the absolute errors too small."""
@@ -223,7 +299,7 @@ class ReferenceTie:
         offsets = catalogue_map.Offsets(
             self.identified.rows,
             self.identified.xy - positions[self.identified.rows],
-            self.identified.covariance,
+            self.identified.covariance[:, :2, :2],
         )
         relative = errors.star_matrix if len(positions) <= catalogue_map.DENSE else errors.stars
         return catalogue_map.MapEquations(offsets, directions, relative, prior)
@@ -246,20 +322,17 @@ def _common(problem, result, step):
 
 
 def _drifted(problem, result, step):
-    """The `Problem` and the `State` whose motions are moved by a map (2 n_modes,), to first order."""
+    """The `Problem` and the `State` moved by maps (2 n_modes + q,), those that change with time too, to first order."""
     gauge, state = result.gauge, result.state
-    modes = gauge.modes_at(state.positions.T)
-    moved = step.reshape(2, -1) @ modes
-    stars, coefficients = state.stars.copy(), state.coefficients.copy()
-    stars[2:4] += moved
-    change = gauge.drift.motion[:, :, : len(step)] @ step
+    moved = step.reshape(-1, gauge.n_modes) @ gauge.modes_at(state.positions.T)
+    coefficients = state.coefficients.copy()
+    change = gauge.all_motion @ step
     coefficients[:, :, : gauge.n_modes] -= change.reshape(len(change), 2, -1)
     terms = problem.terms
     if terms.is_held:
         mean = np.zeros((terms.n, problem.n_stars)) + terms.mean
-        mean[:2] += moved
-        problem = replace(problem, moving=replace(terms, mean=mean))
-    return problem, State(stars, coefficients, state.poses)
+        problem = replace(problem, moving=replace(terms, mean=mean + moved[2:]))
+    return problem, State(state.stars + moved, coefficients, state.poses)
 
 
 def _pose(gauge, shift):
@@ -321,8 +394,12 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     )
     log.info("%d of the %d stars of %s are in the exposures", len(identified.rows), len(reference), reference.label)
     of = fit.options
+    known = np.all(elimination.inverse_star_blocks(fit.blocks.v)[np.diag(packed(fit.problem.n_star))] > 0, axis=0)
+    if not known[identified.rows].any():
+        raise InputError(f"no star of {reference.label} is seen at several epochs: leave out motion, or the reference")
     tying = ReferenceTie(
-        identified,
+        identified.subset(known[identified.rows]),
+        identified.subset(~known[identified.rows]),
         reference.label,
         matches.stars,
         scale=scale,
@@ -330,9 +407,9 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         shared_errors=fit.shared_errors,
     )
     problem = fit.problem.scaled(fit.used.astype(float))
-    result = tying.tie(problem, result)
-    if problem.terms.n and identified.motion is not None:
-        problem, result = tying.tie_rates(problem, result)
+    result, prior = tying.tie(problem, result)
+    if problem.terms.n:
+        problem, result = tying.hold_stars(problem, result, prior)
         fit = replace(fit, problem=replace(fit.problem, moving=problem.moving))
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
 

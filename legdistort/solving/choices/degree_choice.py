@@ -27,6 +27,7 @@ N_WORSE = 3
 CLOSE = 0.005
 #: Excess of a degree's energy over its noise, in standard deviations of the latter, that raises the alarm.
 ALARM = 5.0
+_UNTOLD = 1e-9  # part of the normal equations of a star below which they do not tell an unknown of its motion
 _OUTLIER = 25.0  # times the usual squared scatter of a star, at every degree: mismatched, it has no say
 
 
@@ -108,14 +109,23 @@ def _of(matches, stars):
 
 
 def _squares(solution, table):
-    """Squared scatter of every star over its errors, and its degrees of freedom, shape (n_stars, 2)."""
+    """Squared scatter of every star over its errors, and its degrees of freedom, shape (n_stars, 2).
+
+    About its mean, or its own motion where those of the stars are fitted.
+    """
     xy, sigma = corrected(solution, table)
     weight = np.where(np.isfinite(xy[:, :, 0]), sigma**-2, 0.0)
     xy = np.where(np.isfinite(xy), xy, 0.0)
-    total = weight.sum(axis=0)
-    mean = (weight[..., None] * xy).sum(axis=0) / np.where(total > 0, total, 1)[:, None]
-    squares = (weight * ((xy - mean) ** 2).sum(axis=2)).sum(axis=0)
-    return np.column_stack([squares, 2 * np.maximum((weight > 0).sum(axis=0) - 1, 0)])
+    rows, motions = np.tile(np.eye(2), (len(xy), 1, 1)), solution.motions  # unknowns of a star -> its place
+    if motions is not None:
+        rows = np.concatenate([rows, motions.columns(motions.years, solution.sky)], axis=2)
+    normal = np.einsum("ij,iab,iac->jbc", weight, rows, rows)
+    size, axes = np.linalg.eigh(normal)
+    known = size > _UNTOLD * np.einsum("jbb->j", normal)[:, None]
+    inverse = (axes * np.where(known, 1 / np.where(known, size, 1), 0)[:, None]) @ axes.transpose(0, 2, 1)
+    found = np.einsum("jbc,ij,iac,ija->jb", inverse, weight, rows, xy, optimize=True)
+    squares = np.einsum("ij,ija->j", weight, (xy - np.einsum("iab,jb->ija", rows, found)) ** 2)
+    return np.column_stack([squares, 2 * (weight > 0).sum(axis=0) - known.sum(axis=1)])
 
 
 # -- the aliasing alarm

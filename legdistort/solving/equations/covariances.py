@@ -8,7 +8,7 @@ from ...exceptions import AssumptionWarning, warn
 from ...results.gauge import UnknownDirection
 from . import criterion, elimination, reduced_system
 from .problem import State
-from .star_terms import packed, size_of
+from .star_terms import packed, unpacked
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
 DENSE_LIMIT = 8000
@@ -107,9 +107,17 @@ class Uncertainty:
         See `directions`. A map that stays the same changes motions in second order, by its gradient, and one that
         changes with time the positions of stars that move.
         """
-        gauge, system = self._gauge, self.system
+        gauge, system, terms = self._gauge, self.system, self._problem.terms
         moved = np.stack([system.follow(d) for d in system.moves[: gauge.n_constraints]], axis=2)
-        return -(moved @ np.hstack([gauge.reach, gauge.drift_reach])).transpose(1, 0, 2)
+        out = -(moved @ np.hstack([gauge.reach, gauge.drift_reach])).transpose(1, 0, 2)
+        if terms.is_held and gauge.drift.n_tied:  # the motion that is most probable beforehand moves with the map
+            values = gauge.modes_at(self._blocks.stars[:2].T)
+            for k, m in np.ndindex(2, gauge.n_modes):
+                pull = np.zeros((self._problem.n_star, self._problem.n_stars))
+                pull[2 + k] = terms.precision[k] * values[m]
+                column = 2 * gauge.n_modes + k * gauge.n_modes + m
+                out[:, :, column] += system.settle(np.zeros_like(self._blocks.g_exposure), pull)[0].T
+        return out
 
     def unknown_at(self, positions, coefficients, poses):
         """How the directions of `Gauge.unknown` move the stars where the solution has moved to: (2 n_stars, m).
@@ -135,7 +143,7 @@ class Uncertainty:
 
     def _system_at(self, positions, coefficients, poses):
         """The reduced system there, with the same constraints."""
-        stars = np.concatenate([positions.T, self._blocks.motions])
+        stars = np.concatenate([positions.T, self._blocks.stars[2:]])
         blocks = criterion.linearise(self._problem, State(stars, coefficients, poses))
         rows = self.system.rows[self._gauge.n_constraints :]
         return reduced_system.reduced_system(self._problem, blocks, self._gauge, rows)
@@ -146,7 +154,7 @@ class Uncertainty:
 
     @cached_property
     def bends(self):
-        """Covariance of star positions with the bend that leads to the convention, (n_stars, 2, 2 n_modes), px^2.
+        """Covariance of the unknowns of stars with the bend to the convention, (n_stars, 2 + k, 2 n_modes).
 
         See `legdistort.results.gauge.Gauge.to_convention`; None where the convention holds, or the covariance of the
         coefficients is approximated.
@@ -157,7 +165,7 @@ class Uncertainty:
         inverse, moved = elimination.inverse_star_blocks(blocks.v), []
         for errors in self._gauge.bend_errors(self.coefficients)[0].T:
             on_stars = elimination.to_stars(problem, blocks, errors.reshape(problem.n_exposures, -1))
-            moved.append(-elimination.symmetric_times(inverse, on_stars)[:2])
+            moved.append(-elimination.symmetric_times(inverse, on_stars))
         return np.stack(moved, axis=2).transpose(1, 0, 2)
 
     @cached_property
@@ -179,24 +187,36 @@ class Uncertainty:
     @cached_property
     def star_matrix(self):
         """Covariance between all star positions in the gauge, shape (2 n_stars,) squared, px^2; all x first."""
-        problem, blocks = self._problem, self._blocks
-        inverse = elimination.inverse_star_blocks(blocks.v)
-        n = problem.n_stars
-        alone = _star_blocks(inverse)
+        return self.covariance_between(np.arange(self._problem.n_stars), 2)
+
+    def covariance_between(self, stars, size):
+        """Covariance between the first `size` unknowns of some stars in the gauge, (size * n,) squared; all x first.
+
+        Parameters
+        ----------
+        stars : ndarray of int, shape (n,)
+        size : int
+            2 for the positions, 2 + k for all unknowns.
+        """
+        problem, blocks, n = self._problem, self._blocks, len(stars)
+        inverse = unpacked(elimination.inverse_star_blocks(blocks.v[:, stars]))[:, :size]
+        where = np.full(problem.n_stars, -1)
+        where[stars] = np.arange(n)
         coupling = np.zeros((problem.n_star, n, problem.n_exposures, 2 * problem.n_modes))
         for i in range(problem.n_exposures):
-            part = problem.part(i)
-            f, b = blocks.coupling[:, :, part], blocks.values[:, part]
+            part, seen = problem.part(i), where[problem.star[problem.part(i)]]
+            on = seen >= 0
+            f, b = blocks.coupling[:, :, part][:, :, on], blocks.values[:, part][:, on]
             pulled = problem.terms.pull(i, np.einsum("can,mn->camn", f, b))
-            coupling[:, problem.star[part], i] = np.moveaxis(pulled, 3, 1).reshape(problem.n_star, b.shape[1], -1)
-        spread = alone[: 2 * n] @ coupling.reshape(problem.n_star * n, -1)
-        shared = _star_blocks(np.broadcast_to(self._shared, (3, n)))
-        return self._scale**2 * alone[: 2 * n, : 2 * n] + shared + spread @ self.coefficients @ spread.T
-
-
-def _star_blocks(blocks):
-    """Symmetric packed blocks (m, n) of the stars as one matrix, all x first, then all y and so on."""
-    return np.block([[np.diag(blocks[k]) for k in row] for row in packed(size_of(blocks))])
+            coupling[:, seen[on], i] = np.moveaxis(pulled, 3, 1).reshape(problem.n_star, b.shape[1], -1)
+        coupling = coupling.reshape(problem.n_star, n, -1)
+        spread = np.concatenate([np.einsum("jb,bjk->jk", inverse[:, a], coupling) for a in range(size)])
+        out = spread @ self.coefficients @ spread.T
+        own = self._scale**2 * inverse[:, :, :size]
+        own[:, :2, :2] += unpacked(np.broadcast_to(self._shared, (3, problem.n_stars))[:, stars])
+        index = np.arange(size * n).reshape(size, n).T
+        out[index[:, :, None], index[:, None, :]] += own
+        return out
 
 
 def _block_diagonal(factor, covariance, n_star):

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...geometry import basis, detector_modes
-from .star_terms import packed, symmetric_times
+from .star_terms import symmetric_times
 
 #: Weight on steps along directions that are fixed, relative to that of the data.
 _HOLD = 1e4
@@ -53,10 +53,10 @@ class Blocks:
         Basis at every observation.
     unknowns : Unknowns
         The tangents at this state.
-    motions : ndarray, shape (k, n_stars)
-        Unknowns of the stars beside their positions, at this state.
+    stars : ndarray, shape (2 + k, n_stars)
+        Unknowns of the stars at this state.
     held : float
-        Part of J by what is known beforehand of the motions of stars.
+        Part of J by what is known beforehand of the stars.
     """
 
     chi2: float
@@ -70,7 +70,7 @@ class Blocks:
     coupling: np.ndarray
     values: np.ndarray
     unknowns: object
-    motions: np.ndarray
+    stars: np.ndarray
     held: float = 0.0
 
     @property
@@ -153,7 +153,7 @@ def linearise(problem, state):
     else:
         values, coupling, residual, v, g_star, u, g_exposure = _sums(problem, state)
         chi2 = float(squares(problem, residual).sum())
-    u_data, penalty, held = u, 0.0, 0.0
+    u_data, penalty = u, 0.0
     if problem.has_prior:
         u = u.copy()
         for i in range(problem.n_exposures):
@@ -166,21 +166,11 @@ def linearise(problem, state):
                 rows = problem.fixed[i]
                 u[i] += _HOLD * np.trace(u_data[i]) / len(departure) * rows.T @ rows
                 g_exposure[i] -= rows.T @ (rows @ g_exposure[i])
-    if problem.terms.is_held:
-        held = _hold_motions(problem.terms, state.stars[2:], v, g_star)
+    held = problem.terms.hold(state.stars, v, g_star)
     tangents = problem.unknowns.at(state.coefficients)
     return Blocks(
-        chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values, tangents, state.stars[2:], held
+        chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values, tangents, state.stars, held
     )
-
-
-def _hold_motions(terms, values, v, g_star):
-    """Add what is known beforehand of the terms of the stars, at values (k, n_stars); the part of J."""
-    values = values - terms.mean
-    for k, place in enumerate(np.diag(packed(2 + terms.n))[2:]):
-        v[place] += terms.precision[k]
-        g_star[2 + k] -= terms.precision[k] * values[k]
-    return float((terms.precision * values**2).sum())
 
 
 def _sums(problem, state):

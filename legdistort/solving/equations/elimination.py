@@ -61,8 +61,7 @@ def star_freedom(problem, blocks):
     number = 2 * int(np.count_nonzero(blocks.v[0] > 0))
     if not problem.terms.n:
         return number
-    held = (problem.terms.precision * inverse[places[2:]]).sum()
-    return number + np.count_nonzero(inverse[places[2:]] > 0) - float(held)
+    return number + np.count_nonzero(inverse[places[2:]] > 0) - problem.terms.done_by_prior(inverse)
 
 
 def to_stars(problem, blocks, a):

@@ -15,6 +15,42 @@ TERMS = {"proper": ("vx", "vy"), "parallax": ("vx", "vy", "parallax")}
 
 
 @dataclass(frozen=True, eq=False)
+class StarPrior:
+    """What is known beforehand of single stars, as of those of a reference catalogue: a normal distribution of each.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (2 + k, n_stars)
+    precision : ndarray, shape (m, n_stars)
+        Inverse covariances, packed (`packed`); zero for what is not known.
+    """
+
+    mean: np.ndarray
+    precision: np.ndarray
+
+    @classmethod
+    def of(cls, n_stars, rows, values, covariance):
+        """That of some stars with values (n, 2 + k), NaN for what is not known, and covariances (n, 2 + k, 2 + k)."""
+        size = values.shape[1]
+        mean, precision = np.zeros((size, n_stars)), np.zeros((n_stars, size, size))
+        mean[:, rows] = np.nan_to_num(values).T
+        precision[rows] = known_precision(values, covariance)
+        lower = np.tril_indices(size)
+        out = np.zeros((size * (size + 1) // 2, n_stars))
+        out[packed(size)[lower]] = precision[:, *lower].T
+        return cls(mean, out)
+
+
+def known_precision(values, covariance):
+    """Inverse covariances (n, s, s) of values (n, s), with zeros for those that are NaN or have no error."""
+    size = values.shape[1]
+    known = np.isfinite(values) & np.isfinite(np.einsum("jaa->ja", covariance))
+    both = known[:, :, None] & known[:, None, :]
+    filled = np.where(both, covariance, np.eye(size))
+    return np.where(both, np.linalg.inv(filled), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
 class StarTerms:
     """Terms of the stars of a problem; none by default.
 
@@ -32,6 +68,8 @@ class StarTerms:
         Year of the positions.
     mean : ndarray, shape (k, n_stars), or float
         Most probable values of the unknowns beforehand.
+    catalogue : StarPrior or None
+        What is known beforehand of single stars, positions and unknowns.
     """
 
     columns: np.ndarray
@@ -40,6 +78,7 @@ class StarTerms:
     years: np.ndarray | None = None
     epoch: float | None = None
     mean: np.ndarray | float = 0.0
+    catalogue: StarPrior | None = None
 
     @classmethod
     def none(cls, n_exposures):
@@ -75,8 +114,40 @@ class StarTerms:
 
     @property
     def is_held(self):
-        """Whether something is known of the unknowns beforehand."""
+        """Whether something is known beforehand of how the unknowns scatter over the stars."""
         return bool(np.any(self.precision))
+
+    def hold(self, stars, v, g_star):
+        """Add what is known beforehand to packed blocks (m, n_stars) and gradients, (2 + k, n_stars) as `stars`.
+
+        Returns
+        -------
+        float
+            Its part of J.
+        """
+        part = 0.0
+        if self.is_held:
+            off = stars[2:] - self.mean
+            v[np.diag(packed(2 + self.n))[2:]] += self.precision
+            g_star[2:] -= self.precision * off
+            part += float((self.precision * off**2).sum())
+        if self.catalogue is not None:
+            off = stars - self.catalogue.mean
+            pull = symmetric_times(self.catalogue.precision, off)
+            v += self.catalogue.precision
+            g_star -= pull
+            part += float((pull * off).sum())
+        return part
+
+    def done_by_prior(self, inverse):
+        """Number of unknowns that what is known beforehand determines, from inverse packed blocks (m, n_stars)."""
+        places = np.diag(packed(2 + self.n))
+        number = float((self.precision * inverse[places[2:]]).sum())
+        if self.catalogue is not None:
+            twice = np.full((len(inverse), 1), 2.0)  # off the diagonal entries count for both of theirs
+            twice[places] = 1.0
+            number += float((twice * self.catalogue.precision * inverse).sum())
+        return number
 
     def lift(self, n_modes):
         """Fields of the unknowns -> displacement fields of every exposure, (n_exposures, 2 n, (2 + k) n), n modes."""

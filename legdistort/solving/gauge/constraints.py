@@ -60,14 +60,15 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     error = conditional_errors(blocks.u_data)
     maps = _taken_back(problem, motion, box, shared_shears)
     static = _static_variance(problem, others, group, shared)
+    drifting, drifts, rates = _drifts(problem, motion, others, shared_shears, all_drifts)
     if dynamic is None:
-        dynamic = dynamic_covariance(problem, state, error, others @ motion @ maps.T, others, group, static)
+        moved = np.concatenate([others @ motion @ maps.T, others @ drifting @ drifts.T], axis=2)
+        dynamic = dynamic_covariance(problem, state, error, moved, others, group, static)
     spread = others @ (dynamic + np.where(held, 0, 1)[:, None, None] * error) @ others.transpose(0, 2, 1)
     weight = np.where(held, 1, influence(error, others))[:, None, None] * np.linalg.inv(spread)
     positions = state.positions.T[used]
     values = basis.values(problem.degree, *((positions - box[0]) / box[1]).T)
     power = values @ values.T / values.shape[1]
-    drifting, drifts, rates = _drifts(problem, motion, others, shared_shears, all_drifts)
     size = tuple(2 * box[1, ::-1])
     hierarchy = Hierarchy(motion, others, dynamic, weight, group, static, maps, size, power, drifting @ drifts.T)
     poses = _pose_rows(kind, motion, error, similar, box)
@@ -77,6 +78,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     known = hierarchy.solve(kind, released)
     rows = np.concatenate([known.rows, poses])
     covariance, drift_covariance = hierarchy.covariance(known, poses, drifting @ rates.T)
+    pointed = _without_rates(hierarchy.pointed, values, drifting.shape[2]) @ drifts.T
     made = Gauge(
         kind,
         constraint=rows,
@@ -88,7 +90,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         static=_in_a_word(static, shared),
         prior=bool(held.any()),
         convention=np.concatenate([hierarchy.convention(kind), poses]) if static.any() else None,
-        drift=Drift(problem.terms.names, drifting, drifts.T @ drift_covariance @ drifts, drifts, rates)
+        drift=Drift(problem.terms.names, drifting, pointed @ drift_covariance @ pointed.T, drifts, rates)
         if problem.terms.n
         else None,
     )
@@ -128,6 +130,19 @@ def _drifts(problem, motion, others, shared_shears, all_drifts):
         return drifting, np.zeros((0, drifting.shape[2])), carried
     inside = complement(carried @ possible.T) @ possible
     return drifting, inside, carried
+
+
+def _without_rates(pointed, values, q):
+    """Takes off modes (q,) of maps that change with time the rates and mean parallax that they do to the stars, (q, q).
+
+    `pointed` (2 n, 2 n) does so for a common map; `values` (n, n_stars) are the modes at the stars.
+    """
+    n = len(values)
+    out, first = np.eye(q), 2 * n if q >= 2 * n else 0
+    out[:first, :first] = pointed[:first, :first]
+    if q > first:
+        out[first, first:] -= values.mean(axis=1) / values[0].mean()
+    return out
 
 
 def _null_space(matrix, tolerance):

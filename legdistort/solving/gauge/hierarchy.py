@@ -112,13 +112,14 @@ class Hierarchy:
         return smallest
 
     @cached_property
-    def _pointed(self):
+    def pointed(self):
+        """Takes off modes of a map the similarity that they do to the stars, (2 n, 2 n)."""
         return _pointing_off(self.power, self.size)
 
     @cached_property
     def metric(self):
         """Mean square displacement of the stars, per axis, by modes (2 n,) squared, once a similarity is taken off."""
-        return _metric(self.power, self._pointed)
+        return _metric(self.power, self.pointed)
 
     def solve(self, kind, released=None):
         """What is known of the common map, with constraints: `Constraints`.
@@ -149,7 +150,7 @@ class Hierarchy:
             unknown = unknown @ complement(inside.T).T
         rows = np.concatenate([np.tensordot(known.T, rows[:n], 1), np.tensordot(unknown.T, held[:n], 1), rows[n:]])
         return Constraints(
-            rows, self.maps.T @ known, _named(self.maps.T @ unknown, self._pointed, self.metric, self.size)
+            rows, self.maps.T @ known, _named(self.maps.T @ unknown, self.pointed, self.metric, self.size)
         )
 
     def covariance(self, known, poses, rates):
@@ -176,7 +177,7 @@ class Hierarchy:
             also = np.einsum("bia,iac->bc", rows, np.concatenate([self.drifts, rates], axis=2), optimize=True)
             reach = np.concatenate([reach, also], axis=1)
         inverse = np.linalg.inv(reach)
-        back, drifting = self._pointed @ maps[:, :n] @ inverse[:n], inverse[maps.shape[1] :][:m]
+        back, drifting = self.pointed @ maps[:, :n] @ inverse[:n], inverse[maps.shape[1] :][:m]
         return back @ inside @ back.T, drifting @ inside @ drifting.T
 
 
