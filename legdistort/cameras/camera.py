@@ -186,24 +186,30 @@ class Camera:
         return "\n".join(lines)
 
     @classmethod
-    def gsaoi(cls):
+    def gsaoi(cls, *, size=GSAOI_SIZE):
         """The four detectors of GSAOI at Gemini South, "1" to "4", by the polynomials that DRAGONS uses.
 
         1 is the lower right one, 2 lower left, 3 upper left, 4 upper right. A pixel of the focal plane is 0.0197
         arcsec. The uncertainty of the published numbers is not known.
+
+        Parameters
+        ----------
+        size : int
+            Pixels along a side of a detector. Other than 2048 it is the same field on coarser or finer pixels.
         """
-        size, detectors = (GSAOI_SIZE, GSAOI_SIZE), {}
+        shape, detectors = (size, size), {}
         for k in (1, 2, 3, 4):
-            published = GsaoiMap(k)
+            published = GsaoiMap(k, size)
 
             def shift(u, v, published=published):
-                q = basis.denormalize(u, v, size)
+                q = basis.denormalize(u, v, shape)
                 return (published.distort(q) - q).T
 
-            scale = np.column_stack([GSAOI_SCALE * np.eye(2), np.zeros(2)])
+            pixel = GSAOI_SCALE * GSAOI_SIZE / size
+            scale = np.column_stack([pixel * np.eye(2), np.zeros(2)])
             layout = similarity.compose(similarity.invert(published.similarity), scale)
             static = basis.project(shift, GSAOI_DEGREE, GSAOI_DEGREE + 8)
-            detectors[str(k)] = Detector(size, layout=layout, static=static)
+            detectors[str(k)] = Detector(shape, layout=layout, static=static)
         return cls("GSAOI", detectors)
 
     def of_detectors(self, exposures):
