@@ -1,5 +1,6 @@
 """Cameras of several detectors: value objects, the focal plane, solutions over all detectors."""
 
+import json
 from dataclasses import replace
 
 import asdf
@@ -16,6 +17,8 @@ from legdistort.cameras import camera as cameras
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
+from legdistort.simulation import gsaoi_night
+from legdistort.simulation.observations import simulate_gsaoi_matches
 from legdistort.wcs import storage
 
 SIGMA = 0.01
@@ -593,6 +596,41 @@ def sky_header(chip, shift, camera):
         "CRVAL1": 30.0 + place[0], "CRVAL2": place[1],
         "CD1_1": slope[0, 0], "CD1_2": slope[0, 1], "CD2_1": slope[1, 0], "CD2_2": slope[1, 1],
     }  # fmt: skip
+
+
+class TestSimulation:
+    def test_truth_is_as_published(self):
+        """Pixels of the simulated stars on all detectors are those of the published polynomials, up to one shift."""
+        truth, _ = gsaoi_night.draw_night(gsaoi_night.make_night(True, camera="gsaoi", dynamic_rms=0.0), 3)
+        away, coarse = [], gsaoi_images.SIZE / 256
+        for key, chip in gsaoi_images.CHIPS.items():
+            xy = truth.on_detector("exp02", key, truth.positions)
+            seen = np.isfinite(xy[:, 0])
+            arcsec = gsaoi_images.to_arcsec(gsaoi_images.published()[chip], (xy[seen] + 0.5) * coarse - 0.5)
+            away.append(arcsec / cameras.GSAOI_SCALE / coarse - truth.distort("exp02", truth.positions[seen]))
+        away = np.concatenate(away)
+        assert len(away) > 60
+        assert np.abs(away - away.mean(axis=0)).max() < 1e-5
+
+    def test_demo(self, tmp_path, capsys):
+        """The demonstration with a camera: at the bound, in one mosaic as sharp as the frames."""
+        out = tmp_path / "demo"
+        assert main(["demo", "--camera", "gsaoi", "--small", "--out", str(out), "--quiet", "--json"]) == 0
+        summary = json.loads(capsys.readouterr().out)
+        assert summary["b_px"] < 1.3 * summary["b_bound_px"]
+        assert summary["b_abs_px"] < 2 * summary["b_abs_err_px"]
+        assert 0.97 < summary["fwhm_ratio"] < 1.03
+        with fits.open(out / "frames" / "exp00.fits") as hdulist:
+            assert [(hdu.name, hdu.ver, hdu.header["CCDCHIP"]) for hdu in hdulist[1:]] == [
+                ("SCI", k, k) for k in (1, 2, 3, 4)
+            ]
+        assert len(list((out / "wcs").iterdir())) == 4 * summary["n_exposures"]
+
+    def test_other_cameras_are_refused(self, tmp_path):
+        with pytest.raises(InputError, match="camera must be 'gsaoi' or None, got 'wfc3'"):
+            legdistort.simulate_exposures(camera="wfc3")
+        with pytest.raises(InputError, match="camera is for images"):
+            simulate_gsaoi_matches(camera="gsaoi")
 
 
 class TestFrames:

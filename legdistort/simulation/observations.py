@@ -48,7 +48,7 @@ class SimulatedExposures:
     Attributes
     ----------
     hdus : dict
-        ``{name: HDUList}``, image in the primary HDU.
+        ``{name: HDUList}``, image in the primary HDU, or those of the detectors of a camera in extensions ``SCI``.
     truth : Truth
     psfs : dict
         ``{name: PSF}``, what `~legdistort.simulation.rendering.render` was given for each.
@@ -214,12 +214,13 @@ def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **set
     """Images of a simulated GSAOI night.
 
     Stars are drawn with at least 10 FWHM between them. Their true pixels are ``D(q) + d_i(q)``: the published static
-    distortion D of the real detector, inverted by Newton's method, and a dynamic Legendre part.
+    distortion D of the real detector, inverted by Newton's method, and a dynamic Legendre part. With
+    ``camera="gsaoi"`` they are those of four detectors in one focal plane, to which the dynamic part belongs.
 
     Parameters
     ----------
     small : bool
-        Six exposures of 512 x 512 pixels instead of eleven of 2048 x 2048.
+        Six exposures of 512 x 512 pixels instead of eleven of 2048 x 2048; of a camera that has so many in all.
     noise : bool
         Photon and read noise; without it the images are float32 and not clipped at saturation.
     seed : int
@@ -245,15 +246,28 @@ def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **set
     hdus, psfs = {}, {}
     for i, name in enumerate(tqdm(truth.names, desc="simulate", disable=not progress)):
         psfs[name] = psf = night.psf_of(i, rng)
-        xy = truth.distort(name, truth.positions)
-        image = rendering.render(truth.shape, xy, truth.flux, psf=psf, sky=night.sky)
-        if noise:
-            image = rendering.add_noise(image, rng, gain=night.gain, read_noise=night.read_noise)
-            image = np.rint(np.clip(image, 0, min(night.saturation, 65535))).astype(np.uint16)
-        else:
-            image = image.astype(np.float32)
-        hdus[name] = fits.HDUList([fits.PrimaryHDU(image, gsaoi_night.header(truth, name, night, i))])
+        if truth.camera is None:
+            xy = truth.distort(name, truth.positions)
+            image = _image(night, truth.shape, xy, truth.flux, psf, rng, noise)
+            hdus[name] = fits.HDUList([fits.PrimaryHDU(image, gsaoi_night.header(truth, name, night, i))])
+            continue
+        hdus[name] = fits.HDUList([fits.PrimaryHDU(header=fits.Header({"INSTRUME": "GSAOI"}))])
+        for version, (key, chip) in enumerate(truth.camera.detectors.items(), start=1):
+            xy = truth.on_detector(name, key, truth.positions)
+            seen = np.isfinite(xy[:, 0])
+            image = _image(night, chip.shape, xy[seen], truth.flux[seen], psf, rng, noise)
+            header = gsaoi_night.header(truth, name, night, i, detector=key)
+            hdus[name].append(fits.ImageHDU(image, header, name="SCI", ver=version))
     return SimulatedExposures(hdus, truth, psfs)
+
+
+def _image(night, shape, xy, flux, psf, rng, noise):
+    """One image of a night; float32 without noise."""
+    image = rendering.render(shape, xy, flux, psf=psf, sky=night.sky)
+    if not noise:
+        return image.astype(np.float32)
+    image = rendering.add_noise(image, rng, gain=night.gain, read_noise=night.read_noise)
+    return np.rint(np.clip(image, 0, min(night.saturation, 65535))).astype(np.uint16)
 
 
 def simulate_gsaoi_matches(*, small=False, seed=0, **settings):
@@ -268,6 +282,8 @@ def simulate_gsaoi_matches(*, small=False, seed=0, **settings):
     Simulation
     """
     night = gsaoi_night.make_night(small, **settings)
+    if night.camera:
+        raise InputError("camera is for images: simulate_exposures, whose detectors measure finds")
     truth, rng = gsaoi_night.draw_night(night, seed)
     observed = gsaoi_night.stars_inside(truth, night, truth.positions)
     observed &= np.count_nonzero(observed, axis=0) >= min(4, night.n_exposures)
