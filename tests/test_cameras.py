@@ -17,6 +17,7 @@ from legdistort.cameras import camera as cameras
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
+from legdistort.reporting.page import render
 from legdistort.simulation import gsaoi_night
 from legdistort.simulation.observations import simulate_gsaoi_matches
 from legdistort.wcs import storage
@@ -114,7 +115,7 @@ class TestCamera:
 
     def test_prints(self, gsaoi):
         assert repr(gsaoi) == "<Camera GSAOI: 4 detectors in a focal plane of 4301 x 4276 px>"
-        assert str(gsaoi).splitlines()[3].split() == ["2", "2048", "x", "2048", "1089.95", "1034.66", "-0.4787",
+        assert str(gsaoi).splitlines()[3].split() == ["2", "2048", "x", "2048", "1089.95", "1034.66", "0.0237",
                                                       "0.991644", "2.900"]  # fmt: skip
 
     def test_file(self, gsaoi, tmp_path):
@@ -143,7 +144,7 @@ class TestCamera:
             ({"layout": np.eye(3)}, "layout must be"),
             ({"shape": (1, 5)}, "shape must be"),
             ({"static": np.full((2, 10), np.nan)}, "coefficients must be finite"),
-            ({"static_sigma": -1}, "static_sigma must be finite and not negative"),
+            ({"static_sigma": -1}, "static_sigma must not be negative or NaN"),
             ({"layout_sigma": [1, 2]}, "layout_sigma must be"),
             ({"static": legdistort.Prior(np.zeros((2, 10)), shape=(9, 9))}, "prior is for a detector of shape"),
         ],
@@ -164,6 +165,8 @@ class TestCamera:
             legdistort.Camera("c", {})
         with pytest.raises(InputError, match="camera c has no detector '7'; it has 1"):
             legdistort.Camera("c", {1: one})["7"]
+        with pytest.raises(InputError, match=r"common_sigma must be standard deviations \(2, n_modes\)"):
+            legdistort.Camera("c", {1: one}, common_sigma=[1.0, -1.0])
 
     def test_picture(self, gsaoi):
         ax = gsaoi.plot()
@@ -422,8 +425,46 @@ class TestFittedCamera:
         kept = kept[np.bincount(kept["star"])[kept["star"]] >= 3]
         pair = kept[np.isin(kept["detector"], ["1", "3"])]
         matches = legdistort.Matches.from_table(pair, camera=gsaoi)
-        with pytest.warns(AssumptionWarning, match="2 unknowns of camera GSAOI are not determined by these exposures"):
-            legdistort.solve(matches, layout="fit")
+        words = r"2 unknowns of camera GSAOI are not determined by these exposures.*\(no star in common: 1 \| 3\)"
+        with pytest.warns(AssumptionWarning, match=words):
+            solution = legdistort.solve(matches, layout="fit")
+        for key in "13":
+            assert np.isinf(solution.camera[key].layout_sigma).any()
+        assert solution.camera["2"].layout_sigma is None  # nothing was measured on it
+        assert "so that their places relative to each other are not determined" in solution.camera_sentence
+        assert "inf" in str(solution).splitlines()[-4]
+        again = legdistort.Camera.read(solution.camera.write("camera.asdf"))
+        assert np.array_equal(again["1"].layout_sigma, solution.camera["1"].layout_sigma)
+
+    def test_errors_of_places(self, gsaoi):
+        """Centres and rotations in the printed table scatter by their errors, draw by draw; the report has them."""
+        night, camera = gsaoi_images.Night(n_exposures=6, n_stars=350, dither=6.0), misplaced(gsaoi, shift=1, turn=0.01)
+        places, errors = [], []
+        for seed in range(8):
+            solution = legdistort.solve(
+                legdistort.Matches.from_table(night.table(sigma=SIGMA, seed=seed), camera=camera), layout="fit"
+            )
+            each = [detector.place for detector in solution.camera.detectors.values()]
+            places.append([(place.x, place.y, place.rotation) for place in each])
+            errors.append([place.errors for place in each])
+        ratio = np.sqrt(np.var(places, axis=0, ddof=1) / np.mean(np.square(errors), axis=0))
+        assert np.all((ratio > 0.3) & (ratio < 1.8))
+        assert np.mean(ratio) == pytest.approx(1, abs=0.3)
+        page = render(solution)
+        assert "Detectors of camera GSAOI" in page
+        assert f"{each[0].x:.3f} ± {each[0].errors[0]:.2g}" in page
+
+    def test_the_next_night_knows_what_this_one_did_not(self, gsaoi):
+        """A camera found without rolls leaves the common shear unknown, also where it is taken as known later."""
+        night = gsaoi_images.Night(n_exposures=6, n_stars=350, dither=6.0, turn=0.0)
+        table = night.table(sigma=SIGMA)
+        camera = legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi), layout="fit").camera
+        assert np.isinf(camera.common_sigma[:, 1:3]).all()
+        again = legdistort.Camera.from_meta(legdistort.Camera.read(camera.write("c.asdf")).to_meta())
+        next_night = legdistort.Matches.from_table(table, camera=again)
+        for layout in ("hold", "prior"):
+            assert legdistort.solve(next_night, layout=layout).gauge.unknown_names == ("shear",)
+        assert legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi)).gauge.unknown_names == ()
 
     def test_a_mismatch_does_not_move_the_camera(self, gsaoi):
         night = gsaoi_images.Night(n_stars=400, dither=6.0)

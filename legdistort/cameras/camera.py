@@ -7,11 +7,12 @@ exposure adds to them is a distortion of the focal plane as a whole.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from astropy import units as u
+from scipy.sparse.csgraph import connected_components
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity
@@ -45,6 +46,10 @@ class Camera:
     field : tuple, optional
         ``(ny, nx)`` of the focal plane, whose pixels are counted from 0 as those of a detector. None: the box around
         all detectors, to which the layouts are shifted.
+    common_sigma : array_like, shape (2, n_modes), optional
+        Uncertainty of a distortion of the focal plane that all detectors have in common, standard deviations of its
+        modes in pixels, beside that of each detector; infinite where nothing is known. Exposures cannot tell it from
+        one of their own, so that layouts and static distortions found from them leave it out. None: none.
 
     Raises
     ------
@@ -55,6 +60,7 @@ class Camera:
     name: str
     detectors: dict
     field: tuple | None = None
+    common_sigma: np.ndarray | None = None
 
     def __post_init__(self):
         if not isinstance(self.detectors, dict) or not self.detectors:
@@ -84,6 +90,7 @@ class Camera:
             )
         object.__setattr__(self, "detectors", detectors)
         object.__setattr__(self, "field", field)
+        object.__setattr__(self, "common_sigma", _common(self.common_sigma))
         self._check_overlaps()
 
     def _check_overlaps(self):
@@ -165,25 +172,47 @@ class Camera:
             self[key]  # refuses an unknown one
         return detector
 
+    def groups(self, table):
+        """Lists of detectors that have stars in common, directly or through others.
+
+        Parameters
+        ----------
+        table : `~astropy.table.Table`
+            Columns ``detector`` and ``star``. Detectors without a position are in none.
+        """
+        keys, detector = np.unique(self.ids(table), return_inverse=True)
+        stars, star = np.unique(np.asarray(table["star"]), return_inverse=True)
+        seen = np.zeros((len(keys), len(stars)), dtype=bool)
+        seen[detector, star] = True
+        _, group = connected_components(seen.astype(int) @ seen.T, directed=False)
+        return [[str(key) for key in keys[group == g]] for g in np.unique(group)]
+
     def __repr__(self):
         ny, nx = self.field
         return f"<Camera {self.name}: {len(self.detectors)} detectors in a focal plane of {nx} x {ny} px>"
 
     def __str__(self):
+        return "\n".join([repr(self)[1:-1], *self.table_lines()])
+
+    def table_lines(self):
+        """Lines of a table of where the detectors lie, with the errors of that where it is not exact."""
+        places = {key: each.place for key, each in self.detectors.items()}
+        known = any(place.errors is not None for place in places.values())
+        errors = f" {'+-':>8s}" * known
         lines = [
-            repr(self)[1:-1],
-            f"{'detector':10s} {'size [px]':>13s} {'centre x':>10s} {'centre y':>10s} {'rotation':>9s} {'scale':>9s} "
-            f"{'static':>8s}",
+            f"{'detector':10s} {'size [px]':>13s} {'centre x':>10s}{errors} {'centre y':>10s}{errors} "
+            f"{'rotation':>9s}{errors} {'scale':>9s} {'static':>8s}"
         ]
-        for key, each in self.detectors.items():
-            ny, nx = each.shape
-            x, y = each.to_focal_plane(basis.denormalize(np.zeros(1), np.zeros(1), each.shape))[0]
-            d = similarity.describe(each.layout)
-            lines.append(
-                f"{key[:10]:10s} {f'{nx} x {ny}':>13s} {x:10.2f} {y:10.2f} {d['rotation']:9.4f} {d['scale']:9.6f} "
-                f"{each.rms:8.3f}"
+        for key, place in places.items():
+            ny, nx = self[key].shape
+            x, y, rotation = (
+                f" {error:8.2g}" if known else "" for error in (place.errors if place.errors else (0.0, 0.0, 0.0))
             )
-        return "\n".join(lines)
+            lines.append(
+                f"{key[:10]:10s} {f'{nx} x {ny}':>13s} {place.x:10.2f}{x} {place.y:10.2f}{y} "
+                f"{place.rotation:9.4f}{rotation} {place.scale:9.6f} {self[key].rms:8.3f}"
+            )
+        return lines
 
     @classmethod
     def gsaoi(cls, *, size=GSAOI_SIZE):
@@ -290,11 +319,23 @@ class Camera:
         return storage.read_camera(path, cls)
 
 
+def _common(sigma):
+    """`common_sigma` as an array (2, n_modes), or None."""
+    if sigma is None:
+        return None
+    out = np.array(sigma, dtype=float)
+    if out.ndim != 2 or len(out) != 2 or not np.all(out >= 0):
+        raise InputError(
+            f"common_sigma must be standard deviations (2, n_modes) in pixels, none negative or NaN, got {sigma!r}"
+        )
+    basis.degree_of(out.shape[1])  # refuses a number that is none of modes
+    return out
+
+
 def _shifted(detector, first):
     """The detector in a focal plane whose origin lies at `first` of the one before."""
     layout = similarity.compose(detector.layout, np.column_stack([np.eye(2), first]))
-    widths = {"layout_sigma": detector.layout_sigma, "static_sigma": detector.static_sigma}
-    return Detector(detector.shape, layout=layout, static=detector.static, **widths)
+    return replace(detector, layout=layout)
 
 
 def _within(outline, field):
