@@ -639,6 +639,35 @@ def sky_header(chip, shift, camera):
     }  # fmt: skip
 
 
+class TestPrediction:
+    def test_as_solved(self, gsaoi):
+        """Errors predicted for stars, dithers and a camera are those of the solution of such positions."""
+        night = gsaoi_images.Night(n_exposures=6, n_stars=350, turn=0.0, dynamic=0.0)
+        table = night.table(sigma=SIGMA)
+        solution = legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi), degree=3)
+        planned = legdistort.predict(
+            n_exposures=6, stars=solution.positions, sigma=SIGMA, poses=solution.poses, camera=gsaoi, min_exposures=3
+        )
+        assert np.sum(planned.solution.stars["n"]) == np.sum(solution.stars["n"])
+        found, expected = (s.stars["x_err"].value for s in (solution, planned.solution))
+        assert np.allclose(found, expected, rtol=0.02)
+
+    def test_more_detectors_tell_more(self, gsaoi):
+        """In the shell; over the field of all detectors as over that of one, for as many stars a detector."""
+        given = {"n_exposures": 8, "density": 50, "sigma": 0.02, "dithers": 200.0}
+        whole = legdistort.predict(camera=gsaoi, **given)
+        assert whole.b_abs < 1 or np.isnan(whole.b_abs)
+        assert whole.sigma < legdistort.predict(prior=legdistort.Prior(np.zeros((2, 1))), **given).sigma
+        shell = "predict --camera gsaoi --n-exposures 8 --density 50 --sigma 0.02 --dither 200"
+        assert main(shell.split()) == 0
+
+    def test_shape_and_camera(self, gsaoi):
+        with pytest.raises(InputError, match="shape and camera both say how large the field is"):
+            legdistort.predict(n_exposures=4, n_stars=50, sigma=0.01, shape=(2048, 2048), camera=gsaoi)
+        with pytest.raises(InputError, match=r"camera must be a legdistort\.Camera, got str"):
+            legdistort.predict(n_exposures=4, n_stars=50, sigma=0.01, camera="gsaoi")
+
+
 class TestSimulation:
     def test_truth_is_as_published(self):
         """Pixels of the simulated stars on all detectors are those of the published polynomials, up to one shift."""

@@ -172,6 +172,18 @@ class Camera:
             self[key]  # refuses an unknown one
         return detector
 
+    def sees(self, f):
+        """Which positions f (n, 2) of the focal plane fall on each detector, bool (n_detectors, n)."""
+        return np.array([each.sees(f) for each in self.detectors.values()])
+
+    def errors_in_focal_plane(self, f, errors):
+        """Errors (n, 2) at positions f (n, 2) by those measured on the detector there; unchanged where there is none."""
+        out = np.array(errors, dtype=float)
+        for each, here in zip(self.detectors.values(), self.sees(f), strict=True):
+            back = np.linalg.inv(each.slope(f[here]))
+            out[here] = np.sqrt(np.einsum("nab,nb->na", back**2, out[here] ** 2))
+        return out
+
     def groups(self, table):
         """Lists of detectors that have stars in common, directly or through others.
 

@@ -129,6 +129,14 @@ class Detector:
         back = np.linalg.inv(self.slope(f))
         return f, back @ covariance @ back.mT
 
+    def sees(self, f):
+        """Which positions f (n, 2) of the focal plane fall on it."""
+        q, size = similarity.apply(self.layout, f), np.array(self.shape[::-1])
+        near = np.all((q > -0.1 * size) & (q < 1.1 * size), axis=1)  # beyond that the series means nothing
+        xy = self.distortion(q[near])
+        near[near] = np.all((xy >= -0.5) & (xy <= size - 0.5), axis=1)
+        return near
+
     def slope(self, f):
         """Derivative (n, 2, 2) of the detector pixels by the focal-plane pixels f (n, 2)."""
         return self.distortion.jacobian(similarity.apply(self.layout, f)) @ self.layout[:, :2]

@@ -210,7 +210,7 @@ def _drawn(rng, given, shape, name):
     return given * rng.normal(size=shape) if given.ndim == 0 else given
 
 
-def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **settings):
+def simulate_exposures(*, small=False, camera=None, noise=True, seed=0, progress=False, **settings):
     """Images of a simulated GSAOI night.
 
     Stars are drawn with at least 10 FWHM between them. Their true pixels are ``D(q) + d_i(q)``: the published static
@@ -221,6 +221,8 @@ def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **set
     ----------
     small : bool
         Six exposures of 512 x 512 pixels instead of eleven of 2048 x 2048; of a camera that has so many in all.
+    camera : str, optional
+        "gsaoi": its four detectors.
     noise : bool
         Photon and read noise; without it the images are float32 and not clipped at saturation.
     seed : int
@@ -241,7 +243,7 @@ def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **set
     InputError
         For an unknown setting or one out of range.
     """
-    night = gsaoi_night.make_night(small, **settings)
+    night = gsaoi_night.make_night(small, camera=camera, **settings)
     truth, rng = gsaoi_night.draw_night(night, seed)
     hdus, psfs = {}, {}
     for i, name in enumerate(tqdm(truth.names, desc="simulate", disable=not progress)):
