@@ -780,6 +780,47 @@ class TestFrames:
         assert np.abs(np.linalg.norm(apart) - np.linalg.norm(true)) < 1
         assert matches.sky is not None
 
+    def test_bad_cameras_in_the_shell(self, frames, tmp_path, capsys):
+        """Each is refused before anything is measured, in a sentence that names file and camera."""
+        folder, camera, _ = frames
+        other = legdistort.Camera("WFC", dict(zip("AB", camera.detectors.values(), strict=True)))
+        other.write(tmp_path / "other.asdf")
+        (tmp_path / "text.asdf").write_text("detectors")
+        for name, words in (
+            (
+                tmp_path / "other.asdf",
+                "exp0-1 is of detector 1, and camera WFC has A, B: is it a camera of another ins",
+            ),
+            (tmp_path / "text.asdf", "text.asdf is not a readable ASDF file"),
+            (tmp_path / "none.asdf", "none.asdf: no such file"),
+            ("gsaoi", "exp0-1 has shape (300, 200), detector 1 of camera GSAOI (2048, 2048) (ny, nx): is it a camera"),
+        ):
+            given = ["--ext", "SCI", "--camera", str(name), "--out", str(tmp_path / "out"), "--quiet"]
+            assert main(["run", f"{folder}/*.fits", *given]) == 1
+            assert words in capsys.readouterr().err
+            assert not (tmp_path / "out").exists()
+
+    @pytest.mark.parametrize("known", [True, False])
+    def test_a_file_with_more_extensions_than_others(self, frames, tmp_path, known):
+        """A detector that the camera does not have is named; by headers alone it is one more."""
+        folder, camera, _ = frames
+        with fits.open(folder / "exp2.fits") as hdulist:
+            extra = fits.ImageHDU(hdulist["SCI", 2].data[::-1], hdulist["SCI", 2].header, name="SCI", ver=3)
+            extra.header["CCDCHIP"], extra.header["CRPIX1"] = 3, extra.header["CRPIX1"] - 215
+            extra.header["GAIN"] = 1.0
+            fits.HDUList([*(hdu.copy() for hdu in hdulist), extra]).writeto(tmp_path / "exp2.fits")
+        paths = [*sorted(folder.glob("exp[0134].fits")), tmp_path / "exp2.fits"]
+        exposures = legdistort.read_exposures(paths, ext="SCI")
+        assert [e.name for e in exposures if e.frame == "exp2"] == ["exp2-1", "exp2-2", "exp2-3"]
+        if known:
+            with pytest.raises(
+                InputError, match=r"exp2-3 is of detector 3, and camera TWO has 1, 2: .* leave these ext"
+            ):
+                camera.of_detectors(exposures)
+        else:
+            matches = legdistort.match(legdistort.measure(exposures), exposures=exposures, min_exposures=3)
+            assert list(matches.camera.detectors) == ["1", "2", "3"]
+
     def test_a_camera_of_another_instrument(self, frames, gsaoi):
         folder, _, _ = frames
         exposures = legdistort.read_exposures(f"{folder}/*.fits", ext="SCI")

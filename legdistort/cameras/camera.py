@@ -177,7 +177,7 @@ class Camera:
         return np.array([each.sees(f) for each in self.detectors.values()])
 
     def errors_in_focal_plane(self, f, errors):
-        """Errors (n, 2) at positions f (n, 2) by those measured on the detector there; unchanged where there is none."""
+        """Errors (n, 2) at positions f (n, 2), of those measured on the detector there; unchanged off all detectors."""
         out = np.array(errors, dtype=float)
         for each, here in zip(self.detectors.values(), self.sees(f), strict=True):
             back = np.linalg.inv(each.slope(f[here]))
@@ -263,9 +263,32 @@ class Camera:
         Raises
         ------
         InputError
-            If a header names no detector of the camera, or a file name does not have it.
+            If a header names no detector of the camera, a file name does not have it, or one is not of this camera
+            (`check`).
         """
-        return of_files(exposures, self.detectors)
+        exposures = of_files(exposures, self.detectors)
+        for exposure in exposures:
+            self.check(exposure)
+        return exposures
+
+    def check(self, exposure):
+        """Raise `InputError` unless an exposure is of one of the detectors, by its id and shape."""
+        key = exposure.detector
+        if key is None:
+            raise InputError(
+                f"{exposure.name} does not tell which detector of camera {self.name} it is: read all extensions of its "
+                "file by their name (ext='SCI', --ext SCI)"
+            )
+        if key not in self.detectors:
+            raise InputError(
+                f"{exposure.name} is of detector {key}, and camera {self.name} has {', '.join(self.detectors)}: is it "
+                "a camera of another instrument? Else leave these extensions out, or add the detector to the camera"
+            )
+        if exposure.shape != self[key].shape:
+            raise InputError(
+                f"{exposure.name} has shape {exposure.shape}, detector {key} of camera {self.name} {self[key].shape} "
+                "(ny, nx): is it a camera of another instrument?"
+            )
 
     @classmethod
     def of_frames(cls, exposures):
