@@ -16,11 +16,12 @@ PRIOR_DEGREE = 5
 _HELD_OUT_PER_SIDE = 20
 
 
-def run_demo(*, out, small=False, seed=0, overwrite=False, progress=False):
+def run_demo(*, out, small=False, camera=None, seed=0, overwrite=False, progress=False):
     """Simulate a GSAOI-like night, solve its frames and say how far the result is from the truth.
 
     The static distortion is that of a GSAOI detector (published polynomials), known beforehand as the prior; every
-    exposure adds a dynamic distortion of its own and a header that is 0.3" off.
+    exposure adds a dynamic distortion of its own and a header that is 0.3" off. With ``camera="gsaoi"`` all four
+    detectors are simulated, in one file an exposure, and solved as one focal plane.
 
     Parameters
     ----------
@@ -28,6 +29,8 @@ def run_demo(*, out, small=False, seed=0, overwrite=False, progress=False):
         Folder; gets ``frames/`` with the FITS files beside the results of `legdistort.run`.
     small : bool
         A night of a few seconds.
+    camera : str, optional
+        "gsaoi": its four detectors, the field of 85" on coarser pixels, dithered over the gaps.
     seed : int
     overwrite, progress : bool
 
@@ -38,17 +41,21 @@ def run_demo(*, out, small=False, seed=0, overwrite=False, progress=False):
     """
     out = Path(out)
     check_results(out, overwrite)
-    night = simulate_exposures(small=small, seed=seed, progress=progress)
-    shape = night.truth.shape
+    night = simulate_exposures(small=small, camera=camera, seed=seed, progress=progress)
+    truth = night.truth
     out.mkdir(parents=True, exist_ok=True)
     paths = night.write(out / "frames")
-    prior = Prior.from_model(
-        gsaoi_static(2, size=shape[1]), shape=shape, direction="detector_to_reference", degree=PRIOR_DEGREE
-    )
-    result = run(paths, out=out, prior=prior, overwrite=overwrite, progress=progress)
-    result.summary.update(compare_with_truth(result.solution, night.truth, seed=seed))
+    known = {"camera": truth.camera, "ext": "SCI"} if camera else {"prior": _published(truth.shape)}
+    result = run(paths, out=out, **known, overwrite=overwrite, progress=progress)
+    result.summary.update(compare_with_truth(result.solution, truth, seed=seed))
     write_summary(out / "summary.json", result.summary)
     return result
+
+
+def _published(shape):
+    """The static distortion of the detector of the night, as its prior."""
+    known = {"shape": shape, "direction": "detector_to_reference", "degree": PRIOR_DEGREE}
+    return Prior.from_model(gsaoi_static(2, size=shape[1]), **known)
 
 
 def compare_with_truth(solution, truth, *, seed=0):

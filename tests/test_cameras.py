@@ -1,5 +1,6 @@
 """Cameras of several detectors: value objects, the focal plane, solutions over all detectors."""
 
+import json
 from dataclasses import replace
 
 import asdf
@@ -16,6 +17,9 @@ from legdistort.cameras import camera as cameras
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
+from legdistort.reporting.page import render
+from legdistort.simulation import gsaoi_night
+from legdistort.simulation.observations import simulate_gsaoi_matches
 from legdistort.wcs import storage
 
 SIGMA = 0.01
@@ -111,7 +115,7 @@ class TestCamera:
 
     def test_prints(self, gsaoi):
         assert repr(gsaoi) == "<Camera GSAOI: 4 detectors in a focal plane of 4301 x 4276 px>"
-        assert str(gsaoi).splitlines()[3].split() == ["2", "2048", "x", "2048", "1089.95", "1034.66", "-0.4787",
+        assert str(gsaoi).splitlines()[3].split() == ["2", "2048", "x", "2048", "1089.95", "1034.66", "0.0237",
                                                       "0.991644", "2.900"]  # fmt: skip
 
     def test_file(self, gsaoi, tmp_path):
@@ -140,7 +144,7 @@ class TestCamera:
             ({"layout": np.eye(3)}, "layout must be"),
             ({"shape": (1, 5)}, "shape must be"),
             ({"static": np.full((2, 10), np.nan)}, "coefficients must be finite"),
-            ({"static_sigma": -1}, "static_sigma must be finite and not negative"),
+            ({"static_sigma": -1}, "static_sigma must not be negative or NaN"),
             ({"layout_sigma": [1, 2]}, "layout_sigma must be"),
             ({"static": legdistort.Prior(np.zeros((2, 10)), shape=(9, 9))}, "prior is for a detector of shape"),
         ],
@@ -161,6 +165,8 @@ class TestCamera:
             legdistort.Camera("c", {})
         with pytest.raises(InputError, match="camera c has no detector '7'; it has 1"):
             legdistort.Camera("c", {1: one})["7"]
+        with pytest.raises(InputError, match=r"common_sigma must be standard deviations \(2, n_modes\)"):
+            legdistort.Camera("c", {1: one}, common_sigma=[1.0, -1.0])
 
     def test_picture(self, gsaoi):
         ax = gsaoi.plot()
@@ -419,8 +425,46 @@ class TestFittedCamera:
         kept = kept[np.bincount(kept["star"])[kept["star"]] >= 3]
         pair = kept[np.isin(kept["detector"], ["1", "3"])]
         matches = legdistort.Matches.from_table(pair, camera=gsaoi)
-        with pytest.warns(AssumptionWarning, match="2 unknowns of camera GSAOI are not determined by these exposures"):
-            legdistort.solve(matches, layout="fit")
+        words = r"2 unknowns of camera GSAOI are not determined by these exposures.*\(no star in common: 1 \| 3\)"
+        with pytest.warns(AssumptionWarning, match=words):
+            solution = legdistort.solve(matches, layout="fit")
+        for key in "13":
+            assert np.isinf(solution.camera[key].layout_sigma).any()
+        assert solution.camera["2"].layout_sigma is None  # nothing was measured on it
+        assert "so that their places relative to each other are not determined" in solution.camera_sentence
+        assert "inf" in str(solution).splitlines()[-4]
+        again = legdistort.Camera.read(solution.camera.write("camera.asdf"))
+        assert np.array_equal(again["1"].layout_sigma, solution.camera["1"].layout_sigma)
+
+    def test_errors_of_places(self, gsaoi):
+        """Centres and rotations in the printed table scatter by their errors, draw by draw; the report has them."""
+        night, camera = gsaoi_images.Night(n_exposures=6, n_stars=350, dither=6.0), misplaced(gsaoi, shift=1, turn=0.01)
+        places, errors = [], []
+        for seed in range(8):
+            solution = legdistort.solve(
+                legdistort.Matches.from_table(night.table(sigma=SIGMA, seed=seed), camera=camera), layout="fit"
+            )
+            each = [detector.place for detector in solution.camera.detectors.values()]
+            places.append([(place.x, place.y, place.rotation) for place in each])
+            errors.append([place.errors for place in each])
+        ratio = np.sqrt(np.var(places, axis=0, ddof=1) / np.mean(np.square(errors), axis=0))
+        assert np.all((ratio > 0.3) & (ratio < 1.8))
+        assert np.mean(ratio) == pytest.approx(1, abs=0.3)
+        page = render(solution)
+        assert "Detectors of camera GSAOI" in page
+        assert f"{each[0].x:.3f} ± {each[0].errors[0]:.2g}" in page
+
+    def test_the_next_night_knows_what_this_one_did_not(self, gsaoi):
+        """A camera found without rolls leaves the common shear unknown, also where it is taken as known later."""
+        night = gsaoi_images.Night(n_exposures=6, n_stars=350, dither=6.0, turn=0.0)
+        table = night.table(sigma=SIGMA)
+        camera = legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi), layout="fit").camera
+        assert np.isinf(camera.common_sigma[:, 1:3]).all()
+        again = legdistort.Camera.from_meta(legdistort.Camera.read(camera.write("c.asdf")).to_meta())
+        next_night = legdistort.Matches.from_table(table, camera=again)
+        for layout in ("hold", "prior"):
+            assert legdistort.solve(next_night, layout=layout).gauge.unknown_names == ("shear",)
+        assert legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi)).gauge.unknown_names == ()
 
     def test_a_mismatch_does_not_move_the_camera(self, gsaoi):
         night = gsaoi_images.Night(n_stars=400, dither=6.0)
@@ -595,6 +639,70 @@ def sky_header(chip, shift, camera):
     }  # fmt: skip
 
 
+class TestPrediction:
+    def test_as_solved(self, gsaoi):
+        """Errors predicted for stars, dithers and a camera are those of the solution of such positions."""
+        night = gsaoi_images.Night(n_exposures=6, n_stars=350, turn=0.0, dynamic=0.0)
+        table = night.table(sigma=SIGMA)
+        solution = legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi), degree=3)
+        planned = legdistort.predict(
+            n_exposures=6, stars=solution.positions, sigma=SIGMA, poses=solution.poses, camera=gsaoi, min_exposures=3
+        )
+        assert np.sum(planned.solution.stars["n"]) == np.sum(solution.stars["n"])
+        found, expected = (s.stars["x_err"].value for s in (solution, planned.solution))
+        assert np.allclose(found, expected, rtol=0.02)
+
+    def test_more_detectors_tell_more(self, gsaoi):
+        """In the shell; over the field of all detectors as over that of one, for as many stars a detector."""
+        given = {"n_exposures": 8, "density": 50, "sigma": 0.02, "dithers": 200.0}
+        whole = legdistort.predict(camera=gsaoi, **given)
+        assert whole.b_abs < 1 or np.isnan(whole.b_abs)
+        assert whole.sigma < legdistort.predict(prior=legdistort.Prior(np.zeros((2, 1))), **given).sigma
+        shell = "predict --camera gsaoi --n-exposures 8 --density 50 --sigma 0.02 --dither 200"
+        assert main(shell.split()) == 0
+
+    def test_shape_and_camera(self, gsaoi):
+        with pytest.raises(InputError, match="shape and camera both say how large the field is"):
+            legdistort.predict(n_exposures=4, n_stars=50, sigma=0.01, shape=(2048, 2048), camera=gsaoi)
+        with pytest.raises(InputError, match=r"camera must be a legdistort\.Camera, got str"):
+            legdistort.predict(n_exposures=4, n_stars=50, sigma=0.01, camera="gsaoi")
+
+
+class TestSimulation:
+    def test_truth_is_as_published(self):
+        """Pixels of the simulated stars on all detectors are those of the published polynomials, up to one shift."""
+        truth, _ = gsaoi_night.draw_night(gsaoi_night.make_night(True, camera="gsaoi", dynamic_rms=0.0), 3)
+        away, coarse = [], gsaoi_images.SIZE / 256
+        for key, chip in gsaoi_images.CHIPS.items():
+            xy = truth.on_detector("exp02", key, truth.positions)
+            seen = np.isfinite(xy[:, 0])
+            arcsec = gsaoi_images.to_arcsec(gsaoi_images.published()[chip], (xy[seen] + 0.5) * coarse - 0.5)
+            away.append(arcsec / cameras.GSAOI_SCALE / coarse - truth.distort("exp02", truth.positions[seen]))
+        away = np.concatenate(away)
+        assert len(away) > 60
+        assert np.abs(away - away.mean(axis=0)).max() < 1e-5
+
+    def test_demo(self, tmp_path, capsys):
+        """The demonstration with a camera: at the bound, in one mosaic as sharp as the frames."""
+        out = tmp_path / "demo"
+        assert main(["demo", "--camera", "gsaoi", "--small", "--out", str(out), "--quiet", "--json"]) == 0
+        summary = json.loads(capsys.readouterr().out)
+        assert summary["b_px"] < 1.3 * summary["b_bound_px"]
+        assert summary["b_abs_px"] < 2 * summary["b_abs_err_px"]
+        assert 0.97 < summary["fwhm_ratio"] < 1.03
+        with fits.open(out / "frames" / "exp00.fits") as hdulist:
+            assert [(hdu.name, hdu.ver, hdu.header["CCDCHIP"]) for hdu in hdulist[1:]] == [
+                ("SCI", k, k) for k in (1, 2, 3, 4)
+            ]
+        assert len(list((out / "wcs").iterdir())) == 4 * summary["n_exposures"]
+
+    def test_other_cameras_are_refused(self, tmp_path):
+        with pytest.raises(InputError, match="camera must be 'gsaoi' or None, got 'wfc3'"):
+            legdistort.simulate_exposures(camera="wfc3")
+        with pytest.raises(InputError, match="camera is for images"):
+            simulate_gsaoi_matches(camera="gsaoi")
+
+
 class TestFrames:
     def test_reading(self, frames):
         folder, _, _ = frames
@@ -671,6 +779,47 @@ class TestFrames:
         true = camera["2"].to_focal_plane(middle) - camera["1"].to_focal_plane(middle)
         assert np.abs(np.linalg.norm(apart) - np.linalg.norm(true)) < 1
         assert matches.sky is not None
+
+    def test_bad_cameras_in_the_shell(self, frames, tmp_path, capsys):
+        """Each is refused before anything is measured, in a sentence that names file and camera."""
+        folder, camera, _ = frames
+        other = legdistort.Camera("WFC", dict(zip("AB", camera.detectors.values(), strict=True)))
+        other.write(tmp_path / "other.asdf")
+        (tmp_path / "text.asdf").write_text("detectors")
+        for name, words in (
+            (
+                tmp_path / "other.asdf",
+                "exp0-1 is of detector 1, and camera WFC has A, B: is it a camera of another ins",
+            ),
+            (tmp_path / "text.asdf", "text.asdf is not a readable ASDF file"),
+            (tmp_path / "none.asdf", "none.asdf: no such file"),
+            ("gsaoi", "exp0-1 has shape (300, 200), detector 1 of camera GSAOI (2048, 2048) (ny, nx): is it a camera"),
+        ):
+            given = ["--ext", "SCI", "--camera", str(name), "--out", str(tmp_path / "out"), "--quiet"]
+            assert main(["run", f"{folder}/*.fits", *given]) == 1
+            assert words in capsys.readouterr().err
+            assert not (tmp_path / "out").exists()
+
+    @pytest.mark.parametrize("known", [True, False])
+    def test_a_file_with_more_extensions_than_others(self, frames, tmp_path, known):
+        """A detector that the camera does not have is named; by headers alone it is one more."""
+        folder, camera, _ = frames
+        with fits.open(folder / "exp2.fits") as hdulist:
+            extra = fits.ImageHDU(hdulist["SCI", 2].data[::-1], hdulist["SCI", 2].header, name="SCI", ver=3)
+            extra.header["CCDCHIP"], extra.header["CRPIX1"] = 3, extra.header["CRPIX1"] - 215
+            extra.header["GAIN"] = 1.0
+            fits.HDUList([*(hdu.copy() for hdu in hdulist), extra]).writeto(tmp_path / "exp2.fits")
+        paths = [*sorted(folder.glob("exp[0134].fits")), tmp_path / "exp2.fits"]
+        exposures = legdistort.read_exposures(paths, ext="SCI")
+        assert [e.name for e in exposures if e.frame == "exp2"] == ["exp2-1", "exp2-2", "exp2-3"]
+        if known:
+            with pytest.raises(
+                InputError, match=r"exp2-3 is of detector 3, and camera TWO has 1, 2: .* leave these ext"
+            ):
+                camera.of_detectors(exposures)
+        else:
+            matches = legdistort.match(legdistort.measure(exposures), exposures=exposures, min_exposures=3)
+            assert list(matches.camera.detectors) == ["1", "2", "3"]
 
     def test_a_camera_of_another_instrument(self, frames, gsaoi):
         folder, _, _ = frames

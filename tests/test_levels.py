@@ -68,6 +68,39 @@ def blank(n, **changes):
 
 
 class TestFluxScale:
+    @pytest.mark.parametrize("areas", [None, {"a": 1.0, "b": 0.9}])
+    def test_detectors_of_a_camera(self, areas):
+        """Clouds by stars that stay on a detector, sensitivities by those that change it; both at once."""
+        depth, sensitivity, rng, rows = [1.0, 0.7, 0.9], {"a": 1.0, "b": 1.06}, np.random.default_rng(4), []
+        for i, d in enumerate(depth):
+            for star in range(60):
+                key = "ab"[(star + 17 * i) % 60 >= 30]
+                flux = (1000 + 50 * star) * d * sensitivity[key] * (areas or {}).get(key, 1)
+                rows.append((f"frame{i}-{key}", star, flux * np.exp(rng.normal(0, 0.01)), True))
+        solution = measured(plain()[0], QTable(rows=rows, names=["exposure", "star", "flux", "used"]))
+        frames = [
+            Exposure(f"frame{i}-{key}", np.ones(SHAPE), exposure_time=60.0, frame=f"frame{i}", detector=key)
+            for i in range(3)
+            for key in "ab"
+        ]
+        by_part = areas and {f.name: areas[f.detector] for f in frames}
+        factors, origin = flux_scales(frames, "auto", solution, by_part)
+        product = np.array([factors[f"frame{i}-{key}"] * depth[i] * sensitivity[key] for i in range(3) for key in "ab"])
+        assert origin == "stars"
+        np.testing.assert_allclose(product / product.mean(), 1, atol=0.005)
+        assert factors["frame0-a"] / factors["frame0-b"] == pytest.approx(factors["frame2-a"] / factors["frame2-b"])
+
+    def test_detectors_that_share_no_star(self):
+        """Each keeps its sensitivity; the clouds are known all the same."""
+        parts = [(i, key) for i in (0, 1) for key in "ab"]
+        rows = [
+            (f"frame{i}-{k}", f"{k}{star}", 100.0 * star * (1 + i), True) for i, k in parts for star in range(1, 20)
+        ]
+        solution = measured(plain()[0], QTable(rows=rows, names=["exposure", "star", "flux", "used"]))
+        frames = [Exposure(f"frame{i}-{k}", np.ones(SHAPE), frame=f"frame{i}", detector=k) for i, k in parts]
+        factors, _ = flux_scales(frames, "auto", solution)
+        assert [factors[f.name] / factors["frame0-a"] for f in frames] == pytest.approx([1, 1, 0.5, 0.5])
+
     @pytest.mark.parametrize("scale", ["auto", "stars"])
     def test_stars_through_clouds(self, scale):
         depth = np.array([1.0, 0.7, 0.9, 0.4, 1.1])

@@ -7,11 +7,12 @@ exposure adds to them is a distortion of the focal plane as a whole.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from astropy import units as u
+from scipy.sparse.csgraph import connected_components
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity
@@ -45,6 +46,10 @@ class Camera:
     field : tuple, optional
         ``(ny, nx)`` of the focal plane, whose pixels are counted from 0 as those of a detector. None: the box around
         all detectors, to which the layouts are shifted.
+    common_sigma : array_like, shape (2, n_modes), optional
+        Uncertainty of a distortion of the focal plane that all detectors have in common, standard deviations of its
+        modes in pixels, beside that of each detector; infinite where nothing is known. Exposures cannot tell it from
+        one of their own, so that layouts and static distortions found from them leave it out. None: none.
 
     Raises
     ------
@@ -55,6 +60,7 @@ class Camera:
     name: str
     detectors: dict
     field: tuple | None = None
+    common_sigma: np.ndarray | None = None
 
     def __post_init__(self):
         if not isinstance(self.detectors, dict) or not self.detectors:
@@ -84,6 +90,7 @@ class Camera:
             )
         object.__setattr__(self, "detectors", detectors)
         object.__setattr__(self, "field", field)
+        object.__setattr__(self, "common_sigma", _common(self.common_sigma))
         self._check_overlaps()
 
     def _check_overlaps(self):
@@ -165,45 +172,85 @@ class Camera:
             self[key]  # refuses an unknown one
         return detector
 
+    def sees(self, f):
+        """Which positions f (n, 2) of the focal plane fall on each detector, bool (n_detectors, n)."""
+        return np.array([each.sees(f) for each in self.detectors.values()])
+
+    def errors_in_focal_plane(self, f, errors):
+        """Errors (n, 2) at positions f (n, 2), of those measured on the detector there; unchanged off all detectors."""
+        out = np.array(errors, dtype=float)
+        for each, here in zip(self.detectors.values(), self.sees(f), strict=True):
+            back = np.linalg.inv(each.slope(f[here]))
+            out[here] = np.sqrt(np.einsum("nab,nb->na", back**2, out[here] ** 2))
+        return out
+
+    def groups(self, table):
+        """Lists of detectors that have stars in common, directly or through others.
+
+        Parameters
+        ----------
+        table : `~astropy.table.Table`
+            Columns ``detector`` and ``star``. Detectors without a position are in none.
+        """
+        keys, detector = np.unique(self.ids(table), return_inverse=True)
+        stars, star = np.unique(np.asarray(table["star"]), return_inverse=True)
+        seen = np.zeros((len(keys), len(stars)), dtype=bool)
+        seen[detector, star] = True
+        _, group = connected_components(seen.astype(int) @ seen.T, directed=False)
+        return [[str(key) for key in keys[group == g]] for g in np.unique(group)]
+
     def __repr__(self):
         ny, nx = self.field
         return f"<Camera {self.name}: {len(self.detectors)} detectors in a focal plane of {nx} x {ny} px>"
 
     def __str__(self):
+        return "\n".join([repr(self)[1:-1], *self.table_lines()])
+
+    def table_lines(self):
+        """Lines of a table of where the detectors lie, with the errors of that where it is not exact."""
+        places = {key: each.place for key, each in self.detectors.items()}
+        known = any(place.errors is not None for place in places.values())
+        errors = f" {'+-':>8s}" * known
         lines = [
-            repr(self)[1:-1],
-            f"{'detector':10s} {'size [px]':>13s} {'centre x':>10s} {'centre y':>10s} {'rotation':>9s} {'scale':>9s} "
-            f"{'static':>8s}",
+            f"{'detector':10s} {'size [px]':>13s} {'centre x':>10s}{errors} {'centre y':>10s}{errors} "
+            f"{'rotation':>9s}{errors} {'scale':>9s} {'static':>8s}"
         ]
-        for key, each in self.detectors.items():
-            ny, nx = each.shape
-            x, y = each.to_focal_plane(basis.denormalize(np.zeros(1), np.zeros(1), each.shape))[0]
-            d = similarity.describe(each.layout)
-            lines.append(
-                f"{key[:10]:10s} {f'{nx} x {ny}':>13s} {x:10.2f} {y:10.2f} {d['rotation']:9.4f} {d['scale']:9.6f} "
-                f"{each.rms:8.3f}"
+        for key, place in places.items():
+            ny, nx = self[key].shape
+            x, y, rotation = (
+                f" {error:8.2g}" if known else "" for error in (place.errors if place.errors else (0.0, 0.0, 0.0))
             )
-        return "\n".join(lines)
+            lines.append(
+                f"{key[:10]:10s} {f'{nx} x {ny}':>13s} {place.x:10.2f}{x} {place.y:10.2f}{y} "
+                f"{place.rotation:9.4f}{rotation} {place.scale:9.6f} {self[key].rms:8.3f}"
+            )
+        return lines
 
     @classmethod
-    def gsaoi(cls):
+    def gsaoi(cls, *, size=GSAOI_SIZE):
         """The four detectors of GSAOI at Gemini South, "1" to "4", by the polynomials that DRAGONS uses.
 
         1 is the lower right one, 2 lower left, 3 upper left, 4 upper right. A pixel of the focal plane is 0.0197
         arcsec. The uncertainty of the published numbers is not known.
+
+        Parameters
+        ----------
+        size : int
+            Pixels along a side of a detector. Other than 2048 it is the same field on coarser or finer pixels.
         """
-        size, detectors = (GSAOI_SIZE, GSAOI_SIZE), {}
+        shape, detectors = (size, size), {}
         for k in (1, 2, 3, 4):
-            published = GsaoiMap(k)
+            published = GsaoiMap(k, size)
 
             def shift(u, v, published=published):
-                q = basis.denormalize(u, v, size)
+                q = basis.denormalize(u, v, shape)
                 return (published.distort(q) - q).T
 
-            scale = np.column_stack([GSAOI_SCALE * np.eye(2), np.zeros(2)])
+            pixel = GSAOI_SCALE * GSAOI_SIZE / size
+            scale = np.column_stack([pixel * np.eye(2), np.zeros(2)])
             layout = similarity.compose(similarity.invert(published.similarity), scale)
             static = basis.project(shift, GSAOI_DEGREE, GSAOI_DEGREE + 8)
-            detectors[str(k)] = Detector(size, layout=layout, static=static)
+            detectors[str(k)] = Detector(shape, layout=layout, static=static)
         return cls("GSAOI", detectors)
 
     def of_detectors(self, exposures):
@@ -216,9 +263,32 @@ class Camera:
         Raises
         ------
         InputError
-            If a header names no detector of the camera, or a file name does not have it.
+            If a header names no detector of the camera, a file name does not have it, or one is not of this camera
+            (`check`).
         """
-        return of_files(exposures, self.detectors)
+        exposures = of_files(exposures, self.detectors)
+        for exposure in exposures:
+            self.check(exposure)
+        return exposures
+
+    def check(self, exposure):
+        """Raise `InputError` unless an exposure is of one of the detectors, by its id and shape."""
+        key = exposure.detector
+        if key is None:
+            raise InputError(
+                f"{exposure.name} does not tell which detector of camera {self.name} it is: read all extensions of its "
+                "file by their name (ext='SCI', --ext SCI)"
+            )
+        if key not in self.detectors:
+            raise InputError(
+                f"{exposure.name} is of detector {key}, and camera {self.name} has {', '.join(self.detectors)}: is it "
+                "a camera of another instrument? Else leave these extensions out, or add the detector to the camera"
+            )
+        if exposure.shape != self[key].shape:
+            raise InputError(
+                f"{exposure.name} has shape {exposure.shape}, detector {key} of camera {self.name} {self[key].shape} "
+                "(ny, nx): is it a camera of another instrument?"
+            )
 
     @classmethod
     def of_frames(cls, exposures):
@@ -284,11 +354,23 @@ class Camera:
         return storage.read_camera(path, cls)
 
 
+def _common(sigma):
+    """`common_sigma` as an array (2, n_modes), or None."""
+    if sigma is None:
+        return None
+    out = np.array(sigma, dtype=float)
+    if out.ndim != 2 or len(out) != 2 or not np.all(out >= 0):
+        raise InputError(
+            f"common_sigma must be standard deviations (2, n_modes) in pixels, none negative or NaN, got {sigma!r}"
+        )
+    basis.degree_of(out.shape[1])  # refuses a number that is none of modes
+    return out
+
+
 def _shifted(detector, first):
     """The detector in a focal plane whose origin lies at `first` of the one before."""
     layout = similarity.compose(detector.layout, np.column_stack([np.eye(2), first]))
-    widths = {"layout_sigma": detector.layout_sigma, "static_sigma": detector.static_sigma}
-    return Detector(detector.shape, layout=layout, static=detector.static, **widths)
+    return replace(detector, layout=layout)
 
 
 def _within(outline, field):

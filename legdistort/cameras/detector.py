@@ -22,9 +22,32 @@ def _widths(value, n, name):
         out = np.broadcast_to(np.asarray(value, dtype=float), (2, n)).copy()
     except (TypeError, ValueError):
         raise InputError(f"{name} must be a number, one per mode ({n},) or (2, {n}), got {value!r}") from None
-    if not (np.isfinite(out).all() and np.all(out >= 0)):
-        raise InputError(f"{name} must be finite and not negative (standard deviations in pixels), got {value!r}")
+    if not np.all(out >= 0):
+        raise InputError(f"{name} must not be negative or NaN (standard deviations in pixels), got {value!r}")
     return out
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a detector lies in the focal plane.
+
+    Attributes
+    ----------
+    x, y : float
+        Its centre, pixels of the focal plane.
+    rotation : float
+        From the focal plane to the detector, degrees.
+    scale : float
+        Detector pixels in one of the focal plane.
+    errors : tuple of float or None
+        Standard deviations of x, y and rotation; None where the layout is exact.
+    """
+
+    x: float
+    y: float
+    rotation: float
+    scale: float
+    errors: tuple | None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,9 +65,12 @@ class Detector:
         to the layout: what is given there is moved into it.
     layout_sigma : array_like, optional
         Standard deviation of the layout, as that of modes of orders 0 and 1 over the detector (constant, x, y), pixels:
-        a number, (3,) or (2, 3). None takes it as exact.
+        a number, (3,) or (2, 3); infinite where nothing is known. None takes it as exact.
     static_sigma : array_like, optional
         That of `static`, the same forms; that of the Prior if one is given. None takes it as exact.
+    layout_covariance : array_like, shape (6, 6), optional
+        Covariance of the modes of `layout_sigma`, those of x first, instead of it, px^2. It is for the errors of
+        `place`: as a prior they count as independent.
 
     Raises
     ------
@@ -58,6 +84,7 @@ class Detector:
     static: np.ndarray | None = None
     layout_sigma: np.ndarray | None = None
     static_sigma: np.ndarray | None = None
+    layout_covariance: np.ndarray | None = None
 
     def __post_init__(self):
         shape = check_shape(self.shape)
@@ -72,7 +99,9 @@ class Detector:
         static = np.zeros((2, 1)) if static is None else Distortion(static, shape).coefficients
         static, layout = _split(static, shape, layout)
         given = {"shape": shape, "layout": layout, "static": static}
-        given["layout_sigma"] = _widths(self.layout_sigma, 3, "layout_sigma")
+        covariance = _covariance(self.layout_covariance)
+        widths = self.layout_sigma if covariance is None else np.sqrt(np.diag(covariance)).reshape(2, 3)
+        given["layout_sigma"], given["layout_covariance"] = _widths(widths, 3, "layout_sigma"), covariance
         given["static_sigma"] = _widths(sigma, static.shape[1], "static_sigma")
         for key, value in given.items():
             object.__setattr__(self, key, value)
@@ -100,6 +129,14 @@ class Detector:
         back = np.linalg.inv(self.slope(f))
         return f, back @ covariance @ back.mT
 
+    def sees(self, f):
+        """Which positions f (n, 2) of the focal plane fall on it."""
+        q, size = similarity.apply(self.layout, f), np.array(self.shape[::-1])
+        near = np.all((q > -0.1 * size) & (q < 1.1 * size), axis=1)  # beyond that the series means nothing
+        xy = self.distortion(q[near])
+        near[near] = np.all((xy >= -0.5) & (xy <= size - 0.5), axis=1)
+        return near
+
     def slope(self, f):
         """Derivative (n, 2, 2) of the detector pixels by the focal-plane pixels f (n, 2)."""
         return self.distortion.jacobian(similarity.apply(self.layout, f)) @ self.layout[:, :2]
@@ -113,12 +150,47 @@ class Detector:
         return self.to_focal_plane(basis.denormalize(*sides.T, self.shape))
 
     @property
+    def place(self):
+        """The `Place` of the detector."""
+        x, y = self.to_focal_plane(basis.denormalize(np.zeros(1), np.zeros(1), self.shape))[0]
+        m, errors = self.layout[:, :2], None
+        parity = np.sign(np.linalg.det(m))
+        rotation = np.degrees(np.arctan2(m[1, 0] - parity * m[0, 1], m[0, 0] + parity * m[1, 1]))  # without the shear
+        if self.layout_sigma is not None:
+            (ny, nx), back = self.shape, np.linalg.inv(m)
+            covariance = self.layout_covariance
+            covariance = np.diag(self.layout_sigma.ravel() ** 2) if covariance is None else covariance
+            weights = np.zeros((3, 6))
+            weights[:2, [0, 3]] = back / 2  # L_0 is 1/2
+            weights[2, [2, 4]] = np.degrees(np.sqrt(0.75)) * np.array([-1 / ny, 1 / nx])  # half the curl, sqrt(3)/2 u
+            errors = tuple(_error(row, covariance) for row in weights)
+        return Place(float(x), float(y), float(rotation), float(np.sqrt(abs(np.linalg.det(m)))), errors)
+
+    @property
     def rms(self):
         """Root mean square of the static distortion over the detector, both axes, pixels."""
         return float(np.sqrt((self.static**2).sum()) / 2)
 
     def __repr__(self):
         return f"<Detector: {self.shape[1]} x {self.shape[0]} px, static distortion {self.rms:.3g} px rms>"
+
+
+def _covariance(value):
+    """A covariance (6, 6) of the modes of a layout; None as None."""
+    if value is None:
+        return None
+    out = np.array(value, dtype=float)
+    if out.shape != (6, 6) or np.isnan(out).any() or not np.all(np.diag(out) >= 0):
+        raise InputError(f"layout_covariance must be a (6, 6) covariance in px^2, got an array of shape {out.shape}")
+    return out
+
+
+def _error(weights, covariance):
+    """Standard deviation of a weighted sum of modes, infinite where one of them is that counts."""
+    counts = weights != 0
+    if np.isinf(np.diag(covariance)[counts]).any():
+        return float("inf")
+    return float(np.sqrt(weights[counts] @ covariance[np.ix_(counts, counts)] @ weights[counts]))
 
 
 def affine_of(modes, shape):

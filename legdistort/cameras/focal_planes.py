@@ -6,7 +6,6 @@ import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from ..exceptions import InputError
 from ..geometry import basis, similarity, tangent_plane
 from ..inputs.sky_wcs import to_icrs
 
@@ -56,16 +55,7 @@ def focal_planes(camera, exposures):
     """
     frames = {}
     for exposure in exposures:
-        if exposure.detector is None:
-            raise InputError(
-                f"{exposure.name} does not tell which detector of camera {camera.name} it is: read all extensions of "
-                "its file by their name (ext='SCI', --ext SCI)"
-            )
-        if exposure.shape != camera[exposure.detector].shape:
-            raise InputError(
-                f"{exposure.name} has shape {exposure.shape}, detector {exposure.detector} of camera {camera.name} "
-                f"{camera[exposure.detector].shape} (ny, nx): is it a camera of another instrument?"
-            )
+        camera.check(exposure)
         frames.setdefault(exposure.frame, []).append(exposure)
     return [FocalPlane(name, camera.field, _wcs(camera, parts), parts[0].header) for name, parts in frames.items()]
 

@@ -13,7 +13,7 @@ from .detector import Detector
 
 #: Version of the layout under ``legdistort_camera``.
 LAYOUT = 1
-_ARRAYS = "layout", "static", "layout_sigma", "static_sigma"
+_ARRAYS = "layout", "static", "layout_sigma", "static_sigma", "layout_covariance"
 
 
 def to_tree(camera, *, plain=False):
@@ -24,18 +24,21 @@ def to_tree(camera, *, plain=False):
         if plain:
             arrays = {name: None if array is None else array.tolist() for name, array in arrays.items()}
         detectors.append({"id": key, "shape": list(each.shape)} | arrays)
-    return {"name": camera.name, "field": list(camera.field), "detectors": detectors}
+    common = camera.common_sigma
+    common = common.tolist() if plain and common is not None else common
+    return {"name": camera.name, "field": list(camera.field), "detectors": detectors, "common_sigma": common}
 
 
 def from_tree(tree, kind):
     """The `Camera`, the `kind`, of a tree; arrays may be lists."""
     detectors = {}
     for each in tree["detectors"]:
-        arrays = {name: None if each[name] is None else np.array(each[name], dtype=float) for name in _ARRAYS}
+        given = {name: each.get(name) for name in _ARRAYS}
+        arrays = {name: None if array is None else np.array(array, dtype=float) for name, array in given.items()}
         detectors[each["id"]] = Detector(tuple(each["shape"]), **arrays)
     if len(detectors) < len(tree["detectors"]):
         raise InputError("two detectors have the same id")
-    return kind(tree["name"], detectors, tuple(tree["field"]))
+    return kind(tree["name"], detectors, tuple(tree["field"]), tree.get("common_sigma"))
 
 
 def write_camera(camera, path, *, overwrite=False):

@@ -203,6 +203,7 @@ def do_predict(a):
         keywords["stars"] = _read_table(a.stars, a)
     if a.shape is not None:
         keywords["shape"] = tuple(a.shape)
+    keywords["camera"] = _camera(a.camera)
     prediction = legdistort.predict(**keywords)
     _draw(prediction, a)
     plans = prediction.alternatives()

@@ -85,6 +85,7 @@ KNOWN_STATIC = {
 NIGHT = {
     "small": Option("six frames of 512 x 512 instead of eleven of 2048 x 2048", action="store_true"),
     "seed": Option("of the random numbers (default 0)", type=int),
+    "camera": Option("all detectors of this camera, in one file an exposure", choices=("gsaoi",)),
 }
 AT_EPOCH = {"epoch": Option("where they are at another time: a decimal year (default: of the solution)", type=float)}
 MOVING = {

@@ -114,6 +114,7 @@ COMMANDS = {
         "expected errors of a planned set of exposures",
         "--n-exposures 11 --n-stars 80 --sigma 0.02 --degree 3",
         options.PREDICTING,
+        options.CAMERA,
         options.picture("map of the error over the field"),
         options.REPLACING,
         options.TABLE,

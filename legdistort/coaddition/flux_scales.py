@@ -1,4 +1,7 @@
-"""Factors that bring exposures to one flux scale: by exposure times, or by the fluxes of common stars."""
+"""Factors that bring exposures to one flux scale: by exposure times, or by the fluxes of common stars.
+
+Of a camera a factor is that of the exposure times that of the detector, which is common to all exposures.
+"""
 
 import logging
 from collections.abc import Mapping
@@ -16,8 +19,8 @@ _SAME = 0.02  # by which fluxes of stars must differ from the exposure times to 
 _FEW = 5  # common stars that two exposures must have
 
 
-def flux_scales(frames, scale, solution):
-    """Factors that bring exposures to one flux scale.
+def flux_scales(frames, scale, solution, areas=None):
+    """Factors that bring exposures, and the detectors of a camera, to one flux scale.
 
     Parameters
     ----------
@@ -27,6 +30,9 @@ def flux_scales(frames, scale, solution):
         See `legdistort.coadd`.
     solution : Solution
         Its observations have the fluxes of stars, if `legdistort.measure` made them.
+    areas : dict, optional
+        Detector pixels in a pixel of the mosaic, by name, where it is to conserve surface brightness: stars then have
+        their flux divided by these.
 
     Returns
     -------
@@ -43,34 +49,43 @@ def flux_scales(frames, scale, solution):
     names = [f.name for f in frames]
     if isinstance(scale, Mapping):
         return by_name("scale", scale, names), "given"
-    factors, origin = _factors(frames, names, scale, solution)
+    factors, origin = _factors(frames, scale, solution, areas or {})
     return dict(zip(names, factors.tolist(), strict=True)), origin
 
 
-def _factors(frames, names, scale, solution):
+def _factors(frames, scale, solution, areas):
     if scale is None:
-        return np.ones(len(names)), "none"
-    times = [f.exposure_time or None for f in frames]
-    stars = None if scale == "exptime" else _star_scales(names, solution)
-    if scale == "stars" and stars is None:
+        return np.ones(len(frames)), "none"
+    if scale == "exptime":
+        return _time_scales(frames, [f.exposure_time or None for f in frames]), "exptime"
+    exposures = list(dict.fromkeys(f.frame or f.name for f in frames))
+    detectors = list(dict.fromkeys(f.detector for f in frames))
+    place = np.array([(exposures.index(f.frame or f.name), detectors.index(f.detector)) for f in frames])
+    first = [frames[k] for k in np.unique(place[:, 0], return_index=True)[1]]
+    stars = _star_scales([f.name for f in frames], place, solution, areas)
+    if stars is None and scale == "stars":
         raise InputError(
             f"scale='stars': the solution has no fluxes of {_FEW} common stars or more that join all exposures; "
             "give scale='exptime' or a dict by exposure"
         )
+    times = [f.exposure_time or None for f in first]
     if stars is None:
-        return _time_scales(frames, times), "exptime"
-    logs, errors = stars
+        return _time_scales(first, times)[place[:, 0]], "exptime"
+    (logs, errors), (of_detectors, their_errors) = stars
+    sensitive = scale == "stars" or np.any(np.abs(of_detectors) > 3 * their_errors)
+    of_detectors = np.exp(of_detectors) if sensitive else np.ones(len(detectors))
     if scale == "auto" and (None not in times or len(set(times)) == 1):
-        factors = _time_scales(frames, times)
+        factors = _time_scales(first, times)
         off = logs - np.log(factors)
         off -= np.median(off)
         if np.all(np.abs(off) <= np.maximum(_SAME, 3 * errors)):
-            return factors, "exptime"
+            of_all = factors[place[:, 0]] * of_detectors[place[:, 1]]
+            return of_all, "exptime, stars" if sensitive and len(detectors) > 1 else "exptime"
         log.info("by their stars exposures differ in depth by up to %.1f %% more than by time", 100 * max(abs(off)))
     factors = np.exp(logs - np.mean(logs))
     if None not in times:  # the mean exposure time stays what it is
         factors *= np.sum(times) / np.sum(factors * times)
-    return factors, "stars"
+    return factors[place[:, 0]] * of_detectors[place[:, 1]], "stars"
 
 
 def _time_scales(frames, times):
@@ -89,30 +104,73 @@ def _time_scales(frames, times):
     return np.mean(times) / np.array(times, dtype=float)
 
 
-def _star_scales(names, solution):
-    """Logarithms of factors by the fluxes of common stars, and their errors; None if they do not join all exposures.
+def _star_scales(names, place, solution, areas):
+    """Logarithms of factors of exposures, and of detectors, by the fluxes of common stars, each with their errors.
 
-    Differences between exposures are medians over their common stars, the brighter half of all; the factors follow
-    from all pairs by least squares.
+    Exposures are compared where a detector sees the same stars in both; detectors by the stars that fall on one in an
+    exposure and on the other in the next. Detectors without such stars keep the scale that they have.
+
+    Parameters
+    ----------
+    names : list of str
+        What is co-added, exposures or their detectors.
+    place : ndarray of int, shape (n, 2)
+        Exposure and detector of each.
+    solution, areas
+        As for `flux_scales`.
+
+    Returns
+    -------
+    tuple of tuple of ndarray, or None
+        None if stars do not join all exposures.
     """
     rows = solution.observations
     if "flux" not in rows.colnames:
         return None
-    flux, exposure = np.asarray(rows["flux"], dtype=float), np.asarray(rows["exposure"])
-    good = np.asarray(rows["used"]) & np.isfinite(flux) & (flux > 0) & np.isin(exposure, names)
-    stars, column = np.unique(np.asarray(rows["star"])[good], return_inverse=True)
+    flux, part = np.asarray(rows["flux"], dtype=float), np.asarray(rows["exposure"])
+    good = np.asarray(rows["used"]) & np.isfinite(flux) & (flux > 0) & np.isin(part, names)
+    stars, star = np.unique(np.asarray(rows["star"])[good], return_inverse=True)
     if len(stars) < _FEW:
         return None
-    place = {name: i for i, name in enumerate(names)}
-    logs = np.full((len(names), len(stars)), np.nan)
-    logs[[place[name] for name in exposure[good]], column] = np.log(flux[good])
-    middle = np.nanmedian(logs, axis=0)
-    logs = logs[:, middle >= np.median(middle)]
-    difference, count = median_differences(logs)
-    count[count < _FEW] = 0
-    if connected_components(count, directed=False)[0] > 1:
+    known = {name: i for i, name in enumerate(names)}
+    part = np.array([known[name] for name in part[good]])
+    logs = np.log(flux[good]) - np.log([areas.get(name, 1.0) for name in names])[part]
+    exposure, detector = place[part].T
+    on_detector = np.unique(np.stack([detector, star]), axis=1, return_inverse=True)[1].ravel()
+    scales = _compared(exposure, on_detector, logs, len(set(place[:, 0])))
+    if scales is None:
         return None
-    values = values_from_differences(difference, count, np.zeros(len(names)))
-    rest = logs - values[:, None]
+    logs = logs + scales[0][exposure]
+    n_detectors = len(set(place[:, 1]))
+    if n_detectors == 1:
+        return scales, np.zeros((2, 1))
+    return scales, _compared(detector, star, logs, n_detectors, joined=False)
+
+
+def _compared(row, column, logs, n, joined=True):
+    """Logarithms (n,) of factors that make the fluxes in each column agree, and their errors.
+
+    Differences between rows are medians over their common columns, the brighter half of all; the factors follow from
+    all pairs by least squares. None if these do not join all rows; where they need not, the others have zero, with an
+    infinite error.
+    """
+    total, count = np.zeros((2, n, column.max() + 1))
+    np.add.at(total, (row, column), logs)
+    np.add.at(count, (row, column), 1)
+    with np.errstate(invalid="ignore"):
+        samples = total / count
+    middle = np.nanmedian(samples, axis=0)
+    samples = samples[:, middle >= np.median(middle)]
+    difference, common = median_differences(samples)
+    common[common < _FEW] = 0
+    n_groups, group = connected_components(common, directed=False)
+    if joined and n_groups > 1:
+        return None
+    values = values_from_differences(difference, common, np.zeros(n))
+    rest = samples - values[:, None]
     rest -= np.nanmedian(rest, axis=0)
-    return -values, 1.4826 * 1.2533 * np.nanmedian(np.abs(rest), axis=1) / np.sqrt(np.isfinite(rest).sum(axis=1))
+    rest[~np.isfinite(rest).any(axis=1)] = 0.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        errors = 1.4826 * 1.2533 * np.nanmedian(np.abs(rest), axis=1) / np.sqrt(np.isfinite(rest).sum(axis=1))
+    errors[np.bincount(group)[group] == 1] = np.inf if n > 1 else 0.0
+    return -values, errors

@@ -153,7 +153,8 @@ def _coadd(exposures, solution, options, share):
         frames = [f for f in frames if f.name in prepared]
         if not frames:
             raise InputError(f"no exposure meets the output grid: {_reasons(left_out)}")
-        factors, origin = flux_scales(frames, options.scale, solution)
+        areas = None if options.conserve == "flux" else {f.name: _area(maps[f.name]) for f in frames}
+        factors, origin = flux_scales(frames, options.scale, solution, areas)
         layers, recipe = _layers(frames, prepared, maps, factors, solution, output, options)
         planes = assemble(layers, recipe, folder.parent, share)
     _warn_of_misuse(frames, maps, options.algorithm)

@@ -8,6 +8,14 @@ from . import elements
 _ARROWS = 9  # along a side of a detector
 
 
+def outline_detectors(camera, ax):
+    """Draw the detectors with their ids, by their place in the focal plane."""
+    for key, each in camera.detectors.items():
+        ax.fill(*each.outline.T, facecolor="#eef3f8", edgecolor=elements.BLUE, linewidth=1.2, zorder=0)
+        x, y = each.outline.min(axis=0)
+        ax.annotate(key, (x, y), xytext=(5, 5), textcoords="offset points", color=elements.BLUE, parse_math=False)
+
+
 def plot_camera(camera, *, ax=None, scale=None):
     """Outlines of the detectors, and arrows from undistorted to true places on them, magnified.
 
@@ -31,10 +39,7 @@ def plot_camera(camera, *, ax=None, scale=None):
     places, shifts = np.concatenate(places), np.concatenate(shifts)
     longest = np.hypot(*shifts.T).max()
     scale = scale or elements.round_down(0.06 * max(nx, ny) / (longest or 1))
-    for key, each in camera.detectors.items():
-        ax.fill(*each.outline.T, facecolor="#eef3f8", edgecolor=elements.BLUE, linewidth=1.2)
-        x, y = each.outline.min(axis=0)
-        ax.annotate(key, (x, y), xytext=(5, 5), textcoords="offset points", color=elements.BLUE, parse_math=False)
+    outline_detectors(camera, ax)
     if longest > 0:
         ax.quiver(*places.T, *(scale * shifts.T), angles="xy", scale_units="xy", scale=1, width=2e-3)
     ax.set(xlim=(-0.03 * nx, 1.03 * nx), ylim=(-0.03 * ny, 1.03 * ny), aspect="equal")

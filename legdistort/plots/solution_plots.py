@@ -10,6 +10,7 @@ from ..exceptions import InputError
 from ..geometry import basis
 from ..inputs import column_contract
 from . import elements
+from .camera_plots import outline_detectors
 
 #: Panels of one figure of small multiples.
 PANELS = 12
@@ -19,6 +20,8 @@ _PARTS = {"total": "distortion", "nonlinear": "distortion of degree 2 and more",
 
 def plot_residuals(solution, name=None, *, scale=None, ax=None):
     """Arrows of the residuals (measured minus model) over the detector; crosses mark positions not used.
+
+    Of a camera over its focal plane, in which the detectors are outlined.
 
     Of more than 3000 arrows a random sample is drawn.
 
@@ -53,6 +56,8 @@ def plot_residuals(solution, name=None, *, scale=None, ax=None):
     scale = scale or elements.round_down(0.08 * max(nx, ny) / (np.percentile(np.hypot(dx, dy)[rows], 90) or 1))
     if len(rows) > _MAX_ARROWS:
         rows = np.random.default_rng(0).choice(rows, _MAX_ARROWS, replace=False)
+    if solution.camera is not None:
+        outline_detectors(solution.camera, ax)
     ax.plot(x[~used], y[~used], "x", color=elements.RED, markersize=4, label="not used", linestyle="none")
     arrows = ax.quiver(
         *(a[rows] for a in (x, y, dx, dy)),

@@ -84,6 +84,7 @@ def render(solution, *, mosaic=None, psfs=None, summary=None, comparison=None, s
             _facts_table(solution, facts),
             "<h2>Exposures</h2>",
             _exposures_table(solution),
+            _detectors_table(solution.camera) if solution.camera is not None else "",
             compared_corrections(comparison) if comparison else "",
             compared_stacks(stacks) if stacks else "",
             "<h2>Pictures</h2>",
@@ -134,6 +135,8 @@ def _facts_table(solution, facts):
     error = facts["max_inverse_error_px"]
     rows["Largest error of an inverse"] = escape(error) if isinstance(error, str) else f"{error:.1e} px"
     rows["Minimisation"] = escape(str(solution.status))
+    if solution.camera is not None:
+        rows["Camera"] = escape(solution.camera_sentence)
     rows["Gauge"] = escape(solution.gauge.sentence)
     rows |= {key.capitalize(): escape(sentence) for key, sentence in solution.diagnostics.in_words().items()}
     if solution.motions is not None:
@@ -186,6 +189,23 @@ def _exposures_table(solution):
     )
 
 
+def _detectors_table(camera):
+    """One row a detector: where it lies, with the errors of that, and the size of its static distortion."""
+    head = {"detector": "", "centre x": "px", "centre y": "px", "rotation": "deg", "scale": "", "static": "rms, px"}
+    rows = []
+    for key, each in camera.detectors.items():
+        place, errors = each.place, each.place.errors or ("", "", "")
+        errors = ["" if e == "" else " ± unknown" if np.isinf(e) else f" ± {e:.2g}" for e in errors]
+        values = f"{place.x:.3f}", f"{place.y:.3f}", f"{place.rotation:.5f}"
+        cells = [value + error for value, error in zip(values, errors, strict=True)]
+        rows.append([key, *cells, f"{place.scale:.6f}", f"{each.rms:.3f}"])
+    return (
+        f"<h2>Detectors of camera {escape(camera.name)}</h2>\n{wide_table(head, rows)}\n<p><small>Centres in the focal "
+        "plane. Errors, where the layout was fitted, are standard deviations after one affine map of all detectors "
+        "together, which exposures can take over.</small></p>"
+    )
+
+
 def _exposure_rms(solution):
     """Rms of the used residuals in x and y, and their number, by exposure."""
     table = solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]
@@ -212,9 +232,10 @@ def _sizes(solution):
 
 
 def _pictures(solution, mosaic, psfs):
+    place = "on the detector" if solution.camera is None else "in the focal plane, with its detectors"
     residuals = figure(
         solution_plots.plot_residuals(solution, ax=detached_figure(6.4, 6.4).subplots()),
-        "Residuals of all exposures at their places on the detector, magnified: arrows that point the same way "
+        f"Residuals of all exposures at their places {place}, magnified: arrows that point the same way "
         "over a region would mean a distortion that the polynomials do not follow.",
     )
     scatter = figure(
@@ -227,6 +248,11 @@ def _pictures(solution, mosaic, psfs):
         "Coefficients of the Legendre modes, mean of the exposures with their scatter, beside the prior if "
         "there is one: large values in the highest orders would mean a degree too low or too few stars.",
     )
+    if solution.camera is not None:
+        scatter += figure(
+            solution.camera.plot(ax=detached_figure(6.4, 6.4).subplots()),
+            "The detectors in the focal plane with their static distortion, common to all exposures.",
+        )
     figures = [f'<div class="pair">{residuals}{scatter}</div>', *_distortion_figures(solution), coefficients]
     figures += _error_figure(solution)
     figures += _motion_figures(solution)

@@ -573,11 +573,30 @@ class Solution:
     def _camera_in_words(self):
         if self.camera is None:
             return []
+        return _wrapped("camera", self.camera_sentence)
+
+    @property
+    def camera_sentence(self):
+        """Which camera it is, and what of it the exposures do not tell; empty without one."""
+        if self.camera is None:
+            return ""
         ny, nx = self.camera.field
         ids = ", ".join(self.camera.detectors)
-        known = [each.layout_sigma for each in self.camera.detectors.values() if each.layout_sigma is not None]
-        place = f"; layout to {np.sqrt(np.mean(np.square(known))):.2g} px a mode" if known else ""
-        return [f"camera  {self.camera.name}, detectors {ids}; positions in its focal plane, {nx} x {ny} px{place}"]
+        words = f"{self.camera.name}, detectors {ids}; positions in its focal plane, {nx} x {ny} px"
+        groups = self.camera.groups(self.observations[self.observations["used"]])
+        if len(groups) > 1:
+            words += f"; no star in common: {' | '.join(', '.join(group) for group in groups)}"
+            held = any(
+                np.isinf(each.place.errors).any() for each in self.camera.detectors.values() if each.place.errors
+            )
+            words += ", so that their places relative to each other are not determined" * held
+        common = self.camera.common_sigma
+        if common is not None and np.isinf(common[:, 1:3]).any() and "shear" in self.gauge.unknown_names:
+            words += (
+                "; a shear of all detectors together is not determined: the exposures are not turned enough against "
+                "one another"
+            )
+        return words
 
     def _static_in_words(self):
         if self.settings.static != "fit" or self.camera is not None:
@@ -621,6 +640,8 @@ class Solution:
                 f"{name[:24]:24s} {len(rows):5d} {d['dx']:9.2f} {d['dy']:9.2f} {d['rotation']:9.4f} {d['scale']:9.6f} "
                 f"{rms[0]:7.4f} {rms[1]:7.4f} {np.sqrt((a**2).sum()) / 2:10.3f}{self._orientation_in_words(name)}"
             )
+        if self.camera is not None:
+            lines += ["", *self.camera.table_lines()]
         lines += [f"left out {name}: {reason}" for name, reason in self.left_out.items()]
         return "\n".join(lines)
 

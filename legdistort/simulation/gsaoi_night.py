@@ -8,9 +8,10 @@ import numpy as np
 from astropy.io import fits
 from astropy.time import Time
 
+from ..cameras.camera import GSAOI_SCALE, Camera
 from ..exceptions import InputError
 from ..geometry import basis, similarity
-from ..geometry.gsaoi import GsaoiMap
+from ..geometry.gsaoi import GSAOI_SIZE, GsaoiMap
 from ..geometry.tangent_plane import TangentPlane
 from ..runtime.checks import check_counts
 from . import rendering
@@ -55,6 +56,9 @@ class Night:
         Subtract the mean over the exposures from these.
     detector : int
         Of GSAOI, for its static distortion: 2 is the lower left one.
+    camera : str or None
+        "gsaoi": all four detectors of `size` pixels along a side, each in an extension ``SCI``. What an exposure adds
+        to the static distortions then is one distortion of the focal plane.
     pointing_error : float
         How far every header is off on the sky, arcsec, in random directions.
     sigma_range : tuple of float
@@ -87,6 +91,7 @@ class Night:
     residue_rms: float = 0.0
     zero_mean: bool = False
     detector: int = 2
+    camera: str | None = None
     pointing_error: float = 0.3
     sigma_range: tuple = (0.002, 0.14)
     fwhm: float = 4.5
@@ -107,6 +112,8 @@ class Night:
         lo, hi = self.sigma_range
         if not 0 < lo <= hi:
             raise InputError(f"sigma_range must be (smallest, largest) error in pixels, got {self.sigma_range!r}")
+        if self.camera not in (None, "gsaoi"):
+            raise InputError(f"camera must be 'gsaoi' or None, got {self.camera!r}")
         if not self.residue_rms >= 0:
             raise InputError(f"residue_rms must not be negative, got {self.residue_rms!r}")
         if isinstance(self.psf, (list, tuple)) and len(self.psf) != self.n_exposures:
@@ -142,10 +149,14 @@ class Night:
 
 #: A night that is rendered and reduced in seconds.
 SMALL_NIGHT = Night(n_exposures=6, n_stars=70, size=512, dither=60.0)
+#: What changes where all detectors are simulated: as many pixels, over the field of 85 arcsec, in all.
+_OF_CAMERA = {False: {"n_stars": 300, "size": 1024, "dither": 125.0}, True: {"size": 256, "dither": 35.0}}
 
 
-def make_night(small, **settings):
+def make_night(small, *, camera=None, **settings):
     """`SMALL_NIGHT` or the default `Night` with some attributes changed; `InputError` for what is none of them."""
+    if camera is not None:
+        settings = _OF_CAMERA[bool(small)] | settings | {"camera": camera}
     known = [field.name for field in fields(Night)]
     unknown = sorted(settings.keys() - known)
     if unknown:
@@ -168,11 +179,16 @@ def draw_night(night, seed):
     rng : `~numpy.random.Generator`
     """
     star_rng, map_rng, pose_rng, noise_rng, motion_rng = np.random.default_rng(seed).spawn(5)
-    instrument = GsaoiMap(night.detector, night.size)
-    shape, names = (night.size, night.size), exposure_names(night.n_exposures)
+    names = exposure_names(night.n_exposures)
+    if night.camera:
+        camera, instrument = Camera.gsaoi(size=night.size), None
+        shape, pixel_scale = camera.field, GSAOI_SCALE * GSAOI_SIZE / night.size
+    else:
+        camera, instrument = None, GsaoiMap(night.detector, night.size)
+        shape, pixel_scale = (night.size, night.size), instrument.pixel_scale
     true_poses = draw_poses(pose_rng, names, shape, night.dither)
     dynamic = _draw_dynamic(map_rng, night)
-    sky = _sky(instrument, night.size)
+    sky = _sky(pixel_scale, shape)
     epochs = night.epochs
     if epochs is not None:
         epochs = checked_epochs(epochs, night.n_exposures) + np.arange(night.n_exposures) * night.cadence / _YEAR
@@ -182,12 +198,13 @@ def draw_night(night, seed):
         shape=shape,
         positions=np.empty((0, 2)),
         flux=_draw_flux(star_rng, night),
-        static=fit_static(instrument, shape, basis.degree_of(dynamic.shape[2])),
+        static=fit_static(instrument, shape, basis.degree_of(dynamic.shape[2])) if instrument else 0 * dynamic[0],
         dynamic=dynamic,
         poses=true_poses,
-        nominal_poses=_point_wrongly(pose_rng, true_poses, night.pointing_error / instrument.pixel_scale),
+        nominal_poses=_point_wrongly(pose_rng, true_poses, night.pointing_error / pixel_scale),
         instrument=instrument,
         sky=sky,
+        camera=camera,
         **moving,
     )
     positions = draw_stars(
@@ -227,8 +244,13 @@ def _point_wrongly(rng, true_poses, error):
 
 
 def stars_inside(truth, night, xy):
-    """Which positions lie at least 3 FWHM inside each exposure, bool (n_exposures, n)."""
-    return np.array([within(truth.distort(name, xy), truth.shape, 3 * night.fwhm) for name in truth.names])
+    """Which positions lie at least 3 FWHM inside each exposure, on any detector, bool (n_exposures, n)."""
+    margin = 3 * night.fwhm
+    if truth.camera is None:
+        return np.array([within(truth.distort(name, xy), truth.shape, margin) for name in truth.names])
+    keys, size = truth.camera.detectors, (night.size, night.size)
+    on = [[within(truth.on_detector(name, key, xy), size, margin) for key in keys] for name in truth.names]
+    return np.any(on, axis=1)
 
 
 def _draw_flux(rng, night):
@@ -241,15 +263,17 @@ def _draw_flux(rng, night):
     return (a + (b - a) * rng.random(night.n_stars)) ** (-1 / slope)
 
 
-def _sky(instrument, size):
+def _sky(pixel_scale, shape):
     """N159W, as in the paper: north up, east left, tangent point in the middle of the reference plane."""
-    s, middle = instrument.pixel_scale / 3600, (size - 1) / 2
-    return TangentPlane(84.916667, -69.765278, np.array([[-s, 0, s * middle], [0, s, -s * middle]]))
+    s, (y, x) = pixel_scale / 3600, (np.array(shape) - 1) / 2
+    return TangentPlane(84.916667, -69.765278, np.array([[-s, 0, s * x], [0, s, -s * y]]))
 
 
-def header(truth, name, night, index):
-    """FITS header of one exposure, the `index`-th of the night, with the nominal TAN WCS."""
+def header(truth, name, night, index, detector=None):
+    """FITS header of one exposure, the `index`-th of the night, or of a `detector`, with the nominal TAN WCS."""
     sky, pose = truth.sky, truth.nominal_poses[name]
+    if detector is not None:
+        pose = similarity.compose(truth.camera[detector].layout, pose)
     tangent = similarity.apply(pose, similarity.invert(sky.matrix)[:, 2])
     cd = sky.matrix[:, :2] @ np.linalg.inv(pose[:, :2])
     start = datetime(2014, 12, 8, 3) + index * timedelta(seconds=night.cadence)
@@ -259,6 +283,7 @@ def header(truth, name, night, index):
         [
             ("FILENAME", f"{name}.fits"),
             ("OBJECT", "SIMULATED", "simulated star field"),
+            *([("CCDCHIP", int(detector))] if detector else []),
             ("DATE-OBS", start.isoformat()),
             ("MJD-OBS", round((start - datetime(1858, 11, 17)) / timedelta(days=1), 8)),
             ("EXPTIME", night.exptime, "[s]"),

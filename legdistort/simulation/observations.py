@@ -49,7 +49,7 @@ class SimulatedExposures:
     Attributes
     ----------
     hdus : dict
-        ``{name: HDUList}``, image in the primary HDU.
+        ``{name: HDUList}``, image in the primary HDU, or those of the detectors of a camera in extensions ``SCI``.
     truth : Truth
     psfs : dict
         ``{name: PSF}``, what `~legdistort.simulation.rendering.render` was given for each.
@@ -185,17 +185,20 @@ def simulate_matches(
     return Simulation(matches_from(truth, observed, sigma, noise_rng, noise=noise, corr=corr, sky=sky), truth)
 
 
-def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **settings):
+def simulate_exposures(*, small=False, camera=None, noise=True, seed=0, progress=False, **settings):
     """Images of a simulated GSAOI night.
 
     Stars are drawn with at least 10 FWHM between them; with ``motion`` and ``epochs`` they move, and the headers tell
     when. Their true pixels are ``D(q) + d_i(q)``: the published static
-    distortion D of the real detector, inverted by Newton's method, and a dynamic Legendre part.
+    distortion D of the real detector, inverted by Newton's method, and a dynamic Legendre part. With
+    ``camera="gsaoi"`` they are those of four detectors in one focal plane, to which the dynamic part belongs.
 
     Parameters
     ----------
     small : bool
-        Six exposures of 512 x 512 pixels instead of eleven of 2048 x 2048.
+        Six exposures of 512 x 512 pixels instead of eleven of 2048 x 2048; of a camera that has so many in all.
+    camera : str, optional
+        "gsaoi": its four detectors.
     noise : bool
         Photon and read noise; without it the images are float32 and not clipped at saturation.
     seed : int
@@ -216,20 +219,33 @@ def simulate_exposures(*, small=False, noise=True, seed=0, progress=False, **set
     InputError
         For an unknown setting or one out of range.
     """
-    night = gsaoi_night.make_night(small, **settings)
+    night = gsaoi_night.make_night(small, camera=camera, **settings)
     truth, rng = gsaoi_night.draw_night(night, seed)
     hdus, psfs = {}, {}
     for i, name in enumerate(tqdm(truth.names, desc="simulate", disable=not progress)):
         psfs[name] = psf = night.psf_of(i, rng)
-        xy = truth.distort(name, truth.place(name))
-        image = rendering.render(truth.shape, xy, truth.flux, psf=psf, sky=night.sky)
-        if noise:
-            image = rendering.add_noise(image, rng, gain=night.gain, read_noise=night.read_noise)
-            image = np.rint(np.clip(image, 0, min(night.saturation, 65535))).astype(np.uint16)
-        else:
-            image = image.astype(np.float32)
-        hdus[name] = fits.HDUList([fits.PrimaryHDU(image, gsaoi_night.header(truth, name, night, i))])
+        if truth.camera is None:
+            xy = truth.distort(name, truth.place(name))
+            image = _image(night, truth.shape, xy, truth.flux, psf, rng, noise)
+            hdus[name] = fits.HDUList([fits.PrimaryHDU(image, gsaoi_night.header(truth, name, night, i))])
+            continue
+        hdus[name] = fits.HDUList([fits.PrimaryHDU(header=fits.Header({"INSTRUME": "GSAOI"}))])
+        for version, (key, chip) in enumerate(truth.camera.detectors.items(), start=1):
+            xy = truth.on_detector(name, key, truth.place(name))
+            seen = np.isfinite(xy[:, 0])
+            image = _image(night, chip.shape, xy[seen], truth.flux[seen], psf, rng, noise)
+            header = gsaoi_night.header(truth, name, night, i, detector=key)
+            hdus[name].append(fits.ImageHDU(image, header, name="SCI", ver=version))
     return SimulatedExposures(hdus, truth, psfs)
+
+
+def _image(night, shape, xy, flux, psf, rng, noise):
+    """One image of a night; float32 without noise."""
+    image = rendering.render(shape, xy, flux, psf=psf, sky=night.sky)
+    if not noise:
+        return image.astype(np.float32)
+    image = rendering.add_noise(image, rng, gain=night.gain, read_noise=night.read_noise)
+    return np.rint(np.clip(image, 0, min(night.saturation, 65535))).astype(np.uint16)
 
 
 def simulate_gsaoi_matches(*, small=False, seed=0, **settings):
@@ -244,6 +260,8 @@ def simulate_gsaoi_matches(*, small=False, seed=0, **settings):
     Simulation
     """
     night = gsaoi_night.make_night(small, **settings)
+    if night.camera:
+        raise InputError("camera is for images: simulate_exposures, whose detectors measure finds")
     truth, rng = gsaoi_night.draw_night(night, seed)
     observed = gsaoi_night.stars_inside(truth, night, truth.positions)
     observed &= np.count_nonzero(observed, axis=0) >= min(4, night.n_exposures)

@@ -8,6 +8,7 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
 
+from ..cameras.camera import Camera
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.tangent_plane import TangentPlane
@@ -47,8 +48,11 @@ class Plan:
     seed: int
     epochs: object = None
     field: object = None
+    camera: Camera | None = None
 
     def __post_init__(self):
+        for name, value in zip(("shape", "prior"), self._field(), strict=True):
+            object.__setattr__(self, name, value)
         self._check_epochs()
         check_counts(n_grid=self.n_grid, n_exposures=self.n_exposures)
         object.__setattr__(self, "degree", basis.check_degree(self.degree))
@@ -68,6 +72,21 @@ class Plan:
             check_counts(n_stars=self.n_stars)
         if self.density is not None and not (isinstance(self.density, Real) and 0 < self.density < np.inf):
             raise InputError(f"density must be a positive number of stars a detector, got {self.density!r}")
+
+    def _field(self):
+        """Shape and prior: the focal plane of a camera takes the place of the detector, and it is the prior."""
+        camera, shape = self.camera, self.shape
+        if camera is None:
+            return (2048, 2048) if shape is None else shape, self.prior
+        if not isinstance(camera, Camera):
+            raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
+        if shape is not None and tuple(shape) != camera.field:
+            raise InputError("shape and camera both say how large the field is: leave shape out")
+        if self.prior is not None:
+            return camera.field, self.prior
+        widths = camera.common_sigma
+        mean = np.zeros((2, 1) if widths is None else widths.shape)
+        return camera.field, Prior(mean, static_sigma=widths, source=f"camera {camera.name}")
 
     def _check_epochs(self):
         """When the exposures will be taken, and where the field lies."""
@@ -167,7 +186,10 @@ def lay_out(plan):
     pose_list = _poses(plan, pose_rng)
 
     def inside(xy):
-        return np.array([truth.within(similarity.apply(pose, xy), shape) for pose in pose_list.values()])
+        placed = [similarity.apply(pose, xy) for pose in pose_list.values()]
+        if plan.camera is not None:
+            return np.array([np.any(plan.camera.sees(q), axis=0) for q in placed])
+        return np.array([truth.within(q, shape) for q in placed])
 
     region = truth.footprint(pose_list.values(), shape)
     if plan.stars is not None:
@@ -175,7 +197,8 @@ def lay_out(plan):
     elif plan.n_stars is not None:
         positions = truth.draw_stars(star_rng, plan.n_stars, region, inside, plan.least)
     else:
-        count = round(plan.density * np.prod(region[1] - region[0]) / np.prod(shape))
+        sizes = [shape] if plan.camera is None else [each.shape for each in plan.camera.detectors.values()]
+        count = round(plan.density * np.prod(region[1] - region[0]) / np.mean(np.prod(sizes, axis=1)))
         positions = star_rng.uniform(*region, size=(count, 2))
     observed = inside(positions)
     observed &= np.count_nonzero(observed, axis=0) >= plan.least
@@ -185,7 +208,11 @@ def lay_out(plan):
             f"the reference plane, here from {region[0].round()} to {region[1].round()} (x, y)"
         )
     years = None if plan.epochs is None else np.asarray(plan.epochs, dtype=float)
-    return Layout(positions, pose_list, shape, observed, _errors(plan, len(positions)), years, plan.sky)
+    errors = _errors(plan, len(positions))
+    if plan.camera is not None:
+        planes = [similarity.apply(pose, positions) for pose in pose_list.values()]
+        errors = np.array([plan.camera.errors_in_focal_plane(f, e) for f, e in zip(planes, errors, strict=True)])
+    return Layout(positions, pose_list, shape, observed, errors, years, plan.sky)
 
 
 def _poses(plan, rng):

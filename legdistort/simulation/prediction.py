@@ -223,7 +223,8 @@ def predict(
     density=None,
     sigma=None,
     degree=3,
-    shape=(2048, 2048),
+    shape=None,
+    camera=None,
     dithers=0.0,
     poses=None,
     prior=None,
@@ -249,15 +250,18 @@ def predict(
     n_stars : int, optional
         So many are drawn, evenly over the field. With the same seed they are those of `simulate_matches`.
     density : float, optional
-        The same as stars per detector.
+        The same as stars per detector, of a camera the mean of its detectors.
     sigma : float, array_like or callable
         Error of one measured position per axis, pixels: a number, or broadcast to (n_exposures, n_stars), so that
         (n_stars,) is per star and (n_exposures, 1) per exposure; or a function of the column ``flux`` of `stars`.
         By default the columns ``x_err``, ``y_err`` of `stars`.
     degree : int
         Total degree that will be fitted.
-    shape : tuple of int
-        ``(ny, nx)`` of the detector.
+    shape : tuple of int, optional
+        ``(ny, nx)`` of the detector, by default (2048, 2048).
+    camera : `legdistort.Camera`, optional
+        Its detectors take the place of one: stars, dithers and what is expected are in pixels of its focal plane, whose
+        distortion is fitted; `sigma` in those of the detectors. Layout and static distortions count as known.
     dithers : float or array_like, shape (n_exposures, 2)
         Shifts of the exposures in pixels, or their rms length, to be drawn evenly in a square.
     poses : dict, optional
@@ -306,7 +310,7 @@ def predict(
         n_exposures=n_exposures, stars=stars, n_stars=n_stars, density=density, sigma=sigma, degree=degree,
         shape=shape, dithers=dithers, poses=poses, prior=prior, gauge=gauge, dynamic=dynamic, spectrum=spectrum,
         static_spectrum=static_spectrum, min_exposures=min_exposures, n_grid=n_grid, seed=seed,
-        epochs=epochs, field=field,
+        epochs=epochs, field=field, camera=camera,
     )  # fmt: skip
     return _predict(plan)
 

@@ -51,6 +51,8 @@ class Truth:
         Proper motions, pixels a year.
     parallaxes : ndarray, shape (n_stars,), or None
         Pixels.
+    camera : `~legdistort.cameras.camera.Camera` or None
+        Where several detectors were simulated: pixels of exposures are then those of its focal plane.
     """
 
     names: tuple
@@ -67,6 +69,7 @@ class Truth:
     epoch: float | None = None
     motions: np.ndarray | None = None
     parallaxes: np.ndarray | None = None
+    camera: object = None
 
     def place(self, name):
         """True reference-plane positions (n_stars, 2) of the stars at the time of an exposure."""
@@ -90,6 +93,15 @@ class Truth:
         if self.instrument is None:
             return q + displacement(self.coefficients[i], q, self.shape)
         return self.instrument.distort(q) + displacement(self.dynamic[i], q, self.shape)
+
+    def on_detector(self, name, detector, xy):
+        """True pixels (n, 2) of reference-plane positions (n, 2) on one detector of the camera; NaN far off it."""
+        chip, f = self.camera[detector], self.distort(name, xy)
+        q = similarity.apply(chip.layout, f)
+        near = within(q, chip.shape, -0.1 * max(chip.shape))  # beyond that its series means nothing
+        out = np.full(f.shape, np.nan)
+        out[near] = chip.to_pixels(f[near])
+        return out
 
     def grid(self, name, n=20):
         """Reference-plane positions (n*n, 2) that cover one exposure's detector evenly.

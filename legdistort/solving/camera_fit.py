@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..cameras.camera import Camera
 from ..cameras.detector import Detector, affine_of
 from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, warn
 from ..geometry import basis, similarity
@@ -127,6 +126,19 @@ class Sought:
         return np.sqrt(np.sum(widths**2, axis=0)) / np.count_nonzero(self.free.any(axis=(1, 2)))
 
 
+def common_widths(camera, sought):
+    """Uncertainty (2, n_modes) of what detectors and exposures share, with that which the camera states; None if none.
+
+    Parameters
+    ----------
+    camera : Camera
+    sought : Sought or None
+    """
+    widths = [w for w in (camera.common_sigma, sought and sought.of_common_map) if w is not None]
+    top = max((basis.degree_of(w.shape[1]) for w in widths), default=0)
+    return np.sqrt(sum(basis.change_degree(w, top) ** 2 for w in widths)) if widths else None
+
+
 class CameraFit:
     """The way to the camera that exposures call for.
 
@@ -162,9 +174,11 @@ class CameraFit:
         step = self.step
         if step.length >= _SMALL:
             warn(f"the camera has not settled in {_STEPS} steps; give better layouts", ConvergenceWarning)
-        _tell_weak(fit.matches.camera, step)
+        unknown = _unknown(fit.matches.camera, step)
+        _tell_unknown(fit.matches, step, unknown)
         shared = _of_stars(fit, step) + (0.0 if fit.shared_errors is None else fit.shared_errors)
-        camera = changed(fit.matches.camera, np.zeros_like(step.change), step.errors)
+        camera = with_errors(fit.matches.camera, step, unknown)
+        camera = replace(camera, common_sigma=common_widths(camera, self.sought))
         matches = replace(fit.matches, camera=camera)
         return replace(fit, matches=matches, shared_errors=shared, shared_unknowns=step.freedom)
 
@@ -182,21 +196,59 @@ def _of_stars(fit, step):
     return out
 
 
-def _tell_weak(camera, step):
-    """Warn of what is not determined beyond maps that detectors and exposures can exchange."""
-    modes = step.free.any(axis=(0, 1))
-    exchanged = 2 * np.count_nonzero(modes) if modes[:3].all() else 0
-    extra = len(step.weak) - exchanged
-    if extra <= 0:
+def _unknown(camera, step):
+    """Directions (m, k), of unit rms over the unknowns, that are not determined and no exposure can take over."""
+    exchanged = _exchanged(camera, step.free)
+    scale = np.abs(step.weak).max(axis=0, initial=0) + np.finfo(float).tiny
+    weak, common = (
+        step.weak / scale,
+        np.linalg.qr((exchanged / scale).T)[0] if len(exchanged) else np.zeros((len(scale), 0)),
+    )
+    if not len(weak):
+        return weak
+    weak = np.linalg.qr(weak.T)[0].T
+    rest = weak - (weak @ common) @ common.T
+    _, size, directions = np.linalg.svd(rest, full_matrices=False)
+    out = directions[size > 0.5] * scale
+    return out / np.sqrt(np.mean(out**2, axis=1, keepdims=True))
+
+
+def _exchanged(camera, free):
+    """Changes (m, k) of the free modes of all detectors by common maps of the focal plane, which exposures can undo."""
+    modes = free.any(axis=(0, 1))
+    if not modes[:3].all():
+        return np.zeros((0, np.count_nonzero(free)))
+    degree, out = basis.degree_of(np.count_nonzero(modes)), []
+    for axis in (0, 1):
+        for mode in range(basis.n_modes(degree)):
+            change = np.zeros(free.shape)
+            for c, chip in enumerate(camera.detectors.values()):
+
+                def moved(u, v, chip=chip, mode=mode, axis=axis):
+                    q = basis.denormalize(u, v, chip.shape)
+                    f = similarity.apply(similarity.invert(chip.layout), q)
+                    value = basis.values(degree, *basis.normalize(f, camera.field))[mode]
+                    return np.outer(chip.layout[:, axis], value)
+
+                change[c, :, : basis.n_modes(degree)] = basis.project(moved, degree)
+            out.append(change[free])
+    return np.array(out)
+
+
+def _tell_unknown(matches, step, unknown):
+    """Warn of directions of the camera that are not determined."""
+    if not len(unknown):
         return
-    energy = np.zeros(step.free.shape)
-    energy[step.free] = (step.weak**2).sum(axis=0)
+    camera, energy = matches.camera, np.zeros(step.free.shape)
+    energy[step.free] = (unknown**2).sum(axis=0)
     keys = np.array(list(camera.detectors))
     named = keys[np.argsort(-energy.sum(axis=(1, 2)), kind="stable")][:4]
+    groups = camera.groups(matches.table)
+    apart = f" (no star in common: {' | '.join(', '.join(group) for group in groups)})" if len(groups) > 1 else ""
     warn(
-        f"{extra} unknowns of camera {camera.name} are not determined by these exposures and stay where they were, "
-        f"above all of detector {', '.join(named)}: stars that one detector sees in one exposure and another in the "
-        "next tell how these lie; dither over the gaps, or give uncertainties (layout_sigma)",
+        f"{len(unknown)} unknowns of camera {camera.name} are not determined by these exposures and stay where they "
+        f"were, above all of detector {', '.join(named)}{apart}: stars that one detector sees in one exposure and "
+        "another in the next tell how these lie; dither over the gaps, or give uncertainties (layout_sigma)",
         AssumptionWarning,
     )
 
@@ -289,18 +341,48 @@ def _inverse(normal, precision, alone):
     return known @ inner @ known.T, (vectors[:, ~good] * unit[:, None]).T
 
 
-def changed(camera, change, errors=None):
-    """The camera with changes (n_detectors, 2, n_modes) of the series of its detectors, and with their errors."""
+def changed(camera, change):
+    """The camera with changes (n_detectors, 2, n_modes) of the series of its detectors."""
     detectors = {}
     for k, (key, each) in enumerate(camera.detectors.items()):
-        degree = basis.degree_of(change.shape[2])
-        top = max(degree, basis.degree_of(each.static.shape[1]))
+        top = max(basis.degree_of(change.shape[2]), basis.degree_of(each.static.shape[1]))
         low = affine_of(change[k, :, :3], each.shape)
         static = basis.change_degree(each.static, top) + basis.change_degree(change[k], top)
         static[:, :3] = 0.0  # the layout, which moves the static distortion along
-        sigma = {}
-        if errors is not None:
-            widths = basis.change_degree(errors[k], top)
-            sigma = {"layout_sigma": widths[:, :3], "static_sigma": np.where(np.arange(widths.shape[1]) < 3, 0, widths)}
-        detectors[key] = Detector(each.shape, layout=similarity.compose(low, each.layout), static=static, **sigma)
-    return Camera(camera.name, detectors, camera.field)
+        known = {"layout_sigma": each.layout_sigma, "layout_covariance": each.layout_covariance}
+        layout = similarity.compose(low, each.layout)
+        detectors[key] = Detector(each.shape, layout=layout, static=static, static_sigma=_widened(each, top), **known)
+    return replace(camera, detectors=detectors)
+
+
+def _widened(detector, degree):
+    """Uncertainty of the static distortion of a detector with the modes of a degree, which it may not have had."""
+    return None if detector.static_sigma is None else basis.change_degree(detector.static_sigma, degree)
+
+
+def with_errors(camera, step, unknown):
+    """The camera with the errors of a step, infinite along `unknown` directions (m, k) of its free modes.
+
+    Detectors of which nothing is free keep theirs.
+    """
+    errors, index = step.errors, np.full(step.free.shape, -1)
+    free = step.free
+    errors[free] = np.where(np.any(np.abs(unknown) > errors[free], axis=0), np.inf, errors[free])
+    index[free] = np.arange(np.count_nonzero(free))
+    detectors = {}
+    for k, (key, each) in enumerate(camera.detectors.items()):
+        detectors[key] = each
+        if not free[k].any():
+            continue
+        low, places = free[k, :, :3].ravel(), index[k, :, :3].ravel()
+        covariance = np.zeros((6, 6))
+        covariance[np.ix_(low, low)] = step.covariance[np.ix_(places[low], places[low])]
+        lost = np.isinf(errors[k, :, :3].ravel())
+        covariance[lost] = covariance[:, lost] = 0.0
+        covariance[lost, lost] = np.inf
+        top = max(basis.degree_of(free.shape[2]), basis.degree_of(each.static.shape[1]))
+        widths = basis.change_degree(np.where(np.arange(free.shape[2]) < 3, 0.0, errors[k]), top)
+        static = basis.change_degree(each.static, top)
+        known = {"layout_covariance": covariance, "static": static, "static_sigma": widths}
+        detectors[key] = Detector(each.shape, layout=each.layout, **known)
+    return replace(camera, detectors=detectors)

@@ -16,7 +16,7 @@ from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
 from . import model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
-from .camera_fit import CameraFit, Sought
+from .camera_fit import CameraFit, Sought, common_widths
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, only_rows, validation
 from .equations import effective_modes
@@ -215,10 +215,9 @@ def _of_camera(matches, prior, model, degree, layout, static):
     sought = Sought.of(matches, layout, static, 3 if isinstance(degree, str) else degree)
     if prior is not None or model is not None:
         return sought, prior
-    known = {"source": f"camera {camera.name}"}
-    if sought is None:
+    known, widths = {"source": f"camera {camera.name}"}, common_widths(camera, sought)
+    if widths is None:
         return None, Prior(np.zeros((2, 1)), **known)
-    widths = sought.of_common_map
     return sought, Prior(np.zeros_like(widths), static_sigma=widths, **known)
 
 
