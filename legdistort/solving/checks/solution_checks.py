@@ -103,22 +103,24 @@ def _pattern_state(score, residuals):
 
 
 def _stated(solution, residuals):
-    """Chi2 at the stated errors, without floor or scale."""
+    """Chi2 at the stated errors, without floor or scale, and its degrees of freedom."""
+    if not solution.diagnostics.error_floor:
+        return residuals.chi2, residuals.dof
     table = solution.observations
     rows = np.asarray(table["used"])
     x, y, a, b = (table[name][rows].value for name in ("dx", "dy", "x_err", "y_err"))
     c = np.asarray(table["xy_corr"])[rows] if "xy_corr" in table.colnames else np.zeros(len(x))
     square = ((x / a) ** 2 + (y / b) ** 2 - 2 * c * x * y / (a * b)) / (1 - c**2)
-    return float(square.sum()) if solution.diagnostics.error_floor else residuals.chi2
+    return float(square.sum()), solution.dof
 
 
 def errors_check(solution, residuals):
     """Do residuals scatter as the stated errors say?"""
-    dof = solution.dof
+    chi2, dof = _stated(solution, residuals)
     if dof < 1:
         return Check("chi2", "unknown", None, None, "no degrees of freedom are left to judge the errors by",
                      "lower the degree, or add stars or exposures")  # fmt: skip
-    ratio = _stated(solution, residuals) / dof
+    ratio = chi2 / dof
     low, high = (stats.chi2.isf(p, dof) / dof for p in (1 - FALSE_ALARM / 2, FALSE_ALARM / 2))
     low, high = min(low, (1 - NEGLIGIBLE) ** 2), max(high, (1 + NEGLIGIBLE) ** 2)
     floor, scale = solution.diagnostics.error_floor, solution.diagnostics.error_scale
