@@ -142,6 +142,19 @@ def test_freedom_of_observations_sums_to_that_of_chi2():
     assert found.freedom.sum() == pytest.approx(solution.dof - found.released.shape[2])
 
 
+def test_chi2_of_few_observations_is_about_one_where_the_gauge_has_a_second_order():
+    found, values = [], []
+    for seed in range(20):
+        matches = ld.simulate_matches(
+            n_exposures=4, n_stars=30, sigma=0.02, degree=3, static=4.0, dynamic=1.0, seed=seed
+        ).matches
+        solution = ld.solve(matches, degree=3, clip=None)
+        found.append(residuals(solution).released.shape[2] / solution.dof)
+        values.append(next(check.value for check in solution.checks if check.name == "chi2"))
+    assert np.mean(found) > 0.08  # of the degrees of freedom, taken off the residuals
+    assert np.mean(values) == pytest.approx(1, abs=0.06)
+
+
 @pytest.mark.parametrize("clip", [None, 5])
 def test_the_last_system_of_the_minimisation_serves_checks_and_errors(clip):
     table = (matches := simulated(1).matches).table.copy()
@@ -251,7 +264,7 @@ def test_motions_go_with_the_times_where_they_are_known():
     assert dated.cure == "fit the motions of the stars: --motion proper"
     table["epoch"] = 2018.0 + years / 3000
     assert (
-        "in one night it is the measured places that drift"
+        "within one night measured places drift, not stars"
         in next(c for c in solved(changed(matches, table)).checks if c.name == "time").cure
     )
     late = np.argsort(

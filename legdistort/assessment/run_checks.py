@@ -73,7 +73,7 @@ def stack_check(quality):
     words = f"stars of the stack are {ratio:.3f} times as wide as those of single exposures"
     if ratio > BLURRED:
         return Check("sharpness", "warn", ratio, BLURRED, words,
-                     "a higher --degree, or leave out exposures with large residuals")  # fmt: skip
+                     "leave out exposures with wide stars or large residuals, or raise --degree")  # fmt: skip
     return Check("sharpness", "pass", ratio, BLURRED, words)
 
 

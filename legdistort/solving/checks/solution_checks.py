@@ -210,8 +210,8 @@ def time_check(residuals, times):
     how = "with time" if unit == "days" else "in the order of the exposures"
     cure = "fit the motions of the stars: --motion proper"
     if unit != "days" or np.ptp(times) < 1:
-        within = "in one night it is the measured places that drift, and --errors correlated counts that"
-        cure = within if unit == "days" else f"{within}; where years lie between, {cure}"
+        within = "within one night measured places drift, not stars: --errors correlated counts that"
+        cure = within if unit == "days" else f"if years lie between exposures, {cure}; {within}"
     score = residuals.of_motion(times)
     error = _star_error(residuals)
     state, little = _pattern_state(score, residuals)
@@ -301,7 +301,8 @@ def extrapolation_check(residuals):
     words = f"up to {share:.0%} of a frame lies outside its stars, where distortions are extrapolated ({name})"
     if share > limit:
         return Check("extrapolation", "warn", share, limit, words,
-                     "fainter stars there (--threshold), or trust the correction only within the stars")  # fmt: skip
+                     "measure fainter stars (a lower --threshold), or trust the correction only within the stars"
+                     )  # fmt: skip
     return Check("extrapolation", "pass", share, limit, words)
 
 
@@ -326,9 +327,10 @@ def rejection_check(solution):
     n, out = len(used), int(np.count_nonzero(~used))
     share, p = out / n, stats.binom.sf(out - 1, n, GROSS_ERRORS) if out else 1.0
     lost = solution.left_out
-    words = f"{out} of {n} observations ({share:.1%}) were left out"
+    words = f"{out} of {n} observations ({share:.1%}) were left out" if out else f"all {n} observations were used"
     if lost:
-        words += f", and {len(lost)} exposures: " + "; ".join(f"{k} ({v})" for k, v in list(lost.items())[:3])
+        number = f"{len(lost)} exposures were" if len(lost) > 1 else "one exposure was"
+        words += f"; {number} left out: " + "; ".join(f"{k} ({v})" for k, v in list(lost.items())[:3])
     if p < FALSE_ALARM:
         return Check("rejection", "fail" if share > 0.3 else "warn", share, GROSS_ERRORS, words,
                      "mismatches or blends: look at the exposures with most of them, or match with a smaller radius"
@@ -354,7 +356,8 @@ def completeness_check(solution, residuals):
     usual = np.median(share)
     p = stats.binom.cdf(np.minimum(found, expected), expected, usual) * len(names)
     i = int(np.argmin(np.where(share < usual / 2, p, 1)))
-    words = f"exposures have {share.min():.0%} to {share.max():.0%} of the stars that lie on them"
+    low, high = (f"{each:.0%}" for each in (share.min(), share.max()))
+    words = f"exposures have {low if low == high else f'{low} to {high}'} of the stars that lie on them"
     if share[i] < usual / 2 and p[i] < FALSE_ALARM:
         words = f"{names[i]} has {found[i]:.0f} of the {expected[i]:.0f} stars that lie on it, others {usual:.0%}"
         return Check("completeness", "warn", share[i], usual / 2, words, "look at the frame (trailed, clouds, focus)")
