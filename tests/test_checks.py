@@ -18,6 +18,7 @@ from legdistort.cli import main
 from legdistort.reporting.page import render
 from legdistort.results.check import Check, in_lines, worst
 from legdistort.solving.checks.residual_tests import Residuals
+from legdistort.solving.equations.reduced_system import Direct
 
 SIGMA = 0.14
 
@@ -84,7 +85,7 @@ def test_score_of_motions_has_the_mean_that_dense_algebra_gives(n_stars):
     n, stars = len(columns) // 2, columns[:, : 2 * found.problem.n_stars]
     moved = stars * np.tile(times[found.exposure], 2)[:, None]
     p = fitted(moved - (q := fitted(stars)) @ (q.T @ moved))
-    assert score.t == pytest.approx(np.sum((p.T @ found.residual.ravel() / SIGMA) ** 2), rel=1e-6)
+    assert score.t == pytest.approx(np.sum((p.T @ found.whitened.ravel()) ** 2), rel=1e-6)
     known = np.concatenate([columns, found.released.reshape(2 * n, -1)], axis=1)
     free = p - (q := fitted(known)) @ (q.T @ p)
     assert score.nu == pytest.approx(np.sum(free**2), rel=1e-3 if n_stars == 30 else 0.02)
@@ -111,7 +112,7 @@ def test_score_of_cells_is_the_chi2_that_a_dense_fit_gains():
     for axis in (0, 1):
         moved[axis, np.arange(n), axis, cells] = 1
     known = np.concatenate([design(found), found.released.reshape(2 * n, -1)], axis=1)
-    e = found.residual.ravel() / SIGMA
+    e = found.whitened.ravel()
 
     def left(columns):
         return np.sum((e - (q := fitted(columns)) @ (q.T @ e)) ** 2)
@@ -126,8 +127,8 @@ def test_statistics_have_the_mean_they_state():
     for get in (
         lambda r: r.next_degree[0],
         lambda r: r.of_motion(np.arange(4)),
-        lambda r: r.of_rows(r.exposure == 1),
-        lambda r: r.of_rows(r.problem.xy[0] > 1500),
+        lambda r: r.of_groups(r.exposure)[1],
+        lambda r: r.of_groups((r.problem.xy[0] > 1500).astype(int))[1],
     ):
         scores = [get(r) for r in found]
         pull = np.array([(s.t - s.nu) / np.sqrt(2 * s.nu) for s in scores])
@@ -139,6 +140,32 @@ def test_freedom_of_observations_sums_to_that_of_chi2():
     solution = solved(simulated(dither=300.0).matches)
     found = residuals(solution)
     assert found.freedom.sum() == pytest.approx(solution.dof - found.released.shape[2])
+
+
+def test_chi2_of_few_observations_is_about_one_where_the_gauge_has_a_second_order():
+    found, values = [], []
+    for seed in range(20):
+        matches = ld.simulate_matches(
+            n_exposures=4, n_stars=30, sigma=0.02, degree=3, static=4.0, dynamic=1.0, seed=seed
+        ).matches
+        solution = ld.solve(matches, degree=3, clip=None)
+        found.append(residuals(solution).released.shape[2] / solution.dof)
+        values.append(next(check.value for check in solution.checks if check.name == "chi2"))
+    assert np.mean(found) > 0.08  # of the degrees of freedom, taken off the residuals
+    assert np.mean(values) == pytest.approx(1, abs=0.06)
+
+
+@pytest.mark.parametrize("clip", [None, 5])
+def test_the_last_system_of_the_minimisation_serves_checks_and_errors(clip):
+    table = (matches := simulated(1).matches).table.copy()
+    table["x"][[3, 77]] += (0 if clip is None else 40) * SIGMA * u.pix
+    solution = solved(changed(matches, table), clip=clip)
+    parts = solution.checked.keywords
+    made = parts["uncertainty"].system
+    again = Direct(parts["problem"], parts["blocks"], solution.gauge)
+    assert parts["problem"].weight[0].all() == (clip is None)
+    assert made.covariance() == pytest.approx(again.covariance(), rel=1e-9, abs=1e-15)
+    assert made.information == pytest.approx(again.information, rel=1e-6, abs=1e-6)
 
 
 def test_second_order_of_the_gauge_is_no_fault_of_the_degree():
@@ -237,7 +264,7 @@ def test_motions_go_with_the_times_where_they_are_known():
     assert dated.cure == "fit the motions of the stars: --motion proper"
     table["epoch"] = 2018.0 + years / 3000
     assert (
-        "in one night it is the measured places that drift"
+        "within one night measured places drift, not stars"
         in next(c for c in solved(changed(matches, table)).checks if c.name == "time").cure
     )
     late = np.argsort(

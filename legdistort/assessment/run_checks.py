@@ -72,7 +72,7 @@ def stack_check(quality, *, moving=False):
         return Check("sharpness", "unknown", None, BLURRED, "no star could be measured in stack and frames alike", "")
     words = f"stars of the stack are {ratio:.3f} times as wide as those of single exposures"
     if ratio > BLURRED:
-        cure = "a higher --degree, or leave out exposures with large residuals"
+        cure = "leave out exposures with wide stars or large residuals, or raise --degree"
         if moving:
             cure = "stars move from epoch to epoch: stack the exposures of one epoch by themselves"
         return Check("sharpness", "warn", ratio, BLURRED, words, cure)

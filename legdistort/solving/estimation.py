@@ -369,7 +369,7 @@ def _settings(asked, options, form):
 def _solution(fit, scale, settings, diagnostics, form=None):
     uncertainty = fit.uncertainty
     if scale != 1:
-        uncertainty = Uncertainty(fit.weighted, fit.blocks, fit.result.gauge, scale=scale)
+        uncertainty = Uncertainty(fit.weighted, fit.blocks, fit.result.gauge, scale=scale, system=fit.system)
     return assemble(
         fit.matches,
         fit.weighted,

@@ -52,6 +52,8 @@ class Result:
         Factors on the weights from the loss (ones for a linear one).
     n_weak : int
         Unknowns of a distortion common to all exposures that these do not tell.
+    system : Direct or Iterative or None
+        The reduced system there, if it was made with that gauge.
     """
 
     state: State
@@ -62,6 +64,7 @@ class Result:
     n_iterations: int
     robust: np.ndarray
     n_weak: int = 0
+    system: reduced_system.Direct | reduced_system.Iterative | None = None
 
 
 def loss_factors(squares, loss):
@@ -128,7 +131,15 @@ def solve_joint(
         )
         warn(status, ConvergenceWarning)
     return Result(
-        run.state, run.blocks, convention, run.converged, status, len(run.steps), run.factors, run.system.n_weak
+        run.state,
+        run.blocks,
+        convention,
+        run.converged,
+        status,
+        len(run.steps),
+        run.factors,
+        run.system.n_weak,
+        run.system if held else None,
     )
 
 

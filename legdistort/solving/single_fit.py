@@ -82,7 +82,16 @@ class Fit:
     @cached_property
     def uncertainty(self):
         """Covariances at the stated errors."""
-        return Uncertainty(self.weighted, self.blocks, self.result.gauge, shared_errors=self.shared_errors)
+        return Uncertainty(
+            self.weighted, self.blocks, self.result.gauge, shared_errors=self.shared_errors, system=self.system
+        )
+
+    @property
+    def system(self):
+        """The reduced system that the minimisation ended with, if it is that of the weights and the gauge in force."""
+        system, gauge = self.result.system, self.result.gauge
+        fits = system is not None and system.problem is self.weighted and system.blocks is self.blocks
+        return system if fits and np.array_equal(system.gauge.orthonormal, gauge.orthonormal) else None
 
     @property
     def chi2(self):

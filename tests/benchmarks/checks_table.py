@@ -1,13 +1,14 @@
 """How often checks warn of sets in which nothing is wrong, and how surely they see what is.
 
 ``python tests/benchmarks/checks_table.py alarms --sets 2000``, ``... power --sets 200``, and ``... images --sets 100``
-for runs on simulated frames. Distortions of the first two are Chebyshev polynomials (`calibration_table.simulated`),
-none of them made by the package.
+for runs on simulated frames; ``... cost`` for what the checks cost. Distortions of all but the frames are Chebyshev
+polynomials (`calibration_table.simulated`), none of them made by the package.
 """
 
 import argparse
 import logging
 import tempfile
+import time
 import warnings
 from collections import Counter
 from pathlib import Path
@@ -185,10 +186,36 @@ def images(n_sets):
             print("".join(f"  seed {seed}, {frames} frames: {check}\n" for check in bad), end="", flush=True)
 
 
+#: Exposures, stars on a frame, part of the observations that are gross errors.
+SIZES = ((11, 120, 0.0), (65, 700, 0.0), (40, 1000, 0.0), (100, 300, 0.0), (65, 700, 0.01))
+
+
+def cost(n_rounds):
+    """Print CPU times of the default solve and of the first use of its checks, the least of some rounds in turn."""
+    sets = []
+    for n_exposures, n_stars, share in SIZES:
+        matches = simulated(0, n_exposures=n_exposures, n_stars=n_stars, dither=50.0, sigma=SIGMA)[0]
+        table, rng = matches.table.copy(), np.random.default_rng(0)
+        wrong = np.flatnonzero(rng.random(len(table)) < share)
+        _moved(table, wrong, rng.uniform(-20, 20, (len(wrong), 2)))
+        sets.append(ld.Matches.from_table(table, shape=matches.shapes[matches.names[0]], poses=matches.poses))
+    times = np.empty((n_rounds, len(sets), 2))
+    for each in times:
+        for matches, out in zip(sets, each, strict=True):
+            start = time.process_time()
+            solution = solved(matches)
+            middle = time.process_time()
+            solution.checks  # noqa: B018 - made at first use
+            out[:] = middle - start, time.process_time() - middle
+    for (n_exposures, n_stars, share), (solve, checks) in zip(SIZES, times.min(axis=0), strict=True):
+        print(f"{n_exposures:4d} exposures x {n_stars:4d} stars, {share:.0%} gross errors: solve {solve:.2f} s, "
+              f"checks {checks:.3f} s, {checks / solve:.0%}")  # fmt: skip
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("alarms", "power", "images"))
-    parser.add_argument("--sets", type=int, default=100)
+    parser.add_argument("what", choices=("alarms", "power", "images", "cost"))
+    parser.add_argument("--sets", type=int, default=100, help="how many; rounds of `cost`")
     arguments = parser.parse_args()
     logging.disable(logging.WARNING)
-    {"alarms": alarms, "power": power, "images": images}[arguments.what](arguments.sets)
+    {"alarms": alarms, "power": power, "images": images, "cost": cost}[arguments.what](arguments.sets)

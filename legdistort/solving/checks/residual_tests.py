@@ -11,9 +11,10 @@ from functools import cached_property
 
 import numpy as np
 from scipy import special
+from scipy.sparse import csr_array
 
 from ...geometry import basis
-from ..equations import criterion, elimination
+from ..equations import elimination
 from ..equations.leverage import leverages
 
 _DETERMINED = 1e-4  # information [1/px^2]: what is held wrong by some pixels shows where 100 px would be beyond doubt
@@ -62,42 +63,39 @@ class Residuals:
         self.problem, self.state, self.blocks, self.system, self.dof = problem, state, blocks, system, dof
         self.exposure = problem.exposure
         self.used = problem.weight[0] > 0
-        patterns = self._patterns()
-        self.residual = blocks.residual
-        self.released = np.zeros((2, len(self.used), 0))
-        if patterns.shape[2]:
-            whitened = self._whiten(patterns)
-            flat = whitened.reshape(-1, patterns.shape[2])
-            orthonormal, triangle = np.linalg.qr(flat)
-            self.released = orthonormal.reshape(whitened.shape)
-            size = orthonormal.T @ self._whiten(self.residual).ravel()
-            self.residual = self.residual - patterns @ np.linalg.solve(triangle, size)
-            self.dof = dof - patterns.shape[2]
-        self.squares = criterion.squares(problem, self.residual)
+        self.released = self._released()
+        flat, e = self.released.reshape(2 * len(self.used), -1), self._whiten(blocks.residual)
+        self.whitened = e - (flat @ (flat.T @ e.ravel())).reshape(e.shape)
+        self.dof = dof - flat.shape[1]
+        self.squares = np.sum(self.whitened**2, axis=0)
         self.chi2 = float(self.squares.sum())
 
-    def _patterns(self):
-        """Residuals (2, n, k) by unit changes of the values at which the gauge holds the common map, all else refitted.
+    def _released(self):
+        """What the values at which the gauge holds the common map may do to the whitened residuals, all else refitted.
 
         Holding it at values that are not the true ones leaves residuals of second order, which precise data show. They
-        are no fault of the form of the distortion, so that they are taken off.
+        are no fault of the form of the distortion, so that they are taken off. Orthonormal, shape (2, n, k).
         """
-        problem, blocks, system = self.problem, self.blocks, self.system
+        problem, system, n_modes = self.problem, self.system, self.problem.n_modes
+        coupling = problem.pulled(self.blocks.coupling)
         values, vectors = np.linalg.eigh(system.information)
         along = vectors[:, values > _DETERMINED]
-        out = np.zeros((2, len(self.used), along.shape[1]))
-        w, f = problem.weight, blocks.coupling
-        for k, d in enumerate(along.T @ system.moves[: len(values)]):
-            moved = np.einsum("akn,an->kn", f, problem.placed(system.follow(d)))  # W J dX
-            with np.errstate(divide="ignore", invalid="ignore"):
-                moved = np.stack([w[1] * moved[0] - w[2] * moved[1], w[0] * moved[1] - w[2] * moved[0]])
-                moved = moved / (w[0] * w[1] - w[2] ** 2)
-            own = problem.unknowns.spread(d)
-            for i in range(problem.n_exposures):
-                part = problem.part(i)
-                moved[:, part] += own[i].reshape(2, -1) @ blocks.values[:, part]
-            out[:, :, k] = np.where(self.used, moved, 0.0)
-        return out
+        steps = [problem.unknowns.spread(d) for d in along.T @ system.moves[: len(values)]]
+        own = np.reshape(steps, (-1, problem.n_exposures, 2, n_modes)).transpose(1, 2, 3, 0)
+        fields = np.empty((2, len(self.used), own.shape[-1]))
+        for i in range(problem.n_exposures):
+            part = problem.part(i)
+            fields[:, part] = self.blocks.values[:, part].T @ own[i]
+        stars = -elimination.symmetric_times(self._inverse, self._at_stars(coupling, fields))
+        out = self._whiten(fields)
+        for column, star in zip(self._columns, stars, strict=True):
+            out += column[:, :, None] * star[problem.star]
+        flat = out.reshape(2 * len(self.used), -1)
+        size = np.sqrt(np.sum(flat**2, axis=0))
+        flat /= np.where(size > 0, size, 1)
+        values, vectors = np.linalg.eigh(flat.T @ flat)  # nearly unity: they are those of one information
+        kept = values > 1e-12
+        return (flat @ (vectors[:, kept] / np.sqrt(values[kept]))).reshape(2, len(self.used), -1)
 
     @cached_property
     def _roots(self):
@@ -115,8 +113,8 @@ class Residuals:
         return np.stack([l00 * x + l01 * y, l11 * y])
 
     def _gradient(self, whitened):
-        """L'p for what is p in units of errors, (2, n): how it pulls at the model positions."""
-        l00, l01, l11 = self._roots
+        """L'p for what is p in units of errors, (2, n, ...): how it pulls at the model positions."""
+        l00, l01, l11 = (each.reshape(-1, *[1] * (whitened.ndim - 2)) for each in self._roots)
         x, y = whitened
         return np.stack([l00 * x, l01 * x + l11 * y])
 
@@ -128,9 +126,41 @@ class Residuals:
             return np.where(self.used, np.stack([x, (pulled[1] - l01 * x) / l11]), 0.0)
 
     @cached_property
-    def whitened(self):
-        """Residuals (2, n) with unit covariance, were nothing fitted."""
-        return self._whiten(self.residual)
+    def _columns(self):
+        """What a unit of every unknown of a star does to its whitened observations, (2 + k, 2, n)."""
+        return np.stack([self._whitened_gradient(f) for f in self.problem.pulled(self.blocks.coupling)])
+
+    @cached_property
+    def _inverse(self):
+        """Inverse star blocks, packed (m, n_stars, 1)."""
+        return elimination.inverse_star_blocks(self.blocks.v)[:, :, None]
+
+    @cached_property
+    def _rows_of_stars(self):
+        """Observations by star: their indices, and where those of every star begin."""
+        star = self.problem.star
+        first = np.cumsum(np.bincount(star, minlength=self.problem.n_stars))
+        return np.argsort(star, kind="stable"), np.concatenate([[0], first])
+
+    def _at_stars(self, factors, values):
+        """Sums over the observations of stars of factors (a, 2, n) times values (2, n, m): shape (a, n_stars, m)."""
+        rows, first = self._rows_of_stars
+        shape = len(first) - 1, len(rows)
+        return np.stack(
+            [sum(csr_array((f[rows], rows, first), shape) @ v for f, v in zip(each, values, strict=True))
+             for each in factors]
+        )  # fmt: skip
+
+    def _at_exposures(self, factors, stars):
+        """Sums over exposures of factors (a, 2, n) times stars (a, n_stars, m), modes: (n_exposures, 2 n_modes, m)."""
+        problem, m = self.problem, stars.shape[2]
+        out = np.empty((problem.n_exposures, 2 * problem.n_modes, m))
+        for i in range(problem.n_exposures):
+            part = problem.part(i)
+            columns = factors[:, :, None, part] * self.blocks.values[:, part]
+            seen = stars[:, problem.star[part]].reshape(-1, m)
+            out[i] = columns.transpose(1, 2, 0, 3).reshape(len(out[i]), -1) @ seen
+        return out
 
     @cached_property
     def _leverages(self):
@@ -162,39 +192,46 @@ class Residuals:
         weight = np.sum(self.problem.weight[:2]) if weight is None else weight
         return Score(t, nu, min(1.0, tests * p), float(np.sqrt(max(t - nu * scale, 0) / max(weight, 1e-300))))
 
-    def of_rows(self, rows, *, tests=1):
-        """`Score` of all the residuals of some observations."""
-        weight = np.sum(self.problem.weight[:2, rows])
-        return self.score(self.squares[rows].sum(), self.freedom[rows].sum(), tests=tests, weight=weight)
-
     def of_groups(self, labels):
         """The `Score` by group of observations, for labels (n,) from 0; negative ones belong to none."""
-        n = labels.max(initial=-1) + 1
-        return [self.of_rows(labels == k, tests=n) for k in range(n)]
+        rows = labels >= 0
+        sums = [self.squares, self.freedom, self.problem.weight[:2].sum(axis=0)]
+        sums = np.transpose([np.bincount(labels[rows], each[rows]) for each in sums])
+        return [self.score(t, nu, tests=len(sums), weight=weight) for t, nu, weight in sums]
 
     @cached_property
     def next_degree(self):
         """`Score` of the modes of one degree more in every exposure, and that degree."""
-        problem, blocks, e = self.problem, self.blocks, self.whitened
-        degree = problem.degree + 1
-        t = nu = 0.0
-        for i in range(problem.n_exposures):
+        problem, weight, n = self.problem, self.problem.weight, self.problem.n_modes
+        degree, n_used = problem.degree + 1, np.bincount(self.exposure[self.used], minlength=problem.n_exposures)
+        enough = np.flatnonzero(n_used > n + 1)
+        seen, free = np.concatenate([self.whitened[:, :, None], self.released], axis=2), 1 - self.star_share
+        products, apart, g = [], [], []
+        for i in enough:
             part = problem.part(i)
-            part = np.arange(part.start, part.stop)[self.used[part]]
-            if len(part) <= problem.n_modes + 1:
-                continue
             values = self._values(i, part, degree)
-            for k in (0, 1):
-                root = np.sqrt(problem.weight[k, part])
-                own, more = root * blocks.values[:, part], root * values[problem.n_modes :]
-                more = more - more @ own.T @ np.linalg.pinv(own @ own.T, hermitian=True) @ own
-                size, vectors = np.linalg.eigh(more @ more.T)
-                kept = size > _RANK**2 * max(size[-1], 1e-300)
-                kept[: max(len(size) - len(part) + problem.n_modes, 0)] = False
-                u = (vectors[:, kept] / np.sqrt(size[kept])).T @ more
-                t += np.sum((u @ e[k, part]) ** 2)
-                nu += np.sum(u**2 * (1 - self.star_share[part])) - np.sum((u @ self.released[k, part]) ** 2)
-        return self.score(t, nu), degree
+            rows = [np.sqrt(weight[0, part]) * values]
+            rows.append(np.sqrt(weight[1, part]) * values if problem.unequal else rows[0])
+            for k, p in enumerate(rows):
+                equal = k and p is rows[0]
+                products.append(products[-1] if equal else p @ p.T)
+                apart.append(apart[-1] if equal else (p * free[part]) @ p.T)
+                g.append(p @ seen[k, part])
+        if not products:
+            return self.score(0.0, 0.0), degree
+        products, apart, g = np.stack(products), np.stack(apart), np.stack(g)
+        # modes of the next degree with what the others can do taken off, then orthonormal combinations of them
+        own = -products[:, n:, :n] @ np.linalg.pinv(products[:, :n, :n], hermitian=True)
+        rows = np.concatenate([own, np.broadcast_to(np.eye(degree + 1), (len(own), degree + 1, degree + 1))], axis=2)
+        size, vectors = np.linalg.eigh(rows @ products @ rows.transpose(0, 2, 1))
+        kept = size > _RANK**2 * np.maximum(size[:, -1:], 1e-300)
+        kept &= np.arange(degree + 1) >= degree + 1 + n - np.repeat(n_used[enough], 2)[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            unit = np.where(kept, 1 / np.sqrt(size), 0.0)
+        rows = (vectors * unit[:, None, :]).transpose(0, 2, 1) @ rows
+        size = rows @ g
+        nu = np.sum((rows @ apart) * rows) - np.sum(size[:, :, 1:] ** 2)
+        return self.score(float(np.sum(size[:, :, 0] ** 2)), float(nu)), degree
 
     def _values(self, i, part, degree):
         problem, pose = self.problem, self.state.poses[i]
@@ -205,14 +242,10 @@ class Residuals:
     def of_motion(self, times):
         """`Score` of a motion of every star in the reference plane, linear in the times (n_exposures,)."""
         patterns, moving = self._motions(np.asarray(times, dtype=float)[self.exposure])
-        star, n_stars = self.problem.star, self.problem.n_stars
-
-        def squares(whitened):
-            pulls = np.stack([np.bincount(star, np.sum(p * whitened, axis=0), n_stars) for p in patterns])
-            return float(np.sum(pulls**2))
-
-        nu = 2.0 * np.count_nonzero(moving) - sum(squares(p) for p in np.moveaxis(self.released, 2, 0))
-        return self.score(squares(self.whitened), max(nu - self._taken_by_exposures(patterns, moving), 0.0))
+        seen = np.concatenate([self.whitened[:, :, None], self.released], axis=2)
+        t, *taken = np.sum(self._at_stars(patterns, seen) ** 2, axis=(0, 1))
+        nu = 2.0 * np.count_nonzero(moving) - sum(taken) - self._taken_by_exposures(patterns, moving)
+        return self.score(float(t), max(float(nu), 0.0))
 
     def _motions(self, t):
         """Orthonormal patterns of motion of the stars, and which stars (n_stars,) move enough to have any.
@@ -220,22 +253,18 @@ class Residuals:
         Two for every star, what its position takes up removed: shape (2, 2, n), the first axis counts them, the second
         is that of the whitened residuals.
         """
-        problem, star, t = self.problem, self.problem.star, t - t.mean()
-        columns = np.stack([self._whitened_gradient(f) for f in self.blocks.coupling])
-
-        def products(factor):
-            return np.stack(
-                [[np.bincount(star, factor * np.sum(a * b, axis=0), problem.n_stars) for b in columns] for a in columns]
-            ).transpose(2, 0, 1)
-
-        still, cross, square = products(np.ones(len(t))), products(t), products(t**2)
+        t, star, columns = t - t.mean(), self.problem.star, self._columns[:2]
+        products = self._at_stars(columns, (columns[..., None] * np.stack([np.ones(len(t)), t, t**2], axis=1)
+                                            ).transpose(1, 2, 0, 3).reshape(2, len(t), 6))  # fmt: skip
+        still, cross, square = products.reshape(2, -1, 2, 3).transpose(3, 1, 0, 2)
         shift = np.linalg.pinv(still, hermitian=True) @ cross
         left = square - cross @ shift
         moving = np.linalg.eigvalsh(left)[:, 0] > 1e-9 * max(left.max(initial=0), 1e-300)
         left[~moving] = np.eye(2)
         turn = np.linalg.inv(np.linalg.cholesky(left)) * moving[:, None, None]
-        off = columns * t - np.einsum("nab,acn->bcn", shift[star], columns)
-        return np.einsum("nab,bcn->acn", turn[star], off), moving
+        a, b = turn[star].transpose(1, 2, 0), (turn @ shift.transpose(0, 2, 1))[star].transpose(1, 2, 0)
+        factors = a * t - b
+        return factors[:, 0, None] * columns[0] + factors[:, 1, None] * columns[1], moving
 
     def _taken_by_exposures(self, patterns, moving):
         """Degrees of freedom that the distortions take up of patterns as those of `_motions`.
@@ -249,34 +278,26 @@ class Residuals:
         probes = np.sqrt(n) * np.eye(n) if few else np.random.default_rng(0).choice([-1.0, 1.0], (n, _PROBES))
         each = np.zeros((2, self.problem.n_stars, probes.shape[1]))
         each[:, moving] = probes.reshape(2, -1, probes.shape[1])
-        pulled = np.stack([self._gradient(p) for p in patterns])
-        rest = np.empty((self.problem.n_exposures, 2 * self.problem.n_modes, probes.shape[1]))
-        for i in range(self.problem.n_exposures):
-            part = self.problem.part(i)
-            on_rows = np.einsum("akn,anm->knm", pulled[:, :, part], each[:, self.problem.star[part]], optimize=True)
-            rest[i] = (self.blocks.values[:, part] @ on_rows).reshape(-1, probes.shape[1])
-        return float(np.sum(rest * self.system.respond(rest))) / probes.shape[1]
+        rest = self._at_exposures(np.stack([self._gradient(p) for p in patterns]), each)
+        return float(np.vdot(rest, self.system.respond(rest))) / probes.shape[1]
 
     def of_cells(self, cells):
         """`Score` of a displacement common to all observations of a cell, for cells (n,) from 0."""
-        w, n = self.problem.weight, cells.max() + 1
-        g = self._by_cell(cells, self.whitened, n)
-        xx, yy, xy = (np.diag(np.bincount(cells, x, n)) for x in w)
+        n = cells.max() + 1
+        seen = np.concatenate([self.whitened[:, :, None], self.released], axis=2)
+        inside = csr_array((np.ones(len(cells)), (cells, np.arange(len(cells)))), shape=(n, len(cells)))
+        pull = np.concatenate([inside @ each for each in self._gradient(seen)])
+        g, taken = pull[:, 0], pull[:, 1:]
+        xx, yy, xy = (np.diag(inside @ x) for x in self.problem.weight)
         plain = np.block([[xx, xy], [xy, yy]])
         stars, moved, rest = self._followed(cells, n)
-        covariance = plain - np.einsum("ajc,ajd->cd", stars, moved)
-        covariance -= np.einsum("iac,iad->cd", rest, self.system.respond(rest))
-        taken = np.reshape([self._by_cell(cells, p, n) for p in np.moveaxis(self.released, 2, 0)], (-1, 2 * n)).T
-        covariance -= taken @ taken.T
+        covariance = plain - np.tensordot(stars, moved, ([0, 1], [0, 1])) - taken @ taken.T
+        covariance -= np.tensordot(rest, self.system.respond(rest), ([0, 1], [0, 1]))
         unit = 1 / np.sqrt(np.maximum(np.diag(plain), 1e-300))
         values, vectors = np.linalg.eigh((covariance + covariance.T) / 2 * unit[:, None] * unit)
         kept = values > _RANK
         t = np.sum((vectors[:, kept].T @ (unit * g)) ** 2 / values[kept])
         return self.score(t, float(np.count_nonzero(kept)))
-
-    def _by_cell(self, cells, whitened, n):
-        """What pulls at the displacements (2 n,) of cells, x first, in whitened residuals (2, n)."""
-        return np.concatenate([np.bincount(cells, p, n) for p in self._gradient(whitened)])
 
     def _followed(self, cells, n):
         """Gradients of the unknowns by displacements (2 n) of cells, the stars eliminated.
@@ -288,23 +309,19 @@ class Residuals:
         rest : ndarray, shape (n_exposures, 2 n_modes, 2 n)
             What is left for the coefficients.
         """
-        problem, blocks, w = self.problem, self.blocks, self.problem.weight
+        problem, pulled = self.problem, self.problem.pulled(self.blocks.coupling)
         index = problem.star * n + cells
-        pulled = problem.pulled(blocks.coupling)
         stars = np.stack([[np.bincount(index, f, problem.n_stars * n) for f in row] for row in pulled])
         stars = stars.reshape(-1, 2, problem.n_stars, n).transpose(0, 2, 1, 3).reshape(-1, problem.n_stars, 2 * n)
-        inverse = elimination.inverse_star_blocks(blocks.v)[:, :, None]
-        moved = elimination.symmetric_times(inverse, stars)
-        rest = np.empty((problem.n_exposures, 2 * problem.n_modes, 2 * n))
+        moved = elimination.symmetric_times(self._inverse, stars)
+        rest = -self._at_exposures(pulled, moved)
+        own = rest.reshape(problem.n_exposures, 2, problem.n_modes, 2, n)
         for i in range(problem.n_exposures):
             part = problem.part(i)
-            f, b = blocks.coupling[:, :, part, None], blocks.values[:, part]
-            y = problem.terms.place(i, moved[:, problem.star[part]])
-            cell = np.zeros((b.shape[1], n))
-            cell[np.arange(b.shape[1]), cells[part]] = 1
-            for k, row in enumerate(((w[0], w[2]), (w[2], w[1]))):
-                own = np.concatenate([each[part, None] * cell for each in row], axis=1)
-                rest[i, k * len(b) : (k + 1) * len(b)] = b @ (own - f[0, k] * y[0] - f[1, k] * y[1])
+            cell = np.zeros((part.stop - part.start, n))
+            cell[np.arange(len(cell)), cells[part]] = 1
+            xx, yy, xy = ((self.blocks.values[:, part] * w) @ cell for w in problem.weight[:, part])
+            own[i] += np.stack([[xx, xy], [xy, yy]]).transpose(0, 2, 1, 3)
         return stars, moved, rest
 
     def correlations(self):

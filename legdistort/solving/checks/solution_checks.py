@@ -103,22 +103,24 @@ def _pattern_state(score, residuals):
 
 
 def _stated(solution, residuals):
-    """Chi2 at the stated errors, without floor or scale."""
+    """Chi2 at the stated errors, without floor or scale, and its degrees of freedom."""
+    if not solution.diagnostics.error_floor:
+        return residuals.chi2, residuals.dof
     table = solution.observations
     rows = np.asarray(table["used"])
     x, y, a, b = (table[name][rows].value for name in ("dx", "dy", "x_err", "y_err"))
     c = np.asarray(table["xy_corr"])[rows] if "xy_corr" in table.colnames else np.zeros(len(x))
     square = ((x / a) ** 2 + (y / b) ** 2 - 2 * c * x * y / (a * b)) / (1 - c**2)
-    return float(square.sum()) if solution.diagnostics.error_floor else residuals.chi2
+    return float(square.sum()), solution.dof
 
 
 def errors_check(solution, residuals):
     """Do residuals scatter as the stated errors say?"""
-    dof = solution.dof
+    chi2, dof = _stated(solution, residuals)
     if dof < 1:
         return Check("chi2", "unknown", None, None, "no degrees of freedom are left to judge the errors by",
                      "lower the degree, or add stars or exposures")  # fmt: skip
-    ratio = _stated(solution, residuals) / dof
+    ratio = chi2 / dof
     low, high = (stats.chi2.isf(p, dof) / dof for p in (1 - FALSE_ALARM / 2, FALSE_ALARM / 2))
     low, high = min(low, (1 - NEGLIGIBLE) ** 2), max(high, (1 + NEGLIGIBLE) ** 2)
     floor, scale = solution.diagnostics.error_floor, solution.diagnostics.error_scale
@@ -208,8 +210,8 @@ def time_check(residuals, times):
     how = "with time" if unit == "days" else "in the order of the exposures"
     cure = "fit the motions of the stars: --motion proper"
     if unit != "days" or np.ptp(times) < 1:
-        within = "in one night it is the measured places that drift, and --errors correlated counts that"
-        cure = within if unit == "days" else f"{within}; where years lie between, {cure}"
+        within = "within one night measured places drift, not stars: --errors correlated counts that"
+        cure = within if unit == "days" else f"if years lie between exposures, {cure}; {within}"
     score = residuals.of_motion(times)
     error = _star_error(residuals)
     state, little = _pattern_state(score, residuals)
@@ -299,7 +301,8 @@ def extrapolation_check(residuals):
     words = f"up to {share:.0%} of a frame lies outside its stars, where distortions are extrapolated ({name})"
     if share > limit:
         return Check("extrapolation", "warn", share, limit, words,
-                     "fainter stars there (--threshold), or trust the correction only within the stars")  # fmt: skip
+                     "measure fainter stars (a lower --threshold), or trust the correction only within the stars"
+                     )  # fmt: skip
     return Check("extrapolation", "pass", share, limit, words)
 
 
@@ -324,9 +327,10 @@ def rejection_check(solution):
     n, out = len(used), int(np.count_nonzero(~used))
     share, p = out / n, stats.binom.sf(out - 1, n, GROSS_ERRORS) if out else 1.0
     lost = solution.left_out
-    words = f"{out} of {n} observations ({share:.1%}) were left out"
+    words = f"{out} of {n} observations ({share:.1%}) were left out" if out else f"all {n} observations were used"
     if lost:
-        words += f", and {len(lost)} exposures: " + "; ".join(f"{k} ({v})" for k, v in list(lost.items())[:3])
+        number = f"{len(lost)} exposures were" if len(lost) > 1 else "one exposure was"
+        words += f"; {number} left out: " + "; ".join(f"{k} ({v})" for k, v in list(lost.items())[:3])
     if p < FALSE_ALARM:
         return Check("rejection", "fail" if share > 0.3 else "warn", share, GROSS_ERRORS, words,
                      "mismatches or blends: look at the exposures with most of them, or match with a smaller radius"
@@ -352,7 +356,8 @@ def completeness_check(solution, residuals):
     usual = np.median(share)
     p = stats.binom.cdf(np.minimum(found, expected), expected, usual) * len(names)
     i = int(np.argmin(np.where(share < usual / 2, p, 1)))
-    words = f"exposures have {share.min():.0%} to {share.max():.0%} of the stars that lie on them"
+    low, high = (f"{each:.0%}" for each in (share.min(), share.max()))
+    words = f"exposures have {low if low == high else f'{low} to {high}'} of the stars that lie on them"
     if share[i] < usual / 2 and p[i] < FALSE_ALARM:
         words = f"{names[i]} has {found[i]:.0f} of the {expected[i]:.0f} stars that lie on it, others {usual:.0%}"
         return Check("completeness", "warn", share[i], usual / 2, words, "look at the frame (trailed, clouds, focus)")

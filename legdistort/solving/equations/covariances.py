@@ -32,11 +32,15 @@ class Uncertainty:
         Covariance of the coefficients, if they were found in another way than with the stars, `scale` in it.
     shared_errors : ndarray, shape (3, n_stars), optional
         Covariance xx, yy, xy of star positions by errors that exposures share, beside that of independent ones, px^2.
+    system : `legdistort.solving.equations.reduced_system.Direct` or Iterative, optional
+        The reduced system of these, if it is there already.
     """
 
-    def __init__(self, problem, blocks, gauge, *, scale=1.0, coefficients=None, shared_errors=None):
+    def __init__(self, problem, blocks, gauge, *, scale=1.0, coefficients=None, shared_errors=None, system=None):
         self._problem, self._blocks, self._gauge, self._scale = problem, blocks, gauge, scale
         self._given, self._shared = coefficients, 0.0 if shared_errors is None else shared_errors
+        if system is not None:
+            self.system = system
 
     @cached_property
     def coefficients(self):
@@ -46,7 +50,9 @@ class Uncertainty:
         problem, blocks = self._problem, self._blocks
         n = problem.n_exposures * 2 * problem.n_modes
         if n <= DENSE_LIMIT:
-            return self._scale**2 * reduced_system.Direct(problem, blocks, self._gauge).covariance()
+            direct = isinstance(self.system, reduced_system.Direct)
+            system = self.system if direct else reduced_system.Direct(problem, blocks, self._gauge)
+            return self._scale**2 * system.covariance()
         warn(
             f"{n} coefficients: their covariance is approximated by one block an exposure (stars taken as known)",
             AssumptionWarning,
