@@ -139,7 +139,7 @@ def solve_joint(
         len(run.steps),
         run.factors,
         run.system.n_weak,
-        run.system if held else None,
+        run.system if declared else None,
     )
 
 
