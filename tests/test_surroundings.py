@@ -120,7 +120,12 @@ def test_a_package_that_cannot_be_written(table, tmp_path, read_only, compiled_f
     """Nor is there a home: compiled loops are made without a place to keep them."""
     if compiled_from == 1:
         pytest.importorskip("numba")
-    bare = {"PATH": os.environ["PATH"], "PYTHONPATH": str(read_only), "OPENBLAS_NUM_THREADS": "1", "HOME": "/none"}
+    bare = {
+        "PATH": os.environ["PATH"],
+        "PYTHONPATH": str(read_only),
+        "OPENBLAS_NUM_THREADS": "1",
+        "HOME": "/dev/null/none",
+    }
     arguments = [str(compiled_from), *command(table, tmp_path / "out")[3:]]
     run = subprocess.run(
         [*unprivileged(), sys.executable, "-c", WITHOUT_WRITING, *arguments],
