@@ -61,10 +61,10 @@ class CoaddOptions:
         for name, allowed in (("weights", WEIGHTS), ("scale", SCALES)):
             object.__setattr__(self, name, _choice_or_numbers(name, getattr(self, name), allowed))
         if self.planes is not None:
-            planes = [self.planes] if isinstance(self.planes, str) else list(self.planes)
+            planes = tuple(self.planes) if isinstance(self.planes, (list, tuple, set)) else (self.planes,)
             for plane in planes:
-                check_choice(plane, PLANES, "planes")
-            object.__setattr__(self, "planes", tuple(planes))
+                check_choice(plane, tuple(PLANES), "planes")
+            object.__setattr__(self, "planes", planes)
         if self.grid is not None:
             checked_wcs(self.grid)
         if self.algorithm == "drizzle":

@@ -6,7 +6,8 @@ with them at order 3, 1.6 times at order 1 (0.31 and 0.23 s a frame of 2048 x 20
 """
 
 import numpy as np
-from numba import njit
+
+from ...runtime.optional import compiled_loop
 
 _POLE = np.sqrt(3) - 2  # of the cubic B-spline: what a sample is to the coefficients shrinks by this at every pixel
 _REACH = 28  # pixels after which it is below 1e-16
@@ -29,7 +30,7 @@ def interpolate(image, xy, order, out):
     _evaluate(_coefficients(image) if cubic else image, xy, out, cubic)
 
 
-@njit(cache=True, nogil=True)
+@compiled_loop(nogil=True)
 def product(series, xy):
     """Product over the axes of a polynomial in ``f (1 - f)``, f being the fraction of a coordinate; float32."""
     out = np.empty(xy.shape[1:], np.float32)
@@ -44,13 +45,13 @@ def product(series, xy):
     return out
 
 
-@njit(cache=True, nogil=True)
+@compiled_loop(nogil=True)
 def _mirror(i, n):
     """The pixel of n that stands for pixel i, from 1 - n to 2 n - 2, beyond the ends."""
     return n - 1 - abs(n - 1 - abs(i))
 
 
-@njit(cache=True, nogil=True)
+@compiled_loop(nogil=True)
 def _coefficients(image):
     """Of the cubic B-splines through the pixels (Unser 1999, IEEE Signal Processing Magazine 16, 22, Box 2)."""
     ny, nx = image.shape
@@ -81,7 +82,7 @@ def _coefficients(image):
     return c
 
 
-@njit(cache=True, nogil=True)
+@compiled_loop(nogil=True)
 def _place(x, n):
     """Pixel before a coordinate and the fraction behind it; -1 outside."""
     if not -0.5 <= x < n - 0.5:  # NaN neither
@@ -91,7 +92,7 @@ def _place(x, n):
     return i, x - i
 
 
-@njit(cache=True, nogil=True)
+@compiled_loop(nogil=True)
 def _evaluate(image, xy, out, cubic):
     """Values at coordinates, of the pixels or of the coefficients of cubic B-splines."""
     ny, nx = image.shape
@@ -106,20 +107,20 @@ def _evaluate(image, xy, out, cubic):
                 out[r, k] = _linear(image, i, j, u, v)
 
 
-@njit(cache=True, nogil=True)
+@compiled_loop(nogil=True)
 def _linear(image, i, j, u, v):
     low = (1 - u) * image[i, j] + u * image[i, j + 1]
     return (1 - v) * low + v * ((1 - u) * image[i + 1, j] + u * image[i + 1, j + 1])
 
 
-@njit(cache=True, nogil=True)
+@compiled_loop(nogil=True)
 def _weights(f):
     """Of the four B-splines about the fraction f."""
     g = 1 - f
     return g * g * g / 6, (4 - 3 * f * f * (1 + g)) / 6, (4 - 3 * g * g * (1 + f)) / 6, f * f * f / 6
 
 
-@njit(cache=True, nogil=True)
+@compiled_loop(nogil=True)
 def _cubic(c, i, j, u, v):
     ny, nx = c.shape
     a, b = _mirror(j - 1, nx), _mirror(j + 2, nx)

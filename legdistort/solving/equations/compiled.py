@@ -8,15 +8,16 @@ gradient, which decides where the minimum is, stays in double.
 """
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, prange
 
 from ...geometry import basis
+from ...runtime.optional import compiled_loop
 
 _BATCH = 64
 _FAST = {"contract", "reassoc", "nsz"}  # sums may be reordered; NaN and infinity keep their meaning
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@compiled_loop(nogil=True, fastmath=_FAST)
 def _legendre(u, p, d):
     """Normalised Legendre polynomials and derivatives at u (n,), into p and d (top, n)."""
     n = len(u)
@@ -37,7 +38,7 @@ def _legendre(u, p, d):
             d[k, o] *= scale
 
 
-@njit(cache=True, nogil=True)
+@compiled_loop(nogil=True)
 def _bounds(start, n_chunks):
     """Exposure numbers that cut the observations in chunks of about equal size."""
     out = np.zeros(n_chunks + 1, np.int64)
@@ -47,7 +48,7 @@ def _bounds(start, n_chunks):
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@compiled_loop(nogil=True, fastmath=_FAST)
 def _model(a, orders, size, q, work):
     """Distorted positions and I + A grad b of a batch; q (2, n) is overwritten with the positions."""
     pu, du, pv, dv, b, g = work
@@ -71,7 +72,7 @@ def _model(a, orders, size, q, work):
             g[3, o] += ay * slope_v
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@compiled_loop(nogil=True, fastmath=_FAST)
 def _normal_block(weight, b, out):
     """Add ``sum w b b'`` of a batch to the lower triangle of out (n_modes, n_modes)."""
     n_modes = len(out)
@@ -84,7 +85,7 @@ def _normal_block(weight, b, out):
             out[m, other] += total
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@compiled_loop(nogil=True, fastmath=_FAST)
 def _dots(b, x, out):
     for m in range(len(out)):
         total = 0.0
@@ -93,7 +94,7 @@ def _dots(b, x, out):
         out[m] += total
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@compiled_loop(nogil=True, fastmath=_FAST)
 def _terms(row, n_block, phi, f, j, r):
     """Add to the sums of a star what an observation says of the terms beside its position, phi (2, n_terms)."""
     mxx, myy, mxy = f[0] * j[0] + f[1] * j[2], f[2] * j[1] + f[3] * j[3], f[0] * j[1] + f[1] * j[3]
@@ -109,7 +110,7 @@ def _terms(row, n_block, phi, f, j, r):
         place += 3 + t
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@compiled_loop(parallel=True, fastmath=_FAST)
 def _linearise(n_chunks, start, star, xy, weight, unequal, moving, coefficients, poses, sizes, orders, n_modes):
     n_exposures, n, n_all, n_terms = len(start) - 1, len(star), orders.shape[1], moving[1].shape[2]
     (stars, columns), residual = moving, np.empty((2, n))
@@ -173,7 +174,7 @@ def _linearise(n_chunks, start, star, xy, weight, unequal, moving, coefficients,
     return values, coupling, residual, sums, u_blocks, gradient, chi2.sum()
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@compiled_loop(parallel=True, fastmath=_FAST)
 def _to_stars(n_chunks, start, star, values, coupling, columns, a, n_stars):
     n_terms = columns.shape[2]
     sums = np.zeros((n_chunks, n_stars, 2 + n_terms))
@@ -200,7 +201,7 @@ def _to_stars(n_chunks, start, star, values, coupling, columns, a, n_stars):
     return sums
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@compiled_loop(parallel=True, fastmath=_FAST)
 def _to_exposures(n_chunks, start, star, values, coupling, columns, stars):
     n_modes, n_terms = len(values), columns.shape[2]
     out = np.zeros((len(start) - 1, 2, n_modes))
@@ -228,7 +229,7 @@ def _to_exposures(n_chunks, start, star, values, coupling, columns, stars):
     return out
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@compiled_loop(parallel=True, fastmath=_FAST)
 def _distances(start, star, q, poses, positions):
     out = np.empty(q.shape[1])
     for i in prange(len(start) - 1):
@@ -241,7 +242,7 @@ def _distances(start, star, q, poses, positions):
     return out
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@compiled_loop(parallel=True, fastmath=_FAST)
 def _moments(start, star, q, weight, positions):
     """Per exposure: means of source and target, cross moments xx, xy, yx, yy (target, source), power of the source."""
     out = np.zeros((len(start) - 1, 9))
