@@ -173,6 +173,14 @@ def without_a_map(values, xy, degree=3):
     return values - powers @ np.linalg.lstsq(powers, values, rcond=None)[0], powers.shape[1]
 
 
+def without_a_similarity(values, xy):
+    """Values (n, 2) of stars without a common shift, rotation and scale."""
+    (x, y), one, zero = (xy - xy.mean(axis=0)).T, np.ones(len(xy)), np.zeros(len(xy))
+    design = np.array([np.concatenate(each) for each in ((one, zero), (zero, one), (x, y), (-y, x))]).T
+    flat = values.T.ravel()
+    return (flat - design @ np.linalg.lstsq(design, flat, rcond=None)[0]).reshape(2, -1).T
+
+
 @pytest.mark.parametrize(("n", "accuracy"), [(8, 0.1), pytest.param(60, 0.05, marks=pytest.mark.slow)])
 def test_relative_errors_are_calibrated(n, accuracy):
     """Squared pulls after a cubic map of all stars, over n realisations."""
@@ -205,12 +213,9 @@ def test_absolute_errors_of_motions_are_calibrated(n, kind, accuracy):
         epochs, more = (THREE, {}) if kind == "proper" else (FIVE, {"parallax": 0.1})
         sim = field(100, epochs, seed=seed, min_exposures=len(epochs), **more)
         solution = solve(sim.matches, motion=kind, clip=None)
-        found, xy = solution.motions.values, sim.truth.positions - sim.truth.positions.mean(axis=0)
-        one, zero = np.ones(100), np.zeros(100)
-        fields = [(one, zero), (zero, one), tuple(xy.T), (-xy[:, 1], xy[:, 0])]
-        design = np.array([np.concatenate(each) for each in fields]).T
-        flat = (found[:, :2] - sim.truth.motions).T.ravel()
-        true.append([np.mean((flat - design @ np.linalg.lstsq(design, flat, rcond=None)[0]) ** 2)])
+        found = solution.motions.values
+        left = without_a_similarity(found[:, :2] - sim.truth.motions, sim.truth.positions)
+        true.append([np.mean(left**2)])
         stated.append([np.mean([np.mean(solution.stars[name].value ** 2) for name in ("vx_err_abs", "vy_err_abs")])])
         if kind == "parallax":
             true[-1].append(np.var(found[:, 2] - sim.truth.parallaxes))

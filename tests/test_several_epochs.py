@@ -6,13 +6,14 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose
-from test_motions import FIVE, field, without_a_map
+from test_motions import FIVE, SKY, THREE, field, without_a_map, without_a_similarity
 from test_reference_motions import gaia
 
 from legdistort.cli.parser import main
 from legdistort.coaddition.mosaicking import coadd
 from legdistort.exceptions import InputError
 from legdistort.geometry.epochs import header_epoch
+from legdistort.geometry.parallax import on_plane
 from legdistort.inputs.exposures import Exposure
 from legdistort.simulation.observations import simulate_exposures, simulate_gsaoi_matches
 from legdistort.solving.estimation import solve
@@ -93,6 +94,108 @@ def test_stars_at_another_time_are_those_of_a_solution_of_that_time(tied):
 def test_stars_at_another_time_need_motions():
     with pytest.raises(InputError, match="motions of the stars were not fitted"):
         solve(field(40).matches).stars_at(2018.0)
+
+
+# -- positions of known stars carried on
+
+
+@pytest.fixture(scope="module")
+def moving():
+    sim = field(60, FIVE, parallax=0.1)
+    return sim, solve(sim.matches, motion="parallax", clip=None)
+
+
+def test_a_position_is_carried_along_the_path_of_its_star(moving):
+    _, solution = moving
+    name, year = solution.names[0], solution.motions.years[0]
+    seen = solution.distort(name, solution.positions_at(year))
+    inside = np.isfinite(seen[:, 0])
+    seen, stars, then = seen[inside], np.array(solution.star_names)[inside], solution.positions_at(2021.0)[inside]
+    assert_allclose(solution.correct(name, seen, epoch=2021.0, stars=stars), then, atol=1e-6)
+    there = solution.correct(name, seen[5:7] * u.pix, epoch=2021.0, stars=stars[5:7], errors=[0.05, 0.05])
+    assert_allclose(there.xy.to_value(u.pix), then[5:7], atol=1e-6)
+    same = solution.correct(name, seen, errors=0.05, epoch=year, stars=stars)
+    for a, b in zip(solution.correct(name, seen, errors=0.05), same, strict=True):
+        assert_allclose(a, b)
+
+
+@pytest.mark.parametrize("kind", ["proper", "parallax"])
+def test_errors_of_positions_carried_on_are_calibrated(kind):
+    """Fresh measurements in one exposure, carried on by twenty years, after which errors of rates are most of all."""
+    pulls, true, stated = [], [], []
+    epochs, more = (THREE, {}) if kind == "proper" else (FIVE, {"parallax": 0.1})
+    for seed in range(12):
+        sim = field(100, epochs, seed=seed, min_exposures=len(epochs), sigma=0.02, static=0.0, **more)
+        truth, solution = sim.truth, solve(sim.matches, motion=kind, clip=None)
+        name = solution.names[1]
+        seen = truth.distort(name, truth.place(name))
+        seen = seen + 0.02 * np.random.default_rng(seed + 5000).standard_normal(seen.shape)
+        found = solution.correct(name, seen, errors=0.02, epoch=2035.0, stars=solution.star_names)
+        place = truth.positions + (2035.0 - truth.epoch) * truth.motions
+        if kind == "parallax":
+            place = place + truth.parallaxes[:, None] * on_plane(SKY, [2035.0])
+        left, m = without_a_map(found.xy - place, truth.positions)
+        pulls.append(np.mean(left**2 / np.einsum("nkk->nk", found.relative)) * len(left) / (len(left) - m))
+        true.append(np.mean(without_a_similarity(found.xy - place, truth.positions) ** 2))
+        stated.append(np.mean(np.einsum("nkk->nk", found.absolute)))
+    assert np.mean(pulls) == pytest.approx(1, abs=0.15)
+    assert np.sqrt(np.mean(true) / np.mean(stated)) == pytest.approx(1, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"epoch": 2021.0}, "give both epoch and stars, or neither"),
+        ({"stars": ["1", "2"]}, "give both epoch and stars, or neither"),
+        ({"epoch": 20111.0, "stars": ["1", "2"]}, "epoch must be a decimal year"),
+        ({"epoch": 2021.0, "stars": ["1"]}, "stars must name a star of the solution for each of the .* 2"),
+        ({"epoch": 2021.0, "stars": 5}, "stars must name a star"),
+        ({"epoch": 2021.0, "stars": ["1", "vega"]}, "no motion is known of vega: the solution has no such stars"),
+    ],
+)
+def test_positions_that_nothing_carries_on(moving, settings, message):
+    _, solution = moving
+    with pytest.raises(InputError, match=message):
+        solution.correct(solution.names[0], np.full((2, 2), 500.0), **settings)
+
+
+def test_a_star_without_a_motion_stays_with_an_unknown_error():
+    sim = field(60)
+    table = sim.matches.table
+    keep = ~((table["star"] == 7) & (table["epoch"].value > 2016))
+    matches = type(sim.matches).from_table(table[keep], shape=sim.matches.shapes, poses=sim.matches.poses)
+    solution = solve(matches, motion="proper", clip=None)
+    name, stars = solution.names[0], solution.star_names[6:9]
+    here = solution.correct(name, np.full((3, 2), 500.0))
+    there = solution.correct(name, np.full((3, 2), 500.0), errors=0.05, epoch=2021.0, stars=stars)
+    assert_allclose(there.xy[1], here[1])
+    assert np.isnan(there.relative[1]).all()
+    assert np.isnan(there.absolute[1]).all()
+    assert np.isfinite(there.absolute[[0, 2]]).all()
+
+
+def test_a_table_of_positions_carried_on_in_the_shell(moving, tmp_path):
+    _, solution = moving
+    solution.write(tmp_path / "solution.asdf")
+    names = [solution.names[k] for k in (3, 0, 3)]
+    table = QTable({"exposure": names, "star": [solution.star_names[k] for k in (4, 5, 6)]})
+    table["x"] = table["y"] = [500.0, 900.0, 700.0] * u.pix
+    table["x_err"] = table["y_err"] = [0.05] * 3 * u.pix
+    table.write(tmp_path / "seen.ecsv")
+    files = [str(tmp_path / name) for name in ("solution.asdf", "seen.ecsv", "out.ecsv")]
+    assert main(["correct", *files[:2], "--epoch", "2021", "--out", files[2]]) == 0
+    out = QTable.read(files[2])
+    assert out.meta["epoch"] == 2021.0
+    for row, name, star in zip(out, names, table["star"], strict=True):
+        seen = table[(table["star"] == star)]
+        xy = np.array([[seen["x"][0].value, seen["y"][0].value]])
+        single = solution.correct(name, xy, errors=0.05, epoch=2021.0, stars=[star])
+        assert_allclose([row["x"].value, row["y"].value], single.xy[0])
+        assert_allclose(row["x_err"].value, np.sqrt(single.relative[0, 0, 0]))
+        assert_allclose(row["y_err_abs"].value, np.sqrt(single.absolute[0, 1, 1]))
+    table.remove_column("star")
+    with pytest.raises(InputError, match="lacks the column star"):
+        solution.correct_table(table, epoch=2021.0)
 
 
 def test_a_stack_of_one_epoch_shows_the_stars_of_that_time():

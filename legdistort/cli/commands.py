@@ -249,7 +249,7 @@ def do_correct(a):
     """``legdistort correct``."""
     from ..inputs.table_files import write_by_ending
 
-    table = _solution(a).correct_table(_read_table(a.table, a))
+    table = _solution(a).correct_table(_read_table(a.table, a), epoch=a.epoch)
     write_by_ending(table, a.out, overwrite=a.overwrite)
     _say(a, f"{len(table)} positions in {a.out}", {"n_positions": len(table), "out": str(a.out)})
 

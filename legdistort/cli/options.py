@@ -88,6 +88,11 @@ NIGHT = {
     "camera": Option("all detectors of this camera, in one file an exposure", choices=("gsaoi",)),
 }
 AT_EPOCH = {"epoch": Option("where they are at another time: a decimal year (default: of the solution)", type=float)}
+CARRIED = {
+    "epoch": Option(
+        "carry positions to another time, a decimal year, by the motions of the stars in column star", type=float
+    )
+}
 MOVING = {
     "epochs": Option("years, one for each frame; stars then move", type=float, nargs="+"),
     "motion": Option("scatter of the proper motions per axis, pixels a year", type=float),

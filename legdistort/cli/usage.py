@@ -142,6 +142,7 @@ COMMANDS = {
         options.POSITIONS,
         options.out("table (.ecsv, .fits, .vot, .xml or .csv)"),
         options.COLUMNS,
+        options.CARRIED,
     ),
     "report": _command(
         "HTML page of a solution",

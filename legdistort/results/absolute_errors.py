@@ -34,7 +34,7 @@ def relative_variance(gauge, uncertainty, xy):
 def relative_blocks(gauge, uncertainty, xy):
     """The same of all unknowns of the stars, (n_stars, 2 + k, 2 + k), maps that change with time taken off too."""
     good = np.isfinite(xy[:, 0]) & np.isfinite(uncertainty.stars[0])
-    out = _own(gauge, uncertainty)
+    out = own_blocks(gauge, uncertainty)
     out[~np.isfinite(xy[:, 0])] = np.nan
     if gauge.plane is not None or not np.count_nonzero(good):
         return out
@@ -56,7 +56,7 @@ def relative_blocks(gauge, uncertainty, xy):
 def absolute_blocks(gauge, uncertainty, xy):
     """Covariance (n_stars, 2 + k, 2 + k) of all unknowns of the stars with that of common maps, unknown ones aside."""
     directions, hidden = _common(gauge, uncertainty, xy)
-    out = _own(gauge, uncertainty) + directions @ hidden @ directions.transpose(0, 2, 1)
+    out = own_blocks(gauge, uncertainty) + directions @ hidden @ directions.transpose(0, 2, 1)
     out[~np.isfinite(xy[:, 0])] = np.nan
     return out
 
@@ -68,7 +68,7 @@ def _common(gauge, uncertainty, xy):
     return uncertainty.drift_directions, gauge.joint_covariance
 
 
-def _own(gauge, uncertainty):
+def own_blocks(gauge, uncertainty):
     """Covariance (n_stars, 2 + k, 2 + k) of the unknowns of the stars in the gauge."""
     blocks = uncertainty.stars if gauge.drift is None else uncertainty.star_unknowns
     size = 2 if gauge.drift is None else 2 + len(gauge.drift.names)

@@ -6,6 +6,7 @@ from itertools import combinations
 import numpy as np
 from astropy import units as u
 
+from ..exceptions import InputError
 from ..geometry import parallax
 from ..inputs.column_contract import correlation
 
@@ -82,6 +83,13 @@ class StarMotions:
         if twice := np.count_nonzero(self.n_epochs == 2):
             words += f"; {twice} seen at two epochs ha{'s' if twice == 1 else 've'} nothing to check the motion by"
         return words
+
+
+def fitted(motions):
+    """The motions of a solution; `InputError` where they were not fitted."""
+    if motions is None:
+        raise InputError("the motions of the stars were not fitted: call solve with motion='proper'")
+    return motions
 
 
 def add_motions(table, motions, relative, absolute, xy, sky):

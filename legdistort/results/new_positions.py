@@ -12,11 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from astropy import units as u
 
-from ..exceptions import InputError
+from ..exceptions import InputError, some_of
 from ..geometry import basis, similarity
+from ..geometry.epochs import year
 from ..geometry.models import like, to_pixels
 from ..inputs import column_contract
 from . import absolute_errors
+from .motions import fitted
 
 
 class Corrected(NamedTuple):
@@ -38,8 +40,59 @@ class Corrected(NamedTuple):
     absolute: np.ndarray
 
 
-def correct_with_errors(solution, name, xy, errors, detector=None):
-    """`Solution.correct` with errors; see there."""
+class Movement(NamedTuple):
+    """What carries stars seen in an exposure to their places at another time.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (n,)
+        Of the stars in the solution.
+    columns : ndarray, shape (2, k)
+        Displacement [pix] for a unit of each term of the motions.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+
+    def displacement(self, motions):
+        """Displacements (n, 2) [pix]; zero for stars without a motion."""
+        return np.nan_to_num(motions.values[self.rows]) @ self.columns.T
+
+
+def movement(solution, name, stars, epoch, n):
+    """The `Movement` of n positions of named stars from an exposure to an epoch; None without an epoch.
+
+    Raises
+    ------
+    InputError
+        If there are stars without an epoch or an epoch without stars, motions were not fitted, or a star is not in the
+        solution.
+    """
+    if (epoch is None) != (stars is None):
+        raise InputError(
+            "a position is carried to another time by the motion of its star: give both epoch and stars, or neither"
+        )
+    if epoch is None:
+        return None
+    motions = fitted(solution.motions)
+    try:
+        names = np.asarray(stars).astype(str)
+    except (TypeError, ValueError):
+        names = np.empty(0)
+    if names.shape != (n,):
+        raise InputError(f"stars must name a star of the solution for each of the positions, of which there are {n}")
+    order = {each: row for row, each in enumerate(np.asarray(solution.star_names).astype(str).tolist())}
+    if strange := sorted({each for each in names.tolist() if each not in order}):
+        raise InputError(
+            f"no motion is known of {some_of(strange, 6)}: the solution has no such stars, and a position is "
+            "carried to another time by the motion of its star"
+        )
+    there, here = motions.columns([year(epoch), motions.years[solution.index(name)]], solution.sky)
+    return Movement(np.array([order[each] for each in names.tolist()], dtype=int), there - here)
+
+
+def correct_with_errors(solution, name, xy, errors, detector=None, moved=None):
+    """`Solution.correct` with errors, carried to another time by a `Movement`; see there."""
     pixels = np.atleast_2d(to_pixels(xy))
     measured = _covariance(errors, len(pixels))
     if detector is not None:
@@ -48,7 +101,9 @@ def correct_with_errors(solution, name, xy, errors, detector=None):
     distortion.check_fold()
     q = distortion.invert(pixels)
     corrected = similarity.apply(similarity.invert(solution.poses[name]), q)
-    relative, absolute = covariances(solution, name, q, measured)
+    if moved is not None:
+        corrected = corrected + moved.displacement(solution.motions)
+    relative, absolute = covariances(solution, name, q, measured, moved)
     if isinstance(xy, u.Quantity):
         relative, absolute = relative * u.pix**2, absolute * u.pix**2
     return Corrected(like(xy, corrected), relative, absolute)
@@ -95,10 +150,10 @@ def response(solution, name, q):
     return np.einsum("nac,mn->nacm", back, b).reshape(len(q), 2, -1), back
 
 
-def covariances(solution, name, q, measured):
+def covariances(solution, name, q, measured, moved=None):
     """Relative and absolute covariance (n, 2, 2) of positions corrected to undistorted pixels q (n, 2) of an exposure.
 
-    `measured` (n, 2, 2) is the covariance on the detector.
+    `measured` (n, 2, 2) is the covariance on the detector; a `Movement` carries the positions to another time.
     """
     gauge, i = solution.gauge, solution.index(name)
     by_modes, back = response(solution, name, q)
@@ -115,6 +170,11 @@ def covariances(solution, name, q, measured):
         relative = relative + carried(directions - plain @ _taken_off(gauge, solution.positions), hidden)
     if gauge.drift is not None and len(hidden) == 2 * gauge.n_modes:  # at the time of this exposure
         directions, hidden = by_modes @ widened(gauge.all_motion[i], solution.degree), gauge.joint_covariance
+    if moved is not None:
+        known, terms = (gauge, solution.uncertainty), (moved.rows, slice(2, None), slice(2, None))
+        relative = relative + carried(moved.columns, absolute_errors.relative_blocks(*known, solution.positions)[terms])
+        own = own + carried(moved.columns, absolute_errors.own_blocks(*known)[terms])
+        directions = directions + moved.columns @ solution.uncertainty.drift_directions[terms[:2]]
     absolute = own + carried(directions, hidden)
     for each in gauge.unknown:
         moved = by_modes @ widened(each.coefficients[i].reshape(-1, 1), solution.degree)
@@ -123,8 +183,8 @@ def covariances(solution, name, q, measured):
 
 
 def carried(through, covariance):
-    """Covariance (n, 2, 2) of what depends linearly, (n, 2, k), on something with a covariance (k, k) or (n, k, k)."""
-    return through @ covariance @ through.transpose(0, 2, 1)
+    """Covariance (n, 2, 2) of what depends linearly, (n, 2, k) or (2, k), on something of covariance (k, k) or (n, k, k)."""
+    return through @ covariance @ np.swapaxes(through, -1, -2)
 
 
 def widened(changes, degree):
@@ -142,11 +202,16 @@ def _taken_off(gauge, positions):
     return np.linalg.lstsq(plain.reshape(flat), directions.reshape(flat), rcond=None)[0]
 
 
-def correct_table(solution, table):
+def correct_table(solution, table, epoch=None):
     """`Solution.correct_table`; see there."""
     table = column_contract.check(table, column_contract.DETECTED, "the table of positions")
     if solution.camera is not None:
         table = solution.camera.in_focal_plane(table)
+    if epoch is not None and "star" not in table.colnames:
+        raise InputError(
+            "the table of positions lacks the column star: it is the motion of its star that carries a position to "
+            "another time"
+        )
     exposures = np.asarray(table["exposure"]).astype(str)
     pixels, x_err, y_err = (table[name].to_value(u.pix) for name in ("x", "x_err", "y_err"))
     pixels = np.column_stack([pixels, table["y"].to_value(u.pix)])
@@ -155,7 +220,11 @@ def correct_table(solution, table):
     xy, relative, absolute = np.empty_like(pixels), np.empty_like(measured), np.empty_like(measured)
     for name in dict.fromkeys(exposures.tolist()):
         mine = exposures == name
-        xy[mine], relative[mine], absolute[mine] = correct_with_errors(solution, name, pixels[mine], measured[mine])
+        stars = None if epoch is None else table["star"][mine]
+        moved = movement(solution, name, stars, epoch, np.count_nonzero(mine))
+        xy[mine], relative[mine], absolute[mine] = correct_with_errors(
+            solution, name, pixels[mine], measured[mine], moved=moved
+        )
     out = table.copy()
     out["x"], out["y"] = xy.T * u.pix
     for suffix, each in (("err", relative), ("err_abs", absolute)):
@@ -163,6 +232,8 @@ def correct_table(solution, table):
     out["xy_corr"] = relative[:, 0, 1] / np.sqrt(relative[:, 0, 0] * relative[:, 1, 1])
     if solution.sky is not None:
         add_sky(out, solution.sky, xy, _variances(relative), _variances(absolute))
+    if epoch is not None:
+        out.meta["epoch"] = year(epoch)
     return column_contract.describe_stars(out)
 
 

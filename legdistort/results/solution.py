@@ -226,9 +226,7 @@ class Solution:
         InputError
             If motions were not fitted.
         """
-        if self.motions is None:
-            raise InputError("the motions of the stars were not fitted: call solve with motion='proper'")
-        return self.positions + self.motions.displacement(year(epoch), self.sky)
+        return self.positions + star_motions.fitted(self.motions).displacement(year(epoch), self.sky)
 
     def stars_at(self, epoch):
         """The stars where they are at another time, with their errors then, as a table.
@@ -355,10 +353,11 @@ class Solution:
         p[outside(distortion.inverse.valid, q[:, 0], q[:, 1])] = np.nan
         return like(xy, p if detector is None else self._detector(detector).to_pixels(p))
 
-    def correct(self, name, xy, *, errors=None, detector=None):
+    def correct(self, name, xy, *, errors=None, detector=None, epoch=None, stars=None):
         """Detector pixels (n, 2) -> reference positions (n, 2), exact (section 3.3, criterion J_3).
 
-        A quantity in pixels gives a quantity.
+        A quantity in pixels gives a quantity. Positions are those at the time of the exposure; the motions that were
+        fitted carry those of known stars to another.
 
         Parameters
         ----------
@@ -370,6 +369,11 @@ class Solution:
             the correction alone.
         detector : str, optional
             Of a camera, to which the pixels and their errors belong; without it they are those of the focal plane.
+        epoch : float or `~astropy.time.Time`, optional
+            Another time, a Julian year, to which positions are carried. Stars without a motion stay where they are,
+            with errors that are not known.
+        stars : sequence of str, optional
+            With `epoch`: to which stars of the solution the positions belong.
 
         Returns
         -------
@@ -381,27 +385,32 @@ class Solution:
         Raises
         ------
         InputError
-            If there is no such exposure, or for errors of another shape, negative ones or such that are not finite.
+            If there is no such exposure or star, motions were not fitted, or for errors of another shape, negative ones
+            or such that are not finite.
         FoldError
             If the distortion folds.
         """
         chip = None if detector is None else self._detector(detector)
+        pixels = np.atleast_2d(to_pixels(xy))
+        moved = new_positions.movement(self, name, stars, epoch, len(pixels))
         if errors is not None:
-            return new_positions.correct_with_errors(self, name, xy, errors, chip)
+            return new_positions.correct_with_errors(self, name, xy, errors, chip, moved)
         distortion = self.distortion(name)
         distortion.check_fold()
-        pixels = np.atleast_2d(to_pixels(xy))
         q = distortion.invert(pixels if chip is None else chip.to_focal_plane(pixels))
-        return like(xy, similarity.apply(similarity.invert(self.poses[name]), q))
+        corrected = similarity.apply(similarity.invert(self.poses[name]), q)
+        return like(xy, corrected if moved is None else corrected + moved.displacement(self.motions))
 
-    def correct_table(self, table):
+    def correct_table(self, table, *, epoch=None):
         """Positions measured in any exposures -> the reference plane and the sky, with their errors, as a table.
 
         Parameters
         ----------
         table : `~astropy.table.Table`
             Columns ``exposure``, ``x``, ``y``, ``x_err``, ``y_err`` [pix] and perhaps ``xy_corr``, of positions that
-            took no part in the solution.
+            took no part in the solution; with `epoch` ``star`` too, a star of the solution.
+        epoch : float or `~astropy.time.Time`, optional
+            A Julian year, to which the motions that were fitted carry all positions; it is then in the ``meta`` too.
 
         Returns
         -------
@@ -413,9 +422,10 @@ class Solution:
         Raises
         ------
         InputError
-            For a table that lacks columns or has bad values, or names an exposure that the solution does not have.
+            For a table that lacks columns or has bad values, or names an exposure or, with `epoch`, a star that the
+            solution does not have; with `epoch` if motions were not fitted.
         """
-        return new_positions.correct_table(self, table)
+        return new_positions.correct_table(self, table, epoch)
 
     def model(self, name):
         """Reference plane -> detector pixels as an astropy compound model with inverse."""
