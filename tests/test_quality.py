@@ -94,10 +94,12 @@ def test_known_shapes_are_found(fwhm, sub, ellipticity):
     step = int(12 * fwhm)
     xy = np.stack(np.meshgrid(*[np.arange(1, 5) * step] * 2), axis=-1).reshape(-1, 2) + rng.uniform(-0.5, 0.5, (16, 2))
     image = gaussians((5 * step, 5 * step), xy, np.geomspace(1e3, 1e6, 16), sx, sy, theta=0.7, sub=sub)
-    x, y, width, flat, peak = measure_shapes(image, np.round(xy + 0.6), fwhm=fwhm).T
+    x, y, width, flat, peak, angle = measure_shapes(image, np.round(xy + 0.6), fwhm=fwhm).T
     assert np.abs(np.column_stack([x, y]) - xy).max() < 5e-3
     assert width == pytest.approx(fwhm, rel=0.02)
     assert flat == pytest.approx(ellipticity, abs=0.015)
+    if ellipticity:
+        assert angle == pytest.approx(np.degrees(0.7), abs=2)
     # what a fine grid holds within two FWHM
     t = np.linspace(-3 * fwhm, 3 * fwhm, 801)
     profile = np.exp(-((t[None] / sx) ** 2 + (t[:, None] / sy) ** 2) / 2) / (2 * np.pi * sx * sy)
@@ -117,7 +119,7 @@ def test_what_cannot_be_measured_is_nan():
     found = np.isfinite(measure_shapes(image, xy, fwhm=FWHM, bad=bad, saturation=5e4)).all(axis=1)
     assert found.tolist() == [True, False, True, False, False, False, False, False, False]
     assert measure_shapes(image, xy[2:3], fwhm=FWHM)[0, 2] == pytest.approx(FWHM, rel=0.02)
-    assert measure_shapes(image, np.zeros((0, 2)), fwhm=FWHM).shape == (0, 5)
+    assert measure_shapes(image, np.zeros((0, 2)), fwhm=FWHM).shape == (0, 6)
 
 
 def test_a_doubled_star_counts_with_all_its_light():

@@ -8,11 +8,11 @@ from ..results.check import Check
 
 #: A stack whose stars are this much wider than those of single exposures has lost sharpness that can be seen.
 BLURRED = 1.05
-#: Excess of an exposure over the others, in the logarithm of the FWHM and in ellipticity, that has a cause to look for
-#: (a trail of one FWHM makes 0.13 in ellipticity) ...
-WIDE, ELONGATED = 0.2, 0.1
+#: Excess of an exposure over the others in the logarithm of the FWHM, and distance from them in ellipticity, along and
+#: across, that have a cause to look for (a trail of one FWHM makes 0.11 to 0.15 in one, 0.13 to 0.15 in the other) ...
+WIDE, ELONGATED = 0.08, 0.08
 #: ... if it is no more probable than this by chance, as the others scatter: few exposures say no more.
-ODD = 0.01
+ODD = 0.001
 _FEWEST = 4  # exposures, to say how much they differ usually
 
 
@@ -38,30 +38,39 @@ def image_check(quality):
     if len(found) < _FEWEST:
         return Check("images", "unknown", None, None, f"stars were measured in {len(found)} exposures, too few to say "
                      "whether one is unlike the others", "")  # fmt: skip
-    names, values = list(found), np.array(list(found.values()))
+    names, (fwhm, ellipticity, angle) = list(found), np.array(list(found.values())).T
+    stretch = ellipticity * np.exp(2j * np.radians(angle))
     odd = [
-        (*_odd_one(np.log(values[:, 0])), WIDE, "wider", f"{np.median(values[:, 0]):.2f} px", values[:, 0]),
-        (*_odd_one(values[:, 1]), ELONGATED, "more elongated", f"{np.median(values[:, 1]):.2f}", values[:, 1]),
+        (*_odd_one(np.log(fwhm)[:, None]), WIDE),
+        (*_odd_one(np.column_stack([stretch.real, stretch.imag])), ELONGATED),
     ]
-    p, i, excess, least, word, usual, value = max(odd, key=lambda each: each[2] / each[3])
-    if p < ODD and excess > least:
-        what = "FWHM" if word == "wider" else "ellipticity"
-        return Check("images", "warn", value[i], None,
-                     f"stars of {names[i]} are {word} than those of the others ({what} {value[i]:.2f}, usually "
-                     f"{usual})",
-                     "look at the frame (trailed, out of focus), or leave it out")  # fmt: skip
-    return Check("images", "pass", value[i], None, f"stars of all {len(names)} exposures are alike (FWHM {odd[0][5]})")
+    odd = [(p, i) for p, i, excess, least in odd if p < ODD and excess > least]
+    width = np.median(fwhm)
+    if not odd:
+        return Check("images", "pass", width, None,
+                     f"stars of all {len(names)} exposures are alike (FWHM {width:.2f} px)")  # fmt: skip
+    i = min(odd)[1]
+    usual = np.delete(stretch, i).mean()
+    return Check("images", "warn", fwhm[i], None,
+                 f"stars of {names[i]} are unlike those of the others: FWHM {fwhm[i]:.2f} px, usually {width:.2f}, "
+                 f"ellipticity {ellipticity[i]:.2f} at {angle[i]:.0f} degrees from x, in the mean of the others "
+                 f"{abs(usual):.2f} at {np.degrees(np.angle(usual)) / 2:.0f}",
+                 "look at the frame (trailed, out of focus), or leave it out")  # fmt: skip
 
 
 def _odd_one(values):
-    """The value that is most above the others: probability by chance, index, excess over their mean."""
-    n, best = len(values), (1.0, 0, 0.0)
+    """Which of the values (n, k) is most unlike the others: its probability by chance, index, distance from their mean.
+
+    Single values count if they are above the others, vectors in any direction, all of which scatter alike.
+    """
+    (n, k), best = values.shape, (1.0, 0, 0.0)
     for i in range(n):
-        others = np.delete(values, i)
-        excess = values[i] - others.mean()
-        t = excess / max(others.std(ddof=1) * np.sqrt(1 + 1 / (n - 1)), 1e-9)
-        p = min(1.0, n * float(special.stdtr(n - 2, -t)))
-        best = min(best, (p, i, excess))
+        others = np.delete(values, i, axis=0)
+        off = values[i] - others.mean(axis=0)
+        variance = others.var(axis=0, ddof=1).mean() * (1 + 1 / (n - 1))
+        f = float(off @ off) / max(k * variance, 1e-18)
+        p = special.fdtrc(k, k * (n - 2), f) if k > 1 else special.stdtr(n - 2, -np.sign(off[0]) * np.sqrt(f))
+        best = min(best, (min(1.0, n * float(p)), i, float(np.hypot(*off) if k > 1 else off[0])))
     return best
 
 

@@ -46,7 +46,8 @@ class Quality:
         `fwhm` and `peak` over those in single exposures, star by star (NaN without exposures). The second is a
         Strehl ratio with single exposures in place of the diffraction limit.
     exposures : dict
-        ``{name: (FWHM [pix], ellipticity)}``, medians over the stars of single exposures; empty without exposures.
+        ``{name: (FWHM [pix], ellipticity, position angle [deg])}``, medians over the stars of single exposures, the
+        angle of the major axis from x to y; empty without exposures.
     """
 
     n_stars: int
@@ -252,13 +253,13 @@ class _Sample:
         """`measure_shapes` of a mosaic, positions on the reference plane."""
         if mosaic.offset is None:
             raise InputError("the mosaic is not on the reference plane; make one with coadd(..., grid=None)")
-        found = measure_shapes(mosaic.data, self.positions(solution) - mosaic.offset, fwhm=self.fwhm)
+        found = measure_shapes(mosaic.data, self.positions(solution) - mosaic.offset, fwhm=self.fwhm)[:, :5]
         found[:, :2] += mosaic.offset
         return found
 
     def of_exposures(self, exposures, solution):
         """Medians of `measure_shapes` over the exposures (n, 5), offsets of corrected positions (n_exp, n, 2), and
-        ``{exposure: (FWHM, ellipticity)}``, medians over the stars.
+        ``{exposure: (FWHM, ellipticity, position angle)}``, medians over the stars.
 
         A star that is saturated, or cannot be measured for another reason, in every exposure is NaN.
         """
@@ -274,9 +275,11 @@ class _Sample:
             seen = np.isfinite(found[:, 0])
             offset = np.full_like(xy, np.nan)
             offset[seen] = solution.correct(exposure.name, found[seen, :2]) - self.positions(solution)[seen]
-            shapes.append(found)
+            shapes.append(found[:, :5])
             if seen.any():
-                medians[exposure.name] = tuple(np.median(found[seen, 2:4], axis=0).tolist())
+                stretch = found[seen, 3] * np.exp(2j * np.radians(found[seen, 5]))
+                angle = np.degrees(np.angle(np.median(stretch.real) + 1j * np.median(stretch.imag))) / 2
+                medians[exposure.name] = (*np.median(found[seen, 2:4], axis=0).tolist(), float(angle))
             offsets.append(offset)
         if not shapes:
             return None

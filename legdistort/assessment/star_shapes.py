@@ -26,13 +26,13 @@ def measure_shapes(image, xy, *, fwhm, bad=None, saturation=None):
 
     Returns
     -------
-    ndarray, shape (n, 5)
-        x, y, FWHM, ellipticity, peak over flux; NaN for a star near the edge, with bad pixels at its centre or many
-        around it, or without a fit.
+    ndarray, shape (n, 6)
+        x, y, FWHM, ellipticity, peak over flux, position angle of the major axis [deg] from x to y; NaN for a star near
+        the edge, with bad pixels at its centre or many around it, or without a fit.
     """
     half, (ny, nx) = cutouts.box_half(fwhm), np.shape(image)
     xy = np.asarray(xy, dtype=float).reshape(-1, 2)
-    out = np.full((len(xy), 5), np.nan)
+    out = np.full((len(xy), 6), np.nan)
     centres = np.round(np.nan_to_num(xy, nan=-1e6)).astype(int)
     inside = np.flatnonzero(((centres >= half) & (centres < np.array([nx, ny]) - half)).all(axis=1))
     dy, dx = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
@@ -54,7 +54,8 @@ def measure_shapes(image, xy, *, fwhm, bad=None, saturation=None):
     gap = np.hypot((a - b) / 2, c)  # the eigenvalues of the quadratic form are half_sum +- gap, 1 / axis^2
     with np.errstate(divide="ignore", invalid="ignore"):
         peak = params[:, 2] / flux
-    shapes = moffat.fwhm(params), 1 - np.sqrt((half_sum - gap) / (half_sum + gap)), peak
+    angle = np.degrees(np.arctan2(-c, (b - a) / 2)) / 2  # the longer axis is that of the smaller eigenvalue
+    shapes = moffat.fwhm(params), 1 - np.sqrt((half_sum - gap) / (half_sum + gap)), peak, angle
     found = converged & (params[:, 2] > 0) & (flux > 0) & (np.abs(params[:, :2]) < half).all(axis=1)
     out[inside[found]] = np.column_stack([centres[inside] + params[:, :2], *shapes])[found]
     return out

@@ -183,7 +183,7 @@ def covariances(solution, name, q, measured, moved=None):
 
 
 def carried(through, covariance):
-    """Covariance (n, 2, 2) of what depends linearly, (n, 2, k) or (2, k), on something of covariance (k, k) or (n, k, k)."""
+    """Covariance (n, 2, 2) of what follows linearly, by (n, 2, k) or (2, k), from a covariance (k, k) or (n, k, k)."""
     return through @ covariance @ np.swapaxes(through, -1, -2)
 
 

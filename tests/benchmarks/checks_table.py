@@ -23,6 +23,7 @@ from scipy.stats import beta
 import legdistort as ld
 from legdistort.exceptions import LegdistortWarning
 from legdistort.inputs.exposures import Exposure
+from legdistort.simulation.pupil import PupilPSF
 
 SIGMA = 0.02
 #: Pixels: the largest of the distortion in the headers that is not used.
@@ -144,6 +145,11 @@ def headers_with_sip(rng, poses):
     return exposures
 
 
+#: One exposure trailed by 1 FWHM: of cores in a halo; of Moffat profiles, whose width and angle change.
+TRAILED = {
+    "a trail of 1 FWHM, adaptive optics": PupilPSF(strehl=0.3, elongation=0.5),
+    "a trail of 1 FWHM, seeing": None,
+}
 #: What is wrong, and the check that should say so.
 FAULTS = {
     "errors 1.3 x too small": "chi2",
@@ -154,15 +160,42 @@ FAULTS = {
     "an exposure twice as noisy": "exposures",
     "an exposure with a third of its stars": "completeness",
     "SIP of 1 px unused": "header distortion",
-}
+} | dict.fromkeys(TRAILED, "images")
 
 
-def power(n_sets):
+def trailed(psf, seed):
+    """A night of 11 frames; in one the telescope has drifted during the exposure by the FWHM, in any direction."""
+    settings = {"small": True, "seed": 100 + seed, "n_exposures": 11, "psf": psf}
+    night, still = (ld.simulate_exposures(noise=noise, **settings) for noise in (True, False))
+    rng = np.random.default_rng(seed)
+    name = str(rng.choice(list(night.hdus)))
+    angle, image, header = rng.uniform(0, np.pi), still.hdus[name][0].data, still.hdus[name][0].header
+    fy, fx = (np.fft.fftfreq(n) for n in image.shape)
+    length = still.psfs[name].fwhm if psf is None else psf.resolution
+    along = length * (np.cos(angle) * fx + np.sin(angle) * fy[:, None])
+    drifted = np.fft.ifft2(np.fft.fft2(image) * np.sinc(along)).real
+    electrons = rng.poisson(np.clip(drifted, 0, None) * header["GAIN"]) + rng.normal(0, header["RDNOISE"], image.shape)
+    counts = np.clip(np.rint(electrons / header["GAIN"]), 0, header["SATURATE"])
+    night.hdus[name][0].data = counts.astype(np.uint16)
+    return night
+
+
+def checks_of_run(night):
+    """The checks of a run on simulated frames."""
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return ld.run(night.write(Path(folder) / "night"), out=Path(folder) / "out", degree=3).checks
+
+
+def power(n_sets, faults):
     """Print how often each fault is seen, and by the check that should."""
-    for kind, expected in FAULTS.items():
-        seen = Counter()
+    for kind in faults:
+        seen, expected = Counter(), FAULTS[kind]
         for seed in range(n_sets):
-            checks = solved(spoiled(kind, seed), clip=5).checks
+            if kind in TRAILED:
+                checks = checks_of_run(trailed(TRAILED[kind], seed))
+            else:
+                checks = solved(spoiled(kind, seed), clip=5).checks
             bad = {check.name for check in checks if check.state in ("warn", "fail")}
             seen.update(bad)
             seen["any"] += bool(bad)
@@ -175,10 +208,7 @@ def images(n_sets):
     seen = Counter()
     for n in range(1, n_sets + 1):
         seed, frames = n - 1, 4 + (n - 1) % 8
-        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            night = ld.simulate_exposures(small=True, seed=100 + seed, n_exposures=frames)
-            checks = ld.run(night.write(Path(folder) / "night"), out=Path(folder) / "out", degree=3).checks
+        checks = checks_of_run(ld.simulate_exposures(small=True, seed=100 + seed, n_exposures=frames))
         bad = [check for check in checks if check.state in ("warn", "fail")]
         seen.update([check.name for check in bad] + ["any"] * bool(bad))
         if bad or n % 10 == 0:
@@ -216,6 +246,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=("alarms", "power", "images", "cost"))
     parser.add_argument("--sets", type=int, default=100, help="how many; rounds of `cost`")
+    parser.add_argument("--fault", nargs="+", choices=FAULTS, default=list(FAULTS), help="of `power` (default: all)")
     arguments = parser.parse_args()
     logging.disable(logging.WARNING)
-    {"alarms": alarms, "power": power, "images": images, "cost": cost}[arguments.what](arguments.sets)
+    if arguments.what == "power":
+        power(arguments.sets, arguments.fault)
+    else:
+        {"alarms": alarms, "images": images, "cost": cost}[arguments.what](arguments.sets)
