@@ -7,6 +7,33 @@ gwcs objects, ASDF files and a co-added image.
 
 from importlib import import_module
 from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` says the same to Python
+    from .cameras.camera import Camera as Camera
+    from .cameras.detector import Detector as Detector
+    from .coaddition.mosaic import Mosaic as Mosaic
+    from .coaddition.mosaicking import coadd as coadd
+    from .exceptions import LegdistortError as LegdistortError
+    from .exceptions import LegdistortWarning as LegdistortWarning
+    from .inputs.exposure_files import open_exposures as open_exposures
+    from .inputs.exposure_files import read_exposures as read_exposures
+    from .inputs.exposures import Exposure as Exposure
+    from .inputs.matches import Matches as Matches
+    from .matching.matcher import match as match
+    from .measurement.effective.model import EffectivePSF as EffectivePSF
+    from .measurement.noise_calibration import calibrate_noise as calibrate_noise
+    from .measurement.positions import effective_psf as effective_psf
+    from .measurement.positions import measure as measure
+    from .pipeline import run as run
+    from .priors.prior import Prior as Prior
+    from .results.solution import Solution as Solution
+    from .simulation.observations import simulate_exposures as simulate_exposures
+    from .simulation.observations import simulate_matches as simulate_matches
+    from .simulation.prediction import predict as predict
+    from .solving.estimation import solve as solve
+    from .wcs.refinement import refine as refine
+    from .wcs.storage import read_wcs as read_wcs
 
 __version__ = version("legdistort")
 
@@ -42,12 +69,12 @@ _PLACES = {
 __all__ = sorted(_PLACES)
 
 
-def __getattr__(name):
+def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(f".{_PLACES[name]}", __name__), name)
     return value
 
 
-def __dir__():
-    return sorted({*globals(), *__all__})
+def __dir__() -> list[str]:
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

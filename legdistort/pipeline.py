@@ -1,12 +1,16 @@
 """The whole road: frames -> positions -> matches -> solution -> WCS files, mosaic and report."""
 
+from __future__ import annotations
+
 import json
 import logging
 import time
 import uuid
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,6 +34,16 @@ from .runtime import checks, outputs, parallel, provenance
 from .solving.estimation import solve
 from .solving.options import CLIP, SolveOptions, check_reference
 from .wcs.storage import write_wcs
+
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+    from astropy.table import Table
+    from astropy.time import Time
+
+    from .coaddition.mosaic import Mosaic
+    from .priors.prior import Prior
+    from .results.solution import Solution
+    from .runtime.annotations import Extension, Images, StrPath
 
 log = logging.getLogger(__name__)
 
@@ -55,45 +69,45 @@ class Run:
     """
 
     out: Path
-    solution: object
-    mosaic: object
-    summary: dict
+    solution: Solution
+    mosaic: Mosaic
+    summary: dict[str, Any]
 
     @property
-    def checks(self):
+    def checks(self) -> tuple[Check, ...]:
         """The checks of the solution, and those of images and stack: a tuple of `~legdistort.results.check.Check`."""
         return tuple(Check(**each) for each in self.summary["checks"])
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Run: {self.solution!r} in {self.out}>"
 
 
 def run(
-    paths=None,
+    paths: Images | None = None,
     *,
-    out,
-    earlier=None,
-    ext=None,
-    dq_good=None,
-    degree=3,
-    prior=None,
-    camera=None,
-    min_exposures=4,
-    clip=CLIP,
-    psf="auto",
-    reference=None,
-    epoch=None,
-    pixel_scale=None,
-    measuring=None,
-    matching=None,
-    solving=None,
-    coadding=None,
-    compare=False,
-    stop_at_bad=False,
-    overwrite=False,
-    workers=None,
-    progress=False,
-):
+    out: StrPath,
+    earlier: StrPath | None = None,
+    ext: Extension | None = None,
+    dq_good: int | str | Sequence[int] | None = None,
+    degree: int = 3,
+    prior: Prior | Mapping[str, Prior] | str | HeaderPrior | None = None,
+    camera: Camera | None = None,
+    min_exposures: int = 4,
+    clip: float | None = CLIP,
+    psf: Any = "auto",
+    reference: Table | SkyCoord | StrPath | None = None,
+    epoch: float | Time | None = None,
+    pixel_scale: float | None = None,
+    measuring: Mapping[str, Any] | None = None,
+    matching: Mapping[str, Any] | None = None,
+    solving: Mapping[str, Any] | None = None,
+    coadding: Mapping[str, Any] | None = None,
+    compare: bool = False,
+    stop_at_bad: bool = False,
+    overwrite: bool = False,
+    workers: int | None = None,
+    progress: bool = False,
+) -> Run:
     """Solve a set of frames and co-add them.
 
     Parameters

@@ -6,9 +6,13 @@ and s its static distortion, normalised Legendre modes of orders 2 and more. Bot
 exposure adds to them is a distortion of the focal plane as a whole.
 """
 
+from __future__ import annotations
+
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy import units as u
@@ -22,6 +26,14 @@ from . import storage
 from .detector import Detector
 from .from_wcs import camera_of
 from .source import check_shape
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+    from matplotlib.axes import Axes
+    from numpy.typing import ArrayLike
+
+    from ..inputs.exposures import Exposure
+    from ..runtime.annotations import StrPath
 
 #: Detectors may lie on each other by this part of their area: layouts to begin with are not exact.
 OVERLAP = 0.05
@@ -58,11 +70,11 @@ class Camera:
     """
 
     name: str
-    detectors: dict
-    field: tuple | None = None
+    detectors: dict[str, Detector]
+    field: tuple[int, int] | None = None
     common_sigma: np.ndarray | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not isinstance(self.detectors, dict) or not self.detectors:
             raise InputError(f"detectors must be a dict {{id: Detector}} with one at least, got {self.detectors!r}")
         for key, detector in self.detectors.items():
@@ -104,13 +116,13 @@ class Camera:
                         f"{100 * share:.0f} % of their area: correct the layouts (focal plane -> undistorted pixels)"
                     )
 
-    def __getitem__(self, key):
+    def __getitem__(self, key: str) -> Detector:
         """The `Detector` of an id."""
         if str(key) not in self.detectors:
             raise InputError(f"camera {self.name} has no detector {str(key)!r}; it has {', '.join(self.detectors)}")
         return self.detectors[str(key)]
 
-    def in_focal_plane(self, table):
+    def in_focal_plane(self, table: Table) -> QTable:
         """A table of positions on detectors with those in the focal plane in their place.
 
         Parameters
@@ -144,7 +156,7 @@ class Camera:
         table["xy_corr"] = covariance[:, 0, 1] / np.sqrt(covariance[:, 0, 0] * covariance[:, 1, 1])
         return table
 
-    def on_detectors(self, table):
+    def on_detectors(self, table: QTable) -> QTable:
         """A table that `in_focal_plane` made, as it was before."""
         table, detector = table.copy(), self.ids(table)
         f = np.stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)], axis=1)
@@ -161,7 +173,7 @@ class Camera:
         table.remove_columns(["x_detector", "y_detector"])
         return table
 
-    def ids(self, table):
+    def ids(self, table: Table) -> np.ndarray:
         """Detector of every row of a table, as strings; `InputError` if there is none, or one that is not known."""
         if "detector" not in table.colnames:
             raise InputError(
@@ -172,11 +184,11 @@ class Camera:
             self[key]  # refuses an unknown one
         return detector
 
-    def sees(self, f):
+    def sees(self, f: ArrayLike) -> np.ndarray:
         """Which positions f (n, 2) of the focal plane fall on each detector, bool (n_detectors, n)."""
         return np.array([each.sees(f) for each in self.detectors.values()])
 
-    def errors_in_focal_plane(self, f, errors):
+    def errors_in_focal_plane(self, f: ArrayLike, errors: ArrayLike) -> np.ndarray:
         """Errors (n, 2) at positions f (n, 2), of those measured on the detector there; unchanged off all detectors."""
         out = np.array(errors, dtype=float)
         for each, here in zip(self.detectors.values(), self.sees(f), strict=True):
@@ -184,7 +196,7 @@ class Camera:
             out[here] = np.sqrt(np.einsum("nab,nb->na", back**2, out[here] ** 2))
         return out
 
-    def groups(self, table):
+    def groups(self, table: Table) -> list[list[str]]:
         """Lists of detectors that have stars in common, directly or through others.
 
         Parameters
@@ -199,14 +211,14 @@ class Camera:
         _, group = connected_components(seen.astype(int) @ seen.T, directed=False)
         return [[str(key) for key in keys[group == g]] for g in np.unique(group)]
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         ny, nx = self.field
         return f"<Camera {self.name}: {len(self.detectors)} detectors in a focal plane of {nx} x {ny} px>"
 
-    def __str__(self):
+    def __str__(self) -> str:
         return "\n".join([repr(self)[1:-1], *self.table_lines()])
 
-    def table_lines(self):
+    def table_lines(self) -> list[str]:
         """Lines of a table of where the detectors lie, with the errors of that where it is not exact."""
         places = {key: each.place for key, each in self.detectors.items()}
         known = any(place.errors is not None for place in places.values())
@@ -227,7 +239,7 @@ class Camera:
         return lines
 
     @classmethod
-    def gsaoi(cls, *, size=GSAOI_SIZE):
+    def gsaoi(cls, *, size: int = GSAOI_SIZE) -> Camera:
         """The four detectors of GSAOI at Gemini South, "1" to "4", by the polynomials that DRAGONS uses.
 
         1 is the lower right one, 2 lower left, 3 upper left, 4 upper right. A pixel of the focal plane is 0.0197
@@ -253,7 +265,7 @@ class Camera:
             detectors[str(k)] = Detector(shape, layout=layout, static=static)
         return cls("GSAOI", detectors)
 
-    def of_detectors(self, exposures):
+    def of_detectors(self, exposures: Sequence[Exposure]) -> list[Exposure]:
         """Exposures whose detectors are in files of their own, with their `frame` and `detector`.
 
         The detector is the one that the header names (``CCDCHIP``, ``DETECTOR``, ``CHIP``, ``EXTVER`` or ``EXTNAME``),
@@ -271,7 +283,7 @@ class Camera:
             self.check(exposure)
         return exposures
 
-    def check(self, exposure):
+    def check(self, exposure: Exposure) -> None:
         """Raise `InputError` unless an exposure is of one of the detectors, by its id and shape."""
         key = exposure.detector
         if key is None:
@@ -291,7 +303,7 @@ class Camera:
             )
 
     @classmethod
-    def of_frames(cls, exposures):
+    def of_frames(cls, exposures: Sequence[Exposure]) -> Camera:
         """Camera by the headers of that of several exposures which has most detectors, as `from_exposures`.
 
         Parameters
@@ -305,7 +317,9 @@ class Camera:
         return cls.from_exposures(max(frames.values(), key=len))
 
     @classmethod
-    def from_exposures(cls, exposures, *, name=None):
+    def from_exposures(
+        cls, exposures: Mapping[str, Exposure] | Sequence[Exposure], *, name: str | None = None
+    ) -> Camera:
         """Camera from the WCSs of the detectors of one exposure (see `legdistort.cameras.from_wcs`).
 
         Parameters
@@ -323,27 +337,27 @@ class Camera:
         """
         return camera_of(cls, exposures, name)
 
-    def plot(self, *, ax=None, scale=None):
+    def plot(self, *, ax: Axes | None = None, scale: float | None = None) -> Axes:
         """Draw detectors, gaps and distortion (`legdistort.plots.camera_plots.plot_camera`); returns the axes."""
         from ..plots.camera_plots import plot_camera
 
         return plot_camera(self, ax=ax, scale=scale)
 
-    def to_meta(self):
+    def to_meta(self) -> dict[str, Any]:
         """The camera as plain numbers, lists and strings, for the header of a table file; see `from_meta`."""
         return storage.to_tree(self, plain=True)
 
     @classmethod
-    def from_meta(cls, meta):
+    def from_meta(cls, meta: Mapping[str, Any]) -> Camera:
         """The camera that `to_meta` wrote."""
         return storage.from_tree(meta, cls)
 
-    def write(self, path, *, overwrite=False):
+    def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
         """Write to an ASDF file of plain arrays, numbers and strings; returns the path."""
         return storage.write_camera(self, Path(path), overwrite=overwrite)
 
     @classmethod
-    def read(cls, path):
+    def read(cls, path: StrPath) -> Camera:
         """Read what `write` wrote.
 
         Raises

@@ -1,7 +1,10 @@
 """One detector of a camera: its size, where it lies in the focal plane, and its static distortion."""
 
+from __future__ import annotations
+
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +12,9 @@ from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
 from .source import check_shape
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 #: Points along an edge of its outline.
 _EDGE = 32
@@ -47,7 +53,7 @@ class Place:
     y: float
     rotation: float
     scale: float
-    errors: tuple | None
+    errors: tuple[float, ...] | None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,7 +84,7 @@ class Detector:
         For arrays of another shape, not finite, a layout without area, or a Prior of a detector of another shape.
     """
 
-    shape: tuple
+    shape: tuple[int, int]
     _: KW_ONLY
     layout: np.ndarray
     static: np.ndarray | None = None
@@ -86,7 +92,7 @@ class Detector:
     static_sigma: np.ndarray | None = None
     layout_covariance: np.ndarray | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         shape = check_shape(self.shape)
         layout = np.array(self.layout, dtype=float)
         if layout.shape != (2, 3) or not np.isfinite(layout).all() or np.linalg.det(layout[:, :2]) == 0:
@@ -107,15 +113,17 @@ class Detector:
             object.__setattr__(self, key, value)
 
     @cached_property
-    def distortion(self):
+    def distortion(self) -> Distortion:
         """The static `Distortion`: undistorted -> detector pixels."""
         return Distortion(self.static, self.shape)
 
-    def to_pixels(self, f):
+    def to_pixels(self, f: ArrayLike) -> np.ndarray:
         """Focal-plane pixels (n, 2) -> detector pixels (n, 2)."""
         return self.distortion(similarity.apply(self.layout, f))
 
-    def to_focal_plane(self, xy, covariance=None):
+    def to_focal_plane(
+        self, xy: ArrayLike, covariance: ArrayLike | None = None
+    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
         """Detector pixels (n, 2) -> focal-plane pixels (n, 2), exact; with covariances (n, 2, 2) a tuple of both.
 
         Raises
@@ -129,7 +137,7 @@ class Detector:
         back = np.linalg.inv(self.slope(f))
         return f, back @ covariance @ back.mT
 
-    def sees(self, f):
+    def sees(self, f: ArrayLike) -> np.ndarray:
         """Which positions f (n, 2) of the focal plane fall on it."""
         q, size = similarity.apply(self.layout, f), np.array(self.shape[::-1])
         near = np.all((q > -0.1 * size) & (q < 1.1 * size), axis=1)  # beyond that the series means nothing
@@ -137,12 +145,12 @@ class Detector:
         near[near] = np.all((xy >= -0.5) & (xy <= size - 0.5), axis=1)
         return near
 
-    def slope(self, f):
+    def slope(self, f: ArrayLike) -> np.ndarray:
         """Derivative (n, 2, 2) of the detector pixels by the focal-plane pixels f (n, 2)."""
         return self.distortion.jacobian(similarity.apply(self.layout, f)) @ self.layout[:, :2]
 
     @cached_property
-    def outline(self):
+    def outline(self) -> np.ndarray:
         """Its edge in the focal plane, from corner to corner, shape (n, 2)."""
         t = np.linspace(-1, 1, _EDGE)
         one = np.ones(_EDGE)
@@ -150,7 +158,7 @@ class Detector:
         return self.to_focal_plane(basis.denormalize(*sides.T, self.shape))
 
     @property
-    def place(self):
+    def place(self) -> Place:
         """The `Place` of the detector."""
         x, y = self.to_focal_plane(basis.denormalize(np.zeros(1), np.zeros(1), self.shape))[0]
         m, errors = self.layout[:, :2], None
@@ -167,11 +175,11 @@ class Detector:
         return Place(float(x), float(y), float(rotation), float(np.sqrt(abs(np.linalg.det(m)))), errors)
 
     @property
-    def rms(self):
+    def rms(self) -> float:
         """Root mean square of the static distortion over the detector, both axes, pixels."""
         return float(np.sqrt((self.static**2).sum()) / 2)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Detector: {self.shape[1]} x {self.shape[0]} px, static distortion {self.rms:.3g} px rms>"
 
 

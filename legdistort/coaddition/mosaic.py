@@ -1,10 +1,13 @@
 """The co-added image and its file."""
 
+from __future__ import annotations
+
 import bz2
 import gzip
 import re
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import asdf
 import numpy as np
@@ -19,6 +22,11 @@ from ..runtime.outputs import replacing
 from ..runtime.scratch import forget
 from ..runtime.words import PLANES
 from .combination import PixelFlag
+
+if TYPE_CHECKING:
+    from astropy.io.fits import HDUList
+
+    from ..runtime.annotations import StrPath
 
 _ENDING = re.compile(r"\.(?:(?P<asdf>asdf)|(?:fits|fit|fts)(?P<packed>\.gz|\.bz2)?)$", re.IGNORECASE)
 _PACKERS = {".gz": gzip.open, ".bz2": bz2.open}
@@ -74,16 +82,16 @@ class Mosaic:
     flags: np.ndarray
     context: np.ndarray
     wcs: WCS
-    exposures: tuple
-    left_out: dict = field(default_factory=dict)
-    offset: tuple | None = None
+    exposures: tuple[str, ...]
+    left_out: dict[str, str] = field(default_factory=dict)
+    offset: tuple[int, int] | None = None
     header: fits.Header = field(default_factory=fits.Header)
     extrapolated: np.ndarray | None = None
     rejected: np.ndarray | None = None
-    planes: tuple = tuple(PLANES)
+    planes: tuple[str, ...] = tuple(PLANES)
 
     @property
-    def mask(self):
+    def mask(self) -> np.ndarray:
         """Where there is no value, or only saturated ones: ndarray of bool, True = bad, as astropy has it."""
         found = np.empty(self.shape, dtype=bool)
         for start in range(0, len(found), _ROWS):  # the planes may be larger than the memory
@@ -93,7 +101,7 @@ class Mosaic:
             forget(self.flags)
         return found
 
-    def to_ccddata(self):
+    def to_ccddata(self) -> CCDData:
         """The mosaic as a `~astropy.nddata.CCDData`: unit, variance, `mask`, WCS, header.
 
         Its arrays are those of the mosaic, not copies. Without a unit (``BUNIT``) that astropy understands it is
@@ -109,16 +117,16 @@ class Mosaic:
         )
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, int]:
         """Image shape ``(ny, nx)``."""
         return self.data.shape
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         ny, nx = self.shape
         left_out = f", {len(self.left_out)} left out" if self.left_out else ""
         return f"<Mosaic: {nx} x {ny} px, {len(self.exposures)} exposures{left_out}>"
 
-    def contributors(self, x, y):
+    def contributors(self, x: int, y: int) -> tuple[str, ...]:
         """Names of the exposures that contribute to pixel (x, y) of the mosaic, 0-based.
 
         Raises
@@ -134,7 +142,7 @@ class Mosaic:
         planes = self.context[:, int(y), int(x)]
         return tuple(name for i, name in enumerate(self.exposures) if planes[i // 32] >> np.uint32(i % 32) & 1)
 
-    def to_hdulist(self):
+    def to_hdulist(self) -> HDUList:
         """The FITS file: image (primary HDU, ``SCI``), ``UNCERT``, ``MASK``, ``WEIGHT``, ``FOOTPRINT`` and the others.
 
         These are ``FLAGS``, ``EXTRAPOLATED``, ``REJECTED`` and ``CONTEXT``, as far as `planes` names them.
@@ -185,7 +193,7 @@ class Mosaic:
                 hdulist[name].header["BUNIT"] = ("", meaning)
         return hdulist
 
-    def write(self, path, *, overwrite=False):
+    def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
         """Write the mosaic as a FITS file (see `to_hdulist`), or as ASDF.
 
         The file appears under its name only when it is complete.

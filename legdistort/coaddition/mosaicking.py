@@ -1,7 +1,11 @@
 """Resample exposures with the solution's distortions and combine them."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,30 +25,38 @@ from .preparation import prepare
 from .resampling import engines, noise_gain, pixel_maps
 from .weights import make_weights, stellar_widths
 
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+    from astropy.wcs import WCS
+
+    from ..inputs.exposures import Exposure
+    from ..results.solution import Solution
+    from ..runtime.annotations import StrPath
+
 _STORED = 5  # bytes a pixel in the scratch folder, about
 _COARSE = 1.5  # pixels of the grid in those of an exposure from which interpolation leaves out too much
 
 
 def coadd(
-    exposures,
-    solution,
+    exposures: Sequence[Exposure],
+    solution: Solution,
     *,
-    method="mean",
-    order=3,
-    algorithm="interp",
-    grid=None,
-    conserve="flux",
-    match_background=True,
-    weights="noise",
-    scale="auto",
-    extrapolated="flag",
-    pixfrac=1.0,
-    kernel="square",
-    workers=None,
-    scratch=None,
-    planes=None,
-    progress=False,
-):
+    method: str = "mean",
+    order: int | str = 3,
+    algorithm: str = "interp",
+    grid: WCS | Header | None = None,
+    conserve: str = "flux",
+    match_background: bool = True,
+    weights: str | Mapping[str, Any] | None = "noise",
+    scale: str | Mapping[str, float] | None = "auto",
+    extrapolated: str = "flag",
+    pixfrac: float = 1.0,
+    kernel: str = "square",
+    workers: int | None = None,
+    scratch: StrPath | None = None,
+    planes: Sequence[str] | None = None,
+    progress: bool = False,
+) -> Mosaic:
     """Co-add exposures on the distortion-free reference plane, or on any celestial WCS.
 
     Parameters

@@ -5,14 +5,21 @@ detector coordinates). D is exact; the opposite direction has no closed form and
 Legendre tensor whose degree is raised until the round trip holds.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..exceptions import FoldError, InputError
 from . import basis
 from .models import CHUNK, correction_model
+
+if TYPE_CHECKING:
+    from astropy.modeling import Model
+    from numpy.typing import ArrayLike
 
 #: Largest round-trip error of a certified inverse, pixels.
 TOLERANCE = 1e-6
@@ -37,9 +44,9 @@ class Inverse:
 
     tensors: np.ndarray
     error: float
-    valid: tuple
+    valid: tuple[tuple[float, float], tuple[float, float]]
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Inverse: degree {self.tensors.shape[1] - 1}, error {self.error:.1e} px>"
 
 
@@ -66,11 +73,11 @@ class Distortion:
     """
 
     coefficients: np.ndarray
-    shape: tuple
+    shape: tuple[int, int]
     name: str = ""
     certified: Inverse | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         c = np.asarray(self.coefficients, dtype=float)
         if c.ndim != 2 or len(c) != 2 or not np.all(np.isfinite(c)):
             raise InputError(f"coefficients must be finite, of shape (2, n_modes), got shape {c.shape}")
@@ -80,20 +87,20 @@ class Distortion:
             self._check_certificate(self.certified)
 
     @property
-    def degree(self):
+    def degree(self) -> int:
         """Total degree."""
         return basis.degree_of(self.coefficients.shape[1])
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         ny, nx = self.shape
         return f"<Distortion{f' of {self.name}' if self.name else ''}: degree {self.degree}, {nx} x {ny} px>"
 
-    def __call__(self, q):
+    def __call__(self, q: ArrayLike) -> np.ndarray:
         """Undistorted pixels (n, 2) -> detector pixels (n, 2)."""
         q = np.asarray(q, dtype=float)
         return q + (self.coefficients @ basis.values(self.degree, *basis.normalize(q, self.shape))).T
 
-    def jacobian(self, q):
+    def jacobian(self, q: ArrayLike) -> np.ndarray:
         """Derivative dD/dq, shape (n, 2, 2), first index the detector axis."""
         return self._value_and_jacobian(np.asarray(q, dtype=float))[1]
 
@@ -107,7 +114,7 @@ class Distortion:
         jacobian[:, 1, 1] += 1
         return q + (self.coefficients @ b).T, jacobian
 
-    def invert(self, p, *, tolerance=1e-10, max_iterations=50):
+    def invert(self, p: ArrayLike, *, tolerance: float = 1e-10, max_iterations: int = 50) -> np.ndarray:
         """Detector pixels (n, 2) -> undistorted pixels by Newton's method.
 
         The scheme is that of the corrected positions, criterion J_3 of section 3.3.
@@ -152,7 +159,7 @@ class Distortion:
             f"degree {self.degree}?"
         )
 
-    def check_fold(self):
+    def check_fold(self) -> None:
         """Raise `FoldError` if the Jacobian determinant is below `FOLD` anywhere on the detector."""
         t = np.linspace(-1, 1, 8 * self.degree + 9)
         q = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), self.shape)
@@ -162,7 +169,7 @@ class Distortion:
             self._raise_fold(q[worst], f"folds (Jacobian determinant {determinant[worst]:.2f})")
 
     @cached_property
-    def inverse(self):
+    def inverse(self) -> Inverse:
         """The fitted `Inverse`, certified to `TOLERANCE` on a grid, random points, the edges and the corners.
 
         Raises
@@ -195,7 +202,7 @@ class Distortion:
             "the distortion is too strong or too ragged, lower the degree"
         )
 
-    def round_trip_error(self, tensors, p=None):
+    def round_trip_error(self, tensors: Any, p: np.ndarray | None = None) -> float:
         """Largest ``|D(E(p)) - p|`` [pix] of an inverse E given by its displacement tensors, over check points."""
         p = _check_points(self.shape) if p is None else p
         return float(np.abs(self(self._corrected(tensors, p)) - p).max())
@@ -218,11 +225,11 @@ class Distortion:
         if not np.allclose(box, inverse.valid, rtol=0, atol=1e-3):
             raise InputError(f"{whose} is said to be valid in {inverse.valid}, but the detector's image lies in {box}")
 
-    def correction_model(self):
+    def correction_model(self) -> Model:
         """Detector -> undistorted pixels as an astropy compound model, D attached as its inverse."""
         return correction_model(basis.to_tensor(self.coefficients), self.inverse, self.shape)
 
-    def model(self):
+    def model(self) -> Model:
         """D as an astropy compound model (undistorted -> detector pixels) with the certified inverse attached."""
         correction = self.correction_model()
         forward, correction.inverse = correction.inverse, None  # no circle of inverses: files would never end

@@ -5,10 +5,13 @@ polynomials from the DRAGONS reduction package; source and licence stand in
 ``data/gsaoi_static_distortion.json``.
 """
 
+from __future__ import annotations
+
 import json
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.modeling import models
@@ -16,6 +19,9 @@ from numpy.polynomial import polynomial
 
 from ..exceptions import FoldError, InputError
 from .similarity import apply, compose, describe, fit_similarity, invert
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 #: Pixels along a side of a GSAOI detector.
 GSAOI_SIZE = 2048
@@ -116,7 +122,7 @@ class GsaoiMap:
         return gsaoi_polynomials(self.detector)
 
     @cached_property
-    def similarity(self):
+    def similarity(self) -> np.ndarray:
         """S as a pose (2, 3): undistorted pixels -> arcsec."""
         nodes, weights = np.polynomial.legendre.leggauss(12)
         grid = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2)
@@ -129,20 +135,20 @@ class GsaoiMap:
         return pose
 
     @property
-    def pixel_scale(self):
+    def pixel_scale(self) -> float:
         """Size of an undistorted pixel, arcsec."""
         return describe(self.similarity)["scale"]
 
-    def to_arcsec(self, xy):
+    def to_arcsec(self, xy: ArrayLike) -> np.ndarray:
         """Detector pixels (..., 2), 0-based -> arcsec (..., 2): the published polynomials."""
         x, y = self._published_pixel(xy)
         return np.stack([polynomial.polyval2d(x, y, c) for c in self._coefficients], axis=-1)
 
-    def undistort(self, xy):
+    def undistort(self, xy: ArrayLike) -> np.ndarray:
         """Detector pixels (..., 2) -> undistorted pixels."""
         return apply(invert(self.similarity), self.to_arcsec(xy))
 
-    def distort(self, q):
+    def distort(self, q: ArrayLike) -> np.ndarray:
         """Undistorted pixels (..., 2) -> detector pixels, inverse of `undistort`.
 
         Raises

@@ -1,6 +1,9 @@
 """Where the reference plane lies on the sky, and the trigonometry of the sphere that this takes."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy import units as u
@@ -8,6 +11,13 @@ from astropy.coordinates import SkyCoord
 from astropy.modeling import models
 
 from .similarity import apply, invert
+
+if TYPE_CHECKING:
+    from astropy.modeling import Model
+    from astropy.units import Quantity
+    from numpy.typing import ArrayLike
+
+    from ..runtime.annotations import Shape
 
 
 def directions(lon, lat):
@@ -75,10 +85,10 @@ class TangentPlane:
     lat: float
     matrix: np.ndarray
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<TangentPlane: {self.lon:.5f} {self.lat:+.5f} deg, {self.pixel_scale:.4f} arcsec/px>"
 
-    def model(self):
+    def model(self) -> Model:
         """The astropy model (x, y) [pix] -> (ra, dec) [deg], stock parts only, inverse included."""
         m = np.asarray(self.matrix, dtype=float)
         plane = models.AffineTransformation2D(matrix=m[:, :2], translation=m[:, 2], name="plane")
@@ -86,16 +96,16 @@ class TangentPlane:
         return plane | sky
 
     @property
-    def pixel_scale(self):
+    def pixel_scale(self) -> float:
         """Size of a reference-plane pixel, arcsec."""
         return 3600 * np.sqrt(abs(np.linalg.det(self.matrix[:, :2])))
 
-    def to_sky(self, xy):
+    def to_sky(self, xy: ArrayLike) -> SkyCoord:
         """Reference-plane positions (n, 2) -> `~astropy.coordinates.SkyCoord` (ICRS)."""
         xy = np.asarray(xy, dtype=float)
         return SkyCoord(*self.model()(xy[..., 0], xy[..., 1]) * u.deg, frame="icrs")
 
-    def jacobian(self, xy):
+    def jacobian(self, xy: ArrayLike) -> np.ndarray:
         """Derivative of (ra cos(dec), dec) [deg] by (x, y) [pix] at reference positions (n, 2), shape (n, 2, 2).
 
         The direction to a point of the plane is ``s = (s0 + xi e + eta n) / N``; what changes along s itself is of
@@ -108,7 +118,7 @@ class TangentPlane:
         s = (directions(lon, lat) + plane @ axes) / length[:, None]
         return np.stack(compass(*angles(s)), axis=1) @ axes.T @ self.matrix[:, :2] / length[:, None, None]
 
-    def orientation(self, pose, shape):
+    def orientation(self, pose: ArrayLike, shape: Shape) -> tuple[float, float]:
         """How a detector lies on the sky, at its centre, its distortion aside.
 
         Parameters
@@ -131,7 +141,7 @@ class TangentPlane:
         angle = np.degrees(np.arctan2(east[1], north[1]))
         return float((angle + 180) % 360 - 180), float(3600 * np.sqrt(abs(np.linalg.det(slope))))
 
-    def to_sky_errors(self, xy, variance):
+    def to_sky_errors(self, xy: ArrayLike, variance: ArrayLike) -> tuple[Quantity, Quantity, np.ndarray]:
         """Errors on the sky of positions (n, 2) with variances (3, n) ``xx, yy, xy`` [pix^2].
 
         Returns
@@ -148,7 +158,7 @@ class TangentPlane:
         corr = covariance[:, 0, 1] / (ra_error * dec_error)
         return (ra_error * u.deg).to(u.mas), (dec_error * u.deg).to(u.mas), corr
 
-    def from_sky(self, coordinates):
+    def from_sky(self, coordinates: SkyCoord) -> np.ndarray:
         """`~astropy.coordinates.SkyCoord` -> reference-plane positions (..., 2); inverse of `to_sky`."""
         icrs = coordinates.icrs
         return np.stack(self.model().inverse(icrs.ra.deg, icrs.dec.deg), axis=-1)

@@ -1,5 +1,7 @@
 """Images from FITS files, HDU lists, NDData and others: read at once, or when their pixels are needed."""
 
+from __future__ import annotations
+
 import contextlib
 import glob
 import hashlib
@@ -7,9 +9,11 @@ import logging
 import re
 import threading
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.io import fits
@@ -28,6 +32,11 @@ from .exposures import LEAVE_OUT, Exposure, known_from_header
 from .foreign_images import from_nddata, is_nddata, read_roman
 from .pixel_flags import bad_pixels, good_bits
 from .sky_wcs import believable_wcs
+
+if TYPE_CHECKING:
+    from astropy.wcs.wcsapi import BaseHighLevelWCS
+
+    from ..runtime.annotations import Extension, Images
 
 log = logging.getLogger(__name__)
 
@@ -72,8 +81,8 @@ class ExposureFile:
     """
 
     name: str
-    shape: tuple
-    wcs: object
+    shape: tuple[int, int]
+    wcs: BaseHighLevelWCS | None
     header: fits.Header
     saturation: float | None
     gain: float | None
@@ -82,14 +91,14 @@ class ExposureFile:
     path: Path
     checksum: str
     pixels: str
-    identity: tuple
-    ext: object = None
+    identity: tuple[Any, ...]
+    ext: Extension | None = None
     has_gwcs: bool = False
     dq_good: int | None = None
     frame: str | None = None
     detector: str | None = None
 
-    def read(self):
+    def read(self) -> Exposure:
         """The `Exposure` with its pixels; what else is known is not worked out again.
 
         Raises
@@ -123,7 +132,13 @@ class ExposureFile:
 _SHARED = {field.name for field in fields(Exposure)} & {field.name for field in fields(ExposureFile)}
 
 
-def read_exposures(paths, *, ext=None, dq_good=None, progress=False):
+def read_exposures(
+    paths: Images,
+    *,
+    ext: Extension | None = None,
+    dq_good: int | str | Sequence[int] | None = None,
+    progress: bool = False,
+) -> list[Exposure]:
     """Read images.
 
     The name of an exposure is the base name of its file without ``.fits``, ``.fit``, ``.fts`` and
@@ -165,7 +180,15 @@ def read_exposures(paths, *, ext=None, dq_good=None, progress=False):
     return _read_each(paths, partial(_read, good=good_bits(dq_good)), ext, progress)
 
 
-def open_exposures(paths, *, ext=None, dq_good=None, left_out=None, stop_at_bad=False, progress=False):
+def open_exposures(
+    paths: Images,
+    *,
+    ext: Extension | None = None,
+    dq_good: int | str | Sequence[int] | None = None,
+    left_out: dict[str, str] | None = None,
+    stop_at_bad: bool = False,
+    progress: bool = False,
+) -> list[ExposureFile | Exposure]:
     """Exposures for work on more images than the memory holds.
 
     Every file is read once, so that it is known to be sound, and read again when its pixels are needed; what is in

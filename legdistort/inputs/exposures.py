@@ -1,15 +1,21 @@
 """One image and what is known about it, from its header where that is to be believed."""
 
+from __future__ import annotations
+
 import logging
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy.io import fits
 
 from ..exceptions import DamagedError, InputError
 from .exposure_names import check_exposure_name
+
+if TYPE_CHECKING:
+    from astropy.wcs.wcsapi import BaseHighLevelWCS
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +72,7 @@ class Exposure:
     data: np.ndarray
     mask: np.ndarray | None = None
     uncertainty: np.ndarray | None = None
-    wcs: object = None
+    wcs: BaseHighLevelWCS | None = None
     header: fits.Header = field(default_factory=fits.Header)
     saturation: float | None = None
     gain: float | None = None
@@ -77,7 +83,7 @@ class Exposure:
     frame: str | None = None
     detector: str | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_exposure_name(self.name, self.path)
         data = _as_float(np.asarray(self.data), self.name)
         mask = ~np.isfinite(data)
@@ -103,15 +109,15 @@ class Exposure:
         return plane
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, int]:
         """Image shape ``(ny, nx)``."""
         return self.data.shape
 
-    def read(self):
+    def read(self) -> Exposure:
         """The exposure itself: it has its pixels already (see `legdistort.open_exposures`)."""
         return self
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         ny, nx = self.shape
         words = [f"{nx} x {ny} px", f"{np.count_nonzero(self.mask)} masked"]
         words += [

@@ -1,7 +1,11 @@
 """Matched positions: which detection of which exposure is which star, and roughly where everything lies."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy import units as u
@@ -14,6 +18,13 @@ from ..geometry.epochs import exposure_years
 from ..geometry.tangent_plane import TangentPlane
 from ..runtime.checks import check_choice
 from . import column_contract, exposure_names, repetitions, start_poses
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+    from numpy.typing import ArrayLike
+
+    from ..cameras.camera import Camera
+    from ..runtime.annotations import Shape
 
 #: Positions belong on their detector, give or take this part of its size: distortions move stars over its edge.
 MARGIN = 0.1
@@ -48,7 +59,7 @@ class Observations:
     """
 
     table: QTable
-    names: tuple
+    names: tuple[str, ...]
     stars: np.ndarray
     exposure: np.ndarray
     star: np.ndarray
@@ -56,7 +67,7 @@ class Observations:
     covariance: np.ndarray
 
     @classmethod
-    def of(cls, table):
+    def of(cls, table: Table) -> Observations:
         """Those of a table that keeps the contract of matched positions."""
         names, exposure = _first_seen(table["exposure"])
         stars, star = _ranked(table["star"])
@@ -96,31 +107,31 @@ class Matches:
     """
 
     table: QTable
-    shapes: dict
-    poses: dict
+    shapes: dict[str, tuple[int, int]]
+    poses: dict[str, np.ndarray]
     sky: TangentPlane | None = None
-    left_out: dict = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
     epoch: float | None = None
     header_distortion: str | None = None
     observations: Observations | None = None
-    camera: object = None
+    camera: Camera | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.observations is None or self.observations.table is not self.table:
             object.__setattr__(self, "observations", Observations.of(self.table))
 
     @property
-    def names(self):
+    def names(self) -> tuple[str, ...]:
         """Exposure names, in the order in which they first appear."""
         return self.observations.names
 
     @property
-    def stars(self):
+    def stars(self) -> np.ndarray:
         """Star identifiers, sorted."""
         return self.observations.stars
 
     @cached_property
-    def positions(self):
+    def positions(self) -> np.ndarray:
         """Rough reference positions (n_stars, 2): mean of the measured ones carried back by the poses."""
         obs = self.observations
         back = np.empty_like(obs.xy)
@@ -130,7 +141,7 @@ class Matches:
         return start_poses.star_means(back, obs.star, len(self.stars))
 
     @cached_property
-    def times(self):
+    def times(self) -> tuple[np.ndarray, str]:
         """Times (n_exposures,) from the first exposure on, and their unit, by the column ``epoch``.
 
         In "days"; in "exposures", their order, where it is of one night and tells no more than half of them apart.
@@ -145,7 +156,7 @@ class Matches:
         return np.arange(n, dtype=float), "exposures"
 
     @cached_property
-    def epochs(self):
+    def epochs(self) -> np.ndarray | None:
         """Years (n_exposures,) of the exposures, by the column ``epoch``.
 
         Raises
@@ -160,7 +171,7 @@ class Matches:
             )
         return exposure_years(self.names, self.observations.exposure, column_contract.values(self.table, "epoch", u.yr))
 
-    def without(self, reasons):
+    def without(self, reasons: Mapping[str, str]) -> Matches:
         """The same matches without some exposures, ``{name: reason}``, which join `left_out`.
 
         Raises
@@ -179,7 +190,7 @@ class Matches:
         known["camera"] = self.camera
         return type(self).from_table(table, shape=self.shapes, poses=kept, **known)
 
-    def to_meta(self):
+    def to_meta(self) -> dict[str, Any]:
         """Shapes, poses and sky as plain lists, for the header of a table file; see `read_meta`."""
         sky = self.sky
         return {
@@ -192,7 +203,7 @@ class Matches:
         }
 
     @staticmethod
-    def read_meta(meta):
+    def read_meta(meta: Mapping[str, Any]) -> dict[str, Any]:
         """What `to_meta` wrote, as arguments ``poses``, ``sky``, ``left_out``, ``epoch`` of `from_table`."""
         given, sky = meta.get("poses"), meta.get("sky")
         return {
@@ -202,23 +213,23 @@ class Matches:
             "epoch": meta.get("epoch"),
         }
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Matches: {len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures>"
 
     @classmethod
     def from_table(
         cls,
-        table,
+        table: Table,
         *,
-        shape=None,
-        poses=None,
-        columns=None,
-        sky=None,
-        left_out=None,
-        epoch=None,
-        allow_copies=False,
-        camera=None,
-    ):
+        shape: Shape | Mapping[str, Shape] | None = None,
+        poses: Mapping[str, ArrayLike] | None = None,
+        columns: Mapping[str, str] | None = None,
+        sky: TangentPlane | None = None,
+        left_out: Mapping[str, str] | None = None,
+        epoch: float | None = None,
+        allow_copies: bool = False,
+        camera: Camera | None = None,
+    ) -> Matches:
         """Matches from anybody's table.
 
         Parameters

@@ -1,7 +1,11 @@
 """Detections of all exposures -> matches: the same star gets the same number, every exposure its nominal pose."""
 
+from __future__ import annotations
+
 import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy import units as u
@@ -23,6 +27,12 @@ from .options import MatchOptions
 from .star_labels import label_stars
 from .star_lists import StarList
 
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from ..inputs.exposures import Exposure
+    from ..runtime.annotations import Shape
+
 log = logging.getLogger(__name__)
 
 #: Fewest detections with which an exposure can take part.
@@ -32,18 +42,18 @@ FEW_HOT = 0.05
 
 
 def match(
-    detections,
+    detections: Table,
     *,
-    exposures=None,
-    shape=None,
-    camera=None,
-    min_exposures=4,
-    columns=None,
-    tolerance=None,
-    reject_flags=UNUSABLE,
-    isolation=LIMIT,
-    progress=False,
-):
+    exposures: Sequence[Exposure] | None = None,
+    shape: Shape | Mapping[str, Shape] | None = None,
+    camera: Camera | None = None,
+    min_exposures: int = 4,
+    columns: Mapping[str, str] | None = None,
+    tolerance: float | None = None,
+    reject_flags: int = UNUSABLE,
+    isolation: float | None = LIMIT,
+    progress: bool = False,
+) -> Matches:
     """Find out which detections are the same star.
 
     Exposures may differ by any shift that leaves an overlap, any rotation, a flip, several per cent of scale

@@ -1,7 +1,11 @@
 """Noise curves of exposures, by measuring stars put into them as `legdistort.measure` measures all others."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.table import vstack
@@ -14,10 +18,21 @@ from .noise_curves import NoiseCurves
 from .options import MeasureOptions
 from .positions import measure_exposure, warn_of_psf
 
+if TYPE_CHECKING:
+    from ..inputs.exposures import Exposure
+
 
 def calibrate_noise(
-    exposures, *, fluxes=None, fwhm=None, n_positions=100, seed=0, measuring=None, workers=None, progress=False
-):
+    exposures: Exposure | Sequence[Exposure],
+    *,
+    fluxes: Sequence[float] | None = None,
+    fwhm: float | Sequence[float] | None = None,
+    n_positions: int = 100,
+    seed: int = 0,
+    measuring: Mapping[str, Any] | None = None,
+    workers: int | None = None,
+    progress: bool = False,
+) -> NoiseCurves:
     """Find the error of a position as a function of flux, by putting stars into the real background.
 
     As in section 5.2.2 of Bernard et al. 2017: stars of given flux are added at known random positions, with photon

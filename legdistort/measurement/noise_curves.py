@@ -4,9 +4,12 @@ Bernard et al. 2017, section 5.2.2 and Figure "noiseflux". Where sky and detecto
 star's own photons do, as 1/sqrt(flux): ``sigma^2 = (a / flux)^2 + b^2 / flux + floor^2``.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy import units as u
@@ -17,6 +20,13 @@ from ..exceptions import InputError
 from ..inputs.table_files import write_table
 from ..runtime.checks import check_choice, first_line
 from ..runtime.words import POSITION_ERRORS
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+    from matplotlib.axes import Axes
+    from numpy.typing import ArrayLike
+
+    from ..runtime.annotations import StrPath
 
 #: Where the errors of `legdistort.measure` come from: the fit, the curve, or the fit scaled to the curve.
 #: A level of flux counts if this part of its stars was found, and so many.
@@ -48,30 +58,30 @@ class NoiseCurves:
 
     table: QTable
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         missing = [name for name in _COLUMNS if name not in self.table.colnames]
         if missing or not len(self.table):
             what = f"no column {missing[0]!r}" if missing else "no rows"
             raise InputError(f"this is no table of noise curves: {what}; make one with calibrate_noise")
 
     @property
-    def exposures(self):
+    def exposures(self) -> tuple[str, ...]:
         """Names of the exposures."""
         return list(dict.fromkeys(self.table["exposure"].tolist()))
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         widths, fluxes = np.unique(self.laws["fwhm"].value), np.unique(self.table["flux"])
         words = f"{len(self.exposures)} exposures, {len(widths)} widths, fluxes {fluxes[0]:.3g} to {fluxes[-1]:.3g}"
         return f"<NoiseCurves: {words}>"
 
-    def __str__(self):
+    def __str__(self) -> str:
         laws = self.laws["exposure", "fwhm", "x_a", "x_b", "x_floor", "y_a", "y_b", "y_floor", "knee"]
         for name in laws.colnames[1:]:
             laws[name].info.format = ".4g"
         return "\n".join([repr(self)[1:-1], *laws.pformat(max_lines=-1, max_width=-1)])
 
     @cached_property
-    def laws(self):
+    def laws(self) -> QTable:
         """Laws fitted to the robust errors, one row an exposure and width.
 
         Columns ``exposure``, ``fwhm`` [pix]; for either axis ``x_a`` [pix x flux], ``x_b`` [pix x sqrt(flux)],
@@ -92,7 +102,9 @@ class NoiseCurves:
                 rows.append(row)
         return QTable(rows)
 
-    def sigma(self, flux, *, fwhm=None, exposure=None, axis=None):
+    def sigma(
+        self, flux: ArrayLike, *, fwhm: float | None = None, exposure: str | None = None, axis: str | None = None
+    ) -> np.ndarray:
         """Error of a position by the fitted law.
 
         Parameters
@@ -147,7 +159,7 @@ class NoiseCurves:
         own = self.table.meta.get("fwhm", {}).get(exposure) or np.median(widths)
         return widths[np.argmin(np.abs(widths - own))]
 
-    def apply(self, table, source):
+    def apply(self, table: Table, source: str) -> QTable:
         """A table of detections with its errors replaced.
 
         Parameters
@@ -188,18 +200,18 @@ class NoiseCurves:
             np.log(flux), np.log(levels["flux"][order]), ratio[order]
         )
 
-    def plot(self, *, exposure=None, ax=None):
+    def plot(self, *, exposure: str | None = None, ax: Axes | None = None) -> Axes:
         """Errors against flux with the fitted laws and both regimes (Figure "noiseflux"); returns the axes."""
         from ..plots.noise_plots import plot_noise
 
         return plot_noise(self, exposure=exposure, ax=ax)
 
-    def write(self, path, *, overwrite=False):
+    def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
         """Write the table as ECSV."""
         write_table(self.table, path, overwrite=overwrite)
 
     @classmethod
-    def read(cls, path):
+    def read(cls, path: StrPath) -> NoiseCurves:
         """Read what `write` wrote; `InputError` if it is something else."""
         if not Path(path).is_file():
             raise InputError(f"{path} does not exist")

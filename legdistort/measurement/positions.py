@@ -1,10 +1,13 @@
 """Positions of stars, and how well every one is known."""
 
+from __future__ import annotations
+
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from astropy import units as u
@@ -27,6 +30,10 @@ from .profiles import frame_fit, moffat
 from .profiles.cutouts import Stamps, box_half
 from .profiles.location import locate_stars
 
+if TYPE_CHECKING:
+    from ..inputs.exposures import Exposure
+    from ..runtime.annotations import StrPath
+
 log = logging.getLogger(__name__)
 
 _COLUMNS = ("x", "y", "x_err", "y_err", "xy_corr", "flux", "flux_err", "fwhm", "chi2")
@@ -34,23 +41,23 @@ _PIXELS = ("x", "y", "x_err", "y_err", "fwhm")
 
 
 def measure(
-    exposures,
+    exposures: Exposure | Sequence[Exposure],
     *,
-    fwhm=None,
-    threshold=5.0,
-    max_stars=None,
-    box=None,
-    profile="own",
-    blends="together",
-    gain=None,
-    read_noise=None,
-    saturation=None,
-    errors="fit",
-    psf="auto",
-    write_psf=None,
-    workers=None,
-    progress=False,
-):
+    fwhm: float | None = None,
+    threshold: float = 5.0,
+    max_stars: int | None = None,
+    box: int | None = None,
+    profile: str = "own",
+    blends: str = "together",
+    gain: float | None = None,
+    read_noise: float | None = None,
+    saturation: float | None = None,
+    errors: str = "fit",
+    psf: Any = "auto",
+    write_psf: StrPath | None = None,
+    workers: int | None = None,
+    progress: bool = False,
+) -> QTable:
     """Detect stars and measure their positions by fitting elliptical Moffat profiles, or the effective PSF.
 
     Stars are peaks of the image filtered with a Gaussian of the width of the stars, the local light (sky, halos) taken
@@ -158,7 +165,16 @@ def _check_psf_folder(folder, exposures):
                 ) from None
 
 
-def effective_psf(exposure, *, fwhm=None, threshold=5.0, box=None, gain=None, read_noise=None, saturation=None):
+def effective_psf(
+    exposure: Exposure,
+    *,
+    fwhm: float | None = None,
+    threshold: float = 5.0,
+    box: int | None = None,
+    gain: float | None = None,
+    read_noise: float | None = None,
+    saturation: float | None = None,
+) -> EffectivePSF:
     """Make the effective PSF of an exposure from its bright, isolated, unsaturated stars.
 
     Positions of the stars and the oversampled grid are fitted together (Anderson & King 2000, PASP 112, 1360); how much

@@ -1,13 +1,24 @@
 """What is known of the distortion beforehand."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from numbers import Real
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..cameras.source import check_shape
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from ..inputs.exposures import Exposure
+    from ..runtime.annotations import Extension, Shape, StrPath
 
 #: As `sigma` of a `Prior`: to be found from the exposures.
 EVIDENCE = "evidence"
@@ -95,12 +106,12 @@ class Prior:
     _: KW_ONLY
     sigma: np.ndarray | str | None = None
     static_sigma: np.ndarray | float | None = None
-    shape: tuple | None = None
+    shape: tuple[int, int] | None = None
     truncation: float = 0.0
     plane: np.ndarray | None = None
-    source: str | dict | None = None
+    source: str | dict[str, Any] | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.mean is None:
             object.__setattr__(self, "static_sigma", _declared(self.sigma, self.static_sigma))
             return
@@ -118,11 +129,11 @@ class Prior:
             object.__setattr__(self, name, _per_mode(getattr(self, name), mean.shape[1], name))
 
     @property
-    def degree(self):
+    def degree(self) -> int:
         """Total degree of the mean; 0 without one."""
         return 0 if self.mean is None else basis.degree_of(self.mean.shape[1])
 
-    def static_widths(self, degree):
+    def static_widths(self, degree: int) -> np.ndarray:
         """Uncertainty (2, n_modes) of the static distortion to a total degree, pixels; zero where it is exact.
 
         Infinite where nothing is stated.
@@ -133,7 +144,7 @@ class Prior:
             return np.full((2, basis.n_modes(degree)), np.inf)
         return basis.change_degree(np.zeros((2, 1)) if self.static_sigma is None else self.static_sigma, degree)
 
-    def describe(self):
+    def describe(self) -> dict[str, Any]:
         """Everything but the mean as plain numbers and strings, as files of solutions keep it."""
         widths = {"sigma": self.sigma, "static_sigma": self.static_sigma}
         return {
@@ -145,7 +156,7 @@ class Prior:
         }
 
     @property
-    def in_numbers(self):
+    def in_numbers(self) -> np.ndarray | None:
         """`sigma` as an array, or None.
 
         Raises
@@ -159,7 +170,7 @@ class Prior:
             )
         return self.sigma
 
-    def with_sigma(self, sigma, *, degree=0):
+    def with_sigma(self, sigma: ArrayLike | None, *, degree: int = 0) -> Prior:
         """The same prior with another scatter `sigma`, its mean taken as zero from its own degree up to `degree`."""
         degree = max(self.degree, degree)
         if np.ndim(sigma):  # of modes beyond those given nothing is known
@@ -171,7 +182,7 @@ class Prior:
         static = None if self.static_sigma is None else basis.change_degree(self.static_sigma, degree)
         return replace(self, mean=basis.change_degree(self.mean, degree), sigma=sigma, static_sigma=static)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         if self.mean is None:
             return f"<Prior: not known, {self.static_sigma:g} px a mode>"
         words = [f"degree {self.degree}", f"{self.mean.shape[1]} modes an axis"]
@@ -179,7 +190,7 @@ class Prior:
         return f"<Prior: {', '.join(words)}>"
 
     @property
-    def rms(self):
+    def rms(self) -> np.ndarray:
         """Root mean square of the mean over the detector [pix], x and y; zero without one."""
         if self.mean is None:
             return np.zeros(2)
@@ -188,18 +199,18 @@ class Prior:
     @classmethod
     def from_model(
         cls,
-        model,
+        model: Any,
         *,
-        shape=None,
-        direction=None,
-        origin=None,
-        frame=None,
-        degree=5,
-        parity=None,
-        offset=None,
-        sigma=None,
-        static_sigma=None,
-    ):
+        shape: Shape | None = None,
+        direction: str | None = None,
+        origin: int | None = None,
+        frame: str | None = None,
+        degree: int = 5,
+        parity: int | None = None,
+        offset: tuple[float, float] | None = None,
+        sigma: ArrayLike | str | None = None,
+        static_sigma: ArrayLike | None = None,
+    ) -> Prior:
         """Prior from a model, WCS, aperture or function of a detector's static distortion.
 
         The map may end in any plane (arcsec, degrees, pixels): the similarity between that plane and the detector
@@ -255,7 +266,14 @@ class Prior:
         return cls(mean, sigma=sigma, static_sigma=static_sigma, **known)
 
     @classmethod
-    def from_file(cls, where, *, ext=None, frame=None, **options):
+    def from_file(
+        cls,
+        where: StrPath | Sequence[StrPath],
+        *,
+        ext: Extension | None = None,
+        frame: str | None = None,
+        **options: Any,
+    ) -> Prior:
         """Prior from a file, or a name, of any kind that is recognised.
 
         Parameters
@@ -280,7 +298,14 @@ class Prior:
         return open_prior(where, cls, ext=ext, frame=frame, **options)
 
     @classmethod
-    def from_headers(cls, exposures, *, degree=3, sigma=None, static_sigma=None):
+    def from_headers(
+        cls,
+        exposures: Sequence[Exposure],
+        *,
+        degree: int = 3,
+        sigma: ArrayLike | str | None = None,
+        static_sigma: ArrayLike | None = None,
+    ) -> Prior | dict[str, Prior]:
         """Prior from the distortions that the headers of exposures have, as `legdistort.solve` takes it.
 
         Read are SIP, TPV, look-up tables and what else astropy reads; a gwcs in an extension ``ASDF`` goes before them.
@@ -313,14 +338,14 @@ class Prior:
 
         return from_headers(exposures, cls, degree=degree, sigma=sigma, static_sigma=static_sigma)
 
-    def write(self, path, *, overwrite=False):
+    def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
         """Write everything to an ASDF file (`legdistort.priors.storage`)."""
         from .storage import write_prior
 
         return write_prior(self, path, overwrite=overwrite)
 
     @classmethod
-    def read(cls, path):
+    def read(cls, path: StrPath) -> Prior:
         """Read what `write` wrote."""
         from .storage import read_prior
 
@@ -356,11 +381,11 @@ class HeaderPrior:
     static_sigma: np.ndarray | None = None
 
     @property
-    def stand_in(self):
+    def stand_in(self) -> Prior:
         """A prior with the same widths, for checks before a header is read."""
         return Prior([[0.0], [0.0]], **vars(self))
 
-    def read(self, exposures, degree):
+    def read(self, exposures: Sequence[Exposure], degree: int | str) -> Prior | dict[str, Prior]:
         """The prior, or dict of priors; `degree` may be a word."""
         return Prior.from_headers(exposures, degree=3 if isinstance(degree, str) else degree, **vars(self))
 

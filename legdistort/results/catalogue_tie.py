@@ -1,11 +1,17 @@
 """How a reference catalogue tied a solution."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..geometry import basis
 from ..geometry.detector_modes import dynamic_basis, dynamic_degrees, similarity_basis
+
+if TYPE_CHECKING:
+    from ..runtime.annotations import Shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +47,12 @@ class Tie:
     ratio: float
 
     @property
-    def rms(self):
+    def rms(self) -> float:
         """Rms of the used offsets per axis, pixels; rounding is none."""
         return round(float(np.sqrt(np.mean(self.offsets[self.used] ** 2))), 9)
 
     @property
-    def sentence(self):
+    def sentence(self) -> str:
         """What was used, in a sentence."""
         out = self.stars[~self.used]
         words = f"tied to {np.count_nonzero(self.used)} stars of a reference, {self.rms:.2g} px rms per axis from it"
@@ -56,11 +62,11 @@ class Tie:
         return words
 
     @property
-    def alone(self):
+    def alone(self) -> bool:
         """Whether a single star tells the shift, and nothing else."""
         return self.measured[0] < 1
 
-    def errors(self, size):
+    def errors(self, size: Shape) -> list[tuple[str, int, float]]:
         """Name, number of modes and error [px, rms over the field and axis] by degree, as a list.
 
         NaN for rotation and scale if the reference does not tell them. `size` (ny, nx) is that of the box of the modes.
@@ -76,7 +82,7 @@ class Tie:
             for name, part in groups.items()
         ]
 
-    def words(self, convention):
+    def words(self, convention: str) -> str:
         """What pins the modes of every degree, ``{name as in errors: words}``."""
         out = {"shift" if self.alone else "shift, rotation, scale": "the reference"}
         for degree, share in enumerate(self.measured[1:], start=1):
@@ -85,12 +91,12 @@ class Tie:
         return out
 
     @property
-    def statement(self):
+    def statement(self) -> str:
         """What was used and how well it agrees, in sentences."""
         told = "" if np.isnan(self.ratio) else f" (chi2 {self.ratio:.2g} per degree of freedom)"
         return f"The plane is {self.sentence}{told}."
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Tie: {np.count_nonzero(self.used)} of {len(self.used)} reference stars, {self.rms:.2g} px rms>"
 
 

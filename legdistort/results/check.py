@@ -1,5 +1,7 @@
 """What is checked of a result: one question a referee would ask, the answer, and what to do about it."""
 
+from __future__ import annotations
+
 import textwrap
 from dataclasses import dataclass
 from math import isfinite
@@ -34,13 +36,13 @@ class Check:
     sentence: str
     cure: str = ""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("value", "limit"):
             number = getattr(self, name)
             if number is not None:  # plain numbers, as files and JSON have them
                 object.__setattr__(self, name, float(number) if isfinite(number) else None)
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f"{self.state:7s} {self.name}: {self.sentence}{'; ' * bool(self.cure)}{self.cure}"
 
 

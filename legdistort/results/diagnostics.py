@@ -1,8 +1,14 @@
 """What `solve` found out beside the solution itself, in numbers and in words."""
 
+from __future__ import annotations
+
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 #: Twice the gain in the logarithm of the likelihood from which stars count as moving. Without motions it has the
 #: distribution of half a chi2 with one degree of freedom: 0.5 % of motionless sets exceed it
@@ -34,9 +40,9 @@ class AliasedDegree:
     noise: float
     excess: float
     energy: float
-    folds_into: tuple
-    mode: tuple
-    into: tuple
+    folds_into: tuple[float, ...]
+    mode: tuple[int, int]
+    into: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -59,10 +65,10 @@ class DegreeChoice:
     """
 
     degree: int
-    degrees: tuple
-    scores: tuple
+    degrees: tuple[int, ...]
+    scores: tuple[float, ...]
     n_folds: int
-    aliasing: tuple
+    aliasing: tuple[AliasedDegree, ...]
     alarm: bool
     sentence: str
 
@@ -90,7 +96,7 @@ class Validation:
     expected: float
     ratio: float
 
-    def __str__(self):
+    def __str__(self) -> str:
         return (
             f"{self.n_stars} stars, {self.n_observations} observations: they scatter by {self.scatter:.4f} px "
             f"per axis, {self.expected:.4f} expected from the errors (ratio {self.ratio:.2f})"
@@ -133,9 +139,9 @@ class ErrorLaw:
     a: float
     b: float
     floor: float
-    factors: dict
+    factors: dict[str, float]
 
-    def sigma(self, flux, exposure=None):
+    def sigma(self, flux: ArrayLike, exposure: ArrayLike | None = None) -> np.ndarray:
         """Error [pix] of positions with a flux (n,), in the exposures named (n,); by default of the average one."""
         flux = np.asarray(flux, dtype=float)
         sigma = np.sqrt((self.a / flux) ** 2 + self.b**2 / flux + self.floor**2)
@@ -143,11 +149,11 @@ class ErrorLaw:
             return sigma
         return sigma * np.array([self.factors.get(name, 1.0) for name in np.asarray(exposure).tolist()])
 
-    def scaled(self, factor):
+    def scaled(self, factor: float) -> ErrorLaw:
         """The law with all errors multiplied."""
         return ErrorLaw(self.a * factor, self.b * factor, self.floor * factor, self.factors)
 
-    def __str__(self):
+    def __str__(self) -> str:
         factors = list(self.factors.values())
         return (
             f"by brightness, from the scatter of the stars: sqrt(({self.a:.4g} / flux)^2 + {self.b:.4g}^2 / flux + "
@@ -179,11 +185,11 @@ class MotionScatter:
     n_stars: int
 
     @property
-    def is_there(self):
+    def is_there(self) -> bool:
         """Whether stars move beyond doubt."""
         return self.gain > MOVING
 
-    def __str__(self):
+    def __str__(self) -> str:
         seen = f"{self.n_stars} stars, twice the gain in log-likelihood {self.gain:.3g}, {MOVING} needed"
         if self.is_there:
             return f"stars move: proper motions scatter by {self.sigma:.2g} px/yr per axis ({seen})"
@@ -227,16 +233,16 @@ class CorrelatedErrors:
     derivatives: int = 0
 
     @property
-    def scale(self):
+    def scale(self) -> float:
         """Distance at which u of the correlation is 1."""
         return self.length / FOLDING[self.derivatives]
 
-    def correlation(self, distance):
+    def correlation(self, distance: ArrayLike) -> np.ndarray:
         """Correlation of the errors of a star at some distances, in the unit of the length."""
         u = np.abs(distance) / self.scale
         return np.exp(-u) * np.polynomial.polynomial.polyval(u, MATERN[self.derivatives])
 
-    def __str__(self):
+    def __str__(self) -> str:
         constant = "what is the same in all exposures cannot be measured"
         if self.reason:
             return f"those that exposures share are not measurable: {self.reason}"
@@ -299,9 +305,9 @@ class Diagnostics:
     error_scale: float = 1.0
     sky: str | None = None
     reference: UsedReference | None = None
-    widths: tuple | dict | None = None
+    widths: tuple[Any, ...] | dict[str, Any] | None = None
     prior_has_widths: bool = False
-    effective_modes: dict | None = None
+    effective_modes: dict[str, float] | None = None
     departure_ratio: float | None = None
     selection: DegreeChoice | None = None
     validation: Validation | None = None
@@ -310,7 +316,7 @@ class Diagnostics:
     correlated: CorrelatedErrors | None = None
     motion_scatter: MotionScatter | None = None
 
-    def in_words(self):
+    def in_words(self) -> dict[str, str]:
         """Sentences on errors found, the widths of a prior, the degree chosen, and the stars that were kept out.
 
         Returns
@@ -342,7 +348,7 @@ class Diagnostics:
             words["kept"] = str(self.validation)
         return words
 
-    def summary(self):
+    def summary(self) -> dict[str, Any]:
         """What there is of it as plain numbers and strings by name, for summaries."""
         names = "widths", "effective_modes", "departure_ratio", "selection", "validation", "error_law", "correlated"
         names += ("motion_scatter",)

@@ -10,14 +10,22 @@ the smallest dynamic part, ``R_i = N_i' W_i`` (gauge ``"minimal"``), or ``sum_i 
 which the paper's starting point implies for undithered exposures.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from ..geometry import basis
 from ..geometry.detector_modes import similarity_basis
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from .catalogue_tie import Tie
 
 _CONVENTIONS = {
     "minimal": "smallest dynamic part, weighted by its scatter and errors",
@@ -51,7 +59,7 @@ class UnknownMap:
     degree: int
     map: np.ndarray
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<UnknownMap: {self.name}>"
 
 
@@ -72,7 +80,7 @@ class UnknownDirection:
     stars: np.ndarray
     coefficients: np.ndarray
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<UnknownDirection: {self.name}>"
 
 
@@ -103,7 +111,7 @@ class Drift:
         Covariance of the common map and these, where a reference determined them together.
     """
 
-    names: tuple
+    names: tuple[str, ...]
     motion: np.ndarray
     covariance: np.ndarray
     maps: np.ndarray
@@ -114,11 +122,11 @@ class Drift:
     joint: np.ndarray | None = None
 
     @property
-    def n_constraints(self):
+    def n_constraints(self) -> int:
         """Constraints of the gauge on maps and rates."""
         return len(self.maps) + len(self.rates)
 
-    def determined(self, reach, information):
+    def determined(self, reach: np.ndarray, information: np.ndarray) -> Drift:
         """The same where what is known of the motions of stars determines the maps, the rates with them.
 
         Parameters
@@ -133,7 +141,7 @@ class Drift:
         covariance = np.linalg.inv(moved.T @ information @ moved)[: len(self.maps), : len(self.maps)]
         return replace(self, covariance=self.maps.T @ covariance @ self.maps, held=True)
 
-    def variance(self, values):
+    def variance(self, values: np.ndarray) -> np.ndarray:
         """Variance and covariance (k, k, n_stars) that the maps add to the terms of stars, for modes (n_modes, n)."""
         n, k = len(values), len(self.names)
         free = self.covariance.shape[0] // n
@@ -142,7 +150,7 @@ class Drift:
         out[k - free :, k - free :] = np.einsum("mj,ambn,nj->abj", values, blocks, values, optimize=True)
         return out
 
-    def __str__(self):
+    def __str__(self) -> str:
         errors = self.errors()
         rate = np.sqrt(np.mean([error**2 for name, error in errors.items() if name != "parallax"])) if errors else 0.0
         by = "the scatter of the motions of stars" if self.held else "the smallest dynamic part"
@@ -163,12 +171,12 @@ class Drift:
         are = "is" if unknown == ["the mean parallax"] else "are"
         return f"{words}, after {' and '.join(unknown)}, which {are} not known without a reference."
 
-    def tied(self, joint, n_tied, tells_parallax):
+    def tied(self, joint: np.ndarray, n_tied: int, tells_parallax: bool) -> Drift:
         """The same where a reference determined the maps, with the `joint` covariance."""
         size = len(joint) - len(self.covariance)
         return replace(self, covariance=joint[size:, size:], joint=joint, n_tied=n_tied, tells_parallax=tells_parallax)
 
-    def errors(self):
+    def errors(self) -> dict[str, float]:
         """Rms over the field [pix/yr per axis, pix] of what the maps add to motions and parallaxes, by name."""
         n = self.motion.shape[1] // 2
         free = self.names[len(self.names) - self.motion.shape[2] // n :]
@@ -225,19 +233,19 @@ class Gauge:
     dynamic: np.ndarray
     box: np.ndarray
     covariance: np.ndarray
-    unknown_maps: tuple = ()
+    unknown_maps: tuple[UnknownMap, ...] = ()
     static: str = "exact"
     prior: bool = False
     values: np.ndarray | None = None
     released: np.ndarray | None = None
-    tie: object = None
+    tie: Tie | None = None
     convention: np.ndarray | None = None
-    responses: object = field(default=None, repr=False, compare=False)
+    responses: Any = field(default=None, repr=False, compare=False)
     plane: str | None = None
     drift: Drift | None = None
 
     @property
-    def n_constraints(self):
+    def n_constraints(self) -> int:
         """Number of directions that are fixed; 2 n_modes unless exposures have modes that are fixed or shared.
 
         With those that change with time, where the motions of stars are fitted.
@@ -245,46 +253,46 @@ class Gauge:
         return len(self.constraint)
 
     @property
-    def n_maps(self):
+    def n_maps(self) -> int:
         """Number of directions among them that are the same at all times."""
         return self.n_constraints - (0 if self.drift is None else self.drift.n_constraints)
 
     @property
-    def drift_reach(self):
+    def drift_reach(self) -> np.ndarray:
         """Modes of maps that change with time -> values of the orthonormal constraints, (n_constraints, q)."""
         return self.orthonormal @ self.drift.motion.reshape(self.orthonormal.shape[1], -1)
 
     @property
-    def all_motion(self):
+    def all_motion(self) -> np.ndarray:
         """`motion` with that of the maps that change with time, (n_exposures, 2 n_modes, 2 n_modes + q)."""
         return self.motion if self.drift is None else np.concatenate([self.motion, self.drift.motion], axis=2)
 
     @property
-    def n_modes(self):
+    def n_modes(self) -> int:
         """Modes of the reference plane per axis."""
         return self.motion.shape[1] // 2
 
     @property
-    def scatter(self):
+    def scatter(self) -> np.ndarray:
         """Dynamic scatter of single exposures per axis and mode (2, n_modes), pixels, mean over the exposures."""
         return np.sqrt(np.einsum("iaa->a", self.dynamic) / len(self.dynamic)).reshape(2, -1)
 
     @cached_property
-    def orthonormal(self):
+    def orthonormal(self) -> np.ndarray:
         """Orthonormal rows that span `constraint`, shape (n_constraints, n_exposures * 2 n_modes)."""
         return np.linalg.qr(self.constraint.reshape(self.n_constraints, -1).T)[0].T
 
-    def violation(self, departure):
+    def violation(self, departure: np.ndarray) -> np.ndarray:
         """How far departures A_i - A_0 (n_exposures, 2 n_modes) are from the values of the orthonormal constraints."""
         return self.orthonormal @ departure.ravel() - (0 if self.values is None else self.values)
 
     @cached_property
-    def reach(self):
+    def reach(self) -> np.ndarray:
         """Reference-plane modes -> values of the orthonormal constraints, shape (n_constraints, 2 n_modes)."""
         return self.orthonormal @ self.motion.reshape(-1, 2 * self.n_modes)
 
     @cached_property
-    def to_convention(self):
+    def to_convention(self) -> np.ndarray | None:
         """Errors of all A_i -> bend of the plane (2 n_modes,) that takes them to the convention; None if it holds.
 
         Shape (2 n_modes, n_exposures * 2 n_modes). The bend g moves stars by `directions` g and each A_i by
@@ -295,7 +303,7 @@ class Gauge:
         rows = self.convention.reshape(len(self.convention), -1)
         return np.linalg.pinv(rows @ self.all_motion.reshape(rows.shape[1], -1))[: 2 * self.n_modes] @ rows
 
-    def bend_errors(self, covariance):
+    def bend_errors(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Covariance of the bend to the convention with all coefficients, and its own, of theirs.
 
         Parameters
@@ -315,19 +323,19 @@ class Gauge:
         return shared, rows @ shared
 
     @property
-    def measured(self):
+    def measured(self) -> np.ndarray:
         """Combinations of the orthonormal constraints, as columns, at which residuals determine the values."""
         return np.linalg.qr(self.reach @ (np.zeros((2 * self.n_modes, 0)) if self.released is None else self.released))[
             0
         ]
 
-    def modes_at(self, xy, n_modes=None):
+    def modes_at(self, xy: ArrayLike, n_modes: int | None = None) -> np.ndarray:
         """Values (n_modes, n) of the reference-plane modes, by default of the gauge, at reference positions (n, 2)."""
         degree = basis.degree_of(self.n_modes if n_modes is None else n_modes)
         u, v = ((np.asarray(xy) - self.box[0]) / self.box[1]).T
         return basis.values(degree, u, v)
 
-    def common_map(self, departure):
+    def common_map(self, departure: np.ndarray) -> np.ndarray:
         """The map (2 n_modes,) of the reference plane, similarities aside, to which departures A_i - A_0 amount."""
         similar = similarity_basis(2 * self.box[1, ::-1], self.n_modes)
         reach = self.reach if self.drift is None else self.orthonormal @ self.all_motion.reshape(departure.size, -1)
@@ -335,7 +343,7 @@ class Gauge:
         return out - similar.T @ (similar @ out)
 
     @property
-    def directions(self):
+    def directions(self) -> np.ndarray:
         """How a unit of every mode of the common map moves the stars, (n_stars, 2, 2 n_modes).
 
         Each is what the stars do when the plane is held elsewhere by this mode and all else is fitted again: the mode
@@ -344,7 +352,7 @@ class Gauge:
         return self.responses.directions
 
     @property
-    def unknown(self):
+    def unknown(self) -> tuple[UnknownDirection, ...]:
         """Directions that nothing determines, as a tuple of `UnknownDirection`.
 
         Posterior standard deviation above 1 px, rms over the stars, where no size of the static distortion is stated.
@@ -357,7 +365,7 @@ class Gauge:
         return mapped + self.responses.weak
 
     @property
-    def absolute_covariance(self):
+    def absolute_covariance(self) -> np.ndarray:
         """Covariance of the modes of the common map, px^2, without what is unknown.
 
         (2 n_modes,) squared, similarities left out as a matter of pointing; with a reference it is what that leaves
@@ -366,14 +374,14 @@ class Gauge:
         return self.covariance if self.tie is None else self.tie.covariance
 
     @property
-    def joint_covariance(self):
+    def joint_covariance(self) -> np.ndarray:
         """Covariance of the modes of the common map and of `Drift`, (2 n_modes + q) squared."""
         if self.drift.joint is not None:
             return self.drift.joint
         tied = self.absolute_covariance  # in more modes than the drift has where the fitted degree is 0
         return block_diag(tied if len(tied) == 2 * self.n_modes else self.covariance, self.drift.covariance)
 
-    def absolute_errors(self):
+    def absolute_errors(self) -> list[tuple[str, int, float]]:
         """Absolute error by degree of the common map: rms over the field and axis, pixels, without what is unknown.
 
         Returns
@@ -392,13 +400,13 @@ class Gauge:
         return rows
 
     @property
-    def unknown_names(self):
+    def unknown_names(self) -> list[str]:
         """Names of what is unknown, each once."""
         weak = () if self.responses is None else self.responses.weak
         return tuple(dict.fromkeys(each.name for each in (*self.unknown_maps, *weak)))
 
     @property
-    def warning(self):
+    def warning(self) -> str:
         """In a sentence, that absolute positions are not known, why, and what to do; empty if they are."""
         if not self.unknown_names:
             return ""
@@ -407,7 +415,7 @@ class Gauge:
         return f"absolute positions are not known: {why} ({', '.join(self.unknown_names)} unknown); {cure}"
 
     @property
-    def sentence(self):
+    def sentence(self) -> str:
         """The convention in a sentence."""
         if self.plane is not None:
             return f"{self.kind}: the plane is {self.plane}; absolute errors are not available"
@@ -420,10 +428,10 @@ class Gauge:
             known = "absolute positions are not known"
         return f"{self.kind} ({_CONVENTIONS[self.kind]}), {self.n_maps} modes of a common map; {known}"
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Gauge {self.kind!r}: {self.n_constraints} constraints, {len(self.motion)} exposures>"
 
-    def __str__(self):
+    def __str__(self) -> str:
         if self.plane is not None:
             return self.sentence
         convention = f"the constraint ({_CONVENTIONS[self.kind]})" + (" and the prior widths" if self.prior else "")

@@ -1,7 +1,10 @@
 """Proper motions and parallaxes of the stars of a solution, with their errors."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy import units as u
@@ -9,6 +12,11 @@ from astropy import units as u
 from ..exceptions import InputError
 from ..geometry import parallax
 from ..inputs.column_contract import correlation
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from ..geometry.tangent_plane import TangentPlane
 
 #: Units of the terms of stars in the reference plane and on the sky, and their names there.
 UNITS = {"vx": u.pix / u.yr, "vy": u.pix / u.yr, "parallax": u.pix}
@@ -36,7 +44,7 @@ class StarMotions:
         Between the first and the last of them, years.
     """
 
-    names: tuple
+    names: tuple[str, ...]
     values: np.ndarray
     epoch: float
     years: np.ndarray
@@ -45,15 +53,15 @@ class StarMotions:
     span: np.ndarray
 
     @property
-    def kind(self):
+    def kind(self) -> str:
         """Either "proper" or "parallax"."""
         return "parallax" if "parallax" in self.names else "proper"
 
-    def displacement(self, years, sky=None):
+    def displacement(self, years: float, sky: TangentPlane | None = None) -> np.ndarray:
         """Displacements (n_stars, 2) [pix] from the epoch to another year; zero for stars without a motion."""
         return np.nan_to_num(self.values) @ self.columns([years], sky)[0].T
 
-    def columns(self, years, sky=None):
+    def columns(self, years: ArrayLike, sky: TangentPlane | None = None) -> np.ndarray:
         """Displacements (n, 2, k) [pix] at years (n,) for a unit of each term; zero for parallaxes without a sky."""
         years = np.asarray(years, dtype=float)
         out = (years - self.epoch)[:, None, None] * np.eye(2, len(self.names))
@@ -61,18 +69,18 @@ class StarMotions:
             out[:, :, 2] = parallax.on_plane(sky, years)
         return out
 
-    def carried(self, covariance, years, sky=None):
+    def carried(self, covariance: np.ndarray, years: float, sky: TangentPlane | None = None) -> np.ndarray:
         """Covariance xx, yy, xy (3, n_stars) [pix^2] of positions at another year from that (n_stars, 2 + k, 2 + k)."""
         rows = np.hstack([np.eye(2), self.columns([years], sky)[0]])
         moved = rows @ covariance @ rows.T
         return np.stack([moved[:, 0, 0], moved[:, 1, 1], moved[:, 0, 1]])
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         n = int(np.isfinite(self.values[:, 0]).sum())
         return f"<StarMotions: {self.kind}, {n} of {len(self.values)} stars, positions of {self.epoch:.3f}>"
 
     @property
-    def sentence(self):
+    def sentence(self) -> str:
         """What was fitted, in a sentence."""
         what = "proper motions and parallaxes" if self.kind == "parallax" else "proper motions"
         n, once = np.count_nonzero(self.n_epochs > 1), np.count_nonzero(self.n_epochs == 1)

@@ -1,6 +1,9 @@
 """How a solution was asked for."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -33,8 +36,8 @@ class Settings:
     """
 
     degree: int | str = 3
-    prior: object = None
-    model: object = None
+    prior: Any = None
+    model: Any = None
     static: str | None = None
     layout: str | None = None
     exposure_degree: int | None = None

@@ -1,8 +1,13 @@
 """The result of `solve`: positions, distortions, their errors, and everything made from them."""
 
+from __future__ import annotations
+
 import textwrap
+from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field
 from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy import units as u
@@ -27,6 +32,18 @@ from .diagnostics import Diagnostics
 from .gauge import Gauge
 from .motions import StarMotions
 from .settings import Settings
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+    from astropy.modeling import Model
+    from astropy.table import Table
+    from gwcs import WCS as GWCS
+    from numpy.typing import ArrayLike
+
+    from ..cameras.camera import Camera
+    from ..runtime.annotations import StrPath
+    from ..solving.equations.covariances import Uncertainty
+    from .check import Check
 
 
 def _wrapped(key, text):
@@ -97,10 +114,10 @@ class Solution:
         SHA-256 of the file that it was read from. What `dataclasses.replace` makes is another solution and has none.
     """
 
-    names: tuple
+    names: tuple[str, ...]
     degree: int
-    shapes: dict
-    poses: dict
+    shapes: dict[str, tuple[int, int]]
+    poses: dict[str, np.ndarray]
     coefficients: np.ndarray
     prior_mean: np.ndarray
     star_names: np.ndarray
@@ -110,37 +127,37 @@ class Solution:
     dof: int
     status: str
     gauge: Gauge
-    uncertainty: object
+    uncertainty: Uncertainty
     settings: Settings
     diagnostics: Diagnostics
     sky: TangentPlane | None = None
-    left_out: dict = field(default_factory=dict)
-    provenance: dict = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
     form: object = None
-    camera: object = None
-    checked: object = field(default=(), repr=False)
+    camera: Camera | None = None
+    checked: Any = field(default=(), repr=False)
     motions: StarMotions | None = None
-    inverses: InitVar[dict | None] = None
+    inverses: InitVar[dict[str, Any] | None] = None
     file_checksum: InitVar[str | None] = None
 
-    def __post_init__(self, inverses, file_checksum):
+    def __post_init__(self, inverses: dict[str, Any] | None, file_checksum: str | None) -> None:
         object.__setattr__(self, "_inverses", inverses or {})
         object.__setattr__(self, "_checksum", file_checksum)
 
     @property
-    def checksum(self):
+    def checksum(self) -> str | None:
         """SHA-256 of the file that it was read from, in hexadecimal digits; None if it was not."""
         return self._checksum
 
     @cached_property
-    def checks(self):
+    def checks(self) -> tuple[Check, ...]:
         """What a referee would ask, answered: a tuple of `legdistort.results.check.Check`; made at first use."""
         return self.checked(self) if callable(self.checked) else self.checked
 
     # -- tables
 
     @cached_property
-    def stars(self):
+    def stars(self) -> QTable:
         """One row a star: ``star``, ``x``, ``y``, errors [pix], ``n``, mean ``flux`` and the sky if known.
 
         ``x_err``, ``y_err`` are relative: what is left once a common map of the fitted degree is taken off.
@@ -186,7 +203,7 @@ class Solution:
         return column_contract.describe_stars(table)
 
     @property
-    def epoch(self):
+    def epoch(self) -> float | None:
         """Julian year of the positions, or None."""
         return self.diagnostics.epoch if self.motions is None else self.motions.epoch
 
@@ -211,7 +228,7 @@ class Solution:
         }
         return {key: value for key, value in meta.items() if value is not None}
 
-    def positions_at(self, epoch):
+    def positions_at(self, epoch: float | Time) -> np.ndarray:
         """Positions (n_stars, 2) of the stars in the reference plane at another time, pixels.
 
         Stars without a motion stay where they are.
@@ -228,7 +245,7 @@ class Solution:
         """
         return self.positions + star_motions.fitted(self.motions).displacement(year(epoch), self.sky)
 
-    def stars_at(self, epoch):
+    def stars_at(self, epoch: float | Time) -> QTable:
         """The stars where they are at another time, with their errors then, as a table.
 
         Parameters
@@ -264,7 +281,7 @@ class Solution:
         return column_contract.describe_stars(table)
 
     @property
-    def residuals(self):
+    def residuals(self) -> QTable:
         """One row an observation, as given: ``exposure``, ``star``, ``dx``, ``dy`` [pix], ``used`` and more.
 
         A residual is the measured minus the predicted detector position.
@@ -282,7 +299,7 @@ class Solution:
         known = self.gauge, self.uncertainty, self.positions
         return absolute_errors.relative_blocks(*known), absolute_errors.absolute_blocks(*known)
 
-    def absolute_covariance(self, *, without_unknown=False):
+    def absolute_covariance(self, *, without_unknown: bool = False) -> np.ndarray:
         """Covariance (n_stars, 2, 2) [pix^2] of every star position with the error of the common map.
 
         NaN where that is not known, unless the error asked for is that after the unknown directions
@@ -292,7 +309,7 @@ class Solution:
         return np.stack([np.stack([xx, xy]), np.stack([xy, yy])]).transpose(2, 0, 1)
 
     @property
-    def effective_modes(self):
+    def effective_modes(self) -> dict[str, float] | None:
         """``{exposure: number}`` of its modes, both axes together, that the data determine rather than a prior.
 
         The trace of the influence of the data on the coefficients. Without prior widths it is their number, less what
@@ -302,7 +319,7 @@ class Solution:
 
     # -- geometry
 
-    def index(self, name):
+    def index(self, name: str) -> int:
         """Position of an exposure in `names`.
 
         Raises
@@ -322,12 +339,12 @@ class Solution:
             for name, a in zip(self.names, self.coefficients, strict=True)
         ]
 
-    def distortion(self, name):
+    def distortion(self, name: str) -> Distortion:
         """The `Distortion` of an exposure: undistorted -> detector pixels, without the pose."""
         return self._distortions[self.index(name)]
 
     @cached_property
-    def by_detector(self):
+    def by_detector(self) -> Solution:
         """Of a camera, the same with every detector of every exposure, ``NAME-DETECTOR``, as an exposure of its own.
 
         For positions alone, without errors; a solution without a camera is its own. See
@@ -341,7 +358,7 @@ class Solution:
             raise InputError(f"detector={detector!r}: this solution has no camera with several detectors; leave it out")
         return self.camera[detector]
 
-    def distort(self, name, xy, *, detector=None):
+    def distort(self, name: str, xy: ArrayLike, *, detector: str | None = None) -> Any:
         """Reference positions (n, 2) -> detector pixels (n, 2); NaN where the exposure does not reach.
 
         A quantity in pixels gives a quantity. Of a camera the pixels are those of the focal plane, or of a `detector`,
@@ -353,7 +370,16 @@ class Solution:
         p[outside(distortion.inverse.valid, q[:, 0], q[:, 1])] = np.nan
         return like(xy, p if detector is None else self._detector(detector).to_pixels(p))
 
-    def correct(self, name, xy, *, errors=None, detector=None, epoch=None, stars=None):
+    def correct(
+        self,
+        name: str,
+        xy: ArrayLike,
+        *,
+        errors: ArrayLike | None = None,
+        detector: str | None = None,
+        epoch: float | Time | None = None,
+        stars: Sequence[str] | None = None,
+    ) -> Any:
         """Detector pixels (n, 2) -> reference positions (n, 2), exact (section 3.3, criterion J_3).
 
         A quantity in pixels gives a quantity. Positions are those at the time of the exposure; the motions that were
@@ -401,7 +427,7 @@ class Solution:
         corrected = similarity.apply(similarity.invert(self.poses[name]), q)
         return like(xy, corrected if moved is None else corrected + moved.displacement(self.motions))
 
-    def correct_table(self, table, *, epoch=None):
+    def correct_table(self, table: Table, *, epoch: float | Time | None = None) -> QTable:
         """Positions measured in any exposures -> the reference plane and the sky, with their errors, as a table.
 
         Parameters
@@ -427,12 +453,12 @@ class Solution:
         """
         return new_positions.correct_table(self, table, epoch)
 
-    def model(self, name):
+    def model(self, name: str) -> Model:
         """Reference plane -> detector pixels as an astropy compound model with inverse."""
         distortion = self.distortion(name)
         return exposure_model(self.poses[name], distortion, self.form)
 
-    def wcs(self, name, detector=None):
+    def wcs(self, name: str, detector: str | None = None) -> GWCS:
         """The gwcs of an exposure: detector -> undistorted -> reference -> icrs (the last if the sky is known).
 
         That of a `detector` of a camera: detector -> undistorted -> focal_plane -> reference -> icrs.
@@ -443,14 +469,14 @@ class Solution:
         chip = None if detector is None else self._detector(detector)
         return exposure_wcs(name, self.poses[name], distortion, self.sky, chip)
 
-    def header(self, name, *, kind="sip", max_error=1e-3):
+    def header(self, name: str, *, kind: str = "sip", max_error: float = 1e-3) -> Header:
         """FITS header of an exposure, TAN-SIP or TPV, with its error in it (`legdistort.wcs.fits_headers`)."""
         from ..wcs.fits_headers import make_header
 
         distortion = self.distortion(name)
         return make_header(self.poses[name], distortion, self.sky, kind=kind, max_error=max_error)
 
-    def fits_wcs(self, name, *, max_error=1e-3):
+    def fits_wcs(self, name: str, *, max_error: float = 1e-3) -> WCS:
         """The nearest `astropy.wcs.WCS` of an exposure, TAN-SIP, for what takes no other (`CCDData`, `Cutout2D`).
 
         Parameters
@@ -470,7 +496,7 @@ class Solution:
         wcs.array_shape = self.shapes[name]
         return wcs
 
-    def orientation(self, name):
+    def orientation(self, name: str) -> tuple[float, float]:
         """Position angle of an exposure's y axis [deg, north through east] and pixel scale [arcsec], at its centre.
 
         Those of its pose: without the distortion, whose linear part stays out.
@@ -486,13 +512,13 @@ class Solution:
         return self.sky.orientation(self.poses[name], self.shapes[name])
 
     @property
-    def max_inverse_error(self):
+    def max_inverse_error(self) -> float:
         """Largest certified round-trip error over all exposures, pixels."""
         return max(distortion.inverse.error for distortion in self._distortions)
 
     # -- errors
 
-    def coefficient_errors(self, name, *, relative=False):
+    def coefficient_errors(self, name: str, *, relative: bool = False) -> np.ndarray:
         """Standard deviations (2, n_modes) of the fitted coefficients of an exposure, pixels.
 
         With the error of the common map, and NaN for what changes with an unknown direction (`Gauge.unknown`); or
@@ -503,7 +529,7 @@ class Solution:
             return np.sqrt(np.diag(block)).reshape(2, -1)
         return np.sqrt(absolute_errors.coefficient_variance(self.gauge, block, self.index(name)))
 
-    def coefficient_covariance(self, name, *, relative=False):
+    def coefficient_covariance(self, name: str, *, relative: bool = False) -> np.ndarray:
         """Covariance (2 n_modes, 2 n_modes) of the fitted coefficients of an exposure, px^2; x first.
 
         Under the constraints of the gauge; or `relative`, under its convention alone (`Gauge.convention`).
@@ -514,7 +540,9 @@ class Solution:
         mine = slice(self.index(name) * size, (self.index(name) + 1) * size)
         return self.uncertainty.coefficients[mine, mine]
 
-    def sigma_map(self, name, *, n=64, support=True, absolute=False):
+    def sigma_map(
+        self, name: str, *, n: int = 64, support: bool = True, absolute: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Error of the distortion correction over a detector (paper's Figure "ergrid", noise of the position excluded).
 
         Parameters
@@ -552,20 +580,20 @@ class Solution:
             sigma[~self.supported(name, grid).reshape(len(y), len(x))] = np.nan
         return x, y, sigma
 
-    def supported(self, name, xy):
+    def supported(self, name: str, xy: ArrayLike) -> np.ndarray:
         """Whether detector positions (n, 2) lie inside the convex hull of the stars used in an exposure."""
         return supported(support(name, self), np.asarray(xy, dtype=float).T)
 
     # -- words
 
     @property
-    def rms(self):
+    def rms(self) -> np.ndarray:
         """Unweighted rms residual (2,) per axis of the used observations, pixels."""
         used = self.observations["used"]
         return np.array([np.sqrt(np.mean(self.observations[d][used].to_value(u.pix) ** 2)) for d in ("dx", "dy")])
 
     @property
-    def sky_sentence(self):
+    def sky_sentence(self) -> str:
         """Where the reference plane lies on the sky, and how that is known."""
         if self.sky is None:
             return "not known: no WCS in the headers that proved right, no reference catalogue with ra, dec"
@@ -574,7 +602,7 @@ class Solution:
         words = f"tangent point {self.sky.lon:.6f} {self.sky.lat:+.6f} deg, {self.sky.pixel_scale:.5g} arcsec/px"
         return f"{words}{', ' * bool(source)}{source}{tied}"
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return (
             f"<Solution: {len(self.names)} exposures, {len(self.star_names)} stars, degree {self.degree}, "
             f"chi2 {self.chi2:.1f} for {self.dof} degrees of freedom>"
@@ -586,7 +614,7 @@ class Solution:
         return _wrapped("camera", self.camera_sentence)
 
     @property
-    def camera_sentence(self):
+    def camera_sentence(self) -> str:
         """Which camera it is, and what of it the exposures do not tell; empty without one."""
         if self.camera is None:
             return ""
@@ -624,7 +652,7 @@ class Solution:
         angle, scale = self.orientation(name)
         return f" {angle:9.4f} {scale:9.6f}"
 
-    def __str__(self):
+    def __str__(self) -> str:
         used = self.observations["used"]
         lines = [
             repr(self)[1:-1],
@@ -657,14 +685,14 @@ class Solution:
 
     # -- files
 
-    def write(self, path, *, overwrite=False):
+    def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
         """Write everything to an ASDF file (`legdistort.results.storage`)."""
         from .storage import write_solution
 
         return write_solution(self, path, overwrite=overwrite)
 
     @classmethod
-    def read(cls, path, *, max_bytes=None):
+    def read(cls, path: StrPath, *, max_bytes: int | None = None) -> Solution:
         """Read what `write` wrote; the certificate of every inverse is checked again.
 
         Parameters

@@ -3,8 +3,11 @@
 One source of synthetic truth for tests, demonstrations and benchmarks.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy import units as u
@@ -30,6 +33,12 @@ from .truth import (
     within,
 )
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from ..geometry.tangent_plane import TangentPlane
+    from ..runtime.annotations import Shape, StrPath
+
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
@@ -38,7 +47,7 @@ class Simulation:
     matches: Matches
     truth: Truth
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Simulation: {self.matches!r}>"
 
 
@@ -55,11 +64,11 @@ class SimulatedExposures:
         ``{name: PSF}``, what `~legdistort.simulation.rendering.render` was given for each.
     """
 
-    hdus: dict
+    hdus: dict[str, fits.HDUList]
     truth: Truth
-    psfs: dict = field(default_factory=dict)
+    psfs: dict[str, Any] = field(default_factory=dict)
 
-    def write(self, folder):
+    def write(self, folder: StrPath) -> list[Path]:
         """Write ``NAME.fits`` for every exposure and ``truth.ecsv``; return the paths of the images."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -70,36 +79,36 @@ class SimulatedExposures:
         write_table(self.truth.table(), folder / "truth.ecsv", overwrite=True)
         return paths
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         ny, nx = self.truth.shape
         return f"<SimulatedExposures: {len(self.hdus)} images of {ny} x {nx} pixels, {len(self.truth.positions)} stars>"
 
 
 def simulate_matches(
     *,
-    n_stars=30,
-    n_exposures=10,
-    degree=3,
-    sigma=0.14,
-    shape=(2048, 2048),
-    static=1.5,
-    dynamic=0.9,
-    zero_mean=True,
-    dither=0.0,
-    rotations=None,
-    flips=None,
-    seen=1.0,
-    margin=0.0,
-    min_exposures=None,
-    pose_error=0.0,
-    noise=1.0,
-    corr=0.0,
-    motion=0.0,
-    parallax=0.0,
-    epochs=None,
-    sky=None,
-    seed=0,
-):
+    n_stars: int = 30,
+    n_exposures: int = 10,
+    degree: int = 3,
+    sigma: ArrayLike = 0.14,
+    shape: Shape = (2048, 2048),
+    static: ArrayLike = 1.5,
+    dynamic: ArrayLike = 0.9,
+    zero_mean: bool = True,
+    dither: float = 0.0,
+    rotations: ArrayLike | None = None,
+    flips: ArrayLike | None = None,
+    seen: float = 1.0,
+    margin: float = 0.0,
+    min_exposures: int | None = None,
+    pose_error: float = 0.0,
+    noise: float = 1.0,
+    corr: float = 0.0,
+    motion: ArrayLike = 0.0,
+    parallax: ArrayLike = 0.0,
+    epochs: ArrayLike | None = None,
+    sky: TangentPlane | None = None,
+    seed: int = 0,
+) -> Simulation:
     """Catalogues of the same stars in several distorted exposures.
 
     The default is Simulation 1 of Bernard et al. (2017, section 4.1). What is drawn for stars, distortions, poses and
@@ -185,7 +194,15 @@ def simulate_matches(
     return Simulation(matches_from(truth, observed, sigma, noise_rng, noise=noise, corr=corr, sky=sky), truth)
 
 
-def simulate_exposures(*, small=False, camera=None, noise=True, seed=0, progress=False, **settings):
+def simulate_exposures(
+    *,
+    small: bool = False,
+    camera: str | None = None,
+    noise: bool = True,
+    seed: int = 0,
+    progress: bool = False,
+    **settings: Any,
+) -> SimulatedExposures:
     """Images of a simulated GSAOI night.
 
     Stars are drawn with at least 10 FWHM between them; with ``motion`` and ``epochs`` they move, and the headers tell

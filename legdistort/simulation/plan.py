@@ -1,7 +1,10 @@
 """Observations that are planned, as asked for, and where their stars will be measured, and how well."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from numbers import Real
+from typing import Any
 
 import numpy as np
 from astropy import units as u
@@ -30,27 +33,27 @@ class Plan:
     """
 
     n_exposures: int
-    stars: object
+    stars: np.ndarray | None
     n_stars: int | None
     density: float | None
-    sigma: object
+    sigma: Any
     degree: int
-    shape: tuple
-    dithers: object
-    poses: dict | None
+    shape: tuple[int, int]
+    dithers: Any
+    poses: dict[str, np.ndarray] | None
     prior: Prior | None
     gauge: str
-    dynamic: object
-    spectrum: object
-    static_spectrum: object
+    dynamic: Any
+    spectrum: Any
+    static_spectrum: Any
     min_exposures: int | None
     n_grid: int
     seed: int
-    epochs: object = None
-    field: object = None
+    epochs: Any = None
+    field: SkyCoord | None = None
     camera: Camera | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, value in zip(("shape", "prior"), self._field(), strict=True):
             object.__setattr__(self, name, value)
         self._check_epochs()
@@ -101,12 +104,12 @@ class Plan:
             raise InputError(f"field must be the place on the sky as one SkyCoord, got {self.field!r}")
 
     @property
-    def motion(self):
+    def motion(self) -> str | None:
         """What of the motions of stars will be fitted, or None."""
         return None if self.epochs is None else "proper" if self.field is None else "parallax"
 
     @property
-    def sky(self):
+    def sky(self) -> TangentPlane | None:
         """The field on the sky, north up; the scale is of no matter."""
         if self.field is None:
             return None
@@ -115,11 +118,11 @@ class Plan:
         return TangentPlane(place.ra.deg, place.dec.deg, matrix)
 
     @property
-    def least(self):
+    def least(self) -> int:
         """Exposures that a star must be on: four, or all if there are fewer, unless it is said."""
         return min(4, self.n_exposures) if self.min_exposures is None else self.min_exposures
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Plan: {self.n_exposures} exposures, degree {self.degree}, gauge {self.gauge}>"
 
 

@@ -4,7 +4,11 @@ Positions without noise, the normal equations there, the gauge and the covarianc
 no simulation (Bernard et al. 2017, section 4, measures the same by Monte Carlo).
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.table import Table
@@ -21,6 +25,15 @@ from .aliasing import alias, assumed_spectra
 from .noiseless_solution import noiseless_solution
 from .plan import Plan, lay_out
 from .prediction_text import decimals, describe, finite_rms
+
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+    from matplotlib.axes import Axes
+    from numpy.typing import ArrayLike
+
+    from ..cameras.camera import Camera
+    from ..priors.prior import Prior
+    from ..runtime.annotations import Shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,48 +94,48 @@ class Prediction:
     settings: Plan
 
     @property
-    def degree(self):
+    def degree(self) -> int:
         """Total degree that is fitted."""
         return self.solution.degree
 
     @property
-    def n_exposures(self):
+    def n_exposures(self) -> int:
         """Number of exposures."""
         return len(self.solution.names)
 
     @property
-    def n_stars(self):
+    def n_stars(self) -> int:
         """Number of stars that serve."""
         return len(self.solution.star_names)
 
     @property
-    def stars_per_exposure(self):
+    def stars_per_exposure(self) -> np.ndarray:
         """Stars on every exposure, shape (n_exposures,)."""
         table = self.solution.observations
         return np.array([np.count_nonzero(table["exposure"] == name) for name in self.solution.names])
 
     @property
-    def s_b(self):
+    def s_b(self) -> float:
         """Slope of the noise propagation on reference positions, b / sigma_meas (paper, section 4.2)."""
         return self.b / self.sigma_meas
 
     @property
-    def s_sigma(self):
+    def s_sigma(self) -> float:
         """Slope of the noise propagation on corrected positions, sigma / sigma_meas (paper, section 4.2)."""
         return self.sigma / self.sigma_meas
 
     @property
-    def b_total(self):
+    def b_total(self) -> float:
         """Noise and aliasing together, relative."""
         return float(np.hypot(self.b, self.b_alias))
 
     @property
-    def sigma_total(self):
+    def sigma_total(self) -> float:
         """Noise and aliasing together, inside the contour."""
         return float(np.hypot(self.sigma, self.sigma_alias))
 
     @property
-    def thumb(self):
+    def thumb(self) -> tuple[float, float]:
         """Rules of thumb for s_b and s_sigma: 1/sqrt(n_im) and sqrt((1 - 1/n_im)(1 + n_modes/n_star)).
 
         With the mean number of exposures of a star for n_im, and that of stars on an exposure for n_star.
@@ -132,7 +145,7 @@ class Prediction:
         return n_im**-0.5, float(np.sqrt((1 - 1 / n_im) * (1 + basis.n_modes(self.degree) / n_star)))
 
     @property
-    def motion_errors(self):
+    def motion_errors(self) -> dict[str, float]:
         """Expected errors of proper motions [pix/yr per axis] and parallaxes [pix], relative, rms over the stars.
 
         ``{"motion" | "parallax": error}``, empty without epochs. ``solution.stars`` has them star by star.
@@ -144,15 +157,15 @@ class Prediction:
         out = {"motion": finite_rms(np.sqrt(variance[2:4]))}
         return out | ({"parallax": finite_rms(np.sqrt(variance[4]))} if len(variance) > 4 else {})
 
-    def summary(self):
+    def summary(self) -> dict[str, float]:
         """All figures as a dict of numbers."""
         counts = {"n_exposures": self.n_exposures, "n_stars": self.n_stars, "degree": self.degree}
-        names = [f.name for f in fields(self) if f.type is float] + ["b_total", "sigma_total", "s_b", "s_sigma"]
+        names = [f.name for f in fields(self) if f.type == "float"] + ["b_total", "sigma_total", "s_b", "s_sigma"]
         thumb = dict(zip(("thumb_b", "thumb_sigma"), self.thumb, strict=True))
         moving = {f"{name}_error": error for name, error in self.motion_errors.items()}
         return counts | {name: getattr(self, name) for name in names} | moving | thumb
 
-    def plot(self, *, ax=None):
+    def plot(self, *, ax: Axes | None = None) -> Axes:
         """Map of the expected scatter of new positions, aliasing included, with stars and contour; returns the axes.
 
         The paper's Figure "ergrid". Of more than 300 stars none are drawn.
@@ -169,7 +182,7 @@ class Prediction:
         )
         return ax
 
-    def alternatives(self):
+    def alternatives(self) -> Table:
         """The same stars with half and twice the exposures, and fitted one degree lower and higher, as a table.
 
         The distortion assumed stays the same: what a lower degree leaves out is counted as aliasing. Exposures
@@ -205,39 +218,39 @@ class Prediction:
                 table[name].info.format = ".3f" if slope else f".{decimals(self)}f"
         return table
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return (
             f"<Prediction: {self.n_exposures} exposures, {self.n_stars} stars, degree {self.degree}, "
             f"b {self.b:.4f} px, sigma {self.sigma:.4f} px>"
         )
 
-    def __str__(self):
+    def __str__(self) -> str:
         return describe(self)
 
 
 def predict(
     *,
-    n_exposures,
-    stars=None,
-    n_stars=None,
-    density=None,
-    sigma=None,
-    degree=3,
-    shape=None,
-    camera=None,
-    dithers=0.0,
-    poses=None,
-    prior=None,
-    gauge="minimal",
-    dynamic=None,
-    spectrum=None,
-    static_spectrum=None,
-    min_exposures=None,
-    epochs=None,
-    field=None,
-    n_grid=50,
-    seed=0,
-):
+    n_exposures: int,
+    stars: ArrayLike | Table | None = None,
+    n_stars: int | None = None,
+    density: float | None = None,
+    sigma: ArrayLike | Callable[..., Any] | None = None,
+    degree: int = 3,
+    shape: Shape | None = None,
+    camera: Camera | None = None,
+    dithers: ArrayLike = 0.0,
+    poses: Mapping[str, ArrayLike] | None = None,
+    prior: Prior | None = None,
+    gauge: str = "minimal",
+    dynamic: ArrayLike | None = None,
+    spectrum: Mapping[int, float] | ArrayLike | None = None,
+    static_spectrum: Mapping[int, float] | ArrayLike | None = None,
+    min_exposures: int | None = None,
+    epochs: ArrayLike | None = None,
+    field: SkyCoord | None = None,
+    n_grid: int = 50,
+    seed: int = 0,
+) -> Prediction:
     """Expected errors of a planned set of exposures, from its Fisher matrix.
 
     Parameters

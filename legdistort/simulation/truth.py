@@ -5,7 +5,10 @@ time, with `numpy.polynomial.legendre.legval2d` and the published polynomials of
 `legdistort.geometry.basis`, so that a swapped index or direction in the package cannot hide in its own tests.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy import units as u
@@ -16,6 +19,11 @@ from ..exceptions import InputError
 from ..geometry import parallax, similarity
 from ..geometry.gsaoi import GsaoiMap
 from ..geometry.tangent_plane import TangentPlane
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from ..cameras.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,23 +63,23 @@ class Truth:
         Where several detectors were simulated: pixels of exposures are then those of its focal plane.
     """
 
-    names: tuple
-    shape: tuple
+    names: tuple[str, ...]
+    shape: tuple[int, int]
     positions: np.ndarray
     flux: np.ndarray | None
     static: np.ndarray
     dynamic: np.ndarray
-    poses: dict
-    nominal_poses: dict
+    poses: dict[str, np.ndarray]
+    nominal_poses: dict[str, np.ndarray]
     instrument: GsaoiMap | None = None
     sky: TangentPlane | None = None
     years: np.ndarray | None = None
     epoch: float | None = None
     motions: np.ndarray | None = None
     parallaxes: np.ndarray | None = None
-    camera: object = None
+    camera: Camera | None = None
 
-    def place(self, name):
+    def place(self, name: str) -> np.ndarray:
         """True reference-plane positions (n_stars, 2) of the stars at the time of an exposure."""
         if self.motions is None:
             return self.positions
@@ -82,11 +90,11 @@ class Truth:
         return out
 
     @property
-    def coefficients(self):
+    def coefficients(self) -> np.ndarray:
         """Legendre coefficients of every exposure (n_exposures, 2, n_modes), static part included."""
         return self.static + self.dynamic
 
-    def distort(self, name, xy):
+    def distort(self, name: str, xy: ArrayLike) -> np.ndarray:
         """True pixels of reference-plane positions (..., 2) in one exposure, noise-free."""
         q = similarity.apply(self.poses[self._known(name)], xy)
         i = self.names.index(name)
@@ -94,7 +102,7 @@ class Truth:
             return q + displacement(self.coefficients[i], q, self.shape)
         return self.instrument.distort(q) + displacement(self.dynamic[i], q, self.shape)
 
-    def on_detector(self, name, detector, xy):
+    def on_detector(self, name: str, detector: str, xy: ArrayLike) -> np.ndarray:
         """True pixels (n, 2) of reference-plane positions (n, 2) on one detector of the camera; NaN far off it."""
         chip, f = self.camera[detector], self.distort(name, xy)
         q = similarity.apply(chip.layout, f)
@@ -103,7 +111,7 @@ class Truth:
         out[near] = chip.to_pixels(f[near])
         return out
 
-    def grid(self, name, n=20):
+    def grid(self, name: str, n: int = 20) -> np.ndarray:
         """Reference-plane positions (n*n, 2) that cover one exposure's detector evenly.
 
         They are not among the stars: use them, with `distort`, to judge a correction where it was not fitted.
@@ -112,7 +120,7 @@ class Truth:
         q = np.stack([u_.ravel() * self.shape[1] - 0.5, v.ravel() * self.shape[0] - 0.5], axis=-1)
         return similarity.apply(similarity.invert(self.poses[self._known(name)]), q)
 
-    def table(self):
+    def table(self) -> QTable:
         """Stars as a QTable; the rest in its meta.
 
         Columns ``star``, ``x``, ``y``, ``flux``; ``ra``, ``dec`` if known; of stars that move ``vx``, ``vy``,
@@ -150,7 +158,7 @@ class Truth:
             raise InputError(f"no exposure {name!r} was simulated; there are {', '.join(self.names)}")
         return name
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Truth: {len(self.positions)} stars, {len(self.names)} exposures, {self.static.shape[1]} modes>"
 
 

@@ -1,9 +1,13 @@
 """`solve`: from matched positions to a `Solution`."""
 
+from __future__ import annotations
+
 import logging
 import warnings
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,6 +30,15 @@ from .options import CLIP, SolveOptions, check_reference
 from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
 
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+    from astropy.modeling import Model
+    from astropy.table import Table
+    from astropy.time import Time
+
+    from ..results.solution import Solution
+    from ..runtime.annotations import StrPath
+
 log = logging.getLogger(__name__)
 
 #: Stars and exposures that a warning names.
@@ -33,29 +46,29 @@ _MOST_NAMED = 6
 
 
 def solve(
-    matches,
+    matches: Matches,
     *,
-    degree=3,
-    prior=None,
-    model=None,
-    static=None,
-    layout=None,
-    exposure_degree=None,
-    gauge="minimal",
-    method="joint",
-    loss="linear",
-    clip=CLIP,
-    error_floor=0.0,
-    errors="stated",
-    max_iterations=None,
-    validate=None,
-    motion=None,
-    motion_sigma=None,
-    motion_epoch=None,
-    reference=None,
-    epoch=None,
-    pixel_scale=None,
-):
+    degree: int | str = 3,
+    prior: Prior | Mapping[str, Prior] | None = None,
+    model: Model | None = None,
+    static: str | None = None,
+    layout: str | None = None,
+    exposure_degree: int | None = None,
+    gauge: str = "minimal",
+    method: str = "joint",
+    loss: str = "linear",
+    clip: float | None = CLIP,
+    error_floor: float = 0.0,
+    errors: str = "stated",
+    max_iterations: int | None = None,
+    validate: float | None = None,
+    motion: str | None = None,
+    motion_sigma: float | str | None = None,
+    motion_epoch: float | Time | None = None,
+    reference: Table | SkyCoord | StrPath | None = None,
+    epoch: float | Time | None = None,
+    pixel_scale: float | None = None,
+) -> Solution:
     """Estimate all star positions and all distortions at once.
 
     Minimises ``J = sum_ij |x_ij - D_i(X_j)|^2 / sigma_ij^2`` (Bernard et al. 2017, section 3.1) over the reference

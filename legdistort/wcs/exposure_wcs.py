@@ -1,5 +1,9 @@
 """The gwcs of an exposure, made of stock parts."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import gwcs
 import numpy as np
 from astropy import units as u
@@ -7,6 +11,9 @@ from astropy.coordinates import ICRS
 from gwcs import coordinate_frames as cf
 
 from ..geometry import models, similarity
+
+if TYPE_CHECKING:
+    from gwcs import WCS as GWCS
 
 #: Positions that are evaluated at once: what is worked out on the way stays in the cache of a processor.
 _PIECE = 1 << 15
@@ -21,19 +28,19 @@ class ExposureWCS(gwcs.WCS):
     Files hold the stock class.
     """
 
-    def outside_footprint(self, world_arrays):
+    def outside_footprint(self, world_arrays: Any) -> Any:
         """World coordinates as they are: the bounding box of the pixels, and the models, say what is outside."""
         return world_arrays
 
-    def pixel_to_world_values(self, *pixel_arrays):
+    def pixel_to_world_values(self, *pixel_arrays: Any) -> Any:
         """As the stock class; many positions piece by piece, which need less memory and time."""
         return _piecewise(super().pixel_to_world_values, pixel_arrays)
 
-    def world_to_pixel_values(self, *world_arrays):
+    def world_to_pixel_values(self, *world_arrays: Any) -> Any:
         """As the stock class; many positions piece by piece, which need less memory and time."""
         return _piecewise(super().world_to_pixel_values, world_arrays)
 
-    def stock(self):
+    def stock(self) -> GWCS:
         """The same WCS as a plain `gwcs.WCS`."""
         return rebuilt(gwcs.WCS, self)
 

@@ -1,6 +1,9 @@
 """The refined distortion of a solution in the WCS of a pipeline, whose frames it keeps."""
 
+from __future__ import annotations
+
 import logging
+from typing import TYPE_CHECKING
 
 import gwcs
 import numpy as np
@@ -12,10 +15,15 @@ from gwcs import coordinate_frames as cf
 from ..exceptions import InputError
 from .exposure_wcs import ExposureWCS
 
+if TYPE_CHECKING:
+    from gwcs import WCS as GWCS
+
+    from ..results.solution import Solution
+
 log = logging.getLogger(__name__)
 
 
-def refine(wcs, solution, name):
+def refine(wcs: GWCS, solution: Solution, name: str) -> GWCS:
     """A gwcs like the one given, but with the distortion and the pose that a solution found for an exposure.
 
     The frames stay: names, units, order, and the transforms between all but the first two (of JWST and Roman:

@@ -1,6 +1,9 @@
 """The gwcs of an exposure as an ASDF file that any gwcs user can open."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import asdf
 import gwcs
@@ -15,6 +18,11 @@ from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, WITH_WCS, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
 from .exposure_wcs import ExposureWCS, from_focal_plane, rebuilt
+
+if TYPE_CHECKING:
+    from gwcs import WCS as GWCS
+
+    from ..runtime.annotations import StrPath
 
 #: What those should know who open a file without legdistort.
 NOTE = (
@@ -51,7 +59,7 @@ def write_wcs(solution, name, path, *, detector=None, overwrite=False):
     return Path(path)
 
 
-def read_wcs(path, *, max_bytes=None):
+def read_wcs(path: StrPath, *, max_bytes: int | None = None) -> GWCS:
     """Read the WCS of an exposure, ``wcs/NAME.asdf``, as it was in memory.
 
     The stock models in the file do not know where they end, and the word of the file is not taken for the error of the

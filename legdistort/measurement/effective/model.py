@@ -1,7 +1,11 @@
 """The effective point-spread function of an exposure: light that a pixel receives, by its place from the star."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 from numbers import Real
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.io import fits
@@ -12,6 +16,13 @@ from ...exceptions import InputError
 from ...runtime import outputs
 from ...runtime.fits_bytes import open_fits
 from . import splines
+
+if TYPE_CHECKING:
+    from astropy.io.fits import HDUList
+    from numpy.typing import ArrayLike
+    from photutils.psf import GriddedPSFModel
+
+    from ...runtime.annotations import StrPath
 
 #: Extension of files that holds the coefficients.
 EXTENSION = "EPSF"
@@ -38,20 +49,20 @@ class Polynomial:
     """
 
     degree: int = 0
-    zero: tuple = (0.0, 0.0)
-    scale: tuple = (1.0, 1.0)
+    zero: tuple[float, float] = (0.0, 0.0)
+    scale: tuple[float, float] = (1.0, 1.0)
 
     @property
-    def powers(self):
+    def powers(self) -> list[tuple[int, int]]:
         """Powers (i, j) of x and y of every term, those of x first: the order of PSFEx."""
         return [(i, j) for j in range(self.degree + 1) for i in range(self.degree + 1 - j)]
 
-    def __call__(self, xy):
+    def __call__(self, xy: ArrayLike) -> np.ndarray:
         """Terms (n, n_terms) at some places (n, 2)."""
         u, v = ((np.asarray(xy, dtype=float) - self.zero) / self.scale).T
         return np.stack([u**i * v**j for i, j in self.powers], axis=1)
 
-    def __str__(self):
+    def __str__(self) -> str:
         return ("constant", "linear", "quadratic", "cubic")[self.degree] if self.degree < 4 else f"degree {self.degree}"
 
 
@@ -65,17 +76,17 @@ class Grid:
         Increasing [pix]; the PSFs follow each other along x, then y.
     """
 
-    x: tuple
-    y: tuple
+    x: tuple[float, ...]
+    y: tuple[float, ...]
 
-    def __call__(self, xy):
+    def __call__(self, xy: ArrayLike) -> np.ndarray:
         """Terms (n, n_terms) at some places (n, 2)."""
         hats = []
         for places, at in zip((self.x, self.y), np.asarray(xy, dtype=float).T, strict=True):
             hats.append(np.stack([np.interp(at, places, row) for row in np.eye(len(places))], axis=1))
         return (hats[1][:, :, None] * hats[0][:, None, :]).reshape(len(xy), -1)
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f"a grid of {len(self.x)} x {len(self.y)}"
 
 
@@ -113,7 +124,7 @@ class EffectivePSF:
     coefficients: np.ndarray
     spacing: float
     variation: Polynomial | Grid = Polynomial()
-    shape: tuple | None = None
+    shape: tuple[int, int] | None = None
     exposure: str | None = None
     n_stars: int | None = None
     source: str = "effective"
@@ -121,12 +132,12 @@ class EffectivePSF:
     halo: float = 0.0
     fwhm: float = field(init=False)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         object.__setattr__(self, "coefficients", np.asarray(self.coefficients, dtype=float))
         object.__setattr__(self, "fwhm", width(self.grids(self.middle)[0], self.spacing))
 
     @property
-    def middle(self):
+    def middle(self) -> np.ndarray:
         """Centre of the field, (1, 2) [pix]."""
         if self.shape is not None:
             return np.array([[self.shape[1] - 1, self.shape[0] - 1]]) / 2
@@ -134,7 +145,7 @@ class EffectivePSF:
             return np.array([[np.mean(self.variation.x), np.mean(self.variation.y)]])
         return np.array([self.variation.zero], dtype=float)
 
-    def grids(self, xy):
+    def grids(self, xy: ArrayLike) -> np.ndarray:
         """Spline coefficients at some places; (n, ny, nx), or (1, ny, nx) if the PSF does not vary.
 
         Parameters
@@ -146,7 +157,7 @@ class EffectivePSF:
             return self.coefficients
         return np.tensordot(self.variation(xy), self.coefficients, 1)
 
-    def __call__(self, dx, dy, *, at):
+    def __call__(self, dx: ArrayLike, dy: ArrayLike, *, at: tuple[float, float]) -> np.ndarray:
         """Part of the light of a star that a pixel receives.
 
         Parameters
@@ -166,7 +177,7 @@ class EffectivePSF:
         x, y = (splines.basis(d.ravel(), n, self.spacing) for d, n in ((dx, grid.shape[1]), (dy, grid.shape[0])))
         return ((y @ grid) * x).sum(axis=1).reshape(dx.shape)
 
-    def centre(self, xy):
+    def centre(self, xy: ArrayLike) -> np.ndarray:
         """Core-weighted centre, from where the grid has its middle, at some places; (n, 2) [pix]."""
         xy = np.asarray(xy, dtype=float)
         if len(xy) < 2 * _NODES**2 or not isinstance(self.variation, Polynomial):
@@ -177,11 +188,11 @@ class EffectivePSF:
         return np.stack([RectBivariateSpline(x, y, there[..., i].T).ev(*xy.T) for i in (0, 1)], axis=1)
 
     @property
-    def reach(self):
+    def reach(self) -> float:
         """How far from the star there is light [pix]."""
         return int(self.spacing * (max(self.coefficients.shape[1:]) - 1) / 2)
 
-    def on_stamps(self, centres, offsets, half):
+    def on_stamps(self, centres: np.ndarray, offsets: np.ndarray, half: int) -> np.ndarray:
         """Parts of the light of stars on square stamps around pixels, the halo too, (n, npix), rows (y) first.
 
         Parameters
@@ -202,7 +213,9 @@ class EffectivePSF:
         return light + self.halo * np.cos(np.pi / 2 * np.clip(2 * r / self.reach - 1, 0, 1)) ** 2
 
     @classmethod
-    def from_array(cls, data, *, oversampling, positions=None, source="array"):
+    def from_array(
+        cls, data: ArrayLike, *, oversampling: float, positions: ArrayLike | None = None, source: str = "array"
+    ) -> EffectivePSF:
         """A PSF from oversampled images, as photutils has them.
 
         Parameters
@@ -238,7 +251,7 @@ class EffectivePSF:
         variation, order = _grid_of(positions, len(data), source)
         return cls(splines.coefficients(data[order]), 1 / oversampling, variation, source=source)
 
-    def images(self, xy, *, half=None, oversampling=4):
+    def images(self, xy: ArrayLike, *, half: float | None = None, oversampling: int = 4) -> np.ndarray:
         """Oversampled images at some places, (n, k, k); the star is in the middle.
 
         Parameters
@@ -273,7 +286,7 @@ class EffectivePSF:
         places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         return self.images(places, oversampling=_SAMPLES), x, y
 
-    def to_photutils(self):
+    def to_photutils(self) -> GriddedPSFModel:
         """The same as ``GriddedPSFModel`` of photutils: images on a grid of places, linear in between."""
         from photutils.psf import GriddedPSFModel
 
@@ -281,7 +294,7 @@ class EffectivePSF:
         places = [(float(a), float(b)) for b in y for a in x]
         return GriddedPSFModel(NDData(images.copy(), meta={"grid_xypos": places, "oversampling": _SAMPLES}))
 
-    def write(self, path, *, overwrite=False):
+    def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
         """Write a FITS file.
 
         The primary array holds oversampled images in the format STDPSF, which ``GriddedPSFModel.read`` of photutils
@@ -319,7 +332,7 @@ class EffectivePSF:
             fits.HDUList([primary, exact, *left]).writeto(file)
 
     @classmethod
-    def read(cls, path):
+    def read(cls, path: StrPath) -> EffectivePSF:
         """A PSF that `write` has written.
 
         Raises
@@ -335,7 +348,7 @@ class EffectivePSF:
             raise InputError(f"{path}: no FITS file that could be read ({error})") from None
 
     @classmethod
-    def from_hdus(cls, hdus, path):
+    def from_hdus(cls, hdus: HDUList, path: StrPath) -> EffectivePSF:
         """The same from an open file; `path` is for the messages."""
         if EXTENSION not in [hdu.name for hdu in hdus]:
             raise InputError(f"{path}: no extension {EXTENSION}, as EffectivePSF.write makes it: give it as psf=")
@@ -357,11 +370,11 @@ class EffectivePSF:
         except KeyError as error:
             raise InputError(f"{path}: the extension {EXTENSION} is damaged: {error.args[0]}") from None
 
-    def named(self, **changes):
+    def named(self, **changes: Any) -> EffectivePSF:
         """The same with other attributes."""
         return replace(self, **changes)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         size = self.spacing * np.array(self.coefficients.shape[:0:-1])
         made = f"from {self.n_stars} stars" if self.n_stars is not None else f"of {self.source}"
         whose = f" {self.exposure!r}" if self.exposure else ""

@@ -1,6 +1,9 @@
 """Covariances of a solution in its gauge, computed when first asked for."""
 
+from __future__ import annotations
+
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -9,6 +12,9 @@ from ...results.gauge import UnknownDirection
 from . import criterion, elimination, reduced_system
 from .problem import State
 from .star_terms import packed, unpacked
+
+if TYPE_CHECKING:
+    from ...results.gauge import Gauge
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
 DENSE_LIMIT = 8000
@@ -36,14 +42,24 @@ class Uncertainty:
         The reduced system of these, if it is there already.
     """
 
-    def __init__(self, problem, blocks, gauge, *, scale=1.0, coefficients=None, shared_errors=None, system=None):
+    def __init__(
+        self,
+        problem: Any,
+        blocks: Any,
+        gauge: Gauge,
+        *,
+        scale: float = 1.0,
+        coefficients: Any = None,
+        shared_errors: Any = None,
+        system: Any = None,
+    ) -> None:
         self._problem, self._blocks, self._gauge, self._scale = problem, blocks, gauge, scale
         self._given, self._shared = coefficients, 0.0 if shared_errors is None else shared_errors
         if system is not None:
             self.system = system
 
     @cached_property
-    def coefficients(self):
+    def coefficients(self) -> np.ndarray:
         """Covariance of the fitted coefficients, shape (n_exposures * 2 n_modes,) squared, px^2; x modes first."""
         if self._given is not None:
             return self._given
@@ -64,12 +80,12 @@ class Uncertainty:
         return out.reshape(n, n)
 
     @cached_property
-    def stars(self):
+    def stars(self) -> np.ndarray:
         """Covariance xx, yy, xy of every star's position in the gauge, shape (3, n_stars), px^2."""
         return self.star_unknowns[:3] + self._shared
 
     @cached_property
-    def star_unknowns(self):
+    def star_unknowns(self) -> np.ndarray:
         """Covariance of the unknowns of every star in the gauge, packed: position [px^2] and what moves it.
 
         Shape (m, n_stars). NaN for what the observations of a star do not determine.
@@ -92,12 +108,12 @@ class Uncertainty:
         return out
 
     @cached_property
-    def system(self):
+    def system(self) -> Any:
         """The reduced system at the solution."""
         return reduced_system.reduced_system(self._problem, self._blocks, self._gauge)
 
     @cached_property
-    def directions(self):
+    def directions(self) -> np.ndarray:
         """See `legdistort.results.gauge.Gauge.directions`."""
         return self._directions(self.system)
 
@@ -107,7 +123,7 @@ class Uncertainty:
         return -(moved @ gauge.reach).transpose(1, 0, 2)
 
     @cached_property
-    def drift_directions(self):
+    def drift_directions(self) -> np.ndarray:
         """How modes of the common map and of `Drift` change the unknowns of the stars, (n_stars, 2 + k, 2 n_modes + q).
 
         See `directions`. A map that stays the same changes motions in second order, by its gradient, and one that
@@ -125,7 +141,7 @@ class Uncertainty:
                 out[:, :, column] += system.settle(np.zeros_like(self._blocks.g_exposure), pull)[0].T
         return out
 
-    def unknown_at(self, positions, coefficients, poses):
+    def unknown_at(self, positions: np.ndarray, coefficients: np.ndarray, poses: Any) -> np.ndarray:
         """How the directions of `Gauge.unknown` move the stars where the solution has moved to: (2 n_stars, m).
 
         All x first; each for the same change of what holds the solution as here. They turn as the solution moves along
@@ -142,7 +158,7 @@ class Uncertainty:
             ]
         return np.stack(columns, axis=1)
 
-    def directions_at(self, positions, coefficients, poses):
+    def directions_at(self, positions: np.ndarray, coefficients: np.ndarray, poses: Any) -> np.ndarray:
         """`directions` where the solution has moved to, (2 n_stars, 2 n_modes), all x first."""
         maps = self._directions(self._system_at(positions, coefficients, poses))
         return maps.transpose(1, 0, 2).reshape(2 * len(maps), -1)
@@ -159,7 +175,7 @@ class Uncertainty:
         return np.sqrt(np.mean(stars[:, self._blocks.v[0] > 0] ** 2))
 
     @cached_property
-    def bends(self):
+    def bends(self) -> np.ndarray | None:
         """Covariance of the unknowns of stars with the bend to the convention, (n_stars, 2 + k, 2 n_modes).
 
         See `legdistort.results.gauge.Gauge.to_convention`; None where the convention holds, or the covariance of the
@@ -175,7 +191,7 @@ class Uncertainty:
         return np.stack(moved, axis=2).transpose(1, 0, 2)
 
     @cached_property
-    def weak(self):
+    def weak(self) -> tuple[UnknownDirection, ...]:
         """Directions of a distortion that exposures share and do not determine, as a tuple of `UnknownDirection`."""
         problem = self._problem
         if not problem.unknowns.shared or problem.static_sigma is not None or not self.system.n_weak:
@@ -191,11 +207,11 @@ class Uncertainty:
         return tuple(made)
 
     @cached_property
-    def star_matrix(self):
+    def star_matrix(self) -> np.ndarray:
         """Covariance between all star positions in the gauge, shape (2 n_stars,) squared, px^2; all x first."""
         return self.covariance_between(np.arange(self._problem.n_stars), 2)
 
-    def covariance_between(self, stars, size):
+    def covariance_between(self, stars: np.ndarray, size: int) -> np.ndarray:
         """Covariance between the first `size` unknowns of some stars in the gauge, (size * n,) squared; all x first.
 
         Parameters
