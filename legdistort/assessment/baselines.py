@@ -3,7 +3,7 @@
 Every function takes `Matches` and returns a `Solution`, whose residuals, stars and corrections are used like those of
 `legdistort.solve`. Their models leave distortion in the data on purpose, so the stated errors cannot be right: all
 reported errors are scaled to the residuals, and the absolute ones, ``x_err_abs`` and ``y_err_abs``, are not
-available (NaN): nothing in these fits tells how far their plane is from the sky.
+available (NaN): nothing in these fits determines how far their plane is from the sky.
 """
 
 import logging
@@ -256,7 +256,7 @@ def _corrected_mean(matches, problem, state):
 
 
 def _convention(gauge, name, plane, **changes):
-    """The gauge of a correction, whose plane is told in words; absolute errors come out as NaN."""
+    """The gauge of a correction, whose plane is described in words; absolute errors come out as NaN."""
     return replace(gauge, kind=name, plane=plane, unknown_maps=(), **changes)
 
 

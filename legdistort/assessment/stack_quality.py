@@ -169,7 +169,7 @@ def compare_stacks(exposures, comparison, *, mosaic, fwhm=None, max_stars=500, *
     Returns
     -------
     Stacks
-        Positions are compared with those of the method, after the map that the images do not tell (a polynomial of
+        Positions are compared with those of the method, after the map that the images do not determine (a polynomial of
         the degree fitted, common to all exposures) was taken out of every stack alike.
 
     Raises

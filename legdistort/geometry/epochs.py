@@ -8,7 +8,7 @@ from astropy.time import Time
 
 from ..exceptions import InputError, some_of
 
-#: Keywords of headers that tell it, the middle of the exposure before its beginning; those of HST are MJD too.
+#: Keywords of headers that state it, the middle of the exposure before its beginning; those of HST are MJD too.
 KEYWORDS = ("MJD-AVG", "MJD-MID", "MJD-OBS", "MJD-BEG", "EXPSTART", "DATE-AVG", "DATE-OBS")
 #: Numbers between these are modified Julian dates (the years 1949 to 2132), as years they would be absurd.
 _MJD = 33000.0, 100000.0
@@ -101,7 +101,7 @@ def mean_epoch(headers):
 
 
 def header_epoch(header):
-    """Epoch of an exposure by its header (`KEYWORDS`), a Julian year, or None; of the day alone if it tells no more."""
+    """Epoch of an exposure by its header (`KEYWORDS`), a Julian year, or None; that of the day if it has no time."""
     for key in KEYWORDS:
         value = header.get(key)
         try:

@@ -53,7 +53,8 @@ class FastLegendre2D(models.Legendre2D):
 
         astropy's linear fitter hands over positions in the window, as the stock model takes them; its non-linear
         fitters and sums of models hand over plain positions, which the stock model takes for those, too. Here they are
-        told by their size: what goes beyond twice the window, as pixels do unless a detector has but four, is mapped.
+        recognised by their size: what goes beyond twice the window, as pixels do on more than four of them, is
+        mapped.
         """
         if not (_near(self.x_window, x) and _near(self.y_window, y)):
             x = _to_window(x, self.x_domain, self.x_window)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from ..exceptions import InputError
 from .exposure_names import detector_name
 
-#: Header keywords that tell detectors apart, in order of preference.
+#: Header keywords that distinguish detectors, in order of preference.
 KEYWORDS = ("CCDCHIP", "DETECTOR", "CHIP", "EXTVER", "EXTNAME")
 
 

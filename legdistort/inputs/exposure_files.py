@@ -220,7 +220,7 @@ def open_exposures(
         return _read_each(paths, partial(_open, good=good), ext, progress)
     bad, copies = {}, {}
     exposures = _read_each(paths, partial(_open, good=good, even_blank=False), ext, progress, bad, copies)
-    kept, reasons = {exposure.name for exposure in exposures}, repetitions.told(copies)
+    kept, reasons = {exposure.name for exposure in exposures}, repetitions.warned(copies)
     if bad:
         _tell_bad(bad, len(exposures), stop_at_bad)
         reasons |= {name: reason for name, (_, reason, _) in bad.items()}
@@ -238,12 +238,12 @@ def _tell_bad(bad, n_good, stop_at_bad):
     for label, reason, _ in bad.values():
         same.setdefault(reason, []).append(label)
     named = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in same.items())
-    told = f"{len(bad)} of {n_good + len(bad)} frames cannot be used: {named}"
+    unusable = f"{len(bad)} of {n_good + len(bad)} frames cannot be used: {named}"
     if stop_at_bad:
-        raise InputError(f"{told}; mend them, or leave them out")
+        raise InputError(f"{unusable}; repair them, or leave them out")
     if n_good < 2:
-        raise InputError(f"{told}; {'one good frame is' if n_good else 'no good frame is'} left, give at least two")
-    warn(f"{told}; they are left out (--stop-at-bad, stop_at_bad=True, refuses them)", AssumptionWarning)
+        raise InputError(f"{unusable}; {'one good frame is' if n_good else 'no good frame is'} left, give at least two")
+    warn(f"{unusable}; they are left out (--stop-at-bad, stop_at_bad=True, refuses them)", AssumptionWarning)
 
 
 def _read_each(paths, read, ext, progress, bad=None, copies=None):
@@ -278,7 +278,7 @@ def _read_each(paths, read, ext, progress, bad=None, copies=None):
         if exposure.name in origins:
             raise InputError(
                 f"two exposures are named {exposure.name!r} ({origins[exposure.name]} and "
-                f"{origin}); rename a file, names tell exposures apart"
+                f"{origin}); rename a file: exposures are distinguished by their names"
             )
         origins[exposure.name] = origin
         exposures.append(exposure)
@@ -328,7 +328,7 @@ def _parts(sources, ext):
 
 
 def _headers_of_images(source):
-    """The images of a FITS file, or none of what cannot be read: reading it will tell."""
+    """The images of a FITS file, or none of what cannot be read: the error comes when it is read."""
     if isinstance(source, fits.HDUList):
         return [hdu for hdu in source if _is_image(hdu)]
     try:

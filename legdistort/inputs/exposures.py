@@ -128,7 +128,7 @@ class Exposure:
 
 
 def known_from_header(header, data, *, integer):
-    """Saturation, gain, read noise and exposure time, as arguments of `Exposure`; `integer` data may tell the first."""
+    """Saturation, gain, read noise and exposure time, as arguments of `Exposure`; `integer` data may show the first."""
     known = {key: _number(header, keywords) for key, keywords in KEYWORDS.items()}
     # Detector readings are counts; calibrated data say in BUNIT that they are electrons, or electrons per second.
     unit = str(header.get("BUNIT", "")).lower().replace(" ", "")

@@ -96,7 +96,7 @@ class Matches:
     left_out : dict
         ``{exposure: reason}`` of exposures that could not be used.
     epoch : float or None
-        Mean of the exposures, a Julian year, if their headers tell it.
+        Mean of the exposures, a Julian year, if their headers state it.
     header_distortion : str or None
         The largest distortion of the headers, in words, if they have one; it is not in the poses.
     observations : Observations
@@ -144,7 +144,7 @@ class Matches:
     def times(self) -> tuple[np.ndarray, str]:
         """Times (n_exposures,) from the first exposure on, and their unit, by the column ``epoch``.
 
-        In "days"; in "exposures", their order, where it is of one night and tells no more than half of them apart.
+        In "days"; in "exposures", their order, where it is of one night and distinguishes no more than half of them.
         """
         n = len(self.names)
         if "epoch" in self.table.colnames:
@@ -253,7 +253,7 @@ class Matches:
             Keep exposures whose positions are those of another one to the last bit, as in simulations without noise;
             else they are left out with a warning: five stars or more, and over half of those of the shorter list.
         camera : `legdistort.Camera`, optional
-            Where exposures have several detectors, told apart by the column ``detector``: they become one, the focal
+            Where exposures have several detectors, distinguished by the column ``detector``: they become one, the focal
             plane of the camera, whose layout and static distortion count as known. What an exposure adds is then a
             distortion of the focal plane as a whole.
 
@@ -326,7 +326,7 @@ def shapes_by_exposure(shape, names):
 
 
 def _check_spread(seen):
-    """Positions on one line tell nothing across it."""
+    """Positions on one line do not constrain anything across it."""
     if np.linalg.matrix_rank(seen.xy - seen.xy.mean(axis=0)) < 2:
         raise InputError("all positions lie on one line: give stars all over the field, or look at the columns x, y")
 

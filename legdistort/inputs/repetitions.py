@@ -48,10 +48,10 @@ def copies(exposure, xy):
 def reasons(names, exposure, xy):
     """`copies` in words, ``{name: reason}``, with a warning that names both."""
     found = {names[copy]: names[original] for copy, original in copies(exposure, xy).items()}
-    return told({name: f"its positions are those of {original} to the last bit" for name, original in found.items()})
+    return warned({name: f"its positions are those of {original} to the last bit" for name, original in found.items()})
 
 
-def told(repeated):
+def warned(repeated):
     """Exposures that repeat another one, ``{name: reason}``, after a warning of them."""
     if repeated:
         listed = "; ".join(f"{name}: {reason}" for name, reason in repeated.items())

@@ -45,7 +45,7 @@ def read_table(path, *, columns=None, origin=None, error=None):
     -------
     `~astropy.table.Table`
         Pixels from 0; ``meta["inputs"]`` has the checksum of the file, ``meta["shapes"]`` the size of the image if
-        the file tells.
+        the file names.
 
     Raises
     ------

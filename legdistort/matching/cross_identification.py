@@ -197,8 +197,8 @@ def _tangent_plane(reference, positions):
     """Tangent point, rotation, scale and parity from identified stars."""
     if len(positions) < 3:
         raise InputError(
-            f"the exposures have no WCS, and {len(positions)} stars of {reference.label} are too few to tell rotation, "
-            "scale and parity: 3 are needed"
+            f"the exposures have no WCS, and {len(positions)} stars of {reference.label} are too few to determine "
+            "rotation, scale and parity: 3 are needed"
         )
     plane = _middle(reference.sky, 1.0)
     return TangentPlane(plane.lon, plane.lat, similarity.robust_similarity(positions, reference.on_plane(plane)[0]))

@@ -70,7 +70,7 @@ def match(
     shape : tuple or dict, optional
         ``(ny, nx)``, or that by exposure, when there are no `exposures`.
     camera : `legdistort.Camera`, optional
-        Where exposures have several detectors, told apart by the column ``detector``: they are matched as one, the
+        Where exposures have several detectors, distinguished by the column ``detector``: they are matched as one, the
         focal plane. Without it the headers of `exposures` with several detectors say how these lie.
     min_exposures : int
         A star is kept when it was found in that many exposures.
@@ -150,7 +150,7 @@ def match(
 
 
 def _add_epochs(table, named):
-    """Add the column ``epoch`` [yr] if headers tell it and the table does not; NaN where one does not."""
+    """Add the column ``epoch`` [yr] if headers state it and the table does not; NaN where one does not."""
     epochs = {name: header_epoch(exposure.header) for name, exposure in named.items()}
     if any(epoch is not None for epoch in epochs.values()) and "epoch" not in table.colnames:
         years = {name: np.nan if epoch is None else epoch for name, epoch in epochs.items()}

@@ -195,7 +195,7 @@ def _from_header(header, name, hdulist=None):
 
 
 def _shape(header):
-    """Detector of a header without its image, if it tells; the second pair is that of astrometry.net."""
+    """Detector of a header without its image, if it states it; the second pair is that of astrometry.net."""
     for keys in (("NAXIS2", "NAXIS1"), ("IMAGEH", "IMAGEW")):
         if all(isinstance(header.get(key), int) and header[key] >= 2 for key in keys):
             return header[keys[0]], header[keys[1]]

@@ -22,7 +22,7 @@ from ..inputs.sky_wcs import to_icrs
 from .from_files import read_source
 from .from_objects import as_source, of_sky
 
-#: Headers tell one distortion if their series differ by less than this [pix] all over the detector; the degree of a
+#: Headers state one distortion if their series differ by less than this [pix] all over the detector; the degree of a
 #: series is raised until it leaves less out. It is what `legdistort attach` allows a header by default.
 SAME = 1e-3
 #: Highest degree: that of SIP as the convention allows it.

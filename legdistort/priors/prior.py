@@ -74,7 +74,7 @@ class Prior:
         large it is, see `static_sigma`.
     sigma : array_like, optional
         Scatter of single exposures around the mean, pixels: a number, (n_modes,) or (2, n_modes). It shrinks
-        what the data cannot tell. None leaves the exposures free. Zero keeps a mode at the mean, infinity leaves it
+        what data do not determine. None leaves the exposures free. Zero keeps a mode at the mean, infinity leaves it
         free. "evidence" lets `legdistort.solve` find it from the exposures, one width a degree
         (`legdistort.solving.choices.prior_widths`).
     static_sigma : array_like, optional
@@ -222,16 +222,16 @@ class Prior:
         model : callable, astropy model, gwcs, `~astropy.wcs.WCS` or SIAF aperture
             ``model(x, y) -> (x, y)`` on arrays, between detector pixels and an undistorted plane; units are welcome.
         shape : tuple, optional
-            ``(ny, nx)`` of the detector; needed if the model does not tell.
+            ``(ny, nx)`` of the detector; needed if the model does not state it.
         direction : {"detector_to_reference", "reference_to_detector"}, optional
-            What the model does; needed if it does not tell.
+            What the model does; needed if it does not state that.
         origin : {0, 1}, optional
-            Coordinate of the centre of the model's first pixel (default 0; WCSs and apertures tell).
+            Coordinate of the centre of the model's first pixel (default 0; WCSs and apertures state it).
         frame : str, optional
             Where to end: of a gwcs, the name of a frame (default "undistorted", or else "v2v3", or else the last); of a
             SIAF aperture "idl" (default) or "tel".
         degree : int
-            Total degree of the Legendre series; `truncation` tells what it leaves out.
+            Total degree of the Legendre series; `truncation` is what it leaves out.
         parity : {1, -1, None}
             Orientation of the plane relative to the detector; None takes what fits.
         offset : tuple of float, optional
@@ -322,7 +322,7 @@ class Prior:
         Returns
         -------
         Prior or dict
-            One, if all headers tell the same (to 0.001 pixels); else ``{exposure: Prior}``.
+            One, if all headers state the same (to 0.001 pixels); else ``{exposure: Prior}``.
 
         Raises
         ------
@@ -332,7 +332,7 @@ class Prior:
         Warns
         -----
         AssumptionWarning
-            For headers without a distortion where all others tell the same, which is then taken for these too.
+            For headers without a distortion where all others state the same, which is then taken for these too.
         """
         from .from_headers import from_headers
 
@@ -391,7 +391,7 @@ class HeaderPrior:
 
 
 def tells(prior):
-    """Whether a prior, or any of a dict of them, tells of a distortion: its mean is not zero."""
+    """Whether a prior, or any of a dict of them, holds a distortion: its mean is not zero."""
     each = prior.values() if isinstance(prior, dict) else [prior]
     return any(p is not None and np.any(p.mean) for p in each)
 

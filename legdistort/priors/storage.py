@@ -1,4 +1,4 @@
-"""Priors as ASDF files, and the door through which a prior of any kind comes in."""
+"""Priors as ASDF files, and reading a prior of any kind."""
 
 import dataclasses
 import re

@@ -151,7 +151,7 @@ def _without_fits_arrays(path, content):
     """The file with null in the place of the arrays that are HDUs of the FITS file around it."""
     end = re.compile(rb"\r?\n\.\.\.\r?\n").search(content)
     if end is None:
-        return content  # which will be told
+        return content  # which is reported later
     kept, held, depth, elsewhere = [], [], 0, False
     try:
         for event in yaml.parse(content[: end.end()], Loader=_LOADER):
@@ -281,7 +281,7 @@ def _check_array(node, where, room):
 
 
 def understood(path, function, tree):
-    """``function(tree)``, whatever it stumbles over told with the name of the file."""
+    """``function(tree)``, errors in it raised with the name of the file."""
     try:
         with np.errstate(all="ignore"):
             return function(tree)

@@ -1,4 +1,4 @@
-"""One door for work that falls into independent items: in this process, on its cores, or on a cluster of dask."""
+"""Work that falls into independent items: in this process, on its cores, or on a cluster of dask."""
 
 import logging
 import signal

@@ -42,7 +42,7 @@ def checksum(file):
 
 
 def identity(path):
-    """What tells one state of a file from another without reading it; None if there is no file."""
+    """What distinguishes one state of a file from another without reading it; None if there is no file."""
     try:
         found = os.stat(path)
     except (OSError, ValueError):

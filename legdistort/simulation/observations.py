@@ -205,7 +205,7 @@ def simulate_exposures(
 ) -> SimulatedExposures:
     """Images of a simulated GSAOI night.
 
-    Stars are drawn with at least 10 FWHM between them; with ``motion`` and ``epochs`` they move, and the headers tell
+    Stars are drawn with at least 10 FWHM between them; with ``motion`` and ``epochs`` they move, and the headers state
     when. Their true pixels are ``D(q) + d_i(q)``: the published static
     distortion D of the real detector, inverted by Newton's method, and a dynamic Legendre part. With
     ``camera="gsaoi"`` they are those of four detectors in one focal plane, to which the dynamic part belongs.

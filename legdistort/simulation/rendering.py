@@ -269,7 +269,7 @@ def position_covariance(xy, flux, expected, *, psf, gain, read_noise, half=None)
     gain, read_noise : float
         Electrons per ADU, electrons.
     half : int, optional
-        Half side of the square around a star that tells of it [pix]; by default 4 FWHM.
+        Half side of the square around a star that is used for it [pix]; by default 4 FWHM.
 
     Returns
     -------

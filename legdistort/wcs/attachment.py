@@ -83,7 +83,7 @@ def attach(
     of its shape and ``EXTVER``) get the keywords as well. Every other HDU, card and byte stays as it is. Nothing is
     written unless everything can be.
 
-    Frames are told by their names, as `read_exposures` gives them. A frame that was left out of the solution is
+    Frames are identified by their names, as `read_exposures` gives them. A frame that was left out of the solution is
     skipped, which is logged.
 
     Parameters
@@ -253,7 +253,7 @@ def _nothing(solution, path, name):
         try:
             solution.index(name)
         except InputError as error:
-            raise InputError(f"{path}: {error}; frames are told by their names") from None
+            raise InputError(f"{path}: {error}; frames are identified by their names") from None
     log.warning("%s: skipped, it was left out of the solution (%s)", path, solution.left_out[name])
     return {}
 
@@ -312,8 +312,8 @@ def _asdf_hdu(solution, name, number):
         header["SOLSHA"] = solution.checksum  # no room for a comment
     made = tree["meta"]["provenance"]
     packages = ", ".join(f"{package} {each}" for package, each in made["versions"].items())
-    told = f"The solution was made {made['created']} with {packages}. SOLSHA, if known, is the SHA-256 of its file."
-    for line in textwrap.wrap(told, 72):
+    made_by = f"The solution was made {made['created']} with {packages}. SOLSHA, if known, is the SHA-256 of its file."
+    for line in textwrap.wrap(made_by, 72):
         header["HISTORY"] = line
     fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(file, checksum=True)
     return file.getvalue()[BLOCK:]

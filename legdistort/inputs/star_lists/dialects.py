@@ -31,7 +31,7 @@ class Dialect:
     columns : dict
         ``{contract name: names, the best first}``.
     marks : tuple of str
-        Columns that tell it, if the file does not; none for one that the file tells.
+        Columns by which it is recognised where the file does not name it; none for one that the file names.
     origin : int
         Coordinate of the centre of the first pixel.
     flags : callable
@@ -46,8 +46,8 @@ class Dialect:
 
     def speaks(self, table):
         """Whether a table is of this kind."""
-        told = table.meta.get("program")
-        return told == self.program if told else bool(self.marks) and set(self.marks) <= set(table.colnames)
+        stated = table.meta.get("program")
+        return stated == self.program if stated else bool(self.marks) and set(self.marks) <= set(table.colnames)
 
 
 def _positive(name, bit):

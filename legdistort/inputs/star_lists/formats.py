@@ -1,7 +1,7 @@
 """Tables as they stand in files: which format a file has shows in its first bytes, seldom in its name.
 
-A text tells the names of its columns in a line above the numbers, commented or not. Comments may hold much more than
-that (those of hst1pass fill 150 lines), so of the commented lines the last one is taken that has a name for every
+A text file gives the names of its columns in a line above the numbers, commented or not. Comments may hold much more
+than that (those of hst1pass fill 150 lines), so of the commented lines the last one is taken that has a name for every
 column.
 """
 
@@ -31,7 +31,7 @@ _DOTTED = re.compile(r"\.*[A-Za-z0-9]\.*")
 
 
 def read(path):
-    """Every table of a file, as it stands there, with what the file tells about it.
+    """Every table of a file, as it stands there, with what the file states about it.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def read(path):
     list of `~astropy.table.Table`
         One, or as many as an LDAC file has detections of images. ``meta`` has only what is understood: ``shapes``,
         ``poses``, ``sky``, ``left_out``, ``epoch`` and ``inputs`` as `legdistort.inputs.matches.Matches.to_meta` writes
-        them; ``shape`` of the image; ``program``, "hst1pass" or "DAOPHOT", where the columns do not tell.
+        them; ``shape`` of the image; ``program``, "hst1pass" or "DAOPHOT", where the columns do not show it.
 
     Raises
     ------

@@ -35,7 +35,7 @@ def is_pixel(name):
 
 
 def understand(table, columns, *, without_errors=False):
-    """Add x, y, x_err, y_err, xy_corr, flux, flux_err, mag, fwhm and flags where columns of SExtractor tell them.
+    """Add x, y, x_err, y_err, xy_corr, flux, flux_err, mag, fwhm and flags where columns of SExtractor hold them.
 
     Columns that the table has under these names already, or that the caller maps, are left alone. Rows without
     a usable error are left out. Positions stay counted from 1.
