@@ -71,20 +71,23 @@ class Night:
         c = published()
         middle = to_arcsec(c[1], [[SIZE + 70, SIZE + 70]])[0]
         self.sky = middle + rng.uniform(-52, 52, (n_stars, 2))
-        self.focal, self.pixels, self.towards = [], [], []
-        for _ in range(n_exposures):
+        self.focal, self.pixels, self.towards, self._bends = [], [], [], []
+        for i in range(n_exposures):
             angle, shift = rng.normal(0, turn), rng.uniform(-dither, dither, 2)
             rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            place = (self.sky - middle) @ rotation.T + shift
             self.towards.append((middle + shift, rotation))
             powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i + j]
             size = rng.normal(0, 1, (2, len(powers))) * 0.02 * dynamic / np.sqrt(len(powers)) * 2.5
-            bend = sum(
-                s[:, None] * (place[:, 0] / 45) ** i * (place[:, 1] / 45) ** j
-                for s, (i, j) in zip(size.T, powers, strict=True)
-            )
-            self.focal.append(middle + place + bend.T)
+            self._bends.append((middle, shift, list(zip(size.T, powers, strict=True))))
+            self.focal.append(self.bent(i, self.sky))
             self.pixels.append({key: to_pixels(c[chip], self.focal[-1]) for key, chip in CHIPS.items()})
+
+    def bent(self, i, sky):
+        """Where places on the sky (n, 2) fall in the focal plane of exposure i, arcsec."""
+        middle, shift, terms = self._bends[i]
+        place = (sky - middle) @ self.towards[i][1].T + shift
+        u, v = place.T / 45
+        return middle + place + sum(np.outer(u**j * v**k, s) for s, (j, k) in terms)
 
     def table(self, *, sigma=0.01, seed=2, least=3):
         """Measured positions of the stars that lie on a detector in so many exposures, as a QTable."""

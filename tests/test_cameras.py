@@ -115,7 +115,7 @@ class TestCamera:
 
     def test_prints(self, gsaoi):
         assert repr(gsaoi) == "<Camera GSAOI: 4 detectors in a focal plane of 4301 x 4276 px>"
-        assert str(gsaoi).splitlines()[3].split() == ["2", "2048", "x", "2048", "1089.95", "1034.66", "0.0237",
+        assert str(gsaoi).splitlines()[3].split() == ["2", "2048", "x", "2048", "1085.30", "1034.40", "0.0237",
                                                       "0.991644", "2.900"]  # fmt: skip
 
     def test_file(self, gsaoi, tmp_path):
@@ -431,6 +431,11 @@ class TestFittedCamera:
         for key in "13":
             assert np.isinf(solution.camera[key].layout_sigma).any()
         assert solution.camera["2"].layout_sigma is None  # nothing was measured on it
+        for name, lost in (("x_err_abs", np.isnan), ("x_err_known", np.isinf)):
+            assert lost(solution.stars[name]).mean() > 0.9
+        assert np.isfinite(solution.stars["x_err"]).all()
+        xy = np.array([[300.0, 1700.0]])
+        assert np.isnan(solution.correct("frame00", xy, errors=[[0.01, 0.01]], detector="1").absolute).all()
         assert "so that their places relative to each other are not determined" in solution.camera_sentence
         assert "inf" in str(solution).splitlines()[-4]
         again = legdistort.Camera.read(solution.camera.write("camera.asdf"))

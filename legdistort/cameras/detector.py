@@ -40,7 +40,7 @@ class Place:
     Attributes
     ----------
     x, y : float
-        Its centre, pixels of the focal plane.
+        Its undistorted centre, pixels of the focal plane: by the layout alone, as the others.
     rotation : float
         From the focal plane to the detector, degrees.
     scale : float
@@ -160,7 +160,8 @@ class Detector:
     @property
     def place(self) -> Place:
         """The `Place` of the detector."""
-        x, y = self.to_focal_plane(basis.denormalize(np.zeros(1), np.zeros(1), self.shape))[0]
+        middle = basis.denormalize(np.zeros(1), np.zeros(1), self.shape)
+        x, y = similarity.apply(similarity.invert(self.layout), middle)[0]
         m, errors = self.layout[:, :2], None
         parity = np.sign(np.linalg.det(m))
         rotation = np.degrees(np.arctan2(m[1, 0] - parity * m[0, 1], m[0, 0] + parity * m[1, 1]))  # without the shear

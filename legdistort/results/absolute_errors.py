@@ -99,7 +99,7 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
     """Covariance xx, yy, xy (3, n_stars) of positions with that of the common map.
 
     NaN, unless `without_unknown`, for a star that an unknown direction of unit rms moves by more than the rest of its
-    error.
+    error; infinite even so where it is the place of its detector that nothing determines.
     """
     if gauge.plane is not None:
         return np.full_like(uncertainty.stars, np.nan)
@@ -110,14 +110,25 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
     if not without_unknown:
         for each in gauge.unknown:
             out[:, np.sum(each.stars**2, axis=1) > out[0] + out[1]] = np.nan
+    if uncertainty.camera is not None:  # it is not one map that would have to be taken off, but detectors by themselves
+        for each in np.moveaxis(uncertainty.camera.unknown, 2, 0):
+            lost = np.sum(each**2, axis=1) > out[0] + out[1]
+            out[:, lost] = np.inf if without_unknown else np.nan
     return out
 
 
-def relative_coefficients(gauge, uncertainty, i):
-    """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i under the convention of the gauge."""
+def own_coefficients(gauge, uncertainty, i):
+    """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i in the gauge, a camera taken as known."""
     size = len(uncertainty.coefficients) // len(gauge.motion)
     mine = slice(i * size, (i + 1) * size)
-    block = uncertainty.coefficients[mine, mine]
+    return uncertainty.coefficients[mine, mine]
+
+
+def relative_coefficients(gauge, uncertainty, i):
+    """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i under the convention of the gauge, a camera as known."""
+    block = own_coefficients(gauge, uncertainty, i)
+    size = len(block)
+    mine = slice(i * size, (i + 1) * size)
     if uncertainty.bends is None:
         return block
     shared, bend = gauge.bend_errors(uncertainty.coefficients)

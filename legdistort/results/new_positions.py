@@ -96,14 +96,14 @@ def correct_with_errors(solution, name, xy, errors, detector=None, moved=None):
     pixels = np.atleast_2d(to_pixels(xy))
     measured = _covariance(errors, len(pixels))
     if detector is not None:
-        pixels, measured = detector.to_focal_plane(pixels, measured)
+        pixels, measured = solution.camera[detector].to_focal_plane(pixels, measured)
     distortion = solution.distortion(name)
     distortion.check_fold()
     q = distortion.invert(pixels)
     corrected = similarity.apply(similarity.invert(solution.poses[name]), q)
     if moved is not None:
         corrected = corrected + moved.displacement(solution.motions)
-    relative, absolute = covariances(solution, name, q, measured, moved)
+    relative, absolute = covariances(solution, name, q, measured, moved, detector)
     if isinstance(xy, u.Quantity):
         relative, absolute = relative * u.pix**2, absolute * u.pix**2
     return Corrected(like(xy, corrected), relative, absolute)
@@ -150,21 +150,23 @@ def response(solution, name, q):
     return np.einsum("nac,mn->nacm", back, b).reshape(len(q), 2, -1), back
 
 
-def covariances(solution, name, q, measured, moved=None):
+def covariances(solution, name, q, measured, moved=None, detector=None):
     """Relative and absolute covariance (n, 2, 2) of positions corrected to undistorted pixels q (n, 2) of an exposure.
 
-    `measured` (n, 2, 2) is the covariance on the detector; a `Movement` carries the positions to another time.
+    `measured` (n, 2, 2) is the covariance on the detector; a `Movement` carries the positions to another time. Of a
+    camera with errors they have those too: of the `detector`, its id, or of that on which each position falls.
     """
     gauge, i = solution.gauge, solution.index(name)
     by_modes, back = response(solution, name, q)
-    noise = carried(back, measured)
-    own = noise + carried(by_modes, solution.coefficient_covariance(name))
+    noise = carried(back, measured) + by_camera(solution, name, q, by_modes, back, detector)
+    own = noise + carried(by_modes, absolute_errors.own_coefficients(gauge, solution.uncertainty, i))
     if gauge.plane is not None:
         return own, np.full_like(own, np.nan)
     xy = similarity.apply(similarity.invert(solution.poses[name]), q)
     hidden = gauge.absolute_covariance
     plain = absolute_errors.plain_directions(gauge, xy, len(hidden) // 2)
-    relative, directions = noise + carried(by_modes, solution.coefficient_covariance(name, relative=True)), plain
+    relative = noise + carried(by_modes, absolute_errors.relative_coefficients(gauge, solution.uncertainty, i))
+    directions = plain
     if len(hidden) == 2 * gauge.n_modes:
         directions = by_modes @ widened(gauge.motion[i], solution.degree)
         relative = relative + carried(directions - plain @ _taken_off(gauge, solution.positions), hidden)
@@ -176,10 +178,31 @@ def covariances(solution, name, q, measured, moved=None):
         own = own + carried(moved.columns, absolute_errors.own_blocks(*known)[terms])
         directions = directions + moved.columns @ solution.uncertainty.drift_directions[terms[:2]]
     absolute = own + carried(directions, hidden)
+    if (camera := solution.uncertainty.camera) is not None and solution.camera is not None:
+        absolute[camera.lost(solution.camera, solution.distortion(name)(q), detector)] = np.nan
     for each in gauge.unknown:
         moved = by_modes @ widened(each.coefficients[i].reshape(-1, 1), solution.degree)
         absolute[np.sum(moved**2, axis=(1, 2)) > np.trace(absolute, axis1=1, axis2=2)] = np.nan
     return relative, absolute
+
+
+def relative_errors(solution, name, q):
+    """Covariance (n, 2, 2) of the correction of positions q (n, 2) of an exposure under the convention of the gauge."""
+    by_modes, back = response(solution, name, q)
+    own = absolute_errors.relative_coefficients(solution.gauge, solution.uncertainty, solution.index(name))
+    return carried(by_modes, own) + by_camera(solution, name, q, by_modes, back)
+
+
+def by_camera(solution, name, q, by_modes, back, detector=None):
+    """Covariance (n, 2, 2) of corrected positions by the errors of a camera that was fitted: its own, and what the
+    coefficients make of them. Zero without.
+    """
+    errors = solution.uncertainty.camera
+    if errors is None or solution.camera is None:
+        return np.zeros((len(q), 2, 2))
+    seen = errors.in_focal_plane(solution.camera, solution.distortion(name)(q), detector)
+    through = back @ seen - by_modes @ errors.coefficients[solution.index(name)]
+    return through @ through.mT
 
 
 def carried(through, covariance):
@@ -191,6 +214,11 @@ def widened(changes, degree):
     """Changes (2 n, k) of coefficients of a lower degree as those of all modes fitted, (2 n_modes, k)."""
     by_mode = np.moveaxis(changes.reshape(2, len(changes) // 2, -1), 1, 2)
     return np.moveaxis(basis.change_degree(by_mode, degree), 1, 2).reshape(-1, changes.shape[1])
+
+
+def widened_all(motion, degree):
+    """Maps of all exposures (n_exposures, 2 n, k) on all modes fitted, (n_exposures, 2 n_modes, k); see `widened`."""
+    return np.stack([widened(each, degree) for each in motion])
 
 
 def _taken_off(gauge, positions):

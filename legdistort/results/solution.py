@@ -17,7 +17,7 @@ from astropy.time import Time
 from astropy.wcs import WCS
 
 from ..exceptions import InputError
-from ..geometry import basis, similarity
+from ..geometry import similarity
 from ..geometry.distortion import Distortion
 from ..geometry.epochs import year
 from ..geometry.models import exposure_model, like, outside, to_pixels
@@ -163,7 +163,7 @@ class Solution:
         ``x_err``, ``y_err`` are relative: what is left once a common map of the fitted degree is taken off.
         ``x_err_abs``, ``y_err_abs`` add that map: the mean dynamic distortion of the set and the uncertainty of the
         static one; NaN where they are not known (`Gauge.unknown`). ``x_err_known``, ``y_err_known`` are those after the
-        unknown directions are taken off. Pointing, rotation and scale common to all exposures are those of the nominal
+        unknown directions are taken off; infinite where nothing tells how the detectors of a camera lie. Pointing, rotation and scale common to all exposures are those of the nominal
         poses and are not part of these errors, unless a reference ties them: then they are. On the sky:
         ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
         ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue, and ``sky``, the same places as a
@@ -420,7 +420,7 @@ class Solution:
         pixels = np.atleast_2d(to_pixels(xy))
         moved = new_positions.movement(self, name, stars, epoch, len(pixels))
         if errors is not None:
-            return new_positions.correct_with_errors(self, name, xy, errors, chip, moved)
+            return new_positions.correct_with_errors(self, name, xy, errors, detector, moved)
         distortion = self.distortion(name)
         distortion.check_fold()
         q = distortion.invert(pixels if chip is None else chip.to_focal_plane(pixels))
@@ -532,13 +532,11 @@ class Solution:
     def coefficient_covariance(self, name: str, *, relative: bool = False) -> np.ndarray:
         """Covariance (2 n_modes, 2 n_modes) of the fitted coefficients of an exposure, px^2; x first.
 
-        Under the constraints of the gauge; or `relative`, under its convention alone (`Gauge.convention`).
+        With the errors of a camera that was fitted. Under the constraints of the gauge; or `relative`, under its convention alone (`Gauge.convention`).
         """
-        if relative:
-            return absolute_errors.relative_coefficients(self.gauge, self.uncertainty, self.index(name))
-        size = 2 * basis.n_modes(self.degree)
-        mine = slice(self.index(name) * size, (self.index(name) + 1) * size)
-        return self.uncertainty.coefficients[mine, mine]
+        known, camera = (self.gauge, self.uncertainty, self.index(name)), self.uncertainty.camera
+        block = (absolute_errors.relative_coefficients if relative else absolute_errors.own_coefficients)(*known)
+        return block if camera is None else block + camera.of_coefficients(self.index(name))
 
     def sigma_map(
         self, name: str, *, n: int = 64, support: bool = True, absolute: bool = False
@@ -572,8 +570,7 @@ class Solution:
         if absolute:
             covariance = new_positions.covariances(self, name, q, np.zeros((len(q), 2, 2)))[1]
         else:
-            by_modes = new_positions.response(self, name, q)[0]
-            covariance = new_positions.carried(by_modes, self.coefficient_covariance(name, relative=True))
+            covariance = new_positions.relative_errors(self, name, q)
         variance = np.einsum("naa->na", covariance)
         sigma = np.sqrt(np.maximum(variance, 0)).reshape(len(y), len(x), 2)
         if support:

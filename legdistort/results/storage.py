@@ -25,6 +25,7 @@ from ..inputs.plain_columns import plain, plain_columns, restored
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_tree, read_tree, understood
 from ..runtime.outputs import replacing, settle_for
 from ..runtime.provenance import checksums, unchanged
+from .camera_errors import CameraErrors
 from .catalogue_tie import Tie
 from .check import Check
 from .diagnostics import (
@@ -56,11 +57,13 @@ class StoredUncertainty:
     bends: np.ndarray | None = None
     star_unknowns: np.ndarray | None = None
     drift_directions: np.ndarray | None = None
+    camera: CameraErrors | None = None
 
 
 def write_solution(solution, path, *, overwrite=False):
     """Write a `Solution`, its covariances included, to an ASDF file."""
     table = plain_columns(solution.observations)
+    camera = solution.uncertainty.camera
     covariances = ["coefficients", "stars", "directions", "bends"]
     covariances += ["star_unknowns", "drift_directions"] if solution.motions is not None else []
     tree = {
@@ -78,7 +81,8 @@ def write_solution(solution, path, *, overwrite=False):
         "observations": {name: plain(table[name]) for name in table.colnames},
         "motions": solution.motions and dataclasses.asdict(solution.motions),
         "covariance": {key: getattr(solution.uncertainty, key) for key in covariances}
-        | {"weak": [dataclasses.asdict(each) for each in solution.uncertainty.weak]},
+        | {"weak": [dataclasses.asdict(each) for each in solution.uncertainty.weak]}
+        | {"camera": camera and dataclasses.asdict(camera)},
         "gauge": _gauge_tree(solution.gauge),
         "sky": solution.sky and dataclasses.asdict(solution.sky),
         "left_out": solution.left_out,
@@ -174,7 +178,7 @@ def _diagnostics(tree, names):
 
 def _from_tree(kind, checksum, tree):
     exposures = tree["exposures"]
-    uncertainty = _made(StoredUncertainty, tree["covariance"])
+    uncertainty = _made(StoredUncertainty, tree["covariance"], camera=CameraErrors)
     weak = tuple(UnknownDirection(**each) for each in uncertainty.weak)
     uncertainty = dataclasses.replace(uncertainty, weak=weak)
     gauge = _made(Gauge, tree["gauge"], tie=Tie, drift=Drift)

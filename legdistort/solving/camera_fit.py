@@ -17,13 +17,18 @@ import numpy as np
 from ..cameras.detector import Detector, affine_of
 from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, warn
 from ..geometry import basis, similarity
-from ..results.absolute_errors import without_plain_map
+from ..results.camera_errors import CameraErrors, moved_by
+from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
 
 #: Part of what the data would tell of a direction alone below which it is not determined beside all else: what
 #: detectors and exposures can exchange is so to first order, and by the gradient of one times the other beyond.
 _WEAK = 1e-5
+#: Variances below this part of the largest are rounding.
+_ROUNDING = 1e-13
+#: Weight of a change of a layout beside that of a static distortion, where a map can be put into either.
+_LAYOUT_WEIGHT = 0.03
 #: Steps at most, and their length in standard errors at which they end.
 _STEPS, _SMALL = 10, 0.01
 
@@ -41,6 +46,8 @@ class CameraStep:
     free : ndarray of bool, shape (n_detectors, 2, n_modes)
     spread : ndarray, shape (2, n_stars, k)
         How the stars follow.
+    response : ndarray, shape (n_exposures, 2 n_modes, k)
+        How the coefficients follow.
     freedom : float
         Number of changes that the data determine rather than what was known.
     weak : ndarray, shape (m, k)
@@ -51,6 +58,7 @@ class CameraStep:
     covariance: np.ndarray
     free: np.ndarray
     spread: np.ndarray
+    response: np.ndarray
     freedom: float
     weak: np.ndarray
 
@@ -176,24 +184,31 @@ class CameraFit:
             warn(f"the camera has not settled in {_STEPS} steps; give better layouts", ConvergenceWarning)
         unknown = _unknown(fit.matches.camera, step)
         _tell_unknown(fit.matches, step, unknown)
-        shared = _of_stars(fit, step) + (0.0 if fit.shared_errors is None else fit.shared_errors)
         camera = with_errors(fit.matches.camera, step, unknown)
         camera = replace(camera, common_sigma=common_widths(camera, self.sought))
         matches = replace(fit.matches, camera=camera)
-        return replace(fit, matches=matches, shared_errors=shared, shared_unknowns=step.freedom)
+        errors = _errors(fit, step, unknown)
+        return replace(fit, matches=matches, camera_errors=errors, shared_unknowns=step.freedom)
 
 
-def _of_stars(fit, step):
-    """Covariance xx, yy, xy (3, n_stars) of star positions by that of the camera, less a common map."""
-    good, modes = fit.blocks.v[0] > 0, fit.problem.n_modes
-    xy = fit.result.state.positions.T
-    plain = fit.result.gauge.modes_at(xy[good], modes).T
-    spread = step.spread[:, good].transpose(1, 0, 2)
-    left = without_plain_map(spread, plain)
-    out = np.zeros((3, len(good)))
-    moved = left @ step.covariance @ left.transpose(0, 2, 1)
-    out[:, good] = moved[:, 0, 0], moved[:, 1, 1], moved[:, 0, 1]
-    return out
+def _errors(fit, step, unknown):
+    """The `CameraErrors` of a step, a common map of the plane taken off; `unknown` (m, k) are directions of the camera."""
+    good, gauge = fit.blocks.v[0] > 0, fit.result.gauge
+    plain = gauge.modes_at(fit.result.state.positions.T[good], gauge.n_modes).T
+    values, vectors = np.linalg.eigh(step.covariance)
+    rank = values > _ROUNDING * values.max(initial=0)
+    changes = vectors[:, rank] * np.sqrt(values[rank])
+    stars, unknown_stars = np.zeros((len(good), 2, changes.shape[1])), np.zeros((len(good), 2, len(unknown)))
+    spread = step.spread[:, good] @ changes
+    common = np.linalg.pinv(plain) @ spread
+    stars[good] = (spread - plain @ common).transpose(1, 0, 2)
+    motion = widened_all(gauge.motion, fit.problem.degree)
+    coefficients = step.response @ changes + motion @ common.reshape(-1, changes.shape[1])
+    if len(unknown):
+        moved = step.spread[:, good] @ unknown.T
+        moved -= plain @ (np.linalg.pinv(plain) @ moved)
+        unknown_stars[good] = (moved / np.sqrt(np.mean(moved**2, axis=(0, 1)))).transpose(1, 0, 2)
+    return CameraErrors(step.free, changes, stars, coefficients, unknown_stars)
 
 
 def _unknown(camera, step):
@@ -275,38 +290,36 @@ def camera_step(fit, sought, departure):
     patterns = _patterns(fit.matches, camera, problem, free)
     moved = _weighted(problem, patterns)
     k = patterns.shape[2]
-    responses, normal = np.empty((2, problem.n_stars, k)), np.einsum("ank,anl->kl", patterns, moved)
+    stars_follow, normal = np.empty((2, problem.n_stars, k)), np.einsum("ank,anl->kl", patterns, moved)
+    follow = np.empty((*blocks.g_exposure.shape, k))
     alone = np.diag(normal).copy()
     gradients = [_gradient(problem, blocks, patterns[:, :, j], moved[:, :, j]) for j in range(k)]
     for j, (own, stars) in enumerate(gradients):
         star_response, response = system.settle(own, stars)
-        responses[:, :, j] = star_response[:2]
+        stars_follow[:, :, j], follow[:, :, j] = star_response[:2], response
         for m, (other_own, other_stars) in enumerate(gradients):
             normal[m, j] -= np.sum(other_own * response) + np.sum(other_stars * star_response)
     normal = (normal + normal.T) / 2
     precision = 1 / prior[free] ** 2
     pull = -np.einsum("ank,an->k", moved, blocks.residual) - precision * departure[free]
     covariance, weak = _inverse(normal, precision, alone)
+    held = _held(weak, np.nonzero(free)[2])
     change = np.zeros(free.shape)
-    change[free] = covariance @ pull
-    return CameraStep(change, covariance, free, -responses, float(np.sum(covariance * normal)), weak)
+    change[free] = held @ (departure[free] + covariance @ pull) - departure[free]
+    covariance = held @ covariance @ held.T
+    return CameraStep(change, covariance, free, stars_follow, follow, float(np.sum(covariance * normal)), weak)
 
 
 def _patterns(matches, camera, problem, free):
     """Displacements (2, n, k) of what was measured, in the focal plane, by a unit of each free mode."""
-    keys = list(camera.detectors)
     detector = camera.ids(matches.table)[problem.order]
     xy = np.stack([matches.table[f"{axis}_detector"].value[problem.order] for axis in "xy"], axis=1)
-    degree, out = basis.degree_of(free.shape[2]), np.zeros((2, len(xy), np.count_nonzero(free)))
-    places = np.argwhere(free)
-    for c, key in enumerate(keys):
-        rows, mine = detector == key, np.flatnonzero(places[:, 0] == c)
-        chip = camera[key]
-        back = -np.linalg.inv(chip.layout[:, :2])
-        values = basis.values(degree, *basis.normalize(chip.distortion.invert(xy[rows]), chip.shape))
-        for k in mine:
-            _, axis, mode = places[k]
-            out[:, rows, k] = np.outer(back[:, axis], values[mode])
+    out, of_detector = np.zeros((2, len(xy), np.count_nonzero(free))), np.argwhere(free)[:, 0]
+    units = np.eye(free[0].size).reshape(*free[0].shape, -1)
+    for c, (key, chip) in enumerate(camera.detectors.items()):
+        rows = detector == key
+        moved = moved_by(chip, chip.distortion.invert(xy[rows]), units[:, :, free[c].ravel()])
+        out[np.ix_([True, True], rows, of_detector == c)] = moved.transpose(1, 0, 2)
     return out
 
 
@@ -339,6 +352,22 @@ def _inverse(normal, precision, alone):
     known = vectors[:, good] * unit[:, None]
     inner = np.linalg.inv(known.T @ (normal + np.diag(precision)) @ known)
     return known @ inner @ known.T, (vectors[:, ~good] * unit[:, None]).T
+
+
+def _held(weak, modes):
+    """What takes directions (m, k) that are not determined off a change of the camera, (k, k).
+
+    Static distortions stay as they were, as far as that holds these directions, and layouts as far as it does not:
+    layouts may be wrong by many pixels, and to shift detectors against one another is not to bend the focal plane.
+
+    Parameters
+    ----------
+    weak : ndarray, shape (m, k)
+    modes : ndarray of int, shape (k,)
+        That each unknown belongs to.
+    """
+    weights = np.where(modes < 3, _LAYOUT_WEIGHT, 1.0)
+    return np.eye(len(modes)) - weak.T @ np.linalg.pinv(weak.T * weights[:, None]) * weights
 
 
 def changed(camera, change):

@@ -24,7 +24,6 @@ from .camera_fit import CameraFit, Sought, common_widths
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, only_rows, validation
 from .equations import effective_modes
-from .equations.covariances import Uncertainty
 from .motion_choice import resolve as resolve_motion
 from .options import CLIP, SolveOptions, check_reference
 from .residual_errors.by_brightness import estimate_by_brightness
@@ -380,9 +379,7 @@ def _settings(asked, options, form):
 
 
 def _solution(fit, scale, settings, diagnostics, form=None):
-    uncertainty = fit.uncertainty
-    if scale != 1:
-        uncertainty = Uncertainty(fit.weighted, fit.blocks, fit.result.gauge, scale=scale, system=fit.system)
+    uncertainty = fit.uncertainty if scale == 1 else fit.uncertainty_at(scale)
     return assemble(
         fit.matches,
         fit.weighted,

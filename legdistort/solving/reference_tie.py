@@ -62,8 +62,8 @@ class ReferenceTie:
         Factor on the stated errors of the exposures.
     solve : callable
         ``solve(problem, state, common=None)``: `legdistort.solving.minimisers.solve_joint` with the options of the fit.
-    shared_errors : ndarray, optional
-        See `Uncertainty`.
+    common : dict
+        Errors that stars have in common, as `Uncertainty` takes them.
     """
 
     identified: object
@@ -72,7 +72,7 @@ class ReferenceTie:
     names: np.ndarray
     scale: float
     solve: object
-    shared_errors: object = None
+    common: dict
 
     def tie(self, problem, result):
         """The `Result` with the plane where the reference puts it and the `Tie` in its gauge, and the `MapPrior` there.
@@ -274,7 +274,7 @@ class ReferenceTie:
     def _errors(self, problem, result):
         weighted = problem.scaled(result.robust)
         blocks = criterion.linearise(weighted, result.state)
-        return Uncertainty(weighted, blocks, result.gauge, scale=self.scale, shared_errors=self.shared_errors)
+        return Uncertainty(weighted, blocks, result.gauge, scale=self.scale, **self.common)
 
     def _directions(self, gauge, errors, positions):
         """How maps of three modes at least move the stars."""
@@ -404,7 +404,7 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         matches.stars,
         scale=scale,
         solve=partial(minimisers.solve_joint, gauge=of.gauge, loss=of.loss, max_iterations=of.max_iterations),
-        shared_errors=fit.shared_errors,
+        common={"shared_errors": fit.shared_errors, "camera": fit.camera_errors},
     )
     problem = fit.problem.scaled(fit.used.astype(float))
     result, prior = tying.tie(problem, result)

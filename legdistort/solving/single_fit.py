@@ -51,6 +51,8 @@ class Fit:
         ``{exposure: reason}`` of exposures that the fit cannot follow, if it was not judged.
     shared_errors : ndarray, shape (3, n_stars), or None
         See `Uncertainty`.
+    camera_errors : `legdistort.results.camera_errors.CameraErrors` or None
+        Those of a camera that was fitted.
     shared_unknowns : float
         Number of unknowns of a camera that were fitted and that the data determine.
     """
@@ -63,6 +65,7 @@ class Fit:
     widths: prior_widths.Widths | None = None
     unfollowed: dict = field(default_factory=dict)
     shared_errors: np.ndarray | None = None
+    camera_errors: object = None
     shared_unknowns: float = 0.0
 
     @cached_property
@@ -82,9 +85,12 @@ class Fit:
     @cached_property
     def uncertainty(self):
         """Covariances at the stated errors."""
-        return Uncertainty(
-            self.weighted, self.blocks, self.result.gauge, shared_errors=self.shared_errors, system=self.system
-        )
+        return self.uncertainty_at(1.0)
+
+    def uncertainty_at(self, scale):
+        """Covariances at the stated errors times a factor."""
+        common = {"shared_errors": self.shared_errors, "camera": self.camera_errors, "system": self.system}
+        return Uncertainty(self.weighted, self.blocks, self.result.gauge, scale=scale, **common)
 
     @property
     def system(self):

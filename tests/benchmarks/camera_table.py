@@ -6,6 +6,9 @@ in three exposures and more are compared, after a common map of degree 3 of thos
 
 ``python tests/benchmarks/camera_table.py --cost 3``: what four detectors cost against one of them, step by step from
 frames to mosaic, 11 exposures of 512 px detectors, each CPU time the least of so many rounds in turn.
+
+``python tests/benchmarks/camera_table.py --calibrate 40``: layouts and static distortions found from dithers alone, and
+from dithers with rolls; errors beside the bound of a dense matrix of all unknowns, over so many draws.
 """
 
 import argparse
@@ -22,6 +25,7 @@ from legdistort.exceptions import LegdistortWarning
 from legdistort.wcs.storage import write_wcs
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import gsaoi_calibration
 import gsaoi_images
 
 SIGMA, LEAST = 0.01, 3
@@ -133,13 +137,30 @@ def compared(solution, sky, stars, covariance):
     return np.sqrt(np.mean(left**2)), best, np.sqrt(free * np.mean((left / errors) ** 2))
 
 
+def calibrate(draws):
+    """Print how well a camera is found from its own exposures."""
+    print(f"{'':18s} {'':8s} {'error':>8s} {'bound':>8s} {'ratio':>6s} {'pull^2':>7s}   unknown")
+    for name, turn in (("dithers", 0.0), ("dithers and rolls", 0.8)):
+        found = gsaoi_calibration.calibrate(turn, draws)
+        unknown = ", ".join(found.solution.gauge.unknown_names) or "nothing"
+        for k, what in enumerate(("stars", "layout", "static")):
+            error, best = found.errors[k], found.bounds[k]
+            print(
+                f"{name * (k == 0):18s} {what:8s} {error:8.5f} {best:8.5f} {error / best:6.3f} {found.pulls[k]:7.3f}   "
+                f"{unknown * (k == 0)}"
+            )
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=20)
     parser.add_argument("--cost", type=int, default=0, metavar="ROUNDS")
+    parser.add_argument("--calibrate", type=int, default=0, metavar="DRAWS")
     warnings.simplefilter("ignore", LegdistortWarning)
     arguments = parser.parse_args()
     if arguments.cost:
         cost(arguments.cost)
+    elif arguments.calibrate:
+        calibrate(arguments.calibrate)
     else:
         main(arguments.sets)

@@ -38,6 +38,8 @@ class Uncertainty:
         Covariance of the coefficients, if they were found in another way than with the stars, `scale` in it.
     shared_errors : ndarray, shape (3, n_stars), optional
         Covariance xx, yy, xy of star positions by errors that exposures share, beside that of independent ones, px^2.
+    camera : `legdistort.results.camera_errors.CameraErrors`, optional
+        What the errors of a camera do to stars and coefficients, at the stated errors.
     system : `legdistort.solving.equations.reduced_system.Direct` or Iterative, optional
         The reduced system of these, if it is there already.
     """
@@ -51,16 +53,21 @@ class Uncertainty:
         scale: float = 1.0,
         coefficients: Any = None,
         shared_errors: Any = None,
+        camera: Any = None,
         system: Any = None,
     ) -> None:
         self._problem, self._blocks, self._gauge, self._scale = problem, blocks, gauge, scale
         self._given, self._shared = coefficients, 0.0 if shared_errors is None else shared_errors
+        self.camera = None if camera is None else camera.scaled(scale)
         if system is not None:
             self.system = system
 
     @cached_property
     def coefficients(self) -> np.ndarray:
-        """Covariance of the fitted coefficients, shape (n_exposures * 2 n_modes,) squared, px^2; x modes first."""
+        """Covariance of the fitted coefficients, shape (n_exposures * 2 n_modes,) squared, px^2; x modes first.
+
+        A camera is taken as known.
+        """
         if self._given is not None:
             return self._given
         problem, blocks = self._problem, self._blocks
@@ -82,7 +89,7 @@ class Uncertainty:
     @cached_property
     def stars(self) -> np.ndarray:
         """Covariance xx, yy, xy of every star's position in the gauge, shape (3, n_stars), px^2."""
-        return self.star_unknowns[:3] + self._shared
+        return self.star_unknowns[:3] + self._shared + (0.0 if self.camera is None else self.camera.of_stars)
 
     @cached_property
     def star_unknowns(self) -> np.ndarray:
@@ -234,6 +241,9 @@ class Uncertainty:
         coupling = coupling.reshape(problem.n_star, n, -1)
         spread = np.concatenate([np.einsum("jb,bjk->jk", inverse[:, a], coupling) for a in range(size)])
         out = spread @ self.coefficients @ spread.T
+        if self.camera is not None:
+            common = self.camera.stars[stars].transpose(1, 0, 2).reshape(2 * n, -1)
+            out[: 2 * n, : 2 * n] += common @ common.T
         own = self._scale**2 * inverse[:, :, :size]
         own[:, :2, :2] += unpacked(np.broadcast_to(self._shared, (3, problem.n_stars))[:, stars])
         index = np.arange(size * n).reshape(size, n).T

@@ -1,0 +1,87 @@
+"""What the errors of a camera that was fitted do to stars, coefficients and new positions.
+
+Layouts and statics have a covariance of their own, and stars and coefficients follow them. All of it is written as the
+responses to independent errors of unit size: covariances are sums over these, and what two things have in common is in
+them. A common map of the plane is taken off, as relative errors have it.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..geometry import basis, similarity
+
+
+@dataclass(frozen=True, eq=False)
+class CameraErrors:
+    """Responses to r independent errors of a camera, of unit size.
+
+    Attributes
+    ----------
+    free : ndarray of bool, shape (n_detectors, 2, n_modes)
+        Modes that were fitted.
+    changes : ndarray, shape (k, r)
+        Of these modes, pixels.
+    stars : ndarray, shape (n_stars, 2, r)
+        Of the positions, pixels of the reference plane.
+    coefficients : ndarray, shape (n_exposures, 2 n_modes, r)
+        Of the fitted coefficients, pixels.
+    unknown : ndarray, shape (n_stars, 2, m)
+        How stars move with directions of the camera that nothing determines, of unit rms.
+    """
+
+    free: np.ndarray
+    changes: np.ndarray
+    stars: np.ndarray
+    coefficients: np.ndarray
+    unknown: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 0)))
+
+    def scaled(self, factor):
+        """The same with all errors times a factor."""
+        parts = (factor * part for part in (self.changes, self.stars, self.coefficients))
+        return CameraErrors(self.free, *parts, self.unknown)
+
+    @property
+    def of_stars(self):
+        """Covariance xx, yy, xy (3, n_stars) of the positions, px^2."""
+        x, y = self.stars[:, 0], self.stars[:, 1]
+        return np.stack([np.sum(x * x, axis=1), np.sum(y * y, axis=1), np.sum(x * y, axis=1)])
+
+    def of_coefficients(self, i):
+        """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i, px^2."""
+        return self.coefficients[i] @ self.coefficients[i].T
+
+    def lost(self, camera, f, detector=None):
+        """Which positions f (n, 2) of the focal plane are on a detector whose place nothing determines, bool (n,)."""
+        out = np.zeros(len(f), dtype=bool)
+        for key, chip in camera.detectors.items():
+            if chip.layout_sigma is not None and np.isinf(chip.layout_sigma).any():
+                out |= chip.sees(f) if detector is None else key == detector
+        return out
+
+    def in_focal_plane(self, camera, f, detector=None):
+        """Responses (n, 2, r) of positions measured at f (n, 2) in the focal plane, pixels.
+
+        Parameters
+        ----------
+        camera : Camera
+        f : ndarray, shape (n, 2)
+        detector : str, optional
+            To which they belong; by default that on which each falls. Zero off all detectors.
+        """
+        out, changes = np.zeros((len(f), 2, self.changes.shape[1])), np.zeros((*self.free.shape, self.changes.shape[1]))
+        changes[self.free] = self.changes
+        for c, (key, chip) in enumerate(camera.detectors.items()):
+            here = chip.sees(f) if detector is None else np.full(len(f), key == detector)
+            out[here] = moved_by(chip, similarity.apply(chip.layout, f[here]), changes[c])
+        return out
+
+
+def moved_by(detector, q, changes):
+    """How changes (2, n_modes, k) of the modes of a detector move what it measured, in the focal plane, (n, 2, k).
+
+    Modes of orders 0 and 1 are its layout, which moves the static distortion along. `q` (n, 2) are undistorted pixels.
+    """
+    values = basis.values(basis.degree_of(changes.shape[1]), *basis.normalize(q, detector.shape))
+    low, high = (np.einsum("amk,mn->nak", changes[:, part], values[part]) for part in (slice(0, 3), slice(3, None)))
+    return -np.linalg.inv(detector.layout[:, :2]) @ (low + np.linalg.inv(detector.distortion.jacobian(q)) @ high)

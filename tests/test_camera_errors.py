@@ -1,0 +1,162 @@
+"""What a camera that was fitted adds to the errors of coefficients and new positions, against a dense solution."""
+
+import gsaoi_images
+import numpy as np
+import pytest
+
+import legdistort
+from legdistort.geometry import basis, similarity
+from legdistort.results.absolute_errors import own_coefficients, relative_coefficients
+
+SIGMA = 0.01
+
+
+@pytest.fixture(scope="module")
+def night():
+    return gsaoi_images.Night(n_exposures=6, n_stars=200, dither=8.0, turn=0.3)
+
+
+@pytest.fixture(scope="module")
+def solution(night):
+    matches = legdistort.Matches.from_table(night.table(sigma=SIGMA), camera=legdistort.Camera.gsaoi())
+    return legdistort.solve(matches, layout="fit", clip=None)
+
+
+class Dense:
+    """Normal equations of stars, coefficients and layouts together, and covariances on given constraints."""
+
+    def __init__(self, solution):
+        self.solution, camera, table = solution, solution.camera, solution.observations
+        keys, names, self.n_stars = list(camera.detectors), list(solution.names), len(solution.star_names)
+        self.size = 2 * basis.n_modes(solution.degree)
+        self.n_first = 2 * self.n_stars + len(names) * self.size
+        n = self.n_first + 6 * len(keys)
+        self.normal = np.zeros((n, n))
+        for row in table:
+            i, c = names.index(row["exposure"]), keys.index(row["detector"])
+            j = int(np.searchsorted(solution.star_names, row["star"]))
+            design = np.zeros((2, n))
+            q = similarity.apply(solution.poses[row["exposure"]], solution.positions[[j]])
+            by_star, by_exposure, by_layout, f = self.slopes(row["exposure"], camera[row["detector"]], q)
+            design[:, 2 * j : 2 * j + 2] = by_star
+            design[:, 2 * self.n_stars + i * self.size :][:, : self.size] = by_exposure
+            design[:, self.n_first + 6 * c :][:, :6] = by_layout
+            to_pixels = camera[row["detector"]].slope(f)[0] / SIGMA
+            self.normal += (to_pixels @ design).T @ (to_pixels @ design)
+
+    def slopes(self, name, chip, q):
+        """Derivatives of residuals at one undistorted position by star, coefficients and layout; focal-plane position."""
+        distortion, pose = self.solution.distortion(name), self.solution.poses[name]
+        values = basis.values(self.solution.degree, *basis.normalize(q, distortion.shape))[:, 0]
+        f = distortion(q)
+        low = basis.values(1, *basis.normalize(similarity.apply(chip.layout, f), chip.shape))[:, 0]
+        back = np.linalg.inv(chip.layout[:, :2])
+        return distortion.jacobian(q)[0] @ pose[:, :2], np.kron(np.eye(2), values), np.kron(back, low), f
+
+    def covariance(self, rows):
+        """On rows (m, n) that are held at zero."""
+        free = np.linalg.svd(rows)[2][np.linalg.matrix_rank(rows) :].T
+        return free @ np.linalg.inv(free.T @ self.normal @ free) @ free.T
+
+    def by_layouts(self):
+        """Covariance of everything by the errors of the layouts, in the gauge of the solution; a common map is left in."""
+        gauge, n = self.solution.gauge, len(self.normal)
+        rows = np.zeros((gauge.n_constraints, n))
+        rows[:, 2 * self.n_stars : self.n_first] = gauge.orthonormal
+        held = np.zeros((n - self.n_first, n))
+        held[:, self.n_first :] = np.eye(n - self.n_first)
+        known = self.covariance(np.concatenate([rows, held]))
+        first = slice(None, self.n_first)
+        cross = self.normal[self.n_first :, first]
+        left = self.normal[self.n_first :, self.n_first :] - cross @ known[first, first] @ cross.T
+        unit = 1 / np.sqrt(np.diag(self.normal)[self.n_first :])
+        values, vectors = np.linalg.eigh(left * np.outer(unit, unit))
+        assert np.count_nonzero(values < 1e-5) == 6  # an affine map of the focal plane
+        exchanged = np.zeros((6, n))
+        exchanged[:, self.n_first :] = (vectors[:, :6] * unit[:, None]).T
+        return self.covariance(np.concatenate([rows, exchanged])) - known
+
+
+@pytest.fixture(scope="module")
+def dense(solution):
+    return Dense(solution)
+
+
+@pytest.fixture(scope="module")
+def relative(dense, solution):
+    """Covariance by the layouts of stars, coefficients and layouts, a common map of the stars taken off."""
+    gauge, n = solution.gauge, 2 * dense.n_stars
+    modes = gauge.modes_at(solution.positions)
+    fit = np.zeros((gauge.n_modes * 2, len(dense.normal)))
+    for k in range(2):
+        fit[k * gauge.n_modes : (k + 1) * gauge.n_modes, k:n:2] = np.linalg.pinv(modes.T)
+    undo = np.zeros((len(dense.normal), gauge.n_modes * 2))
+    for k in range(2):
+        undo[k:n:2, k * gauge.n_modes : (k + 1) * gauge.n_modes] = -modes.T
+    undo[n : dense.n_first] = gauge.motion.reshape(-1, 2 * gauge.n_modes)
+    take_off = np.eye(len(dense.normal)) + undo @ fit
+    return take_off @ dense.by_layouts() @ take_off.T
+
+
+def test_coefficients(solution, dense, relative):
+    """The covariance of every exposure is that of a known camera, and what the layouts add."""
+    for i, name in enumerate(solution.names):
+        mine = slice(2 * dense.n_stars + i * dense.size, 2 * dense.n_stars + (i + 1) * dense.size)
+        known = own_coefficients(solution.gauge, solution.uncertainty, i)
+        added = solution.coefficient_covariance(name) - known
+        expected = relative[mine, mine]
+        assert np.abs(added - expected).max() < 0.02 * np.abs(expected).max()
+        assert np.trace(expected) > np.trace(known)  # it is not little
+
+
+def test_stars(solution, dense, relative):
+    n = 2 * dense.n_stars
+    matrix = solution.uncertainty.star_matrix.reshape(2, dense.n_stars, 2, dense.n_stars)
+    own = solution.uncertainty.star_unknowns
+    expected = relative[:n, :n].reshape(dense.n_stars, 2, dense.n_stars, 2)
+    for k in range(2):
+        added = np.diag(matrix[k, :, k]) - own[k]
+        assert np.abs(added - np.einsum("jj->j", expected[:, k, :, k])).max() < 0.02 * np.abs(added).max()
+    between = np.delete(expected[0, 0, :, 0], 0)
+    camera = solution.uncertainty.camera.stars
+    assert np.allclose(np.delete(camera[0, 0] @ camera[:, 0].T, 0), between, atol=0.02 * np.abs(between).max())
+
+
+@pytest.mark.parametrize("key", ["1", "2", "3", "4"])
+def test_new_positions(solution, dense, relative, night, key):
+    """Errors of the layout of the detector itself, those of the coefficients, and what they have in common."""
+    chip, name = solution.camera[key], solution.names[1]
+    xy = night.pixels[1][key]
+    xy = xy[np.isfinite(xy[:, 0])][::5]
+    found = solution.correct(name, xy, errors=np.zeros((len(xy), 2)), detector=key).relative
+    q = solution.distortion(name).invert(chip.to_focal_plane(xy))
+    c, block = int(key) - 1, relative_coefficients(solution.gauge, solution.uncertainty, 1)
+    for at, covariance in zip(q, found, strict=True):
+        by_star, by_exposure, by_layout, _ = dense.slopes(name, chip, at[None])
+        through = np.zeros((2, len(relative)))
+        through[:, 2 * dense.n_stars + dense.size :][:, : dense.size] = by_exposure
+        through[:, dense.n_first + 6 * c :][:, :6] = by_layout
+        through = -np.linalg.inv(by_star) @ through
+        coefficients = through[:, 2 * dense.n_stars + dense.size :][:, : dense.size]
+        own = coefficients @ block @ coefficients.T
+        assert np.allclose(covariance - own, through @ relative @ through.T, atol=0.03 * np.trace(covariance))
+
+
+def test_kept_in_files(solution, night, tmp_path):
+    again = legdistort.Solution.read(solution.write(tmp_path / "solution.asdf"))
+    name = solution.names[2]
+    assert np.array_equal(again.coefficient_covariance(name), solution.coefficient_covariance(name))
+    assert np.array_equal(again.sigma_map(name, n=8)[2], solution.sigma_map(name, n=8)[2], equal_nan=True)
+
+
+def test_errors_that_are_scaled(night, solution):
+    """Stated errors of half the size, scaled by the residuals: the errors of the camera are scaled with the others."""
+    table = night.table(sigma=SIGMA)
+    table["x_err"] /= 2
+    table["y_err"] /= 2
+    matches = legdistort.Matches.from_table(table, camera=legdistort.Camera.gsaoi())
+    scaled = legdistort.solve(matches, layout="fit", clip=None, errors="scale")
+    factor = scaled.diagnostics.error_scale / 2
+    assert np.allclose(scaled.stars["x_err"], factor * solution.stars["x_err"], rtol=1e-3)
+    assert np.allclose(scaled.coefficient_errors("frame01", relative=True),
+                       factor * solution.coefficient_errors("frame01", relative=True), rtol=1e-3)  # fmt: skip
