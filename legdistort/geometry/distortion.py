@@ -225,6 +225,11 @@ class Distortion:
         if not np.allclose(box, inverse.valid, rtol=0, atol=1e-3):
             raise InputError(f"{whose} is said to be valid in {inverse.valid}, but the detector's image lies in {box}")
 
+    @cached_property
+    def shared_correction(self) -> Model:
+        """`correction_model` as one object, for those who change nothing of it: models take long to make."""
+        return self.correction_model()
+
     def correction_model(self) -> Model:
         """Detector -> undistorted pixels as an astropy compound model, D attached as its inverse."""
         return correction_model(basis.to_tensor(self.coefficients), self.inverse, self.shape)

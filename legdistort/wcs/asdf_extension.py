@@ -18,8 +18,8 @@ class StockConverter(Converter):
         return
 
     def to_yaml_tree(self, obj, tag, ctx):
-        """The stock object that does the same."""
-        return obj.stock()
+        """The stock object that does the same; of a series one that shares its parameters, as it is written at once."""
+        return obj.stock_view() if hasattr(obj, "stock_view") else obj.stock()
 
     def from_yaml_tree(self, node, tag, ctx):
         """Never called: files hold stock objects only."""

@@ -69,7 +69,7 @@ def rebuilt(kind, wcs):
     return made
 
 
-def exposure_wcs(name, pose, distortion, sky=None, detector=None):
+def exposure_wcs(name, pose, distortion, sky=None, detector=None, *, shared=False):
     """The gwcs of one exposure: detector -> undistorted -> reference (-> icrs).
 
     That of a detector of a camera: detector -> undistorted -> focal_plane -> reference (-> icrs). Forward (pixel to
@@ -83,6 +83,8 @@ def exposure_wcs(name, pose, distortion, sky=None, detector=None):
         Undistorted -> detector pixels; with a detector of a camera, to the pixels of the focal plane.
     sky : TangentPlane, optional
     detector : `~legdistort.Detector`, optional
+    shared : bool
+        Whether distortions may be the same objects in all WCSs that have them, as for files.
 
     Returns
     -------
@@ -90,18 +92,21 @@ def exposure_wcs(name, pose, distortion, sky=None, detector=None):
     """
     ny, nx = (distortion if detector is None else detector).shape
 
+    def correction(of):
+        return of.shared_correction if shared else of.correction_model()
+
     def plane(frame):
         return cf.Frame2D(name=frame, axes_order=(0, 1), unit=(u.pix, u.pix))
 
     back = models.pose_model(similarity.invert(pose), "pose_inverse")
     if detector is None:
-        steps = [(plane("detector"), distortion.correction_model()), (plane("undistorted"), back)]
+        steps = [(plane("detector"), correction(distortion)), (plane("undistorted"), back)]
     else:
         layout = models.pose_model(similarity.invert(detector.layout), "layout_inverse")
         steps = [
-            (plane("detector"), detector.distortion.correction_model()),
+            (plane("detector"), correction(detector.distortion)),
             (plane("undistorted"), layout),
-            (plane("focal_plane"), from_focal_plane(distortion.correction_model(), back)),
+            (plane("focal_plane"), from_focal_plane(correction(distortion), back)),
         ]
     steps.append((plane("reference"), None if sky is None else sky.model()))
     if sky is not None:

@@ -17,7 +17,7 @@ from ..geometry.models import correction_model, displacement_model, leaves, pose
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, WITH_WCS, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
-from .exposure_wcs import ExposureWCS, from_focal_plane, rebuilt
+from .exposure_wcs import ExposureWCS, exposure_wcs, from_focal_plane, rebuilt
 
 if TYPE_CHECKING:
     from gwcs import WCS as GWCS
@@ -38,11 +38,13 @@ def wcs_tree(solution, name, detector=None):
     """The ASDF tree of one exposure, or of a detector of it: its gwcs at ``meta.wcs``, with the errors of inverses."""
     distortion = solution.distortion(name)
     origin = solution.provenance or provenance.stamp()
-    meta = {"wcs": solution.wcs(name, detector), "exposure": name}
+    chip = None if detector is None else solution.camera[detector]
+    wcs = exposure_wcs(name, solution.poses[name], distortion, solution.sky, chip, shared=True)
+    meta = {"wcs": wcs, "exposure": name}
     if detector is None:
         meta |= _certificate(distortion.inverse)
     else:
-        meta |= {"detector": str(detector)} | _certificate(solution.camera[detector].distortion.inverse)
+        meta |= {"detector": str(detector)} | _certificate(chip.distortion.inverse)
         meta["focal_plane"] = _certificate(distortion.inverse)
     meta |= {"provenance": {key: origin[key] for key in ("created", "versions")}, "note": NOTE}
     return {"meta": meta}
