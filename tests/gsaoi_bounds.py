@@ -1,8 +1,8 @@
 """The Fisher matrix of everything at once: stars, exposures and the detectors of GSAOI, dense and in plain powers.
 
 What it is made of are the published numbers and the true positions of a `gsaoi_images.Night`: derivatives are
-differences of its polynomials, distortions are plain powers of angles (exposures) and of pixels (detectors). Neither the
-basis of the package nor its gauge, cameras or eliminations take part.
+differences of its polynomials, distortions are plain powers of angles (exposures) and of pixels (detectors). Neither
+the basis of the package nor its gauge, cameras or eliminations take part.
 """
 
 import gsaoi_images
@@ -80,8 +80,8 @@ class Everything:
     def solved(self, dynamic=None):
         """Covariance of all unknowns on what the positions determine, and the null space (n, m).
 
-        Unknowns are compared in units of what would be told of each if all others were known. Maps that can be exchanged
-        are so to first order, and seen by the product of one with the gradient of another: there must be a gap.
+        Unknowns are compared in units of what would be told of each if all others were known. Maps that can be
+        exchanged are so to first order, and seen by the product of one with the gradient of another: there must be a gap.
 
         Parameters
         ----------

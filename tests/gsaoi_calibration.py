@@ -13,7 +13,7 @@ SIGMA, DEGREE, DYNAMIC = 0.01, 3, 0.4
 
 
 def wrong(camera, *, shift=3.0, turn=0.02, bend=0.1, seed=0):
-    """The camera with detectors that lie wrong by up to so many pixels and degrees, and `bend` px in every static mode."""
+    """The camera with detectors that lie wrong by up to so many pixels and degrees, `bend` px in every static mode."""
     rng, detectors = np.random.default_rng(seed), {}
     for key, each in camera.detectors.items():
         static = each.static.copy()
@@ -33,7 +33,7 @@ def night(turn):
 
 @dataclass
 class Calibration:
-    """Errors of stars, layouts and statics, rms per axis in pixels, beside their bounds, and squared pulls of the three.
+    """Errors of stars, layouts and statics, rms per axis in pixels, beside their bounds, and squared pulls.
 
     Attributes
     ----------

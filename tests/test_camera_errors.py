@@ -45,7 +45,7 @@ class Dense:
             self.normal += (to_pixels @ design).T @ (to_pixels @ design)
 
     def slopes(self, name, chip, q):
-        """Derivatives of residuals at one undistorted position by star, coefficients and layout; focal-plane position."""
+        """Derivatives of residuals at an undistorted position by star, coefficients and layout; focal-plane position."""
         distortion, pose = self.solution.distortion(name), self.solution.poses[name]
         values = basis.values(self.solution.degree, *basis.normalize(q, distortion.shape))[:, 0]
         f = distortion(q)
@@ -59,7 +59,7 @@ class Dense:
         return free @ np.linalg.inv(free.T @ self.normal @ free) @ free.T
 
     def by_layouts(self):
-        """Covariance of everything by the errors of the layouts, in the gauge of the solution; a common map is left in."""
+        """Covariance of everything by the errors of the layouts, in the gauge of the solution, with a common map."""
         gauge, n = self.solution.gauge, len(self.normal)
         rows = np.zeros((gauge.n_constraints, n))
         rows[:, 2 * self.n_stars : self.n_first] = gauge.orthonormal

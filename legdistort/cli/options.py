@@ -148,6 +148,7 @@ SOLVING = {
         "fit one static distortion for all exposures of a detector; of a camera also hold, prior", choices=words.CAMERA
     ),
     "layout": Option("the same for where the detectors of a camera lie", choices=words.CAMERA),
+    "dynamic": Option("of a camera: what has a distortion of its own in every exposure", choices=words.DYNAMIC),
     "exposure_degree": Option("with --static fit: what every exposure adds (default 1)", type=int),
     "gauge": Option("see the docs (default minimal)", choices=words.GAUGES),
     "method": Option("(default joint)", choices=words.METHODS),

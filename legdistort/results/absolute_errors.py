@@ -125,7 +125,10 @@ def own_coefficients(gauge, uncertainty, i):
 
 
 def relative_coefficients(gauge, uncertainty, i):
-    """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i under the convention of the gauge, a camera as known."""
+    """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i under the convention of the gauge.
+
+    A camera is taken as known.
+    """
     block = own_coefficients(gauge, uncertainty, i)
     size = len(block)
     mine = slice(i * size, (i + 1) * size)

@@ -17,7 +17,7 @@ class Settings:
     prior, model : dict or None
         What they were: see `Prior.describe` (by detector or exposure, if they were given so), and ``parts``,
         ``fixed``, ``n_free`` of the model.
-    static, layout : str or None
+    static, layout, dynamic : str or None
     exposure_degree : int or None
         With ``static="fit"``: up to which exposures have modes of their own.
     gauge, loss, errors : str
@@ -40,6 +40,7 @@ class Settings:
     model: Any = None
     static: str | None = None
     layout: str | None = None
+    dynamic: str | None = None
     exposure_degree: int | None = None
     gauge: str = "minimal"
     method: str = "joint"

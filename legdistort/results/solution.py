@@ -163,7 +163,8 @@ class Solution:
         ``x_err``, ``y_err`` are relative: what is left once a common map of the fitted degree is taken off.
         ``x_err_abs``, ``y_err_abs`` add that map: the mean dynamic distortion of the set and the uncertainty of the
         static one; NaN where they are not known (`Gauge.unknown`). ``x_err_known``, ``y_err_known`` are those after the
-        unknown directions are taken off; infinite where nothing tells how the detectors of a camera lie. Pointing, rotation and scale common to all exposures are those of the nominal
+        unknown directions are taken off; infinite where nothing tells how the detectors of a camera lie.
+        Pointing, rotation and scale common to all exposures are those of the nominal
         poses and are not part of these errors, unless a reference ties them: then they are. On the sky:
         ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
         ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue, and ``sky``, the same places as a
@@ -532,7 +533,8 @@ class Solution:
     def coefficient_covariance(self, name: str, *, relative: bool = False) -> np.ndarray:
         """Covariance (2 n_modes, 2 n_modes) of the fitted coefficients of an exposure, px^2; x first.
 
-        With the errors of a camera that was fitted. Under the constraints of the gauge; or `relative`, under its convention alone (`Gauge.convention`).
+        With the errors of a camera that was fitted. Under the constraints of the gauge; or `relative`, under its
+        convention alone (`Gauge.convention`).
         """
         known, camera = (self.gauge, self.uncertainty, self.index(name)), self.uncertainty.camera
         block = (absolute_errors.relative_coefficients if relative else absolute_errors.own_coefficients)(*known)

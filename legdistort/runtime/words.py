@@ -19,6 +19,8 @@ ERRORS = ("stated", "scale", "floor", "by-brightness", "correlated")
 MOTIONS = ("proper", "parallax", "auto")
 #: What is done about layouts and static distortions of a camera; without one a static distortion can only be fitted.
 CAMERA = ("hold", "prior", "fit")
+#: What of a camera has a distortion of its own in every exposure.
+DYNAMIC = ("focal_plane", "detector")
 
 # -- co-adding
 COMBINATIONS = ("mean", "median", "clipped")

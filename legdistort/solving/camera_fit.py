@@ -192,7 +192,7 @@ class CameraFit:
 
 
 def _errors(fit, step, unknown):
-    """The `CameraErrors` of a step, a common map of the plane taken off; `unknown` (m, k) are directions of the camera."""
+    """The `CameraErrors` of a step; `unknown` (m, k) are the directions of the camera that nothing determines."""
     good, gauge = fit.blocks.v[0] > 0, fit.result.gauge
     plain = gauge.modes_at(fit.result.state.positions.T[good], gauge.n_modes).T
     values, vectors = np.linalg.eigh(step.covariance)

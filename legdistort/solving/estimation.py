@@ -17,7 +17,7 @@ from ..priors.prior import Prior, tells
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
 from ..runtime.checks import check_choice
-from ..runtime.words import CAMERA
+from ..runtime.words import CAMERA, DYNAMIC
 from . import model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths
@@ -28,6 +28,7 @@ from .motion_choice import resolve as resolve_motion
 from .options import CLIP, SolveOptions, check_reference
 from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
+from .single_detectors import by_detector
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -52,6 +53,7 @@ def solve(
     model: Model | None = None,
     static: str | None = None,
     layout: str | None = None,
+    dynamic: str | None = None,
     exposure_degree: int | None = None,
     gauge: str = "minimal",
     method: str = "joint",
@@ -98,6 +100,10 @@ def solve(
         on ("prior"; the default where uncertainties are given) or from nothing ("fit", up to `degree`); or "hold" it.
     layout : {None, "hold", "prior", "fit"}
         The same for where the detectors of a camera lie. What was found is in ``solution.camera``, with its errors.
+    dynamic : {None, "focal_plane", "detector"}
+        With a camera: what an exposure adds is a distortion of the focal plane as a whole (None does the same), or one
+        for every detector by itself, which then is an exposure of its own, ``NAME-DETECTOR``, with a pose of its own;
+        the result is a solution without a camera, and `layout` has no meaning.
     exposure_degree : int, optional
         With ``static="fit"``: 0 leaves an exposure shift, rotation and scale, 1 (default) an affine map, and so on.
     gauge : {"minimal", "mean"}
@@ -163,9 +169,15 @@ def solve(
         raise InputError(
             f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
         )
+    check_choice(dynamic, (None, *DYNAMIC), "dynamic")
+    if dynamic is not None and matches.camera is None:
+        raise InputError("dynamic is for exposures with several detectors: matches need a camera")
+    if dynamic == "detector":
+        matches, prior, static = _of_detectors(matches, prior, layout, static)
     sought, prior = _of_camera(matches, prior, model, degree, layout, static)
     asked = SolveOptions(
-        degree=degree, prior=prior, model=model, static=static, layout=layout, exposure_degree=exposure_degree,
+        degree=degree, prior=prior, model=model, static=static, layout=layout, dynamic=dynamic,
+        exposure_degree=exposure_degree,
         gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
         max_iterations=max_iterations, validate=validate, motion=motion, motion_sigma=motion_sigma,
         motion_epoch=motion_epoch,
@@ -196,6 +208,20 @@ def solve(
     if sought is not None:
         kept_out = solution.camera.in_focal_plane(matches.camera.on_detectors(kept_out))
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
+
+
+def _of_detectors(matches, prior, layout, static):
+    """The matches of single detectors, what is known of these, and what to do about their statics."""
+    if layout is not None:
+        raise InputError(
+            "with dynamic='detector' every detector of every exposure has a pose of its own: leave layout out"
+        )
+    if prior is not None:
+        raise InputError(
+            "with a camera, give what is known of its detectors to the camera (Detector(..., static=)), not as prior"
+        )
+    check_choice(static, (None, *CAMERA), "static")
+    return *by_detector(matches, static), "fit" if static == "fit" else None
 
 
 def _of_camera(matches, prior, model, degree, layout, static):

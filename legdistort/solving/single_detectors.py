@@ -1,0 +1,65 @@
+"""Exposures of a camera as those of its single detectors, each with a pose and a distortion of its own."""
+
+import numpy as np
+
+from ..geometry import basis, similarity
+from ..inputs.exposure_names import detector_name
+from ..inputs.matches import Matches
+from ..priors.prior import Prior
+
+
+def by_detector(matches, static):
+    """Matches whose exposures are the detectors of every exposure, and what is known of each detector beforehand.
+
+    Where a detector lies is then in the poses of its exposures, but for the shear of its layout.
+
+    Parameters
+    ----------
+    matches : Matches
+        With a camera.
+    static : {None, "hold", "prior", "fit"}
+        "prior", and None, take the uncertainties that detectors state; "hold" and "fit" leave them out.
+
+    Returns
+    -------
+    Matches
+        Exposures are named as by `legdistort.inputs.exposure_names.detector_name`.
+    dict
+        ``{detector: Prior}``.
+    """
+    camera, table = matches.camera, matches.camera.on_detectors(matches.table)
+    parts = list(dict.fromkeys(zip(table["exposure"], camera.ids(table), strict=True)))
+    table["exposure"] = [detector_name(*part) for part in zip(table["exposure"], table["detector"], strict=True)]
+    own = {key: _known(detector, static) for key, detector in camera.detectors.items()}
+    made = Matches.from_table(
+        table,
+        shape={detector_name(*part): camera[part[1]].shape for part in parts},
+        poses={detector_name(*part): similarity.compose(own[part[1]][0], matches.poses[part[0]]) for part in parts},
+        sky=matches.sky,
+        left_out={detector_name(name, key): why for name, why in matches.left_out.items() for key in own},
+        epoch=matches.epoch,
+        allow_copies=True,
+    )
+    return made, {key: prior for key, (_, prior) in own.items()}
+
+
+def _known(detector, static):
+    """Similarity (2, 3) from the focal plane to a detector, and the rest of its map as a `Prior`."""
+    t = np.linspace(-1, 1, 9)
+    q = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), detector.shape)
+    pose = similarity.fit_similarity(similarity.apply(similarity.invert(detector.layout), q), q)
+    back = similarity.invert(pose)
+
+    def shift(u, v):
+        place = basis.denormalize(u, v, detector.shape)
+        return (detector.to_pixels(similarity.apply(back, place)) - place).T
+
+    degree = max(basis.degree_of(detector.static.shape[1]), 1)
+    widths = [detector.layout_sigma, detector.static_sigma]
+    sigma = None
+    if static in (None, "prior") and any(w is not None for w in widths):
+        layout, own = (0.0 if w is None else basis.change_degree(w, degree) for w in widths)
+        low = np.arange(basis.n_modes(degree)) < 3
+        sigma = np.where(low, layout, own) * np.ones((2, 1))
+    mean = basis.project(shift, degree)
+    return pose, Prior(mean, sigma="evidence" if static != "fit" else None, static_sigma=sigma, shape=detector.shape)
