@@ -27,7 +27,17 @@ class DamagedError(InputError):
 
 
 class MatchError(LegdistortError, ValueError):
-    """Exposures cannot be tied together; check overlap, the number of stars or the nominal poses."""
+    """Exposures cannot be tied together; check overlap, the number of stars or the nominal poses.
+
+    Attributes
+    ----------
+    groups : tuple of list of str
+        Exposures that share stars, where they fall apart in several such groups.
+    """
+
+    def __init__(self, *args, groups=()):
+        super().__init__(*args)
+        self.groups = tuple(groups)
 
 
 class SolveError(LegdistortError, ValueError):

@@ -81,7 +81,8 @@ class Everything:
         """Covariance of all unknowns on what the positions determine, and the null space (n, m).
 
         Unknowns are compared in units of what would be told of each if all others were known. Maps that can be
-        exchanged are so to first order, and seen by the product of one with the gradient of another: there must be a gap.
+        exchanged are so to first order, and seen by the product of one with the gradient of another: there must be a
+        gap.
 
         Parameters
         ----------

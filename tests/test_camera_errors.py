@@ -45,7 +45,7 @@ class Dense:
             self.normal += (to_pixels @ design).T @ (to_pixels @ design)
 
     def slopes(self, name, chip, q):
-        """Derivatives of residuals at an undistorted position by star, coefficients and layout; focal-plane position."""
+        """Derivatives of residuals at an undistorted position by star, coefficients and layout; where it falls."""
         distortion, pose = self.solution.distortion(name), self.solution.poses[name]
         values = basis.values(self.solution.degree, *basis.normalize(q, distortion.shape))[:, 0]
         f = distortion(q)

@@ -21,6 +21,7 @@ from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
 from ..priors.from_headers import describe, header_distortions
+from . import detector_layout
 from .exposure_groups import interlink, link, standing, unite, without
 from .header_poses import HeaderPoses
 from .options import MatchOptions
@@ -68,10 +69,12 @@ def match(
     exposures : list of `~legdistort.inputs.exposures.Exposure`, optional
         Give the shapes and the nominal WCSs, by name.
     shape : tuple or dict, optional
-        ``(ny, nx)``, or that by exposure, when there are no `exposures`.
+        ``(ny, nx)``, or that by exposure, when there are no `exposures`; by detector, where these are told apart and
+        there is no camera.
     camera : `legdistort.Camera`, optional
         Where exposures have several detectors, distinguished by the column ``detector``: they are matched as one, the
-        focal plane. Without it the headers of `exposures` with several detectors say how these lie.
+        focal plane. Without it the headers of `exposures` with several detectors say how these lie; without these
+        the dithers, where stars cross from one to another.
     min_exposures : int
         A star is kept when it was found in that many exposures.
     columns : dict, optional
@@ -111,6 +114,11 @@ def match(
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
     table["exposure"] = table["exposure"].astype(str)
     exposures = None if exposures is None else listed(exposures, "match")
+    if camera is None and detector_layout.is_needed(table, exposures):
+        shapes = detector_layout.shapes_of(table, exposures, shape)
+        log.info("neither a camera nor headers: how the detectors lie is sought in the dithers")
+        again = vars(replace(options, columns=None))
+        return detector_layout.match_parts(table, shapes, lambda parts, shape: match(parts, shape=shape, **again))
     if camera is None and exposures is not None and any(e.detector is not None for e in exposures):
         camera = Camera.of_frames(exposures)
         log.info("layout of the detectors by the headers: %s", camera)
@@ -248,7 +256,8 @@ def _check_groups(groups, lists, names, left_out):
     if len(large) > 1:
         listed = "; ".join(", ".join(group) for group in large)
         raise MatchError(
-            f"the exposures form {len(large)} groups with no star in common: {listed}; match each group by itself"
+            f"the exposures form {len(large)} groups with no star in common: {listed}; match each group by itself",
+            groups=large,
         )
     if not large:
         raise MatchError(

@@ -1,0 +1,89 @@
+"""Layouts from the dithers alone: neither a camera nor headers say how the detectors lie."""
+
+import gsaoi_images
+import numpy as np
+import pytest
+
+import legdistort
+from legdistort.cameras.camera import GSAOI_SCALE
+from legdistort.exceptions import InputError, MatchError
+from legdistort.inputs.exposures import Exposure
+
+SIGMA = 0.01
+
+
+@pytest.fixture(scope="module")
+def night():
+    return gsaoi_images.Night(n_exposures=5, n_stars=400, dither=9.0, dynamic=0.2)
+
+
+def detections(night, keys="1234"):
+    """Positions without numbers of stars, of some detectors, and the numbers."""
+    table = night.table(sigma=SIGMA, least=1)
+    table = table[np.isin(table["detector"], list(keys))]
+    return table[["exposure", "detector", "x", "y", "x_err", "y_err"]], np.asarray(table["star"])
+
+
+@pytest.fixture(scope="module")
+def matches(night):
+    return legdistort.match(detections(night)[0], shape=(2048, 2048), min_exposures=3)
+
+
+def test_layout(matches):
+    """Where the middles of the detectors lie, after a similarity, to some of the pixels of their distortions."""
+    middle = np.full((1, 2), gsaoi_images.SIZE / 2)
+    true = [gsaoi_images.to_arcsec(c, middle)[0] / GSAOI_SCALE for c in gsaoi_images.published()]
+    found = [matches.camera[key].to_focal_plane(middle)[0] for key in "1234"]
+    z, w = np.array(found) @ [1, 1j], np.array(true) @ [1, 1j]
+    design = np.stack([z, np.ones(4)], axis=1)
+    assert np.abs(w - design @ np.linalg.lstsq(design, w, rcond=None)[0]).max() < 12
+
+
+def test_stars_cross(matches, night):
+    """The same number on one detector and another, and nearly all stars are found."""
+    table, star = detections(night)
+    where = {(e, d, x): s for e, d, x, s in zip(table["exposure"], table["detector"], table["x"], star, strict=True)}
+    rows = zip(
+        *(matches.table[name] for name in ("exposure", "detector")), matches.table["x_detector"].value, strict=True
+    )
+    true = np.array([where[row] for row in rows])
+    number = np.asarray(matches.table["star"])
+    assert all(len(np.unique(true[number == n])) == 1 for n in np.unique(number))
+    crossing = [n for n in np.unique(number) if len(np.unique(matches.table["detector"][number == n])) > 1]
+    assert len(crossing) > 20
+    assert len(number) > 0.9 * np.count_nonzero(np.bincount(star)[star] >= 3)
+
+
+def test_it_can_be_solved(matches, night):
+    """The layout to begin with is wrong by pixels and knows no static distortion: both are fitted."""
+    solution = legdistort.solve(matches, degree=5, layout="fit", static="fit")
+    assert solution.chi2 == pytest.approx(solution.dof, rel=0.15)
+
+
+def test_no_star_crosses(night):
+    """Detectors in opposite corners: the two are named."""
+    table, _ = detections(night, "13")
+    middle = np.abs(table["x"] - 1023.5) + np.abs(table["y"] - 1023.5) < 1000
+    words = r"how detectors 1 and 3 lie to each other is not known: .* on both .*1 \| 3.* give the camera"
+    with pytest.raises(MatchError, match=words):
+        legdistort.match(table[middle], shape=(2048, 2048), min_exposures=3)
+
+
+def test_shapes(night):
+    table, _ = detections(night)
+    with pytest.raises(InputError, match=r"several detectors \(1, 2, 3, 4\) and no camera is given: give the shape"):
+        legdistort.match(table)
+    with pytest.raises(InputError, match="missing: 3, 4"):
+        legdistort.match(table, shape={"1": (2048, 2048), 2: (2048, 2048)})
+
+
+def test_images_without_wcs(night, matches):
+    """Exposures whose headers have no WCS give shapes and names, no more."""
+    table, _ = detections(night)
+    exposures = [
+        Exposure(f"{name}-{key}", np.broadcast_to(np.float32(0), (2048, 2048)), frame=str(name), detector=key)
+        for name in np.unique(table["exposure"])
+        for key in "1234"
+    ]
+    again = legdistort.match(table, exposures=exposures, min_exposures=3)
+    assert np.array_equal(again.table["star"], matches.table["star"])
