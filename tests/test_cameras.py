@@ -14,6 +14,7 @@ from scipy import special
 
 import legdistort
 from legdistort.cameras import camera as cameras
+from legdistort.cameras import exchanged
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
@@ -846,3 +847,47 @@ def to_nearest(found, true):
         moved = a * (found @ [1, 1j]) + b
         found = np.stack([moved.real, moved.imag], axis=1)
     return (true[near] - found)[good]
+
+
+class TestExchanged:
+    """Two detectors in each other's places: every exposure fits, but no star that crosses does."""
+
+    @staticmethod
+    def exchanged(camera, a, b):
+        return legdistort.Camera(camera.name, camera.detectors | {a: camera[b], b: camera[a]})
+
+    @pytest.mark.parametrize("pair", [("1", "2"), ("1", "3"), ("3", "4")])
+    def test_solving(self, table, gsaoi, pair):
+        words = (
+            f"detectors {pair[0]} and {pair[1]} of camera GSAOI seem to be exchanged: .* exchange them in the camera"
+        )
+        matches = legdistort.Matches.from_table(table, camera=self.exchanged(gsaoi, *pair))
+        with pytest.raises(InputError, match=words):
+            legdistort.solve(matches)
+
+    def test_matching(self):
+        """Of detectors alike: all exposures match, and nothing else would tell."""
+        rng, size = np.random.default_rng(1), 1000
+        places = {"a": 0.0, "b": 1020.0, "c": 2040.0}
+        sky, rows = rng.uniform([-200, -200], [3240, 1200], (500, 2)), []
+        for i in range(6):
+            f = sky + rng.uniform(-200, 200, 2)
+            for key, first in places.items():
+                xy = f - [first, 0] + rng.normal(0, SIGMA, f.shape)
+                inside = np.all((xy > 0) & (xy < size - 1), axis=1)
+                rows += [(f"f{i}", key, *each, SIGMA, SIGMA) for each in xy[inside]]
+        table = QTable(rows=rows, names=["exposure", "detector", "x", "y", "x_err", "y_err"])
+        chips = {
+            key: legdistort.Detector((size, size), layout=[[1, 0, -first], [0, 1, 0]]) for key, first in places.items()
+        }
+        camera = legdistort.Camera("row", chips)
+        assert legdistort.match(table, camera=camera).camera is camera
+        for a, b in ("ab", "ac", "bc"):
+            with pytest.raises(InputError, match=f"detectors {a} and {b} of camera row seem to be exchanged"):
+                legdistort.match(table, camera=self.exchanged(camera, a, b))
+
+    def test_layouts_that_are_wrong_by_pixels(self, gsaoi):
+        """They are not taken for exchanged ones."""
+        rows = gsaoi_images.Night(n_exposures=5, n_stars=470, dither=6.0).table(sigma=SIGMA)
+        for camera in (gsaoi, misplaced(gsaoi, shift=10, turn=0.1)):
+            exchanged.check_places(legdistort.Matches.from_table(rows, camera=camera))

@@ -87,8 +87,8 @@ def _tell_apart(groups):
                 listed = " | ".join(", ".join(each) for each in groups)
                 raise MatchError(
                     f"how detectors {group[0]} and {other[0]} lie to each other is not known: no star was found on "
-                    f"both (detectors that share stars: {listed}), and neither a camera nor headers tell; dither over the "
-                    "gap, or give the camera"
+                    f"both (detectors that share stars: {listed}), and neither a camera nor headers tell; dither over "
+                    "the gap, or give the camera"
                 ) from None
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from astropy import units as u
 
 from ..cameras.camera import Camera
+from ..cameras.exchanged import check_places
 from ..cameras.focal_planes import focal_planes
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..geometry.epochs import header_epoch, mean_epoch
@@ -101,7 +102,8 @@ def match(
     Raises
     ------
     InputError
-        For missing columns, bad values, a missing shape, fewer exposures than `min_exposures`.
+        For missing columns, bad values, a missing shape, fewer exposures than `min_exposures`, or detectors that
+        seem to lie in each other's places.
     MatchError
         For a single exposure, exposures in groups without a star in common, or no star in `min_exposures` exposures.
     """
@@ -149,12 +151,21 @@ def match(
     if not isolated.all():
         log.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
         star[~isolated] = -1
+    _check_detectors(camera, table, star, shapes)
     table, star = _keep_common(table, star, min_exposures, left_out)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
     _add_epochs(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
     matches = _finish(table, star, shapes, headers, left_out, epoch, distortions)
     return replace(matches, left_out=copies | left_out, camera=camera)
+
+
+def _check_detectors(camera, table, star, shapes):
+    """`check_places` with all stars that were found twice: few of those that cross are in many exposures."""
+    if camera is not None:
+        table, star = _keep_common(table, star, 2, {})
+        table["star"] = star
+        check_places(replace(Matches.from_table(table, shape=shapes, allow_copies=True), camera=camera))
 
 
 def _add_epochs(table, named):

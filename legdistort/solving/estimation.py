@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..cameras.exchanged import check_places
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, some_of, warn
 from ..inputs.matches import Matches
 from ..priors.prior import Prior, tells
@@ -250,6 +251,7 @@ def _of_camera(matches, prior, model, degree, layout, static):
         raise InputError(
             "with a camera, give what is known of its detectors to the camera (Detector(..., static=)), not as prior"
         )
+    check_places(matches)
     sought = Sought.of(matches, layout, static, 3 if isinstance(degree, str) else degree)
     if prior is not None or model is not None:
         return sought, prior

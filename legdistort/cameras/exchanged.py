@@ -1,0 +1,89 @@
+"""Detectors whose places were taken for one another, found by the stars that cross from one to the other.
+
+An exposure of detectors in the wrong places still fits the others, as each detector moves with the dithers. But where a
+star goes over to another detector, it does not arrive.
+"""
+
+from itertools import combinations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..exceptions import InputError
+from ..geometry import similarity
+from ..inputs.start_poses import estimate_poses
+
+#: Positions of a star on two detectors agree within so many pixels, or this part of the distance between stars.
+_NEAR, _PART = 20.0, 0.25
+#: Fewest stars on two detectors by their numbers that prove the places, if half of them agree.
+_FEWEST = 10
+#: Standard errors of the difference of two counts beyond which places are taken as exchanged.
+_SURE = 4.0
+
+
+def check_places(matches):
+    """Raise `InputError` if more stars cross from detector to detector with two of these exchanged.
+
+    By more than chance, 4 standard errors of the difference; with the right places it is always fewer.
+
+    Parameters
+    ----------
+    matches : Matches
+        With a camera or without.
+    """
+    camera = matches.camera
+    if camera is None or len(camera.detectors) < 2:
+        return
+    keys, detector = np.unique(camera.ids(matches.table), return_inverse=True)
+    xy = np.stack([matches.table[f"{axis}_detector"].value for axis in "xy"], axis=1)
+    if _proved(matches, detector):
+        return
+    focal = {(a, b): camera[b].to_focal_plane(xy[detector == k]) for k, a in enumerate(keys) for b in keys}
+    given = _crossing(matches, detector, [focal[key, key] for key in keys])
+    for a, b in combinations(keys, 2):
+        if camera[a].shape != camera[b].shape:
+            continue
+        exchanged = _crossing(matches, detector, [focal[key, {a: b, b: a}.get(key, key)] for key in keys])
+        if exchanged - given > _SURE * np.sqrt(exchanged + given):
+            raise InputError(
+                f"detectors {a} and {b} of camera {camera.name} seem to be exchanged: {exchanged} stars are on two "
+                f"detectors with the places of these two exchanged, {given} as they are; exchange them in the camera, "
+                "or in what names the detectors in the headers"
+            )
+
+
+def _proved(matches, detector):
+    """Whether most stars that are on two detectors by their numbers are so by their positions."""
+    observations, poses = matches.observations, [matches.poses[name] for name in matches.names]
+    seen = np.bincount(np.unique(np.stack([observations.star, detector]), axis=1)[0])
+    number = np.sum(seen[seen > 1] - 1)
+    return number >= _FEWEST and _agreeing(observations, detector, observations.xy, poses) > number / 2
+
+
+def _crossing(matches, detector, focal):
+    """Number of stars on two detectors, by positions in the focal plane, one array for each detector.
+
+    What a detector sees of a star counts as a star of its own, so that poses rest on each detector by itself.
+    """
+    f, observations = np.empty((len(detector), 2)), matches.observations
+    for k, each in enumerate(focal):
+        f[detector == k] = each
+    star = np.unique(np.stack([observations.star, detector]), axis=1, return_inverse=True)[1].ravel()
+    poses = estimate_poses(observations.exposure, star, f, names=matches.names)
+    return _agreeing(observations, detector, f, poses)
+
+
+def _agreeing(observations, detector, f, poses):
+    """Number of pairs of stars on different detectors that agree, by positions f (n, 2) in the focal plane."""
+    back = np.stack([similarity.invert(pose) for pose in poses])[observations.exposure]
+    f = np.einsum("nab,nb->na", back[:, :, :2], f) + back[:, :, 2]
+    first = np.unique(np.stack([observations.star, detector]), axis=1, return_index=True)[1]
+    at = [f[first[detector[first] == k]] for k in range(detector.max() + 1)]
+    trees, near = [cKDTree(each) for each in at], _nearness(at)
+    return sum(one.count_neighbors(other, near) for one, other in combinations(trees, 2))
+
+
+def _nearness(at):
+    """Within how many pixels positions (n, 2) of stars on each detector agree."""
+    apart = [np.median(cKDTree(each).query(each, k=2)[0][:, 1]) for each in at if len(each) > 1]
+    return min([_NEAR, *(_PART * distance for distance in apart)])
