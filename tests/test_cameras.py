@@ -17,6 +17,7 @@ from legdistort.cameras import camera as cameras
 from legdistort.cameras import exchanged
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.geometry import models
 from legdistort.inputs.exposures import Exposure
 from legdistort.reporting.page import render
 from legdistort.simulation import gsaoi_night
@@ -564,6 +565,21 @@ class TestFiles:
             assert np.abs(np.array(ours(*xy.T)) - here(*xy.T)).max() < 1e-9
             assert np.abs(np.array(ours.invert(*here(*xy.T))) - xy.T).max() < 1e-5
         assert "camera  GSAOI, detectors 1, 2, 3, 4" in str(solution)
+
+    def test_a_distortion_is_made_once_for_all_files(self, solution, tmp_path, monkeypatch):
+        """Making a series takes longer than all else; the WCSs in memory share nothing."""
+        made, init = [], models.FastLegendre2D.__init__
+        monkeypatch.setattr(models.FastLegendre2D, "__init__", lambda self, *a, **k: made.append(init(self, *a, **k)))
+        fresh = replace(solution, camera=replace(solution.camera, name="again"))
+        for detector in fresh.camera.detectors.values():
+            detector.distortion.__dict__.pop("shared_correction", None)
+        for name in fresh.names[:3]:
+            for key in "1234":
+                storage.write_wcs(fresh, name, tmp_path / f"{name}-{key}.asdf", detector=key)
+        assert len(made) == 4 * (4 + 3)  # x and y, there and back, of four detectors and three exposures
+        first, second = (fresh.wcs("frame00", key).get_transform("focal_plane", "reference") for key in "12")
+        shared = {id(leaf) for leaf in models.leaves(first)} & {id(leaf) for leaf in models.leaves(second)}
+        assert not shared
 
     def test_a_changed_wcs_is_refused(self, solution, tmp_path):
         """The certificates of both distortions, of the detector and of the focal plane, are checked."""
