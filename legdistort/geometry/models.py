@@ -68,7 +68,7 @@ class FastLegendre2D(models.Legendre2D):
     def stock_view(self):
         """The same as `stock`, with the parameters of this one: for reading alone, and 50 times as fast to make."""
         view = models.Legendre2D.__new__(models.Legendre2D)
-        view.__dict__.update(self.__dict__)
+        vars(view).update(vars(self))
         return view
 
 

@@ -170,11 +170,7 @@ def solve(
         raise InputError(
             f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
         )
-    check_choice(dynamic, (None, *DYNAMIC), "dynamic")
-    if dynamic is not None and matches.camera is None:
-        raise InputError("dynamic is for exposures with several detectors: matches need a camera")
-    if dynamic == "detector":
-        matches, prior, static = _of_detectors(matches, prior, layout, static)
+    matches, prior, static = _of_detectors(matches, prior, layout, static, dynamic)
     sought, prior = _of_camera(matches, prior, model, degree, layout, static)
     asked = SolveOptions(
         degree=degree, prior=prior, model=model, static=static, layout=layout, dynamic=dynamic,
@@ -211,8 +207,13 @@ def solve(
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
 
 
-def _of_detectors(matches, prior, layout, static):
-    """The matches of single detectors, what is known of these, and what to do about their statics."""
+def _of_detectors(matches, prior, layout, static, dynamic):
+    """The matches, of single detectors if they are asked for, what is known of these, and what to do about statics."""
+    check_choice(dynamic, (None, *DYNAMIC), "dynamic")
+    if dynamic is not None and matches.camera is None:
+        raise InputError("dynamic is for exposures with several detectors: matches need a camera")
+    if dynamic != "detector":
+        return matches, prior, static
     if layout is not None:
         raise InputError(
             "with dynamic='detector' every detector of every exposure has a pose of its own: leave layout out"
