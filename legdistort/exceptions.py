@@ -35,7 +35,7 @@ class MatchError(LegdistortError, ValueError):
         Exposures that share stars, where they fall apart in several such groups.
     """
 
-    def __init__(self, *args, groups=()):
+    def __init__(self, *args: object, groups: tuple = ()) -> None:
         super().__init__(*args)
         self.groups = tuple(groups)
 
