@@ -121,6 +121,7 @@ def test_bad_words(gsaoi):
         legdistort.solve(alone, dynamic="detector")
 
 
+@pytest.mark.slow
 def test_in_the_shell(drawn, gsaoi, tmp_path, monkeypatch):
     """A WCS for every detector of every exposure, as of a camera."""
     monkeypatch.chdir(tmp_path)
