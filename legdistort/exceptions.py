@@ -15,7 +15,21 @@ from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
 
 class LegdistortError(Exception):
-    """Base of every error that the package raises on purpose."""
+    """Base of every error that the package raises on purpose.
+
+    See Also
+    --------
+    LegdistortWarning : The base of all warnings.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> try:
+    ...     ld.read_exposures("nowhere/*.fits")
+    ... except ld.LegdistortError as error:
+    ...     print(error)
+    no file matches 'nowhere/*.fits'
+    """
 
 
 class InputError(LegdistortError, ValueError):
@@ -57,7 +71,18 @@ class ExportError(LegdistortError, ValueError):
 
 
 class LegdistortWarning(AstropyUserWarning):
-    """Base of every warning of the package."""
+    """Base of every warning of the package.
+
+    See Also
+    --------
+    LegdistortError : The base of all errors.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> import legdistort as ld
+    >>> warnings.filterwarnings("ignore", category=ld.LegdistortWarning)
+    """
 
 
 class ConvergenceWarning(LegdistortWarning):

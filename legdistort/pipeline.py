@@ -164,6 +164,20 @@ def run(
     ------
     LegdistortError
         With the file, exposure or argument at fault.
+
+    See Also
+    --------
+    legdistort.measure, legdistort.match, legdistort.solve, legdistort.coadd : Its steps.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> night = ld.simulate_exposures(small=True, n_exposures=4, seed=1)
+    >>> result = ld.run(night.write("night"), out="results", psf="moffat")
+    >>> result.solution.names
+    ('exp00', 'exp01', 'exp02', 'exp03')
+    >>> sorted(path.name for path in result.out.iterdir() if path.suffix == ".asdf")
+    ['solution.asdf']
     """
     check_results(out, overwrite)
     measuring = _step_options(MeasureOptions, measuring, "measuring", psf=psf)

@@ -67,6 +67,20 @@ class Camera:
     ------
     InputError
         For no detector, detectors that lie on each other, or outside of the field.
+
+    See Also
+    --------
+    Detector : One of its detectors.
+    legdistort.predict : Plan observations with a camera.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> camera = ld.Camera.gsaoi()
+    >>> camera
+    <Camera GSAOI: 4 detectors in a focal plane of 4301 x 4276 px>
+    >>> camera["2"].to_focal_plane([[100.0, 200.0]]).round(1).shape
+    (1, 2)
     """
 
     name: str

@@ -82,6 +82,18 @@ class Detector:
     ------
     InputError
         For arrays of another shape, not finite, a layout without area, or a Prior of a detector of another shape.
+
+    See Also
+    --------
+    legdistort.Camera : All detectors of a focal plane.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import legdistort as ld
+    >>> chip = ld.Detector((2048, 2048), layout=np.array([[1.0, 0.0, 150.0], [0.0, 1.0, 0.0]]))
+    >>> chip.to_focal_plane([[10.0, 20.0]])
+    array([[-140.,   20.]])
     """
 
     shape: tuple[int, int]

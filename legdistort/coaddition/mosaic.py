@@ -73,6 +73,22 @@ class Mosaic:
         rounded up.
     planes : tuple of str
         What `write` puts beside the image, see `to_hdulist`.
+
+    See Also
+    --------
+    legdistort.coadd : Makes one.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> night = ld.simulate_exposures(small=True, n_exposures=4, seed=1)
+    >>> exposures = ld.read_exposures(list(night.hdus.values()))
+    >>> solution = ld.solve(ld.match(ld.measure(exposures, psf="moffat"), exposures=exposures))
+    >>> mosaic = ld.coadd(exposures, solution)
+    >>> mosaic.contributors(300, 300)
+    ('exp00', 'exp01', 'exp02', 'exp03')
+    >>> mosaic.write("mosaic.fits").name
+    'mosaic.fits'
     """
 
     data: np.ndarray
@@ -194,7 +210,7 @@ class Mosaic:
         return hdulist
 
     def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
-        """Write the mosaic as a FITS file (see `to_hdulist`), or as ASDF.
+        """Write the mosaic as a FITS file (see `to_hdulist`), or as ASDF; returns the path.
 
         The file appears under its name only when it is complete.
 
@@ -221,6 +237,7 @@ class Mosaic:
                     self._append_to(packer)
             else:
                 self._append_to(file)
+        return Path(path)
 
     def _append_to(self, file):
         for hdu in self.to_hdulist():

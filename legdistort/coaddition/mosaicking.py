@@ -121,6 +121,20 @@ def coadd(
         without sky or shape, no exposure left, none on the grid.
     DiskFullError
         If the disk of `scratch` is full, or has less room than will be needed. Nothing is left behind.
+
+    See Also
+    --------
+    legdistort.solve : The WCSs that it resamples with.
+    legdistort.Mosaic : What comes out.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> night = ld.simulate_exposures(small=True, n_exposures=4, seed=1)
+    >>> exposures = ld.read_exposures(list(night.hdus.values()))
+    >>> solution = ld.solve(ld.match(ld.measure(exposures, psf="moffat"), exposures=exposures))
+    >>> ld.coadd(exposures, solution, method="median").exposures
+    ('exp00', 'exp01', 'exp02', 'exp03')
     """
     options = CoaddOptions(
         method=method,

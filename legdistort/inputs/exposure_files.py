@@ -176,6 +176,18 @@ def read_exposures(
         Naming the file: missing, not FITS, truncated, without a 2-D image or the extension wanted, with several
         images and no `ext`, without a good pixel, with the name of another one, or with a name that ``wcs/NAME.asdf``
         could not have.
+
+    See Also
+    --------
+    open_exposures : Reads the pixels when they are needed.
+    legdistort.measure : Finds and measures the stars.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> paths = ld.simulate_exposures(small=True, n_exposures=2, seed=1).write("night")
+    >>> ld.read_exposures("night/*.fits")[0].shape
+    (512, 512)
     """
     return _read_each(paths, partial(_read, good=good_bits(dq_good)), ext, progress)
 
@@ -214,6 +226,17 @@ def open_exposures(
     ------
     InputError
         As `legdistort.read_exposures` does; with `left_out` also if fewer than two good ones remain.
+
+    See Also
+    --------
+    read_exposures : The same with the pixels in memory.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> paths = ld.simulate_exposures(small=True, n_exposures=2, seed=1).write("night")
+    >>> [exposure.name for exposure in ld.open_exposures(paths)]
+    ['exp00', 'exp01']
     """
     good = good_bits(dq_good)
     if left_out is None and not stop_at_bad:

@@ -66,6 +66,17 @@ class Exposure:
     InputError
         If the data are not a 2-D image, planes differ in shape, no pixel is good, or the name could not be that of a
         file.
+
+    See Also
+    --------
+    legdistort.read_exposures : Exposures from files.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import legdistort as ld
+    >>> ld.Exposure("night1", np.zeros((100, 120)), gain=2.0, saturation=5e4)
+    <Exposure 'night1': 120 x 100 px, 0 masked, saturation 50000, gain 2, no WCS>
     """
 
     name: str

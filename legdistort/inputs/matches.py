@@ -104,6 +104,20 @@ class Matches:
     camera : `legdistort.Camera` or None
         Where exposures have several detectors. Positions then are those in its focal plane; those on the detectors
         stand in ``x_detector``, ``y_detector``.
+
+    See Also
+    --------
+    legdistort.match : Matches from positions of stars that are not identified.
+    legdistort.solve : Positions and distortions from matches.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> table = ld.simulate_matches(n_stars=20, n_exposures=4, seed=1).matches.table
+    >>> table["exposure", "star", "x", "y", "x_err", "y_err"].colnames
+    ['exposure', 'star', 'x', 'y', 'x_err', 'y_err']
+    >>> ld.Matches.from_table(table, shape=(2048, 2048))
+    <Matches: 80 observations of 20 stars in 4 exposures>
     """
 
     table: QTable

@@ -106,6 +106,19 @@ def match(
         seem to lie in each other's places.
     MatchError
         For a single exposure, exposures in groups without a star in common, or no star in `min_exposures` exposures.
+
+    See Also
+    --------
+    legdistort.measure : Makes the table of detections.
+    legdistort.Matches.from_table : Takes positions that are matched already.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> table = ld.simulate_matches(n_stars=40, n_exposures=5, dither=50, seed=1).matches.table
+    >>> table.remove_column("star")
+    >>> ld.match(table, shape=(2048, 2048)).names
+    ('exp00', 'exp01', 'exp02', 'exp03', 'exp04')
     """
     options = MatchOptions(
         min_exposures=min_exposures, columns=columns, tolerance=tolerance, reject_flags=reject_flags,

@@ -73,6 +73,19 @@ def calibrate_noise(
     -----
     AssumptionWarning
         If exposures lack a gain: the photon noise put in is estimated from their stars.
+
+    See Also
+    --------
+    legdistort.measure : Takes such errors with ``errors="injected"``.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> night = ld.simulate_exposures(small=True, n_exposures=1, seed=1)
+    >>> exposures = ld.read_exposures(list(night.hdus.values()))
+    >>> curves = ld.calibrate_noise(exposures, fluxes=[1e4, 1e5], n_positions=20, measuring={"psf": "moffat"})
+    >>> len(curves.table) > 0
+    True
     """
     exposures = listed(exposures, "calibrate_noise")
     fluxes, widths = check_injection(fluxes, fwhm, n_positions, seed)

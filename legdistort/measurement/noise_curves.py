@@ -207,8 +207,9 @@ class NoiseCurves:
         return plot_noise(self, exposure=exposure, ax=ax)
 
     def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
-        """Write the table as ECSV."""
+        """Write the table as ECSV; returns the path."""
         write_table(self.table, path, overwrite=overwrite)
+        return Path(path)
 
     @classmethod
     def read(cls, path: StrPath) -> NoiseCurves:

@@ -135,6 +135,20 @@ def measure(
         Once, if exposures lack a gain: the photon noise is then estimated from the residuals of the fits, one for all
         frames of a camera (`legdistort.measurement.camera_gain`). Once, if exposures have too few stars for an
         effective PSF.
+
+    See Also
+    --------
+    legdistort.match : Which detection is which star.
+    legdistort.calibrate_noise : Errors of positions from stars put into the images.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> night = ld.simulate_exposures(small=True, n_exposures=4, seed=1)
+    >>> exposures = ld.read_exposures(list(night.hdus.values()))
+    >>> detections = ld.measure(exposures, psf="moffat")
+    >>> detections["exposure", "x", "x_err", "flux"].colnames
+    ['exposure', 'x', 'x_err', 'flux']
     """
     exposures = listed(exposures, "measure")
     options = MeasureOptions(
@@ -195,6 +209,19 @@ def effective_psf(
     ------
     InputError
         If there are too few stars.
+
+    See Also
+    --------
+    legdistort.measure : Measures stars with effective PSFs.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> night = ld.simulate_exposures(small=True, n_exposures=1, seed=1)
+    >>> (exposure,) = ld.read_exposures(list(night.hdus.values()))
+    >>> psf = ld.effective_psf(exposure)
+    >>> psf.exposure, psf.source
+    ('exp00', 'effective')
     """
     options = MeasureOptions(
         fwhm=fwhm, threshold=threshold, box=box, gain=gain, read_noise=read_noise, saturation=saturation,

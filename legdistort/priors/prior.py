@@ -100,6 +100,22 @@ class Prior:
     ------
     InputError
         For arrays of the wrong length or values that are not finite.
+
+    See Also
+    --------
+    legdistort.solve : Takes it as ``prior=``.
+    legdistort.Camera : Several detectors with static distortions of their own.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> def undistorted(x, y):  # detector pixels to undistorted ones, a pincushion
+    ...     r2 = ((x - 1023.5) ** 2 + (y - 1023.5) ** 2) / 1024**2
+    ...     return x - 2 * r2 * (x - 1023.5) / 1024, y - 2 * r2 * (y - 1023.5) / 1024
+    >>> ld.Prior.from_model(
+    ...     undistorted, shape=(2048, 2048), direction="detector_to_reference", degree=3, static_sigma=0.02
+    ... )
+    <Prior: degree 3, 10 modes an axis, static_sigma given>
     """
 
     mean: np.ndarray | None

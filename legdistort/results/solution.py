@@ -112,6 +112,26 @@ class Solution:
         What `dataclasses.replace` makes finds its own.
     file_checksum : str, optional
         SHA-256 of the file that it was read from. What `dataclasses.replace` makes is another solution and has none.
+
+    See Also
+    --------
+    legdistort.solve : Makes one.
+    legdistort.coadd : A mosaic of the exposures of a solution.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> solution = ld.solve(ld.simulate_matches(seed=1).matches)
+    >>> solution
+    <Solution: 10 exposures, 30 stars, degree 3, chi2 ... for ... degrees of freedom>
+    >>> solution.stars["star", "x", "y", "x_err"].colnames
+    ['star', 'x', 'y', 'x_err']
+    >>> solution.correct("exp00", [[100.0, 200.0]]).shape
+    (1, 2)
+    >>> solution.write("solution.asdf").name
+    'solution.asdf'
+    >>> ld.Solution.read("solution.asdf").names == solution.names
+    True
     """
 
     names: tuple[str, ...]

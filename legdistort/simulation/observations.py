@@ -167,6 +167,17 @@ def simulate_matches(
     ------
     InputError
         For arguments out of range.
+
+    See Also
+    --------
+    simulate_exposures : Images of such a night.
+    legdistort.predict : Expected errors without a draw.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> ld.simulate_matches(n_stars=50, n_exposures=8, sigma=0.02, seed=1)
+    <Simulation: <Matches: 400 observations of 50 stars in 8 exposures>>
     """
     checks.check_counts(n_stars=n_stars, n_exposures=n_exposures)
     if not (0 < seen <= 1 and -1 < corr < 1 and dither >= 0 and noise >= 0):
@@ -235,6 +246,17 @@ def simulate_exposures(
     ------
     InputError
         For an unknown setting or one out of range.
+
+    See Also
+    --------
+    simulate_matches : Positions without images.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> night = ld.simulate_exposures(small=True, n_exposures=2, seed=1)
+    >>> [path.name for path in night.write("night")]
+    ['exp00.fits', 'exp01.fits']
     """
     night = gsaoi_night.make_night(small, camera=camera, **settings)
     truth, rng = gsaoi_night.draw_night(night, seed)

@@ -314,10 +314,22 @@ def predict(
     SolveError
         Naming the exposure with fewer stars than modes, as `solve` would.
 
+    See Also
+    --------
+    legdistort.simulate_matches : Draw such observations.
+    legdistort.solve : Solve them.
+
     Notes
     -----
     Up to 8000 coefficients (400 exposures at degree 3) their full covariance is used; beyond, an `AssumptionWarning`
     says that it is approximated by one block an exposure.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> plan = ld.predict(n_exposures=11, n_stars=80, sigma=0.02, dynamic=0.3)
+    >>> plan.n_stars, plan.degree
+    (80, 3)
     """
     plan = Plan(
         n_exposures=n_exposures, stars=stars, n_stars=n_stars, density=density, sigma=sigma, degree=degree,

@@ -165,6 +165,22 @@ def solve(
     SolveError
         If an exposure has fewer stars than modes, the unknowns are not determined, or exposures contradict one another
         and no majority says which are right.
+
+    See Also
+    --------
+    legdistort.match : Makes the matches.
+    legdistort.Solution : What comes out.
+    legdistort.predict : Expected errors before anything is observed.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> sim = ld.simulate_matches(n_stars=50, n_exposures=8, sigma=0.02, seed=1)
+    >>> solution = ld.solve(sim.matches, degree=3)
+    >>> bool(solution.rms.max() < 0.02)
+    True
+    >>> [check.name for check in solution.checks if check.state == "fail"]
+    []
     """
     if not isinstance(matches, Matches):
         raise InputError(

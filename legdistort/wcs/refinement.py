@@ -50,6 +50,19 @@ def refine(wcs: GWCS, solution: Solution, name: str) -> GWCS:
     InputError
         If `wcs` is no such gwcs, is of another detector or place on the sky, or its later transforms cannot be
         inverted; if the solution does not know the sky or the exposure.
+
+    See Also
+    --------
+    legdistort.Solution.wcs : A WCS made of the solution alone.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> night = ld.simulate_exposures(small=True, n_exposures=4, seed=1)
+    >>> exposures = ld.read_exposures(list(night.hdus.values()))
+    >>> solution = ld.solve(ld.match(ld.measure(exposures, psf="moffat"), exposures=exposures))
+    >>> ld.refine(solution.wcs("exp00"), solution, "exp00").available_frames[-1]
+    'icrs'
     """
     solution.index(name)
     _check(wcs, solution, name)

@@ -82,6 +82,19 @@ def read_wcs(path: StrPath, *, max_bytes: int | None = None) -> GWCS:
     ------
     InputError
         For a file that is damaged, too large, no WCS of legdistort, or was changed after it was written.
+
+    See Also
+    --------
+    legdistort.Solution.wcs : The WCS of an exposure of a solution in memory.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> from legdistort.wcs.storage import write_wcs
+    >>> solution = ld.solve(ld.simulate_matches(n_stars=40, seed=1).matches)
+    >>> path = write_wcs(solution, "exp00", "exp00.asdf")
+    >>> ld.read_wcs(path).available_frames
+    ['detector', 'undistorted', 'reference']
     """
     tree = read_tree(path, tags=WITH_WCS, max_bytes=MAX_BYTES if max_bytes is None else max_bytes)
     meta = tree.get("meta")

@@ -119,6 +119,20 @@ class EffectivePSF:
         What the local skies of its stars hold of their light, on each pixel: wide halos pass for sky.
     fwhm : float
         Full width at half maximum at the centre of the field, of a circle of the area above half maximum [pix].
+
+    See Also
+    --------
+    legdistort.effective_psf : Make one from the stars of an exposure.
+    legdistort.measure : Measure stars with it, ``psf=``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import legdistort as ld
+    >>> y, x = np.mgrid[-40:41, -40:41] / 4  # four samples a pixel
+    >>> psf = ld.EffectivePSF.from_array(np.exp(-(x**2 + y**2) / 2 / 1.5**2), oversampling=4)
+    >>> round(psf.fwhm, 1)
+    3.5
     """
 
     coefficients: np.ndarray
@@ -295,7 +309,7 @@ class EffectivePSF:
         return GriddedPSFModel(NDData(images.copy(), meta={"grid_xypos": places, "oversampling": _SAMPLES}))
 
     def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
-        """Write a FITS file.
+        """Write a FITS file; returns the path.
 
         The primary array holds oversampled images in the format STDPSF, which ``GriddedPSFModel.read`` of photutils
         takes; the extension ``EPSF`` the coefficients, from which `EffectivePSF.read` makes the same object again.
@@ -330,6 +344,7 @@ class EffectivePSF:
         left = [] if self.residual is None else [fits.ImageHDU(self.residual, name=_RESIDUAL)]
         with outputs.replacing(path, overwrite=overwrite) as file:
             fits.HDUList([primary, exact, *left]).writeto(file)
+        return Path(path)
 
     @classmethod
     def read(cls, path: StrPath) -> EffectivePSF:
