@@ -1,18 +1,15 @@
-"""A simulated night run through the whole road and compared with its truth."""
+"""A simulated night run through the whole pipeline and compared with its truth."""
 
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .geometry.gsaoi import gsaoi_static
 from .pipeline import check_results, run, write_summary
-from .priors.prior import Prior
 from .results import accuracy
+from .simulation.example_files import published_prior
 from .simulation.observations import simulate_exposures
 
-#: Degree of the prior: the static map is then followed to 3e-6 px.
-PRIOR_DEGREE = 5
 _HELD_OUT_PER_SIDE = 20
 
 
@@ -45,17 +42,11 @@ def run_demo(*, out, small=False, camera=None, seed=0, overwrite=False, progress
     truth = night.truth
     out.mkdir(parents=True, exist_ok=True)
     paths = night.write(out / "frames")
-    known = {"camera": truth.camera, "ext": "SCI"} if camera else {"prior": _published(truth.shape)}
+    known = {"camera": truth.camera, "ext": "SCI"} if camera else {"prior": published_prior(truth.shape)}
     result = run(paths, out=out, **known, overwrite=overwrite, progress=progress)
     result.summary.update(compare_with_truth(result.solution, truth, seed=seed))
     write_summary(out / "summary.json", result.summary)
     return result
-
-
-def _published(shape):
-    """The static distortion of the detector of the night, as its prior."""
-    known = {"shape": shape, "direction": "detector_to_reference", "degree": PRIOR_DEGREE}
-    return Prior.from_model(gsaoi_static(2, size=shape[1]), **known)
 
 
 def compare_with_truth(solution, truth, *, seed=0):

@@ -1,4 +1,4 @@
-"""The whole road: frames -> positions -> matches -> solution -> WCS files, mosaic and report."""
+"""The whole pipeline: frames -> positions -> matches -> solution -> WCS files, mosaic and report."""
 
 from __future__ import annotations
 

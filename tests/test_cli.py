@@ -27,6 +27,7 @@ from legdistort.cli.usage import COMMANDS
 from legdistort.coaddition import preparation
 from legdistort.demo import run_demo
 from legdistort.exceptions import InputError
+from legdistort.simulation.example_files import write_examples
 from legdistort.simulation.observations import simulate_exposures
 from legdistort.simulation.pupil import PupilPSF
 from legdistort.wcs.attachment import attach
@@ -344,6 +345,7 @@ def test_help_has_an_example(command, capsys):
     ("function", "groups"),
     [
         (run_demo, [options.NIGHT]),
+        (write_examples, [options.EXAMPLES]),
         (simulate_exposures, [options.NIGHT]),
         (PupilPSF, [options.OPTICS]),
         (legdistort.run, [options.RUN_FRAMES, options.WORKERS, options.COMPARING]),
@@ -612,3 +614,46 @@ def test_microobservatory_frames(shared_data, tmp_path, capsys):
     rows = rows[rows["used"] & np.isin(rows["star"], bright)]
     for axis in ("dx", "dy"):
         assert np.sqrt(np.mean(rows[axis].value ** 2)) <= 0.05
+
+
+def test_steps_keep_the_sky_as_run_finds_it(night, tmp_path, capsys, monkeypatch):
+    """The table of positions names its frames, whose headers know the sky; moved frames are told."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "frames").mkdir()
+    for path in night:
+        (tmp_path / "frames" / path.name).write_bytes(path.read_bytes())
+    for step in (
+        ["run", "frames/*.fits", "--degree", "1", "--out", "whole"],
+        ["measure", "frames/*.fits", "--out", "stars.ecsv"],
+        ["match", "stars.ecsv", "--out", "matched.ecsv"],
+        ["solve", "matched.ecsv", "--degree", "1", "--out", "steps"],
+    ):
+        assert main([*step, "--quiet"]) == 0, step
+    whole, steps = (Solution.read(folder) for folder in ("whole", "steps"))
+    assert steps.sky_sentence == whole.sky_sentence
+    np.testing.assert_array_equal(steps.stars["ra"], whole.stars["ra"])
+    name = whole.names[0]
+    assert steps.wcs(name)(100.0, 200.0) == whole.wcs(name)(100.0, 200.0)
+    (tmp_path / "frames").rename(tmp_path / "elsewhere")
+    capsys.readouterr()
+    assert main(["match", "stars.ecsv", "--out", "blind.ecsv", "--quiet"]) == 0
+    assert "matched without the headers of its frames, so without their sky: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("kind", "files"), [("keck-lists", "*.lis"), ("hst-lists", "*.xymq"), ("gwcs", "*.asdf")])
+def test_example_files_are_read_and_stay_the_same(kind, files, tmp_path, capsys):
+    assert main(["demo", "--as", kind, "--out", str(tmp_path / "a")]) == 0
+    written = sorted(map(Path, capsys.readouterr().out.split()))
+    assert written == sorted((tmp_path / "a").glob(files))
+    assert main(["demo", "--as", kind, "--out", str(tmp_path / "b"), "--quiet"]) == 0
+    if kind == "gwcs":
+        exposures = open_exposures(written)
+        assert {exposure.wcs.available_frames[1] for exposure in exposures} == {"v2v3"}
+    else:
+        assert [p.read_bytes() for p in written] == [(tmp_path / "b" / p.name).read_bytes() for p in written]
+        lists = [str(path) for path in written]
+        words = ["--shape", "1024", "1024", "--error", "0.05", "--out", str(tmp_path / "m.ecsv")]
+        assert main(["match", *lists, *words]) == 0
+    capsys.readouterr()
+    failed(capsys, main(["demo", "--as", kind, "--out", str(tmp_path / "a")]), "exists already", "--overwrite")
+    failed(capsys, main(["demo", "--as", kind, "--small", "--out", str(tmp_path / "c")]), "--small", "leave it out")

@@ -1,8 +1,12 @@
 """The README and the documentation say what is so: their Python runs, their commands are the ones checked."""
 
 import ast
+import os
 import re
 import shlex
+import subprocess
+import sys
+import time
 import tomllib
 from pathlib import Path
 
@@ -11,7 +15,6 @@ import yaml
 
 import legdistort
 from legdistort.cli import parser
-from legdistort.demo import run_demo
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs").glob("paper/*.md"))]
@@ -26,30 +29,60 @@ def blocks(page, language):
     return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
-@pytest.fixture(scope="module")
-def night(tmp_path_factory):
-    """Folder with ``demo`` as the small demonstration leaves it, and its frames as ``frames``."""
-    folder = tmp_path_factory.mktemp("docs")
-    run_demo(out=folder / "demo", small=True)
-    (folder / "frames").symlink_to(folder / "demo" / "frames")
-    return folder
+#: A fenced block of code: why it cannot run here, if it cannot, its language and its text.
+BLOCK = re.compile(r"^(?:<!-- not run: (.*) -->\n)?```(sh|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES[1:] if blocks(page, "python")], ids=lambda page: page.name)
-def test_python_on_the_page_runs_as_printed(page, night, monkeypatch):
-    monkeypatch.chdir(night)
-    namespace = {}
-    for code in blocks(page, "python"):
-        exec(compile(code, page.name, "exec"), namespace)  # one page is one session
+def reading_order():
+    """The README, and the pages in the order of its links; a page whose code needs that of another comes after it."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    linked = dict.fromkeys(re.findall(r"\]\((docs/[\w/]+\.md)\)", readme))
+    tutorial = "docs/first_mosaic.md"
+    return [ROOT / "README.md", ROOT / tutorial, *(ROOT / page for page in linked if page != tutorial)]
 
 
-def test_readme_example_is_six_lines_and_gives_a_mosaic(night, monkeypatch):
-    monkeypatch.chdir(night)
+def test_the_readme_leads_to_every_page_with_code():
+    assert {page.name for page in PAGES if BLOCK.search(page.read_text(encoding="utf-8"))} <= {
+        page.name for page in [*reading_order(), ROOT / "docs" / "index.md"]
+    }
+
+
+def test_few_blocks_cannot_run_here():
+    reasons = [why for page in PAGES for why, _, _ in BLOCK.findall(page.read_text(encoding="utf-8")) if why]
+    assert len(reasons) <= 16
+    assert all(len(reason.split()) >= 3 for reason in reasons)
+
+
+@pytest.mark.slow
+def test_every_block_of_every_page_runs_as_printed(tmp_path):
+    """In one empty folder, page after page, as a stranger would; the Python of a page is one session."""
+    place = tmp_path / "empty"
+    place.mkdir()
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path, "MPLBACKEND": "Agg"}
+    failed = []
+    for page in reading_order():
+        lines = ["import subprocess", "names = {}"]
+        for why, language, code in BLOCK.findall(page.read_text(encoding="utf-8")):
+            if not why and language == "sh":
+                lines.append(f"subprocess.run(['bash', '-euc', {code!r}], check=True)")
+            elif not why:
+                lines.append(f"exec(compile({code!r}, {page.name!r}, 'exec'), names)")
+        script = tmp_path / "page.py"
+        script.write_text("\n".join(lines), encoding="utf-8")
+        begun = time.monotonic()
+        run = subprocess.run(
+            [sys.executable, str(script)], cwd=place, env=environment, capture_output=True, text=True, check=False
+        )
+        print(f"{page.name}: {time.monotonic() - begun:.0f} s")
+        if run.returncode:
+            failed.append(f"{page.name}:\n{run.stderr[-1500:]}")
+    assert not failed, "\n\n".join(failed)
+
+
+def test_readme_example_is_six_lines():
     (example,) = blocks(ROOT / "README.md", "python")
     assert len([line for line in example.splitlines() if line]) == 6
-    (night / "mosaic.fits").unlink(missing_ok=True)
-    exec(example, {})
-    assert (night / "mosaic.fits").stat().st_size > 1e6
 
 
 def commands():

@@ -14,7 +14,6 @@ from ..coaddition.grids import given_grid, read_grid
 from ..coaddition.mosaic import check_ending
 from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
-from ..inputs.exposure_files import file_checksums
 from ..inputs.star_lists.formats import stack
 from ..inputs.table_files import read_table, write_stars, write_table
 from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
@@ -28,8 +27,14 @@ from .arguments import given, wants_progress
 def do_demo(a):
     """``legdistort demo``."""
     from ..demo import run_demo
+    from ..simulation.example_files import write_examples
 
-    result = run_demo(out=a.out, **given(a, options.NIGHT), overwrite=a.overwrite, progress=wants_progress(a))
+    night = given(a, options.NIGHT)
+    if kind := given(a, options.EXAMPLES):
+        _refuse({"small": a.small, "camera": a.camera}, "goes with a night that is solved, not with --as")
+        written = write_examples(**kind, out=a.out, seed=a.seed or 0, overwrite=a.overwrite)
+        return _say(a, "\n".join(map(str, written)), {"files": [str(path) for path in written]})
+    result = run_demo(out=a.out, **night, overwrite=a.overwrite, progress=wants_progress(a))
     s = result.summary
     _report(a, result.solution, s)
     if not a.json:
@@ -77,6 +82,7 @@ def do_run(a):
 
 def do_measure(a):
     """``legdistort measure``."""
+    from ..measurement.earlier import write_detections
     from ..measurement.options import MeasureOptions
 
     measuring = given(a, options.MEASURING)
@@ -85,8 +91,9 @@ def do_measure(a):
     exposures = _open(a, left_out=bad, stop_at_bad=a.stop_at_bad)
     table = legdistort.measure(exposures, **measuring, **given(a, options.PSF_FILES), **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
-    table.meta |= {"shapes": shapes, "inputs": file_checksums(exposures), "left_out": bad}
-    write_table(table, a.out, overwrite=a.overwrite)
+    table.meta["left_out"] = bad
+    reading = given(a, {"ext": options.FRAMES["ext"]}, options.FLAGGED)
+    write_detections(a.out, table, exposures, a.out.parent, **reading, overwrite=a.overwrite)
     _say(
         a,
         f"{len(table)} detections in {len(exposures)} exposures",
@@ -110,16 +117,19 @@ def do_noise(a):
 
 def do_match(a):
     """``legdistort match``."""
+    from ..measurement.earlier import measured_frames
     from ..pipeline import write_matched
 
-    tables = [_read_table(path, a) for path in a.tables]
+    read = {Path(path): _read_table(path, a) for path in a.tables}
+    tables = list(read.values())
     names = [name for table in tables for name in dict.fromkeys(table["exposure"])]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
     known = {"shape": tuple(a.shape) if a.shape else shapes or None, "camera": _camera(a.camera)}
-    matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
+    exposures = measured_frames(read)
+    matches = legdistort.match(stack(tables), exposures=exposures, **known, **given(a, options.MATCHING))
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
     bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
     bad = {name: reason for name, reason in bad.items() if name not in names}
@@ -276,6 +286,13 @@ def _report(a, solution, summary):
                 print(Check(**check), file=sys.stderr)
     else:
         print(replace(solution, checked=tuple(Check(**check) for check in summary["checks"])))
+
+
+def _refuse(given, reason):
+    """Raise `InputError` for the first of ``{name: value}`` that was given: it would be ignored."""
+    for name, value in given.items():
+        if value not in (None, False):
+            raise InputError(f"--{name.replace('_', '-')} {reason}: leave it out")
 
 
 def _status(a, summary):

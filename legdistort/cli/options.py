@@ -87,6 +87,9 @@ NIGHT = {
     "seed": Option("of the random numbers (default 0)", type=int),
     "camera": Option("all detectors of this camera, in one file an exposure", choices=("gsaoi",)),
 }
+EXAMPLES = {
+    "kind": Option("only write small example files of this form, and solve nothing", "--as", choices=words.EXAMPLES)
+}
 AT_EPOCH = {"epoch": Option("where they are at another time: a decimal year (default: of the solution)", type=float)}
 CARRIED = {
     "epoch": Option(

@@ -28,6 +28,7 @@ COMMANDS = {
         "--out demo",
         options.out("folder for frames and results", path="folder"),
         options.NIGHT,
+        options.EXAMPLES,
     ),
     "run": _command(
         "frames to WCS, mosaic and report",

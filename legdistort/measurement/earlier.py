@@ -8,8 +8,8 @@ import numpy as np
 from astropy.table import Table
 
 from ..cameras.camera import Camera
-from ..exceptions import InputError, some_of
-from ..inputs.exposure_files import ExposureFile, file_checksums
+from ..exceptions import AssumptionWarning, InputError, LegdistortError, some_of, warn
+from ..inputs.exposure_files import ExposureFile, file_checksums, open_exposures
 from ..inputs.table_files import read_table, write_table
 from .effective.model import EffectivePSF
 
@@ -101,8 +101,36 @@ class EarlierRun:
         return table, {name: EffectivePSF.read(file) for name, file in files.items() if file.is_file()}
 
 
-def write_detections(path, detections, exposures, out, *, ext=None, dq_good=None, camera=None):
-    """Write what a run has measured, for `EarlierRun`.
+def measured_frames(tables):
+    """The frames of tables of positions, whose headers may know the sky.
+
+    Parameters
+    ----------
+    tables : dict of Path to Table
+        As `write_detections` wrote them, or others.
+
+    Returns
+    -------
+    list of ExposureFile or None
+        None if one of the tables names no frames, or if frames are not there any more as they were measured: then
+        with a warning.
+    """
+    if not all("frames" in table.meta for table in tables.values()):
+        return None
+    exposures = []
+    for path, table in tables.items():
+        earlier = EarlierRun(path.parent, table)
+        try:
+            exposures += (opened := open_exposures(earlier.frames, **earlier.reading))
+            earlier.of(opened)
+        except LegdistortError as error:
+            warn(f"{path}: matched without the headers of its frames, so without their sky: {error}", AssumptionWarning)
+            return None
+    return exposures
+
+
+def write_detections(path, detections, exposures, out, *, ext=None, dq_good=None, camera=None, overwrite=False):
+    """Write what was measured, for `EarlierRun` and for the command ``match``.
 
     Parameters
     ----------
@@ -114,6 +142,8 @@ def write_detections(path, detections, exposures, out, *, ext=None, dq_good=None
         Where the file will be found: paths of frames are told from there.
     ext, dq_good, camera
         As given to `legdistort.run`.
+    overwrite : bool
+        Replace a file that exists.
     """
     table = detections.copy()
     files = list(dict.fromkeys(exposure.path for exposure in exposures if exposure.path is not None))
@@ -125,4 +155,4 @@ def write_detections(path, detections, exposures, out, *, ext=None, dq_good=None
         "dq_good": dq_good,
         "camera": None if camera is None else camera.to_meta(),
     }
-    write_table(table, path)
+    write_table(table, path, overwrite=overwrite)

@@ -3,6 +3,9 @@
 They stand apart from the functions that act on them, so that the command line can list them without loading those.
 """
 
+# -- simulating
+EXAMPLES = ("frames", "camera", "headers", "gwcs", "keck-lists", "hst-lists")
+
 # -- priors
 DIRECTIONS = ("detector_to_reference", "reference_to_detector")
 
