@@ -26,7 +26,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = f"legdistort {version}"
 html_math_renderer = "mathml"
 html_show_sourcelink = False
-html_sidebars = {"**": []}
+html_sidebars = {"**": ["globaltoc.html"]}
 html_theme_options = {
     "header_links_before_dropdown": 7,
     "navigation_with_keys": False,

@@ -196,7 +196,9 @@ def run(
         with _timed(timings, "measure"):
             detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, measuring, **share)
         with _timed(timings, "match"):
-            matches = match(detections, exposures=exposures, camera=reading["camera"], **vars(matching))
+            matches = match(
+                detections, exposures=exposures, camera=reading["camera"], **vars(matching) | {"progress": progress}
+            )
             matches = replace(matches, left_out=bad | matches.left_out)
         with _timed(timings, "solve"):
             solution = solve(matches, **vars(solving), **tying)

@@ -23,6 +23,7 @@ from legdistort import Prior, Solution, calibrate_noise, coadd, match, measure, 
 from legdistort.cli import commands, options, parser
 from legdistort.cli.arguments import given
 from legdistort.cli.parser import main
+from legdistort.cli.running import in_shell_words
 from legdistort.cli.usage import COMMANDS
 from legdistort.coaddition import preparation
 from legdistort.demo import run_demo
@@ -173,7 +174,7 @@ def test_noise_frame_is_left_out_by_name(night, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["slove", "m.ecsv"], r"legdistort: .*'slove'.*; did you mean solve\?"),
+        (["slove", "m.ecsv"], r"legdistort: .*invalid choice: slove .*; did you mean solve\?"),
         (["solve", "m.ecsv", "--degre", "3", "--out", "x"], r"legdistort solve: .* --degre 3; did you mean --degree\?"),
         (["run", "a.fits", "--over", "--out", "x"], r"legdistort run: .* --over; did you mean --overwrite\?"),
         (["solve"], r"legdistort solve: the following arguments are required: TABLE, --out \("),
@@ -657,3 +658,61 @@ def test_example_files_are_read_and_stay_the_same(kind, files, tmp_path, capsys)
     capsys.readouterr()
     failed(capsys, main(["demo", "--as", kind, "--out", str(tmp_path / "a")]), "exists already", "--overwrite")
     failed(capsys, main(["demo", "--as", kind, "--small", "--out", str(tmp_path / "c")]), "--small", "leave it out")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("run FRAMES --pixfrac 0.5 --out o", "--pixfrac is for --algorithm drizzle"),
+        ("run FRAMES --kernel turbo --out o", "--kernel is for --algorithm drizzle"),
+        ("run FRAMES --algorithm exact --order 1 --out o", "--order is for --algorithm interp"),
+        ("run FRAMES --epoch 2014 --out o", "--epoch is for the catalogue of --reference"),
+        ("run FRAMES --pixel-scale 0.02 --out o", "--pixel-scale is for the catalogue of --reference"),
+        ("match t.ecsv --camera gsaoi --shape 9 9 --out o.ecsv", "--shape is told by --camera"),
+        ("attach s.asdf FRAMES --asdf-only --max-error 0.1 --out o", "--max-error is of the header"),
+        ("predict --n-exposures 9 --n-stars 80 --sigma 0.02 --origin 1", "--origin is for the table of --stars"),
+    ],
+)
+def test_options_that_others_leave_without_effect_are_refused(words, message, night, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    line = [word for each in words.split() for word in (map(str, night) if each == "FRAMES" else [each])]
+    failed(capsys, main(line), message, ": leave it out")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["report s.asdf --out x.pdf", "measure FRAMES --out x.fits", "prior gsaoi-2 --out x", "match t --out x.txt"],
+)
+def test_a_file_of_another_type_is_refused(words, night, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    line = [word for each in words.split() for word in (map(str, night) if each == "FRAMES" else [each])]
+    failed(capsys, main(line), "the ending says the format, give .")
+
+
+def test_outputs_are_tried_and_not_only_permitted(night, tmp_path, capsys, monkeypatch):
+    """A disk that takes no renames, though permissions say that it does."""
+
+    def refuse(*_):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("legdistort.runtime.outputs.os.replace", refuse)
+    monkeypatch.setattr(legdistort, "measure", None)  # that no work is begun
+    words = ["measure", *map(str, night), "--out", str(tmp_path / "s.ecsv")]
+    failed(capsys, main(words), "s.ecsv cannot be written: Read-only file system; write elsewhere")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("python", "shell"),
+    [
+        ("use overwrite=True (--overwrite)", "use --overwrite"),
+        ("a catalogue (reference=, --reference)", "a catalogue (--reference)"),
+        ("errors='floor' finds the error floor", "--errors floor finds the error floor"),
+        ("min_exposures=4 of them", "--min-exposures 4 of them"),
+        ("must be one of 'joint', 'alternating', got 'x'", "must be one of joint, alternating, got x"),
+        ("it's the star's own", "it's the star's own"),
+    ],
+)
+def test_messages_in_the_shell_have_no_words_of_python(python, shell):
+    assert in_shell_words(python) == shell

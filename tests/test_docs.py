@@ -30,7 +30,7 @@ def blocks(page, language):
 
 
 #: A fenced block of code: why it cannot run here, if it cannot, its language and its text.
-BLOCK = re.compile(r"^(?:<!-- not run: (.*) -->\n)?```(sh|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^(?:<!-- not run: ([^\n]*) -->\n)?```(sh|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def reading_order():

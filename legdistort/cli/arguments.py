@@ -67,15 +67,25 @@ class Option:
     path : {"read", "file", "folder", "results"}, optional
         It names what is read, and must not be replaced; or what is written: a file, a folder in which nothing is
         replaced, or the folder of the results of a run.
+    endings : tuple of str, optional
+        Endings that a name of a file may have: they say its format.
     one_of : str, optional
         Options with the same word here exclude one another; one of them is needed if they are `required`.
     **settings
         As `argparse.ArgumentParser.add_argument` takes them.
     """
 
-    def __init__(self, help, flag=None, *, none=None, path=None, one_of=None, **settings):
-        self.flag, self.none, self.path, self.one_of = flag, none, path, one_of
+    def __init__(self, help, flag=None, *, none=None, path=None, endings=None, one_of=None, **settings):
+        self.flag, self.none, self.path, self.endings, self.one_of = flag, none, path, endings, one_of
         self.settings = settings | {"help": help}
+
+
+class Group(dict):
+    """Options by name that stand together in the help, under a title."""
+
+    def __init__(self, title, options):
+        super().__init__(options)
+        self.title = title
 
 
 def _flagged(groups):
@@ -88,14 +98,16 @@ def _flagged(groups):
 def add_options(parser, groups):
     """Give a parser the options of some groups."""
     exclusive = {}
-    for _, flag, _, option in _flagged(groups):
-        place, settings = parser, dict(option.settings)
-        if option.one_of is not None:
-            required = settings.pop("required", False)
-            if option.one_of not in exclusive:
-                exclusive[option.one_of] = parser.add_mutually_exclusive_group(required=required)
-            place = exclusive[option.one_of]
-        place.add_argument(flag, **settings)
+    for group in groups:
+        titled = parser.add_argument_group(group.title) if isinstance(group, Group) else parser
+        for _, flag, _, option in _flagged([group]):
+            place, settings = titled, dict(option.settings)
+            if option.one_of is not None:
+                required = settings.pop("required", False)
+                if option.one_of not in exclusive:
+                    exclusive[option.one_of] = titled.add_mutually_exclusive_group(required=required)
+                place = exclusive[option.one_of]
+            place.add_argument(flag, **settings)
 
 
 def given(arguments, *groups):
@@ -107,13 +119,15 @@ def given(arguments, *groups):
 def check_paths(arguments, groups):
     """Raise `InputError` if an output of a command cannot be written, or would replace what is read."""
     from ..inputs.exposure_files import expand_paths
-    from ..runtime.outputs import check_file, check_folder, check_not_read
+    from ..runtime.outputs import check_ending, check_file, check_folder, check_not_read, try_to_write
 
     named = {"read": [], "file": [], "folder": [], "results": []}
     for _, _, dest, option in _flagged(groups):
         value = getattr(arguments, dest)
         if option.path is not None and value not in (None, option.none):
             named[option.path].append(value)
+            if option.endings is not None:
+                check_ending(value, option.endings)
     inputs = [path for value in named["read"] for path in expand_paths(value)]
     replaced = [path for path in named["file"] if not path.is_dir()]
     for folder in named["results"]:
@@ -126,6 +140,8 @@ def check_paths(arguments, groups):
         check_file(path, overwrite=arguments.overwrite)
     for folder in named["folder"] + named["results"]:
         check_folder(folder)
+    for path in named["file"] + named["folder"] + named["results"]:
+        try_to_write(path)
 
 
 def wants_progress(arguments):

@@ -15,7 +15,7 @@ from ..coaddition.mosaic import check_ending
 from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
 from ..inputs.star_lists.formats import stack
-from ..inputs.table_files import read_table, write_stars, write_table
+from ..inputs.table_files import read_table, write_stars
 from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
 from ..results.check import Check, worst
 from ..runtime import outputs, parallel, provenance
@@ -33,7 +33,8 @@ def do_demo(a):
     if kind := given(a, options.EXAMPLES):
         _refuse({"small": a.small, "camera": a.camera}, "goes with a night that is solved, not with --as")
         written = write_examples(**kind, out=a.out, seed=a.seed or 0, overwrite=a.overwrite)
-        return _say(a, "\n".join(map(str, written)), {"files": [str(path) for path in written]})
+        _say(a, "\n".join(map(str, written)), {"files": [str(path) for path in written]})
+        return
     result = run_demo(out=a.out, **night, overwrite=a.overwrite, progress=wants_progress(a))
     s = result.summary
     _report(a, result.solution, s)
@@ -51,6 +52,7 @@ def do_demo(a):
 
 def do_run(a):
     """``legdistort run``."""
+    _refuse_ignored(a)
     measuring, matching, solving = (
         given(a, options.MEASURING),
         given(a, options.MATCHING),
@@ -117,6 +119,8 @@ def do_noise(a):
 
 def do_match(a):
     """``legdistort match``."""
+    if a.camera is not None:
+        _refuse({"shape": a.shape}, "is told by --camera")
     from ..measurement.earlier import measured_frames
     from ..pipeline import write_matched
 
@@ -128,8 +132,10 @@ def do_match(a):
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
     known = {"shape": tuple(a.shape) if a.shape else shapes or None, "camera": _camera(a.camera)}
-    exposures = measured_frames(read)
-    matches = legdistort.match(stack(tables), exposures=exposures, **known, **given(a, options.MATCHING))
+    if (exposures := measured_frames(read)) is not None:
+        _refuse({"shape": a.shape}, "is told by the frames")
+    known |= {"exposures": exposures, "progress": wants_progress(a)}
+    matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
     bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
     bad = {name: reason for name, reason in bad.items() if name not in names}
@@ -146,10 +152,15 @@ def do_solve(a):
     from ..reporting.page import write_report
 
     check_results(a.out, a.overwrite)
+    _refuse_ignored(a)
     with outputs.replacing_folder(a.out, former=RESULTS) as target:  # a mosaic there does not belong to this solution
         table = _read_table(a.table, a)
         shape = tuple(a.shape) if a.shape else table.meta.get("shapes")
         camera = _camera(a.camera, table.meta.get("camera"))
+        if camera is None:
+            _refuse({"layout": a.layout}, "is for the detectors of a camera")
+        else:
+            _refuse({"shape": a.shape}, "is told by the camera")
         if shape is None and camera is None:
             raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
         known = {"shape": shape, "camera": camera} | legdistort.Matches.read_meta(table.meta)
@@ -182,6 +193,7 @@ def do_prior(a):
 def do_coadd(a):
     """``legdistort coadd``."""
     check_ending(a.out)
+    _refuse_drops(a)
     solution = _solution(a)
     coadding = given(a, options.COADDING) | {"grid": _grid(a.grid, solution)}
     CoaddOptions(**coadding)  # which refuses them before a frame is read
@@ -197,6 +209,8 @@ def do_attach(a):
 
     keywords = given(a, options.FRAMES, options.ATTACHING)
     tpv, asdf_only = keywords.pop("tpv"), keywords.pop("asdf_only")
+    if asdf_only:
+        _refuse({"max_error": a.max_error}, "is of the header, which --asdf-only leaves alone")
     kind = None if asdf_only else "tpv" if tpv else "sip"
     done = attach(_solution(a), **keywords, kind=kind, progress=wants_progress(a))
     errors = {item.exposure: {"path": str(item.path)} | item.errors for item in done}
@@ -211,6 +225,10 @@ def do_predict(a):
     keywords.pop("static_sigma", None)
     if a.stars is not None:
         keywords["stars"] = _read_table(a.stars, a)
+    else:
+        _refuse({"columns": a.columns or None, "origin": a.origin, "error": a.error}, "is for the table of --stars")
+    if a.camera is not None:
+        _refuse({"shape": a.shape}, "is told by --camera")
     if a.shape is not None:
         keywords["shape"] = tuple(a.shape)
     keywords["camera"] = _camera(a.camera)
@@ -295,6 +313,22 @@ def _refuse(given, reason):
             raise InputError(f"--{name.replace('_', '-')} {reason}: leave it out")
 
 
+def _refuse_ignored(a):
+    """Options of `run` and `solve` that others leave without effect."""
+    if a.reference is None:
+        _refuse({"epoch": a.epoch, "pixel_scale": a.pixel_scale}, "is for the catalogue of --reference")
+    if a.command == "run":
+        _refuse_drops(a)
+
+
+def _refuse_drops(a):
+    """Options of one way of resampling with another."""
+    if a.algorithm != "drizzle":
+        _refuse({"pixfrac": a.pixfrac, "kernel": a.kernel}, "is for --algorithm drizzle")
+    if a.algorithm not in (None, "interp"):
+        _refuse({"order": a.order}, "is for --algorithm interp")
+
+
 def _status(a, summary):
     """Exit status 3 where a check fails and `--strict` asks for it."""
     return 3 if a.strict and worst(Check(**check) for check in summary["checks"]) == "fail" else 0
@@ -373,4 +407,4 @@ def _draw(result, a):
     """The picture of a result, if it is asked for."""
     if a.plot is not None:
         with outputs.replacing(a.plot, overwrite=a.overwrite) as file:
-            result.plot().figure.savefig(file, format="png", dpi=120)
+            result.plot().figure.savefig(file, format=a.plot.suffix[1:].lower(), dpi=120)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ..runtime import words
-from .arguments import Option, columns, extension, number_or_name, planes, spectrum, word_or
+from .arguments import Group, Option, columns, extension, number_or_name, planes, spectrum, word_or
 
 # -- options that several commands have
 
@@ -54,17 +54,21 @@ MATCHED = {"table": Option("exposure, star, x, y, x_err, y_err", "table", metava
 WORKERS = {"workers": Option("cores to use (default 1)", type=int, metavar="N")}
 
 
-def out(what, *, path="file"):
+#: Endings of tables and of pictures.
+TABLE_ENDINGS, PICTURE_ENDINGS = (".ecsv",), (".png", ".pdf", ".svg")
+
+
+def out(what, *, path="file", endings=None):
     """The output of a command."""
     return {
-        "out": Option(what, required=True, type=Path, path=path),
+        "out": Option(what, required=True, type=Path, path=path, endings=endings),
         "overwrite": Option("replace what an earlier call left", action="store_true"),
     }
 
 
 def picture(what):
     """A picture that is made if it is asked for."""
-    return {"plot": Option(what, type=Path, metavar="FILE.png", path="file")}
+    return {"plot": Option(what, type=Path, metavar="FILE.png", path="file", endings=PICTURE_ENDINGS)}
 
 
 REPLACING = {"overwrite": Option("replace a picture that exists", action="store_true")}
@@ -110,18 +114,21 @@ DETECTOR = {
     "read_noise": Option("electrons (default: header)", type=float),
     "saturation": Option("ADU (default: header, or a piled-up maximum)", type=float),
 }
-MEASURING = {
-    "fwhm": Option("of the stars, pixels (default: found)", type=float),
-    **DETECTOR,
-    "profile": Option("shape: of a star, or the whole frame", choices=words.PROFILES),
-    "psf": Option("auto (default), moffat, effective, or a file or folder with PSFs", path="read"),
-    "blends": Option("how stars that touch are fitted (default together)", choices=words.BLENDS),
-    "errors": Option(
-        "of the fit, or by stars of known position put into the frame (default fit)",
-        "--position-errors",
-        choices=words.POSITION_ERRORS,
-    ),
-}
+MEASURING = Group(
+    "measuring",
+    {
+        "fwhm": Option("of the stars, pixels (default: found)", type=float),
+        **DETECTOR,
+        "profile": Option("shape: of a star, or the whole frame", choices=words.PROFILES),
+        "psf": Option("auto (default), moffat, effective, or a file or folder with PSFs", path="read"),
+        "blends": Option("how stars that touch are fitted (default together)", choices=words.BLENDS),
+        "errors": Option(
+            "of the fit, or by stars of known position put into the frame (default fit)",
+            "--position-errors",
+            choices=words.POSITION_ERRORS,
+        ),
+    },
+)
 PSF_FILES = {"write_psf": Option("folder for the effective PSF of every exposure", type=Path, path="folder")}
 INJECTING = {
     "fwhm": Option("of the stars put in, pixels (default: that of the frame's)", type=float, nargs="+"),
@@ -134,56 +141,72 @@ CAMERA = {
         "of exposures with several detectors: a camera file, or gsaoi (default: by the headers)", metavar="CAMERA"
     )
 }
-MATCHING = {
-    "min_exposures": Option("keep stars seen in so many exposures (default 4)", type=int),
-    "isolation": Option("largest crowding of a star; inf keeps all (default 3)", type=float),
-}
+MATCHING = Group(
+    "matching",
+    {
+        "min_exposures": Option("keep stars seen in so many exposures (default 4)", type=int),
+        "isolation": Option("largest crowding of a star; inf keeps all (default 3)", type=float),
+    },
+)
 
 
-SOLVING = {
-    "degree": Option("total degree, or auto (default 3)", type=word_or(int, "auto"), default=3),
-    **KNOWN_STATIC,
-    "prior_sigma": Option(
-        "scatter of exposures around it; evidence: found from them", type=word_or(float, "evidence"), metavar="PIXELS"
-    ),
-    "validate": Option("of the stars, kept out to test the errors", type=float, metavar="FRACTION"),
-    "static": Option(
-        "fit one static distortion for all exposures of a detector; of a camera also hold, prior", choices=words.CAMERA
-    ),
-    "layout": Option("the same for where the detectors of a camera lie", choices=words.CAMERA),
-    "dynamic": Option("of a camera: what has a distortion of its own in every exposure", choices=words.DYNAMIC),
-    "exposure_degree": Option("with --static fit: what every exposure adds (default 1)", type=int),
-    "gauge": Option("see the docs (default minimal)", choices=words.GAUGES),
-    "method": Option("(default joint)", choices=words.METHODS),
-    "loss": Option("(default linear)", choices=words.LOSSES),
-    "clip": Option("leave out what deviates by more sigma; 0: nothing (default 5)", type=float, none=0),
-    "errors": Option("(default stated)", choices=words.ERRORS),
-    "error_floor": Option("pixels, added in quadrature to every error", type=float),
-    "motion": Option("of the stars, fitted beside their positions", choices=words.MOTIONS),
-    "motion_sigma": Option(
-        "scatter of proper motions, pixels a year; evidence: found", type=word_or(float, "evidence"), metavar="PX/YR"
-    ),
-    "motion_epoch": Option("year of the positions (default: mean)", type=float, metavar="YEAR"),
-    "reference": Option("catalogue to tie the positions to, such as one of Gaia", metavar="TABLE", path="read"),
-    "epoch": Option("of the exposures, for proper motions (default: header)", type=float, metavar="YEAR"),
-    "pixel_scale": Option("helps to find the stars without a header WCS", type=float, metavar="ARCSEC"),
-}
-COADDING = {
-    "method": Option("(default clipped)", "--combine", choices=words.COMBINATIONS, default="clipped"),
-    "order": Option("of the spline (default 3)", type=number_or_name, choices=(*range(6), *words.ORDERS)),
-    "algorithm": Option("of resampling (default interp)", choices=words.ALGORITHMS),
-    "pixfrac": Option("with drizzle: side of the drops (default 1)", type=float),
-    "kernel": Option("with drizzle: shape of the drops (default square)", choices=words.KERNELS),
-    "conserve": Option("when pixels change size (default flux)", choices=words.CONSERVE),
-    "match_background": Option(
-        "leave the levels of the sky as they are", "--no-match-background", action="store_false"
-    ),
-    "weights": Option("of exposures (default noise)", choices=(*words.WEIGHTS, "equal"), none="equal"),
-    "scale": Option("of fluxes (default auto)", choices=(*words.SCALES, "none"), none="none"),
-    "extrapolated": Option("pixels outside the stars used (default flag)", choices=words.EXTRAPOLATED),
-    "planes": Option("beside the image in the file (default all); none: nothing", type=planes, metavar="UNCERT,..."),
-    "scratch": Option("for pixels while work goes on (default: system's)", type=Path, metavar="FOLDER"),
-}
+SOLVING = Group(
+    "solving",
+    {
+        "degree": Option("total degree, or auto (default 3)", type=word_or(int, "auto"), default=3),
+        **KNOWN_STATIC,
+        "prior_sigma": Option(
+            "scatter of exposures around it; evidence: found from them",
+            type=word_or(float, "evidence"),
+            metavar="PIXELS",
+        ),
+        "validate": Option("of the stars, kept out to test the errors", type=float, metavar="FRACTION"),
+        "static": Option(
+            "fit one static distortion for all exposures of a detector; of a camera also hold, prior",
+            choices=words.CAMERA,
+        ),
+        "layout": Option("the same for where the detectors of a camera lie", choices=words.CAMERA),
+        "dynamic": Option("of a camera: what has a distortion of its own in every exposure", choices=words.DYNAMIC),
+        "exposure_degree": Option("with --static fit: what every exposure adds (default 1)", type=int),
+        "gauge": Option("see the docs (default minimal)", choices=words.GAUGES),
+        "method": Option("(default joint)", choices=words.METHODS),
+        "loss": Option("(default linear)", choices=words.LOSSES),
+        "clip": Option("leave out what deviates by more sigma; 0: nothing (default 5)", type=float, none=0),
+        "errors": Option("(default stated)", choices=words.ERRORS),
+        "error_floor": Option("pixels, added in quadrature to every error", type=float),
+        "motion": Option("of the stars, fitted beside their positions", choices=words.MOTIONS),
+        "motion_sigma": Option(
+            "scatter of proper motions, pixels a year; evidence: found",
+            type=word_or(float, "evidence"),
+            metavar="PX/YR",
+        ),
+        "motion_epoch": Option("year of the positions (default: mean)", type=float, metavar="YEAR"),
+        "reference": Option("catalogue to tie the positions to, such as one of Gaia", metavar="TABLE", path="read"),
+        "epoch": Option("of the exposures, for proper motions (default: header)", type=float, metavar="YEAR"),
+        "pixel_scale": Option("helps to find the stars without a header WCS", type=float, metavar="ARCSEC"),
+    },
+)
+COADDING = Group(
+    "co-adding",
+    {
+        "method": Option("(default clipped)", "--combine", choices=words.COMBINATIONS, default="clipped"),
+        "order": Option("of the spline (default 3)", type=number_or_name, choices=(*range(6), *words.ORDERS)),
+        "algorithm": Option("of resampling (default interp)", choices=words.ALGORITHMS),
+        "pixfrac": Option("with drizzle: side of the drops (default 1)", type=float),
+        "kernel": Option("with drizzle: shape of the drops (default square)", choices=words.KERNELS),
+        "conserve": Option("when pixels change size (default flux)", choices=words.CONSERVE),
+        "match_background": Option(
+            "leave the levels of the sky as they are", "--no-match-background", action="store_false"
+        ),
+        "weights": Option("of exposures (default noise)", choices=(*words.WEIGHTS, "equal"), none="equal"),
+        "scale": Option("of fluxes (default auto)", choices=(*words.SCALES, "none"), none="none"),
+        "extrapolated": Option("pixels outside the stars used (default flag)", choices=words.EXTRAPOLATED),
+        "planes": Option(
+            "beside the image in the file (default all); none: nothing", type=planes, metavar="UNCERT,..."
+        ),
+        "scratch": Option("for pixels while work goes on (default: system's)", type=Path, metavar="FOLDER"),
+    },
+)
 GRID = {"grid": Option("image or header text whose grid is taken", type=Path, metavar="FILE", path="read")}
 COMPARING = {"compare": Option("also by shifts, static map and relative polynomial", action="store_true")}
 EXPANDING = {

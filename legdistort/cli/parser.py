@@ -37,6 +37,7 @@ class _Parser(argparse.ArgumentParser):
             known = re.findall(r"[^', ]+", wrong[2])
         words = [wrong[1]] if wrong else re.findall(r"(?<!\S)-[\w-]+", message)
         near = [match for word in words if word not in known for match in _nearest(word, known)]
+        message = re.sub(r"'([^' ]*)'", r"\1", message)
         hint = f"; did you mean {' '.join(near)}?" if near else ""
         self.exit(2, f"{self.prog}: {message}{hint} ({self.prog} --help lists what there is)\n")
 

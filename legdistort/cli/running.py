@@ -1,6 +1,7 @@
 """A command while it runs: its log, its signals, what becomes of its errors."""
 
 import logging
+import re
 import signal
 import sys
 import threading
@@ -22,14 +23,14 @@ def run_command(arguments):
         with _stopping(), _logging(arguments), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of other packages
             warnings.simplefilter("default", LegdistortWarning)
-            warnings.showwarning = lambda message, *_, **__: log.warning("%s", message)
+            warnings.showwarning = lambda message, *_, **__: log.warning("%s", in_shell_words(str(message)))
             with logging_redirect_tqdm([log]) if wants_progress(arguments) else nullcontext():  # bars stay whole
                 check_paths(arguments, arguments.groups)
                 status = getattr(commands, f"do_{arguments.command}")(arguments)
     except LegdistortError as error:
         if arguments.debug:
             raise
-        print(f"legdistort: {error}", file=sys.stderr)
+        print(f"legdistort: {in_shell_words(str(error))}", file=sys.stderr)
         return 1
     except BrokenPipeError:  # the reader of our output has left, as in ``legdistort show FILE | head``
         sys.stdout = None
@@ -48,6 +49,18 @@ def run_command(arguments):
         print("legdistort: interrupted; nothing was left half-written", file=sys.stderr)
         return 130
     return status or 0
+
+
+def in_shell_words(text):
+    """A message with arguments of Python as the options of the shell, ``clip=None`` as ``--clip 0`` and the like."""
+    text = re.sub(r"\b\w+=\S*,? \((--[^()]*)\)", r"\1", text)  # overwrite=True (--overwrite)
+    text = re.sub(r"\(\w+=, (--[^()]*)\)", r"(\1)", text)  # (earlier=, --from)
+    text = re.sub(r"(?<![-\w])([a-z_]+)=(?:'([\w-]+)'|([\d.]+))", _as_option, text)
+    return re.sub(r"(?<!\w)'([\w.,-]+)'(?!\w)", r"\1", text)
+
+
+def _as_option(found):
+    return f"--{found[1].replace('_', '-')} {found[2] or found[3]}"
 
 
 @contextmanager

@@ -52,7 +52,7 @@ COMMANDS = {
         options.FRAMES,
         options.FLAGGED,
         options.STOPPING,
-        options.out("table (ECSV) of detections"),
+        options.out("table (ECSV) of detections", endings=options.TABLE_ENDINGS),
         options.MEASURING,
         options.PSF_FILES,
         options.WORKERS,
@@ -62,7 +62,7 @@ COMMANDS = {
         "frames/a.fits --out noise.ecsv",
         options.FRAMES,
         options.FLAGGED,
-        options.out("table (ECSV) of errors against flux"),
+        options.out("table (ECSV) of errors against flux", endings=options.TABLE_ENDINGS),
         options.INJECTING,
         options.picture("picture of the curves"),
         options.DETECTOR,
@@ -72,7 +72,7 @@ COMMANDS = {
         "tables of positions to matched stars",
         "A.lis B.lis C.lis --columns x_err=xe,y_err=ye --shape 1024 1024 --out matched.ecsv",
         options.TABLES,
-        options.out("table (ECSV) of matched positions"),
+        options.out("table (ECSV) of matched positions", endings=options.TABLE_ENDINGS),
         options.TABLE,
         options.CAMERA,
         options.MATCHING,
@@ -90,7 +90,7 @@ COMMANDS = {
     "prior": _command(
         "a known static distortion as a file for --prior",
         "x.fits y.fits --out prior.asdf",
-        options.out("prior (ASDF)"),
+        options.out("prior (ASDF)", endings=(".asdf",)),
         options.EXPANDING,
     ),
     "coadd": _command(
@@ -149,6 +149,6 @@ COMMANDS = {
         "HTML page of a solution",
         "results/solution.asdf --out report.html",
         options.SOLUTION,
-        options.out("page (HTML)"),
+        options.out("page (HTML)", endings=(".html", ".htm")),
     ),
 }

@@ -50,6 +50,30 @@ def check_file(path, *, overwrite=False):
     _check_permission(path, path.parent)
 
 
+def check_ending(path, endings):
+    """Raise `InputError` if the ending of a name, in whatever case, is none of those that say a format."""
+    if Path(path).suffix.lower() not in endings:
+        raise InputError(f"{path}: the ending says the format, give {' or '.join(endings)}")
+
+
+def try_to_write(path):
+    """Make, write and rename a file where an output will be made; permissions alone do not tell that it can be.
+
+    Raises
+    ------
+    InputError
+        If that fails.
+    """
+    folder = next(place for place in Path(path).absolute().parents if place.is_dir())
+    folder = Path(path) if Path(path).is_dir() else folder
+    try:
+        with locks.temporary_folder(folder, _PARTIAL) as (trial, _):
+            (trial / "file").write_bytes(b"0")
+            os.replace(trial / "file", trial / "renamed")
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror or error}; write elsewhere") from None
+
+
 def check_folder(out):
     """Refuse a folder that could not be made or filled, before the work for it begins.
 
