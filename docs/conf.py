@@ -28,10 +28,10 @@ html_math_renderer = "mathml"
 html_show_sourcelink = False
 html_sidebars = {"**": ["globaltoc.html"]}
 html_theme_options = {
-    "header_links_before_dropdown": 7,
     "navigation_with_keys": False,
     "secondary_sidebar_items": ["page-toc"],
     "navbar_persistent": ["search-button"],
+    "navbar_center": [],
     "navbar_end": ["theme-switcher"],
     "footer_end": [],
 }

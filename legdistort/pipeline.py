@@ -190,29 +190,29 @@ def run(
     share, timings = {"workers": workers, "progress": progress}, {}
     with outputs.replacing_folder(out, former=RESULTS) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
-        with _timed(timings, "read"):
+        with timed(timings, "read"):
             exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, **reading)
             solving = replace(solving, prior=_known_prior(prior, exposures, degree))
-        with _timed(timings, "measure"):
+        with timed(timings, "measure"):
             detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, measuring, **share)
-        with _timed(timings, "match"):
+        with timed(timings, "match"):
             matches = match(
                 detections, exposures=exposures, camera=reading["camera"], **vars(matching) | {"progress": progress}
             )
             matches = replace(matches, left_out=bad | matches.left_out)
-        with _timed(timings, "solve"):
+        with timed(timings, "solve"):
             solution = solve(matches, **vars(solving), **tying)
             solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
-        with _timed(timings, "coadd"):
+        with timed(timings, "coadd"):
             kept = [exposure for exposure in exposures if (exposure.frame or exposure.name) in solution.names]
             mosaic = coadd(kept, solution, **vars(coadding), **share)
-        with _timed(timings, "assess"):
+        with timed(timings, "assess"):
             quality = _if_possible(stack_quality.assess, mosaic, solution.by_detector, exposures=kept)
         comparison = stacks = None
         if compare:
-            with _timed(timings, "compare"):
+            with timed(timings, "compare"):
                 comparison, stacks = _compared(matches, solution, solving, quality and mosaic, kept, coadding)
-        with _timed(timings, "write"):
+        with timed(timings, "write"):
             write_results(solution, target, psfs=psfs, mosaic=mosaic)
             write_detections(target / "detections.ecsv", detections, exposures, Path(out), **reading)
             write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
@@ -413,7 +413,8 @@ def _check_exposures(exposures, min_exposures, bad):
 
 
 @contextmanager
-def _timed(timings, step):
+def timed(timings, step):
+    """Log when a step begins and how long it took, and add its seconds to ``{step: seconds}``."""
     log.info("%s ...", step)
     begin = time.perf_counter()
     yield

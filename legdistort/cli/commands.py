@@ -122,7 +122,7 @@ def do_match(a):
     if a.camera is not None:
         _refuse({"shape": a.shape}, "is told by --camera")
     from ..measurement.earlier import measured_frames
-    from ..pipeline import write_matched
+    from ..pipeline import timed, write_matched
 
     read = {Path(path): _read_table(path, a) for path in a.tables}
     tables = list(read.values())
@@ -135,7 +135,8 @@ def do_match(a):
     if (exposures := measured_frames(read)) is not None:
         _refuse({"shape": a.shape}, "is told by the frames")
     known |= {"exposures": exposures, "progress": wants_progress(a)}
-    matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
+    with timed({}, "match"):
+        matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
     empty = {name: "no star was detected in it" for name in shapes if name not in names}
     bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
     bad = {name: reason for name, reason in bad.items() if name not in names}
@@ -148,7 +149,7 @@ def do_match(a):
 
 def do_solve(a):
     """``legdistort solve``."""
-    from ..pipeline import RESULTS, check_results, listed_files, summarise, write_results, write_summary
+    from ..pipeline import RESULTS, check_results, listed_files, summarise, timed, write_results, write_summary
     from ..reporting.page import write_report
 
     check_results(a.out, a.overwrite)
@@ -165,9 +166,13 @@ def do_solve(a):
             raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
         known = {"shape": shape, "camera": camera} | legdistort.Matches.read_meta(table.meta)
         matches = legdistort.Matches.from_table(table, **known)
-        solution = provenance.with_inputs(legdistort.solve(matches, **_solving(a, a.shape)), table.meta["inputs"])
-        summary = summarise(solution)
-        write_results(solution, target)
+        with timed({}, "solve"):
+            solution = legdistort.solve(matches, **_solving(a, a.shape))
+        solution = provenance.with_inputs(solution, table.meta["inputs"])
+        with timed({}, "assess"):
+            summary = summarise(solution)
+        with timed({}, "write"):
+            write_results(solution, target)
         write_report(target / "report.html", solution, summary=summary)
         write_summary(target / "summary.json", summary := summary | listed_files(target))
     _report(a, solution, summary)
