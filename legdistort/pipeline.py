@@ -181,7 +181,7 @@ def run(
     """
     check_results(out, overwrite)
     measuring = _step_options(MeasureOptions, measuring, "measuring", psf=psf)
-    matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures)
+    matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures, progress=progress)
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
     tying = _tying(reference, epoch, pixel_scale, solving)
@@ -196,9 +196,7 @@ def run(
         with timed(timings, "measure"):
             detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, measuring, **share)
         with timed(timings, "match"):
-            matches = match(
-                detections, exposures=exposures, camera=reading["camera"], **vars(matching) | {"progress": progress}
-            )
+            matches = match(detections, exposures=exposures, camera=reading["camera"], **vars(matching))
             matches = replace(matches, left_out=bad | matches.left_out)
         with timed(timings, "solve"):
             solution = solve(matches, **vars(solving), **tying)
