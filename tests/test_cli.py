@@ -489,7 +489,7 @@ def test_orders_that_there_are_not(order, capsys):
 FILES = {
     "measure": "measure IN --out OUT",
     "noise": "noise IN --out OUT",
-    "noise's plot": "noise IN --out elsewhere --plot OUT",
+    "noise's plot": "noise IN --out elsewhere.ecsv --plot OUT",
     "match": "match other.ecsv IN --out OUT",
     "prior": "prior IN --out OUT",
     "coadd": "coadd other.fits IN --solution s.asdf --out OUT",
@@ -519,13 +519,23 @@ def _ready(monkeypatch, line, *, read, out):
 
 @pytest.mark.parametrize("line", FILES.values(), ids=FILES)
 def test_files_that_cannot_be_written(line, tmp_path, capsys, monkeypatch):
-    (tmp_path / "old").write_text("precious")
+    command = "plot" if "--plot OUT" in line else line.split()[0]
+    endings = {
+        "plot": ".png",
+        "coadd": ".fits",
+        "prior": ".asdf",
+        "report": ".html",
+        "stars": ".vot",
+        "correct": ".csv",
+    }
+    old = f"old{endings.get(command, '.ecsv')}"
+    (tmp_path / old).write_text("precious")
     (tmp_path / "in.fits").write_text("")
-    for name, words in (("old", "old exists already"), ("", "is a folder"), ("none/m.fits", "none does not exist")):
+    for name, words in ((old, f"{old} exists already"), ("", "is a folder"), ("none/m.fits", "none does not exist")):
         failed(capsys, main(_ready(monkeypatch, line, read=tmp_path / "in.fits", out=tmp_path / name)), words)
-    assert (tmp_path / "old").read_text() == "precious"
+    assert (tmp_path / old).read_text() == "precious"
     with pytest.raises(pytest.fail.Exception, match="the work began"):
-        main([*_ready(monkeypatch, line, read="in.fits", out=tmp_path / "old"), "--overwrite"])
+        main([*_ready(monkeypatch, line, read="in.fits", out=tmp_path / old), "--overwrite"])
 
 
 @pytest.mark.parametrize("line", FOLDERS.values(), ids=FOLDERS)

@@ -126,8 +126,6 @@ def check_paths(arguments, groups):
         value = getattr(arguments, dest)
         if option.path is not None and value not in (None, option.none):
             named[option.path].append(value)
-            if option.endings is not None:
-                check_ending(value, option.endings)
     inputs = [path for value in named["read"] for path in expand_paths(value)]
     replaced = [path for path in named["file"] if not path.is_dir()]
     for folder in named["results"]:
@@ -140,6 +138,9 @@ def check_paths(arguments, groups):
         check_file(path, overwrite=arguments.overwrite)
     for folder in named["folder"] + named["results"]:
         check_folder(folder)
+    for _, _, dest, option in _flagged(groups):
+        if option.endings is not None and getattr(arguments, dest) is not None:
+            check_ending(getattr(arguments, dest), option.endings)
     for path in named["file"] + named["folder"] + named["results"]:
         try_to_write(path)
 

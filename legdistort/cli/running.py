@@ -54,8 +54,9 @@ def run_command(arguments):
 def in_shell_words(text):
     """A message with arguments of Python as the options of the shell, ``clip=None`` as ``--clip 0`` and the like."""
     text = re.sub(r"\b\w+=\S*,? \((--[^()]*)\)", r"\1", text)  # overwrite=True (--overwrite)
+    text = re.sub(r"\b\w+=\{[^{}]*\} or (?=--)", "", text)  # columns={...} or --columns
     text = re.sub(r"\(\w+=, (--[^()]*)\)", r"(\1)", text)  # (earlier=, --from)
-    text = re.sub(r"(?<![-\w])([a-z_]+)=(?:'([\w-]+)'|([\d.]+))", _as_option, text)
+    text = re.sub(r"(?<![-\w])([a-z_]+)=(?:'([\w-]+)'|(\d[\d.]*))", _as_option, text)
     return re.sub(r"(?<!\w)'([\w.,-]+)'(?!\w)", r"\1", text)
 
 
