@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .assessment import baselines, run_checks, stack_quality
+from .assessment.truth import compare_with_truth
 from .cameras.camera import Camera
 from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
 from .exceptions import InputError, MatchError
 from .inputs import exposure_files, table_files
 from .inputs.exposure_names import detector_name
+from .inputs.exposures import observed
 from .matching.matcher import match
 from .matching.options import MatchOptions
 from .measurement.earlier import EarlierRun, write_detections
@@ -31,6 +33,8 @@ from .reporting.page import write_report
 from .results import accuracy
 from .results.check import Check
 from .runtime import checks, outputs, parallel, provenance
+from .runtime.notebook import ShownAsPrinted
+from .simulation.truth import Truth
 from .solving.estimation import solve
 from .solving.options import CLIP, SolveOptions, check_reference
 from .wcs.storage import write_wcs
@@ -55,7 +59,7 @@ RESULTS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Run(ShownAsPrinted):
     """What `run` made.
 
     Attributes
@@ -103,6 +107,7 @@ def run(
     solving: Mapping[str, Any] | None = None,
     coadding: Mapping[str, Any] | None = None,
     compare: bool = False,
+    truth: Truth | None = None,
     stop_at_bad: bool = False,
     overwrite: bool = False,
     workers: int | None = None,
@@ -145,6 +150,9 @@ def run(
         Also correct by shifts, by the prior's static distortion and shifts, and by a relative polynomial
         (`legdistort.assessment.baselines`), and report the scatter and the sharpness of the stack that each of them
         leaves.
+    truth : Truth, optional
+        What was put into simulated frames (`legdistort.simulate_exposures`): summary and report then say how far the
+        result is from it.
     stop_at_bad : bool
         Raise `InputError` for blank, truncated or damaged frames, naming all of them; else they are left out with a
         warning.
@@ -185,7 +193,7 @@ def run(
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
     tying = _tying(reference, epoch, pixel_scale, solving)
-    parallel.check_workers(workers)
+    _check_others(workers, truth)
     paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
     share, timings = {"workers": workers, "progress": progress}, {}
     with outputs.replacing_folder(out, former=RESULTS) as target:
@@ -214,9 +222,9 @@ def run(
             write_results(solution, target, psfs=psfs, mosaic=mosaic)
             write_detections(target / "detections.ecsv", detections, exposures, Path(out), **reading)
             write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
-        summary = summarise(solution, timings=timings) | _assessed(solution, quality, comparison, stacks)
-        shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks}
-        write_report(target / "report.html", solution, summary=summary, **shown)
+        summary = summarise(solution, timings=timings) | _assessed(solution, kept, quality, comparison, stacks, truth)
+        shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
+        write_report(target / "report.html", solution, summary=summary, **shown, files=linked_files(target))
         write_summary(target / "summary.json", summary := summary | listed_files(target))
     return Run(Path(out), solution, mosaic, summary)
 
@@ -276,17 +284,27 @@ def _step_options(kind, given, argument, *, defaults=None, **own):
     return checks.options_from(kind, given, argument)
 
 
-def _assessed(solution, quality, comparison, stacks):
+def _check_others(workers, truth):
+    """Raise `InputError` for arguments that no step looks at before it begins."""
+    parallel.check_workers(workers)
+    if truth is not None and not isinstance(truth, Truth):
+        raise InputError(
+            f"truth must be that of a simulation (simulate_exposures(...).truth), got {type(truth).__name__}"
+        )
+
+
+def _assessed(solution, exposures, quality, comparison, stacks, truth):
     """What the summary says of images, mosaic and other corrections, as far as it is known; all checks among it."""
     checked = solution.checks + run_checks.check_run(solution, quality)
     figures = {"checks": [asdict(check) for check in checked], "fwhm_ratio": quality and quality.fwhm_ratio}
+    figures["observed"] = observed(exposures)
     if quality:
         figures["quality"] = asdict(quality)
     if comparison:
         figures["comparison"] = {name: accuracy.scatter_summary(made) for name, made in comparison.items()}
     if stacks:
         figures["stacks"] = stacks.figures()
-    return figures
+    return figures if truth is None else figures | compare_with_truth(solution, truth)
 
 
 def write_matched(path, matches, inputs, *, overwrite=False):
@@ -311,6 +329,14 @@ def write_results(solution, target, *, psfs=None, mosaic=None):
     write_psfs(psfs or {}, target / "psf")
     if mosaic is not None:
         mosaic.write(target / "mosaic.fits")
+
+
+def linked_files(target):
+    """Results in a folder as the report beside them links to them: files, and folders of many."""
+    there = (Path(each).parts for each in (*RESULTS, "summary.json"))
+    names = [parts[0] + "/" * (len(parts) > 1) for parts in there]
+    made = [name for name in dict.fromkeys(names) if (target / name).exists() or name == "summary.json"]
+    return [name for name in made if name != "report.html"]
 
 
 def listed_files(target):
@@ -349,6 +375,7 @@ def summarise(solution, *, timings=None):
         "reference": found.reference and asdict(found.reference),
         "max_inverse_error_px": float(solution.max_inverse_error),
         "left_out": dict(solution.left_out),
+        "command": provenance.command_line(),
         **found.summary(),
         "timings": {step: round(seconds, 3) for step, seconds in (timings or {}).items()},
     }

@@ -7,15 +7,22 @@ import pytest
 from astropy import units as u
 from astropy.table import QTable
 from matplotlib import pyplot
-from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.collections import EllipseCollection, LineCollection, PathCollection, QuadMesh
+from matplotlib.container import BarContainer
 from matplotlib.quiver import Quiver, QuiverKey
+from scipy import stats
 
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
-from legdistort.plots import elements, solution_plots, stack_plots
+from legdistort.plots import elements, residual_plots, solution_plots, stack_plots
+from legdistort.priors.prior import Prior
+from legdistort.results import accuracy
 from legdistort.results.diagnostics import Diagnostics
+from legdistort.results.pulls import pulls_of
 from legdistort.results.settings import Settings
 from legdistort.results.solution import Solution
+from legdistort.simulation.observations import simulate_matches
+from legdistort.solving.estimation import solve
 
 
 def make_solution(
@@ -41,7 +48,7 @@ def make_solution(
     if flux:
         rows["flux"] = np.tile(brightness, len(names))
     rows["used"] = rng.uniform(size=len(rows)) > 0.01
-    return Solution(
+    solution = Solution(
         names=names,
         degree=degree,
         shapes=dict.fromkeys(names, shape),
@@ -60,6 +67,10 @@ def make_solution(
         diagnostics=Diagnostics(),
         left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},
     )
+    stars = {"star": solution.star_names, "x": positions[:, 0] * u.pix, "y": positions[:, 1] * u.pix}
+    stars |= {f"{axis}_{kind}": np.full(n_stars, 0.01) * u.pix for kind in ("err", "err_abs") for axis in "xy"}
+    vars(solution)["stars"] = QTable(stars | {"n": np.full(n_stars, len(names))})  # without covariances
+    return solution
 
 
 def make_mosaic(size=900, seed=2):
@@ -205,7 +216,7 @@ def test_bars_are_the_coefficients_beside_the_prior(degree):
     panels = solution_plots.plot_coefficients(solution, solution.names[1])
     n = basis.n_modes(degree)
     for axis, ax in enumerate(panels):
-        heights = {c.get_label(): [bar.get_height() for bar in c] for c in ax.containers}
+        heights = {c.get_label(): [bar.get_height() for bar in c] for c in ax.containers if isinstance(c, BarContainer)}
         np.testing.assert_allclose(heights[solution.names[1]], solution.coefficients[1, axis])
         if degree >= 2:
             np.testing.assert_allclose(heights["prior"], solution.prior_mean[1, axis])
@@ -218,10 +229,102 @@ def test_bars_are_the_coefficients_beside_the_prior(degree):
 
 def test_bars_of_all_exposures_show_mean_and_scatter(solution):
     panels = solution_plots.plot_coefficients(solution)
-    bars = next(c for c in panels[0].containers if "mean" in c.get_label())
-    np.testing.assert_allclose([b.get_height() for b in bars], solution.coefficients[:, 0].mean(axis=0))
-    error = bars.errorbar.lines[2][0].get_segments()
-    np.testing.assert_allclose([np.ptp(s[:, 1]) / 2 for s in error], solution.coefficients[:, 0].std(axis=0))
+    bars = {c.get_label(): c for c in panels[0].containers}
+    np.testing.assert_allclose([b.get_height() for b in bars["mean"]], solution.coefficients[:, 0].mean(axis=0))
+    for name, size in {"scatter": solution.coefficients[:, 0].std(axis=0), "1σ error": 0.01}.items():
+        error = bars[name].lines[2][0].get_segments()
+        np.testing.assert_allclose([np.ptp(s[:, 1]) / 2 for s in error], size)
+
+
+def test_lowest_degree_leaves_out_what_is_like_a_pose(solution):
+    panels = solution_plots.plot_coefficients(solution, solution.names[1], lowest=2)
+    bars = next(c for c in panels[1].containers if c.get_label() == solution.names[1])
+    np.testing.assert_allclose([b.get_height() for b in bars], solution.coefficients[1, 1, 3:])
+    assert panels[1].get_xticklabels()[0].get_text() == "(2, 0)"
+    with pytest.raises(InputError, match="lowest is 4, but the distortion has modes up to degree 3 only"):
+        solution_plots.plot_coefficients(solution, lowest=4)
+
+
+# -- what the correction does, and residuals
+
+
+@pytest.fixture(scope="module")
+def solved():
+    simulated = simulate_matches(n_stars=60, n_exposures=6, degree=3, seed=5)
+    return solve(simulated.matches, prior=Prior(simulated.truth.static)), simulated.truth
+
+
+def ends(ax):
+    """Where the lines of a panel begin and end, (n, 2, 2)."""
+    return np.array(next(c for c in ax.collections if isinstance(c, LineCollection)).get_segments())
+
+
+def test_each_step_of_the_correction_leaves_less(solved):
+    solution, _ = solved
+    panels = residual_plots.plot_steps(solution, scale=100)
+    rms = [np.sqrt(np.mean(np.diff(ends(ax), axis=1) ** 2)) / 100 for ax in panels]
+    assert [float(ax.get_title(loc="left").splitlines()[1].split()[0]) for ax in panels] == pytest.approx(rms, abs=6e-4)
+    corrected = accuracy.corrected_positions(solution)
+    expected = np.sqrt(np.nanmean((corrected - np.nanmean(corrected, axis=0)) ** 2))
+    assert rms[2] == pytest.approx(expected, rel=1e-6)
+    assert rms[2] < min(rms[:2]) / 4
+    without = residual_plots.plot_steps(make_solution(4, 30, prior=False))
+    assert len(without) == 2
+
+
+def test_mean_residuals_are_as_large_as_their_errors_say(solved):
+    solution, _ = solved
+    ax = residual_plots.plot_mean_residuals(solution, scale=1000)
+    off = np.diff(ends(ax), axis=1)[:, 0] / 1000
+    rows = solution.residuals[solution.residuals["used"]]
+    side = 2048 / int(np.sqrt(len(rows) / 12))
+    start = ends(ax)[3, 0]
+    near = np.flatnonzero(
+        np.all(np.abs(np.stack([rows["x"].value, rows["y"].value], axis=1) - start) < side / 2, axis=1)
+    )
+    weight = 2 / (rows["x_err"].value ** 2 + rows["y_err"].value ** 2)[near]
+    np.testing.assert_allclose(off[3, 0], np.average(rows["dx"].value[near], weights=weight))
+    circles = next(c for c in ax.collections if isinstance(c, EllipseCollection))
+    radius = circles._widths[3] / 1000
+    assert radius == pytest.approx(1 / np.sqrt(weight.sum()))
+
+
+def test_pulls_are_one_with_right_errors_and_their_sum_is_chi2():
+    sums, factor = [], 2.0
+    for seed in range(4):
+        solution = solve(simulate_matches(n_stars=60, n_exposures=5, degree=3, seed=seed).matches)
+        pulls = pulls_of(solution)
+        assert pulls.squares.sum() == pytest.approx(solution.chi2, rel=1e-6)
+        assert pulls.freedom.sum() == pytest.approx(solution.dof, rel=1e-6)
+        sums.append(pulls.by_star())
+    inside = [stats.chi2.cdf(s.rms**2 * s.freedom, s.freedom) for s in sums]
+    assert 0.9 < np.mean(np.abs(np.concatenate(inside) - 0.5) < 0.475) < 0.985  # 95 % are expected
+    solution.observations["x_err"] *= factor
+    solution.observations["y_err"] *= factor
+    np.testing.assert_allclose(pulls_of(solution).by_exposure().rms, pulls.by_exposure().rms / factor)
+
+
+@pytest.mark.parametrize("against", ["brightness", "time"])
+def test_pulls_are_drawn_by_star_and_by_exposure(solved, against):
+    pulls = pulls_of(solved[0])
+    ax = residual_plots.plot_pulls(pulls, against=against)
+    dots = next(c for c in ax.collections if isinstance(c, PathCollection))
+    sums = pulls.by_star() if against == "brightness" else pulls.by_exposure()
+    np.testing.assert_allclose(dots.get_offsets()[:, 1], sums.rms)
+    assert dots.get_gid().startswith("marks:s=" if against == "brightness" else "marks:e=")
+    with pytest.raises(InputError, match="against must be 'brightness' or 'time', got 'x'"):
+        residual_plots.plot_pulls(pulls, against="x")
+
+
+def test_mosaic_on_a_slope_shows_its_stars_and_no_empty_bands():
+    mosaic = make_mosaic(300)
+    y, x = np.indices((300, 300))
+    slope = 3.0 * x + 2.0 * y  # of noise 2
+    off = stack_plots.smooth_sky(mosaic.data + slope) - stack_plots.smooth_sky(mosaic.data) - slope
+    assert np.ptp(off) < 8  # 1500 before
+    assert np.std(off) < 1
+    ax = stack_plots.plot_mosaic(SimpleNamespace(data=mosaic.data + slope))
+    assert ax.get_xlim() == (9.5, 299.5)
 
 
 def test_no_orange_bars_without_prior():
@@ -274,7 +377,7 @@ def test_mosaic_is_averaged_in_blocks_and_keeps_its_pixels():
     assert np.ma.getmaskarray(image.get_array())[:, :3].all()  # the strip of 10 pixels without data
     assert image.get_extent() == [-0.5, 299.5, -0.5, 299.5]
     assert texts(ax)[1:] == ("x [px]", "y [px]")
-    np.testing.assert_array_equal(ax.lines[0].get_xdata(), [10, 200])
+    np.testing.assert_array_equal(ax.collections[0].get_offsets()[:, 0], [10, 200])
 
 
 def test_block_mean_ignores_what_is_not_finite():

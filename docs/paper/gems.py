@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 import legdistort as ld
 from legdistort.assessment import baselines
-from legdistort.demo import nearest
+from legdistort.assessment.truth import nearest
 from legdistort.geometry.gsaoi import gsaoi_static
 from legdistort.results import accuracy
 from legdistort.simulation import rendering

@@ -14,6 +14,7 @@ from ..exceptions import InputError
 from ..geometry import basis
 from ..inputs import column_contract
 from ..results import accuracy
+from ..runtime.notebook import ShownAsPrinted
 from . import baselines
 from .star_shapes import measure_shapes
 
@@ -26,7 +27,7 @@ _MEDIAN_DISTANCE = np.sqrt(2 * np.log(2))  # of a Gaussian scatter in two axes, 
 
 
 @dataclass(frozen=True)
-class Quality:
+class Quality(ShownAsPrinted):
     """Sharpness and positions of stars in one image, medians over the stars.
 
     Attributes
@@ -92,7 +93,7 @@ class Zoom:
 
 
 @dataclass(frozen=True, eq=False)
-class Stacks:
+class Stacks(ShownAsPrinted):
     """Stacks made with several corrections, side by side.
 
     Attributes

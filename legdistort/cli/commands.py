@@ -149,7 +149,16 @@ def do_match(a):
 
 def do_solve(a):
     """``legdistort solve``."""
-    from ..pipeline import RESULTS, check_results, listed_files, summarise, timed, write_results, write_summary
+    from ..pipeline import (
+        RESULTS,
+        check_results,
+        linked_files,
+        listed_files,
+        summarise,
+        timed,
+        write_results,
+        write_summary,
+    )
     from ..reporting.page import write_report
 
     check_results(a.out, a.overwrite)
@@ -173,7 +182,7 @@ def do_solve(a):
             summary = summarise(solution)
         with timed({}, "write"):
             write_results(solution, target)
-        write_report(target / "report.html", solution, summary=summary)
+        write_report(target / "report.html", solution, summary=summary, files=linked_files(target))
         write_summary(target / "summary.json", summary := summary | listed_files(target))
     _report(a, solution, summary)
     return _status(a, summary)

@@ -12,6 +12,7 @@ import numpy as np
 from astropy.io import fits
 
 from ..exceptions import DamagedError, InputError
+from ..runtime.notebook import ShownAsPrinted
 from .exposure_names import check_exposure_name
 
 if TYPE_CHECKING:
@@ -27,12 +28,21 @@ KEYWORDS = {
     "exposure_time": ("EXPTIME", "EXPOSURE", "XPOSURE", "ITIME", "EFFEXPTM"),
 }
 
+#: Header keywords of what was observed, in order of preference; of filters all that are there count.
+OBSERVED = {
+    "target": ("OBJECT", "TARGNAME", "TARGPROP"),
+    "telescope": ("TELESCOP",),
+    "instrument": ("INSTRUME",),
+}
+_FILTERS = re.compile(r"FILTERS?\d?|FILTNAM\d?|PUPIL|HIERARCH ESO INS FILT\d NAME|ESO INS FILT\d NAME")
+_OPEN = re.compile(r"open|clear\w*|none|empty|n/?a|", re.IGNORECASE)
+
 #: What to do about an exposure that has nothing to offer.
 LEAVE_OUT = "; leave this exposure out or mend it"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Exposure:
+class Exposure(ShownAsPrinted):
     """One image and what is known about it.
 
     Attributes
@@ -136,6 +146,46 @@ class Exposure:
         ]
         words += ["with uncertainty"] * (self.uncertainty is not None) + ["WCS" if self.wcs is not None else "no WCS"]
         return f"<Exposure {self.name!r}: {', '.join(words)}>"
+
+
+def observed(exposures):
+    """What was observed, in words, as far as the headers say: ``{"target" | "instrument" | "filter" | ...: text}``.
+
+    Parameters
+    ----------
+    exposures : sequence of Exposure or ExposureFile
+
+    Returns
+    -------
+    dict
+        ``target``, ``telescope``, ``instrument``, ``filter``, ``dates``, ``exposure time``; absent ones are not there.
+    """
+    headers = [exposure.header for exposure in exposures]
+    found = {}
+    for what, keywords in OBSERVED.items():
+        values = [next((str(h[key]).strip() for key in keywords if str(h.get(key, "")).strip()), "") for h in headers]
+        found[what] = _listed(values)
+    filters = [[str(h[key]).strip() for key in h if _FILTERS.fullmatch(key) and _is_closed(h[key])] for h in headers]
+    found["filter"] = _listed([" + ".join(each) for each in filters])
+    dates = sorted(date for h in headers if re.match(r"\d{4}-\d\d-\d\d", date := str(h.get("DATE-OBS", ""))))
+    if dates:
+        found["dates"] = dates[0] if dates[0] == dates[-1] else f"{dates[0]} to {dates[-1]}"
+    frames = {exposure.frame or exposure.name: exposure.exposure_time for exposure in exposures}
+    times = [time for time in frames.values() if time]
+    if times and len(times) == len(frames):
+        same = min(times) == max(times)
+        found["exposure time"] = f"{len(times)} x {times[0]:g} s" if same else f"{sum(times):g} s in all"
+    return {what: text for what, text in found.items() if text}
+
+
+def _is_closed(value):
+    return isinstance(value, str) and not _OPEN.fullmatch(value.strip())
+
+
+def _listed(values, most=4):
+    """Different texts in a line, not more than some."""
+    values = list(dict.fromkeys(filter(None, values)))
+    return ", ".join(values[:most]) + (f" and {len(values) - most} more" if len(values) > most else "")
 
 
 def known_from_header(header, data, *, integer):

@@ -5,7 +5,7 @@ import numpy as np
 from ..geometry import basis
 
 #: Colours that stay apart for colour-blind readers and in grey print (Okabe & Ito).
-BLUE, ORANGE, RED, GREY = "#0072B2", "#E69F00", "#D55E00", "#9a9a9a"
+BLUE, ORANGE, RED, GREEN, GREY = "#0072B2", "#E69F00", "#D55E00", "#009E73", "#9a9a9a"
 
 _GRID_LINES = 11
 
@@ -65,13 +65,32 @@ def peak(coefficients):
     return float(np.abs(np.tensordot(coefficients, basis.values(degree, u, v), 1)).max())
 
 
+def mark(artist, *, stars=None, exposures=None):
+    """Say which stars and exposures the members of a collection, or axes, belong to, by their indices.
+
+    The SVG has it as the ``id`` of a group, ``marks:s=1,2:e=0,0``; other files have nothing of it.
+    """
+    given = {"s": stars, "e": exposures}
+    keys = (f"{key}={','.join(map(str, each))}" for key, each in given.items() if each is not None)
+    artist.set_gid(":".join(["marks", *keys]))
+
+
+def draw_lines(ax, segments, **style):
+    """Straight lines (n, 2, 2), with the limits of the axes following them."""
+    from matplotlib.collections import LineCollection
+
+    lines = ax.add_collection(LineCollection(segments, **style))
+    ax.autoscale_view()
+    return lines
+
+
 def draw_grid(ax, shape, coefficients, **style):
     """Grid lines over the detector, displaced by a Legendre series."""
     from matplotlib.collections import LineCollection
 
-    lines, along = np.linspace(-1, 1, _GRID_LINES), np.linspace(-1, 1, 65)
-    u, v = np.meshgrid(along, lines)
     degree = basis.degree_of(coefficients.shape[1])
+    lines, along = np.linspace(-1, 1, _GRID_LINES), np.linspace(-1, 1, 6 * degree + 1)
+    u, v = np.meshgrid(along, lines)
     paths = []
     for first, second in ((u, v), (v, u)):
         shift = np.tensordot(coefficients, basis.values(degree, first, second), 1)
@@ -120,4 +139,4 @@ def block_mean(image, block):
     cells = image.reshape(image.shape[0] // block, block, -1, block)
     finite = np.isfinite(cells)
     with np.errstate(invalid="ignore"):  # 0 / 0 = NaN where a block is empty
-        return np.where(finite, cells, 0.0).sum(axis=(1, 3)) / finite.sum(axis=(1, 3))
+        return np.where(finite, cells, 0).sum(axis=(1, 3), dtype=float) / finite.sum(axis=(1, 3))

@@ -137,16 +137,25 @@ def plot_distortions(solution, *, names=None, page=0, part="total", scale=50, fi
     columns = min(4, len(shown))
     rows = -(-len(shown) // columns)
     fig = elements.new_figure(fig, (2.3 * columns + 0.5, 2.3 * rows + 0.6))
-    panels = list(fig.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)
+    panels = list(fig.subplots(rows, columns, squeeze=False).flat)
     scale = scale or distortion_scale(solution, shown, part=part)
     for i, (ax, name) in enumerate(zip(panels, shown, strict=False)):
         plot_distortion(solution, name, part=part, scale=scale, ax=ax)
+        elements.mark(ax, exposures=[solution.index(name)])
         elements.set_title(ax, elements.shorten(name, 26), size="small")
         ax.set(xlabel="", ylabel="")
-        ax.tick_params(labelsize="x-small", labelleft=i % columns == 0, labelbottom=i + columns >= len(shown))
+        ax.tick_params(labelsize="x-small")
         ax.locator_params(nbins=3)
+        if i % columns:
+            ax.set_yticks([])
+        if i + columns < len(shown):
+            ax.set_xticks([])
     for ax in panels[len(shown) :]:
         ax.remove()
+    limits = np.array([[ax.get_xlim(), ax.get_ylim()] for ax in panels[: len(shown)]])
+    low, high = limits[..., 0].min(axis=0), limits[..., 1].max(axis=0)
+    for ax in panels[: len(shown)]:  # one scale for the eye
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     fig.supxlabel("x [px]", fontsize="medium")
     fig.supylabel("y [px]", fontsize="medium")
     heading = _heading(part, scale, part != "dynamic" and np.any(solution.prior_mean))
@@ -161,7 +170,7 @@ def distortion_scale(solution, names, *, part="total"):
     return elements.round_down(0.1 * size / peak) if peak > 0 else 1.0
 
 
-def plot_coefficients(solution, name=None, *, fig=None):
+def plot_coefficients(solution, name=None, *, lowest=0, fig=None):
     """Bars of the distortion coefficients beside the prior mean (the paper's Figure "coeff").
 
     Displacement along x above, along y below; modes are named by their orders in x and y.
@@ -171,18 +180,24 @@ def plot_coefficients(solution, name=None, *, fig=None):
     solution : `~legdistort.results.solution.Solution`
         What is drawn.
     name : str, optional
-        One exposure; by default the mean of all, with their scatter (standard deviation) as bars.
+        One exposure, with its 1-sigma errors, relative ones; by default the mean of all with the scatter of the
+        exposures (standard deviation), and beside it the error of one, the median of a dozen.
+    lowest : int
+        Lowest degree that is drawn: 2 leaves out what is like shift, rotation, scale and shear.
     fig : `~matplotlib.figure.Figure`, optional
         Where to draw.
+
+    Raises
+    ------
+    InputError
+        If there is no such exposure, or no mode of that degree.
     """
-    if name is None:
-        values, prior = np.mean(solution.coefficients, axis=0), np.mean(solution.prior_mean, axis=0)
-        label, scatter = "mean of the exposures, and scatter", np.std(solution.coefficients, axis=0)
-    else:
-        values, prior = _parts(solution, name, "total")
-        label, scatter = elements.shorten(name), [None, None]
+    first = basis.n_modes(lowest - 1) if lowest else 0
+    n = solution.coefficients.shape[2] - first
+    if n < 1:
+        raise InputError(f"lowest is {lowest}, but the distortion has modes up to degree {solution.degree} only")
+    values, prior, label, bars = _coefficients(solution, name)
     has_prior = prior is not None and np.any(prior)
-    n = values.shape[1]
     fig = elements.new_figure(fig, (max(6.4, 0.34 * n + 1.2), 4.8))
     panels = list(fig.subplots(2, 1, sharex=True, sharey=True))
     width = 0.4 if has_prior else 0.7
@@ -190,26 +205,43 @@ def plot_coefficients(solution, name=None, *, fig=None):
         ax.axhline(0, color="black", linewidth=0.6)
         at = np.arange(n)
         if has_prior:
-            ax.bar(at - width / 2, prior[axis], width, color=elements.ORANGE, label="prior")
+            ax.bar(at - width / 2, prior[axis, first:], width, color=elements.ORANGE, label="prior")
             at = at + width / 2
-        bars = ax.bar(at, values[axis], width, yerr=scatter[axis], color=elements.BLUE, error_kw={"elinewidth": 0.8})
-        bars.set_label(label)
+        ax.bar(at, values[axis, first:], width, color=elements.BLUE, label=label)
+        for k, (words, (colour, size)) in enumerate(bars.items()):
+            shift = (k - (len(bars) - 1) / 2) * width / 2
+            ax.errorbar(at + shift, values[axis, first:], size[axis, first:], fmt="none", ecolor=colour, capsize=2,
+                        elinewidth=1, label=words)  # fmt: skip
         ax.set_ylabel(f"along {'xy'[axis]} [px]")
         ax.grid(axis="y", linewidth=0.3)
         ax.set_axisbelow(True)
+    orders = list(zip(*basis.orders(basis.degree_of(n + first)), strict=True))[first:]
     tall = n > 15
-    panels[1].set_xticks(
-        range(n),
-        [f"({i}, {j})" for i, j in zip(*basis.orders(basis.degree_of(n)), strict=True)],
-        rotation=90 if tall else 0,
-        fontsize="small",
-    )
+    panels[1].set_xticks(range(n), [f"({i}, {j})" for i, j in orders], rotation=90 * tall, fontsize="small")
     panels[1].set_xlabel("orders of the mode in x, y")
-    legend = panels[0].legend(fontsize="small", loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
+    legend = panels[0].legend(fontsize="small", loc="lower right", bbox_to_anchor=(1, 1), ncols=4, frameon=False,
+                              handlelength=1.3, columnspacing=1.2)  # fmt: skip
     for text in legend.get_texts():
         text.set_parse_math(False)
-    elements.set_title(panels[0], "Distortion coefficients")
+    elements.set_title(panels[0], "Distortion coefficients" if not first else f"Coefficients of degree {lowest} and up")
     return panels
+
+
+def _coefficients(solution, name):
+    """Coefficients, those of the prior, what they are called, and ``{name of an error bar: (colour, its size)}``."""
+    if name is not None:
+        values, prior = _parts(solution, name, "total")
+        return values, prior, elements.shorten(name), {"1σ": ("black", _padded(solution, [name]))}
+    values, prior = np.mean(solution.coefficients, axis=0), np.mean(solution.prior_mean, axis=0)
+    bars = {"scatter": ("black", np.std(solution.coefficients, axis=0))}
+    some = solution.names[:: -(-len(solution.names) // PANELS)]
+    return values, prior, "mean", bars | {"1σ error": (elements.RED, _padded(solution, some))}
+
+
+def _padded(solution, names):
+    """Median over exposures of the errors of their coefficients (2, n_modes); 0 for what was not fitted."""
+    errors = np.median([solution.coefficient_errors(name, relative=True) for name in names], axis=0)
+    return np.pad(np.nan_to_num(errors), [(0, 0), (0, solution.coefficients.shape[2] - errors.shape[1])])
 
 
 def plot_scatter(solution, *, label="scatter of one star", color=elements.BLUE, ax=None):

@@ -10,7 +10,9 @@ _PLAIN = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
 
 
 def plot_mosaic(mosaic, *, stars=None, max_size=900, ax=None):
-    """Co-added image, asinh stretch, dark stars on light sky; pixels without data are pale blue.
+    """Co-added image less its smooth sky, asinh stretch, dark stars on light sky; pixels without data are pale blue.
+
+    Rows and columns without any data are cut off.
 
     Parameters
     ----------
@@ -24,11 +26,12 @@ def plot_mosaic(mosaic, *, stars=None, max_size=900, ax=None):
         Where to draw.
     """
     ax = elements.new_axes(ax, (7.0, 7.0))
-    data = np.asarray(mosaic.data, dtype=float)
+    data = np.asarray(mosaic.data)
     image = elements.block_mean(data, block := max(1, -(-max(data.shape) // max_size)))
-    good = image[np.isfinite(image)]
-    if not good.size:
+    if not np.isfinite(image).any():
         raise InputError(f"the mosaic of shape {data.shape} has no finite pixel to show")
+    image = image - smooth_sky(image)
+    good = image[np.isfinite(image)]
     sky, high = np.percentile(good, [50, 99.9])
     soft = 2 * (sky - np.percentile(good, 16)) or 1.0  # twice the noise of the sky
     low, high = np.arcsinh(-1.2), max(np.arcsinh((high - sky) / soft), 4.0)
@@ -36,11 +39,65 @@ def plot_mosaic(mosaic, *, stars=None, max_size=900, ax=None):
     extent = (-0.5, width - 0.5, -0.5, height - 0.5)
     elements.draw_image(ax, image, sky=sky, soft=soft, low=low, high=high, extent=extent)
     if stars is not None:
-        ax.plot(*np.asarray(stars, dtype=float).T, "o", mfc="none", color=elements.RED, markersize=9, mew=0.9)
-    ny, nx = data.shape
-    ax.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), xlabel="x [px]", ylabel="y [px]")
-    elements.set_title(ax, "Mosaic (asinh stretch)")
+        x, y = np.asarray(stars, dtype=float).T
+        dots = ax.scatter(x, y, s=81, facecolors="none", edgecolors=elements.RED, linewidths=0.9)
+        seen = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+        elements.mark(dots, stars=seen)
+    limits = [_covered(image, axis, block) for axis in (0, 1)]
+    ax.set(xlim=limits[0], ylim=limits[1], xlabel="x [px]", ylabel="y [px]")
+    elements.set_title(ax, "Mosaic less its smooth sky (asinh stretch)")
     return ax
+
+
+def smooth_sky(image, cells=8):
+    """Smooth level of an image: medians of cells, those of cells that bright objects fill replaced, interpolated.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        NaN where there are no data.
+    cells : int
+        Along the longer side.
+
+    Returns
+    -------
+    ndarray, shape (ny, nx)
+    """
+    from scipy import ndimage
+
+    plane = _plane(image)
+    side = max(1, -(-max(image.shape) // cells))
+    padded = np.pad(image - plane, [(0, -n % side) for n in image.shape], constant_values=np.nan)
+    blocks = padded.reshape(padded.shape[0] // side, side, -1, side).transpose(0, 2, 1, 3)
+    blocks = blocks.reshape(*blocks.shape[:2], -1)
+    enough = np.isfinite(blocks).sum(axis=2) > side**2 / 20
+    if not enough.any():
+        return plane
+    level = np.full(enough.shape, np.nan)
+    level[enough] = np.nanmedian(blocks[enough], axis=1)
+    nearest = ndimage.distance_transform_edt(np.isnan(level), return_distances=False, return_indices=True)
+    level = ndimage.median_filter(level[tuple(nearest)], 3, mode="nearest")
+    at = np.meshgrid(*((np.arange(n) + 0.5) / side - 0.5 for n in image.shape), indexing="ij")
+    return plane + ndimage.map_coordinates(level, at, order=1, mode="nearest")
+
+
+def _plane(image, most=20_000):
+    """The plane through the finite pixels of an image, bright ones left out, fitted to so many of them."""
+    rows = np.flatnonzero(np.isfinite(image))
+    y, x = np.unravel_index(rows[:: max(1, len(rows) // most)], image.shape)
+    columns, values, kept = np.stack([np.ones(len(x)), y, x], axis=1), image[y, x], np.ones(len(x), dtype=bool)
+    for _ in range(4):
+        slope = np.linalg.lstsq(columns[kept], values[kept], rcond=None)[0]
+        off = values - columns @ slope
+        kept = np.abs(off - np.median(off)) <= 4.5 * np.median(np.abs(off - np.median(off)))  # 3 sigma
+    v, u = np.ogrid[: image.shape[0], : image.shape[1]]
+    return slope[0] + slope[1] * v + slope[2] * u
+
+
+def _covered(image, axis, block):
+    """Limits along x (axis 0) or y between which there are data, in pixels of the mosaic."""
+    there = np.flatnonzero(np.isfinite(image).any(axis=axis))
+    return block * there[0] - 0.5, block * (there[-1] + 1) - 0.5
 
 
 def plot_zooms(zooms, *, fig=None):

@@ -1,7 +1,5 @@
 """The verdict at the top of a report: what was checked, how it ended, what to do."""
 
-from html import escape
-
 from ..results.check import STATES
 
 _WORDS = {
@@ -13,7 +11,7 @@ _WORDS = {
 
 
 def verdict(checks):
-    """The worst state in words, a row for each check that does not pass, and the others by name.
+    """The worst state in words, the checks that do not pass, the worst first, and the others.
 
     Parameters
     ----------
@@ -22,30 +20,12 @@ def verdict(checks):
 
     Returns
     -------
-    str
-        HTML; empty without checks.
+    dict or None
+        ``worst``, ``words``, ``open``, ``passed``; None without checks.
     """
     if not checks:
-        return ""
+        return None
     worst = max((check["state"] for check in checks), key=STATES.index)
     rows = sorted((c for c in checks if c["state"] != "pass"), key=lambda c: -STATES.index(c["state"]))
-    body = "".join(_row(check) for check in rows)
-    passed = "; ".join(f"{escape(c['name'])}: {escape(c['sentence'])}" for c in checks if c["state"] == "pass")
-    table = f'<table class="checks">\n{body}</table>\n' if rows else ""
-    n = sum(c["state"] == "pass" for c in checks)
-    return (
-        f'<section class="verdict {worst}"><h2>{_WORDS[worst]}</h2>\n{table}'
-        f"<details><summary>{n} of {len(checks)} checks pass</summary>"
-        f"<p><small>{passed}.</small></p></details></section>"
-    )
-
-
-def _row(check):
-    cure = f"<br><b>What to do:</b> {_sentence(check['cure'])}" if check["cure"] else ""
-    state = f'<span class="state {check["state"]}">{check["state"]}</span>'
-    name = f'<th scope="row">{escape(check["name"])}</th>'
-    return f"<tr><td>{state}</td>{name}<td>{_sentence(check['sentence'])}{cure}</td></tr>\n"
-
-
-def _sentence(text):
-    return f"{escape(text[0].upper() + text[1:])}."
+    passed = [check for check in checks if check["state"] == "pass"]
+    return {"worst": worst, "words": _WORDS[worst], "open": rows, "passed": passed, "n": len(checks)}

@@ -6,7 +6,8 @@ from ..assessment import baselines
 from ..inputs import column_contract
 from ..plots import elements, stack_plots
 from ..results import accuracy
-from .html import count, detached_figure, figure, wide_table
+from .svg import detached_figure
+from .tables import Row, Table, count
 
 #: Colour and marker of every correction, told apart in grey print and by colour-blind readers (Okabe & Ito).
 STYLES = {
@@ -69,8 +70,8 @@ def _abscissa(solution):
     return np.where(flux > 0, flux, np.nan), error, f"flux [{table['flux'].unit or 'unit of the input'}]"
 
 
-def compared_corrections(comparison):
-    """Scatter of corrected positions by correction: table and picture."""
+def compared_corrections(comparison, gallery):
+    """Scatter of corrected positions by correction: title, table and picture."""
     head = {
         "correction": "",
         "stars": "",
@@ -81,27 +82,25 @@ def compared_corrections(comparison):
     }
     figures, shown = map(accuracy.scatter_summary, comparison.values()), ("mean", "std", "mean_total", "std_total")
     rows = [
-        [name, str(s["n_stars"]), *(f"{s[key]:.4f}" for key in shown)]
+        Row([name, str(s["n_stars"]), *(f"{s[key]:.4f}" for key in shown)])
         for name, s in zip(comparison, figures, strict=True)
     ]
-    picture = figure(
-        plot_comparison(comparison, ax=detached_figure(7.0, 5.0).subplots()),
+    picture = gallery.add(
+        plot_comparison(comparison, ax=detached_figure(7.0, 5.0).subplots()).figure,
         "Scatter of every star's corrected positions over the exposures, by correction, with the error of one "
         "measured position: a correction is as good as the data allow where its marks lie along the curve.",
     )
-    return (
-        f"<h2>Corrections compared</h2>\n{wide_table(head, rows)}\n<p><small>Scatter of corrected positions over the "
-        "exposures, star by star, on the positions that the solution used.</small></p>\n"
-        f"{picture}"
-    )
+    note = "Scatter of corrected positions over the exposures, star by star, on the positions that the solution used."
+    return "Corrections compared", Table(head, rows, note), picture
 
 
-def compared_stacks(made):
-    """Sharpness of stacks made with other corrections: table and zooms.
+def compared_stacks(made, gallery):
+    """Sharpness of stacks made with other corrections: title, table and zooms.
 
     Parameters
     ----------
     made : `~legdistort.assessment.stack_quality.Stacks`
+    gallery : `~legdistort.reporting.pictures.Gallery`
     """
     head = {
         "image": "",
@@ -113,31 +112,23 @@ def compared_stacks(made):
     }
     shown = "fwhm", "fwhm_ratio", "peak_ratio", "ellipticity"
     rows = [
-        [name, *(f"{getattr(q, key):.3f}" for key in shown), f"{q.position:.4f}"] for name, q in made.qualities.items()
+        Row([name, *(f"{getattr(q, key):.3f}" for key in shown), f"{q.position:.4f}"])
+        for name, q in made.qualities.items()
     ]
     n = next(iter(made.qualities.values())).n_stars
     removed = "similarity" if made.removed == "similarity" else f"map of degree {made.removed}"
-    picture = ""
+    picture = None
     if made.zooms:
-        picture = figure(
-            stack_plots.plot_zooms(made.zooms, fig=detached_figure())[0, 0],
+        picture = gallery.add(
+            stack_plots.plot_zooms(made.zooms, fig=detached_figure())[0, 0].figure,
             "The same stars towards the corners of the field in every stack, each row in one stretch, cores "
             "saturated to show the wings; the line is half the height of the star: wide, long or ragged outlines "
             "are stars that the correction smeared.",
         )
-    return (
-        f"<h2>Stacks compared</h2>\n{wide_table(head, rows)}\n<p><small>Medians over the {count(n, 'star')} of the "
-        "brighter half, isolated and unsaturated, that were measured in all stacks; the stacks differ in nothing but "
-        "the correction. Peak: height over flux. Positions: scatter about those solved, in single exposures after "
-        f"correction, in stacks after a common {removed}, which the images do not tell, was taken out."
-        f"</small></p>\n{picture}"
+    note = (
+        f"Medians over the {count(n, 'star')} of the brighter half, isolated and unsaturated, measured in all "
+        "stacks; the stacks differ in nothing but the correction. Peak: height over flux. Positions: scatter about "
+        f"those solved, in single exposures after correction, in stacks after a common {removed}, which the images do "
+        "not tell, was taken out."
     )
-
-
-def sharpness(quality):
-    """Figures of the mosaic in a line, from a `~legdistort.assessment.stack_quality.Quality` as a dict."""
-    return (
-        "{stars}: FWHM {fwhm:.2f} px, {fwhm_ratio:.3f} times that of single exposures; peak over flux {peak_ratio:.3f} "
-        "times; ellipticity {ellipticity:.3f}; {position:.4f} px per axis off the positions solved "
-        "<small>(medians over the brighter half)</small>"
-    ).format(stars=count(quality["n_stars"], "star"), **quality)
+    return "Stacks compared", Table(head, rows, note), picture

@@ -3,6 +3,8 @@
 import datetime
 import hashlib
 import os
+import shlex
+import sys
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -25,6 +27,14 @@ def stamp():
 @cache
 def _versions():
     return {name: version(name) for name in PACKAGES}
+
+
+def command_line():
+    """The command that runs now, as it would be typed; None where it is another program that calls."""
+    program = Path(sys.argv[0]) if sys.argv else Path()
+    if program.stem != "legdistort" and program.parts[-2:] != ("legdistort", "__main__.py"):
+        return None
+    return shlex.join(["legdistort", *sys.argv[1:]])
 
 
 def checksums(*paths):

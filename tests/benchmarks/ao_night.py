@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import ao_images as ao
 
 import legdistort as ld
-from legdistort.demo import nearest
+from legdistort.assessment.truth import nearest
 from legdistort.geometry.gsaoi import gsaoi_static
 from legdistort.results import accuracy
 from legdistort.simulation import rendering

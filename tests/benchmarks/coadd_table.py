@@ -48,7 +48,7 @@ def prepare(folder, small):
     from astropy.io import fits
 
     from legdistort import coadd, match, measure, read_exposures, simulate_exposures, solve
-    from legdistort.demo import nearest
+    from legdistort.assessment.truth import nearest
     from legdistort.geometry.gsaoi import gsaoi_static
     from legdistort.priors.prior import Prior
     from legdistort.wcs.attachment import attach

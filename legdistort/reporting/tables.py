@@ -1,0 +1,151 @@
+"""Tables of a report, as plain texts that the template puts into a page."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry import similarity
+from ..results.pulls import exposure_rms
+
+#: An exposure whose residuals exceed the median by this factor is marked.
+_MARK = 2.0
+#: Stars that are listed, the brightest; all of them are in the file.
+MOST_STARS = 500
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row: its texts, the columns that are marked, and the index of its star or exposure.
+
+    Attributes
+    ----------
+    cells : list of str
+    high : tuple of int
+    star, exposure : int or None
+    """
+
+    cells: list
+    high: tuple = ()
+    star: int | None = None
+    exposure: int | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of figures.
+
+    Attributes
+    ----------
+    head : dict
+        ``{column: unit}``, "" for none.
+    rows : list of Row
+    note : str
+    """
+
+    head: dict
+    rows: list
+    note: str = ""
+
+
+def count(n, what):
+    """A number with its noun."""
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def exposures_table(solution):
+    """One row an exposure: pose, number of stars, residuals, size of the distortion."""
+    dx, dy, n = exposure_rms(solution)
+    distortion, dynamic = sizes(solution)
+    head = {
+        "exposure": "",
+        "shift x": "px",
+        "shift y": "px",
+        "rotation": "deg",
+        "scale": "",
+        "stars": "",
+        "rms x": "px",
+        "rms y": "px",
+        "distortion": "rms, px",
+        "dynamic part": "rms, px",
+    }
+    rows = []
+    for i, name in enumerate(solution.names):
+        pose = similarity.describe(solution.poses[name])
+        cells = [
+            name,
+            f"{pose['dx']:.2f}",
+            f"{pose['dy']:.2f}",
+            f"{pose['rotation']:.4f}{', mirrored' if pose['parity'] < 0 else ''}",
+            f"{pose['scale']:.6f}",
+            f"{n[i]}",
+            *(_number(rms[i]) for rms in (dx, dy)),
+            f"{distortion[i]:.3f}",
+            f"{dynamic[i]:.3f}",
+        ]
+        high = tuple(k for k, rms in ((6, dx), (7, dy)) if np.isfinite(rms[i]) and rms[i] > _MARK * np.nanmedian(rms))
+        rows.append(Row(cells, high, exposure=i))
+    reference = "static distortion" if np.any(solution.prior_mean) else "mean of the exposures"
+    return Table(
+        head,
+        rows,
+        "Shift, rotation and scale lead from the reference plane to the detector. Distortion: length of the "
+        "displacement over the detector, less its mean; dynamic part: the same of the departure from the "
+        f"{reference}. Residuals above {_MARK:g} times the median are marked.",
+    )
+
+
+def stars_table(solution, pulls):
+    """One row a star, the brightest first: place, errors, number of observations, residuals."""
+    table, sums = solution.stars, pulls.by_star()
+    first = np.argsort(-np.nan_to_num(table["flux"]), kind="stable") if "flux" in table.colnames else range(len(table))
+    head = {"star": "", "x": "px", "y": "px", "x_err": "px", "y_err": "px", "x_err_abs": "px", "y_err_abs": "px"}
+    head |= {name: unit for name, unit in {"ra": "deg", "dec": "deg"}.items() if name in table.colnames}
+    columns = {name: (table[name].value, 7 if name in ("ra", "dec") else 4) for name in list(head)[1:]}
+    columns |= {"flux": (np.asarray(table["flux"]), 0)} if "flux" in table.colnames else {}
+    columns |= {"positions": (table["n"], 0), "residuals": (sums.rms, 2)}
+    head |= {name: "" for name in columns if name not in head} | {"residuals": "over expected"}
+    rows = [
+        Row([str(table["star"][i]), *(_number(v[i], digits) for v, digits in columns.values())], star=int(i))
+        for i in list(first)[:MOST_STARS]
+    ]
+    note = f"The {MOST_STARS} brightest of {len(table)}. " if len(table) > MOST_STARS else ""
+    return Table(
+        head,
+        rows,
+        f"{note}Relative errors hold once a map common to all exposures is taken off; absolute ones (abs) have it in "
+        "them. Residuals: their rms over what their errors and the fit lead to expect.",
+    )
+
+
+def detectors_table(camera):
+    """One row a detector: where it lies, with the errors of that, and the size of its static distortion."""
+    head = {"detector": "", "centre x": "px", "centre y": "px", "rotation": "deg", "scale": "", "static": "rms, px"}
+    rows = []
+    for key, each in camera.detectors.items():
+        place, errors = each.place, each.place.errors or ("", "", "")
+        errors = ["" if e == "" else " ± unknown" if np.isinf(e) else f" ± {e:.2g}" for e in errors]
+        values = f"{place.x:.3f}", f"{place.y:.3f}", f"{place.rotation:.5f}"
+        cells = [value + error for value, error in zip(values, errors, strict=True)]
+        rows.append(Row([key, *cells, f"{place.scale:.6f}", f"{each.rms:.3f}"]))
+    return Table(
+        head,
+        rows,
+        "Centres in the focal plane. Errors, where the layout was fitted, are standard deviations after one affine map "
+        "of all detectors together, which exposures can take over.",
+    )
+
+
+def sizes(solution):
+    """Rms length over the detector of each distortion and of its dynamic part, without the constant mode, pixels.
+
+    The basis is orthonormal on a square of area 4: the mean square is the sum of squared coefficients over 4.
+    """
+    static = solution.prior_mean
+    if not np.any(static):
+        static = np.mean(solution.coefficients, axis=0)
+    parts = solution.coefficients, solution.coefficients - static
+    return [np.sqrt(np.sum(part[:, :, 1:] ** 2, axis=(1, 2))) / 2 for part in parts]
+
+
+def _number(value, digits=4):
+    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
