@@ -3,6 +3,7 @@
 Everything is seeded and goes through the public functions, so the pictures show what a user gets.
 """
 
+import shutil
 import tempfile
 import warnings
 from pathlib import Path
@@ -13,22 +14,19 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
-from astropy import units as u
 from PIL import Image
 
 import legdistort as ld
 from legdistort.assessment import baselines, stack_quality
 from legdistort.demo import run_demo
-from legdistort.geometry import similarity
-from legdistort.geometry.distortion import Distortion
 from legdistort.plots import solution_plots, stack_plots
+from legdistort.plots.residual_plots import plot_steps
 from legdistort.results import accuracy
 from legdistort.solving import minimisers, start_values
 from legdistort.solving.equations.problem import build_problem
 
 IMAGES = Path(__file__).parent / "images"
-BLUE, GREEN, ORANGE = "#0072B2", "#009E73", "#D55E00"
-MAGNIFIED = 80
+BLUE, ORANGE = "#0072B2", "#D55E00"
 
 
 def main():
@@ -39,7 +37,8 @@ def main():
     save(ld.Camera.gsaoi().plot().figure, "gsaoi_camera.png")
     with tempfile.TemporaryDirectory() as folder:
         night = run_demo(out=Path(folder) / "night")
-        save(before_after(night.solution), "before_after.png", colours=256)
+        save(plot_steps(night.solution)[0].figure, "before_after.png", colours=256)
+        save_report(night.out / "report.html")
         save(stacked(night), "stacks.png", colours=256)
         save(noise(night.out / "frames" / "exp00.fits"), "noise.png")
         small = run_demo(out=Path(folder) / "small", small=True)
@@ -79,60 +78,6 @@ def sweeps(n_sweeps=300, n_seeds=10):
     ax.set_ylim(0.03, None)
     ax.legend(fontsize="small", frameon=False)
     return fig
-
-
-def before_after(solution):
-    """Arrows from the mean of each star to its single positions: similarities alone, static part removed, solved."""
-    fig, panels = plt.subplots(1, 3, figsize=(11, 4.3), sharex=True, sharey=True, layout="constrained")
-    steps = {
-        "Shift, rotation and scale only": (aligned(solution), ORANGE),
-        "Known static distortion removed": (aligned(solution, static=True), GREEN),
-        "Every distortion solved": (by_star(solution, solution.correct), BLUE),
-    }
-    for ax, (title, (positions, colour)) in zip(panels, steps.items(), strict=True):
-        mean = np.nanmean(positions, axis=0)
-        away = positions - mean
-        start = np.broadcast_to(mean, positions.shape)
-        arrows = ax.quiver(
-            *start.reshape(-1, 2).T,
-            *away.reshape(-1, 2).T,
-            angles="xy",
-            scale_units="xy",
-            scale=1 / MAGNIFIED,
-            width=0.0028,
-            color=colour,
-        )
-        ax.quiverkey(arrows, 0.84, 1.03, 1, "1 px", labelpos="E", coordinates="axes")
-        ax.set(xlabel="x [px]", aspect="equal")
-        rms = np.sqrt(np.nanmean(away**2))
-        ax.set_title(f"{title}\n{rms:.3f} px rms per axis", loc="left", fontsize="medium")
-    panels[0].set_ylabel("y [px]")
-    return fig
-
-
-def aligned(solution, *, static=False):
-    """Positions (n_exposures, n_stars, 2) carried to the reference plane by similarities fitted to them."""
-    table = solution.observations.copy()
-    if static:
-        for name, coefficients in zip(solution.names, solution.prior_mean, strict=True):
-            rows = table["exposure"] == name
-            xy = np.column_stack([table["x"][rows].value, table["y"][rows].value])
-            undistorted = Distortion(coefficients, solution.shapes[name]).invert(xy)
-            table["x"][rows], table["y"][rows] = undistorted.T * u.pix
-    matches = ld.Matches.from_table(table, shape=solution.shapes)  # estimates the similarities from the positions
-    back = {name: similarity.invert(matches.poses[name]) for name in solution.names}
-    return by_star(solution, lambda name, xy: similarity.apply(back[name], xy), table=table)
-
-
-def by_star(solution, to_reference, *, table=None):
-    """Used positions (n_exposures, n_stars, 2) in the reference plane, NaN where a star was not used."""
-    table = solution.observations if table is None else table
-    out = np.full((len(solution.names), len(solution.star_names), 2), np.nan)
-    for i, name in enumerate(solution.names):
-        rows = table[(table["exposure"] == name) & table["used"]]
-        xy = np.column_stack([rows["x"].value, rows["y"].value])
-        out[i, np.searchsorted(solution.star_names, rows["star"])] = to_reference(name, xy)
-    return out
 
 
 def stacked(run):
@@ -180,10 +125,29 @@ def planned():
     return fig
 
 
+def save_report(path, *, width=1100, height=1500):
+    """The top of a report as a browser shows it: report.png, where Playwright and Chromium are installed."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        found = shutil.which("chromium") or shutil.which("google-chrome")
+        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        tab = browser.new_page(viewport={"width": width, "height": height})
+        tab.goto(Path(path).absolute().as_uri())
+        tab.screenshot(path=IMAGES / "report.png")
+        browser.close()
+    shrink("report.png", 128)
+
+
 def save(fig, name, *, colours=64):
     """Write a figure as a small PNG with a palette."""
     fig.savefig(IMAGES / name, dpi=100, bbox_inches="tight", pad_inches=0.08)
     plt.close(fig)
+    shrink(name, colours)
+
+
+def shrink(name, colours):
+    """Give a PNG a palette."""
     image = Image.open(IMAGES / name).convert("RGB")
     image.quantize(colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(
         IMAGES / name, optimize=True

@@ -273,3 +273,69 @@ def test_files_open_with_gwcs_alone(solution, tmp_path, stack):
         assert_allclose(back, [x, y], rtol=0, atol=1e-6)
         tensors = to_tensor(solution.coefficients[solution.index(name)])
         assert coefficients == [tensor.T.ravel().tolist() for tensor in tensors]  # to the bit
+
+
+# --- notebooks, and what is called the wrong way round --------------------------------------------------------------
+
+
+def test_a_notebook_shows_what_print_shows(simulation, solution):
+    from html import unescape
+
+    image = Exposure(name="<b>", data=np.zeros((20, 30)))
+    things = [
+        solution,
+        solution.gauge,
+        solution.checks[0],
+        simulation,
+        simulation.matches,
+        Prior(np.zeros((2, 6))),
+        image,
+    ]
+    for thing in things:
+        shown = thing._repr_html_()
+        assert shown.startswith("<pre")
+        assert unescape(shown.split(">", 1)[1].removesuffix("</pre>")) == str(thing)
+        assert "<b>" not in shown
+    for name in ("Camera", "Detector", "EffectivePSF", "Exposure", "Matches", "Mosaic", "Prior", "Solution"):
+        assert hasattr(getattr(legdistort, name), "_repr_html_"), name
+
+
+def test_objects_draw_themselves_where_they_are_told(solution):
+    from matplotlib.figure import Figure
+
+    name = solution.names[0]
+    mosaic = legdistort.Mosaic(np.random.default_rng(0).normal(size=(30, 40)), *[None] * 6, exposures=())
+    for draw in (
+        solution.plot,
+        solution.plot_residuals,
+        lambda ax: solution.plot_residuals(name, ax=ax),
+        lambda ax: solution.plot_error_map(name, ax=ax),
+        lambda ax: solution.plot_error_map(name, absolute=True, ax=ax),
+        mosaic.plot,
+    ):
+        ax = Figure().subplots()
+        assert draw(ax=ax) is ax
+        assert ax.get_title(loc="left")
+    with pytest.raises(LegdistortError, match="no exposure 'x' in the solution"):
+        solution.plot_error_map("x")
+
+
+def test_calls_the_wrong_way_round_are_told_the_right_one(simulation, solution):
+    image = Exposure(name="e1", data=np.zeros((20, 30)))
+    calls = {
+        r"call coadd\(exposures, solution\)": lambda: legdistort.coadd(solution, [image]),
+        "a Solution after the exposures, as solve gives it, got Matches": lambda: legdistort.coadd(
+            [image], simulation.matches
+        ),
+        "coadd takes exposures as read_exposures gives them, got Matches": lambda: legdistort.coadd(
+            simulation.matches, solution
+        ),
+        r"call match\(measure\(exposures\)\)": lambda: legdistort.match([image]),
+        "the table of detections must be a table, got Solution": lambda: legdistort.match(solution),
+        "matches must be Matches .* got list": lambda: legdistort.solve([image]),
+        "or a sequence of them, got Solution": lambda: legdistort.run(solution, out="never made"),
+        "truth must be that of a simulation .* got str": lambda: legdistort.run([], out="never made", truth="x"),
+    }
+    for words, call in calls.items():
+        with pytest.raises(LegdistortError, match=words):
+            call()

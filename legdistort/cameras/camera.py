@@ -22,6 +22,7 @@ from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.gsaoi import GSAOI_SIZE, GsaoiMap
 from ..inputs.detector_images import of_files
+from ..runtime.notebook import ShownAsPrinted
 from . import storage
 from .detector import Detector
 from .from_wcs import camera_of
@@ -47,7 +48,7 @@ _SIDE = 32  # points along a side of a detector that are sought on others
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Camera:
+class Camera(ShownAsPrinted):
     """Detectors in one focal plane.
 
     Parameters

@@ -11,6 +11,7 @@ import numpy as np
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
+from ..runtime.notebook import ShownAsPrinted
 from .source import check_shape
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Detector:
+class Detector(ShownAsPrinted):
     """One detector: its size, where it lies in the focal plane, and its static distortion.
 
     Parameters

@@ -17,7 +17,9 @@ from astropy.nddata import CCDData, VarianceUncertainty
 from astropy.wcs import WCS
 
 from ..exceptions import InputError
+from ..plots.stack_plots import plot_mosaic
 from ..runtime.fits_bytes import BLOCK, sum32, with_checksum
+from ..runtime.notebook import ShownAsPrinted
 from ..runtime.outputs import replacing
 from ..runtime.scratch import forget
 from ..runtime.words import PLANES
@@ -34,7 +36,7 @@ _ROWS = 256  # that are written at a time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Mosaic:
+class Mosaic(ShownAsPrinted):
     """Co-added image.
 
     The planes that `legdistort.coadd` makes are arrays on disk, in a folder for temporary files; only what is worked on
@@ -141,6 +143,27 @@ class Mosaic:
         ny, nx = self.shape
         left_out = f", {len(self.left_out)} left out" if self.left_out else ""
         return f"<Mosaic: {nx} x {ny} px, {len(self.exposures)} exposures{left_out}>"
+
+    def plot(self, *, stars=None, ax=None):
+        """The image less its smooth sky, see `legdistort.plots.stack_plots.plot_mosaic`.
+
+        Parameters
+        ----------
+        stars : array_like, shape (n, 2), optional
+            Positions to be circled, pixels of the mosaic.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+
+        Raises
+        ------
+        InputError
+            If no pixel has data.
+        """
+        return plot_mosaic(self, stars=stars, ax=ax)
 
     def contributors(self, x: int, y: int) -> tuple[str, ...]:
         """Names of the exposures that contribute to pixel (x, y) of the mosaic, 0-based.

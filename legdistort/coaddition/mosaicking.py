@@ -11,6 +11,8 @@ import numpy as np
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.star_hull import support
+from ..inputs.exposure_files import listed
+from ..results.solution import Solution
 from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
 from ..runtime.words import PLANES
@@ -136,6 +138,7 @@ def coadd(
     >>> ld.coadd(exposures, solution, method="median").exposures
     ('exp00', 'exp01', 'exp02', 'exp03')
     """
+    exposures, solution = _in_order(exposures, solution)
     options = CoaddOptions(
         method=method,
         order=order,
@@ -153,6 +156,17 @@ def coadd(
     )
     share = partial(map_items, workers=workers, threads=True, progress=progress)
     return _coadd(exposures, solution.by_detector, options, share)
+
+
+def _in_order(exposures, solution):
+    """Exposures as a list, and the solution; `InputError` for anything else."""
+    if isinstance(exposures, Solution):
+        raise InputError("coadd takes the exposures first and then the solution: call coadd(exposures, solution)")
+    if not isinstance(solution, Solution):
+        raise InputError(
+            f"coadd takes a Solution after the exposures, as solve gives it, got {type(solution).__name__}"
+        )
+    return listed(exposures, "coadd"), solution
 
 
 def _coadd(exposures, solution, options, share):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..exceptions import FoldError, InputError
+from ..runtime.notebook import ShownAsPrinted
 from . import basis
 from .models import CHUNK, correction_model
 
@@ -51,7 +52,7 @@ class Inverse:
 
 
 @dataclass(frozen=True, eq=False)
-class Distortion:
+class Distortion(ShownAsPrinted):
     """Distortion of one exposure in its own pixels.
 
     Attributes

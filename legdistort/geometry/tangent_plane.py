@@ -10,6 +10,7 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.modeling import models
 
+from ..runtime.notebook import ShownAsPrinted
 from .similarity import apply, invert
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def gnomonic(lon, lat, lon0, lat0, degrees=1.0):
 
 
 @dataclass(frozen=True, eq=False)
-class TangentPlane:
+class TangentPlane(ShownAsPrinted):
     """Where the reference plane lies on the sky (gnomonic projection).
 
     Attributes

@@ -23,6 +23,7 @@ from tqdm import tqdm
 from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, without_astropy_warnings
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.fits_bytes import open_fits
+from ..runtime.notebook import ShownAsPrinted
 from ..runtime.outputs import settle_for
 from ..runtime.provenance import checksum, unchanged
 from . import repetitions
@@ -61,7 +62,7 @@ _UNREADABLE = (OSError, EOFError, TypeError, ValueError, KeyError, IndexError, z
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ExposureFile:
+class ExposureFile(ShownAsPrinted):
     """What is known about an image whose pixels are in its file.
 
     Attributes
@@ -327,6 +328,10 @@ def expand_paths(paths):
     """The argument of `read_exposures` as a flat list of sources, patterns expanded."""
     if isinstance(paths, (str, Path, fits.HDUList)) or is_nddata(paths):
         paths = [paths]
+    if not np.iterable(paths):
+        raise InputError(
+            f"frames must be a path, an HDUList, an NDData or a sequence of them, got {type(paths).__name__}"
+        )
     paths = list(paths)
     settle_for(*(path for path in paths if isinstance(path, (str, Path))))
     sources = []

@@ -17,6 +17,7 @@ from ..geometry import similarity
 from ..geometry.epochs import exposure_years
 from ..geometry.tangent_plane import TangentPlane
 from ..runtime.checks import check_choice
+from ..runtime.notebook import ShownAsPrinted
 from . import column_contract, exposure_names, repetitions, start_poses
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ class Observations:
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class Matches(ShownAsPrinted):
     """Positions of the same stars in several exposures.
 
     Attributes

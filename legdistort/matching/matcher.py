@@ -16,7 +16,8 @@ from ..cameras.focal_planes import focal_planes
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..geometry.epochs import header_epoch, mean_epoch
 from ..inputs import column_contract, repetitions
-from ..inputs.exposure_files import listed
+from ..inputs.exposure_files import ExposureFile, listed
+from ..inputs.exposures import Exposure
 from ..inputs.matches import Matches, in_focal_plane, shapes_by_exposure
 from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
@@ -124,6 +125,7 @@ def match(
         min_exposures=min_exposures, columns=columns, tolerance=tolerance, reject_flags=reject_flags,
         isolation=isolation, progress=progress,
     )  # fmt: skip
+    _check_measured(detections)
     if columns:
         detections = column_contract.rename(detections, columns)
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
@@ -179,6 +181,13 @@ def _check_detectors(camera, table, star, shapes):
         table, star = _keep_common(table, star, 2, {})
         table["star"] = star
         check_places(replace(Matches.from_table(table, shape=shapes, allow_copies=True), camera=camera))
+
+
+def _check_measured(detections):
+    """Raise `InputError` for exposures in the place of what was measured in them."""
+    each = detections if isinstance(detections, (list, tuple)) else [detections]
+    if each and isinstance(each[0], (Exposure, ExposureFile)):
+        raise InputError("match takes the table that measure makes of exposures: call match(measure(exposures))")
 
 
 def _add_epochs(table, named):

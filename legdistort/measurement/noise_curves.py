@@ -19,6 +19,7 @@ from scipy.optimize import nnls
 from ..exceptions import InputError
 from ..inputs.table_files import write_table
 from ..runtime.checks import check_choice, first_line
+from ..runtime.notebook import ShownAsPrinted
 from ..runtime.words import POSITION_ERRORS
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ _COLUMNS = ("exposure", "flux", "n", "found", "x_ratio", "y_ratio", *_PIXELS)
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseCurves:
+class NoiseCurves(ShownAsPrinted):
     """Errors of positions against flux, for one or more exposures and widths.
 
     Attributes

@@ -13,6 +13,7 @@ import numpy as np
 from ..cameras.source import check_shape
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis
+from ..runtime.notebook import ShownAsPrinted
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -64,7 +65,7 @@ def _declared(sigma, static_sigma):
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class Prior(ShownAsPrinted):
     """Static distortion known beforehand, and how far to trust it.
 
     Parameters

@@ -6,6 +6,8 @@ import textwrap
 from dataclasses import dataclass
 from math import isfinite
 
+from ..runtime.notebook import ShownAsPrinted
+
 #: Probability with which a check warns of a set in which nothing is wrong; all of them together make 2 %.
 FALSE_ALARM = 1e-3
 #: From best to worst; "unknown" is a question that the data cannot answer.
@@ -13,7 +15,7 @@ STATES = ("pass", "unknown", "warn", "fail")
 
 
 @dataclass(frozen=True)
-class Check:
+class Check(ShownAsPrinted):
     """One check of a result.
 
     Attributes

@@ -21,6 +21,7 @@ from scipy.linalg import block_diag
 
 from ..geometry import basis
 from ..geometry.detector_modes import similarity_basis
+from ..runtime.notebook import ShownAsPrinted
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -185,7 +186,7 @@ class Drift:
 
 
 @dataclass(frozen=True, eq=False)
-class Gauge:
+class Gauge(ShownAsPrinted):
     """What is known of a map common to all exposures, and the convention for the rest.
 
     Attributes

@@ -12,6 +12,7 @@ from astropy import units as u
 from ..exceptions import InputError
 from ..geometry import parallax
 from ..inputs.column_contract import correlation
+from ..runtime.notebook import ShownAsPrinted
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -23,7 +24,7 @@ UNITS = {"vx": u.pix / u.yr, "vy": u.pix / u.yr, "parallax": u.pix}
 
 
 @dataclass(frozen=True, eq=False)
-class StarMotions:
+class StarMotions(ShownAsPrinted):
     """What moves the stars from exposure to exposure.
 
     Attributes

@@ -24,6 +24,8 @@ from ..geometry.models import exposure_model, like, outside, to_pixels
 from ..geometry.star_hull import support, supported
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
+from ..plots import residual_plots, solution_plots
+from ..runtime.notebook import ShownAsPrinted
 from . import absolute_errors, new_positions
 from . import motions as star_motions
 from .check import in_lines
@@ -52,7 +54,7 @@ def _wrapped(key, text):
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(ShownAsPrinted):
     """Distortion-free star positions and the distortion of every exposure.
 
     Made by `legdistort.solve`, read back by `Solution.read`.
@@ -602,6 +604,69 @@ class Solution:
     def supported(self, name: str, xy: ArrayLike) -> np.ndarray:
         """Whether detector positions (n, 2) lie inside the convex hull of the stars used in an exposure."""
         return supported(support(name, self), np.asarray(xy, dtype=float).T)
+
+    # -- pictures
+
+    def plot(self, *, ax=None):
+        """Map of the mean residuals of all exposures, see `legdistort.plots.residual_plots.plot_mean_residuals`.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+        """
+        return residual_plots.plot_mean_residuals(self, ax=ax)
+
+    def plot_residuals(self, name=None, *, ax=None):
+        """Arrows of the residuals of an exposure, or of all, see `legdistort.plots.solution_plots.plot_residuals`.
+
+        Parameters
+        ----------
+        name : str, optional
+            Exposure; by default all are drawn over each other.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+
+        Raises
+        ------
+        InputError
+            If the exposure is unknown or none of its positions was used.
+        """
+        return solution_plots.plot_residuals(self, name, ax=ax)
+
+    def plot_error_map(self, name, *, absolute=False, ax=None):
+        """Map of the error of the correction over an exposure, see `sigma_map`.
+
+        Parameters
+        ----------
+        name : str
+            Exposure.
+        absolute : bool
+            With the error of the common map.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+
+        Raises
+        ------
+        InputError
+            If there is no such exposure.
+        FoldError
+            If its distortion folds.
+        """
+        self.index(name)
+        return solution_plots.plot_sigma_map(*self.sigma_map(name, absolute=absolute), ax=ax)
 
     # -- words
 

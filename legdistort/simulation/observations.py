@@ -20,6 +20,7 @@ from ..geometry import similarity
 from ..inputs.matches import Matches
 from ..inputs.table_files import write_table
 from ..runtime import checks, outputs
+from ..runtime.notebook import ShownAsPrinted
 from . import gsaoi_night, rendering
 from .truth import (
     Truth,
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Simulation:
+class Simulation(ShownAsPrinted):
     """A simulated catalogue: `matches`, as they would be measured, and the `truth`."""
 
     matches: Matches
@@ -52,7 +53,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, eq=False)
-class SimulatedExposures:
+class SimulatedExposures(ShownAsPrinted):
     """Simulated images.
 
     Attributes

@@ -18,6 +18,7 @@ from ..geometry import basis
 from ..results import accuracy
 from ..results.absolute_errors import relative_blocks
 from ..results.solution import Solution
+from ..runtime.notebook import ShownAsPrinted
 from ..solving import star_motions
 from ..solving.equations.problem import build_problem
 from ..solving.options import SolveOptions
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(ShownAsPrinted):
     """Expected errors of a planned set of exposures, made by `predict`.
 
     All are rms per axis in pixels; the paper's equations, which sum both axes, give sqrt(2) times as much.

@@ -15,6 +15,7 @@ from scipy.interpolate import RectBivariateSpline
 from ...exceptions import InputError
 from ...runtime import outputs
 from ...runtime.fits_bytes import open_fits
+from ...runtime.notebook import ShownAsPrinted
 from . import splines
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ class Grid:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class EffectivePSF:
+class EffectivePSF(ShownAsPrinted):
     """The effective point-spread function of an exposure (Anderson & King 2000, PASP 112, 1360).
 
     It holds the part of the light of a star that falls into a pixel, by the offset of the pixel's centre from the
