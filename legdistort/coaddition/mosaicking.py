@@ -163,9 +163,8 @@ def _in_order(exposures, solution):
     if isinstance(exposures, Solution):
         raise InputError("coadd takes the exposures first and then the solution: call coadd(exposures, solution)")
     if not isinstance(solution, Solution):
-        raise InputError(
-            f"coadd takes a Solution after the exposures, as solve gives it, got {type(solution).__name__}"
-        )
+        kind = type(solution).__name__
+        raise InputError(f"coadd takes a Solution after the exposures, as solve gives it, got {kind}")
     return listed(exposures, "coadd"), solution
 
 
