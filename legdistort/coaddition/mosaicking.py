@@ -162,7 +162,7 @@ def _in_order(exposures, solution):
     """Exposures as a list, and the solution; `InputError` for anything else."""
     if isinstance(exposures, Solution):
         raise InputError("coadd takes the exposures first and then the solution: call coadd(exposures, solution)")
-    if not isinstance(solution, Solution):
+    if not hasattr(solution, "by_detector"):
         kind = type(solution).__name__
         raise InputError(f"coadd takes a Solution after the exposures, as solve gives it, got {kind}")
     return listed(exposures, "coadd"), solution
