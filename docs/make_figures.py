@@ -136,7 +136,7 @@ def save_report(path, *, width=1100, height=1500):
         tab.goto(Path(path).absolute().as_uri())
         tab.screenshot(path=IMAGES / "report.png")
         browser.close()
-    shrink("report.png", 128)
+    shrink("report.png", 256, Image.Quantize.MAXCOVERAGE)
 
 
 def save(fig, name, *, colours=64):
@@ -146,12 +146,10 @@ def save(fig, name, *, colours=64):
     shrink(name, colours)
 
 
-def shrink(name, colours):
+def shrink(name, colours, method=Image.Quantize.MEDIANCUT):
     """Give a PNG a palette."""
     image = Image.open(IMAGES / name).convert("RGB")
-    image.quantize(colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(
-        IMAGES / name, optimize=True
-    )
+    image.quantize(colours, method=method, dither=Image.Dither.NONE).save(IMAGES / name, optimize=True)
     print(f"{name}: {(IMAGES / name).stat().st_size / 1024:.0f} kB")
 
 

@@ -327,7 +327,7 @@ def test_calls_the_wrong_way_round_are_told_the_right_one(simulation, solution):
         "a Solution after the exposures, as solve gives it, got Matches": lambda: legdistort.coadd(
             [image], simulation.matches
         ),
-        "coadd takes exposures as read_exposures gives them, got Matches": lambda: legdistort.coadd(
+        "exposures must be images as open_exposures or read_exposures give them, got Matches": lambda: legdistort.coadd(
             simulation.matches, solution
         ),
         r"call match\(measure\(exposures\)\)": lambda: legdistort.match([image]),

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.star_hull import support
-from ..inputs.exposure_files import listed
 from ..results.solution import Solution
 from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
@@ -138,7 +137,7 @@ def coadd(
     >>> ld.coadd(exposures, solution, method="median").exposures
     ('exp00', 'exp01', 'exp02', 'exp03')
     """
-    exposures, solution = _in_order(exposures, solution)
+    _check_order(exposures, solution)
     options = CoaddOptions(
         method=method,
         order=order,
@@ -158,14 +157,13 @@ def coadd(
     return _coadd(exposures, solution.by_detector, options, share)
 
 
-def _in_order(exposures, solution):
-    """Exposures as a list, and the solution; `InputError` for anything else."""
+def _check_order(exposures, solution):
+    """Raise `InputError` for a solution in the place of exposures, and for anything else in the place of a solution."""
     if isinstance(exposures, Solution):
         raise InputError("coadd takes the exposures first and then the solution: call coadd(exposures, solution)")
     if not hasattr(solution, "by_detector"):
         kind = type(solution).__name__
         raise InputError(f"coadd takes a Solution after the exposures, as solve gives it, got {kind}")
-    return listed(exposures, "coadd"), solution
 
 
 def _coadd(exposures, solution, options, share):
@@ -256,7 +254,8 @@ def _area(exposure_map):
 
 def _select(exposures, solution):
     """Exposures that can be used, and the reasons why others cannot."""
-    exposures = [exposures] if exposures is None or isinstance(exposures, str | Path) else list(exposures)
+    one = isinstance(exposures, str | Path) or not np.iterable(exposures)
+    exposures = [exposures] if one else list(exposures)
     if not all(hasattr(e, "read") for e in exposures):
         raise InputError(
             "exposures must be images as open_exposures or read_exposures give them, got "
