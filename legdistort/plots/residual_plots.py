@@ -4,13 +4,11 @@ As in `legdistort.plots.solution_plots`.
 """
 
 import numpy as np
-from astropy import units as u
 
 from ..exceptions import InputError
 from ..geometry import similarity
 from ..geometry.distortion import Distortion
 from ..inputs import column_contract
-from ..inputs.matches import Matches
 from . import elements
 from .camera_plots import outline_detectors
 
@@ -38,7 +36,7 @@ def plot_steps(solution, *, scale=None, fig=None):
     Raises
     ------
     LegdistortError
-        If a distortion folds, or the positions do not determine the similarities.
+        If a distortion folds.
     """
     steps = {"Shift, rotation and scale only": (_aligned(solution), elements.RED)}
     if np.any(solution.prior_mean):
@@ -85,24 +83,22 @@ def _draw_arrows(ax, mean, off, scale, colour):
 
 
 def _aligned(solution, *, static=False):
-    """Positions (n_exposures, n_stars, 2) carried to the reference plane by similarities fitted to them."""
-    table = solution.observations.copy()
-    table = table[np.asarray(table["used"], dtype=bool)]
-    if static:
-        for name, coefficients in zip(solution.names, solution.prior_mean, strict=True):
-            rows = np.flatnonzero(table["exposure"] == name)
-            xy = np.column_stack([table["x"][rows].to_value(u.pix), table["y"][rows].to_value(u.pix)])
-            table["x"][rows], table["y"][rows] = (
-                Distortion(coefficients, solution.shapes[name], name).invert(xy).T * u.pix
-            )
-    numbers = {name: f"e{i}" for i, name in enumerate(solution.names)}  # a name may be none that a file could have
-    plain = table["star", "x", "y", "x_err", "y_err"]
-    plain["exposure"] = [numbers[name] for name in table["exposure"].tolist()]
-    shapes = {number: solution.shapes[name] for name, number in numbers.items()}
-    poses = Matches.from_table(plain, shape=shapes, allow_copies=True).poses
-    back = {name: similarity.invert(poses[number]) for name, number in numbers.items() if number in poses}
-    to_plane = _at_epoch(solution, lambda name, xy: similarity.apply(back[name], xy))
-    return _by_star(solution, to_plane, table=table)
+    """Positions (n_exposures, n_stars, 2) in the reference plane by similarities that fit best to those solved."""
+
+    def to_plane(name, xy):
+        if static:
+            xy = Distortion(solution.prior_mean[solution.index(name)], solution.shapes[name], name).invert(xy)
+        return similarity.apply(similarity.invert(solution.poses[name]), xy)
+
+    positions = _by_star(solution, _at_epoch(solution, to_plane))
+    for each in positions:
+        seen = np.isfinite(each + solution.positions).all(axis=1)
+        z, wanted = (xy[seen, 0] + 1j * xy[seen, 1] for xy in (each, solution.positions))
+        if len(z):
+            fit = np.linalg.lstsq(np.stack([z, np.ones(len(z))], axis=1), wanted, rcond=None)[0]
+            moved = np.stack([z, np.ones(len(z))], axis=1) @ fit
+            each[seen] = np.stack([moved.real, moved.imag], axis=1)
+    return positions
 
 
 def _at_epoch(solution, to_plane):
@@ -114,9 +110,9 @@ def _at_epoch(solution, to_plane):
     return lambda name, xy, star: to_plane(name, xy) - moved[name][star]
 
 
-def _by_star(solution, to_plane, *, table=None):
+def _by_star(solution, to_plane):
     """Used positions (n_exposures, n_stars, 2) in the reference plane, NaN where a star was not used."""
-    table = solution.observations if table is None else table
+    table = solution.observations
     table = table[np.asarray(table["used"], dtype=bool)]
     x, y = (column_contract.values(table, axis, "pix") for axis in "xy")
     exposure, star = np.asarray(table["exposure"]), np.searchsorted(solution.star_names, table["star"])
