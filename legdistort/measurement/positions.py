@@ -300,11 +300,18 @@ def warn_of_psf(verdicts):
 def _camera_gains(exposures, options, share):
     """Gains of exposures that have none, found from several frames of their camera: ``{name: e-/ADU}``."""
     asked = camera_gain.pilots(exposures)
-    work = partial(measure_exposure, options=replace(options, errors="fit", psf="moffat"))
+    work = partial(_photon_noise, options=options)
     told = iter(list(share(work, [frame for frames in asked.values() for frame in frames], description="gain")))
-    gains = {camera: camera_gain.pooled([next(told).photon for _ in frames]) for camera, frames in asked.items()}
+    gains = {camera: camera_gain.pooled([next(told) for _ in frames]) for camera, frames in asked.items()}
     found = {e.name: gains.get(camera_gain.camera(e)) for e in exposures if not e.gain}
     return {name: gain for name, gain in found.items() if gain is not None}
+
+
+def _photon_noise(exposure, options):
+    """Variance per unit of star light that an exposure tells, None if it is known or there are no stars."""
+    exposure = options.with_detector(exposure.read())
+    stamps, shape = _stamps(exposure, options)
+    return None if stamps is None or stamps.frame.photon is not None else frame_fit.photon_noise(stamps, shape)
 
 
 def _measure_with_gain(pair, options):
@@ -378,14 +385,11 @@ def _measure_frame(exposure, options):
     """What `measure_exposure` gives, errors as the fits state them."""
     name, max_stars = exposure.name, options.max_stars
     psf = options.psf_of(name)
-    frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
-    if len(centres) == 0:
+    stamps, shape = _stamps(exposure, options)
+    if stamps is None:
         log.warning("%s: no star above %g times the noise", name, options.threshold)
         return MeasuredExposure(_empty(), None, None, frame_psf.Verdict("moffat", 0))
-    if max_stars is not None:
-        centres = centres[: 3 * max_stars]  # some will turn out to be hot pixels or saturated
     fwhm = float(moffat.fwhm(shape))
-    stamps = Stamps(frame, centres, options.box // 2 if options.box else box_half(fwhm))
     fitted = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     measured, verdict = frame_psf.measure_frame(stamps, fitted, shape, psf)
     usable = ((fitted.flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
@@ -404,6 +408,15 @@ def _measure_frame(exposure, options):
     known = exposure.gain or exposure.uncertainty is not None or not len(table)
     own = None if measured is None else measured.psf.named(exposure=name)
     return MeasuredExposure(table, None if known else fitted.photon, own, verdict)
+
+
+def _stamps(exposure, options):
+    """Stamps around the detections of an exposure, None if there are none, and the usual shape of its stars."""
+    frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
+    if options.max_stars is not None:
+        centres = centres[: 3 * options.max_stars]  # some will turn out to be hot pixels or saturated
+    half = options.box // 2 if options.box else box_half(float(moffat.fwhm(shape)))
+    return (Stamps(frame, centres, half) if len(centres) else None), shape
 
 
 def _is_deformed(stamps, fitted, usable):

@@ -76,9 +76,7 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
     """
     width = float(moffat.fwhm(shape))
     nodes = moffat.quadrature(width)
-    found, _ = fit_once(stamps, shape, nodes)
-    models = stamps.models(found.params, nodes)
-    noise = pixel_noise(stamps, found, models, nodes)
+    found, models, noise = _first_pass(stamps, shape, nodes)
     radius = min(2 * width, stamps.half) if blends == "together" else 0.0
     hot, weights = _is_hot(stamps, found, models, stamps.good), None
     done = hot & (moffat.fwhm(found.params) < 0.6 * width)
@@ -107,6 +105,18 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
     snr = _ratio(models, weights)
     flags = _flags(stamps, found, weights > 0, (wild, hot, snr), width)
     return FrameFit(found, flags, snr, models, labels, *noise)
+
+
+def photon_noise(stamps, shape):
+    """Variance per unit of star light, as `fit_stars` takes it, by its first pass alone."""
+    return _first_pass(stamps, shape, moffat.quadrature(float(moffat.fwhm(shape))))[2][1]
+
+
+def _first_pass(stamps, shape, nodes):
+    """Stars fitted with the noise of the sky, models from that, and the noise of the pixels that they tell."""
+    found, _ = fit_once(stamps, shape, nodes)
+    models = stamps.models(found.params, nodes)
+    return found, models, pixel_noise(stamps, found, models, nodes)
 
 
 def _ratio(models, weights):
