@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 from hashlib import sha256
 
+import ao_images
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -20,6 +21,7 @@ from legdistort.inputs.exposures import Exposure
 from legdistort.measurement.effective import building, splines
 from legdistort.measurement.effective.model import EffectivePSF, Grid, Polynomial
 from legdistort.measurement.effective.own_error import own_covariance
+from legdistort.simulation import rendering
 
 SIZE, STEP, SAMPLES = 420, 0.25, 256
 #: Signal-to-noise ratios between the thirds.
@@ -222,6 +224,30 @@ def test_errors_grow_where_the_psf_is_wrong(made):
     bright = slice(0, 12)  # brightest first
     assert np.median(table["chi2"][bright]) > 3 * np.median(made["effective"]["chi2"][bright])
     assert np.median(table["x_err"][bright]) > 1.5 * np.median(made["effective"]["x_err"][bright])
+
+
+def test_what_all_bright_stars_leave_is_no_noise_of_theirs():
+    """Elongation that no quadratic PSF follows raises chi2 of bright stars, and moves none: errors are the bound.
+
+    What a single star leaves beyond that, by a companion that is not seen, is its own, and raises its errors.
+    """
+    frame = ao_images.frame("elongated", 0.6, 1)
+    bright = np.flatnonzero(frame.snr > 300)
+    bound = np.sqrt(np.einsum("naa->na", frame.covariance[bright]))
+
+    def measured(data):
+        table = ld.measure(Exposure("frame", data, gain=ao_images.GAIN, read_noise=ao_images.READ_NOISE))
+        assert set(table["psf"]) == {"effective"}
+        rows = ao_images.identify(positions(table), frame.xy, 2.0)[bright]
+        return np.asarray(table["chi2"])[rows], errors(table)[rows] / bound
+
+    chi2, stated = measured(frame.data)
+    assert np.median(chi2) > 1.6
+    assert np.median(stated) == pytest.approx(1.03, abs=0.06)
+    k = np.argmin(np.abs(frame.xy[bright] - len(frame.data) / 2).max(axis=1))  # near the axis, where the PSF fits best
+    one, psf = bright[[k]], ao_images.start("elongated", 0.6, 1, len(frame.data))[1]
+    companion = rendering.render(frame.data.shape, frame.xy[one] + [1.8, 1.2], frame.flux[one] / 10, psf=psf)
+    assert measured(frame.data + companion.astype(np.float32))[1][k].min() > 1.3 * stated[k].max()
 
 
 def test_neighbours_are_fitted_together():

@@ -69,7 +69,9 @@ def measure(
 
     Pixel variances are ``uncertainty**2`` if the exposure has that plane, else the observed variance of the sky
     (at least that of the read noise) plus ``star light / gain``. Where the fit leaves more than noise (reduced
-    chi2 above 1 by more than chance), errors are scaled up accordingly.
+    chi2 above 1 by more than chance), errors are scaled up accordingly; of positions measured with an effective PSF
+    made from the stars of the exposure, where it leaves more than of the other stars: what it leaves of all of them is
+    its own error, which the errors of positions have in them.
 
     Parameters
     ----------
@@ -439,6 +441,7 @@ class _Stars(NamedTuple):
     dof: np.ndarray
     snr: np.ndarray
     flags: np.ndarray
+    misfit: float = 0.0
 
 
 def _moffat_stars(fitted):
@@ -459,7 +462,7 @@ def _psf_stars(fitted, measured):
     width = moffat.fwhm(fitted.found.params)
     return _Stars(
         fit.params[:, :2], fit.covariance[:, :2, :2], fit.params[:, 2], flux_err, width, fit.chi2, fit.dof,
-        measured.snr, flags,
+        measured.snr, flags, measured.misfit,
     )  # fmt: skip
 
 
@@ -475,21 +478,26 @@ def _table(name, stamps, stars):
     flags, flux, width = stars.flags, stars.flux, stars.width
     dof = np.maximum(stars.dof, 1)
     chi2 = stars.chi2 / dof
-    # Three standard deviations of chi2 are allowed for, else chance alone would raise the errors of good fits.
-    scale = np.sqrt(np.maximum(1, chi2 - 3 * np.sqrt(2 / dof)))
+    # Near the detection limit the fit is no longer linear (measured at a ratio of 7: errors 8 to 15 % too small).
+    faint = 1 + 5 / np.maximum(stars.snr, 1) ** 2
+    # What all bright stars leave is the error of their PSF: the errors of positions have it, those of fluxes do not.
+    scale, flux_scale = (faint * _scale(c, dof) for c in (chi2 / (1 + (stars.misfit * stars.snr) ** 2 / dof), chi2))
     error = np.sqrt(np.einsum("nii->ni", stars.covariance))
     lost = ~(error < stamps.half).all(axis=1)
     corr = np.where(lost, 0.0, stars.covariance[:, 0, 1] / error.prod(axis=1))
-    # Near the detection limit the fit is no longer linear (measured at a ratio of 7: errors 8 to 15 % too small).
-    scale *= 1 + 5 / np.maximum(stars.snr, 1) ** 2
     error = np.where(lost[:, None], stamps.half, scale[:, None] * error)
     hot = (flags & Flag.HOT) != 0  # they stay on their pixel: a profile fitted to one pixel wanders off
     xy = stamps.centres + np.where(hot[:, None], 0.0, stars.xy)
     to_edge = np.minimum(xy + 0.5, np.array([nx, ny]) - 0.5 - xy).min(axis=1)
     flags = flags | np.where(lost, Flag.NOT_CONVERGED, 0) | np.where(to_edge < width, Flag.EDGE, 0)
-    columns = (xy[:, 0], xy[:, 1], error[:, 0], error[:, 1], corr, flux, scale * stars.flux_err, width, chi2)
+    columns = (xy[:, 0], xy[:, 1], error[:, 0], error[:, 1], corr, flux, flux_scale * stars.flux_err, width, chi2)
     named = {key: v * u.pix if key in _PIXELS else v for key, v in zip(_COLUMNS, columns, strict=True)}
     return QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})[np.argsort(-flux, kind="stable")]
+
+
+def _scale(chi2, dof):
+    """Factor on errors; three standard deviations of chi2 are chance, which must not raise those of good fits."""
+    return np.sqrt(np.maximum(1, chi2 - 3 * np.sqrt(2 / dof)))
 
 
 def _distinct(table, fwhm):

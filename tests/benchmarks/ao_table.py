@@ -4,7 +4,8 @@ For every PSF and third of brightness: rms deviation of positions from the truth
 PSF, rms of deviation / error, false stars, completeness, and the part that `match` would keep. Positions are compared
 after the common polynomial of the PSF's field order, which the bounds and errors go through as well. Frames and what
 every method found in them are kept in FOLDER; ``--redo`` measures again. ``--crowded`` makes the table of crowded
-fields instead: rms of deviation / error of isolated stars with no other near, by signal-to-noise ratio.
+fields instead: rms of deviation / error of isolated stars with no other near, by signal-to-noise ratio. ``--strength``
+multiplies elongation and coma; it takes a FOLDER of its own.
 """
 
 import argparse
@@ -170,10 +171,12 @@ if __name__ == "__main__":
     parser.add_argument("--psf", nargs="+", choices=CELLS, default=CELLS)
     parser.add_argument("--method", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--frames", type=int, default=10)
+    parser.add_argument("--strength", type=float, default=1.0)
     parser.add_argument("--crowded", action="store_true")
     parser.add_argument("--redo", action="store_true")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
+    ao.SHAPES = {kind: {name: given.strength * by for name, by in more.items()} for kind, more in ao.SHAPES.items()}
     warnings.simplefilter("ignore")  # of photutils: fits without convergence
     if given.crowded:
         print("rms / bound, [rms of deviation / error], stars; by signal-to-noise ratio: 10-30, 30-100, 100-300, above")

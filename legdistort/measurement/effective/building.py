@@ -91,6 +91,8 @@ class Built:
         Inverse variances of their prior.
     factor : tuple
         Cholesky factor of the inverse covariance of the amplitudes.
+    misfit : float
+        Part of their light by which the brighter stars deviate from the PSF beyond their noise.
     """
 
     base: np.ndarray
@@ -101,6 +103,7 @@ class Built:
     amplitudes: np.ndarray
     precision: np.ndarray
     factor: tuple
+    misfit: float = 0.0
 
     def for_stars(self, params):
         """The same with other stars: x, y, flux, background (n, 4)."""
@@ -211,10 +214,11 @@ def improved(before, stars, *, iterations=_ANEW):
             params = _moved(params, linear, longest)
     coefficients = corrections.grids(corrections.raw(amplitudes))
     coefficients[0] += base
-    known = {"n_stars": int(used.sum()), "residual": _mean_residual(stars, params, grids, spacing, used)}
+    linear = _linearise(stars, params, grids, spacing, 0.0)
+    known = {"n_stars": int(used.sum()), "residual": _mean_residual(linear, params, used)}
     halo = max(float(theilslopes(params[used, 3], params[used, 2]).slope), 0.0)
     psf = replace(before.psf, coefficients=coefficients, halo=halo, **known)
-    return Built(base, psf, params, used, corrections, amplitudes, precision, factor)
+    return Built(base, psf, params, used, corrections, amplitudes, precision, factor, _misfit(linear))
 
 
 def _evidence(precision, amplitudes, factor, degrees):
@@ -229,13 +233,12 @@ def _evidence(precision, amplitudes, factor, degrees):
     return out
 
 
-def _mean_residual(stars, params, grids, spacing, used):
+def _mean_residual(linear, params, used):
     """Weighted mean of what is left of the stars used, in parts of their light, on their pixels; a square array."""
-    linear = _linearise(stars, params, grids, spacing, 0.0)
     flux, weights = params[used, 2:3], linear.weights[used]
     weights = weights / (1 + weights * (_EVEN * linear.model[used]) ** 2)  # else the brightest star alone would show
     left = (weights * flux * linear.residual[used]).sum(axis=0) / np.maximum((weights * flux**2).sum(axis=0), 1e-300)
-    return left.reshape(2 * stars.half + 1, -1)
+    return left.reshape(round(np.sqrt(len(left))), -1)
 
 
 def settled(stars, start, psf, *, iterations=4):

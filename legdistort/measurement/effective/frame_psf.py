@@ -60,12 +60,15 @@ class Measured(NamedTuple):
     astray : ndarray of bool, shape (n,)
         Positions far from the detection.
     psf : `~legdistort.measurement.effective.model.EffectivePSF`
+    misfit : float
+        Part of their light by which bright stars deviate from a PSF of their own: its error, which is in their errors.
     """
 
     fit: Fit
     snr: np.ndarray
     astray: np.ndarray
     psf: object
+    misfit: float
 
 
 def measure_frame(stamps, fitted, shape, psf):
@@ -253,4 +256,5 @@ def measure_with(stamps, fitted, fit, psf, built=None):
         covariance[rows, :2, :2] += own_covariance(built, stars, params[rows], covariance[rows])
     params[:, :2] += psf.centre(stamps.centres + params[:, :2])
     astray = np.hypot(*params[:, :2].T) > 1 + psf.fwhm / 2
-    return Measured(Fit(params, covariance, fit.chi2, fit.dof, fit.converged), snr, astray, psf)
+    misfit = 0.0 if built is None else built.misfit
+    return Measured(Fit(params, covariance, fit.chi2, fit.dof, fit.converged), snr, astray, psf, misfit)
