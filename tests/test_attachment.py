@@ -549,7 +549,7 @@ def _foreign(path):
         (
             None,
             {"ext": "SCI"},
-            r"frame.fits: no exposure 'frame_SCI' in the solution; it has frame, other; frames are told by",
+            r"frame.fits: no exposure 'frame_SCI' in the solution; it has frame, other; frames are identified by",
         ),
         (os.unlink, {}, "frame.fits: no such file"),
         (None, {"kind": "tan"}, "kind must be one of"),

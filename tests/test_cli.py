@@ -466,11 +466,14 @@ def test_options_of_coadd_reach_it(demo, tmp_path, capsys, monkeypatch):
     failed(capsys, main(_coadd(demo, tmp_path / "m.fits")), "enough")
     own = {name: p.default for name, p in inspect.signature(coadd).parameters.items() if p.kind is p.KEYWORD_ONLY}
     assert own | given == own | {"method": "clipped"}
-    options = "--combine mean --order bicubic --algorithm drizzle --pixfrac 0.5 --kernel point --conserve "
+    failed(capsys, main(_coadd(demo, tmp_path / "m.fits", "--order", "bicubic")), "enough")
+    assert given["order"] == "bicubic"
+    given.clear()
+    options = "--combine mean --algorithm drizzle --pixfrac 0.5 --kernel point --conserve "
     options += "surface_brightness --no-match-background --weights equal --scale none --extrapolated mask --workers 2"
     failed(capsys, main(_coadd(demo, tmp_path / "m.fits", *options.split(), "--scratch", tmp_path)), "enough")
-    assert given == {
-        "method": "mean", "order": "bicubic", "algorithm": "drizzle", "pixfrac": 0.5, "kernel": "point", "grid": None,
+    assert own | given == own | {
+        "method": "mean", "algorithm": "drizzle", "pixfrac": 0.5, "kernel": "point", "grid": None,
         "conserve": "surface_brightness", "match_background": False, "weights": None, "scale": None,
         "extrapolated": "mask", "workers": 2, "scratch": tmp_path, "progress": False,
     }  # fmt: skip

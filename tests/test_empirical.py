@@ -428,7 +428,7 @@ def test_command_line_refuses_other_words(capsys):
     with pytest.raises(SystemExit) as stop:
         parser.main(["solve", "matched.ecsv", "--prior-sigma", "wide", "--out", "out"])
     assert stop.value.code == 2
-    assert "'wide' is neither a number nor 'evidence'" in capsys.readouterr().err
+    assert "wide is neither a number nor evidence" in capsys.readouterr().err
 
 
 # --- against fixed degrees ---------------------------------------------------------------------------------------

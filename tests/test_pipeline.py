@@ -72,7 +72,7 @@ def test_other_arguments_are_refused_before_a_frame_is_read(bad, words, tmp_path
         ("run --pixfrac 2 --algorithm drizzle", "coadding: pixfrac must"),
         ("run --degree 99", "degree must be"),
         ("run --min-exposures 1", "min_exposures must be"),
-        ("run --pixel-scale -1", "pixel_scale must be"),
+        ("run --pixel-scale -1", "--pixel-scale is for the catalogue of --reference"),
         ("run --workers 0", "workers must be"),
         ("measure --fwhm 0", "fwhm must lie between"),
         ("measure --workers 0", "workers must be"),
@@ -83,6 +83,7 @@ def test_other_arguments_are_refused_before_a_frame_is_read(bad, words, tmp_path
 )
 def test_the_command_line_refuses_options_before_a_frame_is_read(line, words, tmp_path, capsys):
     command, *more = line.split()
-    assert main([command, "a.fits", "--out", str(tmp_path / "out"), *more]) == 1
+    out = tmp_path / ("out" if command == "run" else "out.ecsv")
+    assert main([command, "a.fits", "--out", str(out), *more]) == 1
     assert f"legdistort: {words}" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

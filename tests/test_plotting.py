@@ -62,7 +62,7 @@ def make_solution(
         dof=1380,
         status="converged after 4 iterations",
         gauge=SimpleNamespace(sentence="minimal: by convention", warning="", motion=coefficients),
-        uncertainty=SimpleNamespace(coefficients=1e-4 * np.eye(coefficients.size), bends=None),
+        uncertainty=SimpleNamespace(coefficients=1e-4 * np.eye(coefficients.size), bends=None, camera=None),
         settings=Settings(degree),
         diagnostics=Diagnostics(),
         left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},

@@ -490,4 +490,4 @@ def test_command(tmp_path, capsys):
     assert "5 stars, fewer than the 10 modes" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main([*asked, "--n-stars", "30", "--spectrum", "much"])
-    assert "'much' is not of the form 3=0.9,4=0.1" in capsys.readouterr().err
+    assert "much is not of the form 3=0.9,4=0.1" in capsys.readouterr().err

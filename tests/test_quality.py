@@ -296,7 +296,7 @@ def test_zooms_are_drawn_in_one_stretch(stacks):
 
 
 def test_report_has_the_stacks(stacks, solution, monkeypatch):
-    monkeypatch.setattr(report, "_pictures", lambda *args: "")
+    monkeypatch.setattr(report, "_pictures", lambda *args: {"steps": None, "pairs": []})
     made, _ = stacks
     page = report.render(solution, stacks=made, summary={"quality": made.figures()[baselines.METHOD]})
     assert page.count("<h2>Stacks compared</h2>") == 1

@@ -44,9 +44,9 @@ def plot_steps(solution, *, scale=None, fig=None):
     steps["Every distortion solved"] = _by_star(solution, _at_epoch(solution, solution.correct)), elements.BLUE
     fig = elements.new_figure(fig, (3.6 * len(steps) + 0.2, 4.3))
     panels = list(fig.subplots(1, len(steps), sharex=True, sharey=True, squeeze=False)[0])
-    away = [positions - np.nanmean(positions, axis=0) for positions, _ in steps.values()]
-    means = [np.nanmean(positions, axis=0) for positions, _ in steps.values()]
-    field = np.ptp(means[0], axis=0).max()
+    means = [_mean_positions(positions) for positions, _ in steps.values()]
+    away = [positions - mean for (positions, _), mean in zip(steps.values(), means, strict=True)]
+    field = (np.nanmax(means[0], axis=0) - np.nanmin(means[0], axis=0)).max()
     scale = scale or elements.round_down(0.05 * field / (np.nanpercentile(np.hypot(*away[0].T), 90) or 1))
     for ax, title, mean, off, (_, colour) in zip(panels, steps, means, away, steps.values(), strict=True):
         _draw_arrows(ax, mean, off, scale, colour)
@@ -60,6 +60,12 @@ def plot_steps(solution, *, scale=None, fig=None):
     panels[-1].plot([1 - key * scale / _width(panels[-1]), 1], [1.01, 1.01], transform=panels[-1].transAxes,
                     color="black", linewidth=1.5, clip_on=False)  # fmt: skip
     return panels
+
+
+def _mean_positions(positions):
+    """Means (n_stars, 2) of positions (n_exposures, n_stars, 2), NaN for a star without any."""
+    number = np.isfinite(positions).sum(axis=0)
+    return np.where(number > 0, np.nansum(positions, axis=0) / np.maximum(number, 1), np.nan)
 
 
 def _width(ax):

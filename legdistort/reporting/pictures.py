@@ -154,7 +154,7 @@ class Gallery:
         """What changes from exposure to exposure."""
         panels = trend_plots.plot_trends(
             solution, pulls.time, pulls.time_label, dynamic=sizes(solution)[1], fig=_quick_figure(),
-            fwhm={name: size for name, (size, _) in ((quality or {}).get("exposures") or {}).items()},
+            fwhm={name: size for name, (size, *_) in ((quality or {}).get("exposures") or {}).items()},
         )  # fmt: skip
         return self.add(
             panels[0].figure,
