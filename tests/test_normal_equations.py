@@ -1,5 +1,6 @@
 """Normal equations and reduced system against dense matrices from a numerical Jacobian: no step of theirs in common."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,13 +10,17 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import null_space
 
+from legdistort.exceptions import AssumptionWarning
 from legdistort.geometry.detector_modes import similarity_basis
 from legdistort.priors.prior import Prior
+from legdistort.results.coefficient_covariance import exposure_blocks
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving import start_values
-from legdistort.solving.equations import criterion, elimination, reduced_system
+from legdistort.solving.equations import covariances, criterion, elimination, reduced_system
+from legdistort.solving.equations.covariances import Uncertainty
 from legdistort.solving.equations.problem import State, build_problem
 from legdistort.solving.equations.reduced_system import Direct, Iterative
+from legdistort.solving.equations.star_system import OnStars
 from legdistort.solving.equations.star_terms import StarTerms, symmetric_times, unpacked
 from legdistort.solving.gauge import constraints
 
@@ -202,7 +207,7 @@ def close(found, expected, tolerance=1e-6):
     assert_allclose(found, expected, rtol=0, atol=tolerance * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("way", [Direct, Iterative])
+@pytest.mark.parametrize("way", [Direct, Iterative, OnStars])
 def test_reduced_system_under_constraints(case, way):
     problem, state, blocks, _ = case
     gauge = constraints.make("minimal", problem, state, blocks)
@@ -228,12 +233,46 @@ def test_reduced_system_under_constraints(case, way):
     close(system.moves, moves, 1e-3)
     curvature = moves @ bordered.s @ moves.T
     close(system.information, curvature, 1e-3)
-    close(system.pull, moves @ rhs, 1e-6 if way is Direct else 0.05)
+    close(system.pull, moves @ rhs, 0.05 if way is Iterative else 1e-6)
+    if way is Iterative:
+        return
+    gradients = RNG.normal(size=(N, 2 * K, 3))
+    covariance = bordered.inverse[: bordered.n, : bordered.n]
+    close(system.respond(gradients), (covariance @ gradients.reshape(-1, 3)).reshape(gradients.shape))
     if way is Direct:
-        gradients = RNG.normal(size=(N, 2 * K, 3))
-        covariance = bordered.inverse[: bordered.n, : bordered.n]
-        close(system.respond(gradients), (covariance @ gradients.reshape(-1, 3)).reshape(gradients.shape))
         close(system.covariance(), covariance)
+    else:
+        close(system.covariance_blocks(), exposure_blocks(covariance, N))
+
+
+def test_errors_are_the_same_whichever_side_is_eliminated(case, monkeypatch):
+    """Exact without the covariance between exposures; as blocks with the stars taken as known, and it is measured."""
+    problem, state, blocks, _ = case
+    gauge = constraints.make("minimal", problem, state, blocks)
+    dense = Uncertainty(problem, blocks, gauge, scale=1.5)
+    monkeypatch.setattr(covariances, "DENSE_LIMIT", 10)
+    small = Uncertainty(problem, blocks, gauge, scale=1.5)
+    assert small.coefficients.shape == (N, 2 * K, 2 * K)
+    close(small.coefficients, exposure_blocks(dense.coefficients, N))
+    close(small.star_unknowns, dense.star_unknowns)
+    close(small.star_matrix, dense.star_matrix)
+    monkeypatch.setattr(reduced_system, "STAR_LIMIT", 10)
+    rough = Uncertainty(problem, blocks, gauge, scale=1.5)
+    with pytest.warns(AssumptionWarning, match=r"errors of 16 stars solved exactly are ([0-9.]+) times") as caught:
+        variance = rough.star_unknowns
+    told = float(re.search(r"are ([0-9.]+) times", str(caught[0].message))[1])
+    ratio = np.sqrt(dense.star_unknowns[:2] / variance[:2])[np.arange(M) % 2, np.arange(M)]
+    assert told == pytest.approx(np.median(ratio), rel=1e-3)
+    assert told > 1.02
+
+
+def test_singular_stars_are_left_to_the_other_ways(case):
+    """An exposure that its stars do not determine cannot be eliminated."""
+    problem, state, blocks, _ = case
+    gauge = constraints.make("minimal", problem, state, blocks)
+    flat = replace(blocks, u=np.where(np.arange(N)[:, None, None] == 2, 1.0, blocks.u))
+    with pytest.raises(np.linalg.LinAlgError):
+        OnStars(problem, flat, gauge)
 
 
 def test_conjugate_gradients_stop_where_they_are_told():

@@ -9,6 +9,7 @@ relative errors.
 import numpy as np
 
 from ..geometry import basis
+from .coefficient_covariance import exposure_block
 
 
 def plain_directions(gauge, xy, n):
@@ -119,9 +120,7 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
 
 def own_coefficients(gauge, uncertainty, i):
     """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i in the gauge, a camera taken as known."""
-    size = len(uncertainty.coefficients) // len(gauge.motion)
-    mine = slice(i * size, (i + 1) * size)
-    return uncertainty.coefficients[mine, mine]
+    return exposure_block(uncertainty.coefficients, len(gauge.motion), i)
 
 
 def relative_coefficients(gauge, uncertainty, i):

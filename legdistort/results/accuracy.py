@@ -10,6 +10,7 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity
+from .coefficient_covariance import exposure_blocks, times
 
 #: Numbers held at once while expected scatters are computed.
 _BLOCK = 2**24
@@ -330,7 +331,7 @@ def expected_scatter(solution, xy, sigma, *, seen=None, covariance=None):
         Error of one detector position, pixels per axis.
     seen : array_like of bool, shape (n_exposures, n), optional
         In which exposures a position is measured; by default those on whose detector it falls.
-    covariance : ndarray, shape (n_exposures * 2 n_modes,) squared, optional
+    covariance : ndarray, shape (n_exposures * 2 n_modes,) squared or (n_exposures, 2 n_modes, 2 n_modes), optional
         Of the errors of the coefficients, of this or a higher degree; by default that of the solution.
 
     Returns
@@ -341,7 +342,7 @@ def expected_scatter(solution, xy, sigma, *, seen=None, covariance=None):
     xy = np.asarray(xy, dtype=float)
     covariance = solution.uncertainty.coefficients if covariance is None else covariance
     sigma = np.broadcast_to(sigma, (len(solution.names), len(xy)))
-    step = max(1, _BLOCK // (2 * len(covariance)))
+    step = max(1, _BLOCK // (2 * len(covariance) * (1 if covariance.ndim == 2 else covariance.shape[1])))
     parts = [
         _expected_variance(
             solution, xy[part], sigma[:, part], None if seen is None else np.asarray(seen)[:, part], covariance
@@ -354,7 +355,8 @@ def expected_scatter(solution, xy, sigma, *, seen=None, covariance=None):
 def _expected_variance(solution, xy, sigma, seen, covariance):
     """Square of `expected_scatter` for as many positions as fit in memory."""
     n_exposures = len(solution.names)
-    size = len(covariance) // n_exposures
+    blocks = exposure_blocks(covariance, n_exposures)
+    size = blocks.shape[1]
     degree = basis.degree_of(size // 2)
     rows = np.zeros((n_exposures, len(xy), 2, size))
     own, noise, n = np.zeros(len(xy)), np.zeros(len(xy)), np.zeros(len(xy), dtype=int)
@@ -369,11 +371,11 @@ def _expected_variance(solution, xy, sigma, seen, covariance):
         back = np.linalg.inv(distortion.jacobian(q[on]) @ pose[:, :2])
         b = basis.values(degree, *basis.normalize(q[on], solution.shapes[name]))
         rows[i, on] = mine = np.einsum("kac,mk->kacm", back, b).reshape(len(b.T), 2, size)
-        own[on] += (mine @ covariance[i * size : (i + 1) * size, i * size : (i + 1) * size] * mine).sum(axis=(1, 2))
+        own[on] += (mine @ blocks[i] * mine).sum(axis=(1, 2))
         noise[on] += sigma[i, on] ** 2 * (back**2).sum(axis=(1, 2))
         n[on] += 1
     flat = rows.transpose(1, 2, 0, 3).reshape(2 * len(xy), -1)
-    together = ((flat @ covariance) * flat).sum(axis=1).reshape(-1, 2).sum(axis=1)
+    together = (times(covariance, flat.T).T * flat).sum(axis=1).reshape(-1, 2).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = (own + noise - (together + noise) / n) / (2 * n)
     return np.where(n > 1, np.maximum(variance, 0), np.nan)

@@ -238,7 +238,11 @@ def _check_consistent(solution):
     for what, array, shape in (
         ("positions", solution.positions, (n_stars, 2)),
         ("prior means", solution.prior_mean, solution.coefficients.shape),
-        ("covariance of the coefficients", solution.uncertainty.coefficients, (n * own, n * own)),
+        (
+            "covariance of the coefficients",
+            solution.uncertainty.coefficients,
+            (n, own, own) if np.ndim(solution.uncertainty.coefficients) == 3 else (n * own, n * own),
+        ),
         ("covariance of the stars", solution.uncertainty.stars, (3, n_stars)),
         ("directions", solution.uncertainty.directions, (n_stars, 2, modes)),
         (

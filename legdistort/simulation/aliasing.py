@@ -12,6 +12,7 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis
+from ..results.coefficient_covariance import times
 from ..solving.equations import criterion, elimination
 from ..solving.equations.covariances import Uncertainty
 from ..solving.equations.problem import State
@@ -136,7 +137,7 @@ def alias(problem, state, gauge, covariance, *, independent, common):
     normal = elimination.reduced_matrix(full, blocks)
     fitted = np.tile(np.arange(full.n_modes) < n_fit, 2 * n_exposures)
     left = np.zeros((len(normal), np.count_nonzero(~fitted)))  # of all modes, for unit amplitudes of those left out
-    left[fitted] = -covariance @ normal[np.ix_(fitted, ~fitted)]
+    left[fitted] = -times(covariance, normal[np.ix_(fitted, ~fitted)])
     left[~fitted] = np.eye(left.shape[1])
     independent, common = (basis.change_degree(a, degree)[:, n_fit:].ravel() for a in (independent, common))
     together = left.reshape(len(left), n_exposures, -1).sum(axis=1)

@@ -52,7 +52,7 @@ class Result:
         Factors on the weights from the loss (ones for a linear one).
     n_weak : int
         Unknowns of a distortion common to all exposures that these do not tell.
-    system : Direct or Iterative or None
+    system : Direct, OnStars, Iterative or None
         The reduced system there, if it was made with that gauge.
     """
 
@@ -64,7 +64,7 @@ class Result:
     n_iterations: int
     robust: np.ndarray
     n_weak: int = 0
-    system: reduced_system.Direct | reduced_system.Iterative | None = None
+    system: reduced_system.Reduced | None = None
 
 
 def loss_factors(squares, loss):

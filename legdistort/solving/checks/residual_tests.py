@@ -54,7 +54,7 @@ class Residuals:
     state : State
     blocks : Blocks
         At the solution.
-    system : `legdistort.solving.equations.reduced_system.Direct` or Iterative
+    system : `legdistort.solving.equations.reduced_system.Direct`, OnStars or Iterative
         In the gauge.
     dof : float
     """

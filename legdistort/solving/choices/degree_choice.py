@@ -10,6 +10,7 @@ from astropy import units as u
 
 from ...exceptions import InputError, LegdistortError
 from ...geometry import basis, similarity
+from ...results.coefficient_covariance import exposure_blocks
 from ...results.diagnostics import AliasedDegree, DegreeChoice
 from .held_out import corrected, only_rows
 
@@ -191,8 +192,8 @@ def folding(solution, degree, higher):
 
 def _covariances(solution, high):
     """Covariance (n_exposures, 2 n, 2 n) of some modes of every exposure, x before y."""
-    n, size = len(solution.names), 2 * basis.n_modes(solution.degree)
-    blocks = solution.uncertainty.coefficients.reshape(n, size, n, size)[np.arange(n), :, np.arange(n)]
+    blocks = exposure_blocks(solution.uncertainty.coefficients, len(solution.names))
+    size = 2 * basis.n_modes(solution.degree)
     rows = np.arange(size).reshape(2, -1)[:, high].ravel()
     return blocks[:, rows[:, None], rows]
 

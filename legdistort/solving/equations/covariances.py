@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.linalg import LinAlgError
 
 from ...exceptions import AssumptionWarning, warn
+from ...results.coefficient_covariance import times
 from ...results.gauge import UnknownDirection
 from . import criterion, elimination, reduced_system
 from .problem import State
+from .star_system import OnStars
 from .star_terms import packed, unpacked
 
 if TYPE_CHECKING:
@@ -18,6 +22,8 @@ if TYPE_CHECKING:
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
 DENSE_LIMIT = 8000
+#: Stars whose errors by approximated blocks are compared with exact ones.
+_N_CHECKED = 50
 
 
 class Uncertainty:
@@ -40,7 +46,7 @@ class Uncertainty:
         Covariance xx, yy, xy of star positions by errors that exposures share, beside that of independent ones, px^2.
     camera : `legdistort.results.camera_errors.CameraErrors`, optional
         What the errors of a camera do to stars and coefficients, at the stated errors.
-    system : `legdistort.solving.equations.reduced_system.Direct` or Iterative, optional
+    system : Direct, OnStars or Iterative, optional
         The reduced system of these, if it is there already.
     """
 
@@ -67,24 +73,75 @@ class Uncertainty:
         """Covariance of the fitted coefficients, shape (n_exposures * 2 n_modes,) squared, px^2; x modes first.
 
         A camera is taken as known.
+        Beyond `DENSE_LIMIT` one block an exposure, shape (n_exposures, 2 n_modes, 2 n_modes):
+        `legdistort.results.coefficient_covariance` reads both.
         """
         if self._given is not None:
             return self._given
         problem, blocks = self._problem, self._blocks
-        n = problem.n_exposures * 2 * problem.n_modes
-        if n <= DENSE_LIMIT:
+        if self._is_dense:
             direct = isinstance(self.system, reduced_system.Direct)
             system = self.system if direct else reduced_system.Direct(problem, blocks, self._gauge)
             return self._scale**2 * system.covariance()
+        if self._on_stars is not None:
+            return self._scale**2 * self._on_stars.covariance_blocks()
+        return self._scale**2 * self._approximated
+
+    @property
+    def _is_dense(self):
+        if self._given is not None:
+            return self._given.ndim == 2
+        return self._problem.n_exposures * 2 * self._problem.n_modes <= DENSE_LIMIT
+
+    @cached_property
+    def _on_stars(self):
+        """The equations with the coefficients eliminated, where that is less work; None elsewhere."""
+        problem, system = self._problem, self.__dict__.get("system")
+        if self._given is not None:
+            return None
+        if isinstance(system, OnStars):
+            return system
+        n = problem.n_exposures * 2 * problem.n_modes
+        less = problem.n_star * problem.n_stars <= n / 2 or not self._is_dense
+        if less and reduced_system.has_few_stars(problem):
+            with contextlib.suppress(LinAlgError):
+                return OnStars(problem, self._blocks, self._gauge)
+        return None
+
+    @cached_property
+    def _approximated(self):
+        """Covariance of the coefficients of every exposure as if the stars were known, and in words how good it is."""
+        problem, blocks = self._problem, self._blocks
+        n = problem.n_exposures * 2 * problem.n_modes
+        out = problem.unknowns.conditional_covariances(blocks.u)
+        ratio = self._checked(out)
         warn(
-            f"{n} coefficients: their covariance is approximated by one block an exposure (stars taken as known)",
+            f"{n} coefficients, {problem.n_stars} stars: the covariance of the coefficients is approximated by one "
+            f"block an exposure (stars taken as known); {ratio}",
             AssumptionWarning,
         )
-        size = 2 * problem.n_modes
-        out = np.zeros((problem.n_exposures, size, problem.n_exposures, size), dtype=np.float32)
-        index = np.arange(problem.n_exposures)
-        out[index, :, index, :] = self._scale**2 * np.linalg.inv(blocks.u)
-        return out.reshape(n, n)
+        return out
+
+    def _checked(self, covariance):
+        """Errors of `_N_CHECKED` stars with a covariance of the coefficients against exact ones, in words."""
+        problem, blocks = self._problem, self._blocks
+        if problem.unknowns.shared:
+            return "not checked where exposures share a distortion"
+        seen = np.flatnonzero(blocks.v[0] > 0)
+        stars = np.sort(np.random.default_rng(0).choice(seen, min(_N_CHECKED, len(seen)), replace=False))
+        n, system, exact = len(stars), reduced_system.Iterative(problem, blocks, self._gauge), np.empty(len(stars))
+        for k, star in enumerate(stars):
+            pull = np.zeros((problem.n_star, problem.n_stars))
+            pull[k % 2, star] = 1
+            exact[k] = system.settle(np.zeros_like(blocks.g_exposure), pull, accuracy=1e-3)[0][k % 2, star]
+        inverse, spread = self._spread(stars, 2)
+        rows = spread.reshape(2, n, -1)[np.arange(n) % 2, np.arange(n)]
+        known = inverse[np.arange(n), np.arange(n) % 2, np.arange(n) % 2] + (rows.T * times(covariance, rows.T)).sum(0)
+        ratio = np.sqrt(exact / known)
+        return (
+            f"errors of {n} stars solved exactly are {np.median(ratio):.4f} times those that follow from it "
+            f"({ratio.min():.4f} to {ratio.max():.4f})"
+        )
 
     @cached_property
     def stars(self) -> np.ndarray:
@@ -98,15 +155,18 @@ class Uncertainty:
         Shape (m, n_stars). NaN for what the observations of a star do not determine.
         """
         problem, blocks, n_star = self._problem, self._blocks, self._problem.n_star
-        inverse, roots = elimination.inverse_star_blocks(blocks.v), elimination.star_roots(blocks.v)
-        factors = elimination.star_factors(problem, blocks)
-        inner = np.concatenate([_block_diagonal(each, self.coefficients, n_star) for each in factors], axis=2)
-        spread = np.einsum("apj,pqj,bqj->abj", roots, inner / self._scale**2, roots, optimize=True)
-        index = packed(n_star)
-        out = inverse.copy()
+        inverse, index = elimination.inverse_star_blocks(blocks.v), packed(n_star)
+        out = np.empty_like(inverse)
+        if self._on_stars is not None:
+            whole = np.einsum("ajbj->abj", self._on_stars.star_covariance)
+        else:
+            roots, factors = elimination.star_roots(blocks.v), elimination.star_factors(problem, blocks)
+            inner = np.concatenate([_block_diagonal(each, self.coefficients, n_star) for each in factors], axis=2)
+            whole = np.einsum("apj,pqj,bqj->abj", roots, inner / self._scale**2, roots, optimize=True)
+            whole += unpacked(inverse).transpose(1, 2, 0)
         for a in range(n_star):
             for b in range(a + 1):
-                out[index[a, b]] += spread[b, a]
+                out[index[a, b]] = whole[b, a]
         out = self._scale**2 * out
         for row, diagonal in zip(index, np.diag(index), strict=True):
             lost = np.flatnonzero(inverse[diagonal] <= 0)
@@ -189,7 +249,7 @@ class Uncertainty:
         coefficients is approximated.
         """
         problem, blocks = self._problem, self._blocks
-        if self._gauge.to_convention is None or len(self.coefficients) > DENSE_LIMIT:
+        if self._gauge.to_convention is None or not self._is_dense:
             return None
         inverse, moved = elimination.inverse_star_blocks(blocks.v), []
         for errors in self._gauge.bend_errors(self.coefficients)[0].T:
@@ -227,6 +287,24 @@ class Uncertainty:
         size : int
             2 for the positions, 2 + k for all unknowns.
         """
+        n = len(stars)
+        shared = np.zeros((n, size, size))
+        shared[:, :2, :2] = unpacked(np.broadcast_to(self._shared, (3, self._problem.n_stars))[:, stars])
+        if self._on_stars is not None:
+            out = self._on_stars.star_covariance[:size, stars][:, :, :size, stars].reshape(size * n, -1)
+            out, own = self._scale**2 * out, shared
+        else:
+            inverse, spread = self._spread(stars, size)
+            out, own = spread @ times(self.coefficients, spread.T), self._scale**2 * inverse[:, :, :size] + shared
+        if self.camera is not None:
+            common = self.camera.stars[stars].transpose(1, 0, 2).reshape(2 * n, -1)
+            out[: 2 * n, : 2 * n] += common @ common.T
+        index = np.arange(size * n).reshape(size, n).T
+        out[index[:, :, None], index[:, None, :]] += own
+        return out
+
+    def _spread(self, stars, size):
+        """V^-1 (n, size, 2 + k) of stars (n,), and how coefficients move their first unknowns, (size * n, n_coeffs)."""
         problem, blocks, n = self._problem, self._blocks, len(stars)
         inverse = unpacked(elimination.inverse_star_blocks(blocks.v[:, stars]))[:, :size]
         where = np.full(problem.n_stars, -1)
@@ -239,19 +317,10 @@ class Uncertainty:
             pulled = problem.terms.pull(i, np.einsum("can,mn->camn", f, b))
             coupling[:, seen[on], i] = np.moveaxis(pulled, 3, 1).reshape(problem.n_star, b.shape[1], -1)
         coupling = coupling.reshape(problem.n_star, n, -1)
-        spread = np.concatenate([np.einsum("jb,bjk->jk", inverse[:, a], coupling) for a in range(size)])
-        out = spread @ self.coefficients @ spread.T
-        if self.camera is not None:
-            common = self.camera.stars[stars].transpose(1, 0, 2).reshape(2 * n, -1)
-            out[: 2 * n, : 2 * n] += common @ common.T
-        own = self._scale**2 * inverse[:, :, :size]
-        own[:, :2, :2] += unpacked(np.broadcast_to(self._shared, (3, problem.n_stars))[:, stars])
-        index = np.arange(size * n).reshape(size, n).T
-        out[index[:, :, None], index[:, None, :]] += own
-        return out
+        return inverse, np.concatenate([np.einsum("jb,bjk->jk", inverse[:, a], coupling) for a in range(size)])
 
 
 def _block_diagonal(factor, covariance, n_star):
     """Diagonal blocks (k, k, n_stars) of ``factor' C factor`` for factors (n, k n_stars)."""
-    product = (covariance @ factor).reshape(len(factor), n_star, -1)
+    product = times(covariance, factor).reshape(len(factor), n_star, -1)
     return np.einsum("naj,nbj->abj", factor.reshape(product.shape), product)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...geometry.detector_modes import dynamic_basis
+from ...results.coefficient_covariance import exposure_blocks
 from . import criterion
 
 
@@ -20,9 +21,8 @@ def done_by_prior(problem, uncertainty):
     """
     if not problem.has_prior:
         return np.zeros(problem.n_exposures)
-    n, size = problem.n_exposures, 2 * problem.n_modes
-    blocks = uncertainty.coefficients.reshape(n, size, n, size)
-    return np.array([np.sum(criterion.prior_precision(problem, i) * blocks[i, :, i]) for i in range(n)])
+    blocks = exposure_blocks(uncertainty.coefficients, problem.n_exposures)
+    return np.array([np.sum(criterion.prior_precision(problem, i) * block) for i, block in enumerate(blocks)])
 
 
 def effective_modes(problem, gauge, uncertainty):

@@ -275,7 +275,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         prior_mean=mean,
         prior_sigma=None if free.all() else sigma,
         static_sigma=_static_sigma(priors, degree),
-        mean_sigma=np.stack([_mean_sigma(p, degree) for p in priors]),
+        mean_sigma=_mean_sigma(priors, degree),
         own_degree=own_degree,
         group=_groups(matches),
     )
@@ -288,7 +288,8 @@ def _groups(matches):
     """Number of the detector of every exposure: by the column ``detector``, else by shape."""
     detector = _detectors(matches)
     keys = [(detector.get(name), tuple(matches.shapes[name])) for name in matches.names]
-    return np.array([sorted(set(keys), key=keys.index).index(key) for key in keys])
+    number = {key: k for k, key in enumerate(dict.fromkeys(keys))}
+    return np.array([number[key] for key in keys])
 
 
 def _detectors(matches):
@@ -324,8 +325,10 @@ def _static_sigma(priors, degree):
     return np.max(given, axis=0) if given else None
 
 
-def _mean_sigma(prior, degree):
-    return np.full((2, basis.n_modes(degree)), np.inf) if prior is None else prior.static_widths(degree)
+def _mean_sigma(priors, degree):
+    free = np.full((2, basis.n_modes(degree)), np.inf)
+    made = {id(p): free if p is None else p.static_widths(degree) for p in {id(p): p for p in priors}.values()}
+    return np.stack([made[id(p)] for p in priors])
 
 
 def _highest_degree(count):

@@ -1,10 +1,12 @@
 """The reduced system: stars eliminated, coefficients solved for under the constraints of the gauge.
 
 The reduced matrix ``S = U - E' V^-1 E`` is singular along maps common to all exposures, or nearly so; the
-constraints of the gauge, ``rows d = target``, fill in. Small systems are factorised (`Direct`), large ones solved by
-conjugate gradients that never form S (`Iterative`): the same answer.
+constraints of the gauge, ``rows d = target``, fill in. Small systems are factorised (`Direct`), or the coefficients
+eliminated instead where the stars are few (`legdistort.solving.equations.star_system`), large ones solved by conjugate
+gradients that never form S (`Iterative`): the same answer.
 """
 
+import contextlib
 import logging
 from functools import cached_property
 
@@ -13,18 +15,25 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from ...exceptions import SolveError
 from . import elimination
+from .reduced_base import Reduced
+from .star_system import OnStars
 
 log = logging.getLogger(__name__)
 
 #: Up to this many unknown coefficients the reduced matrix is factorised; beyond, conjugate gradients.
 DIRECT_LIMIT = 3000
+#: Up to this many unknowns of stars their own matrix is.
+STAR_LIMIT = 8000
 #: ... and while building it costs no more than this many multiplications.
 _DIRECT_COST = 4e9
 _WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not told
 
 
 def reduced_system(problem, blocks, gauge, weak=None):
-    """`Direct` or `Iterative`, by the size of the problem."""
+    """`Direct`, `OnStars` or `Iterative`, by the size of the problem."""
+    if has_few_stars(problem, _DIRECT_COST) and 2 * problem.n_star * problem.n_stars <= problem.unknowns.size:
+        with contextlib.suppress(LinAlgError):
+            return OnStars(problem, blocks, gauge)
     return Direct(problem, blocks, gauge, weak) if uses_direct(problem) else Iterative(problem, blocks, gauge)
 
 
@@ -34,65 +43,13 @@ def uses_direct(problem):
     return problem.unknowns.shared or (n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= _DIRECT_COST)
 
 
-class _Reduced:
-    """What both ways share.
-
-    Parameters
-    ----------
-    problem : Problem
-    blocks : Blocks
-    gauge : Gauge
-    """
-
-    n_weak = 0  # unknowns that the exposures share and that they do not tell
-
-    def __init__(self, problem, blocks, gauge):
-        self.problem, self.blocks, self.gauge = problem, blocks, gauge
-        self.unknowns = blocks.unknowns
-        self.rows = self._on_unknowns(gauge)
-        self.inverse = elimination.inverse_star_blocks(blocks.v)
-
-    def _on_unknowns(self, gauge):
-        """The constraints as rows on the unknowns; those of the gauge act on the modes up to its own degree."""
-        n, size = len(gauge.motion), self.problem.n_modes
-        rows = gauge.orthonormal.reshape(gauge.n_constraints, n, 2, -1)
-        rows = np.pad(rows, ((0, 0), (0, 0), (0, 0), (0, size - rows.shape[3]))).reshape(-1, n, 2 * size)
-        return self.problem.unknowns.gather(rows.transpose(1, 2, 0)).T
-
-    def _couple(self, d):
-        """E d, shape (2 + k, n_stars)."""
-        return elimination.to_stars(self.problem, self.blocks, self.unknowns.spread(d))
-
-    def _gradient(self, own, stars):
-        """``own - E' V^-1 stars``, shape (n,)."""
-        moved = elimination.symmetric_times(self.inverse, stars)
-        return self.unknowns.gather(own - elimination.to_exposures(self.problem, self.blocks, moved))
-
-    def _own(self, d):
-        """U d."""
-        return np.einsum("iab,ib->ia", self.blocks.u, self.unknowns.spread(d))
-
-    def _stars(self, stars):
-        """Star step V^-1 (g_star - E d)."""
-        return elimination.symmetric_times(self.inverse, stars)
-
-    @cached_property
-    def rhs(self):
-        """Right-hand side (n,) of the reduced system: the gradient where the stars follow the coefficients."""
-        return self._gradient(self.blocks.g_exposure, self.blocks.g_star)
-
-    def follow(self, d):
-        """How the stars (2 + k, n_stars) follow a change (n,) of the unknowns."""
-        return -self._stars(self._couple(d))
-
-    @property
-    def dof(self):
-        """Degrees of freedom under the gauge; widths of a prior not allowed for."""
-        n_free = elimination.star_freedom(self.problem, self.blocks)
-        return 2 * np.count_nonzero(self.problem.weight[0]) - n_free - self.unknowns.size + len(self.rows)
+def has_few_stars(problem, cost=np.inf):
+    """Whether `OnStars` serves a problem, at no more than some multiplications."""
+    n = problem.n_star * problem.n_stars
+    return not problem.unknowns.shared and n <= STAR_LIMIT and n * n * float(problem.unknowns.size) <= cost
 
 
-class Direct(_Reduced):
+class Direct(Reduced):
     """The reduced matrix S, factorised together with the constraints of the gauge.
 
     Parameters
@@ -238,7 +195,7 @@ def _singular_message(problem, s):
     )
 
 
-class Iterative(_Reduced):
+class Iterative(Reduced):
     """Matrix-free solution of the reduced system on the constraints, preconditioned by the exposure blocks.
 
     For problems in which exposures share nothing.
@@ -256,9 +213,9 @@ class Iterative(_Reduced):
     def _block_solve(self, r):
         return np.einsum("iab,ib->ia", self._block_inverses, r.reshape(self.blocks.g_exposure.shape)).ravel()
 
-    def settle(self, own, stars):
-        """As for `Direct`."""
-        stars, d = self._solve(own, stars, self.rows, np.zeros(len(self.rows)), 1e-8)
+    def settle(self, own, stars, accuracy=1e-8):
+        """As for `Direct`, to an accuracy relative to the size of the step."""
+        stars, d = self._solve(own, stars, self.rows, np.zeros(len(self.rows)), accuracy)
         return stars, self.unknowns.spread(d)
 
     def respond(self, gradients):
