@@ -24,8 +24,10 @@ def _set(**settings):
     return sim, Prior(np.pad(sim.truth.static, ((0, 0), (0, 5))) + 0.01)
 
 
+@pytest.mark.parametrize("threads_from", [0, 30_000])
 @pytest.mark.parametrize("settings", [{"sigma": 0.05}, {"sigma": RNG.uniform(0.02, 0.2, (9, 120, 2)), "corr": 0.4}])
-def test_compiled_sums_are_the_plain_ones(monkeypatch, settings):
+def test_compiled_sums_are_the_plain_ones(monkeypatch, settings, threads_from):
+    monkeypatch.setattr("legdistort.solving.equations.compiled.THREADS_FROM", threads_from)
     sim, prior = _set(**settings)
     problem = build_problem(sim.matches, 3, prior=prior)
     state, _ = start_values.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))

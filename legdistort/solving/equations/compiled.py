@@ -7,14 +7,38 @@ its own, so results do not depend on timing. The coupling is kept in single prec
 gradient, which decides where the minimum is, stays in double.
 """
 
+from types import FunctionType
+
 import numpy as np
 from numba import get_num_threads, prange
 
 from ...geometry import basis
 from ...runtime.optional import compiled_loop
 
+#: Number of observations from which they are shared out among threads.
+THREADS_FROM = 30_000
 _BATCH = 64
 _FAST = {"contract", "reassoc", "nsz"}  # sums may be reordered; NaN and infinity keep their meaning
+
+
+def _shared_out(function):
+    """Decorator: compiled with its loop over chunks of exposures shared out among threads, and, as `alone`, in one.
+
+    Few observations are done before threads have met, above all on a machine with other work.
+    """
+    alone = FunctionType(function.__code__, function.__globals__, f"{function.__name__}_alone")
+    alone.__module__ = function.__module__  # what is compiled is kept by module and name
+    threaded, alone = compiled_loop(parallel=True, fastmath=_FAST)(function), compiled_loop(fastmath=_FAST)(alone)
+
+    def call(problem, *arguments):
+        return (threaded if _n_chunks(problem) > 1 else alone)(*arguments)
+
+    return call
+
+
+def _n_chunks(problem):
+    """Parts that the exposures are shared out in: one for each thread, if there are so many observations."""
+    return get_num_threads() if problem.xy.shape[1] >= THREADS_FROM else 1
 
 
 @compiled_loop(nogil=True, fastmath=_FAST)
@@ -110,7 +134,7 @@ def _terms(row, n_block, phi, f, j, r):
         place += 3 + t
 
 
-@compiled_loop(parallel=True, fastmath=_FAST)
+@_shared_out
 def _linearise(n_chunks, start, star, xy, weight, unequal, moving, coefficients, poses, sizes, orders, n_modes):
     n_exposures, n, n_all, n_terms = len(start) - 1, len(star), orders.shape[1], moving[1].shape[2]
     (stars, columns), residual = moving, np.empty((2, n))
@@ -174,7 +198,7 @@ def _linearise(n_chunks, start, star, xy, weight, unequal, moving, coefficients,
     return values, coupling, residual, sums, u_blocks, gradient, chi2.sum()
 
 
-@compiled_loop(parallel=True, fastmath=_FAST)
+@_shared_out
 def _to_stars(n_chunks, start, star, values, coupling, columns, a, n_stars):
     n_terms = columns.shape[2]
     sums = np.zeros((n_chunks, n_stars, 2 + n_terms))
@@ -201,7 +225,7 @@ def _to_stars(n_chunks, start, star, values, coupling, columns, a, n_stars):
     return sums
 
 
-@compiled_loop(parallel=True, fastmath=_FAST)
+@_shared_out
 def _to_exposures(n_chunks, start, star, values, coupling, columns, stars):
     n_modes, n_terms = len(values), columns.shape[2]
     out = np.zeros((len(start) - 1, 2, n_modes))
@@ -229,7 +253,7 @@ def _to_exposures(n_chunks, start, star, values, coupling, columns, stars):
     return out
 
 
-@compiled_loop(parallel=True, fastmath=_FAST)
+@_shared_out
 def _distances(start, star, q, poses, positions):
     out = np.empty(q.shape[1])
     for i in prange(len(start) - 1):
@@ -242,7 +266,7 @@ def _distances(start, star, q, poses, positions):
     return out
 
 
-@compiled_loop(parallel=True, fastmath=_FAST)
+@_shared_out
 def _moments(start, star, q, weight, positions):
     """Per exposure: means of source and target, cross moments xx, xy, yx, yy (target, source), power of the source."""
     out = np.zeros((len(start) - 1, 9))
@@ -272,7 +296,8 @@ def linearise(problem, state):
     """Twin of the sums in `legdistort.solving.equations.criterion.linearise`; the same arrays, and chi2."""
     orders = np.stack(basis.orders(basis.degree_of(state.coefficients.shape[2])))
     values, coupling, residual, sums, parts, gradient, chi2 = _linearise(
-        get_num_threads(),
+        problem,
+        _n_chunks(problem),
         problem.start,
         problem.star,
         problem.xy,
@@ -296,20 +321,20 @@ def linearise(problem, state):
 def to_stars(problem, blocks, a):
     """Twin of `legdistort.solving.equations.elimination.to_stars`."""
     terms = blocks.values, blocks.coupling, problem.terms.columns
-    sums = _to_stars(get_num_threads(), problem.start, problem.star, *terms, a, problem.n_stars)
+    sums = _to_stars(problem, _n_chunks(problem), problem.start, problem.star, *terms, a, problem.n_stars)
     return sums.sum(axis=0).T.copy()
 
 
 def to_exposures(problem, blocks, y):
     """Twin of `legdistort.solving.equations.elimination.to_exposures`."""
     terms = blocks.values, blocks.coupling, problem.terms.columns
-    out = _to_exposures(get_num_threads(), problem.start, problem.star, *terms, np.ascontiguousarray(y))
+    out = _to_exposures(problem, _n_chunks(problem), problem.start, problem.star, *terms, np.ascontiguousarray(y))
     return out.reshape(len(out), -1)
 
 
 def distances(problem, pose_list, q, positions):
     """Twin of `legdistort.solving.start_values.distances`."""
-    return _distances(problem.start, problem.star, q, pose_list, np.ascontiguousarray(positions))
+    return _distances(problem, problem.start, problem.star, q, pose_list, np.ascontiguousarray(positions))
 
 
 def moments(problem, q, weight, positions):
@@ -321,6 +346,6 @@ def moments(problem, q, weight, positions):
     cross : ndarray, shape (n_exposures, 2, 2)
         See `legdistort.geometry.similarity.similarity_of`; NaN where the stars lie at one place.
     """
-    out = _moments(problem.start, problem.star, q, weight, np.ascontiguousarray(positions))
+    out = _moments(problem, problem.start, problem.star, q, weight, np.ascontiguousarray(positions))
     with np.errstate(divide="ignore", invalid="ignore"):
         return out[:, :2], out[:, 2:4], (out[:, 4:8] / out[:, 8:]).reshape(-1, 2, 2)
