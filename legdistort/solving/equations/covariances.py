@@ -65,6 +65,7 @@ class Uncertainty:
         self._problem, self._blocks, self._gauge, self._scale = problem, blocks, gauge, scale
         self._given, self._shared = coefficients, 0.0 if shared_errors is None else shared_errors
         self.camera = None if camera is None else camera.scaled(scale)
+        self._made = system
         if system is not None:
             self.system = system
 
@@ -96,7 +97,7 @@ class Uncertainty:
     @cached_property
     def _on_stars(self):
         """The equations with the coefficients eliminated, where that is less work; None elsewhere."""
-        problem, system = self._problem, self.__dict__.get("system")
+        problem, system = self._problem, self._made
         if self._given is not None:
             return None
         if isinstance(system, OnStars):
