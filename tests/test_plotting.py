@@ -12,13 +12,13 @@ from matplotlib.container import BarContainer
 from matplotlib.quiver import Quiver, QuiverKey
 from scipy import stats
 
+from legdistort.assessment.pulls import pulls_of
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
 from legdistort.plots import elements, residual_plots, solution_plots, stack_plots
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.results.diagnostics import Diagnostics
-from legdistort.results.pulls import pulls_of
 from legdistort.results.settings import Settings
 from legdistort.results.solution import Solution
 from legdistort.simulation.observations import simulate_matches

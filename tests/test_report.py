@@ -15,13 +15,13 @@ from matplotlib import pyplot, style
 from PIL import Image
 from test_plotting import make_mosaic, make_solution
 
+from legdistort.assessment.pulls import pulls_of
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
 from legdistort.inputs.exposures import Exposure, observed
 from legdistort.reporting import page as report
 from legdistort.reporting.pictures import Picture
 from legdistort.reporting.svg import STYLE, detached_figure, svg_of
-from legdistort.results.pulls import pulls_of
 from legdistort.simulation import observations
 from legdistort.solving.estimation import solve
 

@@ -197,8 +197,8 @@ def plot_pulls(pulls, *, against="brightness", ax=None):
 
     Parameters
     ----------
-    pulls : `~legdistort.results.pulls.Pulls`
-        See `legdistort.results.pulls.pulls_of`.
+    pulls : `~legdistort.assessment.pulls.Pulls`
+        See `legdistort.assessment.pulls.pulls_of`.
     against : {"brightness", "time"}
         One mark a star, or one an exposure.
     ax : `~matplotlib.axes.Axes`, optional

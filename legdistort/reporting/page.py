@@ -5,7 +5,7 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
-from ..results.pulls import pulls_of
+from ..assessment.pulls import pulls_of
 from ..runtime.outputs import replacing
 from .checks_table import verdict
 from .comparison import compared_corrections, compared_stacks

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from markupsafe import Markup
 
+from ..assessment.pulls import exposure_rms
 from ..exceptions import FoldError, LegdistortError
 from ..plots import motion_plots, psf_plots, residual_plots, solution_plots, stack_plots, trend_plots
-from ..results.pulls import exposure_rms
 from .svg import detached_figure, svg_of
 from .tables import sizes
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..assessment.pulls import exposure_rms
 from ..geometry import similarity
-from ..results.pulls import exposure_rms
 
 #: An exposure whose residuals exceed the median by this factor is marked.
 _MARK = 2.0

@@ -327,8 +327,8 @@ def _static_sigma(priors, degree):
 
 def _mean_sigma(priors, degree):
     free = np.full((2, basis.n_modes(degree)), np.inf)
-    made = {id(p): free if p is None else p.static_widths(degree) for p in {id(p): p for p in priors}.values()}
-    return np.stack([made[id(p)] for p in priors])
+    made = {p: free if p is None else p.static_widths(degree) for p in dict.fromkeys(priors)}
+    return np.stack([made[p] for p in priors])
 
 
 def _highest_degree(count):
