@@ -24,6 +24,8 @@ from .star_terms import packed, unpacked
 _BLOCK = 2**23
 #: Reciprocal condition below which K, and least pivot below which a block of U, counts as singular.
 _SINGULAR, _LEAST_PIVOT = 1e-14, 1e-4
+#: Part of the information on a star, left when exposures with hardly more stars than modes are free, that is rounding.
+_LOST = 1e-8
 
 
 class OnStars(Reduced):
@@ -35,7 +37,8 @@ class OnStars(Reduced):
     Raises
     ------
     LinAlgError
-        If the stars of an exposure do not determine its coefficients, or the gauge and the data not those of all.
+        If the stars of an exposure do not determine its coefficients, nothing is left of the information on a star, or
+        the gauge and the data do not determine all.
     """
 
     def __init__(self, problem, blocks, gauge):
@@ -51,9 +54,13 @@ class OnStars(Reduced):
         self._roots = unit[:, :, None] * np.linalg.inv(lower).mT  # U^-1 = root root'
         self._determined = self.inverse[np.diag(packed(problem.n_star))] > 0
         matrix = self._of_stars()
+        before = np.diag(matrix).copy()
         for _, factor in self._factors():
             matrix -= factor @ factor.T
-        self._unit = 1 / np.sqrt(np.abs(np.diag(matrix)))
+        left = np.abs(np.diag(matrix))
+        if not (left > _LOST * before).all():
+            raise LinAlgError
+        self._unit = 1 / np.sqrt(left)
         matrix *= self._unit[:, None]
         matrix *= self._unit
         size = np.abs(matrix).sum(axis=0).max()
