@@ -103,8 +103,8 @@ class Uncertainty:
         if isinstance(system, OnStars):
             return system
         n = problem.n_exposures * 2 * problem.n_modes
-        less = problem.n_star * problem.n_stars <= n / 2 or not self._is_dense
-        if less and reduced_system.has_few_stars(problem):
+        few = n > reduced_system.DIRECT_LIMIT and problem.n_star * problem.n_stars <= n / 2
+        if (few or not self._is_dense) and reduced_system.has_few_stars(problem):
             with contextlib.suppress(LinAlgError):
                 return OnStars(problem, self._blocks, self._gauge)
         return None

@@ -26,40 +26,24 @@ DIRECT_LIMIT = 3000
 STAR_LIMIT = 8000
 #: ... and while building it costs no more than this many multiplications.
 _DIRECT_COST = 4e9
-#: Up to this many where compiled loops make the steps of conjugate gradients cheap.
-_FAST_DIRECT_LIMIT = 150
 _LEAST_PIVOT = 1e-7  # of the normalised equations, below which they count as singular
 _WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not told
 
 
 def reduced_system(problem, blocks, gauge, weak=None):
     """`Direct`, `OnStars` or `Iterative`, by the size of the problem."""
-    if has_few_stars(problem, _DIRECT_COST) and 2 * problem.n_star * problem.n_stars <= problem.unknowns.size:
+    large = problem.unknowns.size > DIRECT_LIMIT
+    if large and has_few_stars(problem, _DIRECT_COST) and 2 * problem.n_star * problem.n_stars <= problem.unknowns.size:
         with contextlib.suppress(LinAlgError):
             return OnStars(problem, blocks, gauge)
-    small = problem.unknowns.size <= DIRECT_LIMIT
-    if uses_direct(problem) or (small and _is_singular(blocks.u)):  # which says whose stars are to blame
+    if uses_direct(problem):
         return Direct(problem, blocks, gauge, weak)
     return Iterative(problem, blocks, gauge)
-
-
-def _is_singular(blocks):
-    """Whether some block of an exposure (n, k, k) is singular, as where its stars lie on a line."""
-    unit = np.sqrt(np.einsum("iaa->ia", blocks))
-    if not unit.min() > 0:
-        return True
-    try:
-        lower = np.linalg.cholesky(blocks / unit[:, :, None] / unit[:, None, :])
-    except LinAlgError:
-        return True
-    return bool(np.einsum("iaa->ia", lower).min() < _LEAST_PIVOT)
 
 
 def uses_direct(problem):
     """Whether the reduced system is small enough to be factorised; it always is where exposures share modes."""
     n = problem.unknowns.size
-    if problem.uses_compiled_loops and not problem.unknowns.shared and n > _FAST_DIRECT_LIMIT:
-        return False
     return problem.unknowns.shared or (n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= _DIRECT_COST)
 
 
