@@ -17,6 +17,7 @@ from legdistort.assessment.stack_quality import Quality
 from legdistort.cli import main
 from legdistort.reporting.page import render
 from legdistort.results.check import Check, in_lines, worst
+from legdistort.simulation.pupil import PupilPSF
 from legdistort.solving.checks.residual_tests import Residuals
 from legdistort.solving.equations.reduced_system import Direct
 
@@ -445,15 +446,15 @@ def test_frames_that_differ_by_chance_are_alike():
 
 @pytest.mark.slow
 def test_a_trailed_frame_is_seen_in_a_run(tmp_path):
-    night = ld.simulate_exposures(small=True, seed=2)
+    night = ld.simulate_exposures(small=True, seed=2, n_exposures=9, psf=PupilPSF(strehl=0.3, elongation=0.5))
     paths = night.write(tmp_path / "night")
     with fits.open(paths[2]) as hdulist:
         pixels, header = hdulist[0].data.astype(float), hdulist[0].header
-        steps = np.linspace(-2.25, 2.25, 9)  # one FWHM along x
+        steps = np.linspace(-1.4, 1.4, 9)  # one FWHM along x
         trailed = np.mean([ndimage.shift(pixels, (0, step), order=1, mode="nearest") for step in steps], axis=0)
         trailed = np.rint(trailed + np.random.default_rng(0).normal(0, 4, trailed.shape))
-        fits.writeto(paths[2], trailed.astype(np.uint16), header, overwrite=True)
-    result = ld.run(paths, out=tmp_path / "out", degree=3)
+        fits.writeto(paths[2], np.clip(trailed, 0, 65535).astype(np.uint16), header, overwrite=True)
+    result = ld.run(paths, out=tmp_path / "out", degree=3, psf="moffat")
     found = {check.name: check for check in result.checks}
     assert found["images"].state == "warn"
     assert "exp02" in found["images"].sentence

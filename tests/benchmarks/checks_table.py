@@ -180,11 +180,11 @@ def trailed(psf, seed):
     return night
 
 
-def checks_of_run(night):
+def checks_of_run(night, **options):
     """The checks of a run on simulated frames."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return ld.run(night.write(Path(folder) / "night"), out=Path(folder) / "out", degree=3).checks
+        return ld.run(night.write(Path(folder) / "night"), out=Path(folder) / "out", degree=3, **options).checks
 
 
 def power(n_sets, faults):
@@ -193,7 +193,7 @@ def power(n_sets, faults):
         seen, expected = Counter(), FAULTS[kind]
         for seed in range(n_sets):
             if kind in TRAILED:
-                checks = checks_of_run(trailed(TRAILED[kind], seed))
+                checks = checks_of_run(trailed(TRAILED[kind], seed), psf="moffat")  # of shapes, not positions
             else:
                 checks = solved(spoiled(kind, seed), clip=5).checks
             bad = {check.name for check in checks if check.state in ("warn", "fail")}
