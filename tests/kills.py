@@ -34,8 +34,7 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 import fcntl
 
 from legdistort.cli.parser import main
-from legdistort.runtime import locks, outputs
-from legdistort.wcs import attachment
+from legdistort.runtime import locks, outputs, provenance
 
 #: What changes from call to call, the time aside: the word of a run and the seconds it took.
 VARYING = {"summary.json", "report.html"}
@@ -424,7 +423,7 @@ def cases(folder, only=None):
 
 def kill(n_kills, folder, only=None):
     """Rows of the table, and the faults."""
-    attachment._now = lambda: "2026-01-01T00:00:00"
+    provenance.now = lambda: "2026-01-01T00:00:00"
     rows, faults = [], []
     everything = list(cases(Path(folder), only))
     for i, case in enumerate(everything):

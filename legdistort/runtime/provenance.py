@@ -18,10 +18,12 @@ PACKAGES = ("legdistort", "astropy", "gwcs", "asdf", "numpy", "scipy")
 
 def stamp():
     """Versions and time, as plain strings: ``created``, ``versions``."""
-    return {
-        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "versions": dict(_versions()),
-    }
+    return {"created": f"{now()}+00:00", "versions": dict(_versions())}
+
+
+def now():
+    """The time, UTC, to the second, as FITS headers have it: ``2026-01-31T23:59:59``."""
+    return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%S")
 
 
 @cache

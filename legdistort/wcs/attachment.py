@@ -1,6 +1,5 @@
 """A solution goes into the frames it was made from: distortion in their headers, and the exact gwcs as a table."""
 
-import datetime
 import io
 import logging
 import re
@@ -18,6 +17,7 @@ from tqdm import tqdm
 
 from ..exceptions import ExportError, InputError
 from ..inputs import exposure_files, exposure_names
+from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, readable, splice
 from ..runtime.outputs import replacing, replacing_folders
@@ -212,12 +212,8 @@ def _header(solution, name, kind, max_error):
         raise type(error)(f"{error}; kind=None (--asdf-only) attaches the exact WCS alone") from None
     if solution.checksum is not None:
         header["SOLSHA"] = solution.checksum  # no room for a comment
-    header["HISTORY"] = f"{_HISTORY.format(version('legdistort'))}, {_now()[:10]}"
+    header["HISTORY"] = f"{_HISTORY.format(version('legdistort'))}, {provenance.now()[:10]}"
     return header
-
-
-def _now():
-    return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%S")
 
 
 def _number(hdulist, hdu):
@@ -307,7 +303,8 @@ def _asdf_hdu(solution, name, number):
     header = hdu.header
     header["EXPNAME"] = exposure_names.in_header(name)
     header["CREATOR"] = f"legdistort {version('legdistort')}"
-    header["DATE"] = (_now(), "UTC, when this extension was made")
+    now = provenance.now()
+    header["DATE"] = (now, "UTC, when this extension was made")
     if solution.checksum is not None:
         header["SOLSHA"] = solution.checksum  # no room for a comment
     made = tree["meta"]["provenance"]
@@ -315,5 +312,6 @@ def _asdf_hdu(solution, name, number):
     made_by = f"The solution was made {made['created']} with {packages}. SOLSHA, if known, is the SHA-256 of its file."
     for line in textwrap.wrap(made_by, 72):
         header["HISTORY"] = line
-    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(file, checksum=True)
+    hdu.add_checksum(when=f"updated {now}")
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(file)
     return file.getvalue()[BLOCK:]
