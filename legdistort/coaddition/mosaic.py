@@ -27,6 +27,8 @@ from .combination import PixelFlag
 
 if TYPE_CHECKING:
     from astropy.io.fits import HDUList
+    from matplotlib.axes import Axes
+    from numpy.typing import ArrayLike
 
     from ..runtime.annotations import StrPath
 
@@ -144,7 +146,7 @@ class Mosaic(ShownAsPrinted):
         left_out = f", {len(self.left_out)} left out" if self.left_out else ""
         return f"<Mosaic: {nx} x {ny} px, {len(self.exposures)} exposures{left_out}>"
 
-    def plot(self, *, stars=None, ax=None):
+    def plot(self, *, stars: ArrayLike | None = None, ax: Axes | None = None) -> Axes:
         """The image less its smooth sky, see `legdistort.plots.stack_plots.plot_mosaic`.
 
         Parameters

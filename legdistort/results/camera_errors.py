@@ -5,11 +5,17 @@ responses to independent errors of unit size: covariances are sums over these, a
 them. A common map of the plane is taken off, as relative errors have it.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..geometry import basis, similarity
+
+if TYPE_CHECKING:
+    from ..cameras.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,22 +42,22 @@ class CameraErrors:
     coefficients: np.ndarray
     unknown: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 0)))
 
-    def scaled(self, factor):
+    def scaled(self, factor: float) -> CameraErrors:
         """The same with all errors times a factor."""
         parts = (factor * part for part in (self.changes, self.stars, self.coefficients))
         return CameraErrors(self.free, *parts, self.unknown)
 
     @property
-    def of_stars(self):
+    def of_stars(self) -> np.ndarray:
         """Covariance xx, yy, xy (3, n_stars) of the positions, px^2."""
         x, y = self.stars[:, 0], self.stars[:, 1]
         return np.stack([np.sum(x * x, axis=1), np.sum(y * y, axis=1), np.sum(x * y, axis=1)])
 
-    def of_coefficients(self, i):
+    def of_coefficients(self, i: int) -> np.ndarray:
         """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i, px^2."""
         return self.coefficients[i] @ self.coefficients[i].T
 
-    def lost(self, camera, f, detector=None):
+    def lost(self, camera: Camera, f: np.ndarray, detector: str | None = None) -> np.ndarray:
         """Which positions f (n, 2) of the focal plane are on a detector whose place nothing determines, bool (n,)."""
         out = np.zeros(len(f), dtype=bool)
         for key, chip in camera.detectors.items():
@@ -59,7 +65,7 @@ class CameraErrors:
                 out |= chip.sees(f) if detector is None else key == detector
         return out
 
-    def in_focal_plane(self, camera, f, detector=None):
+    def in_focal_plane(self, camera: Camera, f: np.ndarray, detector: str | None = None) -> np.ndarray:
         """Responses (n, 2, r) of positions measured at f (n, 2) in the focal plane, pixels.
 
         Parameters

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from astropy.modeling import Model
     from astropy.table import Table
     from gwcs import WCS as GWCS
+    from matplotlib.axes import Axes
     from numpy.typing import ArrayLike
 
     from ..cameras.camera import Camera
@@ -607,7 +608,7 @@ class Solution(ShownAsPrinted):
 
     # -- pictures
 
-    def plot(self, *, ax=None):
+    def plot(self, *, ax: Axes | None = None) -> Axes:
         """Map of the mean residuals of all exposures, see `legdistort.plots.residual_plots.plot_mean_residuals`.
 
         Parameters
@@ -621,7 +622,7 @@ class Solution(ShownAsPrinted):
         """
         return residual_plots.plot_mean_residuals(self, ax=ax)
 
-    def plot_residuals(self, name=None, *, ax=None):
+    def plot_residuals(self, name: str | None = None, *, ax: Axes | None = None) -> Axes:
         """Arrows of the residuals of an exposure, or of all, see `legdistort.plots.solution_plots.plot_residuals`.
 
         Parameters
@@ -642,7 +643,7 @@ class Solution(ShownAsPrinted):
         """
         return solution_plots.plot_residuals(self, name, ax=ax)
 
-    def plot_error_map(self, name, *, absolute=False, ax=None):
+    def plot_error_map(self, name: str, *, absolute: bool = False, ax: Axes | None = None) -> Axes:
         """Map of the error of the correction over an exposure, see `sigma_map`.
 
         Parameters

@@ -18,6 +18,7 @@ from .star_system import OnStars
 from .star_terms import packed, unpacked
 
 if TYPE_CHECKING:
+    from ...results.camera_errors import CameraErrors
     from ...results.gauge import Gauge
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
@@ -59,12 +60,12 @@ class Uncertainty:
         scale: float = 1.0,
         coefficients: Any = None,
         shared_errors: Any = None,
-        camera: Any = None,
+        camera: CameraErrors | None = None,
         system: Any = None,
     ) -> None:
         self._problem, self._blocks, self._gauge, self._scale = problem, blocks, gauge, scale
         self._given, self._shared = coefficients, 0.0 if shared_errors is None else shared_errors
-        self.camera = None if camera is None else camera.scaled(scale)
+        self.camera: CameraErrors | None = None if camera is None else camera.scaled(scale)
         self._made = system
         if system is not None:
             self.system = system
