@@ -160,3 +160,7 @@ def test_errors_that_are_scaled(night, solution):
     assert np.allclose(scaled.stars["x_err"], factor * solution.stars["x_err"], rtol=1e-3)
     assert np.allclose(scaled.coefficient_errors("frame01", relative=True),
                        factor * solution.coefficient_errors("frame01", relative=True), rtol=1e-3)  # fmt: skip
+    for key, detector in solution.camera.detectors.items():
+        again = scaled.camera[key]
+        assert np.allclose(again.layout_sigma, factor * detector.layout_sigma, rtol=1e-3)
+        assert np.allclose(again.static_sigma, factor * detector.static_sigma, rtol=1e-3)

@@ -415,3 +415,15 @@ def with_errors(camera, step, unknown):
         known = {"layout_covariance": covariance, "static": static, "static_sigma": widths}
         detectors[key] = Detector(each.shape, layout=each.layout, **known)
     return replace(camera, detectors=detectors)
+
+
+def with_errors_times(camera, free, factor):
+    """The camera with the errors of what was fitted, `free` (n_detectors, 2, n_modes), times a factor."""
+    detectors = {}
+    for (key, each), fitted in zip(camera.detectors.items(), free, strict=True):
+        if not fitted.any():
+            detectors[key] = each
+            continue
+        errors = {"layout_covariance": factor**2 * each.layout_covariance, "static_sigma": factor * each.static_sigma}
+        detectors[key] = Detector(each.shape, layout=each.layout, static=each.static, **errors)
+    return replace(camera, detectors=detectors)

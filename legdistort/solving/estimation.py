@@ -21,7 +21,7 @@ from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA, DYNAMIC
 from . import model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
-from .camera_fit import CameraFit, Sought, common_widths
+from .camera_fit import CameraFit, Sought, common_widths, with_errors_times
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, only_rows, validation
 from .equations import effective_modes
@@ -424,9 +424,11 @@ def _settings(asked, options, form):
 
 
 def _solution(fit, scale, settings, diagnostics, form=None):
-    uncertainty = fit.uncertainty if scale == 1 else fit.uncertainty_at(scale)
+    uncertainty, matches = (fit.uncertainty if scale == 1 else fit.uncertainty_at(scale)), fit.matches
+    if scale != 1 and uncertainty.camera is not None:
+        matches = replace(matches, camera=with_errors_times(matches.camera, uncertainty.camera.free, scale))
     return assemble(
-        fit.matches,
+        matches,
         fit.weighted,
         fit.result.state,
         fit.blocks,

@@ -12,6 +12,7 @@ from dithers with rolls; errors beside the bound of a dense matrix of all unknow
 """
 
 import argparse
+import logging
 import sys
 import tempfile
 import time
@@ -157,6 +158,7 @@ if __name__ == "__main__":
     parser.add_argument("--cost", type=int, default=0, metavar="ROUNDS")
     parser.add_argument("--calibrate", type=int, default=0, metavar="DRAWS")
     warnings.simplefilter("ignore", LegdistortWarning)
+    logging.disable(logging.WARNING)
     arguments = parser.parse_args()
     if arguments.cost:
         cost(arguments.cost)
