@@ -221,7 +221,7 @@ class TestFromExposures:
     def test_without_names_of_detectors(self):
         header = self.header(1)
         exposures = [Exposure(n, np.zeros((300, 200)), wcs=WCS(header), header=header) for n in ("f", "g")]
-        with pytest.raises(InputError, match="the headers of f, g do not tell their detectors apart by any of CCDCHIP"):
+        with pytest.raises(InputError, match="f, g do not distinguish their detectors by any of CCDCHIP"):
             legdistort.Camera.from_exposures(exposures)
 
     def test_without_wcs(self):

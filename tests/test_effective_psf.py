@@ -509,7 +509,7 @@ def test_frames_are_not_replaced_by_their_psfs(tmp_path, psf):
 
 BAD = {
     "psf must be one of 'auto', 'moffat', 'effective' or a file, and there is no file nonsense": "nonsense",
-    "does not tell its oversampling: give EffectivePSF.from_array": np.ones((9, 9)),
+    "does not state its oversampling: give EffectivePSF.from_array": np.ones((9, 9)),
     "psf must be one of .* got int": 5,
 }
 

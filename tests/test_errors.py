@@ -200,7 +200,7 @@ def test_real_frames_of_one_telescope_have_one_scale(shared_data):
 
 @pytest.mark.slow
 def test_absolute_errors_are_right():
-    """Absolute errors, pointing aside, against independent dynamic parts whose mean does not vanish."""
+    """Absolute errors, apart from the pointing, against independent dynamic parts whose mean does not vanish."""
     measured, reported = [], []
     for seed in range(200):
         sim = simulate_matches(seed=seed, zero_mean=False, dither=100.0, sigma=0.05, n_stars=60)

@@ -372,7 +372,7 @@ def test_a_parallax_needs_the_sky():
 
 
 def test_a_parallax_in_one_season_is_told():
-    with pytest.warns(AssumptionWarning, match=r"badly told .* \(condition number \d+"):
+    with pytest.warns(AssumptionWarning, match=r"hardly distinguish .* \(condition number \d+"):
         solve(field(40, np.repeat([2015.5, 2016.501, 2018.498], 4)).matches, motion="parallax")
 
 

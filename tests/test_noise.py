@@ -248,12 +248,12 @@ def test_bad_arguments(options, message):
 def test_frames_that_do_not_serve():
     rng = np.random.default_rng(1)
     empty = Exposure("empty", rng.normal(100, 5, (200, 200)), gain=GAIN)
-    with pytest.raises(InputError, match="empty: no star above 5 times the noise tells how wide stars are; give fwhm"):
+    with pytest.raises(InputError, match="empty: no star above 5 times the noise shows how wide stars are; give fwhm"):
         ld.calibrate_noise(empty)
     curves = ld.calibrate_noise(empty, fwhm=4.0, n_positions=20)
     assert curves.table.meta["fwhm"] == {"empty": None}
     assert np.isfinite(curves.sigma(1e4))
-    with pytest.raises(InputError, match="empty: neither a gain nor stars that would tell the photon noise; give gain"):
+    with pytest.raises(InputError, match="nor stars that would determine the photon noise; give gain"):
         ld.calibrate_noise(replace(empty, gain=None), fwhm=4.0)
     packed = np.stack(np.meshgrid(*[np.arange(8.0, 200, 11)] * 2), axis=-1).reshape(-1, 2)
     full = Exposure("full", observe(packed, np.full(len(packed), 5e4), rng, size=200), gain=GAIN)

@@ -180,7 +180,7 @@ def test_every_detector_has_its_own():
 @pytest.mark.parametrize("own", [0, 1])
 def test_says_what_dithers_alone_do_not_tell(own):
     sim = camera(rolls=None)
-    with warns_here(AssumptionWarning, match=r"(4 of 16|6 of 14) unknowns of the shared distortion are not told"):
+    with warns_here(AssumptionWarning, match=r"(4 of 16|6 of 14) unknowns of the shared distortion are not determined"):
         solution = solve(sim.matches, static="fit", exposure_degree=own)
     assert len(solution.coefficients) == 12
 
@@ -206,7 +206,7 @@ def test_a_mean_without_widths_is_where_the_fit_begins():
 
 
 def test_says_that_it_cannot_without_dithers():
-    with pytest.raises(SolveError, match=r"cannot tell a distortion that they share .* dither"):
+    with pytest.raises(SolveError, match=r"cannot distinguish a distortion that they share .* dither"):
         solve(camera(rolls=None, dither=0.0).matches, static="fit")
 
 

@@ -114,7 +114,7 @@ def test_alternating_reaches_the_same_minimum():
     sim = simulate_matches(seed=3)
     prior = Prior(sim.truth.static)
     joint = solve(sim.matches, prior=prior)
-    with warns_here(ConvergenceWarning, match="drift along directions that the data do not tell"):
+    with warns_here(ConvergenceWarning, match="drift along directions that the data do not determine"):
         published = solve(sim.matches, prior=prior, method="alternating", max_iterations=60)
     assert_allclose(published.chi2, joint.chi2, rtol=2e-4)
     assert accuracy.bias(published.positions, joint.positions, removed=3) < 5e-4

@@ -410,7 +410,7 @@ def test_models_that_end_on_the_sky():
     wcs = gwcs.WCS(
         [(cf.Frame2D(name="detector"), pixels | to_sky), (cf.CelestialFrame(reference_frame=ICRS(), name="sky"), None)]
     )
-    with pytest.raises(InputError, match=r"the model \(gwcs\) does not tell the size of the detector: give shape"):
+    with pytest.raises(InputError, match=r"the model \(gwcs\) does not state the size of the detector: give shape"):
         Prior.from_model(wcs)
     assert np.abs(Prior.from_model(wcs, shape=(101, 101)).mean).max() < 1e-8
     assert np.abs(Prior.from_model(to_sky, shape=(101, 101), origin=1).mean).max() < 1e-4
@@ -621,8 +621,8 @@ def bad(tmp_path_factory):
         ("good.fits", {"origin": 1}, "has origin 0, not 1"),
         ("good.fits", {"shape": (256,)}, r"shape must be \(ny, nx\) in pixels"),
         ("empty.asdf", {}, "empty.asdf holds neither a gwcs nor a distortion model"),
-        ("bare.asdf", {"shape": (9, 9)}, r"bare.asdf \(astropy model\) does not tell what it does: give direction"),
-        ("bare.asdf", {"direction": FORWARD}, "does not tell the size of the detector"),
+        ("bare.asdf", {"shape": (9, 9)}, r"bare.asdf \(astropy model\) does not state what it does: give direction"),
+        ("bare.asdf", {"direction": FORWARD}, "does not state the size of the detector"),
         ("bare.asdf", {"direction": FORWARD, "shape": (9, 9)}, "cannot be inverted over the detector: it folds"),
         ("bare.asdf", {"ext": "meta.wcs"}, "bare.asdf: no gwcs or model at 'meta.wcs'; it has model"),
         ("two.asdf", {}, r"two.asdf holds several distortions: (a, b.c|b.c, a); choose one with ext"),

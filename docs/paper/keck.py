@@ -90,7 +90,7 @@ def compare(matches, *, degree, prior=None):
 def held_out(matches, solution, prior=None, *, n=5, seed=0):
     """Predicted minus measured positions of a fifth of the observations left out in turn: rms per axis, pixels.
 
-    A star left out in one exposure keeps its place in the others: this tells whether a model follows the distortion
+    A star left out in one exposure keeps its place in the others: this shows whether a model follows the distortion
     or the noise. From the median over the observations, since mismatches are among them.
     """
     table = matches.table

@@ -106,7 +106,7 @@ def solve_relative(matches, *, degree=3, reference=None, weighted=True, error_fl
     fixed[slice(None) if name is None else problem.names.index(name)] = 1
     convention = constraints.make("minimal", problem, state, criterion.linearise(problem, state))
     rows = (fixed * np.eye(2 * problem.n_modes)).transpose(1, 0, 2)
-    plane = "the mean of all exposures" if name is None else f"the detector of exposure {name}, undistorted by decree"
+    plane = "the mean of all exposures" if name is None else f"the detector of exposure {name}, taken as undistorted"
     convention = _convention(convention, "relative polynomial", plane, constraint=rows)
     state = State(_corrected_mean(matches, problem, state), state.coefficients, state.poses)
     weights = problem if weighted else _equal(problem)

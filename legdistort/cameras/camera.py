@@ -61,8 +61,8 @@ class Camera(ShownAsPrinted):
         all detectors, to which the layouts are shifted.
     common_sigma : array_like, shape (2, n_modes), optional
         Uncertainty of a distortion of the focal plane that all detectors have in common, standard deviations of its
-        modes in pixels, beside that of each detector; infinite where nothing is known. Exposures cannot tell it from
-        one of their own, so that layouts and static distortions found from them leave it out. None: none.
+        modes in pixels, beside that of each detector; infinite where nothing is known. Exposures cannot distinguish it
+        from one of their own, so that layouts and static distortions found from them leave it out. None: none.
 
     Raises
     ------
@@ -303,7 +303,7 @@ class Camera(ShownAsPrinted):
         key = exposure.detector
         if key is None:
             raise InputError(
-                f"{exposure.name} does not tell which detector of camera {self.name} it is: read all extensions of its "
+                f"{exposure.name} does not say which detector of camera {self.name} it is: read all extensions of its "
                 "file by their name (ext='SCI', --ext SCI)"
             )
         if key not in self.detectors:
@@ -340,7 +340,7 @@ class Camera(ShownAsPrinted):
         Parameters
         ----------
         exposures : dict or list of Exposure
-            ``{id: exposure}``, or images whose headers tell the detectors apart (``CCDCHIP``, ``DETECTOR``, ``EXTVER``
+            ``{id: exposure}``, or images whose headers distinguish the detectors (``CCDCHIP``, ``DETECTOR``, ``EXTVER``
             or ``EXTNAME``), as `legdistort.read_exposures` reads them. FITS WCSs and gwcs, with distortion or without.
         name : str, optional
             By default the instrument of the header.
@@ -348,7 +348,7 @@ class Camera(ShownAsPrinted):
         Raises
         ------
         InputError
-            If the headers do not tell the detectors apart, or a WCS is missing or cannot be followed.
+            If the headers do not distinguish the detectors, or a WCS is missing or cannot be followed.
         """
         return camera_of(cls, exposures, name)
 

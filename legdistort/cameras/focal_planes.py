@@ -50,7 +50,7 @@ def focal_planes(camera, exposures):
     Raises
     ------
     InputError
-        For an exposure that does not tell its detector, a detector that the camera does not have, or one of another
+        For an exposure that does not state its detector, a detector that the camera does not have, or one of another
         shape.
     """
     frames = {}

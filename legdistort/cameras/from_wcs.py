@@ -48,7 +48,7 @@ def _by_detector(exposures):
         ids = detector_ids([each.header for each in exposures])
     if ids is None:
         raise InputError(
-            f"the headers of {', '.join(each.name for each in exposures)} do not tell their detectors apart by any of "
+            f"the headers of {', '.join(each.name for each in exposures)} do not distinguish their detectors by any of "
             f"{', '.join(KEYWORDS)}: give a dict {{id: exposure}} of the detectors of one exposure"
         )
     return dict(zip(ids, exposures, strict=True))

@@ -32,7 +32,7 @@ class Source:
     function : callable
         ``function(x, y) -> (x, y)`` on arrays of plain numbers.
     direction : str or None
-        One of `DIRECTIONS`; None if it does not tell.
+        One of `DIRECTIONS`; None if it does not state any.
     origin : int or None
         Coordinate of the centre of the first pixel.
     shape : tuple or None
@@ -86,12 +86,13 @@ class Source:
         given["origin"] = given["origin"] or 0
         if given["direction"] is None:
             raise InputError(
-                f"{self.name} ({self.kind}) does not tell what it does: give direction (--direction) {DIRECTIONS[0]} "
+                f"{self.name} ({self.kind}) does not state what it does: give direction (--direction) {DIRECTIONS[0]} "
                 f"or {DIRECTIONS[1]}"
             )
         if given["shape"] is None:
             raise InputError(
-                f"{self.name} ({self.kind}) does not tell the size of the detector: give shape=(ny, nx) (--shape NY NX)"
+                f"{self.name} ({self.kind}) does not state the size of the detector: give shape=(ny, nx) "
+                "(--shape NY NX)"
             )
         return replace(self, **given)
 

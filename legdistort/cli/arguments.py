@@ -146,5 +146,5 @@ def check_paths(arguments, groups):
 
 
 def wants_progress(arguments):
-    """Whether progress bars are shown: on a terminal, unless told to be quiet."""
+    """Whether progress bars are shown: on a terminal, unless asked to be quiet."""
     return not arguments.quiet and sys.stderr.isatty()

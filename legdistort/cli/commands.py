@@ -120,7 +120,7 @@ def do_noise(a):
 def do_match(a):
     """``legdistort match``."""
     if a.camera is not None:
-        _refuse({"shape": a.shape}, "is told by --camera")
+        _refuse({"shape": a.shape}, "comes from --camera")
     from ..measurement.earlier import measured_frames
     from ..pipeline import timed, write_matched
 
@@ -133,7 +133,7 @@ def do_match(a):
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
     known = {"shape": tuple(a.shape) if a.shape else shapes or None, "camera": _camera(a.camera)}
     if (exposures := measured_frames(read)) is not None:
-        _refuse({"shape": a.shape}, "is told by the frames")
+        _refuse({"shape": a.shape}, "comes from the frames")
     known |= {"exposures": exposures, "progress": wants_progress(a)}
     with timed({}, "match"):
         matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
@@ -170,7 +170,7 @@ def do_solve(a):
         if camera is None:
             _refuse({"layout": a.layout}, "is for the detectors of a camera")
         else:
-            _refuse({"shape": a.shape}, "is told by the camera")
+            _refuse({"shape": a.shape}, "comes from the camera")
         if shape is None and camera is None:
             raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
         known = {"shape": shape, "camera": camera} | legdistort.Matches.read_meta(table.meta)
@@ -242,7 +242,7 @@ def do_predict(a):
     else:
         _refuse({"columns": a.columns or None, "origin": a.origin, "error": a.error}, "is for the table of --stars")
     if a.camera is not None:
-        _refuse({"shape": a.shape}, "is told by --camera")
+        _refuse({"shape": a.shape}, "comes from --camera")
     if a.shape is not None:
         keywords["shape"] = tuple(a.shape)
     keywords["camera"] = _camera(a.camera)

@@ -213,9 +213,9 @@ EXPANDING = {
     "where": Option(
         "a file or name, or the two maps of shifts in x and y", "sources", nargs="+", metavar="SOURCE", path="read"
     ),
-    "shape": Option("of the detector, where it is not told", type=int, nargs=2, metavar=("NY", "NX")),
+    "shape": Option("of the detector, where it is not stated", type=int, nargs=2, metavar=("NY", "NX")),
     "degree": Option("total degree of the Legendre series (default 5)", type=int),
-    "direction": Option("what the source does, where it is not told", choices=words.DIRECTIONS),
+    "direction": Option("what the source does, where it is not stated", choices=words.DIRECTIONS),
     "origin": Option("coordinate of the first pixel (default 0)", type=int, choices=(0, 1)),
     "ext": Option("extension of FITS files, header of a text, or place in an ASDF tree", type=extension),
     "frame": Option("where to end: frame of a gwcs, or idl or tel of an aperture"),

@@ -1,4 +1,4 @@
-"""The commands as the command line tells them: what each does, an example, its options.
+"""The commands as the command line describes them: what each does, an example, its options.
 
 `commands` has the functions that do it; it is not loaded before one is called for.
 """

@@ -148,7 +148,7 @@ def read_grid(path):
     Returns
     -------
     `~astropy.wcs.WCS`
-        With ``array_shape`` if the file tells it. What no grid can be made of is refused by `legdistort.coadd`.
+        With ``array_shape`` if the file states it. What no grid can be made of is refused by `legdistort.coadd`.
 
     Raises
     ------

@@ -73,7 +73,7 @@ class Mosaic(ShownAsPrinted):
     header : `~astropy.io.fits.Header`
         Unit, exposure times, method and what else goes into the file besides the WCS.
     extrapolated, rejected : ndarray of uint8, shape (ny, nx), or None
-        Of how many exposures the flags 1 and 4 tell: per cent of those that contribute, and of those that are there,
+        Of how many exposures the flags 1 and 4 speak: per cent of those that contribute, and of those that are there,
         rounded up.
     planes : tuple of str
         What `write` puts beside the image, see `to_hdulist`.
@@ -177,7 +177,7 @@ class Mosaic(ShownAsPrinted):
         """
         ny, nx = self.shape
         if not (x % 1 == 0 and y % 1 == 0):
-            raise InputError(f"pixels are told by whole numbers, got ({x}, {y}): round them, centres are at integers")
+            raise InputError(f"pixels are given by whole numbers, got ({x}, {y}): round them, centres are at integers")
         if not (0 <= x < nx and 0 <= y < ny):
             raise InputError(f"pixel ({x}, {y}) is not one of the {nx} x {ny} of the mosaic (x, y from 0)")
         planes = self.context[:, int(y), int(x)]

@@ -167,7 +167,7 @@ def _check_order(exposures, solution):
 
 
 def _coadd(exposures, solution, options, share):
-    """The mosaic; `share` is `map_items`, told who shares the work."""
+    """The mosaic; `share` is `map_items`, which knows who shares the work."""
     frames, left_out = _select(exposures, solution)
     options.check_names([*(f.name for f in frames), *left_out])
     if options.grid is None:
@@ -310,7 +310,7 @@ def _warn_of_misuse(frames, maps, algorithm):
 
 
 def _settings(options, recipe, origin, correlation):
-    """Cards that tell how the mosaic was made."""
+    """Cards that say how the mosaic was made."""
     weights = options.weights
     return [
         ("COMBINE", options.method, "how exposures are combined"),

@@ -26,7 +26,7 @@ class CoaddOptions:
         Of the spline; its name becomes its number.
     grid : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or None
     weights, scale : str, None or dict
-        A dict by exposure has positive numbers; whether it has the right names only the exposures tell.
+        A dict by exposure has positive numbers; whether it has the right names is seen with the exposures.
     planes : tuple of str or None
         Keys of `legdistort.runtime.words.PLANES`.
 

@@ -51,8 +51,8 @@ STARS = {
     "y": ("pos.cartesian.y", "distortion-free position in the reference plane, pixels from 0"),
     "x_err": ("stat.error;pos.cartesian.x", "standard deviation after a common map is taken off"),
     "y_err": ("stat.error;pos.cartesian.y", "standard deviation after a common map is taken off"),
-    "x_err_abs": ("stat.error;pos.cartesian.x", "standard deviation with the common map, pointing aside"),
-    "y_err_abs": ("stat.error;pos.cartesian.y", "standard deviation with the common map, pointing aside"),
+    "x_err_abs": ("stat.error;pos.cartesian.x", "standard deviation with the common map, apart from the pointing"),
+    "y_err_abs": ("stat.error;pos.cartesian.y", "standard deviation with the common map, apart from the pointing"),
     "x_err_known": ("stat.error;pos.cartesian.x", "x_err_abs after the unknown directions are taken off"),
     "y_err_known": ("stat.error;pos.cartesian.y", "y_err_abs after the unknown directions are taken off"),
     "xy_corr": ("stat.correlation;pos.cartesian", "correlation of x_err and y_err"),
@@ -63,8 +63,8 @@ STARS = {
     "ra_error": ("stat.error;pos.eq.ra", "standard deviation of ra times cos(dec), after a common map is taken off"),
     "dec_error": ("stat.error;pos.eq.dec", "standard deviation of dec, after a common map is taken off"),
     "ra_dec_corr": ("stat.correlation;pos.eq", "correlation of ra_error and dec_error"),
-    "ra_error_abs": ("stat.error;pos.eq.ra", "the same with the common map, pointing aside"),
-    "dec_error_abs": ("stat.error;pos.eq.dec", "the same with the common map, pointing aside"),
+    "ra_error_abs": ("stat.error;pos.eq.ra", "the same with the common map, apart from the pointing"),
+    "dec_error_abs": ("stat.error;pos.eq.dec", "the same with the common map, apart from the pointing"),
 }
 
 #: The same where the motions of stars were fitted.

@@ -1,4 +1,4 @@
-"""How the detectors of a camera lie, from the dithers alone: where neither a camera nor headers tell it.
+"""How the detectors of a camera lie, from the dithers alone: where neither a camera nor headers state it.
 
 Every detector of every exposure is first matched as an exposure of its own. Stars that cross from one detector to
 another put all of them on one plane, and two detectors of one exposure then lie there as they do in the camera.
@@ -15,7 +15,7 @@ from ..inputs.matches import Matches
 
 
 def is_needed(table, exposures):
-    """Whether exposures have several detectors, and headers do not tell how these lie."""
+    """Whether exposures have several detectors, and headers do not say how these lie."""
     if exposures is not None:
         return any(e.detector is not None and e.wcs is None for e in exposures)
     if "detector" not in table.colnames:
@@ -87,7 +87,7 @@ def _tell_apart(groups):
                 listed = " | ".join(", ".join(each) for each in groups)
                 raise MatchError(
                     f"how detectors {group[0]} and {other[0]} lie to each other is not known: no star was found on "
-                    f"both (detectors that share stars: {listed}), and neither a camera nor headers tell; dither over "
+                    f"both (detectors that share stars: {listed}), and neither a camera nor headers say; dither over "
                     "the gap, or give the camera"
                 ) from None
 

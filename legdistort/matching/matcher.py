@@ -71,7 +71,7 @@ def match(
     exposures : list of `~legdistort.inputs.exposures.Exposure`, optional
         Give the shapes and the nominal WCSs, by name.
     shape : tuple or dict, optional
-        ``(ny, nx)``, or that by exposure, when there are no `exposures`; by detector, where these are told apart and
+        ``(ny, nx)``, or that by exposure, when there are no `exposures`; by detector, where these are distinguished and
         there is no camera.
     camera : `legdistort.Camera`, optional
         Where exposures have several detectors, distinguished by the column ``detector``: they are matched as one, the

@@ -12,7 +12,7 @@ from .filters import gaussian, gaussian_sums
 
 log = logging.getLogger(__name__)
 
-_DARK = 2.5  # filtered signal, in its noise, up to which a pixel tells the noise of the sky
+_DARK = 2.5  # filtered signal, in its noise, up to which a pixel determines the noise of the sky
 _CLIP = 3.0  # standard deviations beyond which a pixel is left out of the noise
 #: Variance of a unit normal clipped at `_CLIP` (0.973), then where the filtered image is within `_DARK` of its noise.
 _REMAINS = 0.973 * 0.975
@@ -20,7 +20,7 @@ _SETTLED = 0.03
 _ROUNDS = 5  # from a noise that is several times too high, in crowded fields
 _BRIGHT = 5.0  # standard deviations of a binned pixel above the light around it: part of a star
 _ENOUGH = 1_000_000  # pixels: of more every fourth serves
-_FEWEST = 50  # pixels of a mesh that tell its noise
+_FEWEST = 50  # pixels of a mesh that determine its noise
 _POWERS = (0, 0), (1, 0), (0, 1), (2, 0), (0, 2), (1, 1)  # of y and x, of the moments of a plane
 _STEPS = 12  # of light, for the photon noise
 
@@ -172,7 +172,7 @@ def _planes(n, total, width, *, whole=False):
     weight = 1 / (weight + np.finfo(n.dtype).eps)
     mean, by_y, by_x = (sums * weight for sums in gaussian_sums(total, width, _POWERS[:3]))
     y, x, yy, xx, xy = (moment * weight for moment in moments)
-    # never narrower than a quarter of the Gaussian's width: what is left of a star beside a gap tells no slope
+    # never narrower than a quarter of the Gaussian's width: what is left of a star beside a gap determines no slope
     xx, yy = np.maximum(xx - x**2, 0.06 * area), np.maximum(yy - y**2, 0.06 * area)
     xy, by_x, by_y = xy - x * y, by_x - x * mean, by_y - y * mean
     determinant = np.maximum(xx * yy - xy**2, 0.02 * area**2)
@@ -212,7 +212,7 @@ def sky_variance(residual, filtered, light, good, *, start, noise, photon, mesh,
     residual : ndarray, shape (ny, nx)
         Signal without the smooth light.
     filtered : ndarray, shape (ny, nx)
-        The same filtered, which tells where stars are.
+        The same filtered, which determines where stars are.
     light : ndarray, shape (ny, nx)
         The smooth light.
     good : ndarray of bool, shape (ny, nx)

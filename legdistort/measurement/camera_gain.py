@@ -1,4 +1,5 @@
-"""One gain for all frames of a camera whose headers have none: a frame alone tells it within a factor of ten or more.
+"""One gain for all frames of a camera whose headers have none: a frame alone determines it within a factor of ten or
+more.
 
 The photon noise of a frame is estimated from what the fits of its stars leave (`profiles.pixel_noise`). The gain
 belongs to the camera and the unit of its data, not to the frame: the median of the estimates of some is taken for all.
@@ -6,14 +7,14 @@ belongs to the camera and the unit of its data, not to the frame: the median of 
 
 import numpy as np
 
-#: Keywords that tell cameras, their ways of being read, and units apart.
+#: Keywords that distinguish cameras, their ways of being read, and units.
 KEYWORDS = ("TELESCOP", "INSTRUME", "DETECTOR", "CAMERA", "READMODE", "GAIN", "BUNIT")
 #: Frames of a camera that are measured for its gain: the median of so many is known as well as 0.4 of one estimate.
 PILOTS = 12
 
 
 def pilots(exposures):
-    """Of every camera without a gain the frames that tell it: ``{camera: list of exposures}``, at least two each."""
+    """Of cameras without a gain the frames that determine it: ``{camera: list of exposures}``, at least two each."""
     cameras = {}
     for exposure in exposures:
         if not exposure.gain:
@@ -33,7 +34,8 @@ def camera(exposure):
 
 
 def pooled(photons):
-    """Electrons per unit of the data by the variances per unit of light of single frames; None if they do not tell.
+    """Electrons per unit of the data by the variances per unit of light of single frames; None if they do not determine
+    it.
 
     Parameters
     ----------

@@ -24,8 +24,8 @@ DEFORMED = 4.0
 _BETA = 3.0
 _REACH = 6.0  # FWHM: neighbours farther away than this pull at nothing but the background
 _QUARTILE = 0.3186  # of the absolute value of a unit normal
-_SHAPELY = 20  # signal-to-noise ratio of stars that tell what shape is usual
-_FEWEST = 20  # stars that tell what shape is usual
+_SHAPELY = 20  # signal-to-noise ratio of stars that determine what shape is usual
+_FEWEST = 20  # stars that determine what shape is usual
 
 
 def check_isolation(limit):
@@ -37,7 +37,7 @@ def check_isolation(limit):
 def is_isolated(table, limit=LIMIT):
     """Whether detections have neither `crowding` above a limit nor the flag ``DEFORMED``.
 
-    Tables without a column ``crowding``, of other programs, tell nothing: all their rows pass.
+    Tables without a column ``crowding``, of other programs, say nothing of it: all their rows pass.
 
     Parameters
     ----------

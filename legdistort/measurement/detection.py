@@ -11,7 +11,7 @@ from .filters import gaussian_sums
 from .sidelobes import side_light
 
 _CLIPPED = 0.986  # standard deviation of a unit normal after clipping at 3 sigma until nothing changes
-_KERNEL = 0.7  # width relative to the stars: costs 6 % of the signal-to-noise ratio, tells apart closer pairs
+_KERNEL = 0.7  # width relative to the stars: costs 6 % of the signal-to-noise ratio, distinguishes closer pairs
 _LOCAL = 5.0  # width of the local mean taken off, in that of the kernel: costs another 6 %, and removes halos
 _EXTRAPOLATED = 0.5  # of a local light that is extrapolated, over an edge, part that may be wrong
 _STANDS_OUT = 5.0  # signal-to-noise ratio of bright peaks
@@ -56,7 +56,7 @@ def prepare(exposure, *, mesh=MESH):
     """An `Exposure` as a `Frame`; `mesh` is that of the sky [pix]."""
     gain, read_noise, saturation = exposure.gain, exposure.read_noise, exposure.saturation
     data = np.where(exposure.mask, 0, exposure.data).astype(np.float32)
-    saturation = saturation or piled_up(data)  # flat tops of which no header told
+    saturation = saturation or piled_up(data)  # flat tops that no header mentions
     saturated = (data >= saturation) & ~exposure.mask if saturation else np.zeros(data.shape, dtype=bool)
     bad = exposure.mask | saturated
     sky, rms = sky_and_noise(data, bad, mesh)
@@ -74,7 +74,7 @@ def prepare(exposure, *, mesh=MESH):
 
 
 def bright_peaks(frame, fwhm):
-    """Peaks that stand out of the light around them, among them all bright stars: what tells how wide these are.
+    """Peaks that stand out of the light around them, among them all bright stars: they show how wide stars are.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def _weighted_ratio(residual, variance, frame, sigma):
     # The square of a Gaussian is a Gaussian narrower by sqrt(2).
     below = _blur(weight, sigma / np.sqrt(2))
     ratio = _blur(residual * weight, sigma) / np.sqrt(np.maximum(below, 1e-6 * below.max()))
-    if not frame.good.all():  # where most of a star would lie on bad pixels the rest tells little
+    if not frame.good.all():  # where most of a star would lie on bad pixels the rest determines little
         ratio[_blur(frame.good.astype(np.float32), sigma / np.sqrt(2)) < _COVERED] = 0
     return ratio
 
@@ -198,7 +198,7 @@ def _is_highest(image, x, y, reach):
     """Whether pixels are the highest of the square around them; of the few that matter, not of all the image."""
     steps = [(dy, dx) for dy in range(-reach, reach + 1) for dx in range(-reach, reach + 1)]
     left = np.arange(len(x))
-    for dy, dx in sorted(steps, key=lambda step: abs(step[0]) + abs(step[1])):  # next to it most are told
+    for dy, dx in sorted(steps, key=lambda step: abs(step[0]) + abs(step[1])):  # next to it most are decided
         here, other = (y[left], x[left]), (y[left] + dy, x[left] + dx)
         other = np.clip(other[0], 0, image.shape[0] - 1), np.clip(other[1], 0, image.shape[1] - 1)
         left = left[image[here] >= image[other]]

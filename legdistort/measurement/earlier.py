@@ -84,7 +84,7 @@ class EarlierRun:
         """
         without = [exposure.name for exposure in exposures if not isinstance(exposure, ExposureFile)]
         if without:
-            raise InputError(f"{without[0]} is not in a file: nothing tells that it is what was measured; give files")
+            raise InputError(f"{without[0]} is not in a file: nothing proves that it is what was measured; give files")
         measured = self.table.meta["inputs"]
         for file, checksum in file_checksums(exposures).items():
             if file not in measured:
@@ -139,7 +139,7 @@ def write_detections(path, detections, exposures, out, *, ext=None, dq_good=None
     exposures : list of Exposure
         Those that are not in files cannot be gone on from.
     out : Path
-        Where the file will be found: paths of frames are told from there.
+        Where the file will be found: paths of frames are relative to it.
     ext, dq_good, camera
         As given to `legdistort.run`.
     overwrite : bool

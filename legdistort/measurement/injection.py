@@ -68,7 +68,7 @@ def calibrate_frame(exposure, remeasure, *, psf=None, threshold=5.0, widths=None
     name, rng = exposure.name, np.random.default_rng([seed, zlib.crc32(exposure.name.encode())])
     frame, centres, shape = locate_stars(exposure, threshold=threshold)
     if not len(centres) and widths is None:
-        raise InputError(f"{name}: no star above {threshold:g} times the noise tells how wide stars are; give fwhm")
+        raise InputError(f"{name}: no star above {threshold:g} times the noise shows how wide stars are; give fwhm")
     photon = _photon_noise(frame, exposure, centres, shape)
     own = psf or (MoffatStars(shape) if len(centres) else None)
     profiles = [own] if widths is None else [MoffatStars(scaled(shape, width)) for width in widths]
@@ -123,7 +123,7 @@ def _photon_noise(frame, exposure, centres, shape):
     if exposure.gain:
         return 1 / exposure.gain
     if not len(centres):
-        raise InputError(f"{exposure.name}: neither a gain nor stars that would tell the photon noise; give gain")
+        raise InputError(f"{exposure.name}: neither a gain nor stars that would determine the photon noise; give gain")
     if not frame.noise_given:
         return frame_fit.fit_stars(Stamps(frame, centres, box_half(moffat.fwhm(shape))), shape)[-1]
     x, y = centres[:50].T

@@ -86,8 +86,8 @@ class NoiseCurves(ShownAsPrinted):
         """Laws fitted to the robust errors, one row an exposure and width.
 
         Columns ``exposure``, ``fwhm`` [pix]; for either axis ``x_a`` [pix x flux], ``x_b`` [pix x sqrt(flux)],
-        ``x_floor`` [pix; 0 unless the errors tell it]; ``knee``, the flux at which sky and photons weigh the same. NaN
-        where too few stars were found.
+        ``x_floor`` [pix; 0 unless the errors determine it]; ``knee``, the flux at which sky and photons weigh the same.
+        NaN where too few stars were found.
         """
         rows = []
         for name in self.exposures:
@@ -241,7 +241,7 @@ def _variance(law, flux):
 
 
 def _fit_law(levels, sigma):
-    """a, b and floor of the levels at which enough was found; the floor only where the errors tell it."""
+    """a, b and floor of the levels at which enough was found; the floor only where the errors determine it."""
     use = _enough(levels) & (sigma > 0)
     if np.count_nonzero(use) < 2:
         return np.full(3, np.nan)

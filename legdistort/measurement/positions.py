@@ -194,8 +194,8 @@ def effective_psf(
     """Make the effective PSF of an exposure from its bright, isolated, unsaturated stars.
 
     Positions of the stars and the oversampled grid are fitted together (Anderson & King 2000, PASP 112, 1360); how much
-    it varies over the field, up to the second degree in x and y, the stars tell. Its core-weighted centre, the place
-    where the first moments under a Gaussian of standard deviation FWHM / 4 vanish, is 0 everywhere in the field.
+    it varies over the field, up to the second degree in x and y, the stars determine. Its core-weighted centre, the
+    place where the first moments under a Gaussian of standard deviation FWHM / 4 vanish, is 0 everywhere in the field.
 
     Parameters
     ----------
@@ -310,7 +310,7 @@ def _camera_gains(exposures, options, share):
 
 
 def _photon_noise(exposure, options):
-    """Variance per unit of star light that an exposure tells, None if it is known or there are no stars."""
+    """Variance per unit of star light that an exposure determines, None if it is known or there are no stars."""
     exposure = options.with_detector(exposure.read())
     stamps, shape = _stamps(exposure, options)
     return None if stamps is None or stamps.frame.photon is not None else frame_fit.photon_noise(stamps, shape)

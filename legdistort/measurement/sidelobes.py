@@ -38,7 +38,7 @@ def side_light(image, x, y, fwhm, *, hidden=None):
     fwhm : float
         Of the stars [pix].
     hidden : ndarray of bool, shape (ny, nx), optional
-        Pixels of the image that tell nothing: saturated ones.
+        Pixels of the image that determine nothing: saturated ones.
 
     Returns
     -------

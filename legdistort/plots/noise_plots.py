@@ -4,7 +4,7 @@ import numpy as np
 
 from . import elements
 
-#: Colour and marker of every width, told apart in grey print and by colour-blind readers (Okabe & Ito).
+#: Colour and marker of every width, to be distinguished in grey print and by colour-blind readers (Okabe & Ito).
 _STYLES = (
     ("#000000", "o"),
     ("#E69F00", "s"),

@@ -407,7 +407,7 @@ class HeaderPrior:
         return Prior.from_headers(exposures, degree=3 if isinstance(degree, str) else degree, **vars(self))
 
 
-def tells(prior):
+def has_distortion(prior):
     """Whether a prior, or any of a dict of them, holds a distortion: its mean is not zero."""
     each = prior.values() if isinstance(prior, dict) else [prior]
     return any(p is not None and np.any(p.mean) for p in each)

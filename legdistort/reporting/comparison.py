@@ -9,7 +9,7 @@ from ..results import accuracy
 from .svg import detached_figure
 from .tables import Row, Table, count
 
-#: Colour and marker of every correction, told apart in grey print and by colour-blind readers (Okabe & Ito).
+#: Colour and marker of every correction, to be distinguished in grey print and by colour-blind readers (Okabe & Ito).
 STYLES = {
     "shift": ("#000000", "o"),
     "static + shift": ("#0072B2", "s"),
@@ -129,6 +129,6 @@ def compared_stacks(made, gallery):
         f"Medians over the {count(n, 'star')} of the brighter half, isolated and unsaturated, measured in all "
         "stacks; the stacks differ in nothing but the correction. Peak: height over flux. Positions: scatter about "
         f"those solved, in single exposures after correction, in stacks after a common {removed}, which the images do "
-        "not tell, was taken out."
+        "not determine, was taken out."
     )
     return "Stacks compared", Table(head, rows, note), picture

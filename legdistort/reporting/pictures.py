@@ -159,7 +159,7 @@ class Gallery:
         return self.add(
             panels[0].figure,
             "Rotation and scale against their mean, size of the dynamic distortion and, where it was measured, the "
-            "seeing of every exposure: a drift tells of flexure or of the atmosphere.",
+            "seeing of every exposure: a drift is a sign of flexure or of the atmosphere.",
             hspace=0.1,
         )
 

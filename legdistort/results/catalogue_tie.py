@@ -27,7 +27,7 @@ class Tie:
         the noise of the star in common.
     measured : ndarray, shape (n,)
         By how much the reference has brought down the variance of shift, rotation and scale, of shear, of degree 2 and
-        so on: 0, not at all, to 1. The first is 0.5 for a single star, which tells the shift alone.
+        so on: 0, not at all, to 1. The first is 0.5 for a single star, which determines the shift alone.
     stars : ndarray, shape (n_reference,)
         Names of the stars that the reference has.
     offsets : ndarray, shape (n_reference, 2)
@@ -63,13 +63,14 @@ class Tie:
 
     @property
     def alone(self) -> bool:
-        """Whether a single star tells the shift, and nothing else."""
+        """Whether a single star determines the shift, and nothing else."""
         return self.measured[0] < 1
 
     def errors(self, size: Shape) -> list[tuple[str, int, float]]:
         """Name, number of modes and error [px, rms over the field and axis] by degree, as a list.
 
-        NaN for rotation and scale if the reference does not tell them. `size` (ny, nx) is that of the box of the modes.
+        NaN for rotation and scale if the reference does not determine them. `size` (ny, nx) is that of the box of the
+        modes.
         """
         similar, *parts = map_parts(size, len(self.covariance) // 2)
         if self.alone:

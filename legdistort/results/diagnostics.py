@@ -200,7 +200,7 @@ class MotionScatter:
 class CorrelatedErrors:
     """Errors of a star that are alike in neighbouring exposures, found from the residuals of all stars.
 
-    What is the same in all exposures is not among them: it is in the positions, and nothing tells it.
+    What is the same in all exposures is not among them: it is in the positions, and nothing determines it.
 
     Attributes
     ----------

@@ -423,7 +423,7 @@ class Gauge(ShownAsPrinted):
         error = np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()]))
         tied = f"{self.tie.sentence}; " if self.tie is not None else ""
         after = f" after {_listed(self.unknown_names)}" if self.unknown_names else ""
-        aside = ", pointing aside" if self.tie is None else ""
+        aside = ", apart from the pointing" if self.tie is None else ""
         known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}"
         if after and error == 0:  # nothing of the common map is known
             known = "absolute positions are not known"

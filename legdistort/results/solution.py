@@ -186,7 +186,7 @@ class Solution(ShownAsPrinted):
         ``x_err``, ``y_err`` are relative: what is left once a common map of the fitted degree is taken off.
         ``x_err_abs``, ``y_err_abs`` add that map: the mean dynamic distortion of the set and the uncertainty of the
         static one; NaN where they are not known (`Gauge.unknown`). ``x_err_known``, ``y_err_known`` are those after the
-        unknown directions are taken off; infinite where nothing tells how the detectors of a camera lie.
+        unknown directions are taken off; infinite where nothing determines how the detectors of a camera lie.
         Pointing, rotation and scale common to all exposures are those of the nominal
         poses and are not part of these errors, unless a reference ties them: then they are. On the sky:
         ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
@@ -198,7 +198,8 @@ class Solution(ShownAsPrinted):
         ``pmra`` (with cos(dec)), ``pmdec`` [mas/yr] and, if it was fitted, ``parallax`` [mas], all with relative and
         absolute errors and with correlations named alike; ``chi2``, ``n_epochs`` and ``span`` [yr]. ``sky`` then has
         the motions too. Absolute errors of motions leave out common rates of shift, rotation and scale, those of
-        parallaxes the mean parallax: nothing but a reference tells these. NaN where a star is seen at one epoch only.
+        parallaxes the mean parallax: nothing but a reference determines these. NaN where a star is seen at one epoch
+        only.
         """
         table = QTable({"star": self.star_names, "x": self.positions[:, 0] * u.pix, "y": self.positions[:, 1] * u.pix})
         variance = absolute_errors.relative_variance(self.gauge, self.uncertainty, self.positions)
@@ -700,7 +701,7 @@ class Solution(ShownAsPrinted):
 
     @property
     def camera_sentence(self) -> str:
-        """Which camera it is, and what of it the exposures do not tell; empty without one."""
+        """Which camera it is, and what of it the exposures do not determine; empty without one."""
         if self.camera is None:
             return ""
         ny, nx = self.camera.field

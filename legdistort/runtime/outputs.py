@@ -57,7 +57,7 @@ def check_ending(path, endings):
 
 
 def try_to_write(path):
-    """Make, write and rename a file where an output will be made; permissions alone do not tell that it can be.
+    """Make, write and rename a file where an output will be made; permissions alone do not prove that it can be.
 
     Raises
     ------

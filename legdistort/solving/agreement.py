@@ -70,7 +70,7 @@ def without_contradictions(problem, good):
 
 
 def contradiction(group, others):
-    """What to say where no majority tells who is right."""
+    """What to say where no majority shows who is right."""
     return (
         f"exposures contradict one another, and there are not {FEWEST} or more that agree against fewer: the stars of "
         f"{some_of(group, 6)} do not lie as those of {some_of(others, 6)}; match them anew, or leave one side out"

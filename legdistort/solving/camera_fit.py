@@ -22,7 +22,7 @@ from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
 
-#: Part of what the data would tell of a direction alone below which it is not determined beside all else: what
+#: Part of what the data would determine of a direction alone below which it is not determined beside all else: what
 #: detectors and exposures can exchange is so to first order, and by the gradient of one times the other beyond.
 _WEAK = 1e-5
 #: Variances below this part of the largest are rounding.
@@ -93,7 +93,7 @@ class Sought:
 
     @classmethod
     def of(cls, matches, layout, static, degree):
-        """By what `legdistort.solve` was told; None where the camera is held. Detectors without a position are held.
+        """From the options of `legdistort.solve`; None where the camera is held. Detectors without a position are held.
 
         Raises
         ------
@@ -177,7 +177,7 @@ class CameraFit:
         ConvergenceWarning
             If the camera did not settle.
         AssumptionWarning
-            Naming detectors whose place these exposures do not tell.
+            Naming detectors whose place these exposures do not determine.
         """
         step = self.step
         if step.length >= _SMALL:
@@ -263,7 +263,7 @@ def _tell_unknown(matches, step, unknown):
     warn(
         f"{len(unknown)} unknowns of camera {camera.name} are not determined by these exposures and stay where they "
         f"were, above all of detector {', '.join(named)}{apart}: stars that one detector sees in one exposure and "
-        "another in the next tell how these lie; dither over the gaps, or give uncertainties (layout_sigma)",
+        "another in the next determine how these lie; dither over the gaps, or give uncertainties (layout_sigma)",
         AssumptionWarning,
     )
 
@@ -344,7 +344,7 @@ def _gradient(problem, blocks, pattern, weighted):
 def _inverse(normal, precision, alone):
     """Inverse of the sum, on what data or prior determine, and the directions (m, k) that neither does.
 
-    `alone` (k,) is what the data would tell of each unknown if all others were known.
+    `alone` (k,) is what the data would determine of each unknown if all others were known.
     """
     unit = 1 / np.sqrt(alone)
     values, vectors = np.linalg.eigh(normal * np.outer(unit, unit) + np.diag(precision > 0))

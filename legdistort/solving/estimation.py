@@ -14,7 +14,7 @@ import numpy as np
 from ..cameras.exchanged import check_places
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, some_of, warn
 from ..inputs.matches import Matches
-from ..priors.prior import Prior, tells
+from ..priors.prior import Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
 from ..runtime.checks import check_choice
@@ -108,7 +108,7 @@ def solve(
     exposure_degree : int, optional
         With ``static="fit"``: 0 leaves an exposure shift, rotation and scale, 1 (default) an affine map, and so on.
     gauge : {"minimal", "mean"}
-        Convention for what the data cannot tell, see `legdistort.results.gauge`.
+        Convention for what the data cannot determine, see `legdistort.results.gauge`.
     method : {"joint", "alternating"}
         Gauss-Newton on all unknowns, or the scheme of the paper.
     loss : {"linear", "huber", "cauchy"}
@@ -141,18 +141,18 @@ def solve(
     motion_epoch : float or `~astropy.time.Time`, optional
         Of the positions in ``stars``; by default the mean of the observations, where they are most precise.
     reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord` or path, optional
-        Positions with errors that tie shift, rotation and scale, and the maps that the exposures do not tell; relative
-        positions stay as precise as they are. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error`` [mas]
-        and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``parallax``, ``parallax_error``
-        [mas], ``ref_epoch`` [yr] and correlations, as in the Gaia catalogue; or ``x``, ``y``, ``x_err``, ``y_err`` in
-        pixels of the reference plane, perhaps with ``vx``, ``vy`` and their errors; and perhaps ``star``, the stars of
-        the matches, which are otherwise found by their positions. A column that holds a
+        Positions with errors that tie shift, rotation and scale, and the maps that the exposures do not determine;
+        relative positions stay as precise as they are. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error``
+        [mas] and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``parallax``,
+        ``parallax_error`` [mas], ``ref_epoch`` [yr] and correlations, as in the Gaia catalogue; or ``x``, ``y``,
+        ``x_err``, ``y_err`` in pixels of the reference plane, perhaps with ``vx``, ``vy`` and their errors; and perhaps
+        ``star``, the stars of the matches, which are otherwise found by their positions. A column that holds a
         `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch. With `motion` it is more, a prior on
         the positions, motions and parallaxes of its stars.
     epoch : float or `~astropy.time.Time`, optional
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
-        Arcsec, about; helps to find the stars where no header tells the sky.
+        Arcsec, about; helps to find the stars where no header has the sky.
 
     Returns
     -------
@@ -322,7 +322,7 @@ def _estimate(matches, options):
 
 def _warn_of_header(matches, prior):
     """Warn of a distortion in the headers that is not used."""
-    if matches.header_distortion and not tells(prior):
+    if matches.header_distortion and not has_distortion(prior):
         warn(
             f"the headers have a distortion ({matches.header_distortion}) that is not used; --prior header takes it as "
             "the static distortion (in Python: Prior.from_headers(exposures))",
@@ -359,7 +359,7 @@ def _choose_degree(matches, options):
 
 
 def _tell(fit, matches):
-    """Log how the fit ended and what it left out, and warn of what these exposures cannot tell."""
+    """Log how the fit ended and what it left out, and warn of what these exposures cannot determine."""
     log.info("%s; chi2 %.1f for %d degrees of freedom", fit.result.status, fit.chi2, fit.dof)
     for name, reason in fit.matches.left_out.items():
         if name not in matches.left_out:
@@ -367,8 +367,8 @@ def _tell(fit, matches):
     _tell_lost_stars(fit)
     if fit.problem.unknowns.shared and (n_weak := fit.result.n_weak):
         warn(
-            f"static='fit': {n_weak} of {fit.problem.unknowns.n_common} unknowns of the shared distortion are not told "
-            "by these exposures and stay where the prior has them; dithers with rolls tell more",
+            f"static='fit': {n_weak} of {fit.problem.unknowns.n_common} unknowns of the shared distortion are not "
+            "determined by these exposures and stay where the prior has them; dithers with rolls determine more",
             AssumptionWarning,
         )
 

@@ -26,9 +26,9 @@ log = logging.getLogger(__name__)
 #: Iterations of the joint solver and sweeps of the alternating one at most, unless another number is given.
 MAX_ITERATIONS, MAX_SWEEPS = 50, 1000
 #: The constraints follow the state for so many iterations; then they are held. Those of a state that is not yet the
-#: solution may hold what the data tell and leave free what they do not: of 300 sets of 4 to 6 exposures and some 20
-#: stars, with 15 px of static distortion that nobody knew, 21 never settled with 6, one with 12, none with 20. Not for
-#: ever: where few stars of a reference bend the plane by much, state and constraints may chase each other.
+#: solution may hold what the data determine and leave free what they do not: of 300 sets of 4 to 6 exposures and some
+#: 20 stars, with 15 px of static distortion that nobody knew, 21 never settled with 6, one with 12, none with 20. Not
+#: for ever: where few stars of a reference bend the plane by much, state and constraints may chase each other.
 _MADE = 20
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
 
@@ -51,7 +51,7 @@ class Result:
     robust : ndarray, shape (n,)
         Factors on the weights from the loss (ones for a linear one).
     n_weak : int
-        Unknowns of a distortion common to all exposures that these do not tell.
+        Unknowns of a distortion common to all exposures that these do not determine.
     system : Direct, OnStars, Iterative or None
         The reduced system there, if it was made with that gauge.
     """
@@ -91,7 +91,7 @@ def solve_joint(
         Start values, see `legdistort.solving.start_values.start`.
     gauge : {"minimal", "mean"}
     common : ndarray, shape (2 n_modes,), optional
-        Map of the reference plane at which to hold what the data do not tell, see
+        Map of the reference plane at which to hold what the data do not determine, see
         `legdistort.solving.gauge.constraints.make`.
     hold : bool
         Hold the plane, and what changes it with time, where the start values have it.
@@ -275,7 +275,7 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
     """The paper's scheme (section 3.2): stars given A, coefficients given X, until both change by less than 1e-5.
 
     The norms in its two stopping rules are taken as Euclidean over all unknowns. Where it ends along the directions
-    that the data do not tell depends on the start and the number of sweeps, so compare with `solve_joint` only
+    that the data do not determine depends on the start and the number of sweeps, so compare with `solve_joint` only
     what is left after a common map of the fitted degree.
 
     Parameters
@@ -317,7 +317,7 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
     if not converged:
         status = (
             f"stopped after {max_iterations} sweeps with |dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e}: the coefficients "
-            "drift along directions that the data do not tell; method='joint' fixes these"
+            "drift along directions that the data do not determine; method='joint' fixes these"
         )
         warn(status, ConvergenceWarning)
     state, _ = constraints.absorb_similarities(problem, state)

@@ -216,7 +216,7 @@ def _check_free(free, count, degree):
     if np.count_nonzero(free) != count:
         raise InputError(
             f"the {count} free coefficients of the model move {np.count_nonzero(free)} modes of the detector, which "
-            "cannot be told apart: with a domain other than the detector's (-0.5, nx - 0.5), (-0.5, ny - 0.5) every "
+            "cannot be distinguished: with a domain other than the detector's (-0.5, nx - 0.5), (-0.5, ny - 0.5) every "
             "term of lower order than a free one must be free as well, and each term may stand but once"
         )
     linear = free[:, 1:3]

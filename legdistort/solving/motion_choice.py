@@ -1,10 +1,10 @@
 """Whether the stars of a set move, and by how much their motions scatter, by the evidence of the set itself.
 
 A fit in which nothing is known of the motions gives one for every star, ``v_j``, with its covariance C_j. A map that
-all stars have in common, of the degree of the distortion, is no motion that could be told from the distortions, and
-is fitted too. What is left has the likelihood of ``N(0, s^2 + C_j)``, marginal over that map (restricted maximum
-likelihood, Patterson & Thompson 1971), whose maximum is the scatter s of the motions. Their errors are taken at the
-observed scale where that is larger than the stated one.
+all stars have in common, of the degree of the distortion, is no motion that could be distinguished from the
+distortions, and is fitted too. What is left has the likelihood of ``N(0, s^2 + C_j)``, marginal over that map
+(restricted maximum likelihood, Patterson & Thompson 1971), whose maximum is the scatter s of the motions. Their errors
+are taken at the observed scale where that is larger than the stated one.
 """
 
 import logging
@@ -27,7 +27,7 @@ def resolve(matches, options):
     Raises
     ------
     InputError
-        If the epochs do not tell what was asked for.
+        If the epochs do not determine what was asked for.
     """
     if options.motion is None:
         return options, None

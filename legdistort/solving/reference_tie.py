@@ -41,7 +41,7 @@ _SETTLED = 0.01
 _HARMLESS = 0.3
 #: Offsets larger than expected by this factor in chi2 are told.
 _LARGE = 2.0
-#: A map moves the solution to first order; what is left is told by another round.
+#: A map moves the solution to first order; what is left comes from another round.
 _MAP_ROUNDS = 2
 
 
@@ -54,7 +54,7 @@ class ReferenceTie:
     identified : `legdistort.matching.cross_identification.Identified`
         Those stars alone whose motions the exposures determine, where stars move.
     others : `legdistort.matching.cross_identification.Identified`
-        The others, which tell nothing of common maps.
+        The others, which determine nothing of common maps.
     label : str
         How messages call the reference.
     names : ndarray, shape (n_stars,)

@@ -209,7 +209,7 @@ def minimise(matches, options, *, judged=True):
 def _plain(problem, start, common):
     """The fit of all observations; None where it has no answer, as with gross errors."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # told if it is the result
+        warnings.simplefilter("ignore", ConvergenceWarning)  # a warning follows if it is the result
         try:
             return minimisers.solve_joint(problem, start, **common)
         except SolveError as error:

@@ -11,7 +11,7 @@ from .equations.star_terms import StarTerms
 
 #: A parallax that the other unknowns take up to all but this part is not determined.
 _DEGENERATE = 1e-6
-#: ... and is told to be badly determined beyond this condition number: its error is so much larger than it need be.
+#: ... and is called badly determined beyond this condition number: its error is so much larger than it need be.
 _BADLY = 10.0
 
 
@@ -37,7 +37,7 @@ def n_epochs(years):
 
 
 def check_epochs(matches, kind):
-    """Refuse motions that the epochs of the exposures cannot tell; warn of a parallax that they tell badly.
+    """Refuse motions that the epochs of the exposures cannot determine; warn of a parallax that they determine badly.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def check_epochs(matches, kind):
         )
     if number > _BADLY:
         warn(
-            f"parallaxes are badly told from proper motions by these epochs (condition number {number:.2g}): their "
+            f"these epochs hardly distinguish parallaxes from proper motions (condition number {number:.2g}): their "
             "errors are so much larger than at other times of the year",
             AssumptionWarning,
         )

@@ -18,7 +18,7 @@ def drizzle(data, good, variances, pixel_map, resampling):
     pixel_map : `~legdistort.coaddition.resampling.pixel_maps.PixelMap`
         With corners.
     resampling : `~legdistort.coaddition.resampling.engines.Resampling`
-        Its ``kernel`` and ``pixfrac`` tell what a pixel becomes before it falls.
+        Its ``kernel`` and ``pixfrac`` determine what a pixel becomes before it falls.
 
     Returns
     -------

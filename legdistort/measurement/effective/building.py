@@ -22,7 +22,7 @@ from .model import EffectivePSF, Polynomial
 
 #: Usable stars that a PSF takes at least.
 STARS_NEEDED = 12
-#: Degree in x and y of what it varies over the field: how much it does, the stars tell.
+#: Degree in x and y of what it varies over the field: how much it does, the stars determine.
 DEGREE = 2
 
 _PER_FWHM = 4  # knots: cubic splines then follow a diffraction-limited core to 0.1 % of its peak
@@ -31,7 +31,7 @@ _ANEW = 2  # with other stars, from a PSF that is nearly right
 _MOVE = 0.3  # FWHM, largest step of a star in one iteration
 _SETTLE = 2  # iterations of the stars alone
 _DEVIANT = 3.0  # times the median of chi2 / dof: such a star is no single one
-_SIZES = (0.01, 10.0)  # of corrections, relative to those expected: nothing less is told from none
+_SIZES = (0.01, 10.0)  # of corrections, relative to those expected: nothing less differs from none
 _VARIES = 0.1  # size at first of those that vary over the field: it grows in fewer iterations than it shrinks
 _EVEN = 0.02  # relative error that makes bright stars count alike in the mean of what is left
 _AT_ONCE = 32  # stars whose normal matrices are in memory

@@ -217,7 +217,7 @@ def fit_all(stamps, fitted, fit, psf, *, models):
 
 
 def _separate(stamps, fitted, fit, psf, models):
-    """See `separate`; where the models are still Moffat profiles, what they leave tells no slope of the sky."""
+    """See `separate`; where the models are still Moffat profiles, what they leave determines no slope of the sky."""
     partners = fitting.light_of_partners(psf, stamps, fitted.labels, fit.params)
 
     def derivatives(rows):

@@ -288,7 +288,7 @@ class EffectivePSF(ShownAsPrinted):
         return np.broadcast_to(y @ grids @ x.T, (len(xy), len(y), len(x)))
 
     def _sampled(self):
-        """Images with oversampling `_SAMPLES` at places that tell how the PSF varies; those in x and y [pix]."""
+        """Images with oversampling `_SAMPLES` at places that show how the PSF varies; those in x and y [pix]."""
         if isinstance(self.variation, Grid):
             x, y = self.variation.x, self.variation.y
         elif self.variation.degree == 0:

@@ -15,7 +15,7 @@ PSFS = ("auto", "moffat", "effective")
 
 
 def psf_from(given):
-    """What `measure` is told about the PSF: one of `PSFS`, an `EffectivePSF`, or a dict of these.
+    """What `measure` is given as the PSF: one of `PSFS`, an `EffectivePSF`, or a dict of these.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def psf_from(given):
         return read_psf(path)
     if isinstance(given, np.ndarray):
         raise InputError(
-            "psf is an array, which does not tell its oversampling: give "
+            "psf is an array, which does not state its oversampling: give "
             "EffectivePSF.from_array(array, oversampling=...)"
         )
     if all(hasattr(given, name) for name in ("data", "oversampling")):

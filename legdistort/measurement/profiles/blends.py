@@ -27,7 +27,7 @@ def group_stars(xy, radius, *, largest=_LARGEST):
     ndarray of int, shape (n,)
     """
     n = len(xy)
-    if radius < 0.5:  # of pixels none are closer; places that coincide cannot be told apart
+    if radius < 0.5:  # of pixels none are closer; places that coincide cannot be distinguished
         return np.arange(n)
     i, j = cKDTree(xy).query_pairs(radius, output_type="ndarray").T
     labels = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)[1]

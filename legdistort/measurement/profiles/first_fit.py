@@ -1,4 +1,4 @@
-"""The first fit of stars, with the noise of the sky alone, and single bright pixels told from stars."""
+"""The first fit of stars, with the noise of the sky alone, and single bright pixels distinguished from stars."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from . import moffat
 from .levenberg_marquardt import Limits, fit
 from .pixel_noise import NEIGHBOUR
 
-_LIMITS = Limits(20, 1e-4)  # what this fit leaves tells the noise
+_LIMITS = Limits(20, 1e-4)  # what this fit leaves determines the noise
 
 
 def started(stamps, shape):

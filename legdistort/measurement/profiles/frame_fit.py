@@ -1,4 +1,4 @@
-"""All stars of a frame fitted: neighbours subtracted, noise from the model, hot pixels told from stars."""
+"""All stars of a frame fitted: neighbours subtracted, noise from the model, hot pixels distinguished from stars."""
 
 from functools import partial
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from .shape_field import shape_field
 _DEVIATES = 0.2  # fraction of a star by which pixels may deviate from a Moffat profile
 #: Limits of the passes after the first: the second prepares the last.
 _MIDDLE, _LAST = Limits(20, 1e-2), Limits(40, 1e-4)
-_SHAPELY = 20  # signal-to-noise ratio of stars that tell the shape of all
+_SHAPELY = 20  # signal-to-noise ratio of stars that determine the shape of all
 _GAP = 1 / 3  # part of the pixels within one FWHM that may be missing
 _WANDERS = 0.75  # FWHM from the peak: a cosmic ray beside a star draws the peak away by half a FWHM and more
 
@@ -113,7 +113,7 @@ def photon_noise(stamps, shape):
 
 
 def _first_pass(stamps, shape, nodes):
-    """Stars fitted with the noise of the sky, models from that, and the noise of the pixels that they tell."""
+    """Stars fitted with the noise of the sky, models from that, and the noise of the pixels that they determine."""
     found, _ = fit_once(stamps, shape, nodes)
     models = stamps.models(found.params, nodes)
     return found, models, pixel_noise(stamps, found, models, nodes)

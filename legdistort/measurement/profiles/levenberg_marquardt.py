@@ -78,7 +78,7 @@ class Fit:
 def fit(stamps, weights, start, *, nodes, centre, sigma=SHAPE_SIGMA, limits=FULL, offsets=None):
     """Fit profiles by Levenberg-Marquardt, all groups of stars at once, each with its own damping.
 
-    The shape carries a weak Gaussian prior: it decides nothing that the pixels can tell (above a
+    The shape carries a weak Gaussian prior: it decides nothing that the pixels can determine (above a
     signal-to-noise ratio of 10 the errors are those of eight free parameters), and keeps faint stars
     from running away.
 
@@ -134,7 +134,7 @@ class _Pixels:
     def __init__(self, stamps, weights, offsets, nodes):
         g = offsets.shape[1]
         # Single precision serves: photons bound the ratio of signal to noise of a pixel. Stars that touch are
-        # told apart by small differences.
+        # distinguished by small differences.
         self.kind = np.float32 if g == 1 else np.float64
         self.root = np.sqrt(weights, dtype=self.kind)
         self.target = np.where(weights > 0, stamps, 0).astype(self.kind) * self.root

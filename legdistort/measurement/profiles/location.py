@@ -9,7 +9,7 @@ from .cutouts import Stamps, box_half
 from .first_fit import fit_once
 
 _FIRST_FWHM = 3.0
-#: Peaks that tell the width, the brightest: so many that stars remain if a hundred of them are saturated.
+#: Peaks that determine the width, the brightest: so many that stars remain if a hundred of them are saturated.
 _TELLING = 300
 _SETTLED = 0.1  # relative change of the width that ends the search
 _POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no star, however sharp, has so little

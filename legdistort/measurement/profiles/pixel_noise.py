@@ -64,9 +64,9 @@ def _photon_noise(stamps, fit, remains):
     """Variance per unit of star light, from the residuals of the first pass.
 
     The squared residual of a pixel is expected at ``sky variance + photon * model``. Profiles that do not quite fit add
-    a part that goes with the square of the model and differs from star to star: faint stars tell the photons, bright
-    ones that part. A line through the stars is fitted by least absolute deviations: companions too faint to be detected
-    raise single stars only.
+    a part that goes with the square of the model and differs from star to star: faint stars determine the photons,
+    bright ones that part. A line through the stars is fitted by least absolute deviations: companions too faint to be
+    detected raise single stars only.
     """
     rows, own, others, square = remains
     sky = stamps.variance[rows].astype(float)

@@ -3,8 +3,8 @@
 How far single exposures depart from the static distortion is mostly not known. It shows in the data: with stars and
 poses integrated out, the data are Gaussian with a covariance that depends on the variance of the modes of each degree,
 and the widths that make the data most likely are taken (MacKay 1992; in mixed models, restricted maximum likelihood).
-Modes that the data do not tell, and maps common to all exposures, have no say in it, so it works where an exposure has
-fewer stars than modes.
+Modes that the data do not determine, and maps common to all exposures, do not enter it, so it works where an exposure
+has fewer stars than modes.
 """
 
 import logging
@@ -29,7 +29,7 @@ TOLERANCE = 0.01
 MAX_ROUNDS = 12
 #: Widths are sought within these factors of the median position error; at the lower end a degree is as good as fixed.
 RANGE = 1e-3, 1e6
-#: So many coefficients, those of exposures drawn at random, are enough to tell the widths.
+#: So many coefficients, those of exposures drawn at random, are enough to determine the widths.
 MOST = 800
 #: A width is taken for nothing if that costs less than this in the logarithm of the likelihood: two standard errors.
 PARSIMONY = 2.0
@@ -112,7 +112,7 @@ def find_widths(fit, prior, degree, unit, *, scale=False):
     widths = Widths(wanted, np.full((len(wanted), degree), unit))
 
     def fitted():
-        with warnings.catch_warnings(record=True, action="always") as caught:  # of the last fit they are told
+        with warnings.catch_warnings(record=True, action="always") as caught:  # those of the last fit are shown
             return fit(widths.resolve(prior)), caught
 
     for _ in range(MAX_ROUNDS if degree else 0):

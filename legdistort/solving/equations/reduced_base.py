@@ -17,7 +17,7 @@ class Reduced:
     gauge : Gauge
     """
 
-    n_weak = 0  # unknowns that the exposures share and that they do not tell
+    n_weak = 0  # unknowns that the exposures share and that they do not determine
 
     def __init__(self, problem, blocks, gauge):
         self.problem, self.blocks, self.gauge = problem, blocks, gauge

@@ -27,7 +27,7 @@ STAR_LIMIT = 8000
 #: ... and while building it costs no more than this many multiplications.
 _DIRECT_COST = 4e9
 _LEAST_PIVOT = 1e-7  # of the normalised equations, below which they count as singular
-_WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not told
+_WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not determined
 
 
 def reduced_system(problem, blocks, gauge, weak=None):
@@ -92,7 +92,7 @@ class Direct(Reduced):
         self._border = np.linalg.inv(self.rows @ self._lifted)
 
     def _hold_weak(self, s, rows):
-        """Hold what neither dithers nor rolls tell of a common distortion: more rows, that keep to the start.
+        """Hold what neither dithers nor rolls determine of a common distortion: more rows, that keep to the start.
 
         Raises
         ------
@@ -107,7 +107,7 @@ class Direct(Reduced):
         self.n_weak = weak.shape[1]
         if self.n_weak >= self.unknowns.n_common:
             raise SolveError(
-                "static='fit': these exposures cannot tell a distortion that they share from one of the sky; "
+                "static='fit': these exposures cannot distinguish a distortion that they share from one of the sky; "
                 "dither by a good part of the field and turn the camera, or give a prior with static_sigma"
             )
         s += weak @ weak.T
@@ -119,7 +119,7 @@ class Direct(Reduced):
 
     @cached_property
     def information(self):
-        """What the data tell of the values of the constraints, shape (n_constraints,) squared.
+        """What the data determine of the values of the constraints, shape (n_constraints,) squared.
 
         Half the curvature of J along them, all else refitted; nothing but rounding along the exact directions.
         """

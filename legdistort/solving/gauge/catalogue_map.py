@@ -214,7 +214,7 @@ def accepted(equations, label):
 
 
 def estimate(equations, used, names):
-    """The map that the used offsets tell, and the tie.
+    """The map that the used offsets determine, and the tie.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """What is known of a map common to all exposures, and what only a convention holds.
 
 A bend of the reference plane that every exposure takes back leaves all residuals as they are, so the positions alone
-never tell it. What tells it is that single exposures depart from one static distortion by little::
+never determine it. What determines it is that single exposures depart from one static distortion by little::
 
     A_i = A_0 + N_i g + d_i,      d_i ~ N(0, Lambda_i + C_i)
 
@@ -14,11 +14,11 @@ constraints of the gauge, so that the positions and coefficients published are t
 g under them is the absolute error.
 
 Without a prior the rows see only that in which the N_i differ, which dithers and rolls bring about. What they do not
-tell to `LIMIT` pixels, rms over the stars, is *unknown*: there a convention holds the plane (the smallest dynamic part,
-or dynamic parts that sum to zero, around the prior mean), and no error is quoted. Shears, for instance, are unknown to
-any number of exposures of one orientation. Residuals of second order can tell such a direction after all, where an
-unknown static distortion of many pixels meets very precise positions; then it is left to them
-(`legdistort.solving.minimisers`), if they tell it to the same limit.
+determine to `LIMIT` pixels, rms over the stars, is *unknown*: there a convention holds the plane (the smallest dynamic
+part, or dynamic parts that sum to zero, around the prior mean), and no error is quoted. Shears, for instance, are
+unknown to any number of exposures of one orientation. Residuals of second order can determine such a direction after
+all, where an unknown static distortion of many pixels meets very precise positions; then it is left to them
+(`legdistort.solving.minimisers`), if they determine it to the same limit.
 
 Shift, rotation and scale are always those of the nominal poses, or of a reference catalogue.
 """

@@ -24,7 +24,7 @@ FEWEST = 20
 
 
 def estimate_by_brightness(matches, options):
-    """The fit whose errors follow a law of brightness that its own residuals tell.
+    """The fit whose errors follow a law of brightness that its own residuals determine.
 
     The squares of the residuals, their share in their own fit allowed for (`clipping.deviations`), are measurements of
     the variance; the law is fitted to them as the mean of a gamma distribution. In the end it is multiplied so that

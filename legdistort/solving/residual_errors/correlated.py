@@ -7,7 +7,7 @@ effects), of one variance for all stars, whose correlation falls along the time 
 exponentially, or as that of a process that has one or two derivatives (`CorrelatedErrors.derivatives`). Beside it stand
 independent errors, the stated ones with a floor. The variances, the length and the form of the correlation are those of
 the largest restricted likelihood (REML; Patterson & Thompson 1971): that of the residuals, in which nothing is left of
-what is the same in all exposures. That part is in the positions, and no data tell it.
+what is the same in all exposures. That part is in the positions, and no data determine it.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ LONGEST = 0.5
 #: Gain in twice the logarithm of the likelihood from which correlated errors are found: in none of 200 sets
 #: that have none (`tests/benchmarks/correlated_errors_table.py`).
 FOUND = 12.0
-#: Stars that are looked at, the most precise ones: more would tell the variances to better than 2 %.
+#: Stars that are looked at, the most precise ones: more would determine the variances to better than 2 %.
 MOST_STARS = 2000
 _ALONG = "time", "x", "y"
 _STARTS = 0.05, 0.3  # of the longest correlation length
