@@ -6,6 +6,7 @@ import re
 from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from legdistort.assessment.pulls import pulls_of
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
 from legdistort.inputs.exposures import Exposure, observed
+from legdistort.plots import elements
 from legdistort.reporting import page as report
 from legdistort.reporting.pictures import Picture
 from legdistort.reporting.svg import STYLE, detached_figure, svg_of
@@ -137,6 +139,24 @@ def test_marks_belong_to_their_stars_and_exposures(text, solution):
     assert text.count('class="panel" data-e=') == 2 * len(solution.names)
 
 
+@pytest.mark.parametrize("colours", ["red", ["red", "blue", "red"]])
+def test_every_line_is_a_mark_of_its_own(colours):
+    """Also one of no length, and whether or not the lines look alike and are drawn at once."""
+    ends = [[[0.1, 0.1], [0.5, 0.2]], [[0.5, 0.5], [0.5, 0.5]], [[0.9, 0.9], [0.2, 0.8]]]
+    with style.context(["default", STYLE]):
+        figure = detached_figure(2, 2, layout=None)
+        ax = figure.subplots()
+        lines = elements.draw_lines(ax, ends, color=colours)
+        elements.mark(lines, stars=[7, 8, 9], exposures=[0, 0, 1])
+        made = svg_of(figure, "a")
+    drawn = re.findall(r'<path data-s="(\d)" data-e="(\d)" d="M ?([\d.]+) ([\d.]+)\s+L ?([\d.]+) ([\d.]+)', made)
+    assert [each[:2] for each in drawn] == [("7", "0"), ("8", "0"), ("9", "1")]
+    at = [tuple(map(float, each[2:])) for each in drawn]
+    assert at[0][0] < at[0][2]
+    assert at[1][:2] == at[1][2:]
+    assert at[2][0] > at[2][2]
+
+
 def test_text_in_pictures_is_text():
     """Names of exposures in a picture are neither markup nor mathematics."""
     with style.context(["default", STYLE]):
@@ -252,6 +272,14 @@ def test_many_exposures_are_listed_and_the_dozen_that_departs_most_is_drawn():
     assert set(solution.names) <= set(page.cells)
     assert "the 12 exposures that depart most" in text
     assert page.row(solution.names[5])[9] == "0.000"
+
+
+@pytest.mark.slow
+def test_a_page_of_400_exposures_can_be_sent():
+    start = process_time()
+    text = report.render(make_solution(400, 80))
+    assert process_time() - start < 20  # 5 s where it was measured
+    assert len(text.encode()) < 8e6
 
 
 def test_exposure_without_used_positions_has_no_rms(tables_only):

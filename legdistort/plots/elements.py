@@ -1,5 +1,7 @@
 """Pieces that pictures are made of: axes, titles, ticks, grids, round numbers, block means."""
 
+from functools import cache
+
 import numpy as np
 
 from ..geometry import basis
@@ -88,14 +90,19 @@ def draw_grid(ax, shape, coefficients, **style):
     """Grid lines over the detector, displaced by a Legendre series."""
     from matplotlib.collections import LineCollection
 
-    degree = basis.degree_of(coefficients.shape[1])
+    paths = []
+    for u, v, modes in _grid(basis.degree_of(coefficients.shape[1])):
+        shift = np.tensordot(coefficients, modes, 1)
+        paths.extend(basis.denormalize(u, v, shape) + np.moveaxis(shift, 0, -1))
+    ax.add_collection(LineCollection(paths, **style))
+
+
+@cache
+def _grid(degree):
+    """Normalised coordinates and Legendre modes along the lines of a grid, those along x and those along y."""
     lines, along = np.linspace(-1, 1, _GRID_LINES), np.linspace(-1, 1, 6 * degree + 1)
     u, v = np.meshgrid(along, lines)
-    paths = []
-    for first, second in ((u, v), (v, u)):
-        shift = np.tensordot(coefficients, basis.values(degree, first, second), 1)
-        paths.extend(basis.denormalize(first, second, shape) + np.moveaxis(shift, 0, -1))
-    ax.add_collection(LineCollection(paths, **style))
+    return [(*at, basis.values(degree, *at)) for at in ((u, v), (v, u))]
 
 
 def draw_image(ax, image, *, sky, soft, low, high, extent):

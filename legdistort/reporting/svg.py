@@ -4,6 +4,7 @@ import base64
 import io
 import itertools
 import re
+from functools import partial
 
 import numpy as np
 from markupsafe import Markup
@@ -27,8 +28,9 @@ _PLAIN_ID = re.compile(
     r'PolyCollection|QuadMesh|EllipseCollection|FillBetweenPolyCollection|Quiver|QuiverKey|PathPatch)_\d+"'
 )
 _IMAGE = re.compile(r'xlink:href="data:image/png;base64,([^"]*)"')
-_NUMBERS, _DIGITS = re.compile(r' (?:d|x|y)="[^"]*"'), re.compile(r"(\.\d\d)\d+| (?=\n)")
+_NUMBERS, _DIGITS = re.compile(r' (?:d|x|y)="[^"]*"'), re.compile(r"(?<=\.\d\d)\d+| (?=\n)")
 _DRAWN = re.compile(r"<(?:use|path)\b")
+_PATH, _LINE = re.compile(r'<path d="([^"]*)"([^>]*)/>'), re.compile(r"M[^M]*")
 
 
 def detached_figure(*size, layout="constrained"):
@@ -63,6 +65,7 @@ def svg_of(figure, salt, **spaces):
         at = _MARGINS | spaces
         at |= {"left": at["left"] / width, "right": 1 - at["right"] / width}
         figure.subplots_adjust(**at | {"bottom": at["bottom"] / height, "top": 1 - at["top"] / height})
+    _join_lines(figure)
     file = io.StringIO()
     with rc_context({"svg.hashsalt": salt}):
         figure.savefig(file, format="svg", dpi=_DPI, metadata={"Date": None, "Creator": None})
@@ -74,8 +77,21 @@ def svg_of(figure, salt, **spaces):
     text = _PLAIN_ID.sub("", text)
     text = text.replace("#000000", "currentColor").replace("#ffffff", "var(--paper)").replace("#0072b2", "var(--blue)")
     text = _IMAGE.sub(lambda found: f'xlink:href="data:image/png;base64,{_fewer_colours(found[1])}"', text)
-    text = _NUMBERS.sub(lambda found: _DIGITS.sub(r"\1", found[0]), text)
+    text = _NUMBERS.sub(lambda found: _DIGITS.sub("", found[0]), text)
     return Markup(re.sub(r"\n\s*", "\n", _named_marks(text)))
+
+
+def _join_lines(figure):
+    """Make the lines of every collection one path if they look alike: drawn in a tenth of the time."""
+    from matplotlib.collections import LineCollection
+
+    gap = np.full((1, 2), np.nan)
+    for lines in (each for ax in figure.axes for each in ax.collections if isinstance(each, LineCollection)):
+        looks = (lines.get_colors(), lines.get_linewidths(), lines.get_linestyles())
+        paths = [path.vertices for path in lines.get_paths()]
+        if len(paths) > 1 and all(len(each) == 1 for each in looks):
+            lines.set_segments([np.concatenate([part for each in paths for part in (each, gap)])])
+            lines.get_paths()[0].should_simplify = False  # a line of no length stays
 
 
 def _fewer_colours(data):
@@ -107,6 +123,7 @@ def _named_marks(text):
         if group.count("<use") + group.count("<path") > len(members) and len(members) == 1:  # axes: all of the group
             pieces.append(f'<g class="panel"{_attributes(lists, members[0])}>{group}')
             continue
+        group = _PATH.sub(partial(_single_lines, number=len(members)), group)
         body = group[group.index("</defs>") + 7 :] if "</defs>" in group else group
         turn = iter(members)
 
@@ -116,6 +133,15 @@ def _named_marks(text):
         head = group[: len(group) - len(body)]
         pieces.append(f'<g class="marks">{head}{_DRAWN.sub(named, body)}')
     return "".join([*pieces, text[at:]])
+
+
+def _single_lines(path, number):
+    """The lines that `_join_lines` made one path, each as a path again; their looks stand at the group."""
+    lines = _LINE.findall(path[1])
+    if len(lines) != number:
+        return path[0]
+    single = "\n".join(f'<path d="{line.strip()}"/>' for line in lines)
+    return f"<g{path[2]}>\n{single}\n</g>"
 
 
 def _attributes(lists, member):
