@@ -10,7 +10,8 @@ author = "The legdistort developers"
 copyright = f"2026, {author}"
 version = release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "numpydoc"]
+templates_path = ["_templates"]
 exclude_patterns = ["_build", "paper/table.md"]
 default_role = "py:obj"
 suppress_warnings = ["config.cache"]
