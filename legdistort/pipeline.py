@@ -36,7 +36,7 @@ from .runtime import checks, outputs, parallel, provenance
 from .runtime.notebook import ShownAsPrinted
 from .simulation.truth import Truth
 from .solving.estimation import solve
-from .solving.options import CLIP, SolveOptions, check_reference
+from .solving.options import CLIP, SolveOptions, check_detectors, check_reference
 from .wcs.storage import write_wcs
 
 if TYPE_CHECKING:
@@ -200,6 +200,8 @@ def run(
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
             exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, **reading)
+            several = reading["camera"] is not None or any(exposure.frame for exposure in exposures)
+            check_detectors(several, solving.layout, solving.static, solving.dynamic)  # before hours of measuring
             solving = replace(solving, prior=_known_prior(prior, exposures, degree))
         with timed(timings, "measure"):
             detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, measuring, **share)

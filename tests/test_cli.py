@@ -694,6 +694,40 @@ def test_options_that_others_leave_without_effect_are_refused(words, message, ni
 
 
 @pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("measure FRAMES --psf moffat --write-psf p --out o.ecsv", "leave write_psf out, or give --psf effective"),
+        ("measure FRAMES --profile shared --write-psf p --out o.ecsv", "leave write_psf out, or give --psf effective"),
+        ("run FRAMES --layout fit --out o", "--layout fit is for exposures with several detectors"),
+        ("run FRAMES --static hold --out o", "say which camera it is (--camera)"),
+        ("run FRAMES --exposure-degree 1 --out o", "belongs to --static fit"),
+        ("run FRAMES --motion-sigma 1 --out o", "belong to --motion"),
+        ("prior gsaoi-2 --frame tel --out o.asdf", "leave --frame out"),
+        ("prior gsaoi-2 --ext 1 --out o.asdf", "leave --ext out"),
+        ("prior gsaoi-2 --origin 1 --out o.asdf", "leave origin out"),
+        ("prior gsaoi-2 --direction reference_to_detector --out o.asdf", "leave direction out"),
+    ],
+)
+def test_options_that_do_not_apply_are_refused_before_a_star_is_measured(
+    words, message, night, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delattr("legdistort.pipeline.measure_with_psfs")
+    monkeypatch.delattr("legdistort.measurement.positions.measure_with_psfs")
+    line = [word for each in words.split() for word in (map(str, night) if each == "FRAMES" else [each])]
+    failed(capsys, main([*line, "--quiet"]), message)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_epoch_needs_motions(demo, tmp_path, capsys):
+    solution, positions = demo / "solution.asdf", demo / "detections.ecsv"
+    for line in (["stars", solution], ["correct", solution, positions]):
+        words = [*map(str, line), "--epoch", "2014", "--out", str(tmp_path / "o.ecsv")]
+        failed(capsys, main(words), "the motions of the stars were not fitted", "--motion proper")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
     "words",
     ["report s.asdf --out x.pdf", "measure FRAMES --out x.fits", "prior gsaoi-2 --out x", "match t --out x.txt"],
 )

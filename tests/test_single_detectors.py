@@ -112,12 +112,14 @@ def test_bad_words(gsaoi):
         ({"dynamic": "detector", "layout": "fit"}, "has a pose of its own: leave layout out"),
         ({"dynamic": "detector", "prior": legdistort.Prior(np.zeros((2, 10)))}, "to the camera"),
         ({"dynamic": "detector", "static": "free"}, "static must be"),
+        ({"exposure_degree": 1}, "leave exposure_degree out, or take every detector by itself"),
+        ({"exposure_degree": 1, "static": "fit"}, "leave exposure_degree out, or take every detector by itself"),
     ):
         with pytest.raises(InputError, match=words):
             legdistort.solve(matches, **given)
     one = table[table["detector"] == "1"]
     alone = legdistort.Matches.from_table(one[np.bincount(one["star"])[one["star"]] >= 3], shape=(2048, 2048))
-    with pytest.raises(InputError, match="dynamic is for exposures with several detectors"):
+    with pytest.raises(InputError, match="dynamic='detector' is for exposures with several detectors"):
         legdistort.solve(alone, dynamic="detector")
 
 

@@ -373,7 +373,7 @@ def _solving(a, shape=None, *, with_headers=False):
     static_sigma = keywords.pop("static_sigma", None)
     sigma = keywords.pop("prior_sigma", None)
     if with_headers and a.prior == HEADER:
-        return keywords | {"prior": HeaderPrior(sigma)}
+        return keywords | {"prior": HeaderPrior(sigma, static_sigma)}
     prior = _prior(a.prior, shape, static_sigma)
     if sigma is not None:
         degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree

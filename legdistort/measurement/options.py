@@ -65,6 +65,11 @@ class MeasureOptions:
             return "moffat"
         return self.psf
 
+    @property
+    def only_moffat(self):
+        """Whether no exposure is measured with an effective PSF."""
+        return isinstance(self.psf, str) and self.psf_of(None) == "moffat"
+
     def with_detector(self, exposure):
         """The exposure with the gain, read noise and saturation that are given here in place of its own."""
         given = {key: value for key in _DETECTOR if (value := getattr(self, key)) is not None}

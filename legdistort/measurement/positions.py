@@ -158,6 +158,10 @@ def measure(
         read_noise=read_noise, saturation=saturation, errors=errors, psf=psf,
     )  # fmt: skip
     if write_psf is not None:
+        if options.only_moffat:
+            raise InputError(
+                "there is no effective PSF to write with Moffat profiles: leave write_psf out, or give psf='effective'"
+            )
         _check_psf_folder(Path(write_psf), exposures)
     table, psfs = measure_with_psfs(exposures, options, workers=workers, progress=progress)
     if write_psf is not None:

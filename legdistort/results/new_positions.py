@@ -235,6 +235,8 @@ def correct_table(solution, table, epoch=None):
     table = column_contract.check(table, column_contract.DETECTED, "the table of positions")
     if solution.camera is not None:
         table = solution.camera.in_focal_plane(table)
+    if epoch is not None:
+        fitted(solution.motions)
     if epoch is not None and "star" not in table.colnames:
         raise InputError(
             "the table of positions lacks the column star: it is the motion of its star that carries a position to "

@@ -17,8 +17,6 @@ from ..inputs.matches import Matches
 from ..priors.prior import Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
-from ..runtime.checks import check_choice
-from ..runtime.words import CAMERA, DYNAMIC
 from . import model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, with_errors_times
@@ -26,7 +24,7 @@ from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, only_rows, validation
 from .equations import effective_modes
 from .motion_choice import resolve as resolve_motion
-from .options import CLIP, SolveOptions, check_reference
+from .options import CLIP, SolveOptions, check_detectors, check_reference
 from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
 from .single_detectors import by_detector
@@ -187,7 +185,7 @@ def solve(
             f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
         )
     matches, prior, static = _of_detectors(matches, prior, layout, static, dynamic)
-    sought, prior = _of_camera(matches, prior, model, degree, layout, static)
+    sought, prior = _of_camera(matches, prior, model, degree, layout, static, exposure_degree)
     asked = SolveOptions(
         degree=degree, prior=prior, model=model, static=static, layout=layout, dynamic=dynamic,
         exposure_degree=exposure_degree,
@@ -225,9 +223,7 @@ def solve(
 
 def _of_detectors(matches, prior, layout, static, dynamic):
     """The matches, of single detectors if they are asked for, what is known of these, and what to do about statics."""
-    check_choice(dynamic, (None, *DYNAMIC), "dynamic")
-    if dynamic is not None and matches.camera is None:
-        raise InputError("dynamic is for exposures with several detectors: matches need a camera")
+    check_detectors(matches.camera is not None, layout, static, dynamic)
     if dynamic != "detector":
         return matches, prior, static
     if layout is not None:
@@ -238,11 +234,10 @@ def _of_detectors(matches, prior, layout, static, dynamic):
         raise InputError(
             "with a camera, give what is known of its detectors to the camera (Detector(..., static=)), not as prior"
         )
-    check_choice(static, (None, *CAMERA), "static")
     return *by_detector(matches, static), "fit" if static == "fit" else None
 
 
-def _of_camera(matches, prior, model, degree, layout, static):
+def _of_camera(matches, prior, model, degree, layout, static, exposure_degree):
     """What is sought of a camera, if anything, and the prior where positions are those in its focal plane.
 
     That has no distortion of its own: its detectors have theirs, and what is not known of them.
@@ -250,16 +245,10 @@ def _of_camera(matches, prior, model, degree, layout, static):
     Raises
     ------
     InputError
-        For what is known of single detectors: the camera has it; for a layout without a camera.
+        For what is known of single detectors: the camera has it; for modes of exposures alone.
     """
     camera = matches.camera
-    for name, value in (("layout", layout), ("static", static)):
-        check_choice(value, (None, *CAMERA), name)
     if camera is None:
-        if layout is not None or static in ("hold", "prior"):
-            raise InputError(
-                "layout, and static='hold' or 'prior', are for exposures with several detectors: matches need a camera"
-            )
         each = prior.values() if isinstance(prior, dict) else [prior]
         if static == "fit" and any(_knows_nothing_of_a_mode(p) for p in each):
             raise InputError("static='fit' holds what static_sigma of a prior says: make it finite, or leave it out")
@@ -267,6 +256,12 @@ def _of_camera(matches, prior, model, degree, layout, static):
     if isinstance(prior, dict):
         raise InputError(
             "with a camera, give what is known of its detectors to the camera (Detector(..., static=)), not as prior"
+        )
+    if exposure_degree is not None:
+        raise InputError(
+            "exposure_degree is for single detectors; with a camera every exposure has a distortion of the focal plane "
+            "of the whole degree: leave exposure_degree out, or take every detector by itself (static='fit' and "
+            "dynamic='detector')"
         )
     check_places(matches)
     sought = Sought.of(matches, layout, static, 3 if isinstance(degree, str) else degree)

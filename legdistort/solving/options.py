@@ -11,7 +11,7 @@ from ..geometry.epochs import year
 from ..inputs.reference_catalogue import read_reference
 from ..results.settings import Settings
 from ..runtime.checks import LARGEST, check_choice
-from ..runtime.words import CAMERA, ERRORS, GAUGES, LOSSES, METHODS, MOTIONS
+from ..runtime.words import CAMERA, DYNAMIC, ERRORS, GAUGES, LOSSES, METHODS, MOTIONS
 from .choices.degree_choice import AUTO
 from .equations.problem import check_error_floor, check_prior
 
@@ -110,7 +110,10 @@ class SolveOptions(Settings):
         check_choice(self.layout, (None, *CAMERA), "layout")
         if self.static != "fit":
             if self.exposure_degree is not None:
-                raise InputError("exposure_degree belongs to static='fit', where exposures share the modes above it")
+                raise InputError(
+                    "exposure_degree belongs to static='fit', where exposures share the modes above it: give that "
+                    "too, or leave exposure_degree out"
+                )
             return
         if self.method != "joint":
             raise InputError("static='fit' needs method='joint'")
@@ -133,6 +136,18 @@ class SolveOptions(Settings):
         if self.static != "fit":
             return None
         return 1 if self.exposure_degree is None else int(self.exposure_degree)
+
+
+def check_detectors(several, layout, static, dynamic):
+    """Raise `InputError` for what is no choice, and for choices about a camera without several detectors."""
+    given = {"layout": (layout, CAMERA), "static": (static, CAMERA), "dynamic": (dynamic, DYNAMIC)}
+    for name, (value, words) in given.items():
+        check_choice(value, (None, *words), name)
+        if not several and value is not None and (name, value) != ("static", "fit"):
+            raise InputError(
+                f"{name}={value!r} is for exposures with several detectors, and these have one each: leave it out, or "
+                "say which camera it is (camera=, --camera)"
+            )
 
 
 def check_reference(reference, *, epoch=None, pixel_scale=None, method="joint"):
