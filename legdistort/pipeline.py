@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from tqdm import tqdm
 
 from .assessment import baselines, run_checks, stack_quality
 from .assessment.truth import compare_with_truth
@@ -221,7 +222,7 @@ def run(
             with timed(timings, "compare"):
                 comparison, stacks = _compared(matches, solution, solving, quality and mosaic, kept, coadding)
         with timed(timings, "write"):
-            write_results(solution, target, psfs=psfs, mosaic=mosaic)
+            write_results(solution, target, psfs=psfs, mosaic=mosaic, progress=progress)
             write_detections(target / "detections.ecsv", detections, exposures, Path(out), **reading)
             write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
         summary = summarise(solution, timings=timings) | _assessed(solution, kept, quality, comparison, stacks, truth)
@@ -316,7 +317,7 @@ def write_matched(path, matches, inputs, *, overwrite=False):
     table_files.write_table(table, path, overwrite=overwrite)
 
 
-def write_results(solution, target, *, psfs=None, mosaic=None):
+def write_results(solution, target, *, psfs=None, mosaic=None, progress=False):
     """Write ``solution.asdf``, ``stars.ecsv``, ``wcs/NAME.asdf``, ``psf/NAME.fits``, ``mosaic.fits`` into a folder.
 
     Of a camera the WCSs are those of its detectors, ``wcs/NAME-DETECTOR.asdf``.
@@ -324,7 +325,7 @@ def write_results(solution, target, *, psfs=None, mosaic=None):
     solution.write(target / "solution.asdf")
     table_files.write_stars(solution, target / "stars.ecsv")
     (target / "wcs").mkdir()
-    for name in solution.names:
+    for name in tqdm(solution.names, desc="writing", unit="WCS", disable=not progress):
         for detector in solution.camera.detectors if solution.camera else [None]:
             file = f"{name}.asdf" if detector is None else f"{detector_name(name, detector)}.asdf"
             write_wcs(solution, name, target / "wcs" / file, detector=detector)

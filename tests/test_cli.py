@@ -719,6 +719,28 @@ def test_options_that_do_not_apply_are_refused_before_a_star_is_measured(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_widths_go_with_the_prior_of_headers(night, tmp_path, monkeypatch):
+    asked = {}
+
+    def run(**arguments):
+        asked.update(arguments)
+        raise InputError("far enough")
+
+    monkeypatch.setattr(legdistort, "run", run)
+    words = ["--prior", "header", "--prior-sigma", "0.3", "--static-sigma", "0.1", "--quiet", "--out"]
+    assert main(["run", *map(str, night), *words, str(tmp_path / "o")]) == 1
+    assert (asked["prior"].sigma, asked["prior"].static_sigma) == (0.3, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("terminal", "more", "shown"), [(True, [], True), (True, ["--quiet"], False), (False, [], False)]
+)
+def test_writing_shows_a_bar_on_a_terminal(terminal, more, shown, demo, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    main(["solve", str(demo / "matched.ecsv"), "--out", str(tmp_path / "o"), *more])
+    assert ("writing: 100%" in capsys.readouterr().err) == shown
+
+
 def test_another_epoch_needs_motions(demo, tmp_path, capsys):
     solution, positions = demo / "solution.asdf", demo / "detections.ecsv"
     for line in (["stars", solution], ["correct", solution, positions]):

@@ -181,7 +181,7 @@ def do_solve(a):
         with timed({}, "assess"):
             summary = summarise(solution)
         with timed({}, "write"):
-            write_results(solution, target)
+            write_results(solution, target, progress=wants_progress(a))
         write_report(target / "report.html", solution, summary=summary, files=linked_files(target))
         write_summary(target / "summary.json", summary := summary | listed_files(target))
     _report(a, solution, summary)
