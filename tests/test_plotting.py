@@ -9,6 +9,7 @@ from astropy.table import QTable
 from matplotlib import pyplot
 from matplotlib.collections import EllipseCollection, LineCollection, PathCollection, QuadMesh
 from matplotlib.container import BarContainer
+from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
 from scipy import stats
 
@@ -449,3 +450,11 @@ def test_round_down(value, expected):
 def test_grid_collections_carry_lines_only(solution):
     ax = solution_plots.plot_distortion(solution, solution.names[0])
     assert all(isinstance(c, LineCollection) for c in ax.collections)
+
+
+@pytest.mark.parametrize(("largest", "scale"), [(4.0, "linear"), (100.0, "symlog")])
+def test_small_coefficients_are_seen_beside_large_ones(largest, scale):
+    solution = make_solution(6, 20)
+    solution.coefficients[:, 0, 3] += largest
+    panels = solution_plots.plot_coefficients(solution, lowest=2, fig=Figure())
+    assert [ax.get_yscale() for ax in panels] == [scale, scale]

@@ -173,7 +173,8 @@ def distortion_scale(solution, names, *, part="total"):
 def plot_coefficients(solution, name=None, *, lowest=0, fig=None):
     """Bars of the distortion coefficients beside the prior mean (the paper's Figure "coeff").
 
-    Displacement along x above, along y below; modes are named by their orders in x and y.
+    Displacement along x above, along y below; modes are named by their orders in x and y. Where some are more than
+    twenty times as large as the largest error bar, the axis is linear near zero only and logarithmic beyond.
 
     Parameters
     ----------
@@ -215,6 +216,10 @@ def plot_coefficients(solution, name=None, *, lowest=0, fig=None):
         ax.set_ylabel(f"along {'xy'[axis]} [px]")
         ax.grid(axis="y", linewidth=0.3)
         ax.set_axisbelow(True)
+    largest = np.max([size[:, first:] for _, size in bars.values()], initial=0.0)
+    if 0 < 20 * largest < np.abs(values[:, first:]).max():
+        panels[0].set_yscale("symlog", linthresh=elements.round_down(largest))
+        panels[0].yaxis.set_major_formatter("{x:g}")
     orders = list(zip(*basis.orders(basis.degree_of(n + first)), strict=True))[first:]
     tall = n > 15
     panels[1].set_xticks(range(n), [f"({i}, {j})" for i, j in orders], rotation=90 * tall, fontsize="small")

@@ -105,9 +105,11 @@ class Gallery:
         return self.add(
             panels[0].figure,
             "Coefficients of the Legendre modes of degree 2 and up, mean of the exposures, beside the prior if there "
-            "is one. Black: how they scatter from one exposure to the next; red: the error of one. Large values in the "
-            "highest orders would mean a degree too low or too few stars.",
+            "is one. Black: how they scatter from one exposure to the next; red: the error of one. Where a few "
+            "exceed all others by far, the axis is logarithmic beyond its linear middle. Large values in the highest "
+            "orders would mean a degree too low or too few stars.",
             bottom=0.8,
+            left=0.85,
             hspace=0.08,
         )
 
