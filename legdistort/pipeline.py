@@ -201,9 +201,7 @@ def run(
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
             exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, **reading)
-            several = reading["camera"] is not None or any(exposure.frame for exposure in exposures)
-            check_detectors(several, solving.layout, solving.static, solving.dynamic)  # before hours of measuring
-            solving = replace(solving, prior=_known_prior(prior, exposures, degree))
+            solving = _known_of(exposures, solving, prior, reading["camera"])
         with timed(timings, "measure"):
             detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, measuring, **share)
         with timed(timings, "match"):
@@ -240,6 +238,13 @@ def _open_frames(paths, min_exposures, stop_at_bad, progress, *, ext, dq_good, c
     exposures = exposures if camera is None else camera.of_detectors(exposures)
     _check_exposures(exposures, min_exposures, bad)
     return exposures, bad
+
+
+def _known_of(exposures, solving, prior, camera):
+    """The options of `solve` with the prior of these exposures; choices about a camera are refused without one."""
+    several = camera is not None or any(exposure.frame for exposure in exposures)
+    check_detectors(several, solving.layout, solving.static, solving.dynamic)
+    return replace(solving, prior=_known_prior(prior, exposures, solving.degree))
 
 
 def _where_to_begin(paths, earlier, measuring, **reading):
