@@ -1,7 +1,7 @@
 """Table of the solvers on three data sets: time, peak memory, b, sigma, chi2, each in a process of its own.
 
-Run ``python tests/benchmarks/solver_table.py [--scaling | --ratios | --covariances]``. Times are the best of three after
-a first call (which loads compiled code); memory is what the process needed beyond the data and the imports.
+Run ``python tests/benchmarks/solver_table.py [--scaling | --ratios | --covariances]``. Times are the best of three
+after a first call (which loads compiled code); memory is what the process needed beyond the data and the imports.
 """
 
 import argparse
