@@ -15,8 +15,8 @@ from ..geometry import models, similarity
 if TYPE_CHECKING:
     from gwcs import WCS as GWCS
 
-#: Positions that are evaluated at once: some 150 MB for what is worked out on the way. With an eighth of them, which would
-#: stay in the cache of a processor, what astropy does for every call takes a third of the time.
+#: Positions that are evaluated at once: some 150 MB for what is worked out on the way. With an eighth of them, which
+#: would stay in the cache of a processor, what astropy does for every call takes a third of the time.
 _PIECE = 1 << 18
 
 
