@@ -127,6 +127,22 @@ def _terms(row, n_block, phi, f, j, r):
 
 
 @compiled_loop(nogil=True, fastmath=_FAST)
+def _take(first, size, star, stars, weight, phi, pose, q, w):
+    """Undistorted positions and weights of a batch; that at the end of an exposure is filled up with no weight."""
+    for o in range(size):
+        k = first + o
+        x, y = stars[0, star[k]], stars[1, star[k]]
+        for t in range(phi.shape[1]):
+            x += phi[0, t] * stars[2 + t, star[k]]
+            y += phi[1, t] * stars[2 + t, star[k]]
+        q[0, o] = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]
+        q[1, o] = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]
+        w[0, o], w[1, o], w[2, o] = weight[0, k], weight[1, k], weight[2, k]
+    for o in range(size, _BATCH):
+        q[0, o], q[1, o], w[0, o], w[1, o], w[2, o] = 0.0, 0.0, 0.0, 0.0, 0.0
+
+
+@compiled_loop(nogil=True, fastmath=_FAST)
 def _linearise(low, high, mine, start, star, xy, weight, unequal, moving, model, made):
     """The exposures from `low` to `high` into what is `made`, and their star sums into `mine`; returns their chi2."""
     (stars, columns), (coefficients, poses, sizes, orders) = moving, model
@@ -143,17 +159,7 @@ def _linearise(low, high, mine, start, star, xy, weight, unequal, moving, model,
         r00, r01, r10, r11 = pose[0, 0], pose[0, 1], pose[1, 0], pose[1, 1]
         for first in range(start[i], start[i + 1], _BATCH):
             size = min(_BATCH, start[i + 1] - first)
-            for o in range(size):
-                k = first + o
-                x, y = stars[0, star[k]], stars[1, star[k]]
-                for t in range(n_terms):
-                    x += phi[0, t] * stars[2 + t, star[k]]
-                    y += phi[1, t] * stars[2 + t, star[k]]
-                q[0, o] = r00 * x + r01 * y + pose[0, 2]
-                q[1, o] = r10 * x + r11 * y + pose[1, 2]
-                w[0, o], w[1, o], w[2, o] = weight[0, k], weight[1, k], weight[2, k]
-            for o in range(size, _BATCH):  # the last batch of an exposure is filled up with what weighs nothing
-                q[0, o], q[1, o], w[0, o], w[1, o], w[2, o] = 0.0, 0.0, 0.0, 0.0, 0.0
+            _take(first, size, star, stars, weight, phi, pose, q, w)
             _model(coefficients[i], orders, sizes[i], q, work)
             for o in range(size):
                 r[0, o], r[1, o] = xy[0, first + o] - q[0, o], xy[1, first + o] - q[1, o]

@@ -167,7 +167,7 @@ class Uncertainty:
             whole = np.einsum("ajbj->abj", self._on_stars.star_covariance)
         else:
             roots, factors = elimination.star_roots(blocks.v), elimination.star_factors(problem, blocks)
-            if self._given is None and self._is_dense and "coefficients" not in self.__dict__:  # half the work
+            if self._given is None and self._is_dense:  # half the work of the covariance of the coefficients
                 inner = np.concatenate([self._direct.within(each, n_star) for each in factors], axis=2)
             else:
                 inner = np.concatenate([_block_diagonal(each, self.coefficients, n_star) for each in factors], axis=2)
