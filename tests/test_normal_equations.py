@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import null_space
 
-from legdistort.exceptions import AssumptionWarning
+from legdistort.exceptions import AssumptionWarning, SolveError
 from legdistort.geometry.detector_modes import similarity_basis
 from legdistort.priors.prior import Prior
 from legdistort.results.coefficient_covariance import exposure_blocks
@@ -264,6 +264,35 @@ def test_errors_are_the_same_whichever_side_is_eliminated(case, monkeypatch):
     ratio = np.sqrt(dense.star_unknowns[:2] / variance[:2])[np.arange(M) % 2, np.arange(M)]
     assert told == pytest.approx(np.median(ratio), rel=1e-3)
     assert told > 1.02
+
+
+def test_star_errors_need_no_covariance_of_the_coefficients(case):
+    """What they take up of the factorised matrix is what they take up of its inverse."""
+    problem, state, blocks, _ = case
+    gauge = constraints.make("minimal", problem, state, blocks)
+    quick = Uncertainty(problem, blocks, gauge, scale=1.5)
+    whole = Uncertainty(problem, blocks, gauge, scale=1.5, coefficients=quick.coefficients)
+    assert_allclose(quick.star_unknowns, whole.star_unknowns, rtol=1e-9)
+
+
+def test_exposures_to_blame_are_named_where_steps_are_iterated(case, monkeypatch):
+    problem, state, blocks, _ = case
+    gauge = constraints.make("minimal", problem, state, blocks)
+    monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: False)
+    assert isinstance(reduced_system.reduced_system(problem, blocks, gauge), Iterative)
+    flat = replace(blocks, u=np.where(np.arange(N)[:, None, None] == 2, 1.0, blocks.u))
+    with pytest.raises(SolveError, match="do not determine the distortion"):
+        reduced_system.reduced_system(problem, flat, gauge)
+
+
+def test_steps_that_take_too_many_iterations_are_factorised(case, monkeypatch):
+    problem, state, blocks, _ = case
+    gauge = constraints.make("minimal", problem, state, blocks)
+    target = np.zeros(gauge.n_constraints)
+    exact = Direct(problem, blocks, gauge).step(target, 0.0)
+    monkeypatch.setattr(reduced_system, "_FAST_STEPS", 2)
+    for mine, expected in zip(Iterative(problem, blocks, gauge).step(target, 1e-3), exact, strict=True):
+        assert_allclose(mine, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_singular_stars_are_left_to_the_other_ways(case):

@@ -342,7 +342,9 @@ def shapes_by_exposure(shape, names):
 
 def _check_spread(seen):
     """Positions on one line do not constrain anything across it."""
-    if np.linalg.matrix_rank(seen.xy - seen.xy.mean(axis=0)) < 2:
+    off = np.stack([column - column.mean() for column in seen.xy.T])
+    smaller, larger = np.linalg.eigvalsh(off @ off.T)
+    if smaller < 1e-12 * larger and np.linalg.matrix_rank(off) < 2:
         raise InputError("all positions lie on one line: give stars all over the field, or look at the columns x, y")
 
 
@@ -396,7 +398,8 @@ def _inside(seen, shapes):
     """
     xy, sizes = seen.xy, np.array([shapes[name][::-1] for name in seen.names])
     smallest = sizes.min(axis=0)
-    if np.all(xy.min(axis=0) >= -MARGIN * smallest) and np.all(xy.max(axis=0) <= (1 + MARGIN) * smallest):
+    low, high = ([end(column) for column in xy.T] for end in (np.min, np.max))
+    if np.all(low >= -MARGIN * smallest) and np.all(high <= (1 + MARGIN) * smallest):
         return np.ones(len(xy), dtype=bool)
     size = sizes[seen.exposure]
     out = ((xy < -MARGIN * size) | (xy > (1 + MARGIN) * size)).any(axis=1)

@@ -25,10 +25,11 @@ def copies(exposure, xy):
     key = (
         bits[:, 0] * np.uint64(0x9E3779B97F4A7C15) + bits[:, 1]
     )  # wraps around; what falls together is looked at below
+    ascending = np.sort(key)  # in a tenth of the time that the order takes
+    if np.count_nonzero(ascending[1:] == ascending[:-1]) < FEWEST:
+        return {}
     order = np.argsort(key)
     again = key[order[1:]] == key[order[:-1]]
-    if np.count_nonzero(again) < FEWEST:
-        return {}
     places = {}
     for row in order[np.concatenate([[False], again]) | np.concatenate([again, [False]])]:
         places.setdefault(tuple(xy[row].tolist()), set()).add(int(exposure[row]))

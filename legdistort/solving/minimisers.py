@@ -30,6 +30,8 @@ MAX_ITERATIONS, MAX_SWEEPS = 50, 1000
 #: 20 stars, with 15 px of static distortion that nobody knew, 21 never settled with 6, one with 12, none with 20. Not
 #: for ever: where few stars of a reference bend the plane by much, state and constraints may chase each other.
 _MADE = 20
+#: ... nor once a step is below so many standard errors, rms: what they are made from hardly changes then.
+_STEADY = 0.01
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
 
 
@@ -99,7 +101,8 @@ def solve_joint(
     max_iterations : int, optional
         50 if not given.
     tolerance : float
-        Converged when the next step would be below this many standard errors, rms over the unknowns; it is not taken.
+        Converged when the next step would be below this many standard errors, rms over the unknowns; it is not taken,
+        nor made where it would be far below, as the last two tell.
 
     Returns
     -------
@@ -171,9 +174,9 @@ class _Descent:
         self.factors = loss_factors(criterion.squares(self.problem, residuals), self.rules.loss)
         self.weighted = self.problem.scaled(self.factors)
 
-    def _prepare(self):
-        """The gauge and the reduced system at the current state."""
-        if self.n_made < _MADE:
+    def _prepare(self, step=np.inf):
+        """The gauge and the reduced system at the current state, a `step` from where they were made."""
+        if self.n_made < _MADE and step > _STEADY:
             how = {"released": self.released, "common": self.rules.common, "all_drifts": self.rules.hold}
             self.convention = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks, **how)
             self.n_made += 1
@@ -184,7 +187,7 @@ class _Descent:
 
     def descend(self, max_iterations, tolerance):
         """Iterate until the next step would be below `tolerance`."""
-        accuracy, size = 1e-3, np.inf
+        accuracy, size = 1e-3 if self.blocks.coupling.dtype == np.float32 else 1e-5, np.inf
         for _ in range(max_iterations):
             target = -self.convention.violation(_departure(self.problem, self.state))
             d_star, d_exposure = self.system.step(target, accuracy)
@@ -201,7 +204,10 @@ class _Descent:
             if self.rules.loss != "linear":
                 self._reweight(self.blocks.residual)
                 self.blocks = criterion.linearise(self.weighted, self.state)
-            self._prepare()
+            self._prepare(size)
+            if size < _STEADY and size * size / last < 0.1 * tolerance:
+                self.converged = True
+                return
 
     def freer(self):
         """The same with further unknown maps left to the residuals; None if these determine none."""

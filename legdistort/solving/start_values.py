@@ -1,5 +1,7 @@
 """Start values of a minimisation, and exposures that are too far off to take part in one."""
 
+import itertools
+
 import numpy as np
 
 from ..exceptions import FoldError, SolveError
@@ -45,7 +47,7 @@ def start(problem, nominal, *, robust=False):
             weight = full / (1 + distance2 / (2 * np.median(distance2) + 1e-12))
         current = refine(problem, current, q, positions, weight)
     distance2 = distances(problem, current, q, positions)
-    typical = np.array([np.sqrt(np.median(distance2[problem.part(i)])) for i in range(problem.n_exposures)])
+    typical = np.sqrt([_median(distance2[problem.part(i)]) for i in range(problem.n_exposures)])
     common = _common_similarity(problem, nominal, current, misplaced(problem, typical))
     current = np.stack([similarity.compose(pose, common) for pose in current])
     if problem.terms.n:
@@ -71,12 +73,29 @@ def undistorted(problem):
     """Positions (2, n) with the prior distortion taken out to second order, which is enough for a start."""
     if not np.any(problem.prior_mean):
         return problem.xy
-    q = problem.xy.copy()
-    for i, (shape, mean) in enumerate(zip(problem.shapes, problem.prior_mean, strict=True)):
-        distortion, x = Distortion(mean, shape), problem.xy[:, problem.part(i)].T
-        guess = 2 * x - distortion(x)
-        q[:, problem.part(i)] = (x - distortion(guess) + guess).T
+    q, n = np.empty_like(problem.xy), problem.n_exposures
+    alike = [(shape, mean.tobytes()) for shape, mean in zip(problem.shapes, problem.prior_mean, strict=True)]
+    ends = [i for i in range(1, n) if alike[i] != alike[i - 1]]
+    for first, last in itertools.pairwise([0, *ends, n]):  # exposures of one prior are done together
+        distortion = Distortion(problem.prior_mean[first], problem.shapes[first])
+        for part in _chunks(problem.start[first], problem.start[last]):
+            x = problem.xy[:, part].T
+            guess = 2 * x - distortion(x)
+            q[:, part] = (x - distortion(guess) + guess).T
     return q
+
+
+def _chunks(first, last, size=4096):
+    """Slices of observations from `first` to `last`, small enough for what is computed of them to stay in the cache."""
+    return [slice(k, min(k + size, last)) for k in range(first, last, size)]
+
+
+def _median(values):
+    """`numpy.median` without what that does beside, for many short arrays."""
+    half = len(values) // 2
+    if len(values) % 2:
+        return np.partition(values, half)[half]
+    return np.partition(values, (half - 1, half))[half - 1 : half + 1].mean()
 
 
 def refine(problem, pose_list, q, positions, weight):
@@ -101,16 +120,15 @@ def _common_similarity(problem, nominal, refined, astray):
 
     Exposures of like quality count equally, bad ones less, misplaced ones not at all.
     """
-    variance = 1 / np.array([problem.weight[:2, problem.part(i)].sum() for i in range(problem.n_exposures)])
+    variance = 1 / np.add.reduceat(problem.weight[:2].sum(axis=0), problem.start[:-1])
     weight = 1 / (variance + 10 * np.median(variance))
     weight[astray] = 0
-    old, new = [], []
-    for i in range(problem.n_exposures):
-        ny, nx = problem.shapes[i]
-        corners = np.array([[0, 0], [nx, 0], [nx, ny], [0, ny]]) - 0.5
-        old.append(similarity.apply(similarity.invert(nominal[i]), corners))
-        new.append(similarity.apply(similarity.invert(refined[i]), corners))
-    return similarity.fit_similarity(np.concatenate(old), np.concatenate(new), weights=np.repeat(weight, 4), parity=1)
+    corners = np.array(problem.shapes)[:, None, ::-1] * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 0.5
+    old, new = (
+        ((corners - poses[:, None, :, 2]) @ np.linalg.inv(poses[:, :, :2]).mT).reshape(-1, 2)
+        for poses in (nominal, refined)
+    )
+    return similarity.fit_similarity(old, new, weights=np.repeat(weight, 4), parity=1)
 
 
 def far_off(problem, typical):

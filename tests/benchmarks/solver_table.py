@@ -1,7 +1,7 @@
 """Table of the solvers on three data sets: time, peak memory, b, sigma, chi2, each in a process of its own.
 
-Run ``python tests/benchmarks/solver_table.py [--scaling | --covariances]``. Times are the best of three after a first
-call (which loads compiled code); memory is what the process needed beyond the data and the imports.
+Run ``python tests/benchmarks/solver_table.py [--scaling | --ratios | --covariances]``. Times are the best of three
+after a first call (which loads compiled code); memory is what the process needed beyond the data and the imports.
 """
 
 import argparse
@@ -72,6 +72,38 @@ def measure(name, solver, n_exposures, n_stars):
     return row
 
 
+def ratios(n_exposures, n_stars):
+    """CPU time of plain solutions, of default ones, which look for gross errors, and of scipy, in turn: (3,) seconds.
+
+    The least of several rounds, and that of the first plain solution in this process, which may load compiled loops.
+    """
+    import rivals
+    import sets
+
+    from legdistort import Matches, solve
+    from legdistort.solving.options import CLIP
+
+    sim, prior = sets.make("large", n_exposures=n_exposures, n_stars=n_stars)
+    table, shape, poses = sim.matches.table, sim.matches.shapes, sim.matches.poses
+
+    def ours(clip):
+        return solve(Matches.from_table(table, shape=shape, poses=poses), prior=prior, clip=clip)
+
+    ways = {
+        "plain": lambda: ours(None),
+        "default": lambda: ours(CLIP),
+        "scipy": lambda: rivals.solve_scipy(*sets.problem(sim, prior)),
+    }
+    times = {way: [] for way in ways}
+    for count in range(10):
+        for way, function in ways.items():
+            if way != "scipy" or count < (2 if len(table) > 1e5 else 5):
+                begin = time.process_time()
+                function()
+                times[way].append(time.process_time() - begin)
+    return len(table), *(min(each) for each in times.values()), times["plain"][0]
+
+
 def run(*arguments):
     """A row from a process of its own."""
     command = [sys.executable, __file__, "--row", *map(str, arguments)]
@@ -97,6 +129,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--row", nargs=4)
     parser.add_argument("--scaling", action="store_true")
+    parser.add_argument("--ratios", action="store_true", help="CPU time of scipy over ours, and of rejection")
     parser.add_argument("--covariances", action="store_true", help="errors of all stars, many exposures or many stars")
     arguments = parser.parse_args()
     sys.path.insert(0, str(Path(__file__).parent))
@@ -106,6 +139,11 @@ def main():
     elif arguments.scaling:
         for n_exposures, n_stars in ((10, 286), (30, 1000), (100, 3000), (100, 10_000), (300, 10_000), (1000, 10_000)):
             show(run("large", "joint", n_exposures, n_stars))
+    elif arguments.ratios:
+        print("observations  plain [s]  first [s]  scipy / plain  default / plain")
+        for n_exposures, n_stars in ((10, 114), (10, 300), (30, 1000), (100, 3000), (100, 10_000)):
+            n, plain, default, scipy, first = ratios(n_exposures, n_stars)
+            print(f"{n:12d} {plain:10.4f} {first:10.4f} {scipy / plain:14.1f} {default / plain:16.2f}", flush=True)
     elif arguments.covariances:
         for n_exposures, n_stars in ((150, 30), (2000, 30), (400, 60), (100, 3000), (500, 2000), (500, 5000)):
             show(run("large", "joint", n_exposures, n_stars))

@@ -80,14 +80,18 @@ class Uncertainty:
         """
         if self._given is not None:
             return self._given
-        problem, blocks = self._problem, self._blocks
         if self._is_dense:
-            direct = isinstance(self.system, reduced_system.Direct)
-            system = self.system if direct else reduced_system.Direct(problem, blocks, self._gauge)
-            return self._scale**2 * system.covariance()
+            return self._scale**2 * self._direct.covariance()
         if self._on_stars is not None:
             return self._scale**2 * self._on_stars.covariance_blocks()
         return self._scale**2 * self._approximated
+
+    @cached_property
+    def _direct(self):
+        """The reduced matrix, factorised."""
+        if isinstance(self.system, reduced_system.Direct):
+            return self.system
+        return reduced_system.Direct(self._problem, self._blocks, self._gauge)
 
     @property
     def _is_dense(self):
@@ -163,8 +167,12 @@ class Uncertainty:
             whole = np.einsum("ajbj->abj", self._on_stars.star_covariance)
         else:
             roots, factors = elimination.star_roots(blocks.v), elimination.star_factors(problem, blocks)
-            inner = np.concatenate([_block_diagonal(each, self.coefficients, n_star) for each in factors], axis=2)
-            whole = np.einsum("apj,pqj,bqj->abj", roots, inner / self._scale**2, roots, optimize=True)
+            if self._given is None and self._is_dense:  # half the work of the covariance of the coefficients
+                inner = np.concatenate([self._direct.within(each, n_star) for each in factors], axis=2)
+            else:
+                inner = np.concatenate([_block_diagonal(each, self.coefficients, n_star) for each in factors], axis=2)
+                inner /= self._scale**2
+            whole = np.einsum("apj,pqj,bqj->abj", roots, inner, roots, optimize=True)
             whole += unpacked(inverse).transpose(1, 2, 0)
         for a in range(n_star):
             for b in range(a + 1):

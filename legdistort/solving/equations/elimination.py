@@ -1,11 +1,13 @@
 """Stars eliminated from the normal equations: couplings, Schur complement and its factors."""
 
 import numpy as np
+from scipy.linalg.blas import dsyrk
 
 from .star_terms import outer_packed, packed, size_of, symmetric_times
 
 #: Curvature of an unknown, the others fitted, below this part of its own is rounding: it is not determined.
 _ROUNDING = 1e-11
+_TILE = 256  # of a matrix that is mirrored
 
 
 def inverse_star_blocks(v):
@@ -103,7 +105,11 @@ def reduced_matrix(problem, blocks):
     out = unknowns.matrix(blocks.u)
     for factor in star_factors(problem, blocks):
         factor = unknowns.gather(factor.reshape(*blocks.g_exposure.shape, -1))
-        out -= factor @ factor.T
+        out = dsyrk(-1.0, factor.T, trans=1, beta=1.0, c=out.T, lower=1, overwrite_c=1).T  # its upper triangle
+    for i in range(0, len(out), _TILE):
+        part = slice(i, i + _TILE)
+        out[i + _TILE :, part] = out[part, i + _TILE :].T
+        out[part, part] = np.triu(out[part, part]) + np.triu(out[part, part], 1).T
     return out
 
 

@@ -16,7 +16,7 @@ from .star_terms import StarTerms
 from .unknowns import Unknowns
 
 #: Number of observations from which compiled loops are used, if numba is installed.
-COMPILED_FROM = 30_000
+COMPILED_FROM = 20_000
 
 
 def uses_compiled_loops(n):

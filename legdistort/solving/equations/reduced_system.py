@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg.blas import dtrsm
 
 from ...exceptions import SolveError
 from . import elimination
@@ -26,6 +27,9 @@ DIRECT_LIMIT = 3000
 STAR_LIMIT = 8000
 #: ... and while building it costs no more than this many multiplications.
 _DIRECT_COST = 4e9
+#: ... or this many, where compiled loops make the steps of conjugate gradients cheap; there are so many of these before
+#: the matrix is factorised after all.
+_FAST_DIRECT_COST, _FAST_STEPS = 1e8, 60
 _LEAST_PIVOT = 1e-7  # of the normalised equations, below which they count as singular
 _WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not determined
 
@@ -36,15 +40,28 @@ def reduced_system(problem, blocks, gauge, weak=None):
     if large and has_few_stars(problem, _DIRECT_COST) and 2 * problem.n_star * problem.n_stars <= problem.unknowns.size:
         with contextlib.suppress(LinAlgError):
             return OnStars(problem, blocks, gauge)
-    if uses_direct(problem):
+    if uses_direct(problem) or (not large and _is_singular(blocks.u)):  # which says whose stars are to blame
         return Direct(problem, blocks, gauge, weak)
     return Iterative(problem, blocks, gauge)
+
+
+def _is_singular(blocks):
+    """Whether some block of an exposure (n, k, k) is singular, as where its stars lie on a line."""
+    unit = np.sqrt(np.einsum("iaa->ia", blocks))
+    if not unit.min() > 0:
+        return True
+    try:
+        lower = np.linalg.cholesky(blocks / unit[:, :, None] / unit[:, None, :])
+    except LinAlgError:
+        return True
+    return bool(np.einsum("iaa->ia", lower).min() < _LEAST_PIVOT)
 
 
 def uses_direct(problem):
     """Whether the reduced system is small enough to be factorised; it always is where exposures share modes."""
     n = problem.unknowns.size
-    return problem.unknowns.shared or (n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= _DIRECT_COST)
+    cost = _FAST_DIRECT_COST if problem.uses_compiled_loops else _DIRECT_COST
+    return problem.unknowns.shared or (n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= cost)
 
 
 def has_few_stars(problem, cost=np.inf):
@@ -181,6 +198,24 @@ class Direct(Reduced):
         """Changes of the unknowns (n_constraints + n_weak, n), each moving one constraint by one, all else fitted."""
         return (self._lifted @ self._border).T
 
+    def within(self, columns, n):
+        """Blocks (n, n, m) of ``f' C f``, C the covariance of the coefficients, for columns f (n_coefficients, n m).
+
+        Without C itself: ``S^-1 = (L L')^-1``, and half the multiplications of a product with it.
+        """
+        columns = self.unknowns.gather(columns.reshape(*self.blocks.g_exposure.shape, -1))
+        held = (self._lifted.T @ columns).reshape(len(self.rows), n, -1)
+        free = columns * self._unit[:, None]
+        free = dtrsm(1.0, self._factor[0], free.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
+        free = free.reshape(len(free), n, -1)
+        out = np.empty((n, n, free.shape[2]))
+        for a, b in np.ndindex(n, n):
+            if b <= a:
+                out[a, b] = np.einsum("nj,nj->j", free[:, a], free[:, b])
+                out[a, b] -= np.einsum("nj,nj->j", held[:, a], self._border @ held[:, b])
+                out[b, a] = out[a, b]
+        return out
+
     def covariance(self):
         """Covariance of the coefficients of all exposures in the gauge, shape (n_exposures * 2 n_modes,) squared."""
         full = self._apply_inverse(np.eye(len(self._unit)))
@@ -247,11 +282,19 @@ class Iterative(Reduced):
     def step(self, target, accuracy):
         """As for `Direct`."""
         gradients = self.blocks.g_exposure, self.blocks.g_star
-        stars, d = self._solve(*gradients, self.rows, target, accuracy)
-        return stars, self.unknowns.spread(d)
+        n, limit = self.unknowns.size, None
+        if n <= DIRECT_LIMIT and n * n * 2.0 * self.problem.n_stars <= _DIRECT_COST:
+            limit = _FAST_STEPS
+        found = self._solve(*gradients, self.rows, target, accuracy, limit=limit)
+        if found is None:  # exposures hang together weakly
+            return Direct(self.problem, self.blocks, self.gauge).step(target, accuracy)
+        return found[0], self.unknowns.spread(found[1])
 
-    def _solve(self, g_exposure, g_star, rows, target, tolerance, *, max_iterations=1000):
-        """Star step (2 + k, n_stars) and step of the unknown coefficients for gradients, with rows d = target."""
+    def _solve(self, g_exposure, g_star, rows, target, tolerance, *, max_iterations=1000, limit=None):
+        """Star step (2 + k, n_stars) and step of the unknown coefficients for gradients, with rows d = target.
+
+        None if it takes more than `limit` iterations.
+        """
         lifted = np.stack([self._block_solve(row) for row in rows], axis=1)
         border = np.linalg.inv(rows @ lifted)
 
@@ -269,6 +312,8 @@ class Iterative(Reduced):
             if rz <= goal:
                 log.debug("conjugate gradients: %d steps", count)
                 break
+            if count == limit:
+                return None
             ep = self._couple(p)
             sp = self._gradient(self._own(p), ep)
             length = rz / (p @ sp)

@@ -177,10 +177,10 @@ def _static_variance(problem, others, group, shared):
     sigma = np.zeros((problem.n_exposures, 2, problem.n_modes)) if problem.mean_sigma is None else problem.mean_sigma
     if shared:
         sigma = np.where(sigma > 0, sigma, np.inf)
+    sigma = sigma.reshape(problem.n_exposures, -1, 1)
+    flat, known = (others != 0) @ np.isinf(sigma), others**2 @ np.where(np.isinf(sigma), 0, sigma) ** 2
     out = np.zeros((group.max() + 1, others.shape[1]))
-    for mine, rows, g in zip(sigma.reshape(problem.n_exposures, -1), others, group, strict=True):
-        flat = (np.abs(rows) > 0) @ np.isinf(mine)
-        out[g] = np.maximum(out[g], np.where(flat, np.inf, rows**2 @ np.where(np.isinf(mine), 0, mine) ** 2))
+    np.maximum.at(out, group, np.where(flat, np.inf, known)[:, :, 0])
     return out
 
 
@@ -235,8 +235,9 @@ def reference_box(problem, state):
 
 def _by_shape(function, problem):
     """``function(shape, n_modes)`` of every exposure, computed once a shape, stacked."""
-    made = {shape: function(shape, problem.n_modes) for shape in set(problem.shapes)}
-    return np.stack([made[shape] for shape in problem.shapes])
+    number = {shape: k for k, shape in enumerate(dict.fromkeys(problem.shapes))}
+    made = np.stack([function(shape, problem.n_modes) for shape in number])
+    return made[[number[shape] for shape in problem.shapes]]
 
 
 def _motion(problem, pose_list, box):
@@ -247,7 +248,7 @@ def _motion(problem, pose_list, box):
     linear = pose_list[:, :, :2]
     back = _apply_inverse(pose_list, nodes)
     reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
-    mixing = np.einsum("mk,nik->imn", basis.values(degree, u, v) * w, reference, optimize=True)
+    mixing = (basis.values(degree, u, v) * w) @ reference.transpose(1, 2, 0)
     return np.einsum("iab,imn->iambn", linear, mixing).reshape(-1, 2 * size, 2 * size)
 
 
@@ -302,7 +303,7 @@ def absorb_similarities(problem, state):
         linear = np.linalg.inv(shift[:, :, :2])
         old = (nodes - shift[:, None, :, 2]) @ linear.transpose(0, 2, 1)
         values = basis.values(degree, *np.moveaxis((2 * old + 1) / pixels - 1, -1, 0))
-        changed = ((old - nodes).transpose(0, 2, 1) + np.einsum("iam,mik->iak", coefficients, values)) @ project
+        changed = ((old - nodes).transpose(0, 2, 1) + coefficients @ values.transpose(1, 0, 2)) @ project
         coefficients[:, :, :n_modes] = changed[:, :, :n_modes]
     if problem.fixed is not None:
         for a, mean, rows in zip(coefficients, problem.prior_mean, problem.fixed, strict=True):

@@ -45,7 +45,7 @@ def dynamic_covariance(problem, state, error, moved, others, group, static):
     n_modes = problem.n_modes
     departure = (state.coefficients - problem.prior_mean)[:, :, :n_modes].reshape(problem.n_exposures, -1)
     own = np.einsum("ika,ia->ik", others, departure)
-    variance = np.einsum("ika,iab,ikb->ik", others, error, others, optimize=True)
+    variance = (others @ error * others).sum(axis=2)
     counts = variance <= 10 * np.median(variance, axis=0)  # values less certain would add noise and nothing else
     fitted = [_static(others, group == g, variance > 0) for g, variance in enumerate(static)]
     design = np.concatenate([moved, *fitted], axis=2)
@@ -129,5 +129,5 @@ def influence(error, rows):
     """
     if not rows.shape[1]:
         return np.ones(len(error))
-    own = np.einsum("ika,iab,ikb->ik", rows, error, rows, optimize=True).mean(axis=1)
+    own = (rows @ error * rows).sum(axis=2).mean(axis=1)
     return 1 / (1 + (own / (10 * np.median(own))) ** 2)

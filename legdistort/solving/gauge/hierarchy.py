@@ -101,7 +101,7 @@ class Hierarchy:
             # (S^-1 + sum W)^-1 without dividing by a variance of zero; one that is infinite has no S^-1
             inner = np.diag(np.where(known, 1.0, 0.0)) + root[:, None] * total * root
             weighted[mine] -= self.weight[mine] @ (root[:, None] * np.linalg.solve(inner, root[:, None] * pulled))
-        return np.einsum("ika,ikb->bia", self.others, weighted, optimize=True)
+        return (weighted.mT @ self.others).transpose(1, 0, 2)
 
     def convention(self, kind):
         """Rows (m + m', n_exposures, 2 n) of a convention by itself: A_0 at the prior mean."""
@@ -135,10 +135,11 @@ class Hierarchy:
         if not (self.static.any() and len(self.maps)):  # exact: the convention is the posterior mean
             return Constraints(held, self.maps.T, ())
         rows, n = self.rows(self.static), len(self.maps)
-        information = np.einsum("bia,iac,dc->bd", rows[:n], self.motion, self.maps, optimize=True)
+        flat = rows.reshape(len(rows), -1)
+        information = flat[:n] @ (self.motion @ self.maps.T).reshape(flat.shape[1], -1)
         if self.drifts.shape[2]:  # with those that change with time fitted as well
             reached = np.concatenate([self.motion @ self.maps.T, self.drifts], axis=2)
-            full = np.einsum("bia,iac->bc", rows, reached, optimize=True)
+            full = flat @ reached.reshape(flat.shape[1], -1)
             information = information - full[:n, n:] @ np.linalg.solve(full[n:, n:], full[n:, :n])
         metric = self.maps @ self.metric @ self.maps.T
         metric += _RIDGE * np.trace(metric) / len(metric) * np.eye(len(metric))
@@ -167,15 +168,16 @@ class Hierarchy:
         rows, similar = np.concatenate([known.rows, poses]), similarity_basis(self.size, len(self.power)).T
         maps = np.hstack([known.known, *(each.map[:, None] for each in known.unknown), similar])
         n, m = known.known.shape[1], self.drifts.shape[2]
-        inside = np.einsum("bia,iac,dic->bd", rows, self.dynamic, rows, optimize=True)
-        on_modes = np.einsum("bia,ika->bik", rows, self.others, optimize=True)
+        flat, by_exposure = rows.reshape(len(rows), -1), rows.transpose(1, 0, 2)
+        inside = flat @ (self.dynamic @ by_exposure.mT).reshape(flat.shape[1], -1)
+        on_modes = (by_exposure @ self.others.mT).transpose(1, 0, 2)
         for g, variance in enumerate(self.static):
             common = on_modes[:, self.group == g].sum(axis=1)
             inside += common * np.where(np.isfinite(variance), variance, 0) @ common.T
-        reach = np.einsum("bia,iac,cd->bd", rows, self.motion, maps, optimize=True)
+        reach = flat @ (self.motion @ maps).reshape(flat.shape[1], -1)
         if m or rates.shape[2]:
-            also = np.einsum("bia,iac->bc", rows, np.concatenate([self.drifts, rates], axis=2), optimize=True)
-            reach = np.concatenate([reach, also], axis=1)
+            also = np.concatenate([self.drifts, rates], axis=2).reshape(flat.shape[1], -1)
+            reach = np.concatenate([reach, flat @ also], axis=1)
         inverse = np.linalg.inv(reach)
         back, drifting = self.pointed @ maps[:, :n] @ inverse[:n], inverse[maps.shape[1] :][:m]
         return back @ inside @ back.T, drifting @ inside @ drifting.T
@@ -219,13 +221,13 @@ def _pointing_off(power, size):
     `power` (n, n) are the mean products of the modes, over the stars.
     """
     similar = similarity_basis(size, len(power)).T
-    pulled = similar.T @ np.kron(np.eye(2), power)
+    pulled = (similar.T.reshape(-1, 2, len(power)) @ power).reshape(similar.shape[::-1])
     return np.eye(len(similar)) - similar @ np.linalg.pinv(pulled @ similar, rcond=1e-12, hermitian=True) @ pulled
 
 
 def _metric(power, pointed):
     """Mean square displacement of the stars, per axis, by modes (2 n,) squared, once a similarity is taken off."""
-    return pointed.T @ np.kron(np.eye(2), power / 2) @ pointed
+    return (pointed.T.reshape(-1, 2, len(power)) @ power).reshape(pointed.shape) @ pointed / 2
 
 
 def _named(maps, pointed, metric, size):
