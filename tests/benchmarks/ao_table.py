@@ -51,8 +51,9 @@ def ours(**options):
 
 def true_psf(frame):
     """A fit with the true PSF from the true positions: what the bound is."""
-    kind, strehl, seed = frame.name.rsplit("-", 2)
-    psf = ao.start(kind, float(strehl), int(seed), len(frame.data))[1]
+    kind, strehl, *_, seed = frame.name.split("-")  # of crowded ones there is the number of stars, too
+    strehl, seed, size = float(strehl), int(seed), len(frame.data)
+    _, psf = ao.start_crowded(strehl, seed, size) if kind == "crowd" else ao.start(kind, strehl, seed, size)
     error = np.sqrt(np.einsum("naa->na", frame.covariance))
     return ao.fit_true(frame, psf), error, frame.flux
 
