@@ -201,7 +201,7 @@ def confirmed(data, variance, use, *, level=0.0, fwhm=None, widths=None):
     if bad.any():
         near = np.zeros(
             use.shape, dtype=bool
-        )  # what is bad and its eight neighbours: five times faster than binary_dilation
+        )  # and eight neighbours: five times faster than binary_dilation
         near.reshape(len(near), -1)[which[0][bad], which[1][bad]] = True
         for axis in (1, 2):
             one = near.swapaxes(0, axis).copy()

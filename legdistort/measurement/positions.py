@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_TELLING = 10  # usable stars that tell how large chi2 is in a frame
 _COLUMNS = ("x", "y", "x_err", "y_err", "xy_corr", "flux", "flux_err", "fwhm", "chi2")
 _PIXELS = ("x", "y", "x_err", "y_err", "fwhm")
 
@@ -441,7 +442,7 @@ class _Stars(NamedTuple):
     dof: np.ndarray
     snr: np.ndarray
     flags: np.ndarray
-    misfit: float = 0.0
+    misfit: float | None = None  # of a PSF; Moffat profiles have a shape each
 
 
 def _moffat_stars(fitted):
@@ -481,7 +482,9 @@ def _table(name, stamps, stars):
     # Near the detection limit the fit is no longer linear (measured at a ratio of 7: errors 8 to 15 % too small).
     faint = 1 + 5 / np.maximum(stars.snr, 1) ** 2
     # What all bright stars leave is the error of their PSF: the errors of positions have it, those of fluxes do not.
-    scale, flux_scale = (faint * _scale(c, dof) for c in (chi2 / (1 + (stars.misfit * stars.snr) ** 2 / dof), chi2))
+    of_psf = 1 + ((stars.misfit or 0.0) * stars.snr) ** 2 / dof
+    telling = ((flags & UNUSABLE) == 0) & (stars.misfit is not None)
+    scale, flux_scale = (faint * _scale(c, dof, telling) for c in (chi2 / of_psf, chi2))
     error = np.sqrt(np.einsum("nii->ni", stars.covariance))
     lost = ~(error < stamps.half).all(axis=1)
     corr = np.where(lost, 0.0, stars.covariance[:, 0, 1] / error.prod(axis=1))
@@ -495,9 +498,24 @@ def _table(name, stamps, stars):
     return QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})[np.argsort(-flux, kind="stable")]
 
 
-def _scale(chi2, dof):
-    """Factor on errors; three standard deviations of chi2 are chance, which must not raise those of good fits."""
-    return np.sqrt(np.maximum(1, chi2 - 3 * np.sqrt(2 / dof)))
+def _scale(chi2, dof, telling):
+    """Factor on errors, from what fits leave.
+
+    Of one star, three standard deviations of chi2 may be chance, which must not raise the errors of good fits. Of all
+    stars of a frame they are not: where their chi2 are high or spread by more than noise (light of stars too faint or
+    too close to be seen, in crowded fields), the chi2 to be expected of a star is the mean of its own and that of the
+    others, by the weights of spread and noise. `telling` stars say so; Moffat profiles do not, which leave more of
+    bright stars than of faint ones.
+    """
+    chance = np.sqrt(2 / dof)
+    expected = np.ones_like(chi2)
+    if np.count_nonzero(telling) >= _TELLING:
+        level = np.median(chi2[telling])
+        noise2 = (level * chance) ** 2
+        spread2 = (1.4826 * np.median(np.abs(chi2[telling] - level))) ** 2 - np.median(noise2[telling])
+        spread2 = max(spread2, 0.0)
+        expected = level + spread2 / (spread2 + noise2) * (chi2 - level)
+    return np.sqrt(np.maximum.reduce([np.ones_like(chi2), expected, chi2 - 3 * chance]))
 
 
 def _distinct(table, fwhm):
