@@ -199,9 +199,7 @@ def confirmed(data, variance, use, *, level=0.0, fwhm=None, widths=None):
     keep = use.copy()
     bad = excess > _CLIP_SIGMA * sigma
     if bad.any():
-        near = np.zeros(
-            use.shape, dtype=bool
-        )  # and eight neighbours: five times faster than binary_dilation
+        near = np.zeros(use.shape, dtype=bool)  # and eight neighbours: five times faster than binary_dilation
         near.reshape(len(near), -1)[which[0][bad], which[1][bad]] = True
         for axis in (1, 2):
             one = near.swapaxes(0, axis).copy()
