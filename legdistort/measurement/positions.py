@@ -511,7 +511,7 @@ def _scale(chi2, dof, use):
     chance = np.sqrt(2 / dof)
     expected = np.ones_like(chi2)
     if np.count_nonzero(use) >= _ENOUGH:
-        level = np.median(chi2[use])
+        level = max(np.median(chi2[use]), 1.0)
         noise2 = (level * chance) ** 2
         spread2 = (1.4826 * np.median(np.abs(chi2[use] - level))) ** 2 - np.median(noise2[use])
         spread2 = max(spread2, 0.0)
