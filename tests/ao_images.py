@@ -101,10 +101,15 @@ def frame(kind, strehl, seed, *, n=60, size=1024, lowest=10.0, highest=1000.0):
     return Frame(f"{kind}-{strehl:g}-{seed}", data, xy, flux, covariance, snr, ORDERS[kind])
 
 
+def start_crowded(strehl, seed, size):
+    """The random numbers of a crowded frame, and its PSF, which they begin with."""
+    rng = np.random.default_rng([seed, 5])
+    return rng, rendering.as_psf(make_psf("symmetric", strehl, rng), (size, size))
+
+
 def crowded_frame(strehl, seed, *, n, size=512):
     """Stars at random places, with a round PSF; evenly spread in the logarithm of the flux."""
-    rng, shape = np.random.default_rng([seed, 5]), (size, size)
-    psf = rendering.as_psf(make_psf("symmetric", strehl, rng), shape)
+    (rng, psf), shape = start_crowded(strehl, seed, size), (size, size)
     xy, flux = rng.uniform(8, size - 9, (n, 2)), 10 ** rng.uniform(3.2, 6, n)
     covariance, snr, expected = bounds(xy, flux, psf, shape)
     data = rendering.add_noise(expected, rng, gain=GAIN, read_noise=READ_NOISE).astype(np.float32)

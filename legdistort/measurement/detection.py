@@ -90,10 +90,10 @@ def bright_peaks(frame, fwhm):
     sigma = _kernel(fwhm)
     seen = frame.good & ~frame.saturated
     signal = frame.signal if frame.good.all() else np.where(frame.good, frame.signal, np.float32(0))
-    filtered, noise = _blur(signal, sigma), np.float32(_norm(sigma)) * frame.variance
-    y, x = _above(filtered, _STANDS_OUT * np.sqrt(noise))
+    filtered, norm = _blur(signal, sigma), np.float32(_norm(sigma))
+    y, x = _above(filtered, _STANDS_OUT, norm, frame.variance)
     mean, step = mean_light(signal, seen, _LOCAL * sigma)
-    ratio = (filtered[y, x] - mean[y // step, x // step]) / np.sqrt(noise[y, x])
+    ratio = (filtered[y, x] - mean[y // step, x // step]) / np.sqrt(norm * frame.variance[y, x])
     use = (ratio > _STANDS_OUT) & _is_highest(filtered, x, y, max(1, int(fwhm / 2)))
     return np.column_stack([x, y])[use][np.argsort(-ratio[use], kind="stable")]
 
@@ -138,7 +138,7 @@ def detect(frame, fwhm, threshold):
         )  # fmt: skip
         frame = replace(frame, variance=variance)
         variance = variance + np.float32(photon) * np.maximum(light, 0, out=light)
-    x, y, ratio = _peaks(residual, filtered, norm * variance, frame, (sigma, fwhm, threshold))
+    x, y, ratio = _peaks(residual, filtered, (norm, variance), frame, (sigma, fwhm, threshold))
     # of the light of a peak, the part that is neither a side lobe nor an error of the light taken off
     spoilt = binary_dilation(frame.saturated, iterations=int(np.ceil(2 * sigma))) if frame.saturated.any() else None
     other = side_light(filtered, x, y, fwhm, hidden=spoilt) + _EXTRAPOLATED * extrapolated[y // step, x // step]
@@ -160,15 +160,18 @@ def _norm(sigma):
     return ((kernel - _blur(kernel, _LOCAL * sigma)) ** 2).sum()
 
 
-def _peaks(residual, filtered, variance, frame, settings):
-    """Peaks above the threshold, and their signal-to-noise ratios; `variance` is that of the filtered image."""
-    sigma, fwhm, threshold = settings
+def _peaks(residual, filtered, noise, frame, settings):
+    """Peaks above the threshold, and their signal-to-noise ratios.
+
+    `noise` is the norm of the kernel and the variance of the image, their product that of the filtered image.
+    """
+    (norm, variance), (sigma, fwhm, threshold) = noise, settings
     whole = frame.good.all() and not frame.noise_given  # a smooth map of the variance needs no smoothing
-    image = filtered if whole else _weighted_ratio(residual, variance, frame, sigma)
-    y, x = _above(image, threshold * np.sqrt(variance) if whole else threshold)
+    image = filtered if whole else _weighted_ratio(residual, norm * variance, frame, sigma)
+    y, x = _above(image, threshold, norm, variance) if whole else _exceeding(image, threshold)
     peak = _is_highest(image, x, y, max(1, int(fwhm / 2)))
     x, y = x[peak], y[peak]
-    return x, y, filtered[y, x] / np.sqrt(variance[y, x]) if whole else image[y, x]
+    return x, y, filtered[y, x] / np.sqrt(norm * variance[y, x]) if whole else image[y, x]
 
 
 def _weighted_ratio(residual, variance, frame, sigma):
@@ -189,19 +192,25 @@ def _blur(image, sigma):
     return gaussian_sums(image, sigma)[0]
 
 
-def _above(image, limit):
-    """Pixels, y and x, in which an image exceeds a limit."""
+def _above(image, ratio, norm, variance):
+    """Pixels, y and x, in which an image exceeds its noise, of the variance norm * variance, by a ratio."""
+    y, x = _exceeding(image, ratio * np.sqrt(norm * variance.min()))  # few are left to be compared with their own noise
+    above = image[y, x] > ratio * np.sqrt(norm * variance[y, x])
+    return y[above], x[above]
+
+
+def _exceeding(image, limit):
+    """Pixels, y and x, in which an image exceeds a number."""
     return np.divmod(np.flatnonzero(image > limit), image.shape[1])  # ten times as fast as np.nonzero
 
 
 def _is_highest(image, x, y, reach):
     """Whether pixels are the highest of the square around them; of the few that matter, not of all the image."""
     steps = [(dy, dx) for dy in range(-reach, reach + 1) for dx in range(-reach, reach + 1)]
-    left = np.arange(len(x))
-    for dy, dx in sorted(steps, key=lambda step: abs(step[0]) + abs(step[1])):  # next to it most are decided
-        here, other = (y[left], x[left]), (y[left] + dy, x[left] + dx)
-        other = np.clip(other[0], 0, image.shape[0] - 1), np.clip(other[1], 0, image.shape[1] - 1)
-        left = left[image[here] >= image[other]]
+    left, value, flat, (ny, nx) = np.arange(len(x)), image[y, x], image.ravel(), image.shape
     highest = np.zeros(len(x), dtype=bool)
+    for dy, dx in sorted(steps, key=lambda step: abs(step[0]) + abs(step[1])):  # next to it most are decided
+        stays = value >= flat[np.clip(y + dy, 0, ny - 1) * nx + np.clip(x + dx, 0, nx - 1)]
+        left, value, y, x = (kept[stays] for kept in (left, value, y, x))
     highest[left] = True
     return highest

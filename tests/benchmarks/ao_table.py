@@ -5,7 +5,8 @@ PSF, rms of deviation / error, false stars, completeness, and the part that `mat
 after the common polynomial of the PSF's field order, which the bounds and errors go through as well. Frames and what
 every method found in them are kept in FOLDER; ``--redo`` measures again. ``--crowded`` makes the table of crowded
 fields instead: rms of deviation / error of isolated stars with no other near, by signal-to-noise ratio. ``--strength``
-multiplies elongation and coma; it takes a FOLDER of its own.
+multiplies elongation and coma; it takes a FOLDER of its own. ``--order 2`` compares positions in crowded fields after
+a quadratic map: up to that order the own error of an effective PSF belongs to the distortion of the exposure.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import os
 import pickle
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +53,9 @@ def ours(**options):
 
 def true_psf(frame):
     """A fit with the true PSF from the true positions: what the bound is."""
-    kind, strehl, seed = frame.name.rsplit("-", 2)
-    psf = ao.start(kind, float(strehl), int(seed), len(frame.data))[1]
+    kind, strehl, *_, seed = frame.name.split("-")  # of crowded ones there is the number of stars, too
+    strehl, seed, size = float(strehl), int(seed), len(frame.data)
+    _, psf = ao.start_crowded(strehl, seed, size) if kind == "crowd" else ao.start(kind, strehl, seed, size)
     error = np.sqrt(np.einsum("naa->na", frame.covariance))
     return ao.fit_true(frame, psf), error, frame.flux
 
@@ -146,14 +149,14 @@ def show(cell, name, folder, n_frames, redo):
     print(f"{cell:14s} {name:11s} {false} |", " | ".join(texts), f"| {np.mean(seconds):5.1f} s")
 
 
-def show_crowded(strehl, n, name, folder, n_frames, redo):
+def show_crowded(strehl, n, name, folder, n_frames, redo, order):
     """One row of the table of crowded fields."""
     parts = []
     for seed in range(n_frames):
         path = folder / f"crowd-{strehl:g}-{n}-{seed}.pickle"
         if not path.exists():
             path.write_bytes(pickle.dumps(ao.crowded_frame(strehl, seed, n=n)))
-        frame = pickle.loads(path.read_bytes())
+        frame = replace(pickle.loads(path.read_bytes()), order=order)
         found = found_in(folder, frame, name, redo)
         rows = compare(frame, [part[found[3]] for part in found[:4]] + found[4:])[0]
         lonely = cKDTree(frame.xy).query(frame.xy, k=2)[0][:, 1] > LONELY
@@ -173,6 +176,7 @@ if __name__ == "__main__":
     parser.add_argument("--frames", type=int, default=10)
     parser.add_argument("--strength", type=float, default=1.0)
     parser.add_argument("--crowded", action="store_true")
+    parser.add_argument("--order", type=int, default=0)
     parser.add_argument("--redo", action="store_true")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
@@ -182,7 +186,7 @@ if __name__ == "__main__":
         print("rms / bound, [rms of deviation / error], stars; by signal-to-noise ratio: 10-30, 30-100, 100-300, above")
         for strehl, n in CROWDS:
             for name in given.method:
-                show_crowded(strehl, n, name, given.folder, min(given.frames, 4), given.redo)
+                show_crowded(strehl, n, name, given.folder, given.frames, given.redo, given.order)
         sys.exit()
     print(
         "% false stars, % found that are brighter than all but 1 % of false ones; all stars, then thirds of "

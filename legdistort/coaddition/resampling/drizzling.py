@@ -32,17 +32,20 @@ def drizzle(data, good, variances, pixel_map, resampling):
     from drizzle.resample import Drizzle
 
     c = pixel_map.corners
-    centres = (c[:, :-1, :-1] + c[:, 1:, :-1] + c[:, :-1, 1:] + c[:, 1:, 1:]) / 4  # to 1e-5 px
     # Room for all drops: the package leaves out those beyond a straight-edged outline of the output; pieces are bent.
     ny, nx = pixel_map.area.shape
-    low = np.minimum(np.floor(np.nanmin(c, axis=(1, 2))), 0).astype(int) - 2
-    high = np.maximum(np.ceil(np.nanmax(c, axis=(1, 2))), (nx, ny)).astype(int) + 2
+    low = np.minimum(np.floor(np.fmin.reduce(c, axis=(1, 2))), 0).astype(int) - 2
+    high = np.maximum(np.ceil(np.fmax.reduce(c, axis=(1, 2))), (nx, ny)).astype(int) + 2
+    centres = np.empty((*data.shape, 2))
+    for place, at, first in zip(np.moveaxis(centres, -1, 0), c, low, strict=True):
+        rows = at[:-1] + at[1:]
+        place[:] = (rows[:, :-1] + rows[:, 1:]) / 4 - first  # to 1e-5 px
     shape = tuple(int(n) for n in (high - low)[::-1])
     onto = Drizzle(kernel=resampling.kernel, out_shape=shape, fillval=np.nan, disable_ctx=True)
     onto.add_image(
         np.ascontiguousarray(data, dtype=np.float32),
         exptime=1.0,
-        pixmap=np.ascontiguousarray(np.moveaxis(centres, 0, -1)) - low,
+        pixmap=centres,
         data2=[np.ascontiguousarray(v, dtype=np.float32) for v in variances] or None,
         weight_map=good.astype(np.float32),
         pixfrac=resampling.pixfrac,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dpotri
+from scipy.linalg.lapack import dtrtri
 from scipy.stats import theilslopes
 
 from ..profiles import moffat
@@ -223,7 +223,7 @@ def improved(before, stars, *, iterations=_ANEW):
 
 def _evidence(precision, amplitudes, factor, degrees):
     """Inverse variances of the prior, of every degree those that make the data most probable (MacKay 1992)."""
-    inverse = dpotri(factor[0], lower=1)[0].diagonal()
+    inverse = np.square(np.tril(dtrtri(factor[0], lower=1)[0])).sum(axis=0)  # diagonal of the covariance
     out = np.empty_like(precision)
     for degree in np.unique(degrees):
         of = degrees == degree
@@ -313,8 +313,8 @@ def _normal(stars, linear, params, corrections, spacing, terms, used):
     Returns too how the stars' parameters follow the raw corrections at their place, (n, 4, n_modes).
     """
     n_terms, n_modes = terms.shape[1], corrections.modes.shape[-1]
-    first, second = np.tril_indices(n_terms)
-    pairs = np.zeros((len(first), n_modes, n_modes))
+    pairs = corrections.pairs()
+    products = {size: np.zeros((len(first), *size)) for size, (first, _) in pairs.items()}
     right = np.zeros((n_terms, n_modes))
     followed = np.zeros((len(terms), 4, n_modes))
     rows = np.flatnonzero(used)
@@ -329,9 +329,10 @@ def _normal(stars, linear, params, corrections, spacing, terms, used):
         across = light.swapaxes(1, 2)
         own, rest = across @ light, (across @ residual)[:, :, 0]
         t = terms[part]
-        pairs += np.tensordot(t[:, first] * t[:, second], own, (0, 0))
+        for (m, n), (first, second) in pairs.items():
+            products[m, n] += np.tensordot(t[:, first] * t[:, second], own[:, :m, :n], (0, 0))
         right += t.T @ rest
-    return corrections.normal(pairs), corrections.reduced(right), followed
+    return corrections.normal(products), corrections.reduced(right), followed
 
 
 def _moved(params, linear, longest, after=0.0):

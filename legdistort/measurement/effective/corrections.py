@@ -107,17 +107,37 @@ class Corrections:
         """The adjoint of `raw`: (..., n_terms, n_modes) to (..., n_amplitudes)."""
         return np.concatenate([raw[..., t, : len(f)] @ f for t, f in enumerate(self.free)], axis=-1)
 
-    def normal(self, pairs):
+    def pairs(self):
+        """Pairs of terms, the second not after the first, by the number of raw patterns that these have.
+
+        Returns
+        -------
+        dict
+            ``{(n_first, n_second): (first, second)}``, terms as ndarray of int, shape (n_pairs,).
+        """
+        n = np.array([len(f) for f in self.free])
+        first, second = np.tril_indices(len(n))
+        sizes = np.column_stack([n[first], n[second]])
+        same = ((tuple(size.tolist()), (sizes == size).all(axis=1)) for size in np.unique(sizes, axis=0))
+        return {size: (first[of], second[of]) for size, of in same}
+
+    def normal(self, products):
         """Normal matrix of the amplitudes, its lower half, from those of the raw patterns for the pairs of terms.
 
-        Those are (n_pairs, n_modes, n_modes) in the order of `numpy.tril_indices`.
+        Parameters
+        ----------
+        products : dict
+            ``{(n_first, n_second): ndarray, shape (n_pairs, n_first, n_second)}``, as `pairs`.
+
+        Returns
+        -------
+        ndarray, shape (n_amplitudes, n_amplitudes)
         """
         ends = np.cumsum([0, *(f.shape[1] for f in self.free)])
         out = np.zeros((ends[-1], ends[-1]))
-        for k, (t, u) in enumerate(zip(*np.tril_indices(len(self.free)), strict=True)):
-            left, right = self.free[t], self.free[u]
-            block = left.T @ pairs[k, : len(left), : len(right)] @ right
-            out[ends[t] : ends[t + 1], ends[u] : ends[u + 1]] = block
+        for size, terms in self.pairs().items():
+            for t, u, product in zip(*terms, products[size], strict=True):
+                out[ends[t] : ends[t + 1], ends[u] : ends[u + 1]] = self.free[t].T @ product @ self.free[u]
         return out
 
     def grids(self, raw):

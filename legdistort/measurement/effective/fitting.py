@@ -106,7 +106,7 @@ def derivatives(psf, stamps, params, rows):
 def light_of(psf, stamps, params):
     """Light of every star on its own stamp, and the sum of that of all others there; (n, npix) each."""
     kind, wide = stamps.data.dtype, 2 * stamps.half
-    own, total = np.empty_like(stamps.data), np.zeros_like(stamps.frame.signal).ravel()
+    own, total = np.empty_like(stamps.data), np.zeros_like(stamps.frame.signal)
     for k in range(0, len(params), 200):
         rows = slice(k, k + 200)
         grids = psf.grids(stamps.centres[rows] + params[rows, :2])
@@ -114,8 +114,8 @@ def light_of(psf, stamps, params):
         values = values * params[rows, 2:3].astype(kind)
         own[rows] = values[:, stamps.core]
         values[params[rows, 2] <= 0] = 0
-        np.add.at(total, stamps.index_wide[rows][stamps.inside_wide[rows]], values[stamps.inside_wide[rows]])
-    others = total[stamps.index] - np.where(params[:, 2:3] > 0, own, 0)
+        stamps.add_to(total, values, rows)
+    others = stamps.cut(total) - np.where(params[:, 2:3] > 0, own, 0)
     return own, np.where(stamps.inside, others, 0)
 
 

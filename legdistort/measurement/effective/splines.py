@@ -32,17 +32,20 @@ def basis(offsets, n, spacing, *, slopes=False):
     f = t - first
     inside = (f >= 0) & (f <= 1)
     f = np.where(inside, f, 0)
-    columns = first.astype(int)[..., None] + np.arange(-1, 3)
-    values = np.stack([(1 - f) ** 3, 4 + f * f * (3 * f - 6), 1 + 3 * f * (1 + f - f * f), f**3], axis=-1) / 6
+    places = first.astype(int) - 1 + (n + 6) * np.arange(f.size).reshape(f.shape)
+    values = (1 - f) ** 3, 4 + f * f * (3 * f - 6), 1 + 3 * f * (1 + f - f * f), f**3
+    values = _scatter(places, values, inside, 6, n)
     if not slopes:
-        return _scatter(columns, values * inside[..., None], n)
-    by = np.stack([-((1 - f) ** 2), f * (3 * f - 4), 1 + f * (2 - 3 * f), f * f], axis=-1) / (2 * spacing)
-    return tuple(_scatter(columns, v * inside[..., None], n) for v in (values, by))
+        return values
+    by = -((1 - f) ** 2), f * (3 * f - 4), 1 + f * (2 - 3 * f), f * f
+    return values, _scatter(places, by, inside, 2 * spacing, n)
 
 
-def _scatter(columns, values, n):
-    out = np.zeros((*columns.shape[:-1], n + 6), dtype=values.dtype)
-    np.put_along_axis(out, columns, values, axis=-1)
+def _scatter(places, values, inside, divisor, n):
+    """Values of four knots in a row, the first ones at some places of the flattened array, (..., n)."""
+    out = np.zeros((*places.shape, n + 6), dtype=values[0].dtype)
+    for k, value in enumerate(values):
+        out.ravel()[places + k] = value / divisor * inside
     return out[..., 3 : n + 3]
 
 

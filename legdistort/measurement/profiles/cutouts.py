@@ -27,7 +27,6 @@ class Stamps:
     def __init__(self, frame, centres, half):
         self.frame, self.centres, self.half = frame, centres, half
         self.index, self.inside = self._pixels(half)
-        self.index_wide, self.inside_wide = self._pixels(2 * half)
         offsets = np.abs(np.arange(-2 * half, 2 * half + 1)) <= half
         self.core = np.flatnonzero(offsets[:, None] & offsets)
         self.data = self.cut(frame.signal)
@@ -49,7 +48,7 @@ class Stamps:
     def models(self, params, nodes):
         """Every star on its own stamp, and the sum of all others there; (n, npix) each."""
         params = params.astype(self.data.dtype)
-        own, total = np.empty_like(self.data), np.zeros_like(self.frame.signal).ravel()
+        own, total = np.empty_like(self.data), np.zeros_like(self.frame.signal)
         core = np.empty_like(own)  # what the star adds to the sum on its own stamp
         for i in range(0, len(params), _CHUNK):
             rows = slice(i, i + _CHUNK)
@@ -61,8 +60,18 @@ class Stamps:
             wandered = np.abs(params[rows, :2]).max(axis=1) > self.half / 2
             wide[(params[rows, 2] <= 0) | wandered] = 0
             core[rows] = wide[:, self.core]
-            np.add.at(total, self.index_wide[rows][self.inside_wide[rows]], wide[self.inside_wide[rows]])
-        return own, np.where(self.inside, total[self.index] - core, 0)
+            self.add_to(total, wide, rows)
+        return own, np.where(self.inside, self.cut(total) - core, 0)
+
+    def add_to(self, image, light, rows):
+        """Add the light of some stars, (m, npix) on stamps twice as wide, to an image (ny, nx)."""
+        reach = 2 * self.half
+        side = 2 * reach + 1
+        for (x, y), one in zip(self.centres[rows].tolist(), light.reshape(-1, side, side), strict=True):
+            left, low = max(x - reach, 0), max(y - reach, 0)
+            part = image[low : y + reach + 1, left : x + reach + 1]
+            from_x, from_y = left - x + reach, low - y + reach
+            part += one[from_y : from_y + part.shape[0], from_x : from_x + part.shape[1]]
 
     def near(self, params, radius):
         """Pixels within a radius of the fitted centres, (n, npix)."""
