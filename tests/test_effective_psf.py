@@ -21,7 +21,6 @@ from legdistort.inputs.exposures import Exposure
 from legdistort.measurement.effective import building, splines
 from legdistort.measurement.effective.model import EffectivePSF, Grid, Polynomial
 from legdistort.measurement.effective.own_error import own_covariance
-from legdistort.measurement.positions import _scale
 from legdistort.simulation import rendering
 
 SIZE, STEP, SAMPLES = 420, 0.25, 256
@@ -635,14 +634,3 @@ def test_the_command_measures_with_it_and_writes_it(tmp_path, psf):
     given = ["--psf", str(tmp_path / "psf"), "--overwrite"]
     assert main(["measure", str(tmp_path / "night0.fits"), *out, *given]) == 0
     assert main(["measure", str(tmp_path / "night0.fits"), *out, "--psf", "nothing", "--overwrite"]) == 1
-
-
-@pytest.mark.parametrize("crowded", [False, True])
-def test_what_all_stars_of_a_frame_leave_is_in_their_errors(crowded):
-    rng, n, dof = np.random.default_rng(1), 400, 165
-    noise = 1 + crowded * rng.uniform(0, 0.5, n)  # of the pixels, beyond what is stated: stars that are not seen
-    chi2, dof = noise * rng.chisquare(dof, n) / dof, np.full(n, dof)
-    squared = noise / _scale(chi2, dof, np.ones(n, dtype=bool)) ** 2  # mean square of (x - truth) / error
-    assert squared.mean() == pytest.approx(1, abs=0.04)
-    one_by_one = noise / _scale(chi2, dof, np.zeros(n, dtype=bool)) ** 2
-    assert one_by_one.mean() == pytest.approx(1.2 if crowded else 1, abs=0.05)

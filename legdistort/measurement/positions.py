@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_ENOUGH = 10  # stars that determine how large chi2 is in a frame
 _COLUMNS = ("x", "y", "x_err", "y_err", "xy_corr", "flux", "flux_err", "fwhm", "chi2")
 _PIXELS = ("x", "y", "x_err", "y_err", "fwhm")
 
@@ -72,8 +71,7 @@ def measure(
     (at least that of the read noise) plus ``star light / gain``. Where the fit leaves more than noise (reduced
     chi2 above 1 by more than chance), errors are scaled up accordingly; of positions measured with an effective PSF
     made from the stars of the exposure, where it leaves more than of the other stars: what it leaves of all of them is
-    its own error, which the errors of positions have in them. With an effective PSF what the stars of a frame leave in
-    common, in crowded fields, is no chance and raises the errors too.
+    its own error, which the errors of positions have in them.
 
     Parameters
     ----------
@@ -447,7 +445,7 @@ class _Stars(NamedTuple):
     dof: np.ndarray
     snr: np.ndarray
     flags: np.ndarray
-    misfit: float | None = None  # of a PSF; Moffat profiles have a shape each
+    misfit: float = 0.0
 
 
 def _moffat_stars(fitted):
@@ -487,9 +485,7 @@ def _table(name, stamps, stars):
     # Near the detection limit the fit is no longer linear (measured at a ratio of 7: errors 8 to 15 % too small).
     faint = 1 + 5 / np.maximum(stars.snr, 1) ** 2
     # What all bright stars leave is the error of their PSF: the errors of positions have it, those of fluxes do not.
-    of_psf = 1 + ((stars.misfit or 0.0) * stars.snr) ** 2 / dof
-    use = ((flags & UNUSABLE) == 0) & (stars.misfit is not None)
-    scale, flux_scale = (faint * _scale(c, dof, use) for c in (chi2 / of_psf, chi2))
+    scale, flux_scale = (faint * _scale(c, dof) for c in (chi2 / (1 + (stars.misfit * stars.snr) ** 2 / dof), chi2))
     error = np.sqrt(np.einsum("nii->ni", stars.covariance))
     lost = ~(error < stamps.half).all(axis=1)
     corr = np.where(lost, 0.0, stars.covariance[:, 0, 1] / error.prod(axis=1))
@@ -503,24 +499,9 @@ def _table(name, stamps, stars):
     return QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})[np.argsort(-flux, kind="stable")]
 
 
-def _scale(chi2, dof, use):
-    """Factor on errors, from what fits leave.
-
-    Of one star, three standard deviations of chi2 may be chance, which must not raise the errors of good fits. Of all
-    stars of a frame they are not: where their chi2 are high or spread by more than noise (light of stars too faint or
-    too close to be seen, in crowded fields), the chi2 to be expected of a star is the mean of its own and that of the
-    others, by the weights of spread and noise. The stars in `use` determine that; of Moffat profiles none, which leave
-    more of bright stars than of faint ones.
-    """
-    chance = np.sqrt(2 / dof)
-    expected = np.ones_like(chi2)
-    if np.count_nonzero(use) >= _ENOUGH:
-        level = max(np.median(chi2[use]), 1.0)
-        noise2 = (level * chance) ** 2
-        spread2 = (1.4826 * np.median(np.abs(chi2[use] - level))) ** 2 - np.median(noise2[use])
-        spread2 = max(spread2, 0.0)
-        expected = level + spread2 / (spread2 + noise2) * (chi2 - level)
-    return np.sqrt(np.maximum.reduce([np.ones_like(chi2), expected, chi2 - 3 * chance]))
+def _scale(chi2, dof):
+    """Factor on errors; three standard deviations of chi2 are chance, which must not raise those of good fits."""
+    return np.sqrt(np.maximum(1, chi2 - 3 * np.sqrt(2 / dof)))
 
 
 def _distinct(table, fwhm):
