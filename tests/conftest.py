@@ -25,3 +25,11 @@ def shared_data():
     if folder is None:
         pytest.skip("real data absent: set LEGDISTORT_DATA to their folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def geometry():
+    """See `sky_chains.geometries`."""
+    from sky_chains import geometries
+
+    return geometries()

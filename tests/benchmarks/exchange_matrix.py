@@ -39,8 +39,7 @@ from legdistort.wcs.exposure_wcs import exposure_wcs
 from legdistort.wcs.refinement import refine
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-import test_headers
-import test_refinement
+import sky_chains
 from conftest import data_folder
 
 COLUMNS = "{:40s} {:20s} {:>9s} {:>7s} {:>10s}"
@@ -299,15 +298,15 @@ def closest_header(solution, kind):
 
 def exported(reader, read):
     """Rows of one reader: ``read(solution, header) -> ra, dec`` [deg] of pixels, for headers of several distortions."""
-    make = test_headers.geometries()
+    make = sky_chains.geometries()
     for kind in ("sip", "tpv"):
         for degree, peak in ((3, 5), (3, 20), (3, 100), (5, 5), (5, 20)):
             solution = make(degree, peak)
             header = closest_header(solution, kind)
-            p, _, _ = test_headers.detector(solution, "a")
-            back = test_headers.pixels_of(solution, "a", *read(header, p))
+            p, _, _ = sky_chains.detector(solution, "a")
+            back = sky_chains.pixels_of(solution, "a", *read(header, p))
             what = f"{kind.upper()} header, degree {degree}, {peak} px"
-            yield Row(what, reader, test_headers.largest(back, p), header.get("A_ORDER"))
+            yield Row(what, reader, sky_chains.largest(back, p), header.get("A_ORDER"))
 
 
 def headers_in_astropy():
@@ -338,16 +337,16 @@ def tables_in_fits():
         from stdatamodels import asdf_in_fits
     except ImportError:
         raise Skip("stdatamodels is not installed") from None
-    solution = test_headers.geometries()(5, 20)
-    p, _, _ = test_headers.detector(solution, "a")
+    solution = sky_chains.geometries()(5, 20)
+    p, _, _ = sky_chains.detector(solution, "a")
     with tempfile.TemporaryDirectory() as folder:
         frame = Path(folder, "a.fits")
-        fits.PrimaryHDU(np.zeros(test_headers.SHAPE, np.int16)).writeto(frame)
+        fits.PrimaryHDU(np.zeros(sky_chains.SHAPE, np.int16)).writeto(frame)
         attach(solution, [frame], in_place=True)
         with asdf_in_fits.open(frame) as file:
             sky = file["meta"]["wcs"](*p.T)
     yield Row("ASDF table in FITS, degree 5, 20 px", "stdatamodels",
-              test_headers.largest(test_headers.pixels_of(solution, "a", *sky), p), 5)  # fmt: skip
+              sky_chains.largest(sky_chains.pixels_of(solution, "a", *sky), p), 5)  # fmt: skip
 
 
 # -- peers: the exact WCS of an exposure in the hands of other packages, 25 px of distortion, the detector on a pole
@@ -355,9 +354,9 @@ def tables_in_fits():
 
 def bent():
     """The solution that the tests of peers have, its pixels (n, 2) and where they are on the sky."""
-    made = test_headers.geometries()(5, 25.0, lat=90.0, turn=0.0, shape=(400, 560))
+    made = sky_chains.geometries()(5, 25.0, lat=90.0, turn=0.0, shape=(400, 560))
     solution = replace(made, coefficients=-made.coefficients, sky=TangentPlane(10.0, 90.0, 50 * made.sky.matrix))
-    p, ra, dec = (a[404:] for a in test_headers.detector(solution, "a"))
+    p, ra, dec = (a[404:] for a in sky_chains.detector(solution, "a"))
     return solution, p, SkyCoord(ra, dec, unit="deg")
 
 
@@ -395,7 +394,7 @@ def wcs_in_reproject():
     grid_.wcs.ctype, grid_.wcs.crval, grid_.wcs.crpix = ["RA---TAN", "DEC--TAN"], [10.0, 90.0], [140.5, 100.5]
     grid_.wcs.cdelt = np.array([-2.0, 2.0]) * solution.sky.pixel_scale / 3600
     to = np.indices((200, 280))[::-1].reshape(2, -1).T
-    came = test_headers.pixels_of(solution, "a", *grid_.all_pix2world(to, 0).T)
+    came = sky_chains.pixels_of(solution, "a", *grid_.all_pix2world(to, 0).T)
     well = ((came > 6) & (came < [nx - 7, ny - 7])).all(axis=1)
     for method in ("interp", "adaptive", "exact"):
         function = getattr(reproject, f"reproject_{method}")
@@ -432,14 +431,14 @@ def wcs_in_regions():
 def wcs_in_pipelines():
     """`refine` of NIRCam's WCS, in tweakwcs, stcal and a file as Roman has them."""
     with asdf.open(data("gwcs_interop", "nircamwcs.asdf"), memmap=False, lazy_load=False) as file:
-        solution = test_refinement.solution_at(file["wcs"], (2048, 2048), 5.0)
+        solution = sky_chains.solution_at(file["wcs"], (2048, 2048), 5.0)
         made = refine(file["wcs"], solution, "a")
-    p, ra, dec = test_headers.detector(solution, "a")
+    p, ra, dec = sky_chains.detector(solution, "a")
     p, sky = p[404:], SkyCoord(ra[404:], dec[404:], unit="deg")
     with contextlib.suppress(Skip):
         info = {"v2_ref": 86.039, "v3_ref": -493.386, "roll_ref": 0.0}
         corrector = peer("tweakwcs.correctors").JWSTWCSCorrector(made, info)
-        found = test_headers.pixels_of(solution, "a", *corrector.det_to_world(*p.T))
+        found = sky_chains.pixels_of(solution, "a", *corrector.det_to_world(*p.T))
         yield Row("refine(NIRCam), detector to sky", "tweakwcs", apart(found.T, p))
     with contextlib.suppress(Skip):
         pixmap = peer("stcal.resample.utils").calc_pixmap(made, solution.fits_wcs("a"), shape=(2048, 2048))
@@ -518,7 +517,7 @@ def catalogue_of(folder, frame, kind):
 
 def headers_in_sextractor():
     """Positions on the sky of the sources that SExtractor finds, taken back to the pixels where it found them."""
-    solution = test_headers.geometries()(3, 20)
+    solution = sky_chains.geometries()(3, 20)
     with tempfile.TemporaryDirectory() as folder:
         for kind in ("tpv", "sip"):
             frame = Path(folder, f"{kind}.fits")
@@ -527,7 +526,7 @@ def headers_in_sextractor():
                 found = np.array(hdulist["LDAC_OBJECTS"].data)
             found = found[found["FLUX_AUTO"] > 50 * found["FLUXERR_AUTO"]]
             sky = found["ALPHAWIN_J2000"], found["DELTAWIN_J2000"]
-            back = test_headers.pixels_of(solution, "a", *(np.asarray(a, dtype=float) for a in sky))
+            back = sky_chains.pixels_of(solution, "a", *(np.asarray(a, dtype=float) for a in sky))
             seen = np.column_stack([found["XWIN_IMAGE"], found["YWIN_IMAGE"]]) - 1
             yield Row(f"{kind.upper()} header, degree 3, 20 px: {len(found)} stars", "SExtractor", apart(back.T, seen))
 
@@ -535,7 +534,7 @@ def headers_in_sextractor():
 def headers_in_swarp():
     """Where every pixel of SWarp's grid comes from, by frames whose values are positions."""
     swarp = program("SWarp", "swarp")
-    solution = test_headers.geometries()(3, 20)
+    solution = sky_chains.geometries()(3, 20)
     ny, nx = solution.shapes["a"]
     header = closest_header(solution, "tpv")
     with tempfile.TemporaryDirectory() as folder:
@@ -551,7 +550,7 @@ def headers_in_swarp():
             weight = fits.getdata(Path(folder, f"{name}.weight.fits"))
             found.append(out - 1000)
         y, x = np.indices(out.shape)
-        came = test_headers.pixels_of(solution, "a", *made.all_pix2world(np.column_stack([x.ravel(), y.ravel()]), 0).T)
+        came = sky_chains.pixels_of(solution, "a", *made.all_pix2world(np.column_stack([x.ravel(), y.ravel()]), 0).T)
         well = ((came > 3) & (came < [nx - 4, ny - 4])).all(axis=1) & (weight.ravel() > 0)
         yield Row(
             "TPV header, degree 3, 20 px, resampled", "SWarp", apart([a.ravel()[well] for a in found], came[well])
@@ -564,7 +563,7 @@ def headers_in_scamp():
     A plain TAN header of the same stars stands beside it, with the distortion that it leaves out.
     """
     scamp = program("scamp")
-    solution = test_headers.geometries()(3, 20)
+    solution = sky_chains.geometries()(3, 20)
     for n_stars in (36, 200):
         for kind in ("tpv", "tan"):
             with tempfile.TemporaryDirectory() as folder:
@@ -598,7 +597,7 @@ def headers_in_scamp():
 def _reference_for_scamp(path, solution, p):
     """Catalogue (FITS LDAC) of the true places of stars."""
     pose = solution.poses["a"]
-    sky = test_headers.sky_of(solution, "a", solution.correct("a", p) @ pose[:, :2].T + pose[:, 2])
+    sky = sky_chains.sky_of(solution, "a", solution.correct("a", p) @ pose[:, :2].T + pose[:, 2])
     small = np.full(len(p), 1e-7)
     columns = dict(zip(("X_WORLD", "Y_WORLD"), sky, strict=True))
     columns |= {"ERRA_WORLD": small, "ERRB_WORLD": small, "ERRTHETA_WORLD": 0 * small, "MAG": 15 + 0 * small}
@@ -625,8 +624,8 @@ def _scamp_scatter(path, solution):
 def headers_in_ds9():
     """Regions at pixels, loaded in DS9 and saved in degrees."""
     ds9, screen = program("ds9"), program("xvfb-run")
-    solution = test_headers.geometries()(3, 20)
-    p = test_headers.detector(solution, "a")[0][404:444]
+    solution = sky_chains.geometries()(3, 20)
+    p = sky_chains.detector(solution, "a")[0][404:444]
     with tempfile.TemporaryDirectory() as folder:
         for kind in ("sip", "tpv"):
             header = closest_header(solution, kind)
@@ -640,7 +639,7 @@ def headers_in_ds9():
                 "-regions", "sky", "icrs", "-regions", "skyformat", "degrees", "-regions", "save", "out.reg", "-exit",
             )  # fmt: skip
             said = re.findall(r"point\(([-\d.]+),([-\d.]+)\)", Path(folder, "out.reg").read_text())
-            back = test_headers.pixels_of(solution, "a", *np.array(said, dtype=float).T)
+            back = sky_chains.pixels_of(solution, "a", *np.array(said, dtype=float).T)
             yield Row(f"{kind.upper()} header, degree 3, 20 px, regions", "DS9", apart(back.T, p))
 
 
@@ -649,9 +648,9 @@ def refined_in_roman():
     datamodels = peer("roman_datamodels.datamodels")
     with asdf.open(data("gwcs_interop", "roman_wcs.asdf"), memmap=False, lazy_load=False) as file:
         wcs = file["roman"]["wcs"] if "roman" in file.tree else file["wcs"]
-        solution = test_refinement.solution_at(wcs, (5000, 5000), 5.0)
+        solution = sky_chains.solution_at(wcs, (5000, 5000), 5.0)
         made = refine(wcs, solution, "a")
-    p, ra, dec = test_headers.detector(solution, "a")
+    p, ra, dec = sky_chains.detector(solution, "a")
     model = datamodels.ImageModel.create_fake_data(shape=(8, 8))
     model.meta.wcs = made.stock()
     with tempfile.TemporaryDirectory() as folder:

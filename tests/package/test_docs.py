@@ -1,0 +1,179 @@
+"""The README and the documentation say what is so: their Python runs, their commands are the ones checked."""
+
+import ast
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import legdistort
+from legdistort.cli import parser
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs").glob("paper/*.md"))]
+
+
+#: Those that install and run everything.
+COMMANDS = ["pip install . && legdistort demo --out demo", "pip install '.[test]' && pytest -n 2 --dist loadfile"]
+
+
+def blocks(page, language):
+    """Fenced code blocks of a page in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+#: A fenced block of code: why it cannot run here, if it cannot, its language and its text.
+BLOCK = re.compile(r"^(?:<!-- not run: ([^\n]*) -->\n)?```(sh|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def reading_order():
+    """The README, and the pages in the order of its links; a page whose code needs that of another comes after it."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    linked = dict.fromkeys(re.findall(r"\]\((docs/[\w/]+\.md)\)", readme))
+    tutorial = "docs/first_mosaic.md"
+    return [ROOT / "README.md", ROOT / tutorial, *(ROOT / page for page in linked if page != tutorial)]
+
+
+def test_the_readme_leads_to_every_page_with_code():
+    runs = {page for page in PAGES if not all(why for why, _, _ in BLOCK.findall(page.read_text(encoding="utf-8")))}
+    assert runs <= set(reading_order())
+
+
+def test_few_blocks_cannot_run_here():
+    reasons = [why for page in PAGES for why, _, _ in BLOCK.findall(page.read_text(encoding="utf-8")) if why]
+    assert len(reasons) <= 16
+    assert all(len(reason.split()) >= 3 for reason in reasons)
+
+
+@pytest.mark.slow
+def test_every_block_of_every_page_runs_as_printed(tmp_path):
+    """In one empty folder, page after page, as a stranger would; the Python of a page is one session."""
+    place = tmp_path / "empty"
+    place.mkdir()
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path, "MPLBACKEND": "Agg"}
+    failed = []
+    for page in reading_order():
+        lines = ["import subprocess", "names = {}"]
+        for why, language, code in BLOCK.findall(page.read_text(encoding="utf-8")):
+            if not why and language == "sh":
+                lines.append(f"subprocess.run(['bash', '-euc', {code!r}], check=True)")
+            elif not why:
+                lines.append(f"exec(compile({code!r}, {page.name!r}, 'exec'), names)")
+        script = tmp_path / "page.py"
+        script.write_text("\n".join(lines), encoding="utf-8")
+        begun = time.monotonic()
+        run = subprocess.run(
+            [sys.executable, str(script)], cwd=place, env=environment, capture_output=True, text=True, check=False
+        )
+        print(f"{page.name}: {time.monotonic() - begun:.0f} s")
+        if run.returncode:
+            failed.append(f"{page.name}:\n{run.stderr[-1500:]}")
+    assert not failed, "\n\n".join(failed)
+
+
+def test_readme_example_is_six_lines():
+    (example,) = blocks(ROOT / "README.md", "python")
+    assert len([line for line in example.splitlines() if line]) == 6
+
+
+def commands():
+    """Every ``legdistort`` command of the README and the documentation, as (page, arguments)."""
+    for page in PAGES:
+        for block in blocks(page, "sh"):
+            for line in block.splitlines():
+                for part in line.split("#")[0].split("&&"):
+                    words = shlex.split(part)
+                    if words and words[0] == "legdistort":
+                        yield pytest.param(words[1:], id=f"{page.stem}:{words[1]}")
+
+
+@pytest.mark.parametrize("arguments", list(commands()))
+def test_commands_are_understood(arguments):
+    assert parser._parser().parse_args(arguments).command == arguments[0]
+
+
+def test_every_command_is_documented():
+    headings = re.findall(r"^## (\S+)$", (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8"), re.MULTILINE)
+    (commands_,) = (a.choices for a in parser._parser()._actions if a.choices and "run" in a.choices)
+    assert sorted(headings) == sorted(commands_)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_readme_has_each_of_the_two_commands_once(command):
+    assert sum(line == command for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()) == 1
+
+
+def test_the_check_script_takes_its_commands_from_the_readme():
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    endings = re.findall(r"\$\(readme_command '(.*?)'\)", script)
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert sorted(endings) == sorted(command[command.index("&&") :] for command in COMMANDS)
+    for ending in endings:
+        assert sum(line.startswith("pip install ") and line.endswith(ending) for line in lines) == 1
+    assert script.count('bash -c "$') == 2
+
+
+def test_the_workflow_only_calls_the_check_script():
+    (job,) = yaml.safe_load((ROOT / ".github" / "workflows" / "check.yml").read_text(encoding="utf-8"))["jobs"].values()
+    (command,) = (step["run"] for step in job["steps"] if "run" in step)
+    assert command == ".ci/run ${{ matrix.what }}"
+    known = (
+        re.search(r"case \$what in (.*?)\)", (ROOT / ".ci" / "run").read_text(encoding="utf-8")).group(1).split(" | ")
+    )
+    assert {each["what"] for each in job["strategy"]["matrix"]["include"]} == set(known) - {"all"}
+
+
+def test_every_minimum_can_be_pinned():
+    """``.ci/run oldest`` takes the minima from here; what it does not understand it would leave at the newest."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for requirement in sum(project["optional-dependencies"].values(), project["dependencies"]):
+        assert re.fullmatch(r"[\w-]+>=[\d.]+|legdistort\[[\w,]+\]", requirement)
+
+
+def test_versions_agree():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGES.md").read_text(encoding="utf-8"), re.MULTILINE).group(1)
+    cited = re.search(r"^version: (\S+)", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE).group(1)
+    assert newest == cited == version == legdistort.__version__
+
+
+def test_every_public_name_is_in_the_reference():
+    reference = (ROOT / "docs" / "api.rst").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^   ~legdistort\.(\w+)$", reference, re.MULTILINE))  # each on a page of its own
+    assert set(legdistort.__all__) == listed
+
+
+def test_links_and_pictures_exist():
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
+        for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+            if not target.startswith("http"):
+                assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_pictures_are_small():
+    for picture in (ROOT / "docs" / "images").rglob("*.*"):
+        assert picture.suffix == ".png"
+        assert picture.stat().st_size < 200_000
+
+
+def test_messages_on_the_page_of_messages_are_printed():
+    """Each heading is part of a text in the code, between what is put into it."""
+    texts = []
+    for path in (ROOT / "legdistort").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.append(node.value)
+    headings = re.findall(
+        r"^## (.*)$", (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    quoted = [part for heading in headings for part in re.findall("`(.*?)`", heading)]
+    assert len(quoted) >= len(headings) > 10
+    assert [part for part in quoted if not any(part in text for text in texts)] == []

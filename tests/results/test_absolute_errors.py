@@ -1,0 +1,131 @@
+"""Absolute errors against simulated truth made of numpy's polynomials, where they once failed.
+
+All settings are in ``benchmarks/calibration_table.py``.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import legdistort as ld
+from legdistort.exceptions import InputError, LegdistortWarning
+from legdistort.results import accuracy
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import calibration_table as table
+import relative_errors_table
+
+pytestmark = pytest.mark.filterwarnings(
+    f"ignore::{LegdistortWarning.__module__}.{LegdistortWarning.__qualname__}"  # what is not known is known here
+)
+
+
+def offsets(name, seed=0, **changed):
+    """Solution and true positions of a set of the table."""
+    simulating, solving = table.settings()[name]
+    matches, sky, common = table.simulated(seed, **simulating | changed)
+    solution = ld.solve(matches, **solving(matches, sky, common, np.random.default_rng(seed)))
+    return solution, sky[solution.star_names]
+
+
+def ratio(solution, true):
+    """Squared true over reported error after what is unknown."""
+    reported = np.einsum("nkk->nk", solution.absolute_covariance(without_unknown=True))
+    return np.mean(accuracy.known_offsets(solution, true) ** 2) / np.mean(reported)
+
+
+def linear(solution, true):
+    """Rms of the offsets once a similarity and the unknown directions at the solution are taken off."""
+    columns = [table.similarity_fields(true), *(each.stars.T.reshape(-1, 1) for each in solution.gauge.unknown)]
+    return np.sqrt(np.mean(table.without((true - solution.positions).T.ravel(), np.hstack(columns)) ** 2))
+
+
+@pytest.mark.parametrize("name", ["no prior, no dithers", "static='fit', no rolls"])
+def test_unknown_directions_are_taken_off_to_second_order(name):
+    """A static distortion of 5 px, unknown: what its directions at the solution leave behind is of second order."""
+    solution, true = offsets(name, seed=1, static=5.0, n_exposures=6)
+    assert 0.5 < ratio(solution, true) < 1.5
+    left = np.sqrt(np.mean(accuracy.known_offsets(solution, true) ** 2))
+    assert linear(solution, true) > 1.3 * left
+    fewer = np.where(np.arange(len(true))[:, None] < 40, true, np.nan)
+    some = accuracy.known_offsets(solution, fewer)
+    assert np.isnan(some[40:]).all()
+    assert np.isfinite(some[:40]).all()
+
+
+def test_known_offsets_are_those_after_a_similarity_where_all_is_known():
+    solution, true = offsets("prior, exact", n_exposures=4)
+    assert solution.gauge.unknown == ()
+    expected = accuracy.bias(solution.positions, true, removed="similarity")
+    assert np.sqrt(np.mean(accuracy.known_offsets(solution, true) ** 2)) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("prior", "least"), [("none", 1.2), ("exact", 0.8)])
+def test_relative_errors_are_calibrated_after_any_common_map(prior, least):
+    """Positions good to 0.003 px; without a prior the solution is pixels off, and a linear map is not enough."""
+    after, linear = [], []
+    for seed in range(4):
+        after.append(relative_errors_table.one(seed, 3, prior, n_exposures=6)[0])
+        matches, sky, common = table.simulated(seed, n_stars=150, sigma=0.003, n_exposures=6)
+        given = table.as_prior(common, None) if prior == "exact" else None
+        solution = ld.solve(matches, prior=given)
+        wrong = (solution.positions - sky[solution.star_names]).T.ravel()
+        directions = solution.gauge.directions.transpose(1, 0, 2).reshape(len(wrong), -1)
+        linear.append(relative_errors_table.squared_pull(wrong, solution.uncertainty.star_matrix, directions))
+    assert np.mean(after) == pytest.approx(1, abs=0.15)
+    assert least < np.mean(linear) < least + 2
+
+
+def test_known_offsets_refuse_what_they_cannot_do(tmp_path):
+    solution, true = offsets("no prior, no dithers", n_exposures=4)
+    with pytest.raises(InputError, match=r"one row for each of the 70 stars, got shape \(3, 2\)"):
+        accuracy.known_offsets(solution, true[:3])
+    with pytest.raises(InputError, match="20 directions cannot be taken off the offsets of 10 stars"):
+        accuracy.known_offsets(solution, np.where(np.arange(len(true))[:, None] < 10, true, np.nan))
+    solution.write(tmp_path / "solution.asdf")
+    for compare in (accuracy.known_offsets, accuracy.relative_offsets):
+        with pytest.raises(InputError, match="read from a file keeps no equations; call solve again"):
+            compare(ld.Solution.read(tmp_path / "solution.asdf"), true)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_constraints_follow_the_state_to_the_solution(seed):
+    """Held after two iterations, they cost 16 and 21."""
+    solution, _ = offsets("no prior, no dithers", seed, n_exposures=4)
+    assert int(solution.status.split()[2]) <= 10
+
+
+def test_constraints_do_not_follow_the_state_away():
+    """Twelve stars for twenty modes of the plane: constraints that never stop would take this set pixels off."""
+    simulating, solving = table.settings()["12 reference stars"]
+    true, reported, *_, status = table.one(46, simulating | {"n_exposures": 4}, solving)
+    assert "not converged" not in status
+    assert true < 9 * reported
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "n_exposures", "n_sets", "tolerance"),
+    [
+        ("no prior, no dithers", 11, 30, 0.15),
+        ("static='fit', no rolls", 11, 30, 0.15),
+        ("no prior, rolls", 4, 60, 0.25),
+    ],
+)
+def test_absolute_errors_are_calibrated(name, n_exposures, n_sets, tolerance):
+    """Standard errors of the ratios: 0.03, 0.03 and 0.1."""
+    assert table.row(name, n_sets, n_exposures=n_exposures).ratio == pytest.approx(1, abs=tolerance)
+
+
+def test_wrong_models_are_outside_of_the_errors():
+    """Exposures that do not share their distortion, and errors stated at a third of what they are."""
+    solution, true = offsets("static='fit', no rolls", dynamic=0.4)
+    assert ratio(solution, true) > 25
+    assert solution.chi2 > 25 * solution.dof
+    matches, sky, _ = table.simulated(0, dither=0.0)
+    wrong = matches.table.copy()
+    wrong["x_err"], wrong["y_err"] = wrong["x_err"] / 3, wrong["y_err"] / 3
+    solution = ld.solve(ld.Matches.from_table(wrong, shape=(table.SIZE, table.SIZE), poses=matches.poses))
+    assert 5 < ratio(solution, sky[solution.star_names]) < 13

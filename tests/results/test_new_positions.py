@@ -1,0 +1,368 @@
+"""Errors of positions that took no part in the solution: what moves them, limits, tables, and calibration by truth."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
+
+import legdistort as ld
+from legdistort.assessment.baselines import solve_shifts
+from legdistort.cli.parser import main
+from legdistort.exceptions import InputError
+from legdistort.geometry import similarity
+from legdistort.geometry.tangent_plane import TangentPlane
+from legdistort.results import absolute_errors, new_positions
+from legdistort.solving.equations import criterion
+from legdistort.solving.equations.covariances import Uncertainty
+from legdistort.solving.equations.problem import State, build_problem
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import new_positions_table
+
+SKY = TangentPlane(10.0, 20.0, np.array([[-1e-5, 2e-6, 2e-4], [2e-6, 1e-5, -2e-4]]))
+PIXELS = np.array([[300.0, 400.0], [1024.0, 1000.0], [1700.0, 350.0], [900.0, 1800.0]])
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return ld.simulate_matches(
+        n_exposures=6, n_stars=40, degree=3, sigma=0.02, static=3.0, dynamic=0.3, dither=100.0,
+        rotations=10.0 * np.arange(6), zero_mean=False, seed=3,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def solution(sim):
+    return replace(ld.solve(sim.matches, prior=ld.Prior(sim.truth.static)), sky=SKY)
+
+
+@pytest.fixture(scope="module")
+def free(sim):
+    """Without a prior: shears at least are unknown to exposures of one orientation."""
+    plain = ld.simulate_matches(n_exposures=6, n_stars=40, degree=3, sigma=0.02, static=3.0, dither=100.0, seed=3)
+    return ld.solve(plain.matches)
+
+
+# -- what moves a corrected position
+
+
+def test_without_errors_positions_alone(solution):
+    name = solution.names[1]
+    corrected = solution.correct(name, PIXELS, errors=np.zeros(PIXELS.shape))
+    assert isinstance(corrected, new_positions.Corrected)
+    xy, relative, absolute = corrected
+    assert_array_equal(xy, solution.correct(name, PIXELS))
+    assert relative.shape == absolute.shape == (4, 2, 2)
+    with pytest.raises(AttributeError):
+        corrected.xy = 0
+
+
+def test_measurement_goes_through_the_inverse_by_finite_differences(solution):
+    name, step = solution.names[2], 1e-3
+    columns = [(solution.correct(name, PIXELS + e) - solution.correct(name, PIXELS - e)) / (2 * step)
+               for e in step * np.eye(2)]  # fmt: skip
+    back = np.stack(columns, axis=2)
+    measured = np.array([[0.04, 0.01], [0.01, 0.09]])
+    none = solution.correct(name, PIXELS, errors=0.0)
+    given = solution.correct(name, PIXELS, errors=np.broadcast_to(measured, (4, 2, 2)))
+    for with_errors, without in zip(given[1:], none[1:], strict=True):
+        assert_allclose(with_errors - without, back @ measured @ back.transpose(0, 2, 1), rtol=1e-5)
+
+
+def test_coefficients_move_positions_as_finite_differences_say(solution):
+    name, step = solution.names[4], 1e-4
+    q = solution.distortion(name).invert(PIXELS)
+    response = new_positions.response(solution, name, q)[0].reshape(4, 2, 2, -1)
+    for axis, mode in ((0, 0), (1, 4), (0, 9)):
+        moved = []
+        for sign in (1, -1):
+            coefficients = solution.coefficients.copy()
+            coefficients[4, axis, mode] += sign * step
+            moved.append(replace(solution, coefficients=coefficients).correct(name, PIXELS))
+        assert_allclose((moved[1] - moved[0]) / (2 * step), response[:, :, axis, mode], atol=1e-6)
+
+
+def test_a_common_map_moves_new_positions_with_the_stars():
+    """N_i at the pixels of stars against the directions of the stars themselves: second order in the static part."""
+    still = ld.simulate_matches(n_exposures=6, n_stars=40, sigma=0.02, static=3.0, dynamic=0.01, dither=50.0, seed=3)
+    solution = ld.solve(still.matches, prior=ld.Prior(still.truth.static))
+    gauge, worst = solution.gauge, 0.0
+    for i, name in enumerate(solution.names):
+        q = similarity.apply(solution.poses[name], solution.positions)
+        by_modes = new_positions.response(solution, name, q)[0]
+        moved = by_modes @ new_positions.widened(gauge.motion[i], solution.degree)
+        plain = absolute_errors.plain_directions(gauge, solution.positions, gauge.n_modes)
+        inside = (np.abs(q - 1023.5) < 1000).all(axis=1)
+        of_second_order = np.sqrt(np.mean((gauge.directions - plain)[inside] ** 2))
+        worst = max(worst, np.sqrt(np.mean((moved - gauge.directions)[inside] ** 2)) / of_second_order)
+    assert worst < 0.4
+
+
+def test_relative_part_of_the_correction_is_that_of_the_map(solution):
+    name = solution.names[0]
+    x, y, sigma = solution.sigma_map(name, n=5, support=False)
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    relative = np.sqrt(np.einsum("nkk->nk", solution.correct(name, grid, errors=0.0).relative)).reshape(sigma.shape)
+    assert np.all(relative >= sigma * (1 - 1e-9))  # that of second order beside it
+    assert_allclose(relative, sigma, rtol=0.2)
+
+
+def test_sigma_map_is_relative_unless_asked(solution, free):
+    for made in (solution, free):
+        assert np.isfinite(made.sigma_map(made.names[0], n=6, support=False)[2]).all()
+    x, y, absolute = solution.sigma_map(solution.names[0], n=6, support=False, absolute=True)
+    relative = solution.sigma_map(solution.names[0], n=6, support=False)[2]
+    assert np.all(absolute > 1.5 * relative)
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    expected = np.einsum("nkk->nk", solution.correct(solution.names[0], grid, errors=0.0).absolute)
+    assert_allclose(absolute.reshape(-1, 2) ** 2, expected)
+    assert np.isnan(free.sigma_map(free.names[0], n=6, support=False, absolute=True)[2]).any()
+
+
+def test_relative_errors_are_those_under_the_convention_alone():
+    """Without a prior dithers determine the common map, worse than the positions: that is no relative error."""
+    sim = ld.simulate_matches(
+        n_exposures=4, n_stars=40, sigma=0.02, static=3.0, dynamic=0.3, dither=150.0, zero_mean=False, seed=3
+    )
+    solution = ld.solve(sim.matches)
+    gauge = replace(solution.gauge, covariance=np.zeros_like(solution.gauge.covariance))  # nothing of second order
+    problem = build_problem(sim.matches, 3)
+    poses = np.stack([solution.poses[name] for name in solution.names])
+    blocks = criterion.linearise(problem, State(solution.positions.T, solution.coefficients, poses))
+    alone = Uncertainty(problem, blocks, replace(gauge, constraint=gauge.convention, convention=None))
+    variance = absolute_errors.relative_variance(gauge, solution.uncertainty, solution.positions)
+    assert_allclose(variance[:2], alone.stars[:2], rtol=0.03)
+    assert np.mean(solution.uncertainty.stars[:2] / variance[:2]) > 1.2
+    for i, name in enumerate(solution.names):
+        block = alone.coefficients[20 * i : 20 * i + 20, 20 * i : 20 * i + 20]
+        relative = solution.coefficient_covariance(name, relative=True)
+        assert_allclose(relative, block, atol=0.03 * np.abs(block).max())
+        assert_allclose(solution.coefficient_errors(name, relative=True).ravel() ** 2, np.diag(relative))
+
+
+def test_where_the_convention_holds_relative_errors_are_those_of_the_gauge(solution):
+    assert solution.gauge.convention is None
+    assert solution.uncertainty.bends is None
+    covariance = solution.coefficient_covariance("exp01")
+    assert_array_equal(solution.coefficient_covariance("exp01", relative=True), covariance)
+
+
+@pytest.mark.parametrize("n", [4, 6])
+def test_relative_errors_without_a_prior_hold_for_few_exposures(n):
+    """Truth of Chebyshev polynomials; 0.72 and 0.86 in the gauge of what dithers determine."""
+    relative, _ = new_positions_table.row("no prior, 0.02 px", 8, n_exposures=n)
+    assert relative == pytest.approx(1, abs=0.1)
+
+
+# -- limits
+
+
+def test_huge_errors_are_the_measurement_and_many_zero_ones_the_correction(solution):
+    name = solution.names[0]
+    huge = solution.correct(name, PIXELS, errors=np.full((4, 2), 1e6))
+    assert_allclose(huge.absolute, huge.relative, rtol=1e-9)
+    none = solution.correct(name, PIXELS, errors=0.0)
+    assert np.all(np.linalg.eigvalsh(none.absolute - none.relative)[:, 1] > 0)
+
+
+def test_halving_all_errors_of_the_stars_quarters_the_relative_part(sim, solution):
+    table = sim.matches.table.copy()
+    for column in ("x_err", "y_err"):
+        table[column] = table[column] / 2
+    matches = ld.Matches.from_table(table, shape=sim.matches.shapes, poses=sim.matches.poses)
+    finer = ld.solve(matches, prior=ld.Prior(sim.truth.static), gauge="mean")
+    same = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static), gauge="mean")
+    for name in sim.matches.names:
+        ratio = finer.sigma_map(name, n=4, support=False)[2] / same.sigma_map(name, n=4, support=False)[2]
+        assert_allclose(ratio, 0.5, rtol=1e-3)
+
+
+def test_unknown_directions_leave_positions_without_absolute_error(free, sim):
+    name = free.names[0]
+    corrected = free.correct(name, PIXELS, errors=np.full((4, 2), 0.02))
+    assert np.isfinite(corrected.relative).all()
+    assert np.isnan(corrected.absolute).any()
+    # unless their own error is larger than a unit of each of these
+    assert np.isfinite(free.correct(name, PIXELS, errors=np.full((4, 2), 5.0)).absolute).all()
+
+
+def test_limit_of_what_is_unknown_is_the_rest_of_the_error(free):
+    """One direction of unit rms: it is compared, position by position, with the remaining error."""
+    name = free.names[0]
+    one = free.gauge.unknown[0]
+    alone = replace(free, gauge=replace(free.gauge, unknown_maps=free.gauge.unknown_maps[:1]))
+    q = free.distortion(name).invert(PIXELS)
+    by_modes = new_positions.response(free, name, q)[0]
+    moved = np.linalg.norm(by_modes @ one.coefficients[0].ravel(), axis=1)
+    known = replace(free, gauge=replace(free.gauge, unknown_maps=()))
+    for factor, hidden in ((0.99, True), (1.01, False)):
+        rest = np.trace(known.correct(name, PIXELS, errors=0.0).absolute, axis1=1, axis2=2)
+        scale = np.abs(np.linalg.det(new_positions.response(free, name, q)[1]))
+        error = np.sqrt(np.maximum((factor * moved) ** 2 - rest, 0) / (2 * scale))
+        absolute = alone.correct(name, PIXELS, errors=np.column_stack([error, error])).absolute
+        clear = (factor * moved) ** 2 > 1.05 * rest
+        assert clear.any()
+        assert_array_equal(np.isnan(absolute[clear, 0, 0]), hidden)
+
+
+def test_simpler_corrections_have_no_absolute_errors(sim):
+    shifts = solve_shifts(sim.matches, prior=ld.Prior(sim.truth.static))
+    corrected = shifts.correct(shifts.names[0], PIXELS, errors=0.02)
+    assert np.isfinite(corrected.relative).all()
+    assert np.isnan(corrected.absolute).all()
+
+
+def test_shared_distortion_and_reference(sim):
+    """Gauges of fewer modes than are fitted, and a tie that has modes of its own."""
+    rng = np.random.default_rng(0)
+    reference = QTable({"star": np.arange(20), "x": sim.truth.positions[:20, 0], "y": sim.truth.positions[:20, 1]})
+    reference["x"] += 0.005 * rng.normal(size=20)
+    reference["y"] += 0.005 * rng.normal(size=20)
+    reference["x_err"] = reference["y_err"] = 0.005
+    static = ld.simulate_matches(
+        n_exposures=6, n_stars=60, sigma=0.02, static=2.0, dynamic=0.0, dither=300.0, rotations=30.0 * np.arange(6)
+    )
+    shared = ld.solve(static.matches, static="fit", exposure_degree=0)
+    tied = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static), reference=reference)
+    for made in (shared, tied):
+        corrected = made.correct(made.names[0], PIXELS, errors=0.02)
+        assert np.isfinite(corrected.relative).all()
+        finite = np.isfinite(corrected.absolute[:, 0, 0])
+        assert np.all(np.trace(corrected.absolute[finite], axis1=1, axis2=2) > 2 * 0.019**2)
+    loose = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static)).correct(tied.names[0], PIXELS, errors=0.02)
+    assert np.all(tied.correct(tied.names[0], PIXELS, errors=0.02).absolute[:, 0, 0] < loose.absolute[:, 0, 0])
+
+
+# -- what may be given
+
+
+def test_quantities(solution):
+    name, plain = solution.names[0], solution.correct(solution.names[0], PIXELS, errors=np.full((4, 2), 0.03))
+    for errors in (np.full((4, 2), 0.03) * u.pix, np.tile(9e-4 * np.eye(2), (4, 1, 1)) * u.pix**2):
+        given = solution.correct(name, PIXELS * u.pix, errors=errors)
+        assert given.xy.unit == u.pix
+        assert given.relative.unit == given.absolute.unit == u.pix**2
+        assert_allclose(given.absolute.value, plain.absolute)
+    assert_allclose(solution.correct(name, PIXELS, errors=0.03).absolute, plain.absolute)
+    assert_allclose(solution.correct(name, PIXELS[0], errors=[0.03, 0.03]).relative, plain.relative[:1])
+    with pytest.raises(InputError, match="errors must be in pix, got arcsec"):
+        solution.correct(name, PIXELS, errors=np.full((4, 2), 0.03) * u.arcsec)
+
+
+@pytest.mark.parametrize(
+    ("errors", "words"),
+    [
+        (np.zeros((3, 2)), r"shape \(4, 2\) or covariances of shape \(4, 2, 2\).*got shape \(3, 2\)"),
+        (np.zeros((4, 3, 3)), r"got shape \(4, 3, 3\)"),
+        (np.full((4, 2), -0.1), "not negative.*row 0 has"),
+        (np.array([[0.1, 0.1], [0.1, np.nan], [0.1, 0.1], [0.1, 0.1]]), "finite.*row 1 has"),
+        (np.full((4, 2), np.inf), "finite"),
+        (np.tile([[1.0, 2.0], [2.0, 1.0]], (4, 1, 1)), "positive; row 0"),
+        (np.tile([[-1.0, 0.0], [0.0, -1.0]], (4, 1, 1)), "positive; row 0"),
+        (np.tile([[1.0, 0.2], [0.1, 1.0]], (4, 1, 1)), "symmetric"),
+    ],
+)
+def test_bad_errors_are_named(solution, errors, words):
+    with pytest.raises(InputError, match=words):
+        solution.correct(solution.names[0], PIXELS, errors=errors)
+
+
+# -- tables
+
+
+def measured(solution):
+    """A table of positions in two exposures, out of order, with correlated errors and a column of its own."""
+    table = QTable({"exposure": [solution.names[k] for k in (3, 1, 3, 1)], "id": list("abcd")})
+    table["x"], table["y"] = PIXELS.T * u.pix
+    table["x_err"], table["y_err"] = np.array([[0.02, 0.03, 0.04, 0.05], [0.05, 0.04, 0.03, 0.02]]) * u.pix
+    table["xy_corr"] = [0.0, 0.5, -0.5, 0.9]
+    return table
+
+
+def test_table_is_correct_row_by_row(solution):
+    table = measured(solution)
+    out = solution.correct_table(table)
+    assert list(out["id"]) == list("abcd")
+    assert list(out["exposure"]) == list(table["exposure"])
+    assert_allclose(table["x"].value, PIXELS[:, 0])  # what was given is as it was
+    for k, row in enumerate(table):
+        xx, yy = row["x_err"].value, row["y_err"].value
+        covariance = np.array([[xx**2, row["xy_corr"] * xx * yy], [row["xy_corr"] * xx * yy, yy**2]])
+        xy, relative, absolute = solution.correct(row["exposure"], PIXELS[k], errors=covariance[None])
+        assert_allclose([out["x"][k].value, out["y"][k].value], xy[0])
+        assert_allclose([out["x_err"][k].value, out["y_err"][k].value], np.sqrt(np.diag(relative[0])))
+        assert_allclose([out["x_err_abs"][k].value, out["y_err_abs"][k].value], np.sqrt(np.diag(absolute[0])))
+        assert out["xy_corr"][k] == pytest.approx(relative[0, 0, 1] / np.sqrt(relative[0, 0, 0] * relative[0, 1, 1]))
+        jacobian = SKY.jacobian(xy)[0] * 3.6e6
+        for suffix, each in (("", relative), ("_abs", absolute)):
+            sky = jacobian @ each[0] @ jacobian.T
+            errors = [out[f"{name}_error{suffix}"][k].to_value(u.mas) for name in ("ra", "dec")]
+            assert_allclose(errors, np.sqrt(np.diag(sky)))
+        place = SKY.to_sky(xy)[0]
+        assert (out["ra"][k].to_value(u.deg), out["dec"][k].to_value(u.deg)) == pytest.approx(
+            (place.ra.deg, place.dec.deg)
+        )
+    shared = [name for name in solution.stars.colnames if name in out.colnames]
+    assert {"x_err_abs", "ra_error", "ra_dec_corr", "dec_error_abs"} <= set(shared)
+    assert all(out[name].unit == solution.stars[name].unit for name in shared)
+    assert out["ra_error"].info.meta["ucd"] == "stat.error;pos.eq.ra"
+
+
+def test_table_without_a_sky_ends_in_the_plane(solution):
+    out = replace(solution, sky=None).correct_table(measured(solution))
+    assert "ra" not in out.colnames
+    assert "x_err_abs" in out.colnames
+
+
+def test_bad_tables_are_named(solution):
+    table = measured(solution)
+    with pytest.raises(InputError, match="the table of positions lacks the column x_err"):
+        solution.correct_table(table["exposure", "x", "y", "y_err"])
+    table["exposure"] = np.repeat("nobody", 4)
+    with pytest.raises(InputError, match="no exposure 'nobody'"):
+        solution.correct_table(table)
+    table = measured(solution)
+    table["y_err"][2] = 0 * u.pix
+    with pytest.raises(InputError, match="y_err is not a positive finite number in 1 of 4 rows; the first is row 2"):
+        solution.correct_table(table)
+
+
+def test_command(solution, tmp_path, capsys):
+    solution.write(tmp_path / "solution.asdf")
+    measured(solution).write(tmp_path / "new.ecsv")
+    command = ["correct", str(tmp_path / "solution.asdf"), str(tmp_path / "new.ecsv"), "--out"]
+    assert main([*command, str(tmp_path / "out.ecsv")]) == 0
+    assert "4 positions in" in capsys.readouterr().out
+    back, expected = QTable.read(tmp_path / "out.ecsv"), solution.correct_table(measured(solution))
+    assert back.colnames == expected.colnames
+    assert_allclose(back["ra_error_abs"].to_value(u.mas), expected["ra_error_abs"].to_value(u.mas))
+    assert main([*command, str(tmp_path / "out.ecsv")]) == 1
+    assert "exists" in capsys.readouterr().err
+    assert main([*command, str(tmp_path / "out.txt")]) == 1
+    assert "the ending says the format" in capsys.readouterr().err
+
+
+def test_files_keep_what_is_needed(solution, tmp_path):
+    solution.write(tmp_path / "solution.asdf")
+    again = ld.Solution.read(tmp_path / "solution.asdf")
+    for a, b in zip(*(s.correct(s.names[0], PIXELS, errors=0.02) for s in (again, solution)), strict=True):
+        assert_allclose(a, b, rtol=1e-9)
+
+
+# -- are they true?
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["prior, exact, 0.02 px", "prior, exact, 0.003 px", "prior with static_sigma, 0.02 px"]
+)
+def test_errors_are_calibrated(name):
+    """Truth of Chebyshev polynomials; relative after a cubic map, absolute after the similarity of the stars."""
+    relative, absolute = new_positions_table.row(name, 100)
+    assert relative == pytest.approx(1, abs=0.1)
+    assert absolute == pytest.approx(1, abs=0.15)  # 16 amplitudes of the common map a set
