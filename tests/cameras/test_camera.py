@@ -535,7 +535,7 @@ class TestBadInput:
         )
         with pytest.raises(InputError, match="has no camera with several detectors"):
             solution.wcs("frame00", "1")
-        with pytest.raises(InputError, match="are for exposures with several detectors"):
+        with pytest.raises(InputError, match="is for exposures with several detectors"):
             legdistort.solve(legdistort.Matches.from_table(rows, shape=(2048, 2048)), layout="fit")
 
 

@@ -21,7 +21,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROO
 
 
 #: Those that install and run everything.
-COMMANDS = ["pip install . && legdistort demo --out demo", "pip install '.[test]' && pytest -n 2 --dist loadfile"]
+COMMANDS = ["pip install . && legdistort demo --out demo", "pip install '.[test]' && pytest -n 2 --dist loadscope"]
 
 
 def blocks(page, language):
