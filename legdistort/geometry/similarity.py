@@ -28,6 +28,11 @@ def invert(pose):
     return np.column_stack([inverse, -inverse @ pose[:, 2]])
 
 
+def apply_inverses(poses, xy):
+    """Positions (..., k, 2) carried back through poses (n, 2, 3), shape (n, k, 2)."""
+    return (xy - poses[:, None, :, 2]) @ np.linalg.inv(poses[:, :, :2]).mT
+
+
 def compose(second, first):
     """The pose ``x -> second(first(x))``."""
     return np.column_stack([second[:, :2] @ first[:, :2], apply(second, first[:, 2])])

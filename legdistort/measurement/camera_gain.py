@@ -1,5 +1,4 @@
-"""One gain for all frames of a camera whose headers have none: a frame alone determines it within a factor of ten or
-more.
+"""One gain for all frames of a camera whose headers have none: a frame alone determines it to a factor of ten.
 
 The photon noise of a frame is estimated from what the fits of its stars leave (`profiles.pixel_noise`). The gain
 belongs to the camera and the unit of its data, not to the frame: the median of the estimates of some is taken for all.
@@ -34,8 +33,7 @@ def camera(exposure):
 
 
 def pooled(photons):
-    """Electrons per unit of the data by the variances per unit of light of single frames; None if they do not determine
-    it.
+    """Electrons per unit of the data by the variances per unit of light of single frames; None if not determined.
 
     Parameters
     ----------

@@ -105,7 +105,7 @@ class Gallery:
         return self.add(
             panels[0].figure,
             "Coefficients of the Legendre modes of degree 2 and up, mean of the exposures, beside the prior if there "
-            "is one. Black: how they scatter from one exposure to the next; red: the error of one. Where a few "
+            "is one. Scatter: from one exposure to the next; 1σ error: of one exposure. Where a few "
             "exceed all others by far, the axis is logarithmic beyond its linear middle. Large values in the highest "
             "orders would mean a degree too low or too few stars.",
             bottom=0.8,

@@ -69,8 +69,7 @@ class Tie:
     def errors(self, size: Shape) -> list[tuple[str, int, float]]:
         """Name, number of modes and error [px, rms over the field and axis] by degree, as a list.
 
-        NaN for rotation and scale if the reference does not determine them. `size` (ny, nx) is that of the box of the
-        modes.
+        NaN for rotation and scale if not determined by the reference. `size` (ny, nx) is that of the box of the modes.
         """
         similar, *parts = map_parts(size, len(self.covariance) // 2)
         if self.alone:

@@ -419,11 +419,9 @@ def with_errors(camera, step, unknown):
 
 def with_errors_times(camera, free, factor):
     """The camera with the errors of what was fitted, `free` (n_detectors, 2, n_modes), times a factor."""
-    detectors = {}
+    detectors = dict(camera.detectors)
     for (key, each), fitted in zip(camera.detectors.items(), free, strict=True):
-        if not fitted.any():
-            detectors[key] = each
-            continue
-        errors = {"layout_covariance": factor**2 * each.layout_covariance, "static_sigma": factor * each.static_sigma}
-        detectors[key] = Detector(each.shape, layout=each.layout, static=each.static, **errors)
+        if fitted.any():
+            covariance, sigma = factor**2 * each.layout_covariance, factor * each.static_sigma
+            detectors[key] = replace(each, layout_covariance=covariance, static_sigma=sigma)
     return replace(camera, detectors=detectors)

@@ -102,7 +102,7 @@ def solve_joint(
         50 if not given.
     tolerance : float
         Converged when the next step would be below this many standard errors, rms over the unknowns; it is not taken,
-        nor made where it would be far below, as the last two tell.
+        nor made where the last two show that it would be far below.
 
     Returns
     -------

@@ -124,10 +124,7 @@ def _common_similarity(problem, nominal, refined, astray):
     weight = 1 / (variance + 10 * np.median(variance))
     weight[astray] = 0
     corners = np.array(problem.shapes)[:, None, ::-1] * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 0.5
-    old, new = (
-        ((corners - poses[:, None, :, 2]) @ np.linalg.inv(poses[:, :, :2]).mT).reshape(-1, 2)
-        for poses in (nominal, refined)
-    )
+    old, new = (similarity.apply_inverses(poses, corners).reshape(-1, 2) for poses in (nominal, refined))
     return similarity.fit_similarity(old, new, weights=np.repeat(weight, 4), parity=1)
 
 

@@ -26,7 +26,7 @@ class Stamps:
 
     def __init__(self, frame, centres, half):
         self.frame, self.centres, self.half = frame, centres, half
-        self.index, self.inside = self._pixels(half)
+        self.index, self.inside = self._pixels()
         offsets = np.abs(np.arange(-2 * half, 2 * half + 1)) <= half
         self.core = np.flatnonzero(offsets[:, None] & offsets)
         self.data = self.cut(frame.signal)
@@ -34,8 +34,8 @@ class Stamps:
         self.saturated = self.cut(frame.saturated) & self.inside
         self.good = self.cut(frame.good) & self.inside & ~self.saturated
 
-    def _pixels(self, half):
-        ny, nx = self.frame.signal.shape
+    def _pixels(self):
+        (ny, nx), half = self.frame.signal.shape, self.half
         dy, dx = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
         x, y = self.centres[:, :1] + dx, self.centres[:, 1:] + dy
         inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)

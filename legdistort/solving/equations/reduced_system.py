@@ -59,9 +59,14 @@ def _is_singular(blocks):
 
 def uses_direct(problem):
     """Whether the reduced system is small enough to be factorised; it always is where exposures share modes."""
-    n = problem.unknowns.size
     cost = _FAST_DIRECT_COST if problem.uses_compiled_loops else _DIRECT_COST
-    return problem.unknowns.shared or (n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= cost)
+    return problem.unknowns.shared or _is_small(problem, cost)
+
+
+def _is_small(problem, cost):
+    """Whether the matrix of the coefficients serves a problem, at no more than some multiplications."""
+    n = problem.unknowns.size
+    return n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= cost
 
 
 def has_few_stars(problem, cost=np.inf):
@@ -282,9 +287,7 @@ class Iterative(Reduced):
     def step(self, target, accuracy):
         """As for `Direct`."""
         gradients = self.blocks.g_exposure, self.blocks.g_star
-        n, limit = self.unknowns.size, None
-        if n <= DIRECT_LIMIT and n * n * 2.0 * self.problem.n_stars <= _DIRECT_COST:
-            limit = _FAST_STEPS
+        limit = _FAST_STEPS if _is_small(self.problem, _DIRECT_COST) else None
         found = self._solve(*gradients, self.rows, target, accuracy, limit=limit)
         if found is None:  # exposures hang together weakly
             return Direct(self.problem, self.blocks, self.gauge).step(target, accuracy)

@@ -148,8 +148,7 @@ class Unknowns:
         return (whole / np.bincount(self.group)[:, None, None])[self.group]
 
     def conditional_covariances(self, blocks):
-        """Inverses of exposure blocks (n_exposures, 2 n_modes, 2 n_modes), what is shared determined by all that share
-        it.
+        """Inverses of exposure blocks (n_exposures, 2 n_modes, 2 n_modes); what is shared has the data of all.
 
         The covariance of an exposure's coefficients, stars given; own and common part each given the other.
         """

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...exceptions import SolveError
-from ...geometry import basis
+from ...geometry import basis, similarity
 from ...geometry.detector_modes import dynamic_basis, similarity_basis, similarity_part
 from ...results.gauge import Drift, Gauge
 from ...runtime.checks import check_choice
@@ -228,7 +228,7 @@ def reference_box(problem, state):
     usual = np.abs(np.log(scale / np.median(scale))) < np.log(2)  # a mismatched exposure may have any scale
     ends = _by_shape(lambda shape, _: basis.denormalize(_CORNERS[0], _CORNERS[1], shape), problem)[usual]
     pose_list = state.poses[usual]
-    corners = _apply_inverse(pose_list, ends).reshape(-1, 2)
+    corners = similarity.apply_inverses(pose_list, ends).reshape(-1, 2)
     low, high = corners.min(axis=0), corners.max(axis=0)
     return np.stack([(low + high) / 2, (high - low) / 2])
 
@@ -246,7 +246,7 @@ def _motion(problem, pose_list, box):
     u, v, w = basis.quadrature(degree)
     nodes = _by_shape(lambda shape, _: basis.denormalize(u, v, shape), problem)
     linear = pose_list[:, :, :2]
-    back = _apply_inverse(pose_list, nodes)
+    back = similarity.apply_inverses(pose_list, nodes)
     reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
     mixing = (basis.values(degree, u, v) * w) @ reference.transpose(1, 2, 0)
     return np.einsum("iab,imn->iambn", linear, mixing).reshape(-1, 2 * size, 2 * size)
@@ -315,8 +315,3 @@ def absorb_similarities(problem, state):
 def _apply(pose_list, xy):
     """Poses (n, 2, 3) applied to positions (n, k, 2)."""
     return xy @ pose_list[:, :, :2].transpose(0, 2, 1) + pose_list[:, None, :, 2]
-
-
-def _apply_inverse(pose_list, xy):
-    """Positions (n, k, 2) carried back through poses (n, 2, 3)."""
-    return (xy - pose_list[:, None, :, 2]) @ np.linalg.inv(pose_list[:, :, :2]).transpose(0, 2, 1)

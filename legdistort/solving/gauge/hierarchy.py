@@ -221,13 +221,18 @@ def _pointing_off(power, size):
     `power` (n, n) are the mean products of the modes, over the stars.
     """
     similar = similarity_basis(size, len(power)).T
-    pulled = (similar.T.reshape(-1, 2, len(power)) @ power).reshape(similar.shape[::-1])
+    pulled = _times_power(similar.T, power)
     return np.eye(len(similar)) - similar @ np.linalg.pinv(pulled @ similar, rcond=1e-12, hermitian=True) @ pulled
 
 
 def _metric(power, pointed):
     """Mean square displacement of the stars, per axis, by modes (2 n,) squared, once a similarity is taken off."""
-    return (pointed.T.reshape(-1, 2, len(power)) @ power).reshape(pointed.shape) @ pointed / 2
+    return _times_power(pointed.T, power) @ pointed / 2
+
+
+def _times_power(rows, power):
+    """Rows (k, 2 n), modes of x first, times the mean products of the modes (n, n) along either axis."""
+    return (rows.reshape(-1, 2, len(power)) @ power).reshape(rows.shape)
 
 
 def _named(maps, pointed, metric, size):
