@@ -11,7 +11,7 @@ import threading
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, without_astropy_warnings
 from ..runtime.asdf_files import ARCHIVES, read_tree
-from ..runtime.fits_bytes import open_fits
+from ..runtime.fits_bytes import open_fits, readable
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.outputs import settle_for
 from ..runtime.provenance import checksum, unchanged
@@ -115,7 +115,7 @@ class ExposureFile(ShownAsPrinted):
                     image = read_roman(file, str(self.path), self.path, self.dq_good)
                 planes = {name: getattr(image, name) for name in ("data", "mask", "uncertainty")}
             else:
-                with _quiet(), _opened(self.path) as (_, hdulist), _told(f"{self.path}: {_DAMAGED}"):
+                with _quiet(), _opened(self.path) as hdulist, _told(f"{self.path}: {_DAMAGED}"):
                     planes = _planes(hdulist, find_image(hdulist, self.ext, self.path), self.dq_good)
         return Exposure(**{name: getattr(self, name) for name in _SHARED}, **planes)
 
@@ -278,35 +278,48 @@ def _read_each(paths, read, ext, progress, bad=None, copies=None):
     """
     origins, exposures, images = {}, [], {}
     sources = expand_paths(paths)
-    parts = [(i, sources[i], *part) for i, each in enumerate(_parts(sources, ext)) for part in each]
-    for i, source, ext, key in tqdm(parts, desc="reading", unit="frame", disable=not progress):
-        try:
-            with _quiet():
-                exposure = read(source, f"exposure_{i}", ext)
-                exposure = exposure if key is None else of_detector(exposure, ext, key)
-        except DamagedError as error:
-            if bad is None:
-                raise
-            file = Path(source).name if isinstance(source, (str, Path)) else f"exposure_{i}"
-            name = exposure_name(file, ext) if key is None else detector_name(exposure_name(file), key)
-            reason = str(error).removeprefix(f"{source}: ").removeprefix(f"{name}: ").removesuffix(LEAVE_OUT)
-            bad[name] = file, reason, error
-            continue
-        origin = exposure.path if exposure.path is not None else "in memory"
-        if copies is not None:
-            first = images.setdefault(_pixels(exposure), exposure)
-            if first is not exposure:
-                where = f" ({origins[first.name]} and {origin})" * (first.name == exposure.name)
-                copies[exposure.name] = f"its pixels are those of {first.name}{where}"
+    parts = _parts(sources, ext)
+    bar = tqdm(total=sum(map(len, parts)), desc="reading", unit="frame", disable=not progress)
+    with bar, contextlib.closing(_one_after_another(sources, parts)) as opened:
+        for i, source, ext, key in opened:
+            bar.update()
+            try:
+                with _quiet():
+                    exposure = read(source, f"exposure_{i}", ext)
+                    exposure = exposure if key is None else of_detector(exposure, ext, key)
+            except DamagedError as error:
+                if bad is None:
+                    raise
+                file = source.path.name if isinstance(source, _OpenFile) else f"exposure_{i}"
+                name = exposure_name(file, ext) if key is None else detector_name(exposure_name(file), key)
+                reason = str(error).removeprefix(f"{sources[i]}: ").removeprefix(f"{name}: ").removesuffix(LEAVE_OUT)
+                bad[name] = file, reason, error
                 continue
-        if exposure.name in origins:
-            raise InputError(
-                f"two exposures are named {exposure.name!r} ({origins[exposure.name]} and "
-                f"{origin}); rename a file: exposures are distinguished by their names"
-            )
-        origins[exposure.name] = origin
-        exposures.append(exposure)
+            origin = exposure.path if exposure.path is not None else "in memory"
+            if copies is not None:
+                first = images.setdefault(_pixels(exposure), exposure)
+                if first is not exposure:
+                    where = f" ({origins[first.name]} and {origin})" * (first.name == exposure.name)
+                    copies[exposure.name] = f"its pixels are those of {first.name}{where}"
+                    continue
+            if exposure.name in origins:
+                raise InputError(
+                    f"two exposures are named {exposure.name!r} ({origins[exposure.name]} and "
+                    f"{origin}); rename a file: exposures are distinguished by their names"
+                )
+            origins[exposure.name] = origin
+            exposures.append(exposure)
     return exposures
+
+
+def _one_after_another(sources, parts):
+    """Number of the source, the source, extension and id of the detector of every image; a file is opened but once."""
+    for i, (source, images) in enumerate(zip(sources, parts, strict=True)):
+        with contextlib.ExitStack() as stack:
+            if isinstance(source, (str, Path)):
+                source = stack.enter_context(_OpenFile(Path(source)))
+            for ext, key in images:
+                yield i, source, ext, key
 
 
 def file_checksums(exposures):
@@ -360,10 +373,35 @@ def _headers_of_images(source):
     if isinstance(source, fits.HDUList):
         return [hdu for hdu in source if _is_image(hdu)]
     try:
-        with _quiet(), _opened(Path(source)) as (_, hdulist):
+        with _quiet(), _opened(Path(source)) as hdulist:
             return [hdu for hdu in hdulist if _is_image(hdu)]
     except (InputError, TypeError):
         return []
+
+
+class _OpenFile(contextlib.ExitStack):
+    """A file that stays open while its images are read one after another, and is checked to be the same in the end."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.path = path
+
+    @cached_property
+    def identity(self):
+        return self.enter_context(unchanged(self.path))[0]
+
+    @cached_property
+    def file(self):
+        return self.enter_context(_file(self.path))
+
+    @cached_property
+    def hdulist(self):
+        return self.enter_context(open_fits(self.file, self.path))
+
+    @cached_property
+    def checksum(self):
+        self.file.seek(0)
+        return checksum(self.file)
 
 
 def _read(source, default, ext, good=None):
@@ -373,30 +411,27 @@ def _read(source, default, ext, good=None):
         filename = source.filename()
         label = filename or str(source[0].header.get("FILENAME", default)) if len(source) else default
         return _from_hdulist(source, ext, label, Path(filename) if filename else None, good)
-    if not isinstance(source, (str, Path)):
+    if not isinstance(source, _OpenFile):
         raise InputError(f"an exposure must be a path, an HDUList or an NDData, got {type(source).__name__}")
-    path = Path(source)
-    if _is_asdf(path):
-        with _file(path) as file:
-            _check_no_extension(path, ext)
-            return read_roman(file, str(path), path, good)
-    with _opened(path) as (_, hdulist):
-        return _from_hdulist(hdulist, ext, str(path), path, good)
+    if _is_asdf(source.path):
+        with _file(source.path) as file:
+            _check_no_extension(source.path, ext)
+            return read_roman(file, str(source.path), source.path, good)
+    with readable(source.path):
+        exposure = _from_hdulist(source.hdulist, ext, str(source.path), source.path, good)
+        for hdu in filter(_is_image, source.hdulist):
+            del hdu.data  # the memory need hold but one detector of a camera
+    return exposure
 
 
 def _open(source, default, ext, good=None, even_blank=True):
-    if not isinstance(source, (str, Path)):
-        exposure = _read(source, default, ext, good)
-        return exposure if even_blank else _not_blank(exposure)
-    path = Path(source)
-    with unchanged(path) as (identity,):
-        exposure = _read(source, default, ext, good)
-        exposure = exposure if even_blank else _not_blank(exposure)
-        with _file(path) as file:
-            digits = checksum(file)
-    shared = {name: getattr(exposure, name) for name in _SHARED}
-    made = {"shape": exposure.shape, "checksum": digits, "pixels": _pixels(exposure), "identity": identity}
-    return ExposureFile(**shared, **made, ext=ext, dq_good=good)
+    known = {"identity": source.identity} if isinstance(source, _OpenFile) else {}  # before it is read
+    exposure = _read(source, default, ext, good)
+    exposure = exposure if even_blank else _not_blank(exposure)
+    if not known:
+        return exposure
+    known |= {"shape": exposure.shape, "checksum": source.checksum, "pixels": _pixels(exposure)}
+    return ExposureFile(**{name: getattr(exposure, name) for name in _SHARED}, **known, ext=ext, dq_good=good)
 
 
 def _pixels(exposure):
@@ -451,9 +486,9 @@ def _told(sentence):
 
 @contextlib.contextmanager
 def _opened(path):
-    """A FITS file, as it is and as an HDUList."""
+    """A FITS file as an HDUList."""
     with _file(path) as file, open_fits(file, path) as hdulist:
-        yield file, hdulist
+        yield hdulist
 
 
 def _from_hdulist(hdulist, ext, label, path, good=None):

@@ -16,9 +16,12 @@ import legdistort as ld
 from legdistort import pipeline
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.inputs import exposure_files
 from legdistort.inputs.exposures import Exposure
 from legdistort.priors.from_headers import describe, header_distortions
 from legdistort.priors.prior import HeaderPrior
+from legdistort.runtime import fits_bytes
+from legdistort.runtime.provenance import checksums
 from legdistort.wcs.attachment import attach
 
 SHAPE = (256, 256)
@@ -104,6 +107,39 @@ def test_several_images_are_refused_with_their_list(tmp_path, read, names, told,
     assert "(--ext " in message
     (chosen,) = read(path, ext=ext)
     assert np.array_equal(chosen.read().data, pixels(2 if len(names) == 4 else 1))
+
+
+@pytest.mark.parametrize("packed", ["", ".gz"])
+def test_a_file_is_opened_once_for_all_its_detectors(tmp_path, monkeypatch, packed):
+    path = mosaic_file(tmp_path / f"a.fits{packed}", *((name, v) for v in (1, 2, 3, 4) for name in ("SCI", "DQ")))
+    opened = []
+
+    def counted(file, name):
+        opened.append(name)
+        return fits_bytes.open_fits(file, name)
+
+    monkeypatch.setattr(exposure_files, "open_fits", counted)
+    exposures = ld.open_exposures(path, ext="SCI")
+    assert len(opened) <= 2  # which detectors there are, and what they hold
+    assert {exposure.checksum for exposure in exposures} == set(checksums(path).values())
+    for k, each in enumerate(exposures):
+        assert np.array_equal(each.read().data, pixels(2 * k))
+    alone = [ld.read_exposures(path, ext=("SCI", v))[0] for v in (1, 2, 3, 4)]
+    assert all(np.array_equal(a.data, b.data) for a, b in zip(alone, ld.read_exposures(path, ext="SCI"), strict=True))
+
+
+def test_a_file_exchanged_between_two_detectors_is_noticed(tmp_path, monkeypatch):
+    path = mosaic_file(tmp_path / "a.fits", ("SCI", 1), ("SCI", 2))
+    read = exposure_files._from_hdulist
+
+    def exchanged(hdulist, ext, *others):
+        if ext == ("SCI", 2):
+            path.write_bytes(path.read_bytes())
+        return read(hdulist, ext, *others)
+
+    monkeypatch.setattr(exposure_files, "_from_hdulist", exchanged)
+    with pytest.raises(InputError, match=r"a\.fits changed while it was read"):
+        ld.open_exposures(path, ext="SCI")
 
 
 def test_a_long_list_is_cut(tmp_path):
