@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.gsaoi import GSAOI_SIZE, GsaoiMap
-from ..inputs.detector_images import of_files
+from ..inputs.file_images import of_files
 from ..runtime.notebook import ShownAsPrinted
 from . import storage
 from .detector import Detector

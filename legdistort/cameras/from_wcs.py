@@ -9,7 +9,7 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity, tangent_plane
-from ..inputs.detector_images import KEYWORDS, detector_ids
+from ..inputs.file_images import KEYWORDS, detector_ids
 from ..inputs.sky_wcs import to_icrs
 from ..runtime.words import DIRECTIONS
 from .detector import Detector

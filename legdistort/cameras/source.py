@@ -80,7 +80,9 @@ class Source:
         for key, value in given.items():
             known = getattr(self, key)
             if None not in (known, value) and value != known:
-                raise InputError(f"{self.name} ({self.kind}) has {key} {known!r}, not {value!r}; leave {key} out")
+                raise InputError(
+                    f"{self.name} ({self.kind}) has {key} {known!r}, not {value!r}; leave {key} (--{key}) out"
+                )
             given[key] = known if value is None else value
         given["direction"] = given["direction"] or self.usual
         given["origin"] = given["origin"] or 0

@@ -6,7 +6,6 @@ import contextlib
 import glob
 import hashlib
 import logging
-import re
 import threading
 import zlib
 from collections.abc import Sequence
@@ -27,9 +26,9 @@ from ..runtime.notebook import ShownAsPrinted
 from ..runtime.outputs import settle_for
 from ..runtime.provenance import checksum, unchanged
 from . import repetitions
-from .detector_images import every_id, images_of_detectors, of_detector
-from .exposure_names import detector_name, exposure_name, in_header
+from .exposure_names import detector_name, exposure_name
 from .exposures import LEAVE_OUT, Exposure, known_from_header
+from .file_images import find_image, images_of_detectors, is_image, named_images, of_detector
 from .foreign_images import from_nddata, is_nddata, read_roman
 from .pixel_flags import bad_pixels, good_bits
 from .sky_wcs import believable_wcs
@@ -44,18 +43,6 @@ log = logging.getLogger(__name__)
 #: Names of extensions that belong to an image, and how their values become standard deviations.
 UNCERTAINTY_NAMES = {"ERR": "StdDev", "UNCERT": "StdDev", "VAR": "Variance", "VARIANCE": "Variance"}
 MASK_NAMES = ("DQ", "MASK")
-#: Words in the names of extensions that are no images of the sky but stand beside one: errors, masks, weights, times,
-#: backgrounds, and the look-up tables of a WCS, as the archives of HST, JWST, ESO, NOIRLab and Astropy name them.
-_BESIDE = {
-    "ERR", "ERROR", "ERRORS", "UNCERT", "UNCERTAINTY", "VAR", "VARIANCE", "IVAR", "INVVAR", "STAT", "STDDEV",
-    "SIGMA", "RMS", "NOISE", "DQ", "PIXELDQ", "GROUPDQ", "MASK", "BPM", "FLAG", "FLAGS", "QUAL", "QUALITY", "WHT",
-    "WEIGHT", "WEIGHTS", "CON", "CTX", "CONTEXT", "CONFIDENCE", "COVERAGE", "FOOTPRINT", "EXP", "EXPTIME", "EXPMAP",
-    "TIME", "SAMP", "EXTRAPOLATED", "REJECTED", "AREA", "BKG", "BACKGROUND", "SKY", "PSF", "PSFIMAGE", "WCSDVARR",
-    "D2IMARR",
-}  # fmt: skip
-#: Images of a file that a message names.
-_MOST_NAMED = 8
-
 _FILTERS = threading.Lock()  # warning filters belong to the process, not to the thread that changes them
 _DAMAGED = "truncated or damaged, its image cannot be read"
 _UNREADABLE = (OSError, EOFError, TypeError, ValueError, KeyError, IndexError, zlib.error, fits.VerifyError)
@@ -371,10 +358,10 @@ def _parts(sources, ext):
 def _headers_of_images(source):
     """The images of a FITS file, or none of what cannot be read: the error comes when it is read."""
     if isinstance(source, fits.HDUList):
-        return [hdu for hdu in source if _is_image(hdu)]
+        return [hdu for hdu in source if is_image(hdu)]
     try:
         with _quiet(), _opened(Path(source)) as hdulist:
-            return [hdu for hdu in hdulist if _is_image(hdu)]
+            return [hdu for hdu in hdulist if is_image(hdu)]
     except (InputError, TypeError):
         return []
 
@@ -419,7 +406,7 @@ def _read(source, default, ext, good=None):
             return read_roman(file, str(source.path), source.path, good)
     with readable(source.path):
         exposure = _from_hdulist(source.hdulist, ext, str(source.path), source.path, good)
-        for hdu in filter(_is_image, source.hdulist):
+        for hdu in filter(is_image, source.hdulist):
             del hdu.data  # the memory need hold but one detector of a camera
     return exposure
 
@@ -531,91 +518,6 @@ def _gwcs_of(table, name, shape):
     return believable_wcs(wcs, shape, name)
 
 
-def extension_names(hdulist, path):
-    """``{name of an exposure: extension}`` for every way to name an extension of a file, and for none."""
-    names = {exposure_name(path): None}
-    for i, hdu in enumerate(hdulist):
-        forms = (i, hdu.name, (hdu.name, hdu.ver)) if hdu.name else (i,)
-        names |= {exposure_name(path, form): form for form in forms}
-    return names
-
-
-def detector_names(hdulist, path, ext=None):
-    """``{name of an exposure: extension}`` for every way to name the detectors of a file, of one extension or all."""
-    images = [hdu for hdu in hdulist if _is_image(hdu) and not _stands_beside(hdu.name)]
-    kinds = {hdu.name for hdu in images if hdu.name} if ext is None else {ext}
-    forms = [part for kind in kinds for part in every_id(images, kind)]
-    return {detector_name(exposure_name(path), key): form for form, key in forms}
-
-
-def named_images(hdulist, path):
-    """``{name of an exposure, as headers hold it: HDU}`` for every name that an image of a file can have."""
-    found = {}
-    for name, ext in (extension_names(hdulist, path) | detector_names(hdulist, path)).items():
-        with contextlib.suppress(InputError):
-            found[in_header(name)] = find_image(hdulist, ext, str(path), of_several=True)
-    return found
-
-
-def planes_beside(hdulist, image):
-    """HDUs of errors, flags, weights beside an image: of its shape and ``EXTVER``, and of no other image."""
-    alike = [hdu for hdu in hdulist if _is_image(hdu) and hdu.shape == image.shape and hdu.ver == image.ver]
-    planes = [hdu for hdu in alike if hdu is not image and _stands_beside(hdu.name)]
-    return planes if len(planes) == len(alike) - 1 else []
-
-
-def _is_image(hdu):
-    return isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) and len(hdu.shape) > 0
-
-
-def find_image(hdulist, ext, label, *, of_several=False):
-    """The HDU to read (see `read_exposures`), `of_several` images the first; `label` names the file in errors."""
-    where = "" if ext is None else f" in extension {ext!r}"
-    if ext is not None:
-        try:
-            candidates = [hdulist[ext]]
-        except (KeyError, IndexError):
-            present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
-            raise DamagedError(f"{label}: no extension {ext!r}; the file has {present}") from None
-        candidates = [hdu for hdu in candidates if _is_image(hdu)]
-    else:
-        every = [hdu for hdu in hdulist if _is_image(hdu)]
-        science = [hdu for hdu in every if hdu.name == "SCI"]
-        candidates = science or [hdu for hdu in every if not _stands_beside(hdu.name)] or every
-    if not candidates:
-        raise DamagedError(f"{label}: no image{where}")
-    images = [hdu for hdu in candidates if len(hdu.shape) > 1]
-    if len(images) > 1 and of_several:
-        images.sort(key=lambda hdu: len(hdu.shape))  # stable: 2-D before cubes, else the order of the file
-    elif len(images) > 1:
-        raise InputError(f"{label} holds {_listed_images(hdulist, images)}")
-    if not images or len(images[0].shape) > 2:
-        shape = (images or candidates)[0].shape
-        words = "choose one plane, and give it as a file of its own"
-        raise InputError(f"{label}: no 2-D image{where}, the data have shape {shape}; {words}")
-    return images[0]
-
-
-def _stands_beside(name):
-    """Whether an extension is by its name (``ERR``, ``VAR_POISSON``, ``CHIP1.DQ``, ``WHT2``) no image of the sky."""
-    words = re.split(r"[^A-Z0-9]+", name.upper())
-    return any(word in _BESIDE or word.rstrip("0123456789") in _BESIDE for word in words)
-
-
-def _listed_images(hdulist, images):
-    """How many images there are, which, and how to choose one."""
-    numbers = [str(i) for i, hdu in enumerate(hdulist) if any(hdu is image for image in images)]
-    forms = [f"{hdu.name},{hdu.ver}" if hdu.name else i for i, hdu in zip(numbers, images, strict=True)]
-    if len(set(forms)) < len(forms):
-        forms = numbers
-    named = [f"{form} {hdu.shape}" for form, hdu in zip(forms, images, strict=True)][:_MOST_NAMED]
-    more = f" and {len(images) - _MOST_NAMED} more" * (len(images) > _MOST_NAMED)
-    name, comma, version = forms[0].partition(",")
-    python = f"({name!r}, {version})" if comma else name
-    listed_so = f"{len(images)} images, {', '.join(named)}{more} (ny, nx)"
-    return f"{listed_so}: choose one with ext, as in ext={python} (--ext {forms[0]})"
-
-
 def _planes(hdulist, hdu, good=None):
     """Data of an image, and the mask and uncertainty that stand beside it in the same file."""
     data = hdu.data
@@ -624,7 +526,7 @@ def _planes(hdulist, hdu, good=None):
     telescope = hdu.header.get("TELESCOP", hdulist[0].header.get("TELESCOP", ""))
     planes = {"data": data}
     for other in hdulist:
-        alike = other is not hdu and _is_image(other) and other.shape == hdu.shape and other.ver == hdu.ver
+        alike = other is not hdu and is_image(other) and other.shape == hdu.shape and other.ver == hdu.ver
         if alike and other.name in MASK_NAMES:
             planes["mask"] = bad_pixels(other.data, good, do_not_use=telescope in ("JWST", "ROMAN"))
         elif alike and other.name in UNCERTAINTY_NAMES:

@@ -39,7 +39,7 @@ def as_source(model, *, frame=None, name="the model"):
     if hasattr(model, "Sci2IdlDeg"):
         return _of_aperture(model, frame, name)
     if frame is not None:
-        raise InputError(f"frame is for gwcs objects and SIAF apertures; {name} is neither, leave it out")
+        raise InputError(f"frame (--frame) is for gwcs objects and SIAF apertures; {name} is neither, leave it out")
     if isinstance(model, fits_wcs.WCS):
         return _of_fits_wcs(model, name)
     if not callable(model):

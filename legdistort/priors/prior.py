@@ -274,8 +274,13 @@ class Prior(ShownAsPrinted):
         if offset is not None:
             if source.shape is None:
                 raise InputError(f"{source.name} ({source.kind}) has no size of its own: leave offset (--offset) out")
+            if shape is None:
+                raise InputError(
+                    f"offset (--offset) places {source.name} in a detector of another size: give that one's as well, "
+                    "as shape (--shape), or leave the offset out"
+                )
             source = source.stated(direction=direction, origin=origin)
-            known = _placed(source, degree, parity, check_shape(source.shape if shape is None else shape), offset)
+            known = _placed(source, degree, parity, check_shape(shape), offset)
             return cls(**known, sigma=sigma, static_sigma=static_sigma)
         source = source.stated(shape=shape, direction=direction, origin=origin)
         mean, plane, truncation = expand(source, degree, parity)

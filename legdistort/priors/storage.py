@@ -83,7 +83,8 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
         if "shape" in given and ready.shape in (None, tuple(given["shape"])):
             widths["shape"] = check_shape(given.pop("shape"))
         if given:
-            raise InputError(f"{where} is a prior already: {', '.join(given)} cannot be chosen any more; leave it out")
+            named = ", ".join(f"{key} (--{key})" for key in given)
+            raise InputError(f"{where} is a prior already: {named} cannot be chosen any more; leave it out")
         return dataclasses.replace(ready, **widths)
     files = where if isinstance(where, (list, tuple)) else [where]
     files = [path for path in files if isinstance(path, (str, Path))]

@@ -16,7 +16,7 @@ from astropy.io import fits
 from tqdm import tqdm
 
 from ..exceptions import ExportError, InputError
-from ..inputs import exposure_files, exposure_names
+from ..inputs import exposure_files, exposure_names, file_images
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, readable, splice
@@ -195,7 +195,7 @@ def _plan(solution, path, target, *, kind, max_error, ext, overwrite):
             headers[name] = None
             if kind is not None:
                 headers[name] = _header(solution, name, kind, max_error)
-                planes = exposure_files.planes_beside(hdulist, hdulist[image])
+                planes = file_images.planes_beside(hdulist, hdulist[image])
                 for number in (image, *(_number(hdulist, plane) for plane in planes)):
                     start, data, stop, _ = spans[number]
                     new = exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)
@@ -224,15 +224,15 @@ def _images(solution, hdulist, path, ext):
     """``{exposure: number of its HDU}`` of one file; empty if it was left out of the solution."""
     candidates = {exposure_names.exposure_name(path, ext): ext}
     if ext is None:
-        candidates = exposure_files.extension_names(hdulist, path)
-    candidates |= exposure_files.detector_names(hdulist, path, ext)
+        candidates = file_images.extension_names(hdulist, path)
+    candidates |= file_images.detector_names(hdulist, path, ext)
     found = {name: form for name, form in candidates.items() if name in solution.names}
     if not found:
         return _nothing(solution, path, next((n for n in candidates if n in solution.left_out), next(iter(candidates))))
     images = {}
     for name, form in found.items():
         # of several images the first, if the solution knows the file by its name alone
-        hdu = exposure_files.find_image(hdulist, form, str(path), of_several=True)
+        hdu = file_images.find_image(hdulist, form, str(path), of_several=True)
         if hdu.shape != tuple(solution.shapes[name]):
             raise InputError(
                 f"{path}: the image has shape {hdu.shape}, exposure {name} of the solution "
@@ -260,7 +260,7 @@ def _tables(hdulist, spans, path, overwrite):
     One of ours names its exposure: numbers of HDUs change when fpack and other programs move them. Where that is no
     image of this file, since the file was renamed, it is removed, and so, if asked for, is that of another program.
     """
-    named, of_images, others = exposure_files.named_images(hdulist, path), {}, []
+    named, of_images, others = file_images.named_images(hdulist, path), {}, []
     for span in spans:
         if span.header.get("EXTNAME") != "ASDF":
             continue

@@ -704,8 +704,8 @@ def test_options_that_others_leave_without_effect_are_refused(words, message, ni
         ("run FRAMES --motion-sigma 1 --out o", "belong to --motion"),
         ("prior gsaoi-2 --frame tel --out o.asdf", "leave --frame out"),
         ("prior gsaoi-2 --ext 1 --out o.asdf", "leave --ext out"),
-        ("prior gsaoi-2 --origin 1 --out o.asdf", "leave origin out"),
-        ("prior gsaoi-2 --direction reference_to_detector --out o.asdf", "leave direction out"),
+        ("prior gsaoi-2 --origin 1 --out o.asdf", "leave origin (--origin) out"),
+        ("prior gsaoi-2 --direction reference_to_detector --out o.asdf", "leave direction (--direction) out"),
     ],
 )
 def test_options_that_do_not_apply_are_refused_before_a_star_is_measured(

@@ -317,6 +317,11 @@ def test_an_offset_needs_a_size():
         Prior.from_model(_cubic, shape=(1024, 1024), direction="reference_to_detector", offset=(1, 1))
 
 
+def test_an_offset_needs_the_size_of_the_detector():
+    with pytest.raises(InputError, match=r"places gsaoi-2 in a detector of another size: .* \(--shape\), or leave"):
+        Prior.from_file("gsaoi-2", offset=(3, 3))
+
+
 def test_refpix(tmp_path):
     (tmp_path / "c.txt").write_text("# comment\nrefpix 11 21\n\npoly 1\n0 1.5 0.25\n0 -0.25 1.5D0\n")
     source = read_source(tmp_path / "c.txt").stated(shape=(50, 50))
@@ -470,7 +475,7 @@ def test_written_and_read(tmp_path):
     assert_allclose(wider.static_sigma, 0.1)
     with pytest.raises(InputError, match=r"q\.asdf exists already"):
         prior.write(tmp_path / "q.asdf")
-    with pytest.raises(InputError, match="is a prior already: degree cannot be chosen any more"):
+    with pytest.raises(InputError, match=r"is a prior already: degree \(--degree\) cannot be chosen any more"):
         Prior.from_file(tmp_path / "p.asdf", degree=3)
     with pytest.raises(InputError, match="is a prior already: shape"):
         Prior.from_file(tmp_path / "p.asdf", shape=(2048, 2047))
@@ -616,7 +621,7 @@ def bad(tmp_path_factory):
             {"frame": "v2v3"},
             r"good.fits\[0\] \(FITS header, RA---TAN-SIP\) has no frame; leave --frame out",
         ),
-        ("good.fits", {"direction": BACKWARD}, f"has direction '{FORWARD}', not '{BACKWARD}'; leave direction out"),
+        ("good.fits", {"direction": BACKWARD}, f"has direction '{FORWARD}', not '{BACKWARD}'; leave direction"),
         ("good.fits", {"shape": (256, 255)}, r"has shape \(256, 256\), not \(256, 255\)"),
         ("good.fits", {"origin": 1}, "has origin 0, not 1"),
         ("good.fits", {"shape": (256,)}, r"shape must be \(ny, nx\) in pixels"),

@@ -1,0 +1,207 @@
+"""Which images a FITS file holds: of the sky, of the detectors of a camera, and the planes that stand beside them."""
+
+import contextlib
+import re
+from dataclasses import replace
+
+from astropy.io import fits
+
+from ..exceptions import DamagedError, InputError
+from .exposure_names import detector_name, exposure_name, in_header
+
+#: Header keywords that distinguish detectors, in order of preference.
+KEYWORDS = ("CCDCHIP", "DETECTOR", "CHIP", "EXTVER", "EXTNAME")
+#: Words in the names of extensions that are no images of the sky but stand beside one: errors, masks, weights, times,
+#: backgrounds, and the look-up tables of a WCS, as the archives of HST, JWST, ESO, NOIRLab and Astropy name them.
+_BESIDE = {
+    "ERR", "ERROR", "ERRORS", "UNCERT", "UNCERTAINTY", "VAR", "VARIANCE", "IVAR", "INVVAR", "STAT", "STDDEV",
+    "SIGMA", "RMS", "NOISE", "DQ", "PIXELDQ", "GROUPDQ", "MASK", "BPM", "FLAG", "FLAGS", "QUAL", "QUALITY", "WHT",
+    "WEIGHT", "WEIGHTS", "CON", "CTX", "CONTEXT", "CONFIDENCE", "COVERAGE", "FOOTPRINT", "EXP", "EXPTIME", "EXPMAP",
+    "TIME", "SAMP", "EXTRAPOLATED", "REJECTED", "AREA", "BKG", "BACKGROUND", "SKY", "PSF", "PSFIMAGE", "WCSDVARR",
+    "D2IMARR",
+}  # fmt: skip
+#: Images of a file that a message names.
+_MOST_NAMED = 8
+
+
+def detector_ids(headers):
+    """Ids of the detectors of one exposure by the first keyword that all headers have with values of their own.
+
+    None if there is no such keyword.
+    """
+    for keyword in KEYWORDS:
+        values = [header.get(keyword) for header in headers]
+        if None not in values and len(set(values)) == len(values):
+            return [str(value).strip() for value in values]
+    return None
+
+
+def images_of_detectors(files, ext):
+    """What an extension name stands for in several files: their image, or those of the detectors of a camera.
+
+    Parameters
+    ----------
+    files : list of list of HDU
+        The images of every file.
+    ext : int, str, (str, int) or None
+        The extension asked for; a name may stand for the images of several detectors.
+
+    Returns
+    -------
+    list of list
+        ``[(extension, id)]`` for every file; the id is None where it has but one image and no other file has several.
+    """
+    single = [[(ext, None)] for _ in files]
+    if not isinstance(ext, str):
+        return single
+    named = [[hdu for hdu in images if hdu.name == ext.strip().upper()] for images in files]
+    found, known = [], set()
+    for each in named:
+        versions = [hdu.ver for hdu in each]
+        several = len(set(versions)) == len(each) > 1
+        ids = (detector_ids([hdu.header for hdu in each]) or list(map(str, versions))) if several else []
+        found.append([((ext, version), key) for version, key in zip(versions, ids, strict=False)])
+        known |= set(ids)
+    for k, images in enumerate(files):
+        if len(named[k]) == 1:  # an exposure that lacks the other detectors
+            found[k] = [part for part in every_id(images, ext) if part[1] in known][:1]
+    return [parts or one for parts, one in zip(found, single, strict=True)]
+
+
+def every_id(images, ext):
+    """``[(extension, id)]`` of the images of that extension name, with each id that a detector may have."""
+    named = [hdu for hdu in images if isinstance(ext, str) and hdu.name == ext.strip().upper()]
+    values = [((ext, hdu.ver), str(hdu.header.get(keyword, "")).strip()) for keyword in KEYWORDS for hdu in named]
+    return [part for part in values if part[1]]
+
+
+def of_files(exposures, ids):
+    """Exposures whose detectors are in files of their own, with `frame` and `detector`.
+
+    The detector is that of `ids` which the header names (`KEYWORDS`), the frame the name of the file without it.
+
+    Parameters
+    ----------
+    exposures : list of Exposure
+    ids : iterable of str
+
+    Raises
+    ------
+    InputError
+        For a header that names none of the detectors, or a file name that does not have it.
+    """
+    known, out = {key.lower(): key for key in ids}, []
+    for exposure in exposures:
+        if exposure.detector is not None:
+            out.append(exposure)
+            continue
+        values = [str(exposure.header.get(keyword, "")).strip().lower() for keyword in KEYWORDS]
+        key = next((known[value] for value in values if value in known), None)
+        if key is None:
+            raise InputError(
+                f"the header of {exposure.name} names none of the detectors {', '.join(known.values())} "
+                f"({', '.join(KEYWORDS)}): read all extensions of a file by their name (ext='SCI', --ext SCI), or "
+                "correct the ids of the camera"
+            )
+        frame = re.sub(
+            rf"[-_.]?(?<![A-Za-z0-9]){re.escape(key)}(?![A-Za-z0-9])", "", exposure.name, flags=re.IGNORECASE
+        )
+        if frame in ("", exposure.name):
+            raise InputError(
+                f"{exposure.name} is of detector {key}, which its name does not say: files of one exposure are those "
+                f"with one name but for the detector, such as {exposure.name}_{key}; rename them"
+            )
+        out.append(replace(exposure, frame=frame, detector=key))
+    return out
+
+
+def of_detector(exposure, ext, key):
+    """An exposure that was read from one of several images of a file, named after its detector."""
+    frame = exposure.name.removesuffix(f"_{''.join(map(str, ext))}")
+    return replace(exposure, name=detector_name(frame, key), frame=frame, detector=key)
+
+
+def extension_names(hdulist, path):
+    """``{name of an exposure: extension}`` for every way to name an extension of a file, and for none."""
+    names = {exposure_name(path): None}
+    for i, hdu in enumerate(hdulist):
+        forms = (i, hdu.name, (hdu.name, hdu.ver)) if hdu.name else (i,)
+        names |= {exposure_name(path, form): form for form in forms}
+    return names
+
+
+def detector_names(hdulist, path, ext=None):
+    """``{name of an exposure: extension}`` for every way to name the detectors of a file, of one extension or all."""
+    images = [hdu for hdu in hdulist if is_image(hdu) and not _stands_beside(hdu.name)]
+    kinds = {hdu.name for hdu in images if hdu.name} if ext is None else {ext}
+    forms = [part for kind in kinds for part in every_id(images, kind)]
+    return {detector_name(exposure_name(path), key): form for form, key in forms}
+
+
+def named_images(hdulist, path):
+    """``{name of an exposure, as headers hold it: HDU}`` for every name that an image of a file can have."""
+    found = {}
+    for name, ext in (extension_names(hdulist, path) | detector_names(hdulist, path)).items():
+        with contextlib.suppress(InputError):
+            found[in_header(name)] = find_image(hdulist, ext, str(path), of_several=True)
+    return found
+
+
+def planes_beside(hdulist, image):
+    """HDUs of errors, flags, weights beside an image: of its shape and ``EXTVER``, and of no other image."""
+    alike = [hdu for hdu in hdulist if is_image(hdu) and hdu.shape == image.shape and hdu.ver == image.ver]
+    planes = [hdu for hdu in alike if hdu is not image and _stands_beside(hdu.name)]
+    return planes if len(planes) == len(alike) - 1 else []
+
+
+def is_image(hdu):
+    """Whether an HDU is an image that has pixels."""
+    return isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) and len(hdu.shape) > 0
+
+
+def find_image(hdulist, ext, label, *, of_several=False):
+    """The HDU to read (see `read_exposures`), `of_several` images the first; `label` names the file in errors."""
+    where = "" if ext is None else f" in extension {ext!r}"
+    if ext is not None:
+        try:
+            candidates = [hdulist[ext]]
+        except (KeyError, IndexError):
+            present = ", ".join(f"{i} {h.name}".strip() for i, h in enumerate(hdulist))
+            raise DamagedError(f"{label}: no extension {ext!r}; the file has {present}") from None
+        candidates = [hdu for hdu in candidates if is_image(hdu)]
+    else:
+        every = [hdu for hdu in hdulist if is_image(hdu)]
+        science = [hdu for hdu in every if hdu.name == "SCI"]
+        candidates = science or [hdu for hdu in every if not _stands_beside(hdu.name)] or every
+    if not candidates:
+        raise DamagedError(f"{label}: no image{where}")
+    images = [hdu for hdu in candidates if len(hdu.shape) > 1]
+    if len(images) > 1 and of_several:
+        images.sort(key=lambda hdu: len(hdu.shape))  # stable: 2-D before cubes, else the order of the file
+    elif len(images) > 1:
+        raise InputError(f"{label} holds {_listed_images(hdulist, images)}")
+    if not images or len(images[0].shape) > 2:
+        shape = (images or candidates)[0].shape
+        words = "choose one plane, and give it as a file of its own"
+        raise InputError(f"{label}: no 2-D image{where}, the data have shape {shape}; {words}")
+    return images[0]
+
+
+def _stands_beside(name):
+    """Whether an extension is by its name (``ERR``, ``VAR_POISSON``, ``CHIP1.DQ``, ``WHT2``) no image of the sky."""
+    words = re.split(r"[^A-Z0-9]+", name.upper())
+    return any(word in _BESIDE or word.rstrip("0123456789") in _BESIDE for word in words)
+
+
+def _listed_images(hdulist, images):
+    """How many images there are, which, and how to choose one."""
+    numbers = [str(i) for i, hdu in enumerate(hdulist) if any(hdu is image for image in images)]
+    forms = [f"{hdu.name},{hdu.ver}" if hdu.name else i for i, hdu in zip(numbers, images, strict=True)]
+    if len(set(forms)) < len(forms):
+        forms = numbers
+    named = [f"{form} {hdu.shape}" for form, hdu in zip(forms, images, strict=True)][:_MOST_NAMED]
+    more = f" and {len(images) - _MOST_NAMED} more" * (len(images) > _MOST_NAMED)
+    name, comma, version = forms[0].partition(",")
+    python = f"({name!r}, {version})" if comma else name
+    listed_so = f"{len(images)} images, {', '.join(named)}{more} (ny, nx)"
+    return f"{listed_so}: choose one with ext, as in ext={python} (--ext {forms[0]})"
