@@ -34,7 +34,7 @@ _DEVIANT = 3.0  # times the median of chi2 / dof: such a star is no single one
 _SIZES = (0.01, 10.0)  # of corrections, relative to those expected: nothing less differs from none
 _VARIES = 0.1  # size at first of those that vary over the field: it grows in fewer iterations than it shrinks
 _EVEN = 0.02  # relative error that makes bright stars count alike in the mean of what is left
-_AT_ONCE = 32  # stars whose normal matrices are in memory
+_AT_ONCE = 8  # stars whose patterns and normal matrices stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,7 +310,7 @@ def _single(linear):
 def _normal(stars, linear, params, corrections, spacing, terms, used):
     """Normal matrix and right side of the amplitudes, the stars' own parameters eliminated.
 
-    Returns too how the stars' parameters follow the raw corrections at their place, (n, 4, n_modes).
+    Returns too how the stars' parameters follow the corrections at their place, (n, 4, n_modes).
     """
     n_terms, n_modes = terms.shape[1], corrections.modes.shape[-1]
     pairs = corrections.pairs()
@@ -318,11 +318,11 @@ def _normal(stars, linear, params, corrections, spacing, terms, used):
     right = np.zeros((n_terms, n_modes))
     followed = np.zeros((len(terms), 4, n_modes))
     rows = np.flatnonzero(used)
-    for part in np.array_split(rows, max(1, len(rows) // _AT_ONCE)):
+    for part in np.array_split(rows, -(-len(rows) // _AT_ONCE)):
         # single precision for the patterns: all that follows sees the same ones
-        light = corrections.on_stamps(params[part, :2].astype(np.float32), stars.half, spacing).astype(float)
+        light = corrections.on_stamps(params[part, :2].astype(np.float32), stars.half, spacing)
         root = np.sqrt(linear.weights[part])[:, :, None]
-        light *= params[part, 2, None, None] * root
+        light = light * (params[part, 2, None, None] * root)
         slopes, residual = linear.slopes[part] * root.swapaxes(1, 2), linear.residual[part, :, None] * root
         followed[part] = linear.inverse[part] @ (slopes @ light)
         light -= slopes.swapaxes(1, 2) @ followed[part]  # what the star's own parameters do not take up

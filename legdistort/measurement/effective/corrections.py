@@ -28,16 +28,19 @@ class Corrections:
     Attributes
     ----------
     modes : ndarray, shape (k, k, n_modes)
-        Raw patterns, as spline coefficients by y and x.
+        Free patterns, as spline coefficients by y and x; those that the smoothest raw ones make come first.
     size : int
         Knots of the whole grid.
-    free : tuple of ndarray, shape (n, n_free)
-        For every term of the field, of the first n raw patterns.
+    numbers : tuple of int
+        For every term of the field, how many of the patterns it has, the first ones.
+    sizes : tuple of float
+        Expected of their amplitudes, by term.
     """
 
     modes: np.ndarray
     size: int
-    free: tuple
+    numbers: tuple
+    sizes: tuple
 
     @classmethod
     def around(cls, base, spacing, powers, half, *, per_fwhm=4):
@@ -74,21 +77,24 @@ class Corrections:
         edge[0], edge[-1], edge[:, 0], edge[:, -1] = 1, 1, 1, 1
         taken = [np.outer(light, light), np.outer(core, first), np.outer(first, core), edge]
         taken = np.tensordot(np.stack(taken), modes, 2)
-        free = []
-        for degree in (min(a + b, 2) for a, b in powers):
-            m = np.count_nonzero(both[j, i] > _CUT[degree])
-            kept = null_space(taken[:, :m] / np.linalg.norm(taken, axis=1, keepdims=True))
-            free.append(_SIZE[degree] * kept)
-        return cls(modes, n, tuple(free))
+        taken /= np.linalg.norm(taken, axis=1, keepdims=True)
+        degrees = [min(a + b, 2) for a, b in powers]
+        raw = [np.count_nonzero(both[j, i] > _CUT[degree]) for degree in degrees]
+        free, numbers = np.zeros((len(j), 0)), {}
+        for m in sorted(set(raw)):  # what few of them make is part of what more of them make
+            more = null_space(np.vstack([taken[:, :m], free[:m].T]))
+            free = np.hstack([free, np.pad(more, ((0, len(j) - m), (0, 0)))])
+            numbers[m] = free.shape[1]
+        return cls(modes @ free, n, tuple(numbers[m] for m in raw), tuple(_SIZE[degree] for degree in degrees))
 
     @property
     def n_amplitudes(self):
         """Of all terms."""
-        return sum(f.shape[1] for f in self.free)
+        return sum(self.numbers)
 
     def by_term(self, values):
         """Values (n_terms,) repeated for the amplitudes of every term."""
-        return np.repeat(values, [f.shape[1] for f in self.free])
+        return np.repeat(values, self.numbers)
 
     @property
     def _inner(self):
@@ -96,33 +102,33 @@ class Corrections:
         return slice(edge, self.size - edge)
 
     def raw(self, amplitudes):
-        """Amplitudes (n_amplitudes,) as sums of raw patterns, (n_terms, n_modes)."""
-        ends = np.cumsum([f.shape[1] for f in self.free])[:-1]
-        out = np.zeros((len(self.free), self.modes.shape[-1]))
-        for row, f, a in zip(out, self.free, np.split(amplitudes, ends), strict=True):
-            row[: len(f)] = f @ a
+        """Amplitudes (n_amplitudes,) by term and pattern, in the units of the patterns, (n_terms, n_modes)."""
+        ends = np.cumsum(self.numbers)[:-1]
+        out = np.zeros((len(self.numbers), self.modes.shape[-1]))
+        for row, n, size, a in zip(out, self.numbers, self.sizes, np.split(amplitudes, ends), strict=True):
+            row[:n] = size * a
         return out
 
     def reduced(self, raw):
         """The adjoint of `raw`: (..., n_terms, n_modes) to (..., n_amplitudes)."""
-        return np.concatenate([raw[..., t, : len(f)] @ f for t, f in enumerate(self.free)], axis=-1)
+        of_terms = enumerate(zip(self.numbers, self.sizes, strict=True))
+        return np.concatenate([size * raw[..., t, :n] for t, (n, size) in of_terms], axis=-1)
 
     def pairs(self):
-        """Pairs of terms, the second not after the first, by the number of raw patterns that these have.
+        """Pairs of terms, the second not after the first, by the number of patterns that these have.
 
         Returns
         -------
         dict
             ``{(n_first, n_second): (first, second)}``, terms as ndarray of int, shape (n_pairs,).
         """
-        n = np.array([len(f) for f in self.free])
-        first, second = np.tril_indices(len(n))
-        sizes = np.column_stack([n[first], n[second]])
-        same = ((tuple(size.tolist()), (sizes == size).all(axis=1)) for size in np.unique(sizes, axis=0))
-        return {size: (first[of], second[of]) for size, of in same}
+        first, second = np.tril_indices(len(self.numbers))
+        shapes = np.array(self.numbers)[np.column_stack([first, second])]
+        same = ((tuple(shape.tolist()), (shapes == shape).all(axis=1)) for shape in np.unique(shapes, axis=0))
+        return {shape: (first[of], second[of]) for shape, of in same}
 
     def normal(self, products):
-        """Normal matrix of the amplitudes, its lower half, from those of the raw patterns for the pairs of terms.
+        """Normal matrix of the amplitudes, its lower half, from those of the patterns for the pairs of terms.
 
         Parameters
         ----------
@@ -133,28 +139,28 @@ class Corrections:
         -------
         ndarray, shape (n_amplitudes, n_amplitudes)
         """
-        ends = np.cumsum([0, *(f.shape[1] for f in self.free)])
+        ends = np.cumsum([0, *self.numbers])
         out = np.zeros((ends[-1], ends[-1]))
-        for size, terms in self.pairs().items():
-            for t, u, product in zip(*terms, products[size], strict=True):
-                out[ends[t] : ends[t + 1], ends[u] : ends[u + 1]] = self.free[t].T @ product @ self.free[u]
+        for shape, terms in self.pairs().items():
+            for t, u, product in zip(*terms, products[shape], strict=True):
+                out[ends[t] : ends[t + 1], ends[u] : ends[u + 1]] = self.sizes[t] * self.sizes[u] * product
         return out
 
     def grids(self, raw):
-        """Whole grids (n, size, size) of sums of raw patterns (n, n_modes)."""
+        """Whole grids (n, size, size) of sums of patterns (n, n_modes)."""
         out = np.zeros((len(raw), self.size, self.size))
         out[:, self._inner, self._inner] = np.moveaxis(self.modes @ raw.T, -1, 0)
         return out
 
     def on_stamps(self, xy, half, spacing):
-        """Raw patterns on the stamps of stars, (n, npix, n_modes), in the precision of the places."""
+        """Patterns on the stamps of stars, (n, npix, n_modes), in the precision of the places."""
         x, y = self._bases(xy, half, spacing)
         k, _, m = self.modes.shape
         along = y @ self.modes.astype(xy.dtype).reshape(k, -1)
         return (x[:, None] @ along.reshape(*y.shape[:2], k, m)).reshape(len(xy), -1, m)
 
     def against(self, images, xy, half, spacing):
-        """Products of images (n, a, npix) on the stamps of stars with the raw patterns there, (n, a, n_modes)."""
+        """Products of images (n, a, npix) on the stamps of stars with the patterns there, (n, a, n_modes)."""
         n, a = images.shape[:2]
         x, y = self._bases(xy, half, spacing)
         size = 2 * half + 1
