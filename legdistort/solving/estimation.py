@@ -6,7 +6,7 @@ import logging
 import warnings
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,8 +20,9 @@ from ..results.settings import Settings
 from . import model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, with_errors_times
+from .choices import prior_widths
 from .choices.degree_choice import choose_degree
-from .choices.held_out import hold_out, only_rows, validation
+from .choices.held_out import hold_out, validation
 from .equations import effective_modes
 from .motion_choice import resolve as resolve_motion
 from .options import CLIP, SolveOptions, check_detectors, check_reference
@@ -332,22 +333,17 @@ def _choose_degree(matches, options):
         kind = "parallax" if options.motion == "parallax" else "proper"
         options = replace(options, motion=kind, motion_sigma=None)
 
-    def fit(part, degree):
-        trial = single_fit.estimate(part, replace(options, degree=degree, clip=None))
-        return _solution(
-            trial, 1.0, Settings(degree, method=options.method), Diagnostics(error_floor=options.error_floor)
-        )
+    def fit(part, degree, clip):
+        return single_fit.estimate(part, replace(options, degree=degree, clip=clip))
 
-    @cache
-    def sound(degree):
-        if options.clip is None:
-            return matches
-        trial = single_fit.estimate(matches, replace(options, degree=degree))
-        return only_rows(trial.matches, trial.problem.in_table_order(trial.used))
+    def solution(trial):
+        settings = Settings(trial.options.degree, method=options.method)
+        return _solution(trial, 1.0, settings, Diagnostics(error_floor=options.error_floor))
 
+    found = bool(prior_widths.sought(options.prior))
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", LegdistortWarning)  # of fits that are thrown away
-        chosen = choose_degree(matches, fit, sound)
+        chosen = choose_degree(matches, fit, solution, clip=options.clip, found=found)
     if chosen.alarm:
         warn(f"degree {chosen.sentence}", AssumptionWarning)
     return chosen

@@ -1,6 +1,7 @@
 """Stars kept out of the fit: the choice of the degree, the aliasing alarm, and the test of the errors."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from legdistort.exceptions import AssumptionWarning, FoldError, InputError, Solv
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
+from legdistort.solving import single_fit
 from legdistort.solving.choices import degree_choice, held_out
+from legdistort.solving.options import SolveOptions
 
 SHAPE = (2048, 2048)
 
@@ -186,6 +189,26 @@ def test_no_more_than_the_stars_allow():
     """Nine stars, eight or nine at a time: enough for six modes, not for ten."""
     chosen = solved(simulate(9, 0.5, 0.5, 0.02, sigma=0.02), degree="auto").diagnostics.selection
     assert chosen.degrees == (0, 1, 2)
+
+
+@pytest.mark.parametrize("direct", [True, False])
+@pytest.mark.parametrize("degree", [1, 3])
+def test_stars_subtracted_from_one_fit_are_as_if_it_had_not_had_them(degree, direct, monkeypatch):
+    """The squares of stars left out, by one step from the fit of all, against fits without them."""
+    sim = simulate(40, 0.5, 0.5, 0.5, 0.5, dither=200, seen=0.8, n_exposures=6)
+    options = SolveOptions(prior=Prior(sim.truth.static, sigma=0.5))
+    folds = degree_choice._folds(sim.matches)
+    fit = single_fit.estimate(sim.matches, replace(options, degree=degree, clip=None))
+    monkeypatch.setattr(held_out.reduced_system, "uses_direct", lambda problem: direct)
+    quick = held_out.squares(fit, sim.matches, folds)
+    monkeypatch.undo()
+    slow = held_out.refitted_squares(
+        lambda left: solve(left, prior=options.prior, degree=degree, clip=None), sim.matches, folds
+    )
+    assert np.array_equal(quick[:, 1], slow[:, 1])
+    assert quick[:, 0].sum() == pytest.approx(slow[:, 0].sum(), rel=0.02)
+    # the start of those fits is their own
+    assert_allclose(quick[:, 0], slow[:, 0], rtol=0.1, atol=0.1 * np.median(slow[:, 0]))
 
 
 def test_of_equal_degrees_the_lowest():

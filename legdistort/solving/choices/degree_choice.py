@@ -12,7 +12,7 @@ from ...exceptions import InputError, LegdistortError
 from ...geometry import basis, similarity
 from ...results.coefficient_covariance import exposure_blocks
 from ...results.diagnostics import AliasedDegree, DegreeChoice
-from .held_out import corrected, only_rows
+from . import held_out
 
 log = logging.getLogger(__name__)
 
@@ -28,22 +28,28 @@ N_WORSE = 3
 CLOSE = 0.005
 #: Excess of a degree's energy over its noise, in standard deviations of the latter, that raises the alarm.
 ALARM = 5.0
-_UNTOLD = 1e-9  # part of the normal equations of a star below which they do not determine an unknown of its motion
 _OUTLIER = 25.0  # times the usual squared scatter of a star, at every degree: mismatched, it has no say
 
 
-def choose_degree(matches, fit, sound):
+def choose_degree(matches, fit, solution, *, clip, found):
     """The degree from 0 to 6 whose distortions serve stars best that had no part in them.
 
-    What contradicts a fit of all stars takes no part in those of the same degree without some of them.
+    Of every degree there is one fit, and `held_out.squares` gives how stars left out of it would scatter. What
+    contradicts the fit of the degree chosen takes no part, and the degree is chosen once more without it, until it
+    stays.
 
     Parameters
     ----------
     matches : Matches
     fit : callable
-        ``fit(matches, degree)``, a `Solution` of all these observations.
-    sound : callable
-        ``sound(degree)``, the matches without what contradicts a fit of all.
+        ``fit(matches, degree, clip)``, a `legdistort.solving.single_fit.Fit`.
+    solution : callable
+        ``solution(fit)``, the `Solution`.
+    clip : float or None
+        Deviations beyond which observations contradict a fit; None takes all.
+    found : bool
+        Whether a fit finds the widths of its prior. It is then made anew without the stars left out, which takes
+        twenty times as long.
 
     Returns
     -------
@@ -54,36 +60,80 @@ def choose_degree(matches, fit, sound):
     LegdistortError
         If not even degree 0 can be fitted.
     """
-    folds = _folds(matches)
-    degrees, squares = [], []
-    for tried in range(HIGHEST + 1):
-        try:
-            kept = sound(tried)
-            parts = [only_rows(kept, ~_of(kept, stars)) for stars in folds]
-            tests = [matches.table[_of(matches, stars)] for stars in folds]
-            squares.append(
-                np.concatenate([_squares(fit(p, tried), table) for p, table in zip(parts, tests, strict=True)])
-            )
-        except LegdistortError as error:
-            if tried == 0:
-                raise
-            log.debug("degree %d is beyond these stars: %s", tried, error)
+    trials, before = _Trials(matches, fit, solution, found=found), set()
+    while clip is not None and trials.degree not in before:
+        before.add(trials.degree)
+        kept = trials.sound(matches, clip)
+        if len(kept.table) == len(trials.matches.table):
             break
-        degrees.append(tried)
-        scores = _scores(np.array(squares))
-        degree = int(np.argmax(scores <= (1 + CLOSE) * scores.min()))
-        if tried - degree >= N_WORSE:
-            break
-    aliasing = _aliasing(lambda top: fit(sound(top), top), degree)
+        trials = _Trials(kept, fit, solution, found=found)
+    if trials.error is not None:
+        raise trials.error
+    degree, scores = trials.degree, trials.scores
+    aliasing = _aliasing(lambda top: solution(trials.fitted(top)), degree)
     return DegreeChoice(
         degree=degree,
-        degrees=tuple(degrees),
+        degrees=tuple(range(len(scores))),
         scores=tuple(float(score) for score in scores),
-        n_folds=len(folds),
+        n_folds=len(trials.folds),
         aliasing=aliasing,
         alarm=any(a.excess > ALARM for a in aliasing),
-        sentence=_sentence(degree, degrees, scores, aliasing),
+        sentence=_sentence(degree, scores, aliasing),
     )
+
+
+class _Trials:
+    """Fits of some matches with one degree after another, and how stars left out of them would scatter.
+
+    Attributes
+    ----------
+    degree : int
+        The best; 0 if none can be fitted.
+    scores : ndarray, shape (n_degrees,)
+    error : LegdistortError or None
+        Why not even degree 0 can be fitted.
+    """
+
+    def __init__(self, matches, fit, solution, *, found):
+        self.matches, self.folds, self._found = matches, _folds(matches), found
+        self._fit, self._solution = fit, solution
+        self.degree, self.scores, self.error, self._fits = 0, np.zeros(0), None, {}
+        squares = []
+        for tried in range(HIGHEST + 1):
+            try:
+                squares.append(self._squares(tried))
+            except LegdistortError as error:
+                log.debug("degree %d is beyond these stars: %s", tried, error)
+                self.error = error if tried == 0 else None
+                break
+            self.scores = _scores(np.array(squares))
+            self.degree = int(np.argmax(self.scores <= (1 + CLOSE) * self.scores.min()))
+            if tried - self.degree >= N_WORSE:
+                break
+
+    def _squares(self, degree):
+        """How stars left out scatter.
+
+        What the fit holds has to go without them as well: at degree 0 the registration, widths of a prior at others.
+        """
+        if degree > 0 and not self._found:
+            return held_out.squares(self.fitted(degree), self.matches, self.folds)
+
+        def refit(left):
+            return self._solution(self._fit(left, degree, None))
+
+        return held_out.refitted_squares(refit, self.matches, self.folds)
+
+    def fitted(self, degree):
+        """The fit with some degree to all of these matches."""
+        if degree not in self._fits:
+            self._fits[degree] = self._fit(self.matches, degree, None)
+        return self._fits[degree]
+
+    def sound(self, matches, clip):
+        """The given matches without what contradicts a fit with the best degree."""
+        found = self._fit(matches, self.degree, clip)
+        return held_out.only_rows(found.matches, found.problem.in_table_order(found.used))
 
 
 def _scores(squares):
@@ -95,38 +145,12 @@ def _scores(squares):
 
 
 def _folds(matches):
-    """Stars to be left out, in turn."""
-    star = matches.observations.star
-    seen = np.flatnonzero(np.bincount(star) > 1)
+    """Numbers of the stars to be left out, in turn."""
+    seen = np.flatnonzero(np.bincount(matches.observations.star) > 1)
     if len(seen) < 2:
         raise InputError(f"degree={AUTO!r} needs stars that two exposures or more see; there are {len(seen)} of them")
     n = len(seen) if len(seen) <= FEW else N_FOLDS
-    return np.array_split(np.asarray(matches.stars)[np.random.default_rng(0).permutation(seen)], n)
-
-
-def _of(matches, stars):
-    """Rows (n,) of some stars."""
-    return np.isin(matches.table["star"], stars)
-
-
-def _squares(solution, table):
-    """Squared scatter of every star over its errors, and its degrees of freedom, shape (n_stars, 2).
-
-    About its mean, or its own motion where those of the stars are fitted.
-    """
-    xy, sigma = corrected(solution, table)
-    weight = np.where(np.isfinite(xy[:, :, 0]), sigma**-2, 0.0)
-    xy = np.where(np.isfinite(xy), xy, 0.0)
-    rows, motions = np.tile(np.eye(2), (len(xy), 1, 1)), solution.motions  # unknowns of a star -> its place
-    if motions is not None:
-        rows = np.concatenate([rows, motions.columns(motions.years, solution.sky)], axis=2)
-    normal = np.einsum("ij,iab,iac->jbc", weight, rows, rows)
-    size, axes = np.linalg.eigh(normal)
-    known = size > _UNTOLD * np.einsum("jbb->j", normal)[:, None]
-    inverse = (axes * np.where(known, 1 / np.where(known, size, 1), 0)[:, None]) @ axes.transpose(0, 2, 1)
-    found = np.einsum("jbc,ij,iac,ija->jb", inverse, weight, rows, xy, optimize=True)
-    squares = np.einsum("ij,ija->j", weight, (xy - np.einsum("iab,jb->ija", rows, found)) ** 2)
-    return np.column_stack([squares, 2 * (weight > 0).sum(axis=0) - known.sum(axis=1)])
+    return np.array_split(np.random.default_rng(0).permutation(seen), n)
 
 
 # -- the aliasing alarm
@@ -208,15 +232,16 @@ def _fold(solution, name, low, high):
     return np.linalg.lstsq((b[:low] * weight).T, (b[high] * weight).T, rcond=None)[0]
 
 
-def _sentence(degree, degrees, scores, aliasing):
+def _sentence(degree, scores, aliasing):
     """The choice and the alarm in words."""
+    highest = len(scores) - 1
     words = (
-        f"{degree}, of {degrees[0]} to {degrees[-1]}: stars kept out scatter least with it, by "
-        f"{np.sqrt(scores[degrees.index(degree)]):.2f} of their errors"
+        f"{degree}, of 0 to {highest}: stars kept out scatter least with it, by {np.sqrt(scores[degree]):.2f} of their "
+        "errors"
     )
     if degree == HIGHEST:
         words += "; it is the highest that was tried"
-    elif degree == degrees[-1]:
+    elif degree == highest:
         words += "; there are too few stars for more"
     return ". ".join([words, *(_in_words(a, degree) for a in aliasing if a.excess > ALARM)])
 

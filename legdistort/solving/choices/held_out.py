@@ -6,11 +6,21 @@ scatter by their errors, plus what is wrong with the distortions.
 
 import numpy as np
 from astropy import units as u
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from ...exceptions import InputError
+from ...exceptions import InputError, SolveError
 from ...inputs.matches import Matches
 from ...results import accuracy
 from ...results.diagnostics import Validation
+from ..equations import criterion, elimination, reduced_system
+from ..equations.reduced_base import Reduced
+from ..equations.star_terms import packed, symmetric_times
+
+#: Least pivot of normal equations with unit diagonal; below it the stars that are left determine too little.
+_LEAST_PIVOT = 1e-7
+#: Part of the normal equations of a star below which they do not determine an unknown of its motion.
+_UNDETERMINED = 1e-9
+_ACCURACY = 1e-3  # of a step that conjugate gradients take
 
 
 def hold_out(matches, fraction, *, seed=0):
@@ -131,3 +141,174 @@ def _expected(solution, xy, sigma, seen):
     """Expected scatter of every star (n_stars,), NaN where fewer than two exposures see it."""
     place = np.where(seen[..., None], xy, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]
     return accuracy.expected_scatter(solution, place, np.where(seen, sigma, 1), seen=seen)
+
+
+# -- every star left out, from one fit
+
+
+def squares(fit, matches, folds):
+    """Squared scatter of every star over its errors, left out of a fit, and its degrees of freedom, (n_stars, 2).
+
+    About its position, and its motion where those of the stars are fitted. What the others would have given follows
+    from the normal equations of the fit without the part of the stars left out: one Newton step, exact in the
+    coefficients, which the model is linear in. Poses and the widths of a prior stay those of the fit.
+
+    Parameters
+    ----------
+    fit : `legdistort.solving.single_fit.Fit`
+    matches : Matches
+        Whose stars are numbered.
+    folds : sequence of ndarray of int
+        Stars left out together.
+
+    Raises
+    ------
+    SolveError
+        If the stars that are left do not determine the distortion of an exposure.
+    """
+    problem = fit.problem
+    fold = np.full(len(matches.stars), -1)
+    for k, stars in enumerate(folds):
+        fold[stars] = k
+    mine = np.searchsorted(np.asarray(matches.stars), np.asarray(fit.matches.stars))
+    of_row = fold[mine][problem.star]
+    _check_left(problem, fit.used, of_row, len(folds))
+    without = _Subtracted(fit) if reduced_system.uses_direct(problem) else _Solved(fit)
+    blocks = fit.blocks if fit.weighted is problem else criterion.linearise(problem, fit.result.state)
+    left = np.zeros_like(blocks.residual)
+    for k in range(len(folds)):
+        rows = np.flatnonzero(of_row == k)
+        change = without.step(rows).reshape(problem.n_exposures, 2, -1)[problem.exposure[rows]]
+        left[:, rows] = blocks.residual[:, rows] - np.einsum("nam,mn->an", change, blocks.values[:, rows])
+    out = np.zeros((len(fold), 2))
+    out[mine] = _about_stars(problem, blocks, left)
+    out[fold < 0] = 0
+    return out
+
+
+def refitted_squares(fit, matches, folds):
+    """The same by solving anew without these stars.
+
+    Parameters
+    ----------
+    fit : callable
+        ``fit(matches)``, a `Solution` of all these observations.
+    matches, folds
+        As for `squares`.
+
+    Raises
+    ------
+    LegdistortError
+        If one of these fits cannot be made.
+    """
+    out = np.zeros((len(matches.stars), 2))
+    for stars in folds:
+        rows = np.isin(matches.observations.star, stars)
+        out[np.sort(stars)] = _about_places(fit(only_rows(matches, ~rows)), matches.table[rows])
+    return out
+
+
+def _about_places(solution, table):
+    """Weighted squares of corrected positions about the best unknowns of every star, and degrees of freedom."""
+    xy, sigma = corrected(solution, table)
+    weight = np.where(np.isfinite(xy[:, :, 0]), sigma**-2, 0.0)
+    xy = np.where(np.isfinite(xy), xy, 0.0)
+    rows, motions = np.tile(np.eye(2), (len(xy), 1, 1)), solution.motions  # unknowns of a star -> its place
+    if motions is not None:
+        rows = np.concatenate([rows, motions.columns(motions.years, solution.sky)], axis=2)
+    normal = np.einsum("ij,iab,iac->jbc", weight, rows, rows)
+    size, axes = np.linalg.eigh(normal)
+    known = size > _UNDETERMINED * np.einsum("jbb->j", normal)[:, None]
+    inverse = (axes * np.where(known, 1 / np.where(known, size, 1), 0)[:, None]) @ axes.transpose(0, 2, 1)
+    found = np.einsum("jbc,ij,iac,ija->jb", inverse, weight, rows, xy, optimize=True)
+    squares = np.einsum("ij,ija->j", weight, (xy - np.einsum("iab,jb->ija", rows, found)) ** 2)
+    return np.column_stack([squares, 2 * (weight > 0).sum(axis=0) - known.sum(axis=1)])
+
+
+def _check_left(problem, used, of_row, n_folds):
+    """Raise `SolveError` for an exposure in which the stars left, some of them out, are fewer than its modes."""
+    place = problem.exposure[used] * (n_folds + 1) + of_row[used] + 1
+    counts = np.bincount(place, minlength=problem.n_exposures * (n_folds + 1)).reshape(problem.n_exposures, -1)
+    fewest = counts.sum(axis=1) - counts[:, 1:].max(axis=1)
+    for i, name in enumerate(problem.names):
+        if fewest[i] < max(1, problem.n_free(i)):
+            raise SolveError(f"exposure {name} has {fewest[i]} stars when others are left out, too few for this degree")
+
+
+def _about_stars(problem, blocks, residual):
+    """Weighted squares of residuals (2, n) about the best unknowns of every star, and degrees of freedom."""
+    star, n = problem.star, problem.n_stars
+    pull = problem.pulled((blocks.coupling * residual).sum(axis=1))
+    pull = np.stack([np.bincount(star, row, n) for row in pull])
+    inverse = elimination.inverse_star_blocks(blocks.v)
+    total = np.bincount(star, criterion.squares(problem, residual), n)
+    known = np.count_nonzero(inverse[np.diag(packed(problem.n_star))] > 0, axis=0)
+    left = total - (pull * symmetric_times(inverse, pull)).sum(axis=0)
+    return np.column_stack([left, 2 * np.bincount(star, minlength=n) - known])
+
+
+class _Solved:
+    """Steps (n_exposures, 2 n_modes) of the coefficients without the observations in some rows, by solving anew."""
+
+    def __init__(self, fit):
+        self._fit = fit
+
+    def step(self, rows):
+        """The step."""
+        factor = np.ones(self._fit.problem.xy.shape[1])
+        factor[rows] = 0
+        problem, gauge = self._fit.weighted.scaled(factor), self._fit.result.gauge
+        blocks = criterion.linearise(problem, self._fit.result.state)
+        system = reduced_system.reduced_system(problem, blocks, gauge)
+        return system.step(np.zeros(gauge.n_constraints), _ACCURACY)[1]
+
+
+class _Subtracted:
+    """The same where the reduced matrix is small: the part of the stars in these rows is subtracted from it.
+
+    The rows have to be all of these stars.
+    """
+
+    def __init__(self, fit):
+        self._problem, self._blocks = fit.weighted, fit.blocks
+        whole = Reduced(self._problem, self._blocks, fit.result.gauge)
+        self._matrix, self._rhs = elimination.reduced_matrix(self._problem, self._blocks), whole.rhs
+        # lifts the gauge directions, along which the residuals of stars do not change
+        self._matrix += np.mean(np.diag(self._matrix)) * whole.rows.T @ whole.rows
+
+    def step(self, rows):
+        """The step."""
+        problem, blocks = self._problem, self._blocks
+        stars, star = np.unique(problem.star[rows], return_inverse=True)
+        exposure, (n, size) = problem.exposure[rows], blocks.g_exposure.shape
+        w, r, b = problem.weight[:, rows], blocks.residual[:, rows], blocks.values[:, rows]
+        values = np.zeros((n, len(b), len(stars)))
+        values[exposure, :, star] = b.T
+        weight = np.zeros((3, n, 1, len(stars)))
+        weight[:, exposure, 0, star] = w
+        own = np.empty((n, 2, len(b), 2, len(b)))
+        for k, (x, y) in enumerate(((0, 0), (1, 1), (0, 1))):
+            own[:, x, :, y] = (values * weight[k]) @ values.mT
+        own[:, 1, :, 0] = own[:, 0, :, 1]
+        gradient = np.zeros((n, 2, 1, len(stars)))
+        gradient[exposure, :, 0, star] = np.stack([w[0] * r[0] + w[2] * r[1], w[2] * r[0] + w[1] * r[1]]).T
+        rhs = (values[:, None] * gradient).sum(axis=3).reshape(-1)
+        roots = elimination.star_roots(blocks.v[:, stars])
+        pulled = problem.pulled_at(exposure, blocks.coupling[:, :, rows])
+        coupling = np.einsum("can,ckn->nak", pulled, roots[:, :, star])
+        factor = np.zeros((n, 2, len(b), len(roots), len(stars)))
+        factor[exposure, ..., star] = coupling[:, :, None] * b.T[:, None, :, None]
+        factor = factor.reshape(n * size, -1)
+        rhs -= factor @ np.einsum("ckj,cj->kj", roots, blocks.g_star[:, stars]).ravel()
+        matrix = self._matrix + factor @ factor.T
+        for i, block in enumerate(own.reshape(n, size, size)):
+            part = slice(i * size, (i + 1) * size)
+            matrix[part, part] -= block
+        unit = np.sqrt(np.abs(np.diag(matrix)))
+        try:
+            root = cho_factor(matrix, lower=True, overwrite_a=True)
+            if (np.diag(root[0]) / unit).min() < _LEAST_PIVOT:
+                raise LinAlgError
+        except LinAlgError:
+            raise SolveError("the stars that are left do not determine the distortion of this degree") from None
+        return cho_solve(root, self._rhs - rhs)
