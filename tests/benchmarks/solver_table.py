@@ -1,7 +1,7 @@
 """Table of the solvers on three data sets: time, peak memory, b, sigma, chi2, each in a process of its own.
 
-Run ``python tests/benchmarks/solver_table.py [--scaling | --ratios | --covariances]``. Times are the best of three
-after a first call (which loads compiled code); memory is what the process needed beyond the data and the imports.
+Run ``python tests/benchmarks/solver_table.py [--scaling | --ratios | --covariances | --degrees]``. Times are the
+best of three after a first call (which loads compiled code); memory is what the process needed beyond data and imports.
 """
 
 import argparse
@@ -104,6 +104,21 @@ def ratios(n_exposures, n_stars):
     return len(table), *(min(each) for each in times.values()), times["plain"][0]
 
 
+def degrees(n_exposures, n_stars):
+    """CPU time of a solution with a given degree, and with the degree chosen, in turn: (2,) seconds, the least."""
+    from legdistort import simulate_matches, solve
+
+    warnings.simplefilter("ignore")
+    sim = simulate_matches(n_exposures=n_exposures, n_stars=n_stars, degree=3, seed=1)
+    times = {3: [], "auto": []}
+    for _ in range(4):
+        for degree, each in times.items():
+            begin = time.process_time()
+            solve(sim.matches, degree=degree)
+            each.append(time.process_time() - begin)
+    return [min(each) for each in times.values()]
+
+
 def run(*arguments):
     """A row from a process of its own."""
     command = [sys.executable, __file__, "--row", *map(str, arguments)]
@@ -131,6 +146,7 @@ def main():
     parser.add_argument("--scaling", action="store_true")
     parser.add_argument("--ratios", action="store_true", help="CPU time of scipy over ours, and of rejection")
     parser.add_argument("--covariances", action="store_true", help="errors of all stars, many exposures or many stars")
+    parser.add_argument("--degrees", action="store_true", help="CPU time of degree='auto' over a given degree")
     arguments = parser.parse_args()
     sys.path.insert(0, str(Path(__file__).parent))
     if arguments.row:
@@ -144,6 +160,11 @@ def main():
         for n_exposures, n_stars in ((10, 114), (10, 300), (30, 1000), (100, 3000), (100, 10_000)):
             n, plain, default, scipy, first = ratios(n_exposures, n_stars)
             print(f"{n:12d} {plain:10.4f} {first:10.4f} {scipy / plain:14.1f} {default / plain:16.2f}", flush=True)
+    elif arguments.degrees:
+        print("exposures x stars  degree 3 [s]  auto [s]  auto / degree 3")
+        for n_exposures, n_stars in ((11, 80), (11, 300), (30, 1000)):
+            given, chosen = degrees(n_exposures, n_stars)
+            print(f"{n_exposures:9d} x {n_stars:5d} {given:13.3f} {chosen:9.2f} {chosen / given:16.1f}", flush=True)
     elif arguments.covariances:
         for n_exposures, n_stars in ((150, 30), (2000, 30), (400, 60), (100, 3000), (500, 2000), (500, 5000)):
             show(run("large", "joint", n_exposures, n_stars))
