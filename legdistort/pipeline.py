@@ -208,7 +208,7 @@ def run(
             matches = match(detections, exposures=exposures, camera=reading["camera"], **vars(matching))
             matches = replace(matches, left_out=bad | matches.left_out)
         with timed(timings, "solve"):
-            solution = solve(matches, **vars(solving), **tying)
+            solution = solve(matches, **vars(solving), **tying, progress=progress)
             solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
         with timed(timings, "coadd"):
             kept = [exposure for exposure in exposures if (exposure.frame or exposure.name) in solution.names]

@@ -176,7 +176,7 @@ def do_solve(a):
         known = {"shape": shape, "camera": camera} | legdistort.Matches.read_meta(table.meta)
         matches = legdistort.Matches.from_table(table, **known)
         with timed({}, "solve"):
-            solution = legdistort.solve(matches, **_solving(a, a.shape))
+            solution = legdistort.solve(matches, **_solving(a, a.shape), progress=wants_progress(a))
         solution = provenance.with_inputs(solution, table.meta["inputs"])
         with timed({}, "assess"):
             summary = summarise(solution)

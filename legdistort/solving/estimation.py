@@ -17,7 +17,7 @@ from ..inputs.matches import Matches
 from ..priors.prior import Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
-from . import model_forms, reference_tie, single_fit, star_motions
+from . import minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, with_errors_times
 from .choices import prior_widths
@@ -69,6 +69,7 @@ def solve(
     reference: Table | SkyCoord | StrPath | None = None,
     epoch: float | Time | None = None,
     pixel_scale: float | None = None,
+    progress: bool = False,
 ) -> Solution:
     """Estimate all star positions and all distortions at once.
 
@@ -152,6 +153,8 @@ def solve(
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
         Arcsec, about; helps to find the stars where no header has the sky.
+    progress : bool
+        Show a progress bar of the iterations where they take more than a second.
 
     Returns
     -------
@@ -202,7 +205,7 @@ def solve(
         form = model_forms.read(model, matches, degree=degree, gauge=gauge)
         options = replace(options, degree=form.degree, model=None, prior=form.prior())
     given, kept_out = (matches, None) if validate is None else hold_out(matches, validate)
-    with single_fit.threads(given):
+    with single_fit.threads(given), minimisers.iterations_shown(progress):
         fit, options, chosen = _fitted(given, options, sought)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0

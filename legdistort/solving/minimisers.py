@@ -7,9 +7,11 @@ cameras and stars for points.
 
 import contextlib
 import logging
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 
 import numpy as np
+from tqdm import tqdm
 
 from ..exceptions import ConvergenceWarning, SolveError, warn
 from ..geometry import basis
@@ -33,6 +35,8 @@ _MADE = 20
 #: ... nor once a step is below so many standard errors, rms: what they are made from hardly changes then.
 _STEADY = 0.01
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
+#: Counts the iterations of all fits that a solution takes.
+_count = ContextVar("count", default=lambda: None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,17 @@ class Result:
     robust: np.ndarray
     n_weak: int = 0
     system: reduced_system.Reduced | None = None
+
+
+@contextlib.contextmanager
+def iterations_shown(progress):
+    """Show a progress bar of the iterations in the block, of all fits that it makes, if it takes more than a second."""
+    with tqdm(desc="solving", unit=" iterations", delay=1, disable=not progress) as bar:
+        before = _count.set(bar.update)
+        try:
+            yield
+        finally:
+            _count.reset(before)
 
 
 def loss_factors(squares, loss):
@@ -189,6 +204,7 @@ class _Descent:
         """Iterate until the next step would be below `tolerance`."""
         accuracy, size = 1e-3 if self.blocks.coupling.dtype == np.float32 else 1e-5, np.inf
         for _ in range(max_iterations):
+            _count.get()()
             target = -self.convention.violation(_departure(self.problem, self.state))
             d_star, d_exposure = self.system.step(target, accuracy)
             size, last = _step_size(self.blocks, d_star, d_exposure), size
@@ -303,6 +319,7 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
     n_modes = problem.n_modes
     blocks = criterion.linearise(problem, state)
     for sweep in range(1, max_iterations + 1):
+        _count.get()()
         before = state
         for _ in range(3):  # stars given A: a few Newton steps, each star by itself
             step = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)

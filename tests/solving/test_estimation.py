@@ -297,12 +297,12 @@ def test_options_are_judged_without_data(given, message):
 
 
 def test_options_are_the_arguments_and_frozen():
-    """Those of `solve`, at the same defaults, but for what concerns the reference."""
+    """Those of `solve`, at the same defaults, but for what concerns the reference and the progress bar."""
     arguments = inspect.signature(solve).parameters
     for field in dataclasses.fields(SolveOptions):
         assert arguments[field.name].default == field.default
     assert set(arguments) - {f.name for f in dataclasses.fields(SolveOptions)} == {
-        "matches", "reference", "epoch", "pixel_scale",
+        "matches", "reference", "epoch", "pixel_scale", "progress",
     }  # fmt: skip
     with pytest.raises(dataclasses.FrozenInstanceError):
         SolveOptions().degree = 4
