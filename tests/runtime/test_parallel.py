@@ -2,6 +2,7 @@
 
 import _thread
 import io
+import json
 import logging
 import mmap
 import multiprocessing
@@ -227,6 +228,32 @@ class TestExposureFiles:
             assert table.colnames == plain.colnames
             for name in plain.colnames:
                 np.testing.assert_array_equal(table[name], plain[name])
+
+
+def reduced(folder, out):
+    """A night as a task of a cluster."""
+    return ld.run(sorted(folder.glob("*.fits")), out=out, degree=3, psf="moffat")
+
+
+@pytest.mark.slow
+def test_nights_side_by_side_give_the_same_bits(client, tmp_path):
+    nights = [tmp_path / name for name in ("first", "second")]
+    for seed, folder in enumerate(nights):
+        ld.simulate_exposures(small=True, seed=seed).write(folder)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    futures = client.map(reduced, [*nights, empty], [folder / "shared" for folder in [*nights, empty]], pure=False)
+    assert isinstance(futures[2].exception(), InputError)
+    assert not (empty / "shared").exists()
+    for folder, future in zip(nights, futures, strict=False):
+        mine, there = reduced(folder, folder / "here"), future.result()
+        np.testing.assert_array_equal(there.solution.positions, mine.solution.positions)
+        np.testing.assert_array_equal(there.solution.stars["x_err_abs"], mine.solution.stars["x_err_abs"])
+        for plane in ("data", "variance", "weight"):
+            np.testing.assert_array_equal(getattr(there.mosaic, plane), getattr(mine.mosaic, plane))
+        assert json.dumps(there.summary["checks"]) == json.dumps(mine.summary["checks"])
+        assert sorted(os.listdir(folder / "shared")) == sorted(os.listdir(folder / "here"))
+    assert len({future.result().solution.chi2 for future in futures[:2]}) == 2
 
 
 # --- planes on disk -----------------------------------------------------------------------------------------------
