@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 #: Usual share of gross errors in an exposure.
 GROSS = 0.05
@@ -49,7 +49,7 @@ class Verdict:
 
 def beyond_chance(n_off, n, share=GROSS):
     """Whether n_off of n positions or more are off though a `share` of them is usual, and so are most."""
-    return n_off > n / 2 and binom.sf(n_off - 1, n, share) < SIGNIFICANT
+    return n_off > n / 2 and bdtrc(n_off - 1, n, share) < SIGNIFICANT
 
 
 def compare(exposure, star, xy):
@@ -78,7 +78,7 @@ def compare(exposure, star, xy):
         n_off, n = len(few) - _n_near(xy[rows[i]][a[few]], xy[rows[k]][b[few]]), len(few)
         contradict[i, k] = contradict[k, i] = beyond_chance(n_off, n, 1 - (1 - GROSS) ** 2)
         telling = n - _OF_MAP  # so many stars the map may have followed
-        agree[i, k] = telling > 0 and binom.sf(telling - n_off - 1, telling, NEAR_BY_CHANCE) < SIGNIFICANT
+        agree[i, k] = telling > 0 and bdtrc(telling - n_off - 1, telling, NEAR_BY_CHANCE) < SIGNIFICANT
     return _verdict(agree, contradict)
 
 

@@ -4,6 +4,7 @@ As in `legdistort.plots.solution_plots`.
 """
 
 import numpy as np
+from scipy.special import chdtri
 
 from ..exceptions import InputError
 from ..geometry import similarity
@@ -211,15 +212,13 @@ def plot_pulls(pulls, *, against="brightness", ax=None):
     """
     if against not in ("brightness", "time"):
         raise InputError(f"against must be 'brightness' or 'time', got {against!r}")
-    from scipy import stats
-
     ax = elements.new_axes(ax, (6.4, 4.2))
     by_star = against == "brightness"
     sums = pulls.by_star() if by_star else pulls.by_exposure()
     shown = np.flatnonzero((sums.freedom > 0.5) & np.isfinite(sums.at))
     rms, free, at = (each[shown] for each in (sums.rms, sums.freedom, sums.at))
     order = np.argsort(at, kind="stable")
-    low, high = (np.sqrt(stats.chi2.ppf(p, free) / free) for p in (0.5 - _BAND / 2, 0.5 + _BAND / 2))
+    low, high = (np.sqrt(chdtri(free, p) / free) for p in (0.5 + _BAND / 2, 0.5 - _BAND / 2))
     if len(order) > 30:  # a band that follows the number of observations, not each star
         at_band, low = elements.running_median(at, low)
         high = elements.running_median(at, high)[1]

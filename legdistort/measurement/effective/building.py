@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dtrtri
-from scipy.stats import theilslopes
 
 from ..profiles import moffat
 from ..profiles.pixel_noise import pixel_variance
@@ -212,6 +211,8 @@ def improved(before, stars, *, iterations=_ANEW):
         for _ in range(_SETTLE):  # positions are not linear: they follow the new grid before it is changed again
             linear = _linearise(stars, params, grids, spacing, misfit)
             params = _moved(params, linear, longest)
+    from scipy.stats import theilslopes  # a third of a second, which nothing else of a run needs
+
     coefficients = corrections.grids(corrections.raw(amplitudes))
     coefficients[0] += base
     linear = _linearise(stars, params, grids, spacing, 0.0)

@@ -9,7 +9,7 @@ extrapolated? Was anything left out? Limits follow from the null distribution of
 from dataclasses import replace
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...geometry.star_hull import enclosed_area
@@ -121,7 +121,7 @@ def errors_check(solution, residuals):
         return Check("chi2", "unknown", None, None, "no degrees of freedom are left to judge the errors by",
                      "lower the degree, or add stars or exposures")  # fmt: skip
     ratio = chi2 / dof
-    low, high = (stats.chi2.isf(p, dof) / dof for p in (1 - FALSE_ALARM / 2, FALSE_ALARM / 2))
+    low, high = (special.chdtri(dof, p) / dof for p in (1 - FALSE_ALARM / 2, FALSE_ALARM / 2))
     low, high = min(low, (1 - NEGLIGIBLE) ** 2), max(high, (1 + NEGLIGIBLE) ** 2)
     floor, scale = solution.diagnostics.error_floor, solution.diagnostics.error_scale
     found = f"chi2/dof {ratio:.3g} at the stated errors, {low:.2f} to {high:.2f} by chance"
@@ -325,7 +325,7 @@ def rejection_check(solution):
     """Was much left out?"""
     used = np.asarray(solution.observations["used"])
     n, out = len(used), int(np.count_nonzero(~used))
-    share, p = out / n, stats.binom.sf(out - 1, n, GROSS_ERRORS) if out else 1.0
+    share, p = out / n, special.bdtrc(out - 1, n, GROSS_ERRORS) if out else 1.0
     lost = solution.left_out
     words = f"{out} of {n} observations ({share:.1%}) were left out" if out else f"all {n} observations were used"
     if lost:
@@ -343,7 +343,7 @@ def rejection_check(solution):
 def completeness_check(solution, residuals):
     """Does every exposure have the stars that lie on it?"""
     names, found = solution.names, np.diff(residuals.problem.start)
-    expected = np.zeros(len(names))
+    expected = np.zeros(len(names), dtype=int)
     common = solution.positions[np.isfinite(solution.positions[:, 0])]
     for i, name in enumerate(names):
         ny, nx = solution.shapes[name]
@@ -354,7 +354,7 @@ def completeness_check(solution, residuals):
         expected[i] = np.count_nonzero(inside)
     share = np.minimum(found / np.maximum(expected, 1), 1)
     usual = np.median(share)
-    p = stats.binom.cdf(np.minimum(found, expected), expected, usual) * len(names)
+    p = special.bdtr(np.minimum(found, expected), expected, usual) * len(names)
     i = int(np.argmin(np.where(share < usual / 2, p, 1)))
     low, high = (f"{each:.0%}" for each in (share.min(), share.max()))
     words = f"exposures have {low if low == high else f'{low} to {high}'} of the stars that lie on them"
@@ -375,7 +375,7 @@ def duplicates_check(solution, residuals):
     worst = int(np.argmax(z[i, j]))
     i, j, pairs = i[worst], j[worst], len(i)
     value = correlation[i, j]
-    if pairs * stats.norm.sf(z[i, j]) < FALSE_ALARM:
+    if pairs * special.ndtr(-z[i, j]) < FALSE_ALARM:
         return Check("duplicates", "fail", value, _SAME,
                      f"residuals of {solution.names[i]} and {solution.names[j]} are the same (correlation {value:.2f})",
                      "leave one of them out")  # fmt: skip
