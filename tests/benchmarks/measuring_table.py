@@ -24,6 +24,7 @@ from photutils.psf import GaussianPSF, MoffatPSF, PSFPhotometry
 from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
+import ao_images as ao
 import star_images as sky
 
 from legdistort.inputs.exposures import Exposure
@@ -216,18 +217,33 @@ def crowded(n, fwhm=3.5, size=600):
 
 
 def speed(n):
-    """Processor seconds for a frame of 2048 x 2048."""
+    """Processor seconds of the default, of Moffat profiles and of effective PSFs on the same frames, in turn."""
+    for name, exposure in timed_frames():
+        times = {"auto": [], "moffat": [], "effective": []}
+        for _ in range(n):
+            for psf, each in times.items():
+                start = time.process_time()
+                found = measure(exposure, psf=psf)
+                each.append(time.process_time() - start)
+        least = {psf: min(each) for psf, each in times.items()}
+        ratios = ", ".join(f"{psf} / moffat {least[psf] / least['moffat']:.2f}" for psf in ("auto", "effective"))
+        chosen = measure(exposure)["psf"][0]
+        print(
+            f"{name}: {len(found)} found, moffat {least['moffat']:.2f} s, {ratios}; auto chooses {chosen}", flush=True
+        )
+
+
+def timed_frames():
+    """Names and exposures: stars with Moffat profiles, few and many, and cores in a halo, in frames of two sizes."""
     for count in (100, 5000):
         rng = np.random.default_rng(count)
         _, flux, _ = sky.ladder(count, 4.1)
         image = sky.image((2048, 2048), sky.scattered(rng, count, 2048), rng.permutation(flux), 4.1)
-        exposure = Exposure("frame", sky.observe(image, rng), gain=sky.GAIN)
-        times = []
-        for _ in range(n):
-            start = time.process_time()
-            found = len(measure(exposure))
-            times.append(time.process_time() - start)
-        print(f"{count} stars: {found} found, {min(times):.2f} s at best, {np.median(times):.2f} s in the median")
+        yield f"2048 x 2048, {count} Moffats", Exposure("frame", sky.observe(image, rng), gain=sky.GAIN)
+    for size, count in ((1024, 60), (2048, 100)):
+        frame = ao.frame("symmetric", 0.3, 0, n=count, size=size)
+        exposure = Exposure("frame", frame.data, gain=ao.GAIN, read_noise=ao.READ_NOISE)
+        yield f"{size} x {size}, {count} at Strehl 0.3", exposure
 
 
 if __name__ == "__main__":
