@@ -8,6 +8,7 @@ import time
 import uuid
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,6 +58,9 @@ RESULTS = (
     "solution.asdf", "stars.ecsv", "wcs/*.asdf", "psf/*.fits", "mosaic.fits", "report.html", "summary.json",
     "detections.ecsv", "matched.ecsv",
 )  # fmt: skip
+
+#: When the command that calls `run` next began, by `time.perf_counter`: what it loads is the step "start".
+begun: ContextVar[float | None] = ContextVar("begun", default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +201,9 @@ def run(
     _check_others(workers, truth)
     paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
     share, timings = {"workers": workers, "progress": progress}, {}
+    if (since := begun.get()) is not None:
+        timings["start"] = time.perf_counter() - since
+        begun.set(None)
     with outputs.replacing_folder(out, former=RESULTS) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
@@ -225,7 +232,9 @@ def run(
             write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
         summary = summarise(solution, timings=timings) | _assessed(solution, kept, quality, comparison, stacks, truth)
         shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
-        write_report(target / "report.html", solution, summary=summary, **shown, files=linked_files(target))
+        with timed(timings, "report"):
+            write_report(target / "report.html", solution, summary=summary, **shown, files=linked_files(target))
+        summary |= {"timings": _rounded(timings)}
         write_summary(target / "summary.json", summary := summary | listed_files(target))
     return Run(Path(out), solution, mosaic, summary)
 
@@ -385,8 +394,12 @@ def summarise(solution, *, timings=None):
         "left_out": dict(solution.left_out),
         "command": provenance.command_line(),
         **found.summary(),
-        "timings": {step: round(seconds, 3) for step, seconds in (timings or {}).items()},
+        "timings": _rounded(timings or {}),
     }
+
+
+def _rounded(timings):
+    return {step: round(seconds, 3) for step, seconds in timings.items()}
 
 
 def _compared(matches, solution, solving, mosaic, kept, coadding):

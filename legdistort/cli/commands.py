@@ -4,6 +4,7 @@ The verbs are taken from the package itself, which loads each when it is called.
 """
 
 import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,9 @@ from ..runtime import outputs, parallel, provenance
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from . import options
 from .arguments import given, wants_progress
+
+#: Size of frames from which further processes are worth their start, a second or two each.
+_MANY_BYTES = 1 << 25
 
 
 def do_demo(a):
@@ -52,12 +56,15 @@ def do_demo(a):
 
 def do_run(a):
     """``legdistort run``."""
+    from .. import pipeline
+
     _refuse_ignored(a)
     measuring, matching, solving = (
         given(a, options.MEASURING),
         given(a, options.MATCHING),
         _solving(a, with_headers=True),
     )
+    pipeline.begun.set(a.begun)
     own = ("psf", "degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
     result = legdistort.run(
         **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING),
@@ -359,7 +366,12 @@ def _records(table):
 
 
 def _share(a):
-    return {"workers": a.workers, "progress": wants_progress(a)}
+    """Who works on the frames: all cores, unless another number is given or the frames are few and small."""
+    workers = a.workers
+    if workers is None:
+        size = sum(os.path.getsize(path) for path in a.frames if os.path.isfile(path))
+        workers = parallel.n_cores() if size >= _MANY_BYTES or not a.frames else 1
+    return {"workers": workers, "progress": wants_progress(a)}
 
 
 def _open(a, **reading):

@@ -51,7 +51,7 @@ TABLES = {
 }
 POSITIONS = {"table": Option("exposure, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
 MATCHED = {"table": Option("exposure, star, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
-WORKERS = {"workers": Option("cores to use (default 1)", type=int, metavar="N")}
+WORKERS = {"workers": Option("cores to use (default: all, where frames are not few and small)", type=int, metavar="N")}
 
 
 #: Endings of tables and of pictures.

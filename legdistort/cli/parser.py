@@ -6,6 +6,7 @@ Nothing here loads the package, so that help and wrong usage are answered at onc
 import argparse
 import difflib
 import re
+import time
 from importlib.metadata import version
 
 from .arguments import add_options
@@ -17,11 +18,13 @@ def main(argv=None):
 
     0; 1 for a failed run, 2 for wrong usage, 3 where `--strict` is given and a check fails, 130 after Ctrl-C.
     """
+    begun = time.perf_counter()
     arguments, unknown = _parser().parse_known_args(argv)
     if unknown:
         arguments.parser.error(f"no option or place for {' '.join(unknown)}")
     from .running import run_command
 
+    arguments.begun = begun
     return run_command(arguments)
 
 

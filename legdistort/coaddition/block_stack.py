@@ -15,7 +15,7 @@ from .resampling.pixel_maps import ExposureMap
 from .weights import Weight
 
 _SAMPLES = 1 << 23  # pixels of all exposures that are stacked at a time
-_SIDES = 64, 256  # of blocks, px
+_SIDES = 64, 320  # of blocks, px
 _BITS = 32  # exposures in a plane of the context
 
 

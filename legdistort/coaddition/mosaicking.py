@@ -241,7 +241,7 @@ def _layers(frames, prepared, maps, factors, solution, output, options):
 
 def _photons(frame, prepared, factor, variance):
     """Growth of the variance with the signal, by the gain where there is no uncertainty plane (see `Layer.photons`)."""
-    if not frame.gain or "variance" in prepared.stored.paths or variance == 0:
+    if not frame.gain or "variance" in prepared.stored.planes or variance == 0:
         return 0.0
     return float(factor / (variance * frame.gain))
 

@@ -1,6 +1,7 @@
 """Work that falls into independent items: in this process, on its cores, or on a cluster of dask."""
 
 import logging
+import os
 import signal
 import sys
 import warnings
@@ -95,6 +96,11 @@ def check_workers(workers):
     if isinstance(workers, bool) or workers != int(workers) or workers < 1:
         raise InputError(f"workers must be a positive integer, or None for one, got {workers!r}")
     return int(workers)
+
+
+def n_cores():
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _client():

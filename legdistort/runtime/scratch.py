@@ -19,18 +19,20 @@ class Stored:
 
     Attributes
     ----------
-    paths : dict
-        File of each plane, by its name.
+    planes : dict
+        File of each plane, type and shape of its values, by its name.
     """
 
-    paths: dict
+    planes: dict
 
     def piece(self, plane, part):
         """A piece of a plane, by slices of its rows and columns; None if there is no such plane."""
-        if plane not in self.paths:
+        if plane not in self.planes:
             return None
-        # Mapped for this piece alone: what stays mapped counts as memory of the process.
-        return np.array(np.load(self.paths[plane], mmap_mode="r")[part])
+        path, dtype, shape = self.planes[plane]
+        # Mapped for this piece alone: what stays mapped counts as memory of the process. No header is parsed, which
+        # threads cannot do at the same time: now and then compiling ends there in a SystemError (Python 3.11).
+        return np.array(np.memmap(path, dtype, mode="r", shape=shape)[part])
 
 
 @contextmanager
@@ -89,10 +91,12 @@ def store(folder, planes):
     Stored
     """
     own = Path(tempfile.mkdtemp(dir=folder))  # not named as the exposure, which is free text
-    paths = {plane: own / f"{plane}.npy" for plane, values in planes.items() if values is not None}
-    for plane, path in paths.items():
-        np.save(path, planes[plane])
-    return Stored(paths)
+    stored = {}
+    for plane, values in planes.items():
+        if values is not None:
+            stored[plane] = own / plane, values.dtype, values.shape
+            values.tofile(own / plane)
+    return Stored(stored)
 
 
 class _Shared(mmap.mmap):

@@ -9,7 +9,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import asdf
 import numpy as np
@@ -212,8 +214,25 @@ def test_existing_run_is_kept(night, tmp_path, capsys, kept):
     (out / kept).write_text("precious")
     failed(capsys, run(night, out), f"{out} already holds {kept}", "--overwrite")
     assert (out / kept).read_text() == "precious"
+    begun = time.perf_counter()
     assert run(night, out, "--overwrite") == 0
+    waited = time.perf_counter() - begun
     assert Solution.read(out / "solution.asdf").degree == 1
+    timings = json.loads((out / "summary.json").read_text())["timings"]
+    assert list(timings) == ["start", "read", "measure", "match", "solve", "coadd", "assess", "write", "report"]
+    assert 0.7 * waited < sum(timings.values()) < waited  # what is missing is moving the results to their place
+    assert f"start {timings['start']:.2f} s, read" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize(("megabytes", "given", "workers"), [(5, None, 1), (40, None, 3), (40, 2, 2), (5, 2, 2)])
+def test_all_cores_work_where_it_is_worth_it(tmp_path, monkeypatch, megabytes, given, workers):
+    monkeypatch.setattr(commands.parallel, "n_cores", lambda: 3)
+    frames = [tmp_path / "a.fits", tmp_path / "b.fits"]
+    for frame in frames:
+        with open(frame, "wb") as file:
+            file.truncate(megabytes * 1_000_000 // 2)
+    asked = SimpleNamespace(frames=frames, workers=given, quiet=True)
+    assert commands._share(asked) == {"workers": workers, "progress": False}
 
 
 def _not_fits(path, night):

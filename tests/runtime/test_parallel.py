@@ -452,7 +452,7 @@ class TestMosaicInBlocks:
             raise OSError(28, "No space left on device")
 
         with monkeypatch.context() as patch:
-            patch.setattr(np, "save", fail)
+            patch.setattr(preparation, "store", fail)
             with pytest.raises(DiskFullError, match=r"No space left on the disk of .* give another folder as scratch="):
                 ld.coadd(exposures, solution, scratch=tmp_path)
         assert not any(tmp_path.iterdir())
