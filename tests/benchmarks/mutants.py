@@ -84,8 +84,8 @@ MODULES = {
     "geometry/distortion.py": ["geometry/distortion", "wcs/fits_headers"],
     "coaddition/resampling/pixel_maps.py": ["coaddition/mosaicking", "coaddition/compiled_splines"],
     "coaddition/combination.py": ["coaddition/combination", "coaddition/mosaicking"],
-    "priors/prior.py": ["priors/prior", "inputs/exposure_files", "priors/declared_size", "priors/from_files"],
-    "priors/from_headers.py": ["inputs/exposure_files", "inputs/foreign_images", "priors/from_files"],
+    "priors/prior.py": ["priors/prior", "priors/from_headers", "priors/declared_size", "priors/from_files"],
+    "priors/from_headers.py": ["priors/from_headers", "inputs/foreign_images", "priors/from_files"],
     "wcs/fits_headers.py": ["wcs/fits_headers"],
 }
 #: Tests that are not tried: of commands, files and pictures, and of many realisations.

@@ -3,19 +3,14 @@
 All settings are in ``benchmarks/calibration_table.py``.
 """
 
-import sys
-from pathlib import Path
-
+import calibration_table as table
 import numpy as np
 import pytest
+import relative_errors_table
 
 import legdistort as ld
 from legdistort.exceptions import InputError, LegdistortWarning
 from legdistort.results import accuracy
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-import calibration_table as table
-import relative_errors_table
 
 pytestmark = pytest.mark.filterwarnings(
     f"ignore::{LegdistortWarning.__module__}.{LegdistortWarning.__qualname__}"  # what is not known is known here

@@ -1,9 +1,8 @@
 """Errors of positions that took no part in the solution: what moves them, limits, tables, and calibration by truth."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
+import new_positions_table
 import numpy as np
 import pytest
 from astropy import units as u
@@ -20,9 +19,6 @@ from legdistort.results import absolute_errors, new_positions
 from legdistort.solving.equations import criterion
 from legdistort.solving.equations.covariances import Uncertainty
 from legdistort.solving.equations.problem import State, build_problem
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-import new_positions_table
 
 SKY = TangentPlane(10.0, 20.0, np.array([[-1e-5, 2e-6, 2e-4], [2e-6, 1e-5, -2e-4]]))
 PIXELS = np.array([[300.0, 400.0], [1024.0, 1000.0], [1700.0, 350.0], [900.0, 1800.0]])

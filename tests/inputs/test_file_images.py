@@ -1,0 +1,86 @@
+"""Several images in one file: which are of the sky, and how one of them is chosen."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.nddata import CCDData
+
+import legdistort as ld
+from legdistort.cli.parser import main
+from legdistort.exceptions import InputError
+
+SHAPE = (256, 256)
+
+
+def pixels(seed=0, shape=SHAPE):
+    return np.random.default_rng(seed).normal(100, 5, shape).astype("float32")
+
+
+def mosaic_file(path, *names, shape=SHAPE):
+    planes = [np.zeros(shape, "int16") if name == "DQ" else pixels(i, shape) for i, (name, _) in enumerate(names)]
+    hdus = [fits.ImageHDU(plane, name=name, ver=v) for plane, (name, v) in zip(planes, names, strict=True)]
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(path)
+    return path
+
+
+@pytest.mark.parametrize("read", [ld.read_exposures, ld.open_exposures])
+@pytest.mark.parametrize(
+    ("names", "told", "ext"),
+    [
+        ([("SCI", 1), ("ERR", 1), ("SCI", 2), ("DQ", 2)], "2 images, SCI,1 (256, 256), SCI,2 (256, 256)", ("SCI", 2)),
+        ([("CHIP1", 1), ("CHIP2", 1)], "2 images, CHIP1,1 (256, 256), CHIP2,1 (256, 256)", "CHIP2"),
+        ([("", 1), ("", 1)], "2 images, 1 (256, 256), 2 (256, 256)", 2),
+        ([("S", 1), ("S", 1)], "2 images, 1 (256, 256), 2 (256, 256)", 2),
+    ],
+)
+def test_several_images_are_refused_with_their_list(tmp_path, read, names, told, ext):
+    path = mosaic_file(tmp_path / "mef.fits", *names)
+    with pytest.raises(InputError) as error:
+        read(path)
+    message = str(error.value)
+    assert message.startswith(f"{path} holds {told} (ny, nx): choose one with ext")
+    assert "(--ext " in message
+    (chosen,) = read(path, ext=ext)
+    assert np.array_equal(chosen.read().data, pixels(2 if len(names) == 4 else 1))
+
+
+def test_a_long_list_is_cut(tmp_path):
+    path = mosaic_file(tmp_path / "mef.fits", *((f"N{i}", 1) for i in range(12)), shape=(8, 8))
+    with pytest.raises(InputError, match=r"holds 12 images, N0,1 .*, N7,1 \(8, 8\) and 4 more \(ny"):
+        ld.read_exposures(path)
+
+
+def test_a_cube_beside_an_image(tmp_path):
+    cube = fits.ImageHDU(np.ones((3, 8, 8), "float32"))
+    for hdus, words in (
+        ([cube, fits.ImageHDU(pixels(shape=(8, 8)))], r"holds 2 images, 1 \(3, 8, 8\), 2 \(8, 8\)"),
+        ([fits.ImageHDU(cube.data, name="SCI"), fits.ImageHDU(pixels(shape=(8, 8)), name="AREA")], "no 2-D image"),
+    ):
+        fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(tmp_path / "cube.fits", overwrite=True)
+        with pytest.raises(InputError, match=words):
+            ld.read_exposures(tmp_path / "cube.fits")
+
+
+@pytest.mark.parametrize(
+    "beside", ["WHT", "CTX", "VAR_POISSON", "WHT2", "WCSDVARR", "D2IMARR", "CHIP1.DQ", "bad_pixel_mask", "PSFIMAGE"]
+)
+def test_planes_beside_an_image_do_not_count(tmp_path, beside):
+    for name in ("SCI", "DATA", ""):
+        path = mosaic_file(tmp_path / f"a{name}.fits", (name, 1), (beside, 1))
+        assert np.array_equal(ld.read_exposures(path)[0].data[0], pixels(0)[0])
+    alone = mosaic_file(tmp_path / "alone.fits", (beside, 1))
+    assert ld.read_exposures(alone)[0].name == "alone"
+
+
+def test_ccddata_has_one_image(tmp_path):
+    CCDData(pixels(), unit="adu", mask=np.zeros(SHAPE, bool)).write(tmp_path / "ccd.fits")
+    assert ld.read_exposures(tmp_path / "ccd.fits")[0].shape == SHAPE
+
+
+def test_the_command_names_the_way_out(tmp_path, capsys):
+    path = mosaic_file(tmp_path / "mef.fits", ("SCI", 1), ("SCI", 2))
+    assert main(["measure", str(path), "--out", str(tmp_path / "a.ecsv"), "--quiet"]) == 1
+    told = capsys.readouterr().err
+    assert "mef.fits holds 2 images, SCI,1" in told
+    option = told.split("(--ext ")[1].split(")")[0]
+    assert main(["measure", str(path), "--out", str(tmp_path / "a.ecsv"), "--quiet", "--ext", option]) == 0
