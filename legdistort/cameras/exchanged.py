@@ -75,8 +75,7 @@ def _crossing(matches, detector, focal):
 
 def _agreeing(observations, detector, f, poses):
     """Number of pairs of stars on different detectors that agree, by positions f (n, 2) in the focal plane."""
-    back = np.stack([similarity.invert(pose) for pose in poses])[observations.exposure]
-    f = np.einsum("nab,nb->na", back[:, :, :2], f) + back[:, :, 2]
+    f = similarity.apply_inverses(np.asarray(poses)[observations.exposure], f[:, None])[:, 0]
     first = np.unique(np.stack([observations.star, detector]), axis=1, return_index=True)[1]
     at = [f[first[detector[first] == k]] for k in range(detector.max() + 1)]
     trees, near = [cKDTree(each) for each in at], _nearness(at)
