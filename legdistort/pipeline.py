@@ -200,10 +200,7 @@ def run(
     tying = _tying(reference, epoch, pixel_scale, solving)
     _check_others(workers, truth)
     paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
-    share, timings = {"workers": workers, "progress": progress}, {}
-    if (since := begun.get()) is not None:
-        timings["start"] = time.perf_counter() - since
-        begun.set(None)
+    share, timings = {"workers": workers, "progress": progress}, _of_start()
     with outputs.replacing_folder(out, former=RESULTS) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
@@ -232,11 +229,24 @@ def run(
             write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
         summary = summarise(solution, timings=timings) | _assessed(solution, kept, quality, comparison, stacks, truth)
         shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
-        with timed(timings, "report"):
-            write_report(target / "report.html", solution, summary=summary, **shown, files=linked_files(target))
-        summary |= {"timings": _rounded(timings)}
-        write_summary(target / "summary.json", summary := summary | listed_files(target))
+        summary = _written_summary(target, solution, summary, timings, shown)
     return Run(Path(out), solution, mosaic, summary)
+
+
+def _written_summary(target, solution, summary, timings, shown):
+    """The summary with the time of the report and what there is to check the files by; writes both."""
+    with timed(timings, "report"):
+        write_report(target / "report.html", solution, summary=summary, **shown, files=linked_files(target))
+    summary = summary | {"timings": _rounded(timings)} | listed_files(target)
+    write_summary(target / "summary.json", summary)
+    return summary
+
+
+def _of_start():
+    """Seconds by step, to begin with: what the command took that calls, if it is one."""
+    since = begun.get()
+    begun.set(None)
+    return {} if since is None else {"start": time.perf_counter() - since}
 
 
 def _open_frames(paths, min_exposures, stop_at_bad, progress, *, ext, dq_good, camera):

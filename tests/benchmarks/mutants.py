@@ -14,7 +14,7 @@ integer one larger, another number ten times as large, the last two arguments of
 Messages, representations and annotations are left alone.
 
 One process imports the libraries and forks a child for every mutant. Before the mutants the same tests must pass on
-the unchanged modules, taken through the same road. Each child says what module it has loaded, by a word that is
+the unchanged modules, loaded in the same way. Each child says what module it has loaded, by a word that is
 written into the changed source; the command ends with an error if that is another.
 """
 
