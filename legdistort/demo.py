@@ -7,7 +7,7 @@ from .simulation.example_files import published_prior
 from .simulation.observations import simulate_exposures
 
 
-def run_demo(*, out, small=False, camera=None, seed=0, overwrite=False, progress=False):
+def run_demo(*, out, small=False, camera=None, seed=0, workers=None, overwrite=False, progress=False):
     """Simulate a GSAOI-like night, solve its frames and say how far the result is from the truth.
 
     The static distortion is that of a GSAOI detector (published polynomials), known beforehand as the prior; every
@@ -23,6 +23,8 @@ def run_demo(*, out, small=False, camera=None, seed=0, overwrite=False, progress
     camera : str, optional
         "gsaoi": its four detectors, the field of 85" on coarser pixels, dithered over the gaps.
     seed : int
+    workers : int, optional
+        As of `legdistort.run`.
     overwrite, progress : bool
 
     Returns
@@ -37,4 +39,4 @@ def run_demo(*, out, small=False, camera=None, seed=0, overwrite=False, progress
     out.mkdir(parents=True, exist_ok=True)
     paths = night.write(out / "frames")
     known = {"camera": truth.camera, "ext": "SCI"} if camera else {"prior": published_prior(truth.shape)}
-    return run(paths, out=out, **known, truth=truth, overwrite=overwrite, progress=progress)
+    return run(paths, out=out, **known, truth=truth, workers=workers, overwrite=overwrite, progress=progress)

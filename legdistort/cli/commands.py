@@ -39,7 +39,8 @@ def do_demo(a):
         written = write_examples(**kind, out=a.out, seed=a.seed or 0, overwrite=a.overwrite)
         _say(a, "\n".join(map(str, written)), {"files": [str(path) for path in written]})
         return
-    result = run_demo(out=a.out, **night, overwrite=a.overwrite, progress=wants_progress(a))
+    workers = 1 if a.small else parallel.n_cores()
+    result = run_demo(out=a.out, **night, workers=workers, overwrite=a.overwrite, progress=wants_progress(a))
     s = result.summary
     _report(a, result.solution, s)
     if not a.json:

@@ -9,8 +9,11 @@ import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.modeling import models
+from astropy.modeling.core import FittableModel
+from astropy.modeling.parameters import Parameter
 
 from ..runtime.notebook import ShownAsPrinted
+from .models import CHUNK, leaves
 from .similarity import apply, invert
 
 if TYPE_CHECKING:
@@ -163,3 +166,59 @@ class TangentPlane(ShownAsPrinted):
         """`~astropy.coordinates.SkyCoord` -> reference-plane positions (..., 2); inverse of `to_sky`."""
         icrs = coordinates.icrs
         return np.stack(self.model().inverse(icrs.ra.deg, icrs.dec.deg), axis=-1)
+
+
+class PlaneToSky(FittableModel):
+    """`TangentPlane.model` as one model, which takes no sines of angles that have just been made: thrice as fast.
+
+    (x, y) [pix] -> (ra, dec) [deg]; the parameters are those of a `TangentPlane`. The inverse is the stock one.
+    """
+
+    n_inputs = n_outputs = 2
+    _separable = False
+    lon, lat = (Parameter(default=0.0, fixed=True) for _ in range(2))
+    xx, xy, dx = (Parameter(default=d, fixed=True) for d in (1.0, 0.0, 0.0))
+    yx, yy, dy = (Parameter(default=d, fixed=True) for d in (0.0, 1.0, 0.0))
+
+    @classmethod
+    def of(cls, sky):
+        """That of a `TangentPlane`."""
+        return cls(sky.lon, sky.lat, *np.ravel(sky.matrix))
+
+    @classmethod
+    def like(cls, model):
+        """That of a model as `TangentPlane.model` makes it; ValueError for another."""
+        parts = leaves(model)
+        kinds = [models.AffineTransformation2D, models.Pix2Sky_TAN, models.RotateNative2Celestial]
+        if [type(part) for part in parts] != kinds or parts[2].lon_pole.value != 180:
+            raise ValueError("the way to the sky should be an affine map, Pix2Sky_TAN and RotateNative2Celestial")
+        plane, _, turn = parts
+        return cls(turn.lon.value, turn.lat.value, *np.column_stack([plane.matrix.value, plane.translation.value]).flat)
+
+    @staticmethod
+    def evaluate(x, y, lon, lat, *plane):
+        """Right ascension, 0 to 360, and declination."""
+        lon, lat, *plane = (float(np.ravel(each)[0]) for each in (lon, lat, *plane))
+        xx, xy, dx, yx, yy, dy = np.radians(plane)
+        sin0, cos0 = np.sin(np.radians(lat)), np.cos(np.radians(lat))
+        x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
+        out = np.empty((2, *x.shape))
+        flat_x, flat_y, flat = x.reshape(-1), y.reshape(-1), out.reshape(2, -1)
+        for start in range(0, flat_x.size, CHUNK):
+            part = slice(start, start + CHUNK)
+            xi = xx * flat_x[part] + xy * flat_y[part] + dx
+            eta = yx * flat_x[part] + yy * flat_y[part] + dy
+            ahead = cos0 - eta * sin0
+            flat[0, part] = (lon + np.degrees(np.arctan2(xi, ahead))) % 360
+            flat[1, part] = np.degrees(np.arctan2(sin0 + eta * cos0, np.hypot(xi, ahead)))
+        return out[0], out[1]
+
+    @property
+    def inverse(self):
+        """The opposite direction, of stock parts."""
+        return self.stock().inverse
+
+    def stock(self):
+        """The same function of stock parts."""
+        lon, lat, *plane = self.parameters
+        return TangentPlane(lon, lat, np.reshape(plane, (2, 3))).model()

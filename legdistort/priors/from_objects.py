@@ -11,7 +11,7 @@ from gwcs import coordinate_frames as cf
 
 from ..cameras.source import Source, check_shape
 from ..exceptions import InputError
-from ..geometry.tangent_plane import gnomonic
+from ..geometry.tangent_plane import PlaneToSky, gnomonic
 from ..runtime.words import DIRECTIONS
 
 #: Frames of a gwcs where the distortion ends and pointing has not begun, in order of preference.
@@ -53,7 +53,8 @@ def of_model(model, name, **known):
     if (inputs, outputs) != (2, 2):
         raise InputError(f"{name} has {inputs} inputs and {outputs} outputs; a distortion has two of each")
     is_model = isinstance(model, Model)
-    if is_model and isinstance(model[-1] if model.n_submodels > 1 else model, models.RotateNative2Celestial):
+    last = model[-1] if is_model and model.n_submodels > 1 else model
+    if isinstance(last, (models.RotateNative2Celestial, PlaneToSky)):  # between models | is no union of types
         known = {"direction": DIRECTIONS[0], "sphere": 1.0} | known
     kind = "astropy model" if is_model else "function"
     return Source(name, kind, _plain(model, known.get("sphere")), **known)

@@ -11,6 +11,7 @@ from astropy.coordinates import ICRS
 from gwcs import coordinate_frames as cf
 
 from ..geometry import models, similarity
+from ..geometry.tangent_plane import PlaneToSky
 
 if TYPE_CHECKING:
     from gwcs import WCS as GWCS
@@ -109,7 +110,7 @@ def exposure_wcs(name, pose, distortion, sky=None, detector=None, *, shared=Fals
             (plane("undistorted"), layout),
             (plane("focal_plane"), from_focal_plane(correction(distortion), back)),
         ]
-    steps.append((plane("reference"), None if sky is None else sky.model()))
+    steps.append((plane("reference"), None if sky is None else PlaneToSky.of(sky)))
     if sky is not None:
         sky_frame = cf.CelestialFrame(
             name="icrs", reference_frame=ICRS(), unit=(u.deg, u.deg), axes_names=("ra", "dec")

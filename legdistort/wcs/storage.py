@@ -14,6 +14,7 @@ from ..exceptions import InputError
 from ..geometry import basis
 from ..geometry.distortion import Distortion, Inverse
 from ..geometry.models import correction_model, displacement_model, leaves, pose_model
+from ..geometry.tangent_plane import PlaneToSky
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, WITH_WCS, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
@@ -121,6 +122,8 @@ def _checked_wcs(meta):
         correction = _checked_correction(whole.left, meta["focal_plane"], meta["exposure"])
         back = pose_model(np.column_stack([whole.right.matrix.value, whole.right.translation.value]), whole.right.name)
         wcs.set_transform("focal_plane", "reference", from_focal_plane(correction, back))
+    if wcs.available_frames[-1] == "icrs":
+        wcs.set_transform("reference", "icrs", PlaneToSky.like(wcs.get_transform("reference", "icrs")))
     wcs.bounding_box = box
     return rebuilt(ExposureWCS, wcs)
 
