@@ -484,7 +484,7 @@ def test_options_of_coadd_reach_it(demo, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("legdistort.coadd", stand_in)
     failed(capsys, main(_coadd(demo, tmp_path / "m.fits")), "enough")
     own = {name: p.default for name, p in inspect.signature(coadd).parameters.items() if p.kind is p.KEYWORD_ONLY}
-    assert own | given == own | {"method": "clipped"}
+    assert own | given == own | {"method": "clipped", "workers": 1}
     failed(capsys, main(_coadd(demo, tmp_path / "m.fits", "--order", "bicubic")), "enough")
     assert given["order"] == "bicubic"
     given.clear()
