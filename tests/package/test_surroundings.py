@@ -245,7 +245,7 @@ def test_a_solution_in_another_process(solution, method):
 def test_a_solution_on_a_cluster(solution):
     distributed = pytest.importorskip("distributed")
     cluster = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp"
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=":0", protocol="tcp"
     )
     with cluster, distributed.Client(cluster) as client:
         corrected = client.submit(solution.correct, solution.names[0], PIXELS).result(timeout=60)

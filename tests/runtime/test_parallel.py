@@ -70,9 +70,12 @@ def die(i):
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Two processes."""
+    """Two processes. Port 0 is any free one: the usual one may belong to another cluster of this machine."""
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Creating scratch directories is taking")  # on a busy disk
+        cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0")
+    with cluster:
         yield cluster
 
 
