@@ -5,8 +5,10 @@ PSF, rms of deviation / error, false stars, completeness, and the part that `mat
 after the common polynomial of the PSF's field order, which the bounds and errors go through as well. Frames and what
 every method found in them are kept in FOLDER; ``--redo`` measures again. ``--crowded`` makes the table of crowded
 fields instead: rms of deviation / error of isolated stars with no other near, by signal-to-noise ratio. ``--strength``
-multiplies elongation and coma; it takes a FOLDER of its own. ``--order 2`` compares positions in crowded fields after
-a quadratic map: up to that order the own error of an effective PSF belongs to the distortion of the exposure.
+multiplies elongation and coma, ``--halo`` sets the FWHM of the halo [pix], ``--stars`` and ``--faintest`` the number
+of stars and the smallest signal-to-noise ratio: each takes a FOLDER of its own. ``--order 2`` compares positions in
+crowded fields after a quadratic map: up to that order the own error of an effective PSF belongs to the distortion of
+the exposure.
 """
 
 import argparse
@@ -71,12 +73,12 @@ METHODS = {
 }
 
 
-def frame_of(folder, cell, seed):
-    """A frame, from the folder if it is there."""
+def frame_of(folder, cell, seed, stars):
+    """A frame, from the folder if it is there; `stars`: options of `ao_images.frame`."""
     path = folder / f"{cell}-{seed}.npz"
     if not path.exists():
         kind, strehl = cell.rsplit("-", 1)
-        frame = ao.frame(kind, float(strehl), seed)
+        frame = ao.frame(kind, float(strehl), seed, **stars)
         np.savez(path, **vars(frame))
     with np.load(path) as saved:
         values = {name: saved[name] for name in saved.files}
@@ -105,7 +107,7 @@ def compare(frame, found):
     out[:, 0] = np.clip(np.digitize(frame.snr, THIRDS) - 1, 0, 2)
     out[:, 1], out[:, 2] = seen, np.where(seen, kept[row], False)
     false = np.min(np.hypot(*(xy[:, None] - frame.xy).T), axis=0) > FALSE
-    if np.count_nonzero(seen) > 12:
+    if np.count_nonzero(seen) > 2 * (frame.order + 1) ** 2:
         row = row[seen]
         stated = error[row, :, None] ** 2 * np.eye(2)
         left, bound, own = ao.mapped(
@@ -129,11 +131,11 @@ def found_before(detections, n):
     return np.count_nonzero(allowed & (false == 0)) / n
 
 
-def show(cell, name, folder, n_frames, redo):
+def show(cell, name, folder, n_frames, redo, stars):
     """One row of the table."""
     parts, detections, seconds = [], [], []
     for seed in range(n_frames):
-        frame = frame_of(folder, cell, seed)
+        frame = frame_of(folder, cell, seed, stars)
         found = found_in(folder, frame, name, redo)
         for collected, part in zip((parts, detections), compare(frame, found), strict=True):
             collected.append(part)
@@ -171,16 +173,22 @@ def show_crowded(strehl, n, name, folder, n_frames, redo, order):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--psf", nargs="+", choices=CELLS, default=CELLS)
+    parser.add_argument("--psf", nargs="+", default=CELLS, help="as symmetric-0.05: shape and Strehl ratio")
     parser.add_argument("--method", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--frames", type=int, default=10)
     parser.add_argument("--strength", type=float, default=1.0)
+    parser.add_argument("--halo", type=float, default=25.0)
+    parser.add_argument("--stars", type=int, default=60)
+    parser.add_argument("--faintest", type=float, default=10.0)
     parser.add_argument("--crowded", action="store_true")
     parser.add_argument("--order", type=int, default=0)
     parser.add_argument("--redo", action="store_true")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
-    ao.SHAPES = {kind: {name: given.strength * by for name, by in more.items()} for kind, more in ao.SHAPES.items()}
+    ao.SHAPES = {
+        kind: {name: given.strength * by for name, by in more.items()} | {"halo_fwhm": given.halo}
+        for kind, more in ao.SHAPES.items()
+    }
     warnings.simplefilter("ignore")  # of photutils: fits without convergence
     if given.crowded:
         print("rms / bound, [rms of deviation / error], stars; by signal-to-noise ratio: 10-30, 30-100, 100-300, above")
@@ -194,5 +202,5 @@ if __name__ == "__main__":
     )
     for cell in given.psf:
         for name in given.method:
-            show(cell, name, given.folder, given.frames, given.redo)
+            show(cell, name, given.folder, given.frames, given.redo, {"n": given.stars, "lowest": given.faintest})
             sys.stdout.flush()

@@ -102,7 +102,7 @@ def measure_frame(stamps, fitted, shape, psf):
     # too few to be divided: then the stars that make the PSF judge it, too
     brightest = rows[:_DECIDE]
     making, judging = (brightest[1::2], brightest[::2]) if len(rows) >= 2 * building.STARS_NEEDED else (rows, rows)
-    first = _first_psf(stamps, fitted, shape, making)
+    first = _first_psf(stamps, fitted, making)
     if psf == "auto" and not _is_better(stamps, fitted, first.psf, judging):
         return None, Verdict("moffat", len(rows), decided=True)
     built, start = make_psf(stamps, fitted, first, rows)
@@ -168,8 +168,13 @@ def make_psf(stamps, fitted, first, rows):
     return building.improved(first.for_stars(fit.params[rows]), stars), fit
 
 
-def _first_psf(stamps, fitted, shape, rows):
-    """An effective PSF from some stars, their neighbours subtracted as Moffat profiles."""
+def _first_psf(stamps, fitted, rows):
+    """An effective PSF from some stars, the brightest first, their neighbours subtracted as Moffat profiles.
+
+    It starts from the shape of the brightest ones: only these determine the wings, which reach beyond the corrections.
+    """
+    brightest = rows[: max(len(rows) // 3, building.STARS_NEEDED // 2)]
+    shape = np.median(fitted.found.params[brightest, 3:7], axis=0)
     base = building.profile_psf(shape, stamps.half, stamps.frame.signal.shape)
     start = started(fitted, base).params[rows]
     return building.build(ensemble(stamps, fitted, rows, fitted.models[1]), start, base)

@@ -1,5 +1,6 @@
 """All stars of a frame fitted: neighbours subtracted, noise from the model, hot pixels distinguished from stars."""
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -14,13 +15,12 @@ from .local_sky import separate
 from .pixel_noise import pixel_noise
 from .shape_field import shape_field
 
-#: Shapes of stars, and ways to fit those that touch: see `fit_stars`.
-
 _DEVIATES = 0.2  # fraction of a star by which pixels may deviate from a Moffat profile
 #: Limits of the passes after the first: the second prepares the last.
 _MIDDLE, _LAST = Limits(20, 1e-2), Limits(40, 1e-4)
 _SHAPELY = 20  # signal-to-noise ratio of stars that determine the shape of all
 _GAP = 1 / 3  # part of the pixels within one FWHM that may be missing
+_WIDE = 3  # times the width of the stars of the frame, or less than its inverse: no star
 _WANDERS = 0.75  # FWHM from the peak: a cosmic ray beside a star draws the peak away by half a FWHM and more
 
 
@@ -93,6 +93,7 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
         start = np.where(_is_wild(found, width)[:, None], started(stamps, shape), found.params)
         fitting = partial(fit, nodes=nodes, sigma=sigma, limits=_LAST if last else _MIDDLE)
         found = fit_groups(found, labels, pixels, start, stamps=stamps, centre=centre, fitting=fitting)
+        found = _without_wide(stamps, found, shape)
         models = stamps.models(found.params, nodes)
         done = _is_hot(stamps, found, models, weights > 0)
         hot = done | (hot if sigma is HELD else moffat.fwhm(found.params) < 0.6 * width)
@@ -114,9 +115,16 @@ def photon_noise(stamps, shape):
 
 def _first_pass(stamps, shape, nodes):
     """Stars fitted with the noise of the sky, models from that, and the noise of the pixels that they determine."""
-    found, _ = fit_once(stamps, shape, nodes)
+    found = _without_wide(stamps, fit_once(stamps, shape, nodes)[0], shape)
     models = stamps.models(found.params, nodes)
     return found, models, pixel_noise(stamps, found, models, nodes)
+
+
+def _without_wide(stamps, found, shape):
+    """Fits wider than any star, which took up what neighbours leave of the sky, put back to their start."""
+    wide = moffat.fwhm(found.params) > _WIDE * moffat.fwhm(shape)
+    params = np.where(wide[:, None], started(stamps, shape), found.params)
+    return replace(found, params=params, converged=found.converged & ~wide)
 
 
 def _ratio(models, weights):
@@ -171,9 +179,9 @@ def _is_hot(stamps, found, models, good):
 
 
 def _is_wild(fit, width):
-    ratio = moffat.fwhm(fit.params) / width
+    narrow = moffat.fwhm(fit.params) < width / _WIDE
     shift = np.hypot(fit.params[:, 0], fit.params[:, 1])
-    return ~fit.converged | (fit.params[:, 2] <= 0) | (ratio > 3) | (ratio < 1 / 3) | (shift > 1 + _WANDERS * width)
+    return ~fit.converged | (fit.params[:, 2] <= 0) | narrow | (shift > 1 + _WANDERS * width)
 
 
 def _share_shape(data, weights, found, rows, *, shape, nodes):

@@ -6,6 +6,10 @@ from .pixel_noise import NEIGHBOUR, pixel_variance
 
 _OUTLIER = 6.0  # standard deviations, beyond which a pixel follows no model
 _TOO_MANY = 1 / 4  # of the pixels of a core
+_INNER = 0.5  # of the highest pixel of a star
+_PLAIN = 0.4  # of it, beyond noise: such a deviation of a star can be seen
+_MANY = 1 / 4  # of the bright stars, and more than cosmic rays would hit by chance
+_CHANCE_HITS = 3
 _CHANCE = 6.0  # chi2 of a slope, which noise exceeds in 5 % of the stars
 _CHUNK = 300  # stars: their derivatives stay in the processor's cache
 
@@ -28,7 +32,7 @@ def separate(stamps, models, partners, background, noise, *, deviates, derivativ
     derivatives, precision
         See `slopes`; without derivatives the sky is taken as flat.
     core : ndarray of bool, shape (n, npix), optional
-        Cores of the stars: where much of one deviates it is the model that is wrong, and all pixels count.
+        Cores of the stars: where much of one deviates it is the model that is wrong, and all its pixels count.
 
     Returns
     -------
@@ -39,9 +43,10 @@ def separate(stamps, models, partners, background, noise, *, deviates, derivativ
     light = own + others + background.astype(own.dtype)
     variance = pixel_variance(noise, light) + (NEIGHBOUR * (others - partners)) ** 2
     left, allowed = stamps.data - light, _OUTLIER * np.sqrt(variance) + deviates * np.abs(own + partners)
+    wrong = _wrong_peaks(stamps, own, left, allowed)
 
     def weights(left, allowed):
-        good = stamps.good & (np.abs(left) < allowed)
+        good = stamps.good & (wrong | (np.abs(left) < allowed))
         if core is not None:
             good |= ((core & stamps.good & ~good).sum(axis=1) > _TOO_MANY * core.sum(axis=1))[:, None] & stamps.good
         return np.where(good, 1 / variance, 0.0)
@@ -51,6 +56,17 @@ def separate(stamps, models, partners, background, noise, *, deviates, derivativ
         usual = _OUTLIER * 1.5 * np.median(np.abs(left), axis=1)[:, None]  # a slope leaves more than noise everywhere
         slope = slopes(left, weights(left, np.maximum(allowed, usual)), derivatives, precision)
     return stamps.data - slope - (others - partners), weights(left - slope, allowed), slope
+
+
+def _wrong_peaks(stamps, own, left, allowed):
+    """Inner pixels of all stars, where those of many bright ones exceed the model: it lacks their core."""
+    peak = own.max(axis=1)
+    inner = own > _INNER * peak[:, None]
+    middle = own.shape[1] // 2
+    bright = (peak > 0) & (allowed[:, middle] < _PLAIN * peak) & ~stamps.saturated.any(axis=1)
+    higher = (inner & stamps.good & (left > allowed)).any(axis=1) & bright
+    many = higher.sum() > max(_MANY * bright.sum(), _CHANCE_HITS)
+    return inner if many else np.zeros_like(inner)
 
 
 def slopes(left, weights, derivatives, precision=0.0):
