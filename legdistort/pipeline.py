@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from tqdm import tqdm
 
 from .assessment import baselines, run_checks, stack_quality
 from .assessment.truth import compare_with_truth
@@ -36,6 +36,7 @@ from .results import accuracy
 from .results.check import Check
 from .runtime import checks, outputs, parallel, provenance
 from .runtime.notebook import ShownAsPrinted
+from .runtime.progress import Bar
 from .simulation.truth import Truth
 from .solving.estimation import solve
 from .solving.options import CLIP, SolveOptions, check_detectors, check_reference
@@ -223,20 +224,26 @@ def run(
         if compare:
             with timed(timings, "compare"):
                 comparison, stacks = _compared(matches, solution, solving, quality and mosaic, kept, coadding)
-        with timed(timings, "write"):
+        summary = summarise(solution, timings=timings) | _assessed(solution, kept, quality, comparison, stacks, truth)
+        shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
+        report = partial(_write_report, target, solution, summary, shown)
+        with timed(timings, "report"), parallel.beside(report, workers=workers), timed(timings, "write"):
             write_results(solution, target, psfs=psfs, mosaic=mosaic, progress=progress)
             write_detections(target / "detections.ecsv", detections, exposures, Path(out), **reading)
             write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
-        summary = summarise(solution, timings=timings) | _assessed(solution, kept, quality, comparison, stacks, truth)
-        shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
-        summary = _written_summary(target, solution, summary, timings, shown)
+        summary = _written_summary(target, summary, timings)
     return Run(Path(out), solution, mosaic, summary)
 
 
-def _written_summary(target, solution, summary, timings, shown):
-    """The summary with the time of the report and what there is to check the files by; writes both."""
-    with timed(timings, "report"):
-        write_report(target / "report.html", solution, summary=summary, **shown, files=linked_files(target))
+def _write_report(target, solution, summary, shown):
+    """The report of all that `run` leaves, whether it is there yet or written beside it."""
+    files = linked_files(name for name in RESULTS if shown["psfs"] or not name.startswith("psf/"))
+    write_report(target / "report.html", solution, summary=summary, **shown, files=files)
+
+
+def _written_summary(target, summary, timings):
+    """The summary with all times and what there is to check the files by, which it is written with."""
+    timings["report"] -= timings["write"]  # what is waited for beyond that
     summary = summary | {"timings": _rounded(timings)} | listed_files(target)
     write_summary(target / "summary.json", summary)
     return summary
@@ -349,7 +356,7 @@ def write_results(solution, target, *, psfs=None, mosaic=None, progress=False):
     solution.write(target / "solution.asdf")
     table_files.write_stars(solution, target / "stars.ecsv")
     (target / "wcs").mkdir()
-    for name in tqdm(solution.names, desc="writing", unit="WCS", disable=not progress):
+    for name in Bar(solution.names, desc="writing", unit="WCS", disable=not progress):
         for detector in solution.camera.detectors if solution.camera else [None]:
             file = f"{name}.asdf" if detector is None else f"{detector_name(name, detector)}.asdf"
             write_wcs(solution, name, target / "wcs" / file, detector=detector)
@@ -358,12 +365,10 @@ def write_results(solution, target, *, psfs=None, mosaic=None, progress=False):
         mosaic.write(target / "mosaic.fits")
 
 
-def linked_files(target):
-    """Results in a folder as the report beside them links to them: files, and folders of many."""
-    there = (Path(each).parts for each in (*RESULTS, "summary.json"))
-    names = [parts[0] + "/" * (len(parts) > 1) for parts in there]
-    made = [name for name in dict.fromkeys(names) if (target / name).exists() or name == "summary.json"]
-    return [name for name in made if name != "report.html"]
+def linked_files(made):
+    """Some of `RESULTS` as the report beside them links to them: files, and folders of many."""
+    parts = (Path(name).parts for name in made if name != "report.html")
+    return [first + "/" * len(more) for first, *more in parts]
 
 
 def listed_files(target):

@@ -190,7 +190,8 @@ def do_solve(a):
             summary = summarise(solution)
         with timed({}, "write"):
             write_results(solution, target, progress=wants_progress(a))
-        write_report(target / "report.html", solution, summary=summary, files=linked_files(target))
+        files = linked_files(("solution.asdf", "stars.ecsv", "wcs/*.asdf", "summary.json"))
+        write_report(target / "report.html", solution, summary=summary, files=files)
         write_summary(target / "summary.json", summary := summary | listed_files(target))
     _report(a, solution, summary)
     return _status(a, summary)

@@ -11,6 +11,7 @@ from contextlib import contextmanager, nullcontext
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from ..exceptions import LegdistortError, LegdistortWarning
+from ..runtime.progress import Bar
 from . import commands
 from .arguments import check_paths, wants_progress
 
@@ -24,7 +25,7 @@ def run_command(arguments):
             warnings.simplefilter("ignore")  # of other packages
             warnings.simplefilter("default", LegdistortWarning)
             warnings.showwarning = lambda message, *_, **__: log.warning("%s", in_shell_words(str(message)))
-            with logging_redirect_tqdm([log]) if wants_progress(arguments) else nullcontext():  # bars stay whole
+            with logging_redirect_tqdm([log], Bar) if wants_progress(arguments) else nullcontext():  # bars stay whole
                 check_paths(arguments, arguments.groups)
                 status = getattr(commands, f"do_{arguments.command}")(arguments)
     except LegdistortError as error:

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
-from tqdm import tqdm
 
 from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, without_astropy_warnings
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.fits_bytes import open_fits, readable
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.outputs import settle_for
+from ..runtime.progress import Bar
 from ..runtime.provenance import checksum, unchanged
 from . import repetitions
 from .exposure_names import detector_name, exposure_name
@@ -266,7 +266,7 @@ def _read_each(paths, read, ext, progress, bad=None, copies=None):
     origins, exposures, images = {}, [], {}
     sources = expand_paths(paths)
     parts = _parts(sources, ext)
-    bar = tqdm(total=sum(map(len, parts)), desc="reading", unit="frame", disable=not progress)
+    bar = Bar(total=sum(map(len, parts)), desc="reading", unit="frame", disable=not progress)
     with bar, contextlib.closing(_one_after_another(sources, parts)) as opened:
         for i, source, ext, key in opened:
             bar.update()

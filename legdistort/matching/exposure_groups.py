@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from ..geometry import similarity
+from ..runtime.progress import Bar
 from .registration import Registration, continue_from_pairs, continue_from_pose, outwards, register
 from .star_labels import label_stars
 from .star_lists import StarList, Warp, allowed_degree, fit_warp
@@ -63,7 +63,7 @@ def link(lists, guess, *, tolerance=None, progress=False):
     """
     left = set(range(len(lists)))
     groups = []
-    with tqdm(total=len(lists), desc="matching", disable=not progress) as bar:
+    with Bar(total=len(lists), desc="matching", disable=not progress) as bar:
         while left:
             hub = max(left, key=lambda i: (len(lists[i]), -i))
             left.remove(hub)
@@ -170,7 +170,7 @@ def interlink(lists, group, *, tolerance=None, progress=False):
     partners = _partners(overlaps)
     for sweep in ("linking", "completing"):
         labels = label_stars(sizes, known)
-        for i, j in tqdm(partners, desc=sweep, disable=not progress):
+        for i, j in Bar(partners, desc=sweep, disable=not progress):
             shared, rows, columns = np.intersect1d(labels[i], labels[j], return_indices=True)
             rows, columns = rows[shared >= 0], columns[shared >= 0]
             before = known.get((i, j))

@@ -1,9 +1,12 @@
 """Work that falls into independent items: in this process, on its cores, or on a cluster of dask."""
 
+import ctypes
 import logging
 import os
 import signal
 import sys
+import threading
+import time
 import warnings
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -16,10 +19,12 @@ from queue import SimpleQueue
 
 import scipy.linalg  # noqa: F401  (it comes with a linear algebra library of its own, which is to be loaded by then)
 from threadpoolctl import ThreadpoolController
-from tqdm import tqdm
 
 from ..exceptions import InputError, LegdistortError, warn
+from .progress import Bar
 
+_END_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl(2)
+_THREADS, _PATIENCE = "/proc/self/task", 50  # one entry a thread; milliseconds
 _AHEAD = 4  # items in flight for every worker
 
 
@@ -56,7 +61,7 @@ def map_items(function, items, *, workers=None, threads=False, progress=False, d
         and logs in local processes is repeated in this one.
     """
     workers, client = check_workers(workers), _client() if workers is None else None
-    bar = tqdm(
+    bar = Bar(
         total=len(items) if hasattr(items, "__len__") else None, desc=description, unit=unit, disable=not progress
     )
     with bar:
@@ -138,9 +143,11 @@ def _executor(workers, threads, client):
     if client is not None:
         yield partial(client.submit, pure=False)
         return
-    # a worker leaves Ctrl-C to the process that it works for, which then stops it
-    deaf = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
-    pool = ThreadPoolExecutor(workers) if threads else ProcessPoolExecutor(workers, get_context("spawn"), **deaf)
+    if threads:
+        pool = ThreadPoolExecutor(workers)
+    else:
+        context = get_context("fork" if _may_fork() else "spawn")
+        pool = ProcessPoolExecutor(workers, context, initializer=_serve, initargs=(os.getpid(),))
     try:
         yield pool.submit
     except BrokenProcessPool:
@@ -150,6 +157,76 @@ def _executor(workers, threads, client):
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _may_fork():
+    """Whether other processes can begin as copies of this one, which spares them all imports.
+
+    A copy has one thread: what others were at would never be finished there. OpenBLAS ends its own before a copy is
+    made, and starts them again when they are needed.
+    """
+    if not os.path.isdir(_THREADS) or threading.active_count() > 1:
+        return False
+    known = sum(library["num_threads"] - 1 for library in _libraries().info() if library["internal_api"] == "openblas")
+    for _ in range(_PATIENCE):  # a thread that has ended is still listed for a moment
+        if len(os.listdir(_THREADS)) - 1 <= known:
+            return True
+        time.sleep(0.001)
+    return False
+
+
+def _serve(master):
+    """What a worker process does first: it leaves Ctrl-C to the process that it works for, and ends with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_END_WITH_PARENT, signal.SIGKILL)
+        if os.getppid() != master:  # which has ended meanwhile
+            os._exit(1)
+
+
+@contextmanager
+def beside(function, *, workers=None):
+    """Call a function while the block runs, in a copy of this process; after the block where there is no second core.
+
+    Parameters
+    ----------
+    function : callable
+        Without arguments; what it returns is lost, files that it writes stay. It sees this process as it is before the
+        block.
+    workers : int, optional
+        Cores to use, as for `map_items`.
+
+    Raises
+    ------
+    LegdistortError
+        If the copy dies. What the function raises comes at the end of the block.
+    """
+    if workers is None or workers < 2 or not _may_fork():
+        yield
+        function()
+        return
+    context = get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+
+    def work():
+        _serve(master)
+        sender.send(_attempt(lambda _: function(), None))
+
+    master, process = os.getpid(), context.Process(target=work)
+    process.start()
+    sender.close()
+    try:
+        yield
+        attempt = receiver.recv()
+        process.join()
+    except EOFError:
+        raise LegdistortError("a worker process died: it ran out of memory; give workers=1") from None
+    finally:
+        process.kill()
+        process.join()
+        receiver.close()
+    _finish((None, *attempt[1:]))
 
 
 def _attempt(function, item):

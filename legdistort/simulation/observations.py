@@ -13,7 +13,6 @@ import numpy as np
 from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
-from tqdm import tqdm
 
 from ..exceptions import InputError
 from ..geometry import similarity
@@ -21,6 +20,7 @@ from ..inputs.matches import Matches
 from ..inputs.table_files import write_table
 from ..runtime import checks, outputs
 from ..runtime.notebook import ShownAsPrinted
+from ..runtime.progress import Bar
 from . import gsaoi_night, rendering
 from .truth import (
     Truth,
@@ -262,7 +262,7 @@ def simulate_exposures(
     night = gsaoi_night.make_night(small, camera=camera, **settings)
     truth, rng = gsaoi_night.draw_night(night, seed)
     hdus, psfs = {}, {}
-    for i, name in enumerate(tqdm(truth.names, desc="simulate", disable=not progress)):
+    for i, name in enumerate(Bar(truth.names, desc="simulate", disable=not progress)):
         psfs[name] = psf = night.psf_of(i, rng)
         if truth.camera is None:
             xy = truth.distort(name, truth.place(name))

@@ -11,12 +11,12 @@ from contextvars import ContextVar
 from dataclasses import dataclass, replace
 
 import numpy as np
-from tqdm import tqdm
 
 from ..exceptions import ConvergenceWarning, SolveError, warn
 from ..geometry import basis
 from ..results.gauge import Gauge
 from ..runtime.checks import check_choice
+from ..runtime.progress import Bar
 from ..runtime.words import LOSSES
 from .equations import criterion, elimination, reduced_system
 from .equations.problem import State
@@ -76,7 +76,7 @@ class Result:
 @contextlib.contextmanager
 def iterations_shown(progress):
     """Show a progress bar of the iterations in the block, of all fits that it makes, if it takes more than a second."""
-    with tqdm(desc="solving", unit=" iterations", delay=1, disable=not progress) as bar:
+    with Bar(desc="solving", unit=" iterations", delay=1, disable=not progress) as bar:
         before = _count.set(bar.update)
         try:
             yield

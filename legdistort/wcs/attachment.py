@@ -13,7 +13,6 @@ from pathlib import Path
 import asdf
 import numpy as np
 from astropy.io import fits
-from tqdm import tqdm
 
 from ..exceptions import ExportError, InputError
 from ..inputs import exposure_files, exposure_names, file_images
@@ -21,6 +20,7 @@ from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, readable, splice
 from ..runtime.outputs import replacing, replacing_folders
+from ..runtime.progress import Bar
 from .storage import wcs_tree
 
 log = logging.getLogger(__name__)
@@ -125,7 +125,7 @@ def attach(
     paths = _files(paths)
     targets = [path.resolve() for path in paths] if in_place else _targets(paths, Path(out), overwrite)
     plans = []
-    for path, target in zip(tqdm(paths, desc="attaching", unit="frame", disable=not progress), targets, strict=True):
+    for path, target in zip(Bar(paths, desc="attaching", unit="frame", disable=not progress), targets, strict=True):
         plan = _plan(solution.by_detector, path, target, kind=kind, max_error=max_error, ext=ext, overwrite=overwrite)
         plans += [plan] if plan.headers else []
     if not plans:

@@ -145,6 +145,115 @@ class TestEach:
             list(map_items(abs, [1], workers=workers))
 
 
+def in_a_new_process(script, *arguments):
+    """What a script prints that runs in a process of its own, without the threads of this one."""
+    done = subprocess.run([sys.executable, "-c", script, *map(str, arguments)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux")
+class TestCopies:
+    def test_where_no_other_thread_runs_workers_are_copies(self):
+        """They know what was never imported or pickled; a function of a script without a guard, say."""
+        script = """if True:
+            import os, threading, time
+            from legdistort.runtime.parallel import map_items
+            secret = [1]
+            def work(i):
+                time.sleep(0.05)
+                return os.getpid(), secret[0] + i
+            secret[0] = 5
+            found = list(map_items(work, range(6), workers=2))
+            assert [value for _, value in found] == [5, 6, 7, 8, 9, 10]
+            assert len({process for process, _ in found} - {os.getpid()}) == 2
+            threading.Thread(target=time.sleep, args=[3], daemon=True).start()
+            from legdistort.runtime.parallel import _may_fork
+            print(_may_fork())
+        """
+        assert in_a_new_process(script) == "False\n"
+
+    def test_a_function_beside_a_block(self, tmp_path):
+        """It is at work while the block runs, its files stay, what it warns of and raises arrives."""
+        script = """if True:
+            import os, sys, time, warnings
+            from pathlib import Path
+            from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
+            from legdistort.runtime.parallel import beside
+            out = Path(sys.argv[1])
+            def work():
+                warnings.warn("three is assumed", AssumptionWarning)
+                (out / "process").write_text(str(os.getpid()))
+            def refuse():
+                raise InputError("no such thing")
+            with warnings.catch_warnings(record=True, action="always") as caught:
+                with beside(work, workers=2):
+                    while not (out / "process").exists():
+                        time.sleep(0.01)
+            assert [str(w.message) for w in caught] == ["three is assumed"]
+            assert int((out / "process").read_text() or 0) != os.getpid()
+            for function, error, words in (
+                (refuse, InputError, "no such thing"),
+                (lambda: os.kill(os.getpid(), 9), LegdistortError, "a worker process died"),
+            ):
+                try:
+                    with beside(function, workers=2):
+                        pass
+                except error as raised:
+                    assert words in str(raised)
+                else:
+                    raise AssertionError(words)
+            begin = time.monotonic()
+            try:
+                with beside(lambda: time.sleep(60), workers=2):
+                    raise InputError("of the block")
+            except InputError as raised:
+                assert str(raised) == "of the block"
+            assert time.monotonic() - begin < 20
+            with beside(work, workers=1):
+                assert (out / "process").read_text() != str(os.getpid())
+            assert (out / "process").read_text() == str(os.getpid())
+        """
+        in_a_new_process(script, tmp_path)
+
+    @pytest.mark.parametrize("threads", [0, 1])
+    def test_workers_end_with_their_master(self, threads, tmp_path):
+        """Copied or not: nobody is left who would keep a folder locked."""
+        (tmp_path / "script.py").write_text(
+            "import os, sys, threading, time\n"
+            "from pathlib import Path\n"
+            "from legdistort.runtime.parallel import map_items\n"
+            "def work(i):\n"
+            "    Path(sys.path[0], f'pid{i}').write_text(str(os.getpid()))\n"
+            "    time.sleep(60)\n"
+            "if __name__ == '__main__':\n"
+            f"    for _ in range({threads}): threading.Thread(target=time.sleep, args=[60], daemon=True).start()\n"
+            "    list(map_items(work, range(2), workers=2))\n"
+        )
+        pids = [tmp_path / f"pid{i}" for i in range(2)]
+        with subprocess.Popen([sys.executable, tmp_path / "script.py"]) as master:
+            _until(lambda: all(path.exists() and path.read_text() for path in pids))
+            master.kill()
+        _until(lambda: not any(_runs(int(path.read_text())) for path in pids))
+
+
+def _until(condition, seconds=60):
+    """Wait until something is so."""
+    for _ in range(20 * seconds):
+        if condition():
+            return
+        time.sleep(0.05)
+    pytest.fail(f"not within {seconds} s")
+
+
+def _runs(pid):
+    """Whether a process runs, and is not one that has ended and that nobody has asked after."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
 def _process(i):
     time.sleep(0.05)
     return os.getpid()

@@ -3,8 +3,8 @@
 import re
 
 import pytest
-from tqdm import tqdm
 
+from legdistort.runtime.progress import Bar
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving import minimisers
 from legdistort.solving.estimation import solve
@@ -18,9 +18,9 @@ def test_iterations_are_counted(method, monkeypatch, capsys):
 
     def patient(delay, **given):
         delays.append(delay)
-        return tqdm(**given, mininterval=0)
+        return Bar(**given, mininterval=0)
 
-    monkeypatch.setattr(minimisers, "tqdm", patient)
+    monkeypatch.setattr(minimisers, "Bar", patient)
     matches = simulate_matches(n_stars=40, n_exposures=5, degree=2, seed=1).matches
     solve(matches, degree=2, method=method, max_iterations=20)
     assert "iterations" not in capsys.readouterr().err

@@ -1,0 +1,12 @@
+"""Progress bars."""
+
+from tqdm import tqdm
+
+
+class Bar(tqdm):
+    """A bar of tqdm without the thread that would watch it: processes can be copied beside it, see `map_items`."""
+
+    monitor_interval = 0
+
+    def __init__(self, *args, miniters=1, **options):
+        super().__init__(*args, miniters=miniters, **options)  # what the thread is for: slow steps after fast ones
