@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from .pipeline import check_results, run
+from .runtime.parallel import check_workers
 from .simulation.example_files import published_prior
 from .simulation.observations import simulate_exposures
 
@@ -34,6 +35,7 @@ def run_demo(*, out, small=False, camera=None, seed=0, workers=None, overwrite=F
     """
     out = Path(out)
     check_results(out, overwrite)
+    check_workers(workers)
     night = simulate_exposures(small=small, camera=camera, seed=seed, progress=progress)
     truth = night.truth
     out.mkdir(parents=True, exist_ok=True)

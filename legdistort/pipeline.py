@@ -60,8 +60,7 @@ RESULTS = (
     "detections.ecsv", "matched.ecsv",
 )  # fmt: skip
 
-#: When the command that calls `run` next began, by `time.perf_counter`: what it loads is the step "start".
-begun: ContextVar[float | None] = ContextVar("begun", default=None)
+_begun: ContextVar[float | None] = ContextVar("_begun", default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,10 +248,19 @@ def _written_summary(target, summary, timings):
     return summary
 
 
+@contextmanager
+def counted_from(begun):
+    """Context in which `run` counts the time of a command since it began (`time.perf_counter`) as the step "start"."""
+    token = _begun.set(begun)
+    try:
+        yield
+    finally:
+        _begun.reset(token)
+
+
 def _of_start():
     """Seconds by step, to begin with: what the command took that calls, if it is one."""
-    since = begun.get()
-    begun.set(None)
+    since = _begun.get()
     return {} if since is None else {"start": time.perf_counter() - since}
 
 

@@ -65,21 +65,21 @@ def do_run(a):
         given(a, options.MATCHING),
         _solving(a, with_headers=True),
     )
-    pipeline.begun.set(a.begun)
     own = ("psf", "degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
-    result = legdistort.run(
-        **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING),
-        out=a.out,
-        **{name: group.pop(name) for group in (measuring, matching, solving) for name in own if name in group},
-        measuring=measuring,
-        matching=matching,
-        solving=solving,
-        camera=_camera(a.camera),
-        coadding=given(a, options.COADDING),
-        compare=a.compare,
-        overwrite=a.overwrite,
-        **_share(a),
-    )
+    with pipeline.counted_from(a.begun):
+        result = legdistort.run(
+            **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING),
+            out=a.out,
+            **{name: group.pop(name) for group in (measuring, matching, solving) for name in own if name in group},
+            measuring=measuring,
+            matching=matching,
+            solving=solving,
+            camera=_camera(a.camera),
+            coadding=given(a, options.COADDING),
+            compare=a.compare,
+            overwrite=a.overwrite,
+            **_share(a),
+        )
     _report(a, result.solution, result.summary)
     if a.compare and not a.json:
         print("\nScatter of corrected positions, mean and standard deviation over the stars, px per axis")
