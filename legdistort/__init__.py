@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` says the same to Python
+if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` states the same for Python
     from .cameras.camera import Camera as Camera
     from .cameras.detector import Detector as Detector
     from .coaddition.mosaic import Mosaic as Mosaic

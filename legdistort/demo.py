@@ -8,7 +8,7 @@ from .simulation.observations import simulate_exposures
 
 
 def run_demo(*, out, small=False, camera=None, seed=0, workers=None, overwrite=False, progress=False):
-    """Simulate a GSAOI-like night, solve its frames and say how far the result is from the truth.
+    """Simulate a GSAOI-like night, solve its frames and report how far the result is from the truth.
 
     The static distortion is that of a GSAOI detector (published polynomials), known beforehand as the prior; every
     exposure adds a dynamic distortion of its own and a header that is 0.3" off. With ``camera="gsaoi"`` all four

@@ -1,4 +1,4 @@
-"""Errors and warnings; every message names its cause and says what to do.
+"""Errors and warnings; every message names its cause and a cure.
 
 All errors derive from `LegdistortError`, so that one ``except`` catches them
 and the command line can turn each into one clear line.
@@ -63,7 +63,7 @@ class FoldError(LegdistortError, ValueError):
 
 
 class DiskFullError(LegdistortError, OSError):
-    """No space is left where a file was to be written; nothing is there half-written: make room or write elsewhere."""
+    """No space is left for a file; nothing is there half-written: free some space or write elsewhere."""
 
 
 class ExportError(LegdistortError, ValueError):
@@ -86,7 +86,7 @@ class LegdistortWarning(AstropyUserWarning):
 
 
 class ConvergenceWarning(LegdistortWarning):
-    """A minimisation stopped before it converged; its message says how far it was."""
+    """A minimisation stopped before it converged; its message states how far it was."""
 
 
 class AssumptionWarning(LegdistortWarning):

@@ -68,7 +68,7 @@ class Option:
         It names what is read, and must not be replaced; or what is written: a file, a folder in which nothing is
         replaced, or the folder of the results of a run.
     endings : tuple of str, optional
-        Endings that a name of a file may have: they say its format.
+        Endings that a name of a file may have: they select its format.
     one_of : str, optional
         Options with the same word here exclude one another; one of them is needed if they are `required`.
     **settings

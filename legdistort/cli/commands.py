@@ -180,7 +180,7 @@ def do_solve(a):
         else:
             _refuse({"shape": a.shape}, "comes from the camera")
         if shape is None and camera is None:
-            raise InputError(f"{a.table} does not say how large the detectors are: give --shape NY NX")
+            raise InputError(f"{a.table} does not state the size of the detectors: give --shape NY NX")
         known = {"shape": shape, "camera": camera} | legdistort.Matches.read_meta(table.meta)
         matches = legdistort.Matches.from_table(table, **known)
         with timed({}, "solve"):

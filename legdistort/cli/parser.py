@@ -29,7 +29,7 @@ def main(argv=None):
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that takes no shortened options, and says in one line what is wrong, with the nearest option."""
+    """A parser that takes no shortened options, and states an error in one line, with the nearest option."""
 
     def __init__(self, **settings):
         super().__init__(allow_abbrev=False, **settings)

@@ -60,7 +60,7 @@ class Mosaic(ShownAsPrinted):
         Bits: 1 = the distortion of an exposure that contributes is extrapolated, 2 = saturated in all exposures and
         used for want of better, 4 = an exposure was rejected (`legdistort.coaddition.combination.PixelFlag`).
     context : ndarray of uint32, shape (n, ny, nx)
-        Which these are: bit i % 32 of plane i // 32 is set where ``exposures[i]`` contributes.
+        The exposures that contribute: bit i % 32 of plane i // 32 is set where ``exposures[i]`` contributes.
     wcs : `~astropy.wcs.WCS`
         TAN if the sky is known, else linear with the reference plane (0-based) as world; or the WCS asked for.
     exposures : tuple of str
@@ -73,8 +73,8 @@ class Mosaic(ShownAsPrinted):
     header : `~astropy.io.fits.Header`
         Unit, exposure times, method and what else goes into the file besides the WCS.
     extrapolated, rejected : ndarray of uint8, shape (ny, nx), or None
-        Of how many exposures the flags 1 and 4 speak: per cent of those that contribute, and of those that are there,
-        rounded up.
+        Share of the exposures to which the flags 1 and 4 apply: per cent of those that contribute, and of all that are
+        there, rounded up.
     planes : tuple of str
         What `write` puts beside the image, see `to_hdulist`.
 
@@ -291,8 +291,8 @@ def check_ending(path):
     ending = _ENDING.search(Path(path).name)
     if ending is None:
         raise InputError(
-            f"{path}: the ending says the format of a mosaic; give .fits, .fit or .fts, also with .gz or .bz2 behind, "
-            "or .asdf"
+            f"{path}: the ending selects the format of a mosaic; give .fits, .fit or .fts, also with .gz or .bz2 "
+            "behind, or .asdf"
         )
     return ending
 

@@ -149,7 +149,7 @@ class Exposure(ShownAsPrinted):
 
 
 def observed(exposures):
-    """What was observed, in words, as far as the headers say: ``{"target" | "instrument" | "filter" | ...: text}``.
+    """What was observed, in words, as far as headers state it: ``{"target" | "instrument" | "filter" | ...: text}``.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def _listed(values, most=4):
 def known_from_header(header, data, *, integer):
     """Saturation, gain, read noise and exposure time, as arguments of `Exposure`; `integer` data may show the first."""
     known = {key: _number(header, keywords) for key, keywords in KEYWORDS.items()}
-    # Detector readings are counts; calibrated data say in BUNIT that they are electrons, or electrons per second.
+    # Detector readings are counts; calibrated data state in BUNIT that they are electrons, or electrons per second.
     unit = str(header.get("BUNIT", "")).lower().replace(" ", "")
     if re.fullmatch(r"(e-?|electrons?)", unit):
         known["gain"] = 1.0

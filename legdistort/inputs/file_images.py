@@ -108,8 +108,8 @@ def of_files(exposures, ids):
         )
         if frame in ("", exposure.name):
             raise InputError(
-                f"{exposure.name} is of detector {key}, which its name does not say: files of one exposure are those "
-                f"with one name but for the detector, such as {exposure.name}_{key}; rename them"
+                f"{exposure.name} is of detector {key}, which its name does not contain: files of one exposure are "
+                f"those with one name but for the detector, such as {exposure.name}_{key}; rename them"
             )
         out.append(replace(exposure, frame=frame, detector=key))
     return out

@@ -130,7 +130,7 @@ def _plain(node):
 
 
 def _roman_header(meta):
-    """What a FITS header would say of a Roman image."""
+    """What a FITS header would contain for a Roman image."""
     exposure, instrument = meta.get("exposure") or {}, meta.get("instrument") or {}
     header = fits.Header([("TELESCOP", "ROMAN"), ("INSTRUME", str(instrument.get("name", "WFI")))])
     for key, value in (("DETECTOR", instrument.get("detector")), ("FILTER", instrument.get("optical_element"))):

@@ -5,7 +5,7 @@ from astropy.nddata.bitmask import interpret_bit_flags
 
 from ..exceptions import InputError
 
-#: The bit by which JWST and Roman say that a pixel is not to be used; their others only describe.
+#: The bit by which JWST and Roman mark a pixel that is not to be used; their others only describe.
 DO_NOT_USE = 1
 
 
@@ -26,7 +26,7 @@ def good_bits(bits):
         return None
     try:
         if isinstance(bits, str) and bits.strip().startswith("~"):
-            raise ValueError("say which are good, not which are bad")
+            raise ValueError("name those that are good, not those that are bad")
         if isinstance(bits, str) and bits.strip().isdigit():
             bits = int(bits)
         found = interpret_bit_flags(bits)

@@ -22,7 +22,7 @@ def estimate_poses(exposure, star, xy, *, names=None):
 
     The exposure with the most stars becomes the reference plane; the others are tied one after the
     other, each to all that already stand, the best connected first, then all are refined together.
-    Exposures that contradict most others get a pose as well, but have no say in those of the others.
+    Exposures that contradict most others get a pose as well, but zero weight in those of the others.
 
     Parameters
     ----------
@@ -43,26 +43,26 @@ def estimate_poses(exposure, star, xy, *, names=None):
     n_exposures = exposure.max() + 1
     names = range(n_exposures) if names is None else names
     rows = [np.flatnonzero(exposure == i) for i in range(n_exposures)]
-    has_say = np.ones(n_exposures, dtype=bool)
-    found = _tie(rows, star, xy, has_say, names)
+    weighted = np.ones(n_exposures, dtype=bool)
+    found = _tie(rows, star, xy, weighted, names)
     if _far_off(found, rows, star, xy):
-        has_say[list(pair_agreement.compare(exposure, star, xy).against)] = False
-        if not has_say.all():
-            found = _tie(rows, star, xy, has_say, names)
+        weighted[list(pair_agreement.compare(exposure, star, xy).against)] = False
+        if not weighted.all():
+            found = _tie(rows, star, xy, weighted, names)
     return found
 
 
-def _tie(rows, star, xy, has_say, names):
-    """Poses from the positions of exposures that have a say."""
-    has_say, n_stars = has_say.copy(), star.max() + 1
-    first = int(np.argmax([len(r) * say for r, say in zip(rows, has_say, strict=True)]))
+def _tie(rows, star, xy, weighted, names):
+    """Poses from the positions of exposures that have weight."""
+    weighted, n_stars = weighted.copy(), star.max() + 1
+    first = int(np.argmax([len(r) * weight for r, weight in zip(rows, weighted, strict=True)]))
     found = {first: similarity.identity()}
     sums, counts = np.zeros((n_stars, 2)), np.zeros(n_stars)
     np.add.at(sums, star[rows[first]], xy[rows[first]])
     np.add.at(counts, star[rows[first]], 1)
     while len(found) < len(rows):
         shared = {i: r[counts[star[r]] > 0] for i, r in enumerate(rows) if i not in found}
-        best = max(shared, key=lambda i: (has_say[i], len(shared[i])))
+        best = max(shared, key=lambda i: (weighted[i], len(shared[i])))
         r = shared[best]
         if len(r) < 2 or np.all(np.ptp(xy[r], axis=0) == 0):
             raise MatchError(
@@ -72,25 +72,25 @@ def _tie(rows, star, xy, has_say, names):
         mean = sums[star[r]] / counts[star[r], None]
         found[best] = similarity.robust_similarity(mean, xy[r])
         off = np.hypot(*(similarity.apply(found[best], mean) - xy[r]).T)
-        has_say[best] &= np.median(off) <= 0.05 * np.ptp(xy[r], axis=0).max()
-        if has_say[best]:
+        weighted[best] &= np.median(off) <= 0.05 * np.ptp(xy[r], axis=0).max()
+        if weighted[best]:
             back = similarity.apply(similarity.invert(found[best]), xy[rows[best]])
             np.add.at(sums, star[rows[best]], back)
             np.add.at(counts, star[rows[best]], 1)
-    return _refine_poses([found[i] for i in range(len(rows))], rows, star, xy, has_say)
+    return _refine_poses([found[i] for i in range(len(rows))], rows, star, xy, weighted)
 
 
-def _refine_poses(pose_list, rows, star, xy, has_say, n_sweeps=3):
-    """Refit every pose to the mean of those with a say, the first one's plane held by the mean of their poses."""
+def _refine_poses(pose_list, rows, star, xy, weighted, n_sweeps=3):
+    """Refit every pose to the mean of those with weight, the first one's plane fixed by the mean of their poses."""
     ends = np.array([xy.min(axis=0), xy.max(axis=0)])
     for _ in range(n_sweeps):
-        mean = _means(pose_list, rows, star, xy, has_say)
+        mean = _means(pose_list, rows, star, xy, weighted)
         refined = []
         for pose, r in zip(pose_list, rows, strict=True):
             known = r[np.isfinite(mean[star[r], 0])]  # two at least: it was tied to them
             refined.append(similarity.robust_similarity(mean[star[known]], xy[known]) if len(known) > 1 else pose)
         old, new = (
-            np.concatenate([similarity.apply(similarity.invert(pair[i]), ends) for i in np.flatnonzero(has_say)])
+            np.concatenate([similarity.apply(similarity.invert(pair[i]), ends) for i in np.flatnonzero(weighted)])
             for pair in (pose_list, refined)
         )
         common = similarity.robust_similarity(old, new)
@@ -98,9 +98,9 @@ def _refine_poses(pose_list, rows, star, xy, has_say, n_sweeps=3):
     return pose_list
 
 
-def _means(pose_list, rows, star, xy, has_say):
-    """Mean position (n_stars, 2) of every star in the exposures with a say."""
-    voices = np.flatnonzero(has_say)
+def _means(pose_list, rows, star, xy, weighted):
+    """Mean position (n_stars, 2) of every star in the exposures with weight."""
+    voices = np.flatnonzero(weighted)
     back = np.concatenate([similarity.apply(similarity.invert(pose_list[i]), xy[rows[i]]) for i in voices])
     return star_means(back, star[np.concatenate([rows[i] for i in voices])], star.max() + 1)
 

@@ -151,11 +151,11 @@ def write_stars(solution, path, *, epoch=None, overwrite=False):
 
 
 def write_by_ending(table, path, *, overwrite=False):
-    """Write a table in the format that the ending of the path says: as for `write_stars`."""
+    """Write a table in the format that the ending of the path selects: as for `write_stars`."""
     kind = WRITTEN.get(Path(path).suffix.lower())
     table = table[[name for name in table.colnames if not isinstance(table[name], SkyCoord)]]  # ra, dec are beside it
     if kind is None:
-        raise InputError(f"{path}: the ending says the format, give one of {', '.join(WRITTEN)}")
+        raise InputError(f"{path}: the ending selects the format, give one of {', '.join(WRITTEN)}")
     write_table(table, path, kind=kind, overwrite=overwrite)
 
 

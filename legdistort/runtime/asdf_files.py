@@ -37,7 +37,7 @@ ASDF_STANDARD = "1.5.0"
 SCHEMAS = "asdf://legdistort/schemas/"
 #: Bytes that the arrays of a file may take in memory, unless more are allowed.
 MAX_BYTES = 2 << 30
-#: Tags of plain trees: arrays, and what asdf says of itself.
+#: Tags of plain trees: arrays, and what asdf records of itself.
 CORE = ("tag:stsci.edu:asdf/core/",)
 #: Tags of a tree with a gwcs inside.
 WITH_WCS = (
@@ -92,7 +92,7 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
         raise InputError(f"{path} is not a readable ASDF file: not a file")
     try:
         # absolute, since asdf takes ~x for somebody's home
-        quiet = warnings.catch_warnings(action="ignore", category=asdf.exceptions.AsdfWarning)  # the schema has the say
+        quiet = warnings.catch_warnings(action="ignore", category=asdf.exceptions.AsdfWarning)  # the schema decides
         with io.BytesIO(content) if inside else Path(path).absolute().open("rb") as file, quiet:
             with nullcontext(content) if inside else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
                 _check_blocks(whole, _check_yaml(whole, tags, max_bytes), max_bytes)
@@ -248,19 +248,19 @@ def _is_whole(data, checksum, packing, unpacked):
     return hashlib.md5(data, usedforsecurity=False).digest() == checksum
 
 
-def _check_node(node, where, room):
-    """Check references and sizes of arrays below a node of the tree; `room` holds the bytes left for arrays."""
+def _check_node(node, where, left):
+    """Check references and sizes of arrays below a node of the tree; `left` holds the bytes left for arrays."""
     if isinstance(node, dict):
         if "$ref" in node:
             raise ValueError(f"entry {where or 'tree'} refers to another file, which is not followed")
         if "/core/ndarray-" in getattr(node, "_tag", "") and "data" not in node:
-            _check_array(node, where, room)
+            _check_array(node, where, left)
         for key, value in node.items():
             _check_count(key, value, where)
-            _check_node(value, f"{where}.{key}" if where else str(key), room)
+            _check_node(value, f"{where}.{key}" if where else str(key), left)
     elif isinstance(node, list):
         for k, value in enumerate(node):
-            _check_node(value, f"{where}[{k}]", room)
+            _check_node(value, f"{where}[{k}]", left)
 
 
 def _check_count(key, value, where):
@@ -271,12 +271,12 @@ def _check_count(key, value, where):
             raise ValueError(f"entry {where}.{key} has {each}, beyond what can be".replace("entry .", "entry "))
 
 
-def _check_array(node, where, room):
+def _check_array(node, where, left):
     if not isinstance(node.get("source"), int):
         raise ValueError(f"array {where} lies in another file ({str(node.get('source'))[:80]!r}), which is not opened")
     itemsize = asdf_datatype_to_numpy_dtype(node["datatype"], node.get("byteorder", "big")).itemsize
-    room[0] -= math.prod(int(n) for n in node["shape"]) * itemsize  # strides may make much of little
-    if room[0] < 0:
+    left[0] -= math.prod(int(n) for n in node["shape"]) * itemsize  # strides may make much of little
+    if left[0] < 0:
         raise _TooLargeError(f"array {where} has shape {list(node['shape'])}: too large with those before it.")
 
 

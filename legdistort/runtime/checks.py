@@ -24,7 +24,7 @@ def check_counts(**counts):
 
 
 def first_line(error):
-    """What an error of a library says, in one line."""
+    """The message of an error of a library, in one line."""
     text = getattr(error, "message", None) or str(error).strip() or type(error).__name__
     return text.strip().splitlines()[0]
 

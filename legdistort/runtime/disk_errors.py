@@ -10,14 +10,14 @@ _SOME = 1 << 20  # bytes; a disk with less than these is full
 
 
 def is_full(error, folder):
-    """Whether an error, or one that led to it, is that of a disk without room for more.
+    """Whether an error, or one that led to it, is that of a disk without space for more.
 
     Parameters
     ----------
     error : BaseException
     folder : path
         Where was written. Writers do not always hand the number of an error on (``ndarray.tofile``, astropy): then the
-        disk is asked. What the error says is of no use, since it may contain anything, such as a path.
+        disk is asked. The text of the error is not used, since it may contain anything, such as a path.
     """
     numbers = {each.errno for each in _with_causes(error) if isinstance(each, OSError)}
     if numbers & {ENOSPC, EDQUOT, EFBIG}:
@@ -51,12 +51,12 @@ def told_when_full(path, folder):
     """Errors of a full disk as `DiskFullError`, which names `path`; it is written in `folder`."""
     try:
         yield
-    except LegdistortError:  # which says what it is
+    except LegdistortError:  # it has a message of its own
         raise
     except Exception as error:
         if not is_full(error, folder):
             raise
         raise DiskFullError(
-            f"No space left on the disk for {path}: nothing was replaced or left half-written; make room (or allow "
-            "larger files: ulimit -f), or write elsewhere"
+            f"No space left on the disk for {path}: nothing was replaced or left half-written; free some space (or "
+            "allow larger files: ulimit -f), or write elsewhere"
         ) from None

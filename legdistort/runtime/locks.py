@@ -107,7 +107,7 @@ def remove_dead(parent, prefix):
 
 
 def remove(folder):
-    """Remove a folder that is locked, the file of the lock last: it says whose the folder is."""
+    """Remove a folder that is locked, the file of the lock last: it shows that the folder is ours."""
     with suppress(FileNotFoundError):
         for item in folder.iterdir():
             if item.is_dir() and not item.is_symlink():

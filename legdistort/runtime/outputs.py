@@ -51,9 +51,9 @@ def check_file(path, *, overwrite=False):
 
 
 def check_ending(path, endings):
-    """Raise `InputError` if the ending of a name, in whatever case, is none of those that say a format."""
+    """Raise `InputError` if the ending of a name, in whatever case, selects none of the formats."""
     if Path(path).suffix.lower() not in endings:
-        raise InputError(f"{path}: the ending says the format, give {' or '.join(endings)}")
+        raise InputError(f"{path}: the ending selects the format, give {' or '.join(endings)}")
 
 
 def try_to_write(path):
@@ -209,7 +209,7 @@ def replacing_folders(outs):
     Raises
     ------
     LegdistortError
-        As `replacing_folder` does. If a disk fails between one and the next it says which have changed.
+        As `replacing_folder` does. If a disk fails between one and the next, the error names those that have changed.
     """
     done = []
     try:

@@ -608,7 +608,7 @@ def test_the_frames_of_a_mosaic_survive_it(demo, tmp_path, capsys):
 
 def test_the_ending_of_a_mosaic_is_looked_at_first(demo, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("legdistort.open_exposures", lambda *_, **__: pytest.fail("the work began"))
-    failed(capsys, main(_coadd(demo, tmp_path / "m.png")), "m.png: the ending says the format of a mosaic")
+    failed(capsys, main(_coadd(demo, tmp_path / "m.png")), "m.png: the ending selects the format of a mosaic")
 
 
 def test_keck_lists_by_the_command_line(shared_data, tmp_path, capsys):
@@ -718,7 +718,7 @@ def test_options_that_others_leave_without_effect_are_refused(words, message, ni
         ("measure FRAMES --psf moffat --write-psf p --out o.ecsv", "leave write_psf out, or give --psf effective"),
         ("measure FRAMES --profile shared --write-psf p --out o.ecsv", "leave write_psf out, or give --psf effective"),
         ("run FRAMES --layout fit --out o", "--layout fit is for exposures with several detectors"),
-        ("run FRAMES --static hold --out o", "say which camera it is (--camera)"),
+        ("run FRAMES --static hold --out o", "name the camera (--camera)"),
         ("run FRAMES --exposure-degree 1 --out o", "belongs to --static fit"),
         ("run FRAMES --motion-sigma 1 --out o", "belong to --motion"),
         ("prior gsaoi-2 --frame tel --out o.asdf", "leave --frame out"),
@@ -775,7 +775,7 @@ def test_another_epoch_needs_motions(demo, tmp_path, capsys):
 def test_a_file_of_another_type_is_refused(words, night, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     line = [word for each in words.split() for word in (map(str, night) if each == "FRAMES" else [each])]
-    failed(capsys, main(line), "the ending says the format, give .")
+    failed(capsys, main(line), "the ending selects the format, give .")
 
 
 def test_outputs_are_tried_and_not_only_permitted(night, tmp_path, capsys, monkeypatch):

@@ -340,7 +340,7 @@ def test_command(solution, tmp_path, capsys):
     assert main([*command, str(tmp_path / "out.ecsv")]) == 1
     assert "exists" in capsys.readouterr().err
     assert main([*command, str(tmp_path / "out.txt")]) == 1
-    assert "the ending says the format" in capsys.readouterr().err
+    assert "the ending selects the format" in capsys.readouterr().err
 
 
 def test_files_keep_what_is_needed(solution, tmp_path):

@@ -205,7 +205,7 @@ def test_asdf_files(mosaic, tmp_path, name):
 )
 def test_other_endings_are_refused(mosaic, tmp_path, name):
     (tmp_path / name).write_text("precious")
-    with pytest.raises(InputError, match=rf"{name}: the ending says the format of a mosaic; give \.fits"):
+    with pytest.raises(InputError, match=rf"{name}: the ending selects the format of a mosaic; give \.fits"):
         mosaic.write(tmp_path / name, overwrite=True)
     assert (tmp_path / name).read_text() == "precious"
     assert names(tmp_path) == [name]

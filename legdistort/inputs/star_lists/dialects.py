@@ -93,7 +93,7 @@ DIALECTS = (
 
 
 def understand(table, columns, *, without_errors=False):
-    """What the columns of a table are in the words of the contract; where the caller says it, that holds.
+    """What the columns of a table are in the words of the contract; what the caller states goes before.
 
     Parameters
     ----------
