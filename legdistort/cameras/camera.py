@@ -61,8 +61,9 @@ class Camera(ShownAsPrinted):
         all detectors, to which the layouts are shifted.
     common_sigma : array_like, shape (2, n_modes), optional
         Uncertainty of a distortion of the focal plane that all detectors have in common, standard deviations of its
-        modes in pixels, beside that of each detector; infinite where nothing is known. Exposures cannot distinguish it
-        from one of their own, so that layouts and static distortions found from them leave it out. None: none.
+        modes in pixels, beside that of each detector; infinite where nothing is known. It is a degeneracy: exposures do
+        not distinguish it from one of their own, so that layouts and static distortions found from them do not contain
+        it. None: no such uncertainty.
 
     Raises
     ------
@@ -303,8 +304,8 @@ class Camera(ShownAsPrinted):
         key = exposure.detector
         if key is None:
             raise InputError(
-                f"{exposure.name} does not say which detector of camera {self.name} it is: read all extensions of its "
-                "file by their name (ext='SCI', --ext SCI)"
+                f"{exposure.name} does not state which detector of camera {self.name} it is: read all extensions of "
+                "its file by their name (ext='SCI', --ext SCI)"
             )
         if key not in self.detectors:
             raise InputError(

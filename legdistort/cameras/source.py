@@ -40,7 +40,7 @@ class Source:
     sphere : float or None
         Size in degrees of the unit of the outputs, if these are longitude and latitude.
     usual : str or None
-        Direction that is taken if nobody says otherwise.
+        Direction that is taken unless another is given.
     from_middle : bool
         Whether the inputs are offsets from pixel (nx // 2, ny // 2), 0-based.
     files : tuple of paths
@@ -65,12 +65,12 @@ class Source:
         return f"<Source {self.name}: {self.kind}>"
 
     def stated(self, *, shape=None, direction=None, origin=None):
-        """The same, complete with what the caller says; who contradicts the source is refused.
+        """The same, completed by what the caller states; what contradicts the source is refused.
 
         Raises
         ------
         InputError
-            If something is said that cannot be, or something needed is not known.
+            If a statement is impossible, or something that is needed is not known.
         """
         if direction is not None and direction not in DIRECTIONS:
             raise InputError(f"direction must be {' or '.join(map(repr, DIRECTIONS))}, got {direction!r}")

@@ -224,7 +224,7 @@ class Distortion(ShownAsPrinted):
                 "were changed since; solve again, or take the file as it was written"
             )
         if not np.allclose(box, inverse.valid, rtol=0, atol=1e-3):
-            raise InputError(f"{whose} is said to be valid in {inverse.valid}, but the detector's image lies in {box}")
+            raise InputError(f"{whose} is stated to be valid in {inverse.valid}, the detector's image lies in {box}")
 
     @cached_property
     def shared_correction(self) -> Model:

@@ -109,6 +109,6 @@ def header_epoch(header):
                 return year(Time(value, format="mjd"))
             if isinstance(value, str):
                 return year(Time(value.strip(), scale="utc"))
-        except ValueError:  # a header that says nothing readable says nothing
+        except ValueError:  # what cannot be read counts as absent
             continue
     return None

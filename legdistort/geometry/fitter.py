@@ -80,7 +80,7 @@ class LegendreDistortionFitter(Fitter):
             a position out. None weighs all alike.
         clip : float, optional
             Leave out positions that deviate by more standard errors, at the observed scale (from the median) where that
-            is larger than the weights say, from a fit of the others. ``fit_info["used"]`` says which are left.
+            is larger than the weights imply, from a fit of the others. ``fit_info["used"]`` marks those that are left.
             (`~astropy.modeling.fitting.FittingWithOutlierRemoval` fits one output alone, and a map of the plane has
             two: it cannot take its place.)
         inplace : bool

@@ -77,8 +77,8 @@ def compare(exposure, star, xy):
         few = np.unique(np.linspace(0, len(a) - 1, min(len(a), MOST_STARS)).astype(int))
         n_off, n = len(few) - _n_near(xy[rows[i]][a[few]], xy[rows[k]][b[few]]), len(few)
         contradict[i, k] = contradict[k, i] = beyond_chance(n_off, n, 1 - (1 - GROSS) ** 2)
-        telling = n - _OF_MAP  # so many stars the map may have followed
-        agree[i, k] = telling > 0 and bdtrc(telling - n_off - 1, telling, NEAR_BY_CHANCE) < SIGNIFICANT
+        free = n - _OF_MAP  # so many stars the map may have followed
+        agree[i, k] = free > 0 and bdtrc(free - n_off - 1, free, NEAR_BY_CHANCE) < SIGNIFICANT
     return _verdict(agree, contradict)
 
 

@@ -25,7 +25,7 @@ from .storage import wcs_tree
 
 log = logging.getLogger(__name__)
 
-#: What the header of an image says of a WCS that was written into it; `attach` takes it for its own later.
+#: What the header of an image records of a WCS that was written into it; `attach` takes it for its own later.
 _HISTORY = "legdistort {} wrote the WCS of this image"
 #: Keywords of the primary WCS and its distortion, all of which give way; those of alternative WCSs end in a letter.
 WCS_KEYWORDS = re.compile(

@@ -31,7 +31,7 @@ class ExposureWCS(gwcs.WCS):
     """
 
     def outside_footprint(self, world_arrays: Any) -> Any:
-        """World coordinates as they are: the bounding box of the pixels, and the models, say what is outside."""
+        """World coordinates as they are: the bounding box of the pixels, and the models, determine what is outside."""
         return world_arrays
 
     def pixel_to_world_values(self, *pixel_arrays: Any) -> Any:
@@ -48,7 +48,7 @@ class ExposureWCS(gwcs.WCS):
 
 
 def _piecewise(function, arrays):
-    """What a function of coordinates says of arrays, `_PIECE` positions at a time."""
+    """The values of a function of coordinates for arrays, `_PIECE` positions at a time."""
     if any(isinstance(array, u.Quantity) for array in arrays):
         return function(*arrays)
     if len({np.shape(array) for array in arrays}) > 1:  # which the stock class does not take

@@ -121,8 +121,8 @@ def header_error(header, pose, distortion, sky):
     if not wcs.has_celestial:
         raise InputError(f"the header compared with exposure {distortion.name} has no celestial WCS")
     frame = wcs_to_celestial_frame(wcs)
-    said = SkyCoord(*wcs.all_pix2world(points, 0).T, unit="deg", frame=frame)
-    forward = distortion(similarity.apply(pose, sky.from_sky(said)))
+    stated = SkyCoord(*wcs.all_pix2world(points, 0).T, unit="deg", frame=frame)
+    forward = distortion(similarity.apply(pose, sky.from_sky(stated)))
     there = exact.transform_to(frame).spherical
     inverse = _pixels(wcs, np.column_stack([there.lon.deg, there.lat.deg]))
     return tuple(_largest(found - points) for found in (forward, inverse))

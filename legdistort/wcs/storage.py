@@ -65,8 +65,8 @@ def write_wcs(solution, name, path, *, detector=None, overwrite=False):
 def read_wcs(path: StrPath, *, max_bytes: int | None = None) -> GWCS:
     """Read the WCS of an exposure, ``wcs/NAME.asdf``, as it was in memory.
 
-    The stock models in the file do not know where they end, and the word of the file is not taken for the error of the
-    inverse: here the certificate is checked again, and what lies beyond the detector and its image becomes NaN.
+    The stock models in the file have no limits, and its certificate of the inverse is not trusted: here the error of
+    the inverse is measured again, and positions beyond the detector and its image become NaN.
 
     Parameters
     ----------

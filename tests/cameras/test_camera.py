@@ -684,7 +684,7 @@ class TestPrediction:
         assert main(shell.split()) == 0
 
     def test_shape_and_camera(self, gsaoi):
-        with pytest.raises(InputError, match="shape and camera both say how large the field is"):
+        with pytest.raises(InputError, match="shape and camera both state the size of the field"):
             legdistort.predict(n_exposures=4, n_stars=50, sigma=0.01, shape=(2048, 2048), camera=gsaoi)
         with pytest.raises(InputError, match=r"camera must be a legdistort\.Camera, got str"):
             legdistort.predict(n_exposures=4, n_stars=50, sigma=0.01, camera="gsaoi")
@@ -786,7 +786,7 @@ class TestFrames:
             assert np.array_equal(np.sort(parted[name]), np.sort(together[name]))
         with pytest.raises(InputError, match="names none of the detectors A, B"):
             legdistort.Camera("c", dict(zip("AB", camera.detectors.values(), strict=True))).of_detectors(apart)
-        with pytest.raises(InputError, match="is of detector 1, which its name does not say"):
+        with pytest.raises(InputError, match="is of detector 1, which its name does not contain"):
             camera.of_detectors([replace(apart[0], name="frame")])
 
     def test_layout_by_headers(self, frames):

@@ -101,7 +101,7 @@ def test_a_certified_inverse_is_checked_and_taken():
         Distortion(d.coefficients, d.shape, "exp7", wrong)
     with pytest.raises(InputError, match=r"misses by .* coefficients or inverse were changed since"):
         replace(again, coefficients=1.01 * d.coefficients)
-    with pytest.raises(InputError, match="is said to be valid in"):
+    with pytest.raises(InputError, match="is stated to be valid in"):
         Distortion(d.coefficients, d.shape, certified=replace(d.inverse, valid=(0.0, 1.0, 0.0, 1.0)))
 
 

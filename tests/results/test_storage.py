@@ -407,7 +407,7 @@ def test_a_folded_solution_can_be_written(solution, tmp_path):
             lambda e: e["inverse"].update(error_px=0.5),
             r"inverse: .* it should be the fitted inverse with its certificate",
         ),
-        (lambda e: e["inverse"].update(valid_undistorted_px=[-1e6, 1e6, -1e6, 1e6]), "is said to be valid in"),
+        (lambda e: e["inverse"].update(valid_undistorted_px=[-1e6, 1e6, -1e6, 1e6]), "is stated to be valid in"),
         (lambda e: e.update(shape=[300, 501]), "misses by"),
     ],
 )
@@ -493,7 +493,7 @@ def shifted(tree):
             "entry meta.inverse_error_px: 2.0 is greater .* it should be a round",
         ),
         (lambda m: m.update(valid_undistorted_px=[0, 1, 2]), r"entry meta\.valid_undistorted_px: .*x_min, x_max"),
-        (lambda m: m.update(valid_undistorted_px=[0.0, 1, 2, 3]), "is said to be valid in"),
+        (lambda m: m.update(valid_undistorted_px=[0.0, 1, 2, 3]), "is stated to be valid in"),
         (lambda m: m.update(wcs=3), "entry meta.wcs: .*; it should be a gwcs"),
         (lambda m: m.pop("exposure"), "'exposure' is a required property"),
         (shifted, "should be x, y plus two Legendre series"),
