@@ -15,7 +15,7 @@ from .star_lists import StarList
 
 log = logging.getLogger(__name__)
 
-#: Part of the field within which stars must agree that are said to be the same, once a similarity is taken out.
+#: Part of the field within which stars that are taken to be the same must agree, once a similarity is taken out.
 _AGREEMENT = 0.05
 #: Part of the field that the plane of the catalogue may be off.
 _MARGIN = 0.5

@@ -15,7 +15,7 @@ from ..inputs.matches import Matches
 
 
 def is_needed(table, exposures):
-    """Whether exposures have several detectors, and headers do not say how these lie."""
+    """Whether exposures have several detectors, and headers do not state how these lie."""
     if exposures is not None:
         return any(e.detector is not None and e.wcs is None for e in exposures)
     if "detector" not in table.colnames:
@@ -40,7 +40,7 @@ def shapes_of(table, exposures, shape):
 
 
 def match_parts(table, shapes, match):
-    """`Matches` over all detectors, with a camera whose layout the dithers told.
+    """`Matches` over all detectors, with a camera whose layout the dithers determine.
 
     Parameters
     ----------
@@ -87,8 +87,8 @@ def _tell_apart(groups):
                 listed = " | ".join(", ".join(each) for each in groups)
                 raise MatchError(
                     f"how detectors {group[0]} and {other[0]} lie to each other is not known: no star was found on "
-                    f"both (detectors that share stars: {listed}), and neither a camera nor headers say; dither over "
-                    "the gap, or give the camera"
+                    f"both (detectors that share stars: {listed}), and neither a camera nor headers state it; dither "
+                    "over the gap, or give the camera"
                 ) from None
 
 

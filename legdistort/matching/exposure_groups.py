@@ -24,7 +24,7 @@ BLIND_TRIES = 8
 #: Pairs of an exposure registered at most, those of largest overlap first.
 PARTNERS = 6
 #: Stars that two exposures ought to share before a failure to register counts against them.
-TELLING = 25
+ENOUGH = 25
 #: A pair is registered anew when it holds less than this part of the stars that the exposures share by all other pairs.
 COMPLETE = 0.97
 
@@ -179,7 +179,7 @@ def interlink(lists, group, *, tolerance=None, progress=False):
                 found = _register_again(lists[i], lists[j], rows, columns, step, tolerance)
                 if found is not None and (before is None or len(found.source) > len(before.source)):
                     known[i, j] = found
-    return known, _misfits(known, [pair for pair in partners if overlaps[pair] >= TELLING])
+    return known, _misfits(known, [pair for pair in partners if overlaps[pair] >= ENOUGH])
 
 
 def _register_again(source, target, rows, columns, step, tolerance):
@@ -218,10 +218,10 @@ def _partners(overlaps):
     return sorted(chosen)
 
 
-def _misfits(known, telling):
+def _misfits(known, expected):
     """Exposures that register with fewer than half of those with which they should, the worst first."""
     made = {frozenset(pair) for pair in known}
-    pairs = [frozenset(pair) for pair in telling]
+    pairs = [frozenset(pair) for pair in expected]
     out = {}
     while True:
         votes = defaultdict(list)

@@ -1,4 +1,4 @@
-"""What the WCSs in the headers say of where exposures lie: tried first in matching, and never trusted."""
+"""Poses of exposures by the WCSs in their headers: tried first in matching, and always verified."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from ..geometry.tangent_plane import TangentPlane
 from ..inputs.sky_wcs import to_icrs
 from ..priors.from_headers import undistorted_plane
 
-#: Headers that disagree with the others by more than this part of the field do not say where the field lies.
+#: Headers that disagree with the others by more than this part of the field do not determine where the field lies.
 TOLERANCE = 0.1
 
 
@@ -82,12 +82,12 @@ class HeaderPoses:
         -------
         poses : dict
         sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
-            Where their plane lies; None, with the poses as they were, if the headers do not say.
+            Where their plane lies; None, with the poses as they were, if the headers do not determine it.
         """
         names = [name for name in found if name in self.poses]
         if not names:
             return found, None
-        # every header says where the plane of the poses lies in the plane of the sky
+        # every header states where the plane of the poses lies in the plane of the sky
         steps = np.array([similarity.compose(similarity.invert(found[n]), self.poses[n]) for n in names])
         size = max(max(self.shapes[n]) for n in names)
         corners = np.array([similarity.apply(step, _grid(self.shapes[names[0]], 2)) for step in steps])

@@ -60,8 +60,8 @@ def match(
     """Find out which detections are the same star.
 
     Exposures may differ by any shift that leaves an overlap, any rotation, a flip, several per cent of scale
-    and a distortion of about one per cent of the field. Header WCSs, where there are any, are tried first and
-    never trusted: what does not stand out from chance is not a match.
+    and a distortion of about one per cent of the field. Header WCSs, where there are any, are tried first
+    and always verified: what does not stand out from chance is not a match.
 
     Parameters
     ----------
@@ -75,8 +75,8 @@ def match(
         there is no camera.
     camera : `legdistort.Camera`, optional
         Where exposures have several detectors, distinguished by the column ``detector``: they are matched as one, the
-        focal plane. Without it the headers of `exposures` with several detectors say how these lie; without these
-        the dithers, where stars cross from one to another.
+        focal plane. Without it their layout is that of the headers of `exposures`; without these the dithers determine
+        it, where stars cross from one detector to another.
     min_exposures : int
         A star is kept when it was found in that many exposures.
     columns : dict, optional
@@ -88,7 +88,7 @@ def match(
         Detections with any of these bits in ``flags`` are not used.
     isolation : float or None
         Largest ``crowding`` of a detection, see `legdistort.measurement.crowding`; deformed ones are left out too.
-        They help to find out which star is which all the same. None = all are kept. Tables without the column are
+        They still help to identify stars before that. None = all are kept. Tables without the column are
         taken as they are.
     progress : bool
         Show progress bars.

@@ -173,7 +173,7 @@ def _triangles(xy, n_neighbours):
     order = np.argsort(sides, axis=1)
     sides = np.take_along_axis(sides, order, axis=1)
     corners = np.take_along_axis(corners, order, axis=1)
-    # slim triangles have no orientation, and their shape says little
+    # slim triangles have no orientation, and their shape distinguishes little
     keep = sides[:, 0] + sides[:, 1] > 1.03 * sides[:, 2]
     sides, corners = sides[keep], corners[keep]
     size = np.log(sides[:, 2]) * SHAPE_TOLERANCE / SCALE_TOLERANCE
