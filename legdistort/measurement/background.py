@@ -267,12 +267,12 @@ def _means_of_meshes(image, use, mesh):
         )
         for values in (np.where(use, image, 0), use.astype(np.float32))
     )
-    told = n >= _FEWEST
-    if not told.any():
+    enough = n >= _FEWEST
+    if not enough.any():
         return None
-    mean = np.where(told, total / np.maximum(n, 1), np.nan)
+    mean = np.where(enough, total / np.maximum(n, 1), np.nan)
     smooth = _medians_around(mean)
-    return np.where(np.isfinite(smooth), smooth, np.median(mean[told]))
+    return np.where(np.isfinite(smooth), smooth, np.median(mean[enough]))
 
 
 def _medians_around(mesh):

@@ -28,8 +28,8 @@ def camera(exposure):
     """What an exposure has in common with all others of one gain."""
     unit = str(exposure.header.get("BUNIT", "")).lower()
     per_second = "/s" in unit or "s-1" in unit or "s**-1" in unit
-    told = [str(exposure.header.get(key, "")).strip() for key in KEYWORDS]
-    return (*told, exposure.shape, exposure.exposure_time if per_second else None)
+    values = [str(exposure.header.get(key, "")).strip() for key in KEYWORDS]
+    return (*values, exposure.shape, exposure.exposure_time if per_second else None)
 
 
 def pooled(photons):

@@ -1,9 +1,9 @@
 """How much other stars disturb the position of a star.
 
 "We only consider relatively well-isolated stars in order to avoid any confusion" (Bernard et al. 2017, section 5.2.1).
-Two things are asked of every star. *Detected neighbours*: how far would their light pull the position if it were not
-subtracted, in standard errors of the position (`crowding`)? Subtraction leaves a small part of that, some per cent.
-*Neighbours too close to be detected* show in the shape of the star (`is_deformed`).
+Two quantities are computed for every star. *Detected neighbours*: how far their light would pull the position if it
+were not subtracted, in standard errors of the position (`crowding`). Subtraction leaves a small part of that, some per
+cent. *Neighbours too close to be detected*: whether the shape of the star shows one (`is_deformed`).
 """
 
 from functools import lru_cache
@@ -37,7 +37,7 @@ def check_isolation(limit):
 def is_isolated(table, limit=LIMIT):
     """Whether detections have neither `crowding` above a limit nor the flag ``DEFORMED``.
 
-    Tables without a column ``crowding``, of other programs, say nothing of it: all their rows pass.
+    Tables without a column ``crowding``, of other programs, do not have it: all their rows pass.
 
     Parameters
     ----------
@@ -167,9 +167,9 @@ def is_deformed(shapes, covariance, *, xy, snr, chi2, usable):
     # the quartile stays what it is among single stars even where half of the others are blends
     misfit = max(0.0, np.quantile((chi2[best] - 1) / snr[best] ** 2, 0.25))
     covariance = covariance * (1 + misfit * snr**2)[:, None, None]
-    telling = np.zeros(len(shapes), dtype=bool)
-    telling[order[: max(len(best), np.count_nonzero(snr[order] > _SHAPELY))]] = True
-    off = shapes - shape_field(shapes, covariance, xy, telling, degree=2, fallback=np.median(shapes[best], axis=0))
+    bright = np.zeros(len(shapes), dtype=bool)
+    bright[order[: max(len(best), np.count_nonzero(snr[order] > _SHAPELY))]] = True
+    off = shapes - shape_field(shapes, covariance, xy, bright, degree=2, fallback=np.median(shapes[best], axis=0))
     spread = (np.quantile(np.abs(off[best]), 0.25, axis=0) / _QUARTILE) ** 2
     noise = np.median(np.einsum("nii->ni", covariance[best]), axis=0)
     deviations = deviation(off, np.linalg.inv(covariance + np.diag(np.maximum(spread - noise, 0))))

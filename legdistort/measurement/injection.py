@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 #: Distance of injected stars from one another and from the detections of the frame, in FWHM.
 APART, AWAY = 8.0, 3.0
-#: Fewest that must find room in a frame at a time.
+#: Fewest for which a frame must have space at a time.
 ROOM = 4
 #: Fluxes that are tried by default.
 N_FLUXES = 12
@@ -63,7 +63,8 @@ def calibrate_frame(exposure, remeasure, *, psf=None, threshold=5.0, widths=None
     Raises
     ------
     InputError
-        For a frame without stars if `widths` or the gain are missing, without room, or saturated at the faintest stars.
+        For a frame without stars if `widths` or the gain are missing, without space for stars, or saturated at the
+        faintest stars.
     """
     name, rng = exposure.name, np.random.default_rng([seed, zlib.crc32(exposure.name.encode())])
     frame, centres, shape = locate_stars(exposure, threshold=threshold)
@@ -155,7 +156,7 @@ def _offsets(exposure, centres, flux, profile, *, photon, again, rng):
         xy = free_positions(exposure, centres, fwhm, n=n - done, rng=rng)
         if len(xy) < min(ROOM, n - done):
             raise InputError(
-                f"{exposure.name}: no room for injected stars of FWHM {fwhm:.3g} px: only {len(xy)} places lie "
+                f"{exposure.name}: no space for injected stars of FWHM {fwhm:.3g} px: only {len(xy)} places lie "
                 f"{AWAY:g} FWHM from its {len(centres)} detections, clear of edges and bad pixels; give a smaller "
                 "fwhm, another frame, or a higher threshold"
             )
@@ -207,7 +208,7 @@ def free_positions(exposure, taken, fwhm, *, n, rng):
     fwhm : float
         Of the stars that shall stand there [pix].
     n : int
-        So many, or as many as find room `APART`, `AWAY` from the detections, their boxes free of bad pixels.
+        So many, or as many as there is space for, `APART`, `AWAY` from the detections, their boxes free of bad pixels.
     rng : `~numpy.random.Generator`
 
     Returns

@@ -37,8 +37,8 @@ def calibrate_noise(
 
     As in section 5.2.2 of Bernard et al. 2017: stars of given flux are added at known random positions, with photon
     noise, and measured by `legdistort.measure`. They stand three FWHM or more from every detection and eight from one
-    another, as many in one copy of the frame as find room. They have the effective PSF of the frame, where `measure`
-    would take that, and are measured with it; else, and where `fwhm` is given, the median Moffat profile.
+    another, as many in one copy of the frame as it has space for. They have the effective PSF of the frame, where
+    `measure` would take that, and are measured with it; else, and where `fwhm` is given, the median Moffat profile.
 
     Parameters
     ----------
@@ -67,7 +67,8 @@ def calibrate_noise(
     Raises
     ------
     InputError
-        For arguments out of range, a frame without stars if `fwhm` or the gain are missing, and one without room.
+        For arguments out of range, a frame without stars if `fwhm` or the gain are missing, and one without space
+        for stars.
 
     Warns
     -----

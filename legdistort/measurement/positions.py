@@ -67,11 +67,11 @@ def measure(
     neighbours subtracted. (Photon noise taken from the data instead of a model would bias the fit.) In images
     with stars narrower than 3 pixels the profile is averaged over every pixel.
 
-    Pixel variances are ``uncertainty**2`` if the exposure has that plane, else the observed variance of the sky
-    (at least that of the read noise) plus ``star light / gain``. Where the fit leaves more than noise (reduced
-    chi2 above 1 by more than chance), errors are scaled up accordingly; of positions measured with an effective PSF
-    made from the stars of the exposure, where it leaves more than of the other stars: what it leaves of all of them is
-    its own error, which the errors of positions have in them.
+    Pixel variances are ``uncertainty**2`` if the exposure has that plane, else the observed variance of the sky (at
+    least that of the read noise) plus ``star light / gain``. Where the residuals exceed the noise (reduced chi2 above 1
+    by more than chance), errors are scaled up accordingly. With an effective PSF made from the stars of the exposure
+    they are scaled up where the residuals of a star exceed those of the other stars: the residuals that all stars have
+    are the error of the PSF itself, which the errors of positions include.
 
     Parameters
     ----------
@@ -83,18 +83,18 @@ def measure(
         Detection limit, signal-to-noise ratio of the filtered image; stars that do not reach it when fitted are
         flagged ``INSIGNIFICANT``.
     max_stars : int, optional
-        Keep the brightest so many usable detections of every frame, and no others.
+        Keep only this number of usable detections in every frame, the brightest.
     box : int, optional
         Side of the square fitted [pix], odd; by default about 4 FWHM.
     profile : {"own", "shared", "linear"}
-        Whether every star has a shape of its own, or all have the one that the bright stars of the frame have in the
-        mean, or one that varies linearly over the field: then a star has four free parameters, and stars near the
-        detection limit and fluxes become more precise; ``DEFORMED`` is not flagged.
+        Whether every star has a shape of its own, or all have the mean shape of the bright stars of the frame, or one
+        that varies linearly over the field. With the latter two a star has four free parameters; positions near the
+        detection limit and fluxes are more precise, and ``DEFORMED`` is not flagged.
     blends : {"together", "alone"}
         Whether stars within two FWHM of each other are fitted together, with one shape and one background, or one by
         one with the models of the others subtracted.
     gain, read_noise, saturation : float, optional
-        In e-/ADU, e-, ADU; for all exposures instead of what each of them says.
+        In e-/ADU, e-, ADU; for all exposures instead of their own values.
     errors : {"fit", "injected", "scaled"}
         Errors of the positions: of the fit; by the noise curve of every exposure at the star's flux, from stars put
         into it and measured (`legdistort.calibrate_noise`), as in the paper; or those of the fit times the ratio of
@@ -128,8 +128,8 @@ def measure(
     Raises
     ------
     InputError
-        For arguments out of range, and PSFs that are none; if a file that is no such PSF, a frame say, stands where one
-        would be written.
+        For arguments out of range, and PSFs that are none; if a file that is no such PSF, a frame for instance, stands
+        where one would be written.
 
     Warns
     -----
@@ -307,8 +307,8 @@ def _camera_gains(exposures, options, share):
     """Gains of exposures that have none, found from several frames of their camera: ``{name: e-/ADU}``."""
     asked = camera_gain.pilots(exposures)
     work = partial(_photon_noise, options=options)
-    told = iter(list(share(work, [frame for frames in asked.values() for frame in frames], description="gain")))
-    gains = {camera: camera_gain.pooled([next(told) for _ in frames]) for camera, frames in asked.items()}
+    estimates = iter(list(share(work, [frame for frames in asked.values() for frame in frames], description="gain")))
+    gains = {camera: camera_gain.pooled([next(estimates) for _ in frames]) for camera, frames in asked.items()}
     found = {e.name: gains.get(camera_gain.camera(e)) for e in exposures if not e.gain}
     return {name: gain for name, gain in found.items() if gain is not None}
 

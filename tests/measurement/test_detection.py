@@ -150,7 +150,7 @@ def test_a_width_that_no_star_has_is_an_error_within_seconds():
     for a, b in rng.uniform(0, size, (12, 2)):
         data += 2000.0 * (np.abs(np.hypot(x - a, y - b) - 40) < 15)
     start = time.process_time()
-    with pytest.raises(InputError, match=r"raw: no stars to be seen: .* has a FWHM of \d+ pixels. .*fwhm="):
+    with pytest.raises(InputError, match=r"raw: no stars are visible: .* has a FWHM of \d+ pixels. .*fwhm="):
         measure(Exposure("raw", data, gain=1.0))
     assert time.process_time() - start < 5
 

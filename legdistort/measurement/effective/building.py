@@ -2,9 +2,9 @@
 
 The grid is that of a Moffat profile plus corrections, constant, linear and quadratic over the field, that carry a
 Gaussian prior: they are as smooth as images that a telescope makes. How large they are, by degree, is what makes the
-data most probable: a PSF that does not vary gets no terms that do. Where stars say nothing (few of them, gaps between
-the phases of pixels, the dark far wings) the PSF is the Moffat profile. Position, flux and local sky of every star are
-free, and are eliminated from the normal equations of the grid.
+data most probable: a PSF that does not vary gets no terms that do. Where stars determine nothing (few of them, gaps
+between the phases of pixels, the dark far wings) the PSF is the Moffat profile. Position, flux and local sky of every
+star are free, and are eliminated from the normal equations of the grid.
 """
 
 from dataclasses import dataclass, replace
@@ -228,8 +228,8 @@ def _evidence(precision, amplitudes, factor, degrees):
     out = np.empty_like(precision)
     for degree in np.unique(degrees):
         of = degrees == degree
-        told = np.sum(1 - precision[of] * inverse[of])  # number of amplitudes that the stars decide
-        size = np.sqrt(np.sum(amplitudes[of] ** 2) / max(told, 1.0))
+        number = np.sum(1 - precision[of] * inverse[of])  # of amplitudes that the stars determine
+        size = np.sqrt(np.sum(amplitudes[of] ** 2) / max(number, 1.0))
         out[of] = np.clip(size, *_SIZES) ** -2.0
     return out
 
@@ -338,7 +338,7 @@ def _normal(stars, linear, params, corrections, spacing, terms, used):
 
 def _moved(params, linear, longest, after=0.0):
     """Parameters of the stars after a step of their own less `after`, no position farther than `longest`."""
-    told = (linear.slopes * linear.weights[:, None]) @ linear.residual[:, :, None]
-    step = (linear.inverse @ told)[:, :, 0] - after
+    pull = (linear.slopes * linear.weights[:, None]) @ linear.residual[:, :, None]
+    step = (linear.inverse @ pull)[:, :, 0] - after
     step[:, :2] *= np.minimum(1, longest / np.maximum(np.hypot(*step[:, :2].T), 1e-12))[:, None]
     return params + step

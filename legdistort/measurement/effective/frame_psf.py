@@ -39,9 +39,9 @@ class Verdict(NamedTuple):
     psf : str
         "moffat", "effective", or the source of a PSF from elsewhere.
     n_usable : float
-        Stars from which an effective PSF can be made; infinite if nobody asked.
+        Stars from which an effective PSF can be made; infinite if it was not computed.
     decided : bool
-        Whether the stars of the frame said so.
+        Whether the stars of the frame decided it.
     """
 
     psf: str

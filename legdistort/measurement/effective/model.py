@@ -113,11 +113,11 @@ class EffectivePSF(ShownAsPrinted):
     n_stars : int or None
         Stars that it was made from; None if it came from elsewhere.
     source : str
-        "effective", or where it came from: what the column ``psf`` of detections says.
+        "effective", or where it came from: the entry in the column ``psf`` of detections.
     residual : ndarray, shape (k, k), or None
-        What it leaves of the stars that made it, on the pixels around them: the weighted mean, in parts of their light.
+        Residuals of the stars that made it, on the pixels around them: the weighted mean, in parts of their light.
     halo : float
-        What the local skies of its stars hold of their light, on each pixel: wide halos pass for sky.
+        Part of the light of its stars that their local skies contain, on each pixel: wide halos are taken for sky.
     fwhm : float
         Full width at half maximum at the centre of the field, of a circle of the area above half maximum [pix].
 
@@ -244,7 +244,7 @@ class EffectivePSF(ShownAsPrinted):
         positions : array_like, shape (n, 2), optional
             Where on the detector they hold, x and y [pix]: all corners of a rectangular grid, in any order.
         source : str
-            What the column ``psf`` of detections shall say.
+            The entry for the column ``psf`` of detections.
 
         Returns
         -------

@@ -91,7 +91,7 @@ def read_psf(path):
     Raises
     ------
     InputError
-        If it is none of these, or says too little.
+        If it is none of these, or states too little.
     """
     path = Path(path)
     try:

@@ -55,7 +55,7 @@ class FrameFit(NamedTuple):
 def fit_stars(stamps, shape, *, profile="own", blends="together"):
     """Fit all stars of a frame in three passes.
 
-    The first knows the noise of the sky alone; the others add the photon noise of the models of the pass
+    The first has the noise of the sky alone; the others add the photon noise of the models of the pass
     before, fit stars that touch together, subtract the models of the other neighbours and leave out pixels that
     follow none.
 

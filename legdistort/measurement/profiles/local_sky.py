@@ -103,9 +103,9 @@ def slopes(left, weights, derivatives, precision=0.0):
         taken = _solved(by @ slope_of.swapaxes(1, 2), precision, shared)
         normal = (weights[rows] @ squares.T).reshape(-1, 2, 2) - shared.swapaxes(1, 2) @ taken
         right = (weights[rows] * left[rows]) @ grid.T - (left[rows, None] @ by.swapaxes(1, 2) @ taken)[:, 0]
-        told = np.linalg.det(normal) > 1e-6 * np.einsum("nii->n", normal) ** 2
+        determined = np.linalg.det(normal) > 1e-6 * np.einsum("nii->n", normal) ** 2
         slope = np.zeros_like(right)
-        slope[told] = np.linalg.solve(normal[told], right[told, :, None])[..., 0]
+        slope[determined] = np.linalg.solve(normal[determined], right[determined, :, None])[..., 0]
         significance = np.maximum((slope * right).sum(axis=1), 1e-9)
         out[rows] = (np.maximum(1 - _CHANCE / significance, 0)[:, None] * slope) @ grid
     return out

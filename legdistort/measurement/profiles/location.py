@@ -68,8 +68,8 @@ def _frame_shape(frame, fwhm, name):
         width = float(moffat.fwhm(shape))
         if fwhm is None and width > WIDEST:
             raise InputError(
-                f"{name}: no stars to be seen: what stands out of the sky has a FWHM of {width:.0f} pixels. Calibrate "
-                "the frame (dark, flat field), mask what is no sky, or say how wide the stars are (fwhm=)"
+                f"{name}: no stars are visible: what stands out of the sky has a FWHM of {width:.0f} pixels. Calibrate "
+                "the frame (dark, flat field), mask what is no sky, or state how wide the stars are (fwhm=)"
             )
         if fwhm is not None or abs(width - kernel) < _SETTLED * width:
             break

@@ -76,12 +76,12 @@ def _photon_noise(stamps, fit, remains):
     for _ in range(40):
         weights = (sky + photon * own + (NEIGHBOUR * others) ** 2) ** -2.0
         information = (weights * own**2).sum(axis=1)
-        told = information > 0
-        if not told.any():
+        seen = information > 0
+        if not seen.any():
             break
-        norm = information[told]
-        single = (weights * own * (square - sky)).sum(axis=1)[told] / norm
-        bright = (weights * own**3).sum(axis=1)[told] / norm
+        norm = information[seen]
+        single = (weights * own * (square - sky)).sum(axis=1)[seen] / norm
+        bright = (weights * own**3).sum(axis=1)[seen] / norm
         spread = np.sqrt(2 / norm) + misfit * bright
         importance = 1 / (spread * np.maximum(np.abs(single - photon - misfit * bright), 0.01 * spread))
         photon, misfit = _line(bright, single, importance)
