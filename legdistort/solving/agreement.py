@@ -1,7 +1,7 @@
 """Exposures that contradict the others: found in pairs before the fit, or by what the fit cannot follow.
 
-One is left out if three others or more agree, and more than contradict these with one voice; else nobody can say who is
-right, and the error names both sides.
+One is left out if three others or more agree, and are more than those that contradict them and agree with one another.
+Otherwise the data do not determine which side is right, and the error names both.
 """
 
 import numpy as np
@@ -70,7 +70,7 @@ def without_contradictions(problem, good):
 
 
 def contradiction(group, others):
-    """What to say where no majority shows who is right."""
+    """The message where no majority shows which side is right."""
     return (
         f"exposures contradict one another, and there are not {FEWEST} or more that agree against fewer: the stars of "
         f"{some_of(group, 6)} do not lie as those of {some_of(others, 6)}; match them anew, or leave one side out"

@@ -50,7 +50,7 @@ def is_explained(problem, result, *, clip):
 def solve_clipped(problem, start, *, clip, plain=None, gauge="minimal", loss="linear", max_iterations=None):
     """Joint solution without the observations that deviate by more than `clip` standard errors.
 
-    A solution with the Cauchy loss, which gross errors hardly move, says which observations deviate. They
+    A solution with the Cauchy loss, which gross errors hardly move, identifies observations that deviate. They
     are left out of a fit with the loss asked for, and further rounds only take away, so the set settles. The
     residuals are compared with their own errors (the pull of an observation on its own fit is allowed for), at
     the observed scale where that is larger than the stated errors. A star of whose observations no majority is left

@@ -83,8 +83,8 @@ def solve(
         Total degree of the Legendre series, 0 to 30; or the one up to 6 whose distortions serve stars best that are
         left out of the fit (`legdistort.solving.choices.degree_choice`).
     prior : Prior or dict, optional
-        Static distortion; one, or by ``detector`` or exposure name. None: nothing is known of it, so that some of the
-        absolute positions may not be known either (``gauge.unknown``), which is then logged as a warning.
+        Static distortion; one, or by ``detector`` or exposure name. None: nothing is known of it. The null space of the
+        problem may then leave absolute positions undetermined (``gauge.unknown``), which is logged as a warning.
     model : `~astropy.modeling.Model`, optional
         Form of the distortion of every exposure, undistorted -> detector pixels, instead of `degree` and `prior`:
         ``Identity(2) + (Mapping((0, 1, 0, 1)) | Legendre2D & Legendre2D)``, with a static part added if there is one.
@@ -95,12 +95,12 @@ def solve(
     static : {None, "fit"}, with a camera also {"hold", "prior"}
         "fit": one static distortion for all exposures of a detector (column ``detector``, else all of one shape), and
         for each exposure its pose and the modes up to `exposure_degree` alone: the self-calibration of a camera from
-        its own dithers and rolls (Anderson & King 2003). A prior is where it starts, and with ``static_sigma``
-        what holds it.
+        its own dithers and rolls (Anderson & King 2003). A prior is its start value and, with ``static_sigma``,
+        constrains it.
         With a camera: fit the static distortion of every detector, common to all exposures, from what is known of it
         on ("prior"; the default where uncertainties are given) or from nothing ("fit", up to `degree`); or "hold" it.
     layout : {None, "hold", "prior", "fit"}
-        The same for where the detectors of a camera lie. What was found is in ``solution.camera``, with its errors.
+        The same for the layout of the detectors of a camera. The result is in ``solution.camera``, with its errors.
     dynamic : {None, "focal_plane", "detector"}
         With a camera: what an exposure adds is a distortion of the focal plane as a whole (None does the same), or one
         for every detector by itself, which then is an exposure of its own, ``NAME-DETECTOR``, with a pose of its own;
@@ -108,7 +108,7 @@ def solve(
     exposure_degree : int, optional
         With ``static="fit"``: 0 leaves an exposure shift, rotation and scale, 1 (default) an affine map, and so on.
     gauge : {"minimal", "mean"}
-        Convention for what the data cannot determine, see `legdistort.results.gauge`.
+        Convention (datum) for what the data do not determine (their null space), see `legdistort.results.gauge`.
     method : {"joint", "alternating"}
         Gauss-Newton on all unknowns, or the scheme of the paper.
     loss : {"linear", "huber", "cauchy"}
@@ -117,8 +117,8 @@ def solve(
     clip : float or None
         Leave out observations whose residual exceeds this many standard errors (at the observed scale, if
         that is larger than the stated errors), where chance does not explain what a plain fit leaves; they are listed
-        in ``residuals["used"]``. Stars and exposures that contradict the others go as a whole, with a warning. None
-        keeps all. ``method="alternating"`` takes none.
+        in ``residuals["used"]``. Stars and exposures that contradict the others are left out as a whole, with a
+        warning. None keeps all. Not with ``method="alternating"``.
     error_floor : float
         Pixels, added in quadrature to every stated error.
     errors : {"stated", "scale", "floor", "by-brightness", "correlated"}
@@ -130,11 +130,11 @@ def solve(
         What was found is in ``diagnostics``.
     max_iterations : int, optional
     validate : float, optional
-        Keep this fraction of the stars, 0 to 0.5, out of everything, and report their scatter beside the one to be
+        Keep this fraction of the stars, 0 to 0.5, out of the fit, and report their scatter beside the one to be
         expected: ``diagnostics.validation``. They are not in the tables of the solution.
     motion : {None, "proper", "parallax", "auto"}
         Fit a proper motion of every star beside its position, a parallax too, or decide by the evidence of the set
-        whether stars move. When exposures were taken is known from their headers or the column ``epoch``.
+        whether stars move. The times of the exposures are those of their headers or of the column ``epoch``.
     motion_sigma : float or "evidence", optional
         Scatter of the proper motions of stars around their mean, per axis, pixels a year: known, or found from the set.
         None: nothing is known of them.
@@ -147,12 +147,12 @@ def solve(
         ``parallax_error`` [mas], ``ref_epoch`` [yr] and correlations, as in the Gaia catalogue; or ``x``, ``y``,
         ``x_err``, ``y_err`` in pixels of the reference plane, perhaps with ``vx``, ``vy`` and their errors; and perhaps
         ``star``, the stars of the matches, which are otherwise found by their positions. A column that holds a
-        `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch. With `motion` it is more, a prior on
-        the positions, motions and parallaxes of its stars.
+        `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch. With `motion` the reference is also a
+        prior on the positions, motions and parallaxes of its stars.
     epoch : float or `~astropy.time.Time`, optional
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
-        Arcsec, about; helps to find the stars where no header has the sky.
+        Arcsec, approximate; helps to find the stars where no header has a WCS on the sky.
     progress : bool
         Show a progress bar of the iterations where they take more than a second.
 
@@ -166,7 +166,7 @@ def solve(
         For bad options.
     SolveError
         If an exposure has fewer stars than modes, the unknowns are not determined, or exposures contradict one another
-        and no majority says which are right.
+        and no majority shows which are right.
 
     See Also
     --------
@@ -255,7 +255,7 @@ def _of_camera(matches, prior, model, degree, layout, static, exposure_degree):
     if camera is None:
         each = prior.values() if isinstance(prior, dict) else [prior]
         if static == "fit" and any(_knows_nothing_of_a_mode(p) for p in each):
-            raise InputError("static='fit' holds what static_sigma of a prior says: make it finite, or leave it out")
+            raise InputError("static='fit' needs a finite static_sigma of the prior: make it finite, or leave it out")
         return None, prior
     if isinstance(prior, dict):
         raise InputError(
@@ -330,7 +330,7 @@ def _warn_of_header(matches, prior):
 
 
 def _choose_degree(matches, options):
-    """The `DegreeChoice`; an alarm is told."""
+    """The `DegreeChoice`, with a warning where it has an alarm."""
     if options.motion is not None:  # motions, if there are any, are taken off the stars that are kept out
         star_motions.check_epochs(matches, options.motion)
         kind = "parallax" if options.motion == "parallax" else "proper"
@@ -387,7 +387,7 @@ def _tell_lost_stars(fit):
 
 
 def _diagnostics(fit, prior, scale):
-    """What was found before a reference is asked."""
+    """What was found before a reference is used."""
     each = prior.values() if isinstance(prior, dict) else [prior]
     return Diagnostics(
         error_floor=float(fit.options.error_floor),

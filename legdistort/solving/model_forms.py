@@ -1,6 +1,6 @@
 """A caller's astropy model as the form of every exposure's distortion: which coefficients are free, what the rest is.
 
-The solver knows a distortion as normalised Legendre modes of the detector. A form with other domains, fixed
+The solver represents a distortion by normalised Legendre modes of the detector. A form with other domains, fixed
 coefficients or a static part of its own is expanded in these modes once, exactly, and filled with the fitted
 coefficients afterwards. Coefficients that are fixed become modes whose prior has no width.
 """
@@ -139,7 +139,7 @@ def read(model, matches, *, degree, gauge):
         For a model that cannot be the form of a distortion, or arguments that contradict it.
     """
     form = Form(model, matches.shapes)
-    if degree not in (3, form.degree):  # 3 where the caller said nothing
+    if degree not in (3, form.degree):  # 3 where the caller gave none
         raise InputError(
             f"the model has free coefficients up to total degree {form.degree}: leave degree={degree!r} out"
         )
@@ -240,8 +240,8 @@ def _rebuilt(model, shape):
         if domains[f"{axis}_domain"] is None:
             if np.any(model.parameters):
                 raise InputError(
-                    f"a Legendre2D of the model has coefficients but no {axis}_domain: say which pixels they are meant "
-                    f"for, as {axis}_domain=(-0.5, {n - 0.5}) for the whole detector"
+                    f"a Legendre2D of the model has coefficients but no {axis}_domain: state which pixels they are "
+                    f"meant for, as {axis}_domain=(-0.5, {n - 0.5}) for the whole detector"
                 )
             domains[f"{axis}_domain"] = (-0.5, n - 0.5)
     return rebuilt(FastLegendre2D, model, **domains)

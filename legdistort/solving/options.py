@@ -20,7 +20,7 @@ class Unasked(float):
     """The value of an option that nobody asked for: it yields to others that exclude it."""
 
 
-#: Standard errors beyond which an observation is left out, unless the caller says otherwise.
+#: Standard errors beyond which an observation is left out, unless the caller gives another limit.
 CLIP = Unasked(5.0)
 
 
@@ -83,7 +83,7 @@ class SolveOptions(Settings):
                 raise InputError(f"motion={self.motion!r} does not go with {word}, for which stars stay where they are")
 
     def _check_distortion(self):
-        """The degree, what is shared, what is known, what is kept out, and a model that says it all."""
+        """The degree, what is shared, what is known, what is kept out, and a model that states all of it."""
         if not isinstance(self.degree, str):
             basis.check_degree(self.degree)
         elif not self.chooses_degree:
@@ -100,7 +100,7 @@ class SolveOptions(Settings):
 
     def _check_model(self):
         if self.chooses_degree or self.static is not None:
-            raise InputError("a model says what is fitted in every exposure: leave degree='auto' and static out")
+            raise InputError("a model states what is fitted in every exposure: leave degree='auto' and static out")
         if self.prior is not None:
             raise InputError("the static distortion is in the coefficients of model: leave prior out")
         fitter.free_coefficients(self.model)  # refuses what is no map of the plane, ties and bounds
@@ -146,7 +146,7 @@ def check_detectors(several, layout, static, dynamic):
         if not several and value is not None and (name, value) != ("static", "fit"):
             raise InputError(
                 f"{name}={value!r} is for exposures with several detectors, and these have one each: leave it out, or "
-                "say which camera it is (camera=, --camera)"
+                "name the camera (camera=, --camera)"
             )
 
 

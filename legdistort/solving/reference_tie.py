@@ -1,7 +1,7 @@
 """A converged solution tied to a reference catalogue: its gauge alone moves, not the relative positions.
 
-What the reference says about shift, rotation and scale moves positions and poses exactly; what it says about the other
-modes of a common map becomes the value at which the constraints of the gauge are held.
+The shift, rotation and scale by the reference move positions and poses exactly; the other modes of a common map by the
+reference become the value at which the constraints of the gauge are held.
 
 Where the motions of stars are fitted, the reference is a prior on the stars that it has: on positions, motions and
 parallaxes with their full covariance. It comes in two steps that are the posterior together, so that nothing counts
@@ -39,7 +39,7 @@ _ROUNDS = 10
 _SETTLED = 0.01
 #: Not settled, but within this part of its error: absolute errors would change by 5 % at most.
 _HARMLESS = 0.3
-#: Offsets larger than expected by this factor in chi2 are told.
+#: Offsets larger than expected by this factor in chi2 raise a warning.
 _LARGE = 2.0
 #: A map moves the solution to first order; what is left comes from another round.
 _MAP_ROUNDS = 2
@@ -136,7 +136,7 @@ class ReferenceTie:
         return replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown)), prior
 
     def hold_stars(self, problem, result, prior):
-        """The `Problem` and the `Result` with the stars of the reference at what it knows of them.
+        """The `Problem` and the `Result` with the stars of the reference at their values in it.
 
         Parameters
         ----------
@@ -194,7 +194,7 @@ class ReferenceTie:
 
     @staticmethod
     def _offered(found, k):
-        """What a reference knows of its stars: values (n, 2 + k) and covariances, NaN for what it does not."""
+        """Positions and motions in a reference: values (n, 2 + k) and covariances, NaN for what it does not have."""
         n = len(found.rows)
         values, covariance = np.full((n, 2 + k), np.nan), np.full((n, 2 + k, 2 + k), np.nan)
         known = found.xy if found.motion is None else np.hstack([found.xy, found.motion])
@@ -219,7 +219,7 @@ class ReferenceTie:
         if scale > np.sqrt(_LARGE):
             warn(
                 f"the proper motions of {self.label} differ from those of the stars by {scale:.1f} times what the "
-                "errors of both say; the absolute errors of motions rest on the stated ones",
+                "errors of both imply; the absolute errors of motions rest on the stated ones",
                 AssumptionWarning,
             )
         used = gauge.tie.used.copy()
@@ -248,13 +248,13 @@ class ReferenceTie:
         )
 
     def _warn(self, made):
-        """Tell what makes the absolute errors too small."""
+        """Warn of what makes the absolute errors too small."""
         n = np.count_nonzero(made.used)
         if made.ratio > _LARGE and made.ratio > 1 + 6 * np.sqrt(1 / n):
             warn(
                 f"the offsets of the stars from {self.label} are {np.sqrt(made.ratio):.1f} times larger than the "
-                "errors of both say: errors stated too small, motions left out, or a static distortion that the "
-                "exposures do not take back; the absolute errors rest on the stated ones",
+                "errors of both imply: errors stated too small, motions left out, or a static distortion that the "
+                "exposures cannot compensate; the absolute errors rest on the stated ones",
                 AssumptionWarning,
             )
 

@@ -123,7 +123,7 @@ class Fit:
 
 
 def estimate(matches, options):
-    """The fit (`Fit`) with some `SolveOptions`; where the prior asks for it, with the widths that the exposures say."""
+    """The fit (`Fit`) with some `SolveOptions`; with widths from the exposures where the prior asks for them."""
     prior = options.prior
     if not prior_widths.sought(prior):
         return minimise(matches, options)
@@ -146,7 +146,7 @@ def estimate(matches, options):
 
 
 def _with_plain_widths(matches, options):
-    """The fit to all observations with the widths that they say; None unless chance explains what it leaves.
+    """The fit to all observations with the widths that they determine; None unless chance explains its residuals.
 
     With the small widths that a search begins with, good observations of few stars may seem to deviate, and widths
     without these stay small.

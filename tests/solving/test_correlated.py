@@ -70,7 +70,7 @@ def test_errors_of_stars_that_wander_are_true(wandering):
 def test_words_say_what_was_found_and_what_cannot_be(wandering):
     text = str(wandering[0]["correlated"])
     assert "shared by exposures near one another in" in text
-    assert "what is the same in all exposures cannot be measured" in " ".join(text.split())
+    assert "errors that are the same in all exposures cannot be measured" in " ".join(text.split())
 
 
 def test_the_floor_holds_all_errors_of_one_exposure(wandering):
@@ -126,7 +126,7 @@ def test_where_there_is_nothing_the_errors_are_those_of_a_floor(seed):
     matches, _ = drifting(0, seed, n_exposures=12)
     floored, solution = solved(matches, "floor"), solved(matches)
     assert solution.diagnostics.correlated.along is None
-    assert "none that neighbouring exposures share" in str(solution.diagnostics.correlated)
+    assert "no errors that neighbouring exposures share" in str(solution.diagnostics.correlated)
     assert np.array_equal(solution.stars["x_err"], floored.stars["x_err"])
 
 

@@ -173,7 +173,7 @@ def test_wrong_reference_is_told():
     sim = simulate(dynamic=0.05, static=0.5)
     prior = Prior(sim.truth.static)
     before = solve(sim.matches, prior=prior)
-    with warns_here(AssumptionWarning, match=r"are \d+\.\d times larger than the errors of both say"):
+    with warns_here(AssumptionWarning, match=r"are \d+\.\d times larger than the errors of both imply"):
         after = solve(sim.matches, prior=prior, reference=planar(sim, 60, 0.3, stated=0.01))
     changed = accuracy.bias(after.positions, before.positions, removed=3)
     assert changed < 0.05 * accuracy.expected_bias(before, removed=3)

@@ -338,7 +338,7 @@ def test_a_degree_too_high_is_said():
     matches = simulated(4, n_exposures=8, n_stars=80, degree=1).matches
     check = next(c for c in solved(matches, degree=3).checks if c.name == "degree")
     assert check.state == "warn"
-    assert "--degree 2 says the same" in check.cure
+    assert "--degree 2 fits as well" in check.cure
 
 
 def test_exposures_that_are_not_distorted_are_said_to_be_so():

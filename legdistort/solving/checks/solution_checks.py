@@ -71,13 +71,13 @@ def _causes_first(checks):
     """Checks whose cures name those that do not pass either and may be the cause of theirs."""
     wrong = [check.name for check in checks if check.state in ("warn", "fail")]
 
-    def told(check):
+    def with_cause(check):
         causes = [name for name in _CAUSES.get(check.name, ()) if name in wrong]
         if not causes or check.name not in wrong:
             return check
         return replace(check, cure=f"see {' and '.join(causes)} first, which may be the cause; else {check.cure}")
 
-    return tuple(map(told, checks))
+    return tuple(map(with_cause, checks))
 
 
 def _state(p, matters=True):
@@ -115,7 +115,7 @@ def _stated(solution, residuals):
 
 
 def errors_check(solution, residuals):
-    """Do residuals scatter as the stated errors say?"""
+    """Do residuals scatter as the stated errors lead to expect?"""
     chi2, dof = _stated(solution, residuals)
     if dof < 1:
         return Check("chi2", "unknown", None, None, "no degrees of freedom are left to judge the errors by",
@@ -203,7 +203,7 @@ def place_check(residuals):
 
 
 def time_check(residuals, times):
-    """Do stars move through the set? Not asked where their motions are fitted."""
+    """Do stars move through the set? Not checked where their motions are fitted."""
     if residuals.problem.terms.n:
         return None
     times, unit = times
@@ -236,7 +236,7 @@ def degree_check(solution, residuals, uncertainty):
     if solution.degree > 1 and p > 0.05 and not solution.diagnostics.prior_has_widths:
         return Check("degree", "warn", score.rms, error,
                      f"no exposure has modes of degree {solution.degree} beyond noise",
-                     f"--degree {solution.degree - 1} says the same with smaller errors")  # fmt: skip
+                     f"--degree {solution.degree - 1} fits as well, with smaller errors")  # fmt: skip
     return Check("degree", "pass", score.rms, error, f"degree {more} would explain nothing more{little}")
 
 
@@ -266,7 +266,7 @@ def dynamic_check(solution, blocks):
         return Check("dynamic part", "pass", p, FALSE_ALARM, f"exposures depart from {static} beyond noise")
     return Check("dynamic part", "warn", p, FALSE_ALARM,
                  f"none of {len(solution.names)} exposures departs from {static} beyond noise",
-                 "a lower --degree says the same with smaller errors")  # fmt: skip
+                 "a lower --degree fits as well, with smaller errors")  # fmt: skip
 
 
 def absolute_check(solution):

@@ -1,1 +1,1 @@
-"""What the exposures themselves say of degree and prior widths."""
+"""Degree and prior widths as the exposures themselves determine them."""

@@ -28,7 +28,7 @@ N_WORSE = 3
 CLOSE = 0.005
 #: Excess of a degree's energy over its noise, in standard deviations of the latter, that raises the alarm.
 ALARM = 5.0
-_OUTLIER = 25.0  # times the usual squared scatter of a star, at every degree: mismatched, it has no say
+_OUTLIER = 25.0  # times the usual squared scatter of a star, at every degree: mismatched, it has no weight
 
 
 def choose_degree(matches, fit, solution, *, clip, found):

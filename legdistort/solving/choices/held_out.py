@@ -1,7 +1,7 @@
 """Stars that are kept out of the fit: they choose the degree, and test the errors.
 
-A star that is left out says what a fit is worth: corrected with distortions that it had no part in, its positions
-scatter by their errors, plus what is wrong with the distortions.
+A star that is left out tests a fit: corrected with distortions in which it had no part, its positions scatter by their
+own errors and those of the distortions.
 """
 
 import numpy as np

@@ -85,7 +85,7 @@ def sought(prior):
 
 
 def find_widths(fit, prior, degree, unit, *, scale=False):
-    """The fit in which the widths are those that the data say.
+    """The fit in which the widths are those that the data determine.
 
     Fits and widths follow one another until the widths settle: outliers, weights and the point where the model is
     linearised depend on the fit. The first has small widths, so that outliers stand out.
@@ -200,8 +200,8 @@ class Evidence:
     def cost(self, log_widths, *, scale=False):
         """Minus the logarithm of the likelihood, and its gradient; with `scale`, at the best scale of all errors.
 
-        The gradient vanishes where a width is what its coefficients, and the number of them that the data determine,
-        say: the fixed point of MacKay (1992).
+        The gradient vanishes where the square of a width is the sum of the squares of its coefficients over the number
+        of them that the data determine: the fixed point of MacKay (1992).
         """
         w = np.exp(log_widths)[self.label]
         root, lower = cho_factor(np.eye(len(w)) + w[:, None] * self.curvature * w, lower=True)
@@ -266,8 +266,8 @@ def evidence(problem, state, labels, motion):
     labels : ndarray of int, shape (n_exposures, degree)
         Number of the width of every exposure and degree from 1; -1 where none is sought.
     motion : ndarray, shape (n_exposures, 2 n, 2 n)
-        How maps of the reference plane change the coefficients (`legdistort.results.gauge.Gauge`); along them the data
-        say nothing, and what the linear model has to say is noise.
+        How maps of the reference plane change the coefficients (`legdistort.results.gauge.Gauge`); they are the
+        null space of the data, along which the linear model follows the noise.
     """
     wanted = labels[:, 0] >= 0
     sigma = np.where(wanted[:, None, None], np.inf, problem.prior_sigma)

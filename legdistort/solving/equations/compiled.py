@@ -112,7 +112,7 @@ def _dots(b, x, out):
 
 @compiled_loop(nogil=True, fastmath=_FAST)
 def _terms(row, n_block, phi, f, j, r):
-    """Add to the sums of a star what an observation says of the terms beside its position, phi (2, n_terms)."""
+    """Add to the sums of a star what an observation contributes to the terms beside its position, phi (2, n_terms)."""
     mxx, myy, mxy = f[0] * j[0] + f[1] * j[2], f[2] * j[1] + f[3] * j[3], f[0] * j[1] + f[1] * j[3]
     px, py = f[0] * r[0] + f[1] * r[1], f[2] * r[0] + f[3] * r[1]
     place = 3

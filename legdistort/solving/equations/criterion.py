@@ -1,4 +1,4 @@
-"""The weighted least-squares criterion J: residuals, derivatives and normal blocks. It knows no solver.
+"""The weighted least-squares criterion J: residuals, derivatives and normal blocks. It is independent of the solver.
 
 ``J = sum_ij r_ij' W_ij r_ij`` over residuals ``r = x_data - D_i(X_j)`` in detector pixels
 (Bernard et al. 2017, eq. of section 3.1, per axis and with correlated errors), plus Gaussian priors on the

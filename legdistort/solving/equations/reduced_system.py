@@ -40,7 +40,7 @@ def reduced_system(problem, blocks, gauge, weak=None):
     if large and has_few_stars(problem, _DIRECT_COST) and 2 * problem.n_star * problem.n_stars <= problem.unknowns.size:
         with contextlib.suppress(LinAlgError):
             return OnStars(problem, blocks, gauge)
-    if uses_direct(problem) or (not large and _is_singular(blocks.u)):  # which says whose stars are to blame
+    if uses_direct(problem) or (not large and _is_singular(blocks.u)):  # which names the exposure with too few stars
         return Direct(problem, blocks, gauge, weak)
     return Iterative(problem, blocks, gauge)
 

@@ -142,7 +142,7 @@ class Unknowns:
         return out
 
     def common_precision(self, sigma):
-        """What widths (2 n_modes,) say of the common part, a share for each exposure: (n_exposures, 2 n_modes, ...)."""
+        """How widths (2 n_modes,) constrain the common part, a share by exposure: (n_exposures, 2 n_modes, ...)."""
         common = self._rows[1]
         whole = common.transpose(0, 2, 1) @ np.linalg.solve(common * sigma**2 @ common.transpose(0, 2, 1), common)
         return (whole / np.bincount(self.group)[:, None, None])[self.group]

@@ -1,6 +1,6 @@
 """What a reference catalogue determines of a common map: an estimate of it, with its errors.
 
-A common map g of the reference plane, X -> X + D g, is all that a reference is asked for. Its stars lie
+A common map g of the reference plane, X -> X + D g, is all that a reference determines. Its stars lie
 ``r_j = X_cat,j - X_j`` off the relative solution, ``r = D g`` but for the errors of both. What the exposures and a
 prior determine of g (`legdistort.solving.gauge.hierarchy`) counts with its information, that is, of shift, rotation and
 scale nothing. What neither determines to `LIMIT` stays where the convention has it.
@@ -46,7 +46,7 @@ class Offsets:
 
 @dataclass(frozen=True, eq=False)
 class MapPrior:
-    """What is known of the common map before a reference is asked.
+    """What is known of the common map before a reference is used.
 
     Attributes
     ----------

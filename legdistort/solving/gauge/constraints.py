@@ -269,7 +269,7 @@ def absorb_similarities(problem, state):
 
     ``q' = S q`` and ``A' b(q') = q - q' + A b(S^-1 q')``, a polynomial of the same degree, so the change is exact
     (prior modes beyond the fitted degree excepted: they stay with the detector). A distortion that exposures share
-    stays with the detector as a whole, so that D_i becomes what `Unknowns.at` says of a pose.
+    stays with the detector as a whole, so that D_i becomes what `Unknowns.at` states for a pose.
 
     Returns
     -------

@@ -15,7 +15,7 @@ _SMALLEST = 1e-6  # scatter, pixels: where none is seen beyond the errors, Lambd
 
 
 def conditional_errors(u_data):
-    """C_i, covariance of the coefficients if the stars were known; huge where the data say nothing."""
+    """C_i, covariance of the coefficients if the stars were known; huge where the data do not determine them."""
     size = u_data.shape[1]
     ridge = 1e-12 * np.trace(u_data, axis1=1, axis2=2)[:, None, None] / size + 1e-300
     return np.linalg.inv(u_data + ridge * np.eye(size))
@@ -81,8 +81,8 @@ def _fitted(design, weight, own, stated):
     """
     columns, weight = design.reshape(own.size, design.shape[2]), weight.reshape(-1, 1)
     curvature, vectors = np.linalg.eigh((weight * columns).T @ columns + np.diag(stated))
-    told = curvature > 1e-10 * curvature.max(initial=0)
-    columns = columns @ (vectors[:, told] / np.sqrt(curvature[told]))
+    determined = curvature > 1e-10 * curvature.max(initial=0)
+    columns = columns @ (vectors[:, determined] / np.sqrt(curvature[determined]))
     left = own - (columns @ (columns.T @ (weight.ravel() * own.ravel()))).reshape(own.shape)
     return left, np.sum(weight * columns**2, axis=1).reshape(own.shape).sum(axis=0)
 

@@ -286,8 +286,8 @@ def determined_by_residuals(system, gauge):
 def is_explained(chi2, system):
     """Whether a chi2 counts as explained: two per degree of freedom, or a tenth of that of a system.
 
-    Else the residuals have another cause, modes that are not fitted, say, which bending the reference plane by hundreds
-    of pixels can reduce as well.
+    Else the residuals have another cause, such as modes that are not fitted, and bending the reference plane by
+    hundreds of pixels can reduce them as well.
     """
     return chi2 <= max(2.0 * system.dof, 0.1 * system.blocks.chi2)
 

@@ -1,13 +1,14 @@
 """Errors that stay alike from one exposure to the next: found from the residuals, and counted in the errors of stars.
 
-Trails of charge, the place of a star on its pixel, refraction by its colour: an exposure errs in a star about as much
-as the one before, or as another one in which the star fell on the same place. Such errors do not average down with the
-number of exposures, and no error floor says so. Here every star has a random error of its own in each axis (random
-effects), of one variance for all stars, whose correlation falls along the time or along an axis of the detector:
-exponentially, or as that of a process that has one or two derivatives (`CorrelatedErrors.derivatives`). Beside it stand
-independent errors, the stated ones with a floor. The variances, the length and the form of the correlation are those of
-the largest restricted likelihood (REML; Patterson & Thompson 1971): that of the residuals, in which nothing is left of
-what is the same in all exposures. That part is in the positions, and no data determine it.
+Errors by trails of charge, by the place of a star on its pixel or by refraction according to its colour are about the
+same in an exposure as in the one before, or in another one in which the star fell on the same place. They do not
+average down with the number of exposures, and no error floor describes them. Here every star has a random error of its
+own in each axis (random effects), of one variance for all stars, whose correlation falls along the time or along an
+axis of the detector: exponentially, or as that of a process that has one or two derivatives
+(`CorrelatedErrors.derivatives`). Beside it stand independent errors, the stated ones with a floor. The variances, the
+length and the form of the correlation are those of the largest restricted likelihood (REML; Patterson & Thompson 1971):
+that of the residuals, in which nothing is left of what is the same in all exposures. That part is in the positions, and
+no data determine it.
 """
 
 from dataclasses import dataclass, replace
