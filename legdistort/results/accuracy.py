@@ -93,7 +93,7 @@ def known_offsets(solution, xy):
 
 
 def relative_offsets(solution, xy):
-    """Positions of the stars from elsewhere less those of a solution, without any common map that exposures take back.
+    """Positions of the stars from elsewhere less those of a solution, without common maps that exposures compensate.
 
     What is left compares with the covariance of relative positions. `Gauge.directions`, the directions at the solution,
     are followed to second order, as for `known_offsets`.
@@ -279,7 +279,7 @@ def new_scatter(solution, distort, xy, sigma, *, seen=None, rng=None):
 def contour(stars, *, fraction=0.9):
     """The square that holds most stars, inside which the paper (section 4.1) averages sigma.
 
-    The paper does not say how it was chosen. Here it is centred between the outermost stars.
+    The paper does not state how it was chosen. Here it is centred between the outermost stars.
 
     Parameters
     ----------

@@ -93,8 +93,8 @@ class Tie:
     @property
     def statement(self) -> str:
         """What was used and how well it agrees, in sentences."""
-        told = "" if np.isnan(self.ratio) else f" (chi2 {self.ratio:.2g} per degree of freedom)"
-        return f"The plane is {self.sentence}{told}."
+        ratio = "" if np.isnan(self.ratio) else f" (chi2 {self.ratio:.2g} per degree of freedom)"
+        return f"The plane is {self.sentence}{ratio}."
 
     def __repr__(self) -> str:
         return f"<Tie: {np.count_nonzero(self.used)} of {len(self.used)} reference stars, {self.rms:.2g} px rms>"

@@ -243,11 +243,11 @@ class CorrelatedErrors:
         return np.exp(-u) * np.polynomial.polynomial.polyval(u, MATERN[self.derivatives])
 
     def __str__(self) -> str:
-        constant = "what is the same in all exposures cannot be measured"
+        constant = "errors that are the same in all exposures cannot be measured"
         if self.reason:
-            return f"those that exposures share are not measurable: {self.reason}"
+            return f"errors that exposures share are not measurable: {self.reason}"
         if self.along is None:
-            return f"none that neighbouring exposures share were found; {constant}"
+            return f"no errors that neighbouring exposures share were found; {constant}"
         number, unit, most = _readable(self.length, self.longest, self.unit)
         where = "in time" if self.along == "time" else f"along {self.along} of the detector"
         length = f"{number:.2g} {unit}"
@@ -255,7 +255,7 @@ class CorrelatedErrors:
             length = f"{most:.2g} {unit} or more: their slower part is not measured well"
         return (
             f"{self.x:.2g} px in x and {self.y:.2g} px in y of every star are shared by exposures near one another "
-            f"{where}, over {length}; they are in the errors of the stars; {constant}"
+            f"{where}, over {length}; the errors of the stars include them; {constant}"
         )
 
 
@@ -322,8 +322,8 @@ class Diagnostics:
         Returns
         -------
         dict
-            ``{"errors" | "widths" | "modes" | "degree" | "motion" | "kept": sentence}``, those that there is something
-            to say on.
+            ``{"errors" | "widths" | "modes" | "degree" | "motion" | "kept": sentence}``, those
+            that apply.
         """
         found = self.error_law or self.correlated
         words = {} if found is None else {"errors": str(found)}

@@ -1,13 +1,13 @@
-"""What positions alone do not determine, what else determines it, and the convention that holds the rest.
+"""The null space of the positions, what else determines it, and the convention (the datum) that fixes the rest.
 
-Any map G of the reference plane leaves J (nearly) as it is when every D_i takes it back: the six affine directions
-exactly, all 2 n_modes polynomial directions to a part in a million. Left free they are noise. They are fixed by as
-many linear constraints on the coefficients, ``sum_i R_i (A_i - A_0) = 0``. Where exposures differ in place or
+Any map G of the reference plane leaves J (nearly) as it is when every D_i compensates it, a degeneracy: the six affine
+directions exactly, all 2 n_modes polynomial directions to a part in a million. Left free they are noise. They are fixed
+by as many linear constraints on the coefficients, ``sum_i R_i (A_i - A_0) = 0``. Where exposures differ in place or
 orientation, or a prior is given, the constraints are those under which star positions and coefficients are the
-posterior mean of a model in which exposures scatter around a static distortion
-(`legdistort.solving.gauge.hierarchy`). What that does not determine either is *unknown*, and held by the convention:
-the smallest dynamic part, ``R_i = N_i' W_i`` (gauge ``"minimal"``), or ``sum_i (A_i - A_0) = 0`` (gauge ``"mean"``),
-which the paper's starting point implies for undithered exposures.
+posterior mean of a model in which exposures scatter around a static distortion (`legdistort.solving.gauge.hierarchy`).
+Directions that this does not determine either are *unknown*, and are fixed by the convention: the smallest dynamic
+part, ``R_i = N_i' W_i`` (gauge ``"minimal"``), or ``sum_i (A_i - A_0) = 0`` (gauge ``"mean"``), which the paper's
+starting point implies for undithered exposures.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ CURE = "give a prior (--prior) or its size (--static-sigma), turn the camera bet
 
 @dataclass(frozen=True, eq=False)
 class UnknownMap:
-    """A map of the reference plane that nothing determines.
+    """A map of the reference plane that nothing determines: a degeneracy.
 
     Attributes
     ----------
@@ -156,8 +156,8 @@ class Drift:
         rate = np.sqrt(np.mean([error**2 for name, error in errors.items() if name != "parallax"])) if errors else 0.0
         by = "the scatter of the motions of stars" if self.held else "the smallest dynamic part"
         words = (
-            f"Motions. Maps that change with time as all stars may by their motions show in no residual either: "
-            f"{self.n_constraints} modes, held by {by}. Absolute error of a motion {rate:.2g} px/yr rms over the "
+            f"Motions. Maps that change with time as motions of all stars would are in the null space too: "
+            f"{self.n_constraints} modes, fixed by {by}. Absolute error of a motion {rate:.2g} px/yr rms over the "
             "field, per axis"
         )
         if "parallax" in errors:
@@ -438,8 +438,8 @@ class Gauge(ShownAsPrinted):
         convention = f"the constraint ({_CONVENTIONS[self.kind]})" + (" and the prior widths" if self.prior else "")
         degree = basis.degree_of(self.n_modes)
         lines = [
-            f"Gauge {self.kind!r}. A map of the reference plane of degree {degree} that every exposure takes back "
-            f"changes nothing in the data: {self.n_maps} modes, {min(6, self.n_maps)} of them exactly.",
+            f"Gauge {self.kind!r}. A map of the reference plane of degree {degree} that every exposure compensates "
+            f"changes no residual (null space): {self.n_maps} modes, {min(6, self.n_maps)} of them exactly.",
             f"{'modes':24s} {'number':>6s} {'absolute error':>15s}  pinned by",
         ]
         measured = {} if self.tie is None else self.tie.words(convention)
@@ -454,7 +454,7 @@ class Gauge(ShownAsPrinted):
         if self.released is not None:
             lines.append(
                 f"{self.released.shape[1]} combinations that are not known otherwise are determined by residuals of "
-                "second order; the absolute error is theirs."
+                "second order, from which their absolute error follows."
             )
         lines += [self.warning[0].upper() + self.warning[1:] + "."] if self.warning else []
         lines += [] if self.drift is None else [str(self.drift)]

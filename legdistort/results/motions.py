@@ -90,7 +90,7 @@ class StarMotions(ShownAsPrinted):
             where = "stays where it was" if once == 1 else "stay where they were"
             words += f"; {once} seen at a single epoch {where} then"
         if twice := np.count_nonzero(self.n_epochs == 2):
-            words += f"; {twice} seen at two epochs ha{'s' if twice == 1 else 've'} nothing to check the motion by"
+            words += f"; {twice} seen at two epochs only, so that no observation checks the motion{'s' * (twice > 1)}"
         return words
 
 

@@ -77,13 +77,13 @@ class Solution(ShownAsPrinted):
         Static distortion A_0 around which the solution lies (zero without a prior).
     star_names : ndarray, shape (n_stars,)
     positions : ndarray, shape (n_stars, 2)
-        X_ref, reference-plane pixels; NaN for a star none of whose observations was used.
+        X_ref, reference-plane pixels; NaN for a star without a used observation.
     observations : `~astropy.table.QTable`
         The matched table that was solved, with ``dx``, ``dy`` [pix] and ``used`` added.
     chi2 : float
         Weighted sum of squares of the used residuals.
     dof : int
-        Its degrees of freedom, the directions fixed by the gauge counted.
+        Its degrees of freedom; the directions fixed by the gauge (the null space) are counted.
     status : str
         How the minimisation ended.
     gauge : Gauge
@@ -92,21 +92,22 @@ class Solution(ShownAsPrinted):
     settings : Settings
         How `solve` was called.
     diagnostics : Diagnostics
-        What it found out beside all this.
+        What `solve` estimated beside the unknowns.
     sky : TangentPlane or None
     left_out : dict
         ``{exposure: reason}``.
     provenance : dict
         ``created``, ``versions`` of packages and, if files went in, ``inputs`` ``{base name: SHA-256}``.
     form : `legdistort.solving.model_forms.Form` or None
-        The model that was given to `solve`. Files do not keep it: `model` then has the usual form, the same function.
+        The model that was given to `solve`. Files do not keep it: of a solution that was read, `model` has the usual
+        form, which is the same function.
     camera : `legdistort.Camera` or None
         Where several detectors were solved as one focal plane: positions, shapes and distortions then are those of the
         focal plane.
     checked : callable or tuple of Check
-        The `checks`, or what makes them of the solution.
+        The `checks`, or a function that makes them from the solution.
     motions : StarMotions or None
-        What moves the stars, where that was fitted.
+        Motions of the stars, where they were fitted.
 
     Parameters
     ----------
@@ -174,7 +175,7 @@ class Solution(ShownAsPrinted):
 
     @cached_property
     def checks(self) -> tuple[Check, ...]:
-        """What a referee would ask, answered: a tuple of `legdistort.results.check.Check`; made at first use."""
+        """Tests of the solution with their results: a tuple of `legdistort.results.check.Check`; made at first use."""
         return self.checked(self) if callable(self.checked) else self.checked
 
     # -- tables
@@ -183,12 +184,12 @@ class Solution(ShownAsPrinted):
     def stars(self) -> QTable:
         """One row a star: ``star``, ``x``, ``y``, errors [pix], ``n``, mean ``flux`` and the sky if known.
 
-        ``x_err``, ``y_err`` are relative: what is left once a common map of the fitted degree is taken off.
+        ``x_err``, ``y_err`` are relative: the errors once a common map of the fitted degree is taken off.
         ``x_err_abs``, ``y_err_abs`` add that map: the mean dynamic distortion of the set and the uncertainty of the
         static one; NaN where they are not known (`Gauge.unknown`). ``x_err_known``, ``y_err_known`` are those after the
         unknown directions are taken off; infinite where nothing determines how the detectors of a camera lie.
         Pointing, rotation and scale common to all exposures are those of the nominal
-        poses and are not part of these errors, unless a reference ties them: then they are. On the sky:
+        poses. These errors include them only where a reference ties them. On the sky:
         ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,
         ``ra_error_abs``, ``dec_error_abs`` [mas], named as in the Gaia catalogue, and ``sky``, the same places as a
         `~astropy.coordinates.SkyCoord` (not in files). ``meta`` has ``frame``, ``epoch`` (a Julian year, if it is
@@ -338,7 +339,7 @@ class Solution(ShownAsPrinted):
         """``{exposure: number}`` of its modes, both axes together, that the data determine rather than a prior.
 
         The trace of the influence of the data on the coefficients. Without prior widths it is their number, less what
-        the gauge fixes. None if the solution does not know it.
+        the gauge fixes. None if it is not known.
         """
         return self.diagnostics.effective_modes
 
@@ -350,7 +351,7 @@ class Solution(ShownAsPrinted):
         Raises
         ------
         InputError
-            If the solution has no such exposure; says why if it was left out.
+            If the solution has no such exposure; with the reason if it was left out.
         """
         if name not in self.names:
             why = f": it was left out ({self.left_out[name]})" if name in self.left_out else ""
@@ -372,7 +373,7 @@ class Solution(ShownAsPrinted):
     def by_detector(self) -> Solution:
         """Of a camera, the same with every detector of every exposure, ``NAME-DETECTOR``, as an exposure of its own.
 
-        For positions alone, without errors; a solution without a camera is its own. See
+        For positions alone, without errors; a solution without a camera is returned as it is. See
         `legdistort.results.detector_view`.
         """
         return self if self.camera is None else by_detector(self)

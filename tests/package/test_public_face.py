@@ -124,7 +124,7 @@ def test_gauge_says_in_words_what_is_not_known(simulation, kind, words):
     mean = simulation.truth.static
     solution = solve(simulation.matches, prior=Prior(mean, static_sigma=0.1), gauge=kind)
     text = str(solution.gauge)
-    assert text.startswith(f"Gauge {kind!r}. A map of the reference plane of degree 3 that every exposure takes back")
+    assert text.startswith(f"Gauge {kind!r}. A map of the reference plane of degree 3 that every exposure compensates")
     assert "20 modes, 6 of them exactly" in text
     rows = [line for line in text.splitlines() if line.endswith(")") or "nominal poses" in line]
     assert [line[:24].strip() for line in rows] == ["shift, rotation, scale", "shear", "degree 2", "degree 3"]
