@@ -102,7 +102,7 @@ def _noise(frame, bad):
 def _block_medians(data):
     ny, nx = (max(1, n // _BLOCK) for n in data.shape)
     by, bx = data.shape[0] // ny, data.shape[1] // nx  # what is over at the end, less than one block, is left out
-    blocks = data[: ny * by, : nx * bx].reshape(ny, by, nx, bx).swapaxes(1, 2)[:, :, ::2]  # half of them say enough
+    blocks = data[: ny * by, : nx * bx].reshape(ny, by, nx, bx).swapaxes(1, 2)[:, :, ::2]  # half of them are enough
     return np.median(blocks.reshape(ny, nx, -1), axis=2)
 
 

@@ -108,7 +108,7 @@ def assemble(layers, recipe, folder, share):
     folder : path
         The planes are arrays on the disk of this folder.
     share : callable
-        `legdistort.runtime.parallel.map_items`, which knows who shares the work.
+        `legdistort.runtime.parallel.map_items`, which shares the work among threads or processes.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The cards of a mosaic: what its exposures say alike, their times, and how it was made."""
+"""The cards of a mosaic: what its exposures have in common, their times, and how it was made."""
 
 from importlib.metadata import version
 from numbers import Real
@@ -63,7 +63,7 @@ def exposure_start(header):
                 continue  # a day alone is no time
             try:
                 return Time(text, scale="utc", format="isot")
-            except ValueError:  # a header that says nothing readable says nothing
+            except ValueError:  # what cannot be read counts as absent
                 continue
     for key in _DAYS:
         day = header.get(key)

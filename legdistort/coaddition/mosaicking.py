@@ -63,7 +63,7 @@ def coadd(
     Parameters
     ----------
     exposures : sequence of Exposure
-        The images; or what `legdistort.open_exposures` gives: then they are never all in memory.
+        The images; or those of `legdistort.open_exposures`, of which only some are in memory at a time.
     solution : Solution
         With the distortion of every exposure; an exposure without one is left out with a warning.
     method : {'mean', 'median', 'clipped'}
@@ -72,7 +72,7 @@ def coadd(
     order : int or str
         Order of the spline, 0 to 5, or the name that reproject gives it, such as 'bilinear'.
     algorithm : {'interp', 'adaptive', 'exact', 'drizzle'}
-        Which of reproject's algorithms, or that of STScI; `order` counts for 'interp' only. 'exact' is fifty times
+        One of reproject's algorithms, or that of STScI; `order` applies to 'interp' only. 'exact' is fifty times
         slower. 'drizzle' with `pixfrac` 1 is the same, fast; it needs the extra ``legdistort[drizzle]``.
     grid : `~astropy.wcs.WCS` or `~astropy.io.fits.Header`, optional
         Output grid, with its shape. The default is the reference plane, pixel for pixel, as large as all
@@ -118,10 +118,10 @@ def coadd(
     Raises
     ------
     InputError
-        Naming what is wrong: an option, an exposure whose shape is not that of the solution, a grid
-        without sky or shape, no exposure left, none on the grid.
+        For a wrong option, an exposure whose shape is not that of the solution, a grid without sky or shape, no
+        exposure left, or none on the grid.
     DiskFullError
-        If the disk of `scratch` is full, or has less room than will be needed. Nothing is left behind.
+        If the disk of `scratch` is full, or has less space than will be needed. Nothing is left behind.
 
     See Also
     --------
@@ -167,7 +167,7 @@ def _check_order(exposures, solution):
 
 
 def _coadd(exposures, solution, options, share):
-    """The mosaic; `share` is `map_items`, which knows who shares the work."""
+    """The mosaic; `share` is `map_items`, which shares the work among threads or processes."""
     frames, left_out = _select(exposures, solution)
     options.check_names([*(f.name for f in frames), *left_out])
     if options.grid is None:
@@ -310,7 +310,7 @@ def _warn_of_misuse(frames, maps, algorithm):
 
 
 def _settings(options, recipe, origin, correlation):
-    """Cards that say how the mosaic was made."""
+    """Cards that state how the mosaic was made."""
     weights = options.weights
     return [
         ("COMBINE", options.method, "how exposures are combined"),

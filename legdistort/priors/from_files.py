@@ -133,7 +133,7 @@ def _models(tree, path=""):
 
 
 def _reference_model(model, tree, name):
-    """A bare model; distortion reference files of JWST and Roman say that it leads from pixels to V2 and V3."""
+    """A bare model; distortion reference files of JWST and Roman state that it leads from pixels to V2 and V3."""
     roman = tree.get("roman")
     meta = roman.get("meta") if isinstance(roman, dict) else tree.get("meta")
     if not isinstance(meta, dict) or str(meta.get("reftype")).lower() != "distortion":

@@ -66,21 +66,21 @@ def _declared(sigma, static_sigma):
 
 @dataclass(frozen=True, eq=False)
 class Prior(ShownAsPrinted):
-    """Static distortion known beforehand, and how far to trust it.
+    """Static distortion known beforehand, with its uncertainty.
 
     Parameters
     ----------
     mean : array_like, shape (2, n_modes), or None
-        Static distortion A_0 in the normalised Legendre basis, pixels, x then y (reference -> detector). None: only how
-        large it is, see `static_sigma`.
+        Static distortion A_0 in the normalised Legendre basis, pixels, x then y (reference -> detector). None: only its
+        size is known, see `static_sigma`.
     sigma : array_like, optional
-        Scatter of single exposures around the mean, pixels: a number, (n_modes,) or (2, n_modes). It shrinks
-        what data do not determine. None leaves the exposures free. Zero keeps a mode at the mean, infinity leaves it
-        free. "evidence" lets `legdistort.solve` find it from the exposures, one width a degree
+        Scatter of single exposures around the mean, pixels: a number, (n_modes,) or (2, n_modes). It shrinks modes
+        that the data do not determine. None leaves the exposures free. Zero keeps a mode at the mean, infinity leaves
+        it free. "evidence" lets `legdistort.solve` find it from the exposures, one width a degree
         (`legdistort.solving.choices.prior_widths`).
     static_sigma : array_like, optional
         Uncertainty of the mean itself, same forms. It is common to all exposures and does not average down. None takes
-        the mean as exact, infinity says that nothing is known of a mode. Without a mean, a number s: every coefficient
+        the mean as exact, infinity means that nothing is known of a mode. Without a mean, a number s: every coefficient
         of the degree d that is fitted is about that large, in pixels, either sign. This makes
         ``s sqrt(((d + 1) (d + 2) - 4) / 8)`` px of distortion, rms per axis over the detector, shift, rotation and
         scale aside: s at degree 2, 1.4 s at 3, 1.8 s at 4, 2.2 s at 5.
@@ -265,7 +265,7 @@ class Prior(ShownAsPrinted):
         Warns
         -----
         AssumptionWarning
-            If the source covers only a part of the detector, saying which.
+            If the source covers only a part of the detector, which the warning states.
         """
         from ..cameras.expansion import expand
         from .from_objects import as_source

@@ -95,7 +95,7 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
             return kind.from_model(source, **options, **widths)
         except InputError:
             raise
-        except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # its model had the say
+        except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # of the model
             raise InputError(f"{source.name}: the distortion cannot be evaluated ({error})") from None
 
 

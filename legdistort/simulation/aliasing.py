@@ -123,7 +123,7 @@ def alias(problem, state, gauge, covariance, *, independent, common):
         Of the fitted coefficients.
     independent, common : ndarray, shape (2, n_modes)
         Standard deviation of the amplitudes, pixels, of which those beyond the fitted degree count: drawn anew for
-        every exposure, and shared by all (a static distortion that nobody knows).
+        every exposure, and shared by all (an unknown static distortion).
 
     Returns
     -------

@@ -84,7 +84,7 @@ class Plan:
         if not isinstance(camera, Camera):
             raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
         if shape is not None and tuple(shape) != camera.field:
-            raise InputError("shape and camera both say how large the field is: leave shape out")
+            raise InputError("shape and camera both state the size of the field: leave shape out")
         if self.prior is not None:
             return camera.field, self.prior
         widths = camera.common_sigma
@@ -95,7 +95,7 @@ class Plan:
         """When the exposures will be taken, and where the field lies."""
         if self.epochs is None:
             if self.field is not None:
-                raise InputError("field, the place on the sky, is asked for parallaxes: give epochs too")
+                raise InputError("field, the place on the sky, is for parallaxes: give epochs too")
             return
         years = np.asarray(self.epochs, dtype=float)
         if years.shape != (self.n_exposures,) or not np.isfinite(years).all():
@@ -119,7 +119,7 @@ class Plan:
 
     @property
     def least(self) -> int:
-        """Exposures that a star must be on: four, or all if there are fewer, unless it is said."""
+        """Exposures that a star must be on: four, or all if there are fewer, unless `min_exposures` is given."""
         return min(4, self.n_exposures) if self.min_exposures is None else self.min_exposures
 
     def __repr__(self) -> str:
@@ -223,7 +223,7 @@ def _poses(plan, rng):
     n_exposures = plan.n_exposures
     if plan.poses is not None:
         if np.any(plan.dithers):
-            raise InputError("poses and dithers both say where the exposures lie: leave one out")
+            raise InputError("poses and dithers both state where the exposures lie: leave one out")
         if len(plan.poses) != n_exposures:
             raise InputError(f"poses has {len(plan.poses)} exposures, n_exposures is {n_exposures}")
         return {str(name): similarity.check(pose, f"pose of exposure {name!r}") for name, pose in plan.poses.items()}

@@ -192,7 +192,7 @@ class Prediction(ShownAsPrinted):
         Returns
         -------
         `~astropy.table.Table`
-            One row a plan, this one first; ``meta["failed"]`` says which cannot be solved, and why.
+            One row a plan, this one first; ``meta["failed"]`` names those that cannot be solved, with the reason.
         """
         n, settings = self.n_exposures, self.settings
         changes = [{"degree": d} for d in (self.degree - 1, self.degree + 1) if 0 <= d <= basis.MAX_DEGREE]
@@ -286,12 +286,12 @@ def predict(
         As for `solve`.
     dynamic : float or array_like, optional
         Scatter of the fitted coefficients from exposure to exposure, pixels: one, per mode (n_modes,) or
-        (2, n_modes). It gives the absolute error. Not with a prior that has widths, which say the same.
+        (2, n_modes). It gives the absolute error. Not with a prior that has widths, which mean the same.
     spectrum : dict or array_like, optional
         The same with degrees beyond the fitted one, whose aliasing it predicts: ``{degree: pixels}``, the standard
         deviation of each coefficient of a degree, or per mode. Without a fitted degree in it, `dynamic` may be added.
     static_spectrum : dict or array_like, optional
-        The same for a distortion common to all exposures that the prior does not know; only modes beyond the fitted
+        The same for a distortion common to all exposures that the prior does not contain; only modes beyond the fitted
         degree count (for the others see ``static_sigma`` of `Prior`).
     min_exposures : int, optional
         Stars on fewer exposures are left out; default 4, or all if there are fewer.
@@ -323,7 +323,7 @@ def predict(
     Notes
     -----
     Up to 8000 coefficients (400 exposures at degree 3) their full covariance is used; beyond, one block an exposure.
-    With more than 4000 stars as well, it is approximated, and an `AssumptionWarning` says how well.
+    With more than 4000 stars as well, it is approximated, and an `AssumptionWarning` gives the factor.
 
     Examples
     --------

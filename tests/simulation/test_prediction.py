@@ -379,7 +379,7 @@ GOOD = {"n_exposures": 4, "n_stars": 40, "sigma": 0.1}
         ({"dithers": -5}, InputError, "dithers must be an rms length in pixels, or one shift .* got -5"),
         ({"dithers": np.zeros((3, 2))}, InputError, r"one shift for each exposure, shape \(4, 2\), got shape \(3, 2\)"),
         ({"poses": {"a": np.eye(2, 3)}}, InputError, "poses has 1 exposures, n_exposures is 4"),
-        ({"poses": {}, "dithers": 5.0}, InputError, "poses and dithers both say where the exposures lie"),
+        ({"poses": {}, "dithers": 5.0}, InputError, "poses and dithers both state where the exposures lie"),
         ({"poses": dict.fromkeys("abcd", np.ones((2, 3)))}, InputError, "pose of exposure 'a' is not a similarity"),
         ({"gauge": "none"}, InputError, "gauge must be one of 'minimal', 'mean', got 'none'"),
         ({"min_exposures": 5}, InputError, "min_exposures must be from 1 to the 4 exposures, got 5"),
