@@ -127,19 +127,19 @@ def run(
     out : str or path
         Folder for the results; made if it does not exist. Nothing is left there if the run fails.
     earlier : str or path, optional
-        Folder of the results of a run whose measured positions are taken: it goes on from there, with other options of
-        all steps but reading and measuring. Its frames, or those of them that are given, must be as they were.
+        Folder of an earlier run, whose measured positions are taken instead of measuring anew. All options but those of
+        reading and measuring may differ. Its frames, or those of them that are given, must be unchanged.
     ext : int, str or (str, int), optional
         Extension to read from every file.
     dq_good : int, str or sequence of int, optional
-        Flags that are no reason to leave a pixel out.
+        Flags with which a pixel is used nevertheless.
     degree : int
         Total degree of the distortion.
     prior : Prior, dict, "header" or HeaderPrior, optional
         Static distortion. "header": that of the headers, see `legdistort.Prior.from_headers`.
     camera : Camera, optional
         Where exposures have several detectors: `ext` is the name of several extensions, or each detector has a file of
-        its own (`legdistort.Camera.of_detectors`). By default the headers say how the detectors of a file lie.
+        its own (`legdistort.Camera.of_detectors`). By default the layout of the detectors is that of the headers.
     min_exposures : int
         Stars seen in fewer exposures are not used.
     clip : float or None
@@ -156,7 +156,7 @@ def run(
         (`legdistort.assessment.baselines`), and report the scatter and the sharpness of the stack that each of them
         leaves.
     truth : Truth, optional
-        What was put into simulated frames (`legdistort.simulate_exposures`): summary and report then say how far the
+        The truth of simulated frames (`legdistort.simulate_exposures`): summary and report then state how far the
         result is from it.
     stop_at_bad : bool
         Raise `InputError` for blank, truncated or damaged frames, naming all of them; else they are left out with a
@@ -302,7 +302,7 @@ def _known_prior(prior, exposures=None, degree=3):
 
 def _step_options(kind, given, argument, *, defaults=None, **own):
     """The frozen options of a step: from its dict, from what `run` takes itself, and from the defaults of `run`."""
-    kind(**own)  # whatever is wrong with these is said without the dict
+    kind(**own)  # errors of these are raised without a mention of the dict
     given = {} if given is None else given
     if isinstance(given, dict):
         for name in own.keys() & given:
@@ -321,7 +321,7 @@ def _check_others(workers, truth):
 
 
 def _assessed(solution, exposures, quality, comparison, stacks, truth):
-    """What the summary says of images, mosaic and other corrections, as far as it is known; all checks among it."""
+    """The entries of the summary on images, mosaic and other corrections, as far as known, with all checks."""
     checked = solution.checks + run_checks.check_run(solution, quality)
     figures = {"checks": [asdict(check) for check in checked], "fwhm_ratio": quality and quality.fwhm_ratio}
     figures["observed"] = observed(exposures)
@@ -367,9 +367,9 @@ def linked_files(target):
 
 
 def listed_files(target):
-    """What the summary says of the files beside it: a word of its own for the run, and ``{name: SHA-256}``.
+    """The entries of the summary on the files beside it: an identifier of the run, and ``{name: SHA-256}``.
 
-    A program that finds a file with another checksum sees that results of two runs are mixed there.
+    A file with another checksum shows a program that results of two runs are mixed there.
     """
     return {"run": uuid.uuid4().hex, "files": outputs.contents(target)}
 
@@ -420,7 +420,7 @@ def _compared(matches, solution, solving, mosaic, kept, coadding):
 
 
 def _if_possible(judge, *args, **kwargs):
-    """What a judgement of the mosaic says, or None: a run does not fail because no star can be measured in it."""
+    """The result of a judgement of the mosaic, or None: a run does not fail because no star can be measured in it."""
     try:
         return judge(*args, **kwargs)
     except InputError as error:

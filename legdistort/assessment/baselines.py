@@ -130,7 +130,7 @@ def compare(matches, solution, *, prior=None):
     -------
     dict
         ``{name: Solution}``: "shift", "static + shift", "relative polynomial", "all distortions solved". A
-        correction that fails on these data is left out, with a warning in the log that says why.
+        correction that fails on these data is left out, with a warning in the log that gives the reason.
     """
     table = solution.observations[solution.observations["used"]]
     table = table[matches.table.colnames]

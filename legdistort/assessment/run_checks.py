@@ -11,9 +11,9 @@ BLURRED = 1.05
 #: Excess of an exposure over the others in the logarithm of the FWHM, and distance from them in ellipticity, along and
 #: across, that have a cause to look for (a trail of one FWHM makes 0.11 to 0.15 in one, 0.13 to 0.15 in the other) ...
 WIDE, ELONGATED = 0.08, 0.08
-#: ... if it is no more probable than this by chance, as the others scatter: few exposures say no more.
+#: ... if it is no more probable than this by chance, as the others scatter: few exposures determine no more.
 ODD = 0.001
-_FEWEST = 4  # exposures, to say how much they differ usually
+_FEWEST = 4  # exposures, to determine how much they usually differ
 
 
 def check_run(solution, quality=None):
@@ -36,8 +36,8 @@ def image_check(quality):
     """Are the stars of all exposures alike?"""
     found = quality.exposures if quality else {}
     if len(found) < _FEWEST:
-        return Check("images", "unknown", None, None, f"stars were measured in {len(found)} exposures, too few to say "
-                     "whether one is unlike the others", "")  # fmt: skip
+        return Check("images", "unknown", None, None, f"stars were measured in {len(found)} exposures, too few to "
+                     "determine whether one differs from the others", "")  # fmt: skip
     names, (fwhm, ellipticity, angle) = list(found), np.array(list(found.values())).T
     stretch = ellipticity * np.exp(2j * np.radians(angle))
     odd = [

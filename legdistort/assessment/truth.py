@@ -9,7 +9,7 @@ _HELD_OUT_PER_SIDE = 20
 
 
 def compare_with_truth(solution, truth, *, seed=0):
-    """How far a solution is from the truth, and how far its own errors say it should be.
+    """How far a solution is from the truth, and how far its own errors lead to expect.
 
     Returns
     -------

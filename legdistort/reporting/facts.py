@@ -1,4 +1,4 @@
-"""What a report says in words: what was observed, the figures of the solution, and a paragraph for a paper."""
+"""The sentences of a report: what was observed, the figures of the solution, and a paragraph for a paper."""
 
 from dataclasses import asdict
 

@@ -112,8 +112,8 @@ def stars_table(solution, pulls):
     return Table(
         head,
         rows,
-        f"{note}Relative errors hold once a map common to all exposures is taken off; absolute ones (abs) have it in "
-        "them. Residuals: their rms over what their errors and the fit lead to expect.",
+        f"{note}Relative errors hold once a map common to all exposures is taken off; absolute ones (abs) include "
+        "its error. Residuals: their rms over what their errors and the fit lead to expect.",
     )
 
 
