@@ -1,6 +1,6 @@
 """Real star lists from Keck NIRC2 behind adaptive optics, through the same comparison as the twin of the GeMS data.
 
-``python docs/paper/keck.py`` prints the figures of the page and draws its pictures; it says so if the data are absent.
+``python docs/paper/keck.py`` prints the figures of the page and draws its pictures, if the data are there.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A static distortion as somebody gave it: one function between detector pixels and an undistorted plane.
+"""A static distortion as it was given: one function between detector pixels and an undistorted plane.
 
 Its direction, origin and detector shape are settled here. Outputs on a sphere (right ascension and declination, or
 V2 and V3) are projected from the centre of the sphere on the plane that touches it at the centre of the detector,
@@ -21,7 +21,7 @@ FOLD = 0.1
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Source:
-    """A static distortion as somebody gave it.
+    """A static distortion as it was given.
 
     Attributes
     ----------

@@ -20,7 +20,12 @@ FRAMES = {
 }
 RUN_FRAMES = {
     "paths": Option(
-        "as of measure; none with --from: its frames", "frames", none=[], nargs="*", metavar="FRAME", path="read"
+        "as for measure; with --from by default the frames of that run",
+        "frames",
+        none=[],
+        nargs="*",
+        metavar="FRAME",
+        path="read",
     ),
     "ext": FRAMES["ext"],
     "earlier": Option(
@@ -117,13 +122,13 @@ DETECTOR = {
 MEASURING = Group(
     "measuring",
     {
-        "fwhm": Option("of the stars, pixels (default: found)", type=float),
+        "fwhm": Option("full width at half maximum of the stars, pixels (default: estimated)", type=float),
         **DETECTOR,
-        "profile": Option("shape: of a star, or the whole frame", choices=words.PROFILES),
+        "profile": Option("shape of the stars: each its own, or one for the frame", choices=words.PROFILES),
         "psf": Option("auto (default), moffat, effective, or a file or folder with PSFs", path="read"),
         "blends": Option("how stars that touch are fitted (default together)", choices=words.BLENDS),
         "errors": Option(
-            "of the fit, or by stars of known position put into the frame (default fit)",
+            "errors of the fit, or from stars put into the frame at known positions (default fit)",
             "--position-errors",
             choices=words.POSITION_ERRORS,
         ),
@@ -160,21 +165,23 @@ SOLVING = Group(
             type=word_or(float, "evidence"),
             metavar="PIXELS",
         ),
-        "validate": Option("of the stars, kept out to test the errors", type=float, metavar="FRACTION"),
+        "validate": Option("of the stars, kept out of the fit to test the errors", type=float, metavar="FRACTION"),
         "static": Option(
             "fit one static distortion for all exposures of a detector; of a camera also hold, prior",
             choices=words.CAMERA,
         ),
-        "layout": Option("the same for where the detectors of a camera lie", choices=words.CAMERA),
+        "layout": Option("the same for the layout of the detectors of a camera", choices=words.CAMERA),
         "dynamic": Option("of a camera: what has a distortion of its own in every exposure", choices=words.DYNAMIC),
-        "exposure_degree": Option("with --static fit: what every exposure adds (default 1)", type=int),
-        "gauge": Option("see the docs (default minimal)", choices=words.GAUGES),
+        "exposure_degree": Option(
+            "with --static fit: degree of what every exposure has for itself (default 1)", type=int
+        ),
+        "gauge": Option("convention for the null space (default minimal)", choices=words.GAUGES),
         "method": Option("(default joint)", choices=words.METHODS),
         "loss": Option("(default linear)", choices=words.LOSSES),
         "clip": Option("leave out what deviates by more sigma; 0: nothing (default 5)", type=float, none=0),
         "errors": Option("(default stated)", choices=words.ERRORS),
         "error_floor": Option("pixels, added in quadrature to every error", type=float),
-        "motion": Option("of the stars, fitted beside their positions", choices=words.MOTIONS),
+        "motion": Option("motions of the stars, fitted beside their positions", choices=words.MOTIONS),
         "motion_sigma": Option(
             "scatter of proper motions, pixels a year; evidence: found",
             type=word_or(float, "evidence"),
@@ -208,7 +215,7 @@ COADDING = Group(
     },
 )
 GRID = {"grid": Option("image or header text whose grid is taken", type=Path, metavar="FILE", path="read")}
-COMPARING = {"compare": Option("also by shifts, static map and relative polynomial", action="store_true")}
+COMPARING = {"compare": Option("also correct by shifts, static map and relative polynomial", action="store_true")}
 EXPANDING = {
     "where": Option(
         "a file or name, or the two maps of shifts in x and y", "sources", nargs="+", metavar="SOURCE", path="read"
@@ -249,6 +256,6 @@ PREDICTING = {
     "dynamic": Option("rms of a coefficient from exposure to exposure, pixels", type=float),
     "spectrum": Option("the same by degree, beyond the fit too", type=spectrum, metavar="DEGREE=RMS,..."),
     "epochs": Option("years of the exposures: motions are fitted too", type=float, nargs="+", metavar="YEAR"),
-    "gauge": Option("see the docs (default minimal)", choices=words.GAUGES),
+    "gauge": Option("convention for the null space (default minimal)", choices=words.GAUGES),
     "seed": Option("of stars and shifts that are drawn (default 0)", type=int),
 }

@@ -136,7 +136,7 @@ def n_bytes(shape, n_exposures):
 
 
 def side(n_exposures):
-    """Side of a block [px], so that so many exposures of it are held at once, whoever works on it."""
+    """Side of a block [px], so that so many exposures of it are held at once, however the work is shared."""
     low, high = _SIDES
     return int(np.clip(np.sqrt(_SAMPLES / n_exposures) // low * low, low, high))
 

@@ -77,7 +77,7 @@ class LegendreDistortionFitter(Fitter):
             Measured positions, same shape. Masked ones are left out.
         weights : array_like or Quantity, or pair of them, optional
             1/sigma, as everywhere in astropy (*not* 1/sigma^2), [1/pix]; a pair gives x and y their own. Zero leaves
-            a position out. None weighs all alike.
+            a position out. None gives all the same weight.
         clip : float, optional
             Leave out positions that deviate by more standard errors, at the observed scale (from the median) where that
             is larger than the weights imply, from a fit of the others. ``fit_info["used"]`` marks those that are left.

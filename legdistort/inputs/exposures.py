@@ -1,4 +1,4 @@
-"""One image and what is known about it, from its header where that is to be believed."""
+"""One image and what is known about it, from its header where that is plausible."""
 
 from __future__ import annotations
 

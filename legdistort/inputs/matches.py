@@ -245,7 +245,7 @@ class Matches(ShownAsPrinted):
         allow_copies: bool = False,
         camera: Camera | None = None,
     ) -> Matches:
-        """Matches from anybody's table.
+        """Matches from a table of positions whose stars are identified.
 
         Parameters
         ----------

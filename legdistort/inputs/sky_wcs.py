@@ -1,4 +1,4 @@
-"""World coordinate systems of exposures: which are believed, and where on the sky they lead.
+"""World coordinate systems of exposures: which are plausible, and where on the sky they lead.
 
 `~astropy.wcs.WCS` objects of FITS headers, with their distortions or without, and any other that has astropy's shared
 interface for world coordinates (APE 14) and leads to the sky, such as a gwcs.
@@ -19,14 +19,14 @@ from ..exceptions import InputError
 
 log = logging.getLogger(__name__)
 
-#: A WCS is believed for pixel scales in this range [degrees]: 0.1 mas to 6 arcmin.
+#: A WCS is plausible for pixel scales in this range [degrees]: 0.1 mas to 6 arcmin.
 PIXEL_SCALES = (0.0001 / 3600, 0.1)
 #: ... and a reference pixel not farther from the centre than this many frame sizes (mosaics need several).
 REFERENCE_DISTANCE = 20
 
 
 def believable_wcs(wcs, shape, name=""):
-    """The celestial part of a WCS, or None with a log entry if it is not to be believed.
+    """The celestial part of a WCS, or None with a log entry if it is not plausible.
 
     Believable is a WCS that has two celestial axes, a pixel scale in `PIXEL_SCALES` that is the same in x
     and y within a factor of two, and leads from the whole detector to the sky. One of a FITS header must also have its

@@ -74,7 +74,7 @@ def register(source, target, *, guess=None, blind=True, tolerance=None):
     ----------
     source, target : StarList
     guess : ndarray, shape (2, 3), optional
-        Pose source -> target, from headers; it is tried first, then only its orientation is believed, then nothing.
+        Pose source -> target, from headers; it is tried first, then its orientation alone, then no pose.
     blind : bool
         Also try any rotation and a flip.
     tolerance : float, optional

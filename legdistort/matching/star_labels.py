@@ -8,11 +8,11 @@ from scipy.sparse.csgraph import connected_components
 def label_stars(sizes, registrations):
     """Detections of the same star get the same label.
 
-    A star is a connected set of detections in which each is paired with at least half of those it was compared with.
-    A set that holds two detections of one exposure is taken apart: its closest pairs join first, and a pair that would
-    bring the two together is ignored. Then whoever is paired with fewer than half of its companions (among the
-    exposures registered with its own) is dismissed: hot pixels under a slow drift hang together only from one exposure
-    to the next.
+    A star is a connected set of detections in which each is paired with at least half of those it was compared with. A
+    set that holds two detections of one exposure is taken apart: its closest pairs join first, and a pair that would
+    bring the two together is ignored. Then detections that are paired with fewer than half of their companions (among
+    the exposures registered with their own) are dismissed: hot pixels under a slow drift hang together only from one
+    exposure to the next.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 EVIDENCE = "evidence"
 #: As `prior` of `legdistort.run`: that of the headers of the frames.
 HEADER = "header"
-#: Source of a mean that nobody has stated.
+#: Source of a mean whose source is not stated.
 UNSTATED = "unstated"
 
 

@@ -1,4 +1,4 @@
-"""What is checked of a result: one question a referee would ask, the answer, and what to do about it."""
+"""What is checked of a result: a question, the answer, and a cure."""
 
 from __future__ import annotations
 

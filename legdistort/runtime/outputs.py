@@ -273,7 +273,7 @@ def _new_folder(place, out):
         except OSError as error:
             if not os.path.lexists(place):
                 raise
-            raise InputError(f"{out} was made by somebody else meanwhile ({error.strerror}): give another") from None
+            raise InputError(f"{out} was made by another process meanwhile ({error.strerror}): give another") from None
         where = place
         _sync(place.parent)
     finally:
@@ -327,7 +327,7 @@ def _settle_locked(folder):
     except OSError as error:
         raise InputError(
             f"{folder} holds a complete result whose files are not all in their places, since its writer was stopped; "
-            f"they cannot be moved now ({error.strerror or error}): let somebody read it who may write there"
+            f"they cannot be moved now ({error.strerror or error}): read it as a user who may write there"
         ) from None
 
 

@@ -29,7 +29,7 @@ _AHEAD = 4  # items in flight for every worker
 
 
 def map_items(function, items, *, workers=None, threads=False, progress=False, description=None, unit="frame"):
-    """Results of a function for every item, in the order of the items, whoever works on them.
+    """Results of a function for every item, in the order of the items, however they are shared.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def beside(function, *, workers=None):
 
 
 def _attempt(function, item):
-    """Result, error, warnings and log records of a process that nobody listens to."""
+    """Result, error, warnings and log records of a call, to be passed on from a worker process."""
     records, result, raised = SimpleQueue(), None, None
     log = logging.getLogger("legdistort")
     log.handlers[:], log.propagate = [QueueHandler(records)], False

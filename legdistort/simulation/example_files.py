@@ -1,4 +1,4 @@
-"""Example files for whoever has none at hand: small simulated sets in the forms that other programs write."""
+"""Example files: small simulated sets in the forms that other programs write."""
 
 from pathlib import Path
 

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 MAX_ITERATIONS, MAX_SWEEPS = 50, 1000
 #: The constraints follow the state for so many iterations; then they are held. Those of a state that is not yet the
 #: solution may hold what the data determine and leave free what they do not: of 300 sets of 4 to 6 exposures and some
-#: 20 stars, with 15 px of static distortion that nobody knew, 21 never settled with 6, one with 12, none with 20. Not
+#: 20 stars, with 15 px of unknown static distortion, 21 never settled with 6, one with 12, none with 20. Not
 #: for ever: where few stars of a reference bend the plane by much, state and constraints may chase each other.
 _MADE = 20
 #: ... nor once a step is below so many standard errors, rms: what they are made from hardly changes then.

@@ -17,7 +17,7 @@ from .equations.problem import check_error_floor, check_prior
 
 
 class Unasked(float):
-    """The value of an option that nobody asked for: it yields to others that exclude it."""
+    """The value of an option that was not given: it yields to others that exclude it."""
 
 
 #: Standard errors beyond which an observation is left out, unless the caller gives another limit.

@@ -1,1 +1,1 @@
-"""What a referee would ask of a solution, answered from its residuals."""
+"""Checks of a solution, made from its residuals."""

@@ -1,8 +1,8 @@
 """The checks of a solution: `Solution.checks`.
 
-They ask what a referee would ask. Are the errors right? Do residuals depend on the exposure, the brightness, the place
-on the detector, the time? Is the degree too low or too high? Are absolute positions known, and how much of a frame is
-extrapolated? Was anything left out? Limits follow from the null distribution of each statistic
+Their questions: Are the errors right? Do residuals depend on the exposure, the brightness, the place on the detector,
+the time? Is the degree too low or too high? Are absolute positions known, and how much of a frame is extrapolated? Was
+anything left out? Limits follow from the null distribution of each statistic
 (`legdistort.solving.checks.residual_tests`), never from a value that looks large.
 """
 

@@ -64,7 +64,7 @@ class Unknowns:
 
     @property
     def gauge_degree(self):
-        """Degree of the maps of the reference plane that exposures can take back."""
+        """Degree of the maps of the reference plane that exposures can compensate."""
         return max(1, self.own_degree) if self.shared else self.degree
 
     @cached_property

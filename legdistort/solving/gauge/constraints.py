@@ -17,7 +17,7 @@ from .hierarchy import Hierarchy
 
 #: Below this the constraints of the "mean" gauge leave a direction free.
 _MEAN_LIMIT = 1e-3
-_SETTLED = 0.01  # of a map that an exposure cannot take back: less, and the data hardly depend on it
+_SETTLED = 0.01  # of a map that an exposure cannot compensate: less, and the data hardly depend on it
 _CORNERS = np.array([[-1, 1, 1, -1.0], [-1, -1, 1, 1.0]])
 
 
@@ -101,7 +101,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
 
 
 def _drifts(problem, motion, others, shared_shears, all_drifts):
-    """Common maps that change from exposure to exposure as the terms of the stars do, and that all can take back.
+    """Common maps that change from exposure to exposure as the terms of the stars do, and that all can compensate.
 
     Where something is known of the motions of stars beforehand, that determines the maps, and none is left here unless
     all are wanted.
@@ -153,7 +153,7 @@ def _null_space(matrix, tolerance):
 
 
 def _taken_back(problem, motion, box, shared_shears):
-    """Orthonormal rows (m, 2 n): maps of the reference plane, similarities aside, that all exposures can take back."""
+    """Orthonormal rows (m, 2 n): maps of the reference plane, similarities aside, in the null space."""
     similar = similarity_basis(2 * box[1, ::-1], problem.n_modes)
     if shared_shears:
         return np.zeros((0, len(similar.T)))
@@ -201,7 +201,7 @@ def _pose_rows(kind, motion, error, similar, box):
 
 
 def own_part(problem, state, blocks):
-    """The same with those modes alone that can take back a common map, where exposures share the others."""
+    """The same with those modes alone that can compensate a common map, where exposures share the others."""
     unknowns = problem.unknowns
     if not unknowns.shared:
         return problem, state, blocks

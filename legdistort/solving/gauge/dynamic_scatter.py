@@ -1,4 +1,4 @@
-"""How far single exposures scatter around their static distortion, how well each is known, and how much it weighs."""
+"""How far single exposures scatter around their static distortion, how well each is known, and its weight."""
 
 import numpy as np
 
@@ -123,7 +123,7 @@ def _excess(a, variance, counts, dof):
 
 
 def influence(error, rows):
-    """How much each exposure weighs (n_exposures,): 1, fading where the variance exceeds ten times the usual one.
+    """Weight of each exposure (n_exposures,): 1, fading where the variance exceeds ten times the usual one.
 
     The scatter of a convention over a bad exposure's errors would move every star for no gain.
     """

@@ -1,6 +1,6 @@
 """What is known of a map common to all exposures, and what only a convention holds.
 
-A bend of the reference plane that every exposure takes back leaves all residuals as they are, so the positions alone
+A bend of the reference plane that every exposure compensates leaves all residuals as they are, so the positions alone
 never determine it. What determines it is that single exposures depart from one static distortion by little::
 
     A_i = A_0 + N_i g + d_i,      d_i ~ N(0, Lambda_i + C_i)
@@ -62,7 +62,7 @@ class Hierarchy:
     static : ndarray, shape (n_groups, K)
         Variance of A_0 by detector: infinite where it is not known, zero where it is exact.
     maps : ndarray, shape (m, 2 n)
-        Orthonormal rows: the maps that every exposure can take back, similarities aside.
+        Orthonormal rows: the maps that every exposure can compensate (null space), similarities aside.
     size : tuple
         ``(ny, nx)`` of the box of the reference plane on which the modes are defined, pixels.
     power : ndarray, shape (n, n)
