@@ -540,6 +540,7 @@ class TestBadInput:
 
 
 class TestFiles:
+    @pytest.mark.usefixtures("undrawn")
     def test_from_tables_to_wcs_in_the_shell(self, night, table, gsaoi, tmp_path, monkeypatch):
         """Lists without star numbers: matched over the gaps, solved, and a WCS for every detector of every exposure."""
         monkeypatch.chdir(tmp_path)
