@@ -27,6 +27,12 @@ def shared_data():
     return folder
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Reports are written whole, but their pictures are not turned into SVG, which takes most of the time."""
+    monkeypatch.setattr("legdistort.reporting.pictures.svg_of", lambda *_, **__: "")
+
+
 @pytest.fixture(scope="session")
 def geometry():
     """See `sky_chains.geometries`."""

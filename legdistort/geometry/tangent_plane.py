@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -99,6 +100,12 @@ class TangentPlane(ShownAsPrinted):
         sky = models.Pix2Sky_TAN() | models.RotateNative2Celestial(self.lon, self.lat, 180.0)
         return plane | sky
 
+    @cached_property
+    def _ways(self) -> tuple[Model, Model]:
+        """`model` and its inverse for positions, never given away: making them takes longer than to use them."""
+        there = self.model()
+        return there, there.inverse
+
     @property
     def pixel_scale(self) -> float:
         """Size of a reference-plane pixel, arcsec."""
@@ -107,7 +114,7 @@ class TangentPlane(ShownAsPrinted):
     def to_sky(self, xy: ArrayLike) -> SkyCoord:
         """Reference-plane positions (n, 2) -> `~astropy.coordinates.SkyCoord` (ICRS)."""
         xy = np.asarray(xy, dtype=float)
-        return SkyCoord(*self.model()(xy[..., 0], xy[..., 1]) * u.deg, frame="icrs")
+        return SkyCoord(*self._ways[0](xy[..., 0], xy[..., 1]) * u.deg, frame="icrs")
 
     def jacobian(self, xy: ArrayLike) -> np.ndarray:
         """Derivative of (ra cos(dec), dec) [deg] by (x, y) [pix] at reference positions (n, 2), shape (n, 2, 2).
@@ -165,7 +172,7 @@ class TangentPlane(ShownAsPrinted):
     def from_sky(self, coordinates: SkyCoord) -> np.ndarray:
         """`~astropy.coordinates.SkyCoord` -> reference-plane positions (..., 2); inverse of `to_sky`."""
         icrs = coordinates.icrs
-        return np.stack(self.model().inverse(icrs.ra.deg, icrs.dec.deg), axis=-1)
+        return np.stack(self._ways[1](icrs.ra.deg, icrs.dec.deg), axis=-1)
 
 
 class PlaneToSky(FittableModel):

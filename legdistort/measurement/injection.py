@@ -230,11 +230,14 @@ def free_positions(exposure, taken, fwhm, *, n, rng):
         xy = xy[cKDTree(taken).query(xy)[0] > AWAY * fwhm]
     if not len(xy):
         return xy
-    keep = np.ones(len(xy), dtype=bool)
-    for i, j in sorted(cKDTree(xy).query_pairs(APART * fwhm)):  # i < j: who came first stays
-        if keep[i]:
-            keep[j] = False
-    return xy[keep][:n]
+    tree, keep, near = cKDTree(xy), [], np.zeros(len(xy), dtype=bool)
+    for i, place in enumerate(xy):  # who came first stays
+        if not near[i]:
+            keep.append(i)
+            if len(keep) == n:
+                break
+            near[tree.query_ball_point(place, APART * fwhm)] = True
+    return xy[keep]
 
 
 def inject(exposure, xy, flux, profile, *, photon, rng):

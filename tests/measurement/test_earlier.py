@@ -14,7 +14,7 @@ from legdistort.cli.parser import main
 from legdistort.exceptions import InputError
 from legdistort.measurement import positions
 
-pytestmark = pytest.mark.filterwarnings("ignore::legdistort.LegdistortWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore::legdistort.LegdistortWarning"), pytest.mark.usefixtures("undrawn")]
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ from star_images import GAIN, READ_NOISE, SKY, errors, identify, image, observe,
 import legdistort as ld
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
+from legdistort.measurement import injection
 from legdistort.measurement.effective import building, splines
 from legdistort.measurement.effective.model import EffectivePSF, Grid, Polynomial
 from legdistort.measurement.effective.own_error import own_covariance
@@ -633,7 +634,8 @@ def test_noise_curve_is_that_of_the_true_psf(made):
     assert np.mean(ratio) == pytest.approx(1, abs=0.1)
 
 
-def test_errors_of_injected_stars_are_true_on_these_images(made):
+def test_errors_of_injected_stars_are_true_on_these_images(made, monkeypatch):
+    monkeypatch.setattr(injection, "N_FLUXES", 6)
     _, xy, covariance, _ = night()
     table = ld.measure(night()[0], errors="injected")
     assert set(table["psf"]) == {"effective"}

@@ -336,6 +336,7 @@ def test_run_refuses_before_it_reads(tmp_path):
         run(tmp_path / "no.fits", out=tmp_path / "out", solving={"validate": 2})
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_command_line(tmp_path, capsys):
     sim = simulate(30, 0.5, 0.5, n_exposures=5)
     table = sim.matches.table.copy()

@@ -411,6 +411,7 @@ def test_a_plan_needs_numbers():
         predict(n_exposures=5, n_stars=20, sigma=0.1, prior=Prior(np.zeros((2, 10)), sigma="evidence"))
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("arguments", [["--prior-sigma", "evidence"], ["--prior-sigma", "0.9"]])
 def test_command_line(arguments, tmp_path, capsys):
     sim = simulate(7)

@@ -460,6 +460,10 @@ def test_the_report_shows_motions(tmp_path):
     assert "Proper motion of every star with its relative errors" in page
     assert "stars move: proper motions scatter by" in page
     assert "relative to the mean of the stars" in page
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_report_shows_what_motions_are_tied_to(tmp_path):
     sim = field(60)
     page = write_report(tmp_path / "tied.html", solve(sim.matches, motion="proper", reference=catalogue(sim, RNG)))
     assert "tied to those of the reference" in page.read_text()
@@ -520,6 +524,7 @@ def test_positions_motions_and_parallaxes_are_at_the_bound(kind, epochs, realisa
     assert np.all(ratio < 1.05)  # what only residuals of second order tell is unknown to the bound, and held here
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_motions_in_the_shell(tmp_path, capsys):
     field(60).matches.table.write(tmp_path / "matched.ecsv")
     arguments = ["solve", str(tmp_path / "matched.ecsv"), "--shape", "2048", "2048", "--out", str(tmp_path / "out")]
