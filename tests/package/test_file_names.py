@@ -190,6 +190,7 @@ def test_simulated_images_and_maps(solution, place, alone):
     alone(*(f"{name}.fits" for name in NAMES), "truth.ecsv")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run(place_with_frames, capsys):
     """Frames of such names in a folder of such a name: everything lies in the folder asked for."""
     folder, paths = place_with_frames
