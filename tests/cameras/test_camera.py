@@ -443,6 +443,7 @@ class TestFittedCamera:
         again = legdistort.Camera.read(solution.camera.write("camera.asdf"))
         assert np.array_equal(again["1"].layout_sigma, solution.camera["1"].layout_sigma)
 
+    @pytest.mark.usefixtures("undrawn")
     def test_errors_of_places(self, gsaoi):
         """Centres and rotations in the printed table scatter by their errors, draw by draw; the report has them."""
         night, camera = gsaoi_images.Night(n_exposures=6, n_stars=350, dither=6.0), misplaced(gsaoi, shift=1, turn=0.01)
@@ -744,6 +745,7 @@ class TestFrames:
         (one,) = legdistort.read_exposures(folder / "exp0.fits", ext=("SCI", 1))
         assert (one.name, one.detector) == ("exp0_SCI1", None)
 
+    @pytest.mark.usefixtures("undrawn")
     def test_run_to_mosaic_and_headers(self, frames, tmp_path):
         """Frames to mosaic over the gap, and WCSs in all extensions; stars lie where they are."""
         folder, camera, sky = frames

@@ -72,3 +72,13 @@ def test_files_hold_stock_models():
     for wrong in (other, models.Identity(2), models.AffineTransformation2D() | other.left | models.Rotation2D(3)):
         with pytest.raises(ValueError, match="the way to the sky should be an affine map"):
             PlaneToSky.like(wrong)
+
+
+def test_a_model_given_away_is_not_that_of_the_plane():
+    """Whoever changes it changes no positions."""
+    sky, xy = TangentPlane(*PLACES[0], MATRIX), np.array([[10.0, 20.0]])
+    before = sky.to_sky(xy)
+    model = sky.model()
+    model.lon_2, model.inverse.lon_0 = 1.0, 1.0
+    assert sky.to_sky(xy) == before
+    assert_allclose(sky.from_sky(before), xy, rtol=0, atol=1e-7)

@@ -30,11 +30,17 @@ def found(centres, xy, fwhm):
     return apart < 0.6 * fwhm, centres[off > fwhm]
 
 
-@pytest.mark.parametrize("psf", [{"strehl": 0.1}, {"strehl": 0.3, "halo_fwhm": 12.0}, {"strehl": 0.5, "coma": 0.4}])
+@pytest.fixture(
+    scope="module", params=[{"strehl": 0.1}, {"strehl": 0.3, "halo_fwhm": 12.0}, {"strehl": 0.5, "coma": 0.4}]
+)
+def psf(request):
+    """Of a pupil, over 512 x 512 px."""
+    return as_psf(PupilPSF(resolution=3.5, **request.param), (512, 512))
+
+
 @pytest.mark.parametrize("crowded", [False, True])
 def test_halos_and_rings_are_no_stars(psf, crowded):
     rng, shape = np.random.default_rng(3), (512, 512)
-    psf = as_psf(PupilPSF(resolution=3.5, **psf), shape)
     xy = rng.uniform(5, 506, (214, 2)) if crowded else scattered(rng, 49, 512)  # one star a (10 FWHM)^2
     flux = 10 ** rng.uniform(3.5, 6.5, len(xy))
     image = add_noise(render_psf(shape, xy, flux, psf=psf, sky=100.0), rng, gain=GAIN, read_noise=10.0)

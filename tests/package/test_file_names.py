@@ -190,6 +190,7 @@ def test_simulated_images_and_maps(solution, place, alone):
     alone(*(f"{name}.fits" for name in NAMES), "truth.ecsv")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run(place_with_frames, capsys):
     """Frames of such names in a folder of such a name: everything lies in the folder asked for."""
     folder, paths = place_with_frames
@@ -213,7 +214,7 @@ def place_with_frames(tmp_path, monkeypatch):
     """A night whose frames have such names, in a folder of such a name beside one that must not change."""
     monkeypatch.chdir(tmp_path)
     Path("A").write_text("precious")
-    night = simulate_exposures(small=True, n_exposures=3, n_stars=40, size=512, seed=1)
+    night = simulate_exposures(small=True, n_exposures=3, n_stars=40, size=320, seed=1)
     names = ("A#1?x;b", "D%41~$_$", "-ä ~b")
     images = dict(zip(names, night.hdus.values(), strict=True))
     paths = SimulatedExposures(images, night.truth).write("A#1/in[1]*")
