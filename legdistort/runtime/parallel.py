@@ -11,7 +11,7 @@ import warnings
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache, partial
 from logging.handlers import QueueHandler
 from multiprocessing import get_context
@@ -64,8 +64,10 @@ def map_items(function, items, *, workers=None, threads=False, progress=False, d
     bar = Bar(
         total=len(items) if hasattr(items, "__len__") else None, desc=description, unit=unit, disable=not progress
     )
-    with bar:
-        function = partial(_on_one_thread, function)
+    threads = threads and client is None and workers > 1
+    # The limit is one of the process: threads that begin and end at different times would restore it wrongly.
+    with bar, one_blas_thread() if threads else nullcontext():
+        function = function if threads else partial(_on_one_thread, function)
         if client is None and workers == 1:
             results = map(function, items)
         else:

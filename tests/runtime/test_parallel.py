@@ -52,6 +52,15 @@ def test_frames_have_one_thread_of_linear_algebra_each():
             assert set(blas_threads()) == {1}
         assert list(map_items(lambda _: blas_threads(), range(2))) == [[1] * len(before)] * 2
         assert blas_threads() == before
+        steps = threading.Barrier(2)  # two threads whose times with one thread of linear algebra overlap
+
+        def overlap(i):
+            steps.wait()
+            time.sleep(0.1 * i)
+            return blas_threads()
+
+        assert list(map_items(overlap, range(2), workers=2, threads=True)) == [[1] * len(before)] * 2
+        assert blas_threads() == before
 
 
 def work(i):
