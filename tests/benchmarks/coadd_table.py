@@ -21,13 +21,13 @@ from pathlib import Path
 #: Row of the table -> (kernel by which rows are compared, function, its arguments).
 METHODS = {
     "legdistort, bilinear": ("bilinear", "ours", {"order": 1}),
-    "legdistort without numba, bilinear": ("bilinear", "ours", {"order": 1, "compiled": False}),
+    "legdistort with reproject's splines, bilinear": ("bilinear", "ours", {"order": 1, "compiled": False}),
     "reproject_and_coadd, defaults": ("bilinear", "reproject", {}),
     "SWarp, BILINEAR": ("bilinear", "swarp", {"kernel": "BILINEAR"}),
     "drizzle package, square": ("bilinear", "drizzle", {"kernel": "square"}),
     "legdistort, drizzle": ("bilinear", "ours", {"algorithm": "drizzle"}),
     "legdistort, order 3": ("cubic", "ours", {"order": 3}),
-    "legdistort without numba, order 3": ("cubic", "ours", {"order": 3, "compiled": False}),
+    "legdistort with reproject's splines, order 3": ("cubic", "ours", {"order": 3, "compiled": False}),
     "reproject_and_coadd, bicubic": ("cubic", "reproject", {"order": "bicubic"}),
     "SWarp, LANCZOS3": ("cubic", "swarp", {"kernel": "LANCZOS3"}),
     "drizzle package, lanczos3": ("cubic", "drizzle", {"kernel": "lanczos3"}),

@@ -1,10 +1,11 @@
-"""The whole run against the programs it replaces: ``python tests/benchmarks/run_table.py [--ao] [--no-numba]``.
+"""The whole run against the programs it replaces: ``python tests/benchmarks/run_table.py [--ao]``.
 
 A simulated night of 11 frames of 2048 x 2048 px (``--ao``: cores in a seeing halo) goes through ``legdistort run
 --degree 3``, and through source-extractor, SCAMP (the true positions of the stars as its reference) and SWarp on the
 grid of our mosaic, all on the cores there are, in turn. Wall time and CPU time are the least of the rounds; of the
 first run, with an empty cache of compiled loops, the time is printed too. Beside them the accuracy: scatter of star
-positions in the mosaic around the truth after a cubic map, and FWHM of stars there over that in a frame.
+positions in the mosaic around the truth after a cubic map, FWHM of stars there over that in a frame, and scatter of
+their fluxes over the true ones.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
+from astropy.stats import mad_std
 from astropy.table import Table
 from astropy.wcs import WCS
 from scipy.spatial import cKDTree
@@ -113,7 +115,7 @@ def reference(folder, truth):
 
 
 def judge(path, truth, single):
-    """Number of stars in a mosaic, their scatter around the truth after a cubic map, FWHM over that of a frame."""
+    """Stars in a mosaic: number, scatter around the truth after a cubic map, FWHM over a frame's, scatter of fluxes."""
     from legdistort import measure, read_exposures
     from legdistort.results import accuracy
 
@@ -125,8 +127,10 @@ def judge(path, truth, single):
     tree = cKDTree(apart)
     xy += apart[np.argmax(tree.query_ball_point(apart, 15, return_length=True))]  # the mosaics differ in their pointing
     distance, index = cKDTree(places).query(xy)
-    xy, places = xy[distance < 40], places[index[distance < 40]]
-    return len(xy), accuracy.bias(xy, places, removed=3), np.median(stars["fwhm"].value) / single
+    near = distance < 40
+    ratio = np.asarray(stars["flux"].value)[near] / np.asarray(truth["flux"])[index[near]]
+    b = accuracy.bias(xy[near], places[index[near]], removed=3)
+    return np.sum(near), b, np.median(stars["fwhm"].value) / single, mad_std(ratio) / np.median(ratio)
 
 
 def main():
@@ -134,7 +138,6 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--ao", action="store_true", help="cores in a halo, Strehl ratio 0.3")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--no-numba", action="store_true", help="as if numba were not installed")
     a = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -142,9 +145,6 @@ def main():
         timed(night, folder)
         frames, truth = sorted((folder / "night").glob("*.fits")), Table.read(folder / "night" / "truth.ecsv")
         env = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")}
-        if a.no_numba:
-            (folder / "sitecustomize.py").write_text("import sys\nsys.modules['numba'] = None\n")
-            env["PYTHONPATH"] = os.pathsep.join([str(folder), env.get("PYTHONPATH", "")])
         first = ours(frames, folder, env)
         reference(folder, truth)
         rows = {"legdistort run": [], "source-extractor": [], "SCAMP": [], "SWarp": []}
@@ -171,8 +171,10 @@ def main():
         single = float(np.median(one["fwhm"][(one["flags"] == 0) & (one["flux"] > np.median(one["flux"]))].value))
         for row, path in {"legdistort run": "out/mosaic.fits", "chain": "swarp.fits"}.items():
             if (folder / path).exists():
-                n, b, ratio = judge(folder / path, truth, single)
-                print(f"{row:18s} {n} stars, b {b:.4f} px, FWHM {ratio:.3f} x that of a frame")
+                n, b, ratio, flux = judge(folder / path, truth, single)
+                print(
+                    f"{row:18s} {n} stars, b {b:.4f} px, FWHM {ratio:.3f} x that of a frame, fluxes {100 * flux:.2f} %"
+                )
 
 
 if __name__ == "__main__":

@@ -7,12 +7,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from stacks import SHAPE, expose, scene
 
 from legdistort.coaddition.mosaicking import coadd
-from legdistort.coaddition.resampling import engines
+from legdistort.coaddition.resampling import compiled_splines, engines
 from legdistort.coaddition.resampling.pixel_maps import PixelMap
 from legdistort.inputs.exposures import Exposure
-
-pytest.importorskip("numba", reason="compiled splines need the extra 'fast'")
-from legdistort.coaddition.resampling import compiled_splines
 
 RNG = np.random.default_rng(5)
 

@@ -118,8 +118,6 @@ sys.exit(f"{package} can be written")
 @pytest.mark.parametrize("compiled_from", [10**9, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_package_that_cannot_be_written(table, tmp_path, read_only, compiled_from):
     """Nor is there a home: compiled loops are made without a place to keep them."""
-    if compiled_from == 1:
-        pytest.importorskip("numba")
     bare = {
         "PATH": os.environ["PATH"],
         "PYTHONPATH": str(read_only),

@@ -11,8 +11,6 @@ from legdistort.solving.equations import criterion, elimination, reduced_system
 from legdistort.solving.equations.problem import build_problem
 from legdistort.solving.estimation import solve
 
-pytest.importorskip("numba", reason="the compiled loops need the extra 'fast'")
-
 RNG = np.random.default_rng(0)
 
 

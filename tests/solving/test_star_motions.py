@@ -73,7 +73,6 @@ def test_rates_that_fixed_modes_cannot_take_back_are_found():
 
 @pytest.mark.parametrize("kind", ["proper", "parallax"])
 def test_compiled_sums_are_the_plain_ones(monkeypatch, kind):
-    pytest.importorskip("numba", reason="the compiled loops need the extra 'fast'")
     sim = field(120, FIVE, parallax=0.1, seen=0.7, corr=0.4)
     motion = star_motions.terms_of(SolveOptions(motion=kind))
     problem = build_problem(sim.matches, 3, motion=motion)

@@ -1,13 +1,13 @@
 """Compiled twins of what reproject does by scipy's splines, for mosaics of many pixels.
 
-They need numba (the extra ``fast``); without it, and for few pixels, where compiling would not pay, reproject runs.
-Both give the same numbers, but for rounding. They are kept beside it because co-adding as a whole is 2.3 times as fast
-with them at order 3, 1.6 times at order 1 (0.31 and 0.23 s a frame of 2048 x 2048 px instead of 0.73 and 0.37).
+For few pixels, where loading numba would not pay, reproject runs. Both give the same numbers, but for rounding. They
+are kept beside it because co-adding as a whole is 2.3 times as fast with them at order 3, 1.6 times at order 1 (0.31
+and 0.23 s a frame of 2048 x 2048 px instead of 0.73 and 0.37).
 """
 
 import numpy as np
 
-from ...runtime.optional import compiled_loop
+from ...runtime.compiling import compiled_loop
 
 _POLE = np.sqrt(3) - 2  # of the cubic B-spline: what a sample is to the coefficients shrinks by this at every pixel
 _REACH = 28  # pixels after which it is below 1e-16

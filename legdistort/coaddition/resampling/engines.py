@@ -13,13 +13,12 @@ from astropy.coordinates import SkyCoord
 from astropy.wcs.wcsapi import BaseLowLevelWCS
 from scipy.ndimage import map_coordinates
 
-from ...runtime.optional import has_fast
 from .drizzling import drizzle
 from .noise_gain import mean_spline_gain, spline_gain
 
 _BAD_WEIGHT = 0.05  # an output pixel with a larger share of bad pixels is left empty
 _FORGETS = 2, 2, 12, 16, 20, 24  # pixels by which a spline of that order has forgotten, to 1e-8
-#: Pixels of all exposures from which compiled splines are used, if numba is installed.
+#: Pixels of all exposures from which compiled splines are used; below, loading numba takes longer than it saves.
 COMPILED_FROM = 1 << 22
 
 
@@ -60,7 +59,7 @@ class Resampling:
 
 def uses_compiled_splines(algorithm, order, n_pixels):
     """Whether the splines of `legdistort.coaddition.resampling.compiled_splines` serve so many pixels."""
-    return algorithm == "interp" and order in (1, 3) and n_pixels >= COMPILED_FROM and has_fast()
+    return algorithm == "interp" and order in (1, 3) and n_pixels >= COMPILED_FROM
 
 
 class _TableWCS(BaseLowLevelWCS):

@@ -1,11 +1,11 @@
 """Compiled twins of the loops over observations in `legdistort.solving.equations.criterion`, for large problems.
 
-They need numba (the extra ``fast``); without it, and for small problems where compiling would not pay, the plain
-NumPy code runs. Both give the same numbers. Observations are taken in batches, so that the inner loops run over
-neighbours in memory and become vector instructions; exposures of many observations are shared out among threads, each
-with star sums of its own, so results do not depend on timing. Of so many the coupling is kept in single precision: it
-steers the step, while the gradient, which decides where the minimum is, stays in double. Sets of fewer observations may
-have directions that hardly anything determines, and steps along these need all digits.
+For small problems, where loading numba would not pay, the plain NumPy code runs. Both give the same numbers.
+Observations are taken in batches, so that the inner loops run over neighbours in memory and become vector
+instructions; exposures of many observations are shared out among threads, each with star sums of its own, so results
+do not depend on timing. Of so many the coupling is kept in single precision: it steers the step, while the gradient,
+which decides where the minimum is, stays in double. Sets of fewer observations may have directions that hardly
+anything determines, and steps along these need all digits.
 """
 
 import itertools
@@ -15,7 +15,7 @@ import numpy as np
 from numba import get_num_threads
 
 from ...geometry import basis
-from ...runtime.optional import compiled_loop
+from ...runtime.compiling import compiled_loop
 
 #: Number of observations from which they are shared out among threads, and couplings are kept in single precision.
 THREADS_FROM = 200_000

@@ -11,17 +11,16 @@ from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis
 from ...priors.prior import Prior
 from ...runtime.checks import LARGEST
-from ...runtime.optional import has_fast
 from .star_terms import StarTerms
 from .unknowns import Unknowns
 
-#: Number of observations from which compiled loops are used, if numba is installed.
+#: Number of observations from which compiled loops are used; below, loading numba takes longer than it saves.
 COMPILED_FROM = 20_000
 
 
 def uses_compiled_loops(n):
     """Whether the compiled loops of `legdistort.solving.equations.compiled` serve a problem of n observations."""
-    return n >= COMPILED_FROM and has_fast()
+    return n >= COMPILED_FROM
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,21 +1,10 @@
-"""Which optional parts are installed."""
+"""Loops that numba compiles."""
 
-from functools import cache
-
-
-@cache
-def has_fast():
-    """Whether the extra ``fast``, compiled loops, is installed, and works with the NumPy that is there."""
-    try:
-        import numba  # noqa: F401
-    except ImportError:
-        return False
-    return True
+from numba import njit
 
 
 def compiled_loop(**options):
     """Decorator: `numba.njit` with these options, which keeps what it compiled where there is a place for that."""
-    from numba import njit
 
     def decorate(function):
         try:
