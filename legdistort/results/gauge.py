@@ -106,7 +106,7 @@ class Drift:
         Whether what is known of the motions of stars beforehand determined them, not the convention of the gauge.
     n_tied : int
         Stars of a reference whose proper motions tie them, the rates too; their covariance has these then.
-    tells_parallax : bool
+    parallax_tied : bool
         Whether the parallaxes of these stars tie the mean parallax.
     joint : ndarray, shape (2 n_modes + q, 2 n_modes + q), or None
         Covariance of the common map and these, where a reference determined them together.
@@ -119,7 +119,7 @@ class Drift:
     rates: np.ndarray
     held: bool = False
     n_tied: int = 0
-    tells_parallax: bool = False
+    parallax_tied: bool = False
     joint: np.ndarray | None = None
 
     @property
@@ -163,19 +163,19 @@ class Drift:
         if "parallax" in errors:
             words += f", of a parallax {errors['parallax']:.2g} px"
         if self.n_tied:
-            what = "proper motions and parallaxes" if self.tells_parallax else "proper motions"
+            what = "proper motions and parallaxes" if self.parallax_tied else "proper motions"
             words += f"; they are tied to the {what} of {self.n_tied} stars of the reference"
         unknown = [] if self.n_tied else ["common rates of shift, rotation and scale"]
-        unknown += ["the mean parallax"] if "parallax" in self.names and not self.tells_parallax else []
+        unknown += ["the mean parallax"] if "parallax" in self.names and not self.parallax_tied else []
         if not unknown:
             return f"{words}."
         are = "is" if unknown == ["the mean parallax"] else "are"
         return f"{words}, after {' and '.join(unknown)}, which {are} not known without a reference."
 
-    def tied(self, joint: np.ndarray, n_tied: int, tells_parallax: bool) -> Drift:
+    def tied(self, joint: np.ndarray, n_tied: int, parallax_tied: bool) -> Drift:
         """The same where a reference determined the maps, with the `joint` covariance."""
         size = len(joint) - len(self.covariance)
-        return replace(self, covariance=joint[size:, size:], joint=joint, n_tied=n_tied, tells_parallax=tells_parallax)
+        return replace(self, covariance=joint[size:, size:], joint=joint, n_tied=n_tied, parallax_tied=parallax_tied)
 
     def errors(self) -> dict[str, float]:
         """Rms over the field [pix/yr per axis, pix] of what the maps add to motions and parallaxes, by name."""
@@ -440,17 +440,17 @@ class Gauge(ShownAsPrinted):
         lines = [
             f"Gauge {self.kind!r}. A map of the reference plane of degree {degree} that every exposure compensates "
             f"changes no residual (null space): {self.n_maps} modes, {min(6, self.n_maps)} of them exactly.",
-            f"{'modes':24s} {'number':>6s} {'absolute error':>15s}  pinned by",
+            f"{'modes':24s} {'number':>6s} {'absolute error':>15s}  determined by",
         ]
         measured = {} if self.tie is None else self.tie.words(convention)
         for name, number, error in self.absolute_errors():
             text = "not known" if np.isnan(error) else f"{error:.2g} px"
-            pinned = measured.get(name) or ("the nominal poses, mean over exposures" if np.isnan(error) else convention)
+            cause = measured.get(name) or ("the nominal poses, mean over exposures" if np.isnan(error) else convention)
             here = [w for w in self.unknown_maps if (f"degree {w.degree}" if w.degree > 1 else "shear") == name]
             if here:
-                pinned += f"; {len(here)} of them ({_listed(w.name for w in here)}) not known"
+                cause += f"; {len(here)} of them ({_listed(w.name for w in here)}) not known"
                 text = "not known" if len(here) == number else text
-            lines.append(f"{name:24s} {number:6d} {text:>15s}  {pinned}")
+            lines.append(f"{name:24s} {number:6d} {text:>15s}  {cause}")
         if self.released is not None:
             lines.append(
                 f"{self.released.shape[1]} combinations that are not known otherwise are determined by residuals of "

@@ -115,7 +115,7 @@ _EXCHANGED = {
     ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
 }  # fmt: skip
 _SPOKEN = {"__repr__", "describe"}
-_TELLING = {"log", "warn", "logging", "warnings"}
+_MESSAGES = {"log", "warn", "logging", "warnings"}
 
 
 # --- the changes --------------------------------------------------------------------------------------------------
@@ -212,7 +212,7 @@ def _tells(node):
     name = getattr(call, "func", None)
     while isinstance(name, ast.Attribute):
         name = name.value
-    return isinstance(call, ast.Call) and isinstance(name, ast.Name) and name.id in _TELLING
+    return isinstance(call, ast.Call) and isinstance(name, ast.Name) and name.id in _MESSAGES
 
 
 def _is_text(node):

@@ -335,7 +335,7 @@ def test_errors_found_on_request():
     assert quiet.diagnostics.error_floor == 0 or quiet.diagnostics.error_floor < 0.03
 
 
-def test_gauge_says_what_pinned_what():
+def test_gauge_states_what_determines_what():
     sim = simulate_matches(seed=1)
     prior = Prior(sim.truth.static, static_sigma=0.05)
     text = str(solve(sim.matches, prior=prior).gauge)

@@ -10,7 +10,7 @@ from .first_fit import fit_once
 
 _FIRST_FWHM = 3.0
 #: Peaks that determine the width, the brightest: so many that stars remain if a hundred of them are saturated.
-_TELLING = 300
+_BRIGHTEST = 300
 _SETTLED = 0.1  # relative change of the width that ends the search
 _POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no star, however sharp, has so little
 _STEADY = 0.02  # relative error of a width below which stars count alike
@@ -61,7 +61,7 @@ def _frame_shape(frame, fwhm, name):
     """A width that serves to detect stars, and the usual shape of bright ones; found by trying if not known."""
     kernel, shape = fwhm or _FIRST_FWHM, moffat.shape(fwhm or _FIRST_FWHM)
     for _ in range(6):
-        peaks = bright_peaks(frame, kernel)[:_TELLING]
+        peaks = bright_peaks(frame, kernel)[:_BRIGHTEST]
         if len(peaks) == 0:
             break
         shape = _usual_shape(Stamps(frame, peaks, box_half(kernel)), kernel)
