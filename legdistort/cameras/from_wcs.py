@@ -27,7 +27,7 @@ def camera_of(kind, exposures, name=None):
         raise InputError("a camera needs the exposure of one detector at least, got none")
     for key, exposure in named.items():
         if exposure.wcs is None:
-            raise InputError(f"{exposure.name} (detector {key}) has no plausible celestial WCS")
+            raise InputError(f"{exposure.name} (detector {key}) has no celestial WCS, or none that is plausible")
     first = next(iter(named.values()))
     middles = [to_icrs(each.wcs, basis.denormalize(*np.zeros((2, 1)), each.shape))[:, 0] for each in named.values()]
     lon, lat = np.radians(middles).T

@@ -93,7 +93,7 @@ def header_source(exposure):
         except InputError:  # an extension of that name with something else in it
             pass
     if exposure.wcs is None:
-        raise InputError(f"{exposure.name} has no plausible celestial WCS")
+        raise InputError(f"{exposure.name} has no celestial WCS, or none that is plausible")
     return wcs_source(exposure.wcs, exposure.shape, exposure.name)
 
 
