@@ -1,5 +1,6 @@
 """Shared fixtures: where the real data are, and small synthetic sets."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import matplotlib
 import pytest
 
 matplotlib.use("Agg")
+gc.set_threshold(200_000, 20, 50)  # a tenth less time: hundreds of thousands of objects of modules stay anyway
 
 
 def data_folder():

@@ -1,5 +1,7 @@
 """Distortions, poses and both together as astropy models."""
 
+from functools import cache
+
 import numpy as np
 from astropy import units as u
 from astropy.modeling import models
@@ -72,6 +74,42 @@ class FastLegendre2D(models.Legendre2D):
         return view
 
 
+@cache
+def _zeros(degree):
+    model = FastLegendre2D(degree, degree)
+    for name in [name for name, value in vars(model).items() if isinstance(value, Parameter)]:
+        if name not in model.param_names:  # left by series of higher degree that were made before
+            del vars(model)[name]
+    return model
+
+
+def legendre_series(tensor, shape, *, fixed=(), valid=None, name=None):
+    """One Legendre series on a detector.
+
+    It is a copy of one that is made once: astropy's constructor copies the parameters of all series that the process
+    ever made, which takes thirty times as long after one of degree 25 (docs/upstream.md).
+
+    Parameters
+    ----------
+    tensor : ndarray, shape (n, n)
+        Coefficients ``[i, j]`` of the un-normalised ``P_i(u) P_j(v)``.
+    shape : tuple
+        ``(ny, nx)`` of the detector.
+    fixed : sequence of tuple
+        Indices ``(i, j)`` of the coefficients that are marked as fixed for fitters.
+    valid : tuple, optional
+        See `FastLegendre2D`.
+    """
+    ny, nx = shape
+    series = _zeros(len(tensor) - 1).copy()
+    series.name, series.valid = name, valid
+    series.x_domain, series.y_domain = (-0.5, nx - 0.5), (-0.5, ny - 0.5)
+    series.parameters = np.ravel(np.transpose(tensor))
+    for i, j in fixed:
+        getattr(series, f"c{i}_{j}").fixed = True
+    return series
+
+
 def rebuilt(kind, series, **changed):
     """A Legendre series as another class of model, all else the same but for the keywords given."""
     known = {name: getattr(series, name) for name in ("x_domain", "y_domain", "x_window", "y_window", "name", "fixed")}
@@ -135,25 +173,14 @@ def displacement_model(tensors, shape, *, valid=None, name=None):
     valid : tuple, optional
         See `FastLegendre2D`.
     """
-    ny, nx = shape
-    parts, tensors = [], np.asarray(tensors, dtype=float)
-    degree = tensors.shape[1] - 1
-    above = np.argwhere(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) > degree)
-    fixed = {} if np.any(tensors[:, above[:, 0], above[:, 1]]) else {f"c{i}_{j}": True for i, j in above}
-    for axis, tensor in zip("xy", tensors, strict=True):
-        part = FastLegendre2D(
-            degree,
-            degree,
-            x_domain=(-0.5, nx - 0.5),
-            y_domain=(-0.5, ny - 0.5),
-            x_window=(-1, 1),
-            y_window=(-1, 1),
-            name=f"d{axis}",
-            fixed=fixed,
-            **{f"c{i}_{j}": float(tensor[i][j]) for i in range(degree + 1) for j in range(degree + 1)},
-        )
-        part.valid = valid
-        parts.append(part)
+    tensors = np.asarray(tensors, dtype=float)
+    order = np.arange(tensors.shape[1])
+    above = np.argwhere(np.add.outer(order, order) > order[-1])
+    fixed = () if np.any(tensors[:, above[:, 0], above[:, 1]]) else above
+    parts = [
+        legendre_series(tensor, shape, fixed=fixed, valid=valid, name=f"d{axis}")
+        for axis, tensor in zip("xy", tensors, strict=True)
+    ]
     model = models.Identity(2) + (models.Mapping((0, 1, 0, 1)) | (parts[0] & parts[1]))
     model.name = name
     return model

@@ -84,12 +84,12 @@ class StarMotions(ShownAsPrinted):
     def sentence(self) -> str:
         """What was fitted, in a sentence."""
         what = "proper motions and parallaxes" if self.kind == "parallax" else "proper motions"
-        n, once = np.count_nonzero(self.n_epochs > 1), np.count_nonzero(self.n_epochs == 1)
+        n, once, twice = (int(np.sum(at)) for at in (self.n_epochs > 1, self.n_epochs == 1, self.n_epochs == 2))
         words = f"{what} of {n} stars over {np.ptp(self.years):.2f} yr; positions are those of {self.epoch:.4f}"
         if once:
             where = "stays where it was" if once == 1 else "stay where they were"
             words += f"; {once} seen at a single epoch {where} then"
-        if twice := np.count_nonzero(self.n_epochs == 2):
+        if twice:
             words += f"; {twice} seen at two epochs only, so that no observation checks the motion{'s' * (twice > 1)}"
         return words
 

@@ -17,7 +17,7 @@ from oracle import predict
 from legdistort.exceptions import FoldError, InputError
 from legdistort.geometry import basis
 from legdistort.geometry.distortion import TOLERANCE, Distortion
-from legdistort.geometry.models import FastLegendre2D, outside
+from legdistort.geometry.models import FastLegendre2D, displacement_model, outside
 
 SHAPES = [(2048, 2048), (512, 2048), (1500, 300)]
 
@@ -285,3 +285,16 @@ def test_nothing_large_stays_behind():
     assert after - before < 0.2e6  # one image of doubles is 8.4 MB
     assert peak - before < 12 * x.nbytes
     assert len(pickle.dumps(model)) < 1e6
+
+
+def test_models_do_not_depend_on_those_made_before():
+    """astropy gathers the parameters of all series in their class."""
+    tensors = np.random.default_rng(0).normal(size=(2, 2, 2))
+    displacement_model(np.zeros((2, 12, 12)), (300, 200))
+    for _ in range(2):
+        series = displacement_model(tensors, (300, 200), name="d")["dy"]
+        assert not hasattr(series, "c2_0")
+        alike = FastLegendre2D(1, 1, (-0.5, 199.5), (-1, 1), (-0.5, 299.5), (-1, 1), **dict(zip(
+            ("c0_0", "c1_0", "c0_1", "c1_1"), tensors[1].T.ravel(), strict=True)))  # fmt: skip
+        assert series(20.0, 30.0) == alike(20.0, 30.0)
+        series.parameters = 0.0  # which reaches no other

@@ -14,6 +14,7 @@ from legdistort import Matches, Prior, Solution, solve
 from legdistort.assessment import baselines
 from legdistort.exceptions import LegdistortWarning
 from legdistort.results.diagnostics import DegreeChoice, Diagnostics, UsedReference, Validation
+from legdistort.results.motions import StarMotions
 from legdistort.results.settings import Settings
 from legdistort.runtime.provenance import with_inputs
 from legdistort.simulation import prediction
@@ -216,3 +217,15 @@ def test_summary_is_plain():
     assert summary["selection"]["degree"] == 1
     assert summary["validation"]["n_stars"] == 3
     assert replace(found, widths=None).summary().keys() == {"departure_ratio", "selection", "validation"}
+
+
+@pytest.mark.parametrize(("n_epochs", "words"), [
+    ([3, 3, 0], "proper motions of 2 stars over 4.00 yr; positions are those of 2014.0000"),
+    ([3, 1, 0], "; 1 seen at a single epoch stays where it was then"),
+    ([3, 2, 0], "; 1 seen at two epochs only, so that no observation checks the motion"),
+    ([2, 2, 1], "stays where it was then; 2 seen at two epochs only, so that no observation checks the motions"),
+])  # fmt: skip
+def test_the_sentence_on_motions_counts_epochs(n_epochs, words):
+    years, n = np.array([2012.0, 2014.0, 2016.0]), np.array(n_epochs)
+    motions = StarMotions(("vx", "vy"), np.ones((3, 2)), 2014.0, years, np.ones(3), n, np.ones(3))
+    assert motions.sentence.endswith(words)

@@ -193,8 +193,9 @@ def test_real_frames_of_one_telescope_have_one_scale(shared_data):
             warnings.simplefilter("ignore", AssumptionWarning)  # a star that contradicts itself
             solution = solve(matches, degree=degree)
         scales = [np.sqrt(np.linalg.det(pose[:, :2])) for pose in solution.poses.values()]
-        assert_allclose(scales, 1, rtol=0, atol=0.001)
-        # at degree 2 the small turns between the frames determine z^2, to less than the 1 px that counts as unknown
+        # at degree 2 the small turns between the frames determine z^2, to less than the 1 px that counts as unknown;
+        # what there is of degree 3 (chi2 falls with it) goes into the scales
+        assert_allclose(scales, 1, rtol=0, atol=0.002 if degree == 2 else 0.0007)
         assert rms_distortion(solution) < 1.0
 
 
