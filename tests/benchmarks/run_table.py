@@ -128,7 +128,10 @@ def stars_of(path, truth):
     distance, index = cKDTree(places).query(xy)
     table = Table({"star": index, "xy": xy, "places": places[index], "fwhm": stars["fwhm"].value})
     table["flux"] = stars["flux"].value / np.asarray(truth["flux"])[index]
-    return table[distance < 40]
+    nearest = np.argsort(distance)
+    _, first = np.unique(index[nearest], return_index=True)  # a star that was found twice counts once
+    nearest = nearest[first]
+    return table[nearest[distance[nearest] < 40]]
 
 
 def judge(mosaics, truth, single):
