@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 
 #: Iterations of the joint solver and sweeps of the alternating one at most, unless another number is given.
 MAX_ITERATIONS, MAX_SWEEPS = 50, 1000
+#: A minimisation has converged when the next step would be below so many standard errors, rms over the unknowns.
+TOLERANCE = 5e-5
 #: The constraints follow the state for so many iterations; then they are held. Those of a state that is not yet the
 #: solution may hold what the data determine and leave free what they do not: of 300 sets of 4 to 6 exposures and some
 #: 20 stars, with 15 px of unknown static distortion, 21 never settled with 6, one with 12, none with 20. Not
@@ -97,7 +99,7 @@ def loss_factors(squares, loss):
 
 
 def solve_joint(
-    problem, state, *, gauge="minimal", common=None, hold=False, loss="linear", max_iterations=None, tolerance=5e-5
+    problem, state, *, gauge="minimal", common=None, hold=False, loss="linear", max_iterations=None, tolerance=TOLERANCE
 ):
     """Gauss-Newton on all unknowns under the constraints of the gauge.
 

@@ -16,7 +16,7 @@ from . import agreement, clipping, minimisers, star_motions, start_values
 from .choices import prior_widths
 from .equations import criterion, effective_modes, elimination
 from .equations.covariances import Uncertainty
-from .equations.problem import Problem, build_problem, uses_compiled_loops
+from .equations.problem import Problem, State, build_problem, uses_compiled_loops
 
 log = logging.getLogger(__name__)
 
@@ -122,11 +122,14 @@ class Fit:
         return round(2 * np.count_nonzero(self.used) - n_free)
 
 
-def estimate(matches, options):
-    """The fit (`Fit`) with some `SolveOptions`; with widths from the exposures where the prior asks for them."""
+def estimate(matches, options, **how):
+    """The fit (`Fit`) with some `SolveOptions`; with widths from the exposures where the prior asks for them.
+
+    `how` is what `minimise` takes beside, where no widths are sought.
+    """
     prior = options.prior
     if not prior_widths.sought(prior):
-        return minimise(matches, options)
+        return minimise(matches, options, **how)
     unit = np.hypot(np.sqrt(np.median(matches.observations.covariance[:, :2])), options.error_floor)
     fit, widths = prior_widths.find_widths(
         # with the small widths of the first fits an exposure may seem to contradict the others, and does not
@@ -161,11 +164,12 @@ def _with_plain_widths(matches, options):
     return explained
 
 
-def minimise(matches, options, *, judged=True):
+def minimise(matches, options, *, judged=True, near=None, tolerance=minimisers.TOLERANCE):
     """Minimise; exposures that contradict the others are left out, with the reason, and the rest is solved again.
 
     With ``clip`` the fit is a plain one as long as chance explains what it leaves. Exposures that the fit cannot follow
-    stay in one that is not `judged`.
+    stay in one that is not `judged`. It begins at the fit `near`, whatever its degree, if that is one to the same
+    matches; `tolerance`, see `legdistort.solving.minimisers.solve_joint`, is that of a fit without ``clip``.
     """
     problem = build_problem(
         matches,
@@ -176,7 +180,10 @@ def minimise(matches, options, *, judged=True):
         motion=star_motions.terms_of(options),
     )
     nominal = np.stack([matches.poses[name] for name in matches.names])
-    start, typical = start_values.start(problem, nominal, robust=options.loss != "linear")
+    if near is not None and near.matches is matches and near.result.converged:
+        start, typical = _from(near, problem), np.zeros(problem.n_exposures)
+    else:
+        start, typical = start_values.start(problem, nominal, robust=options.loss != "linear")
     everything = np.ones(problem.xy.shape[1], dtype=bool)
     common = {"gauge": options.gauge, "max_iterations": options.max_iterations}
     if options.method == "alternating":
@@ -185,7 +192,8 @@ def minimise(matches, options, *, judged=True):
     if options.clip is None:
         if options.loss != "linear" and (lost := _misplaced(problem, typical)):
             return minimise(matches.without(lost), options, judged=judged)
-        return Fit(matches, problem, minimisers.solve_joint(problem, start, **common), everything, options)
+        result = minimisers.solve_joint(problem, start, **common, tolerance=tolerance)
+        return Fit(matches, problem, result, everything, options)
     if start_values.far_off(problem, typical).any() and (astray := agreement.astray(problem)):
         return minimise(matches.without(astray), options, judged=judged)
     plain = _plain(problem, start, common)
@@ -204,6 +212,13 @@ def minimise(matches, options, *, judged=True):
     if result is plain and not plain.converged:
         warn(plain.status, ConvergenceWarning)
     return Fit(matches, problem, result, used, options)
+
+
+def _from(near, problem):
+    """Start values from another fit, with the modes that both have."""
+    state, coefficients, n = near.result.state, problem.prior_mean.copy(), min(problem.n_modes, near.problem.n_modes)
+    coefficients[:, :, :n] = state.coefficients[:, :, :n]
+    return State(state.stars, coefficients, state.poses)
 
 
 def _plain(problem, start, common):

@@ -175,13 +175,19 @@ def test_the_degree_put_in_is_chosen(degree):
     solution = solved(sim, degree="auto")
     chosen = solution.diagnostics.selection
     assert solution.degree == chosen.degree == solution.settings.degree == degree
-    assert chosen.degrees == tuple(range(min(degree + degree_choice.N_WORSE, degree_choice.HIGHEST) + 1))
+    assert chosen.degrees == tuple(range(max(degree + degree_choice.N_WORSE, degree_choice.CUBIC) + 1))
     assert chosen.scores[degree] == min(chosen.scores)
     assert chosen.scores[degree] == pytest.approx(1 + (degree + 1) * (degree + 2) / 2 / 54, rel=0.2)
     assert not chosen.alarm
     assert f"degree {degree}, of 0 to {chosen.degrees[-1]}: stars kept out scatter least with it" in " ".join(
         str(solution).split()
     )
+
+
+@pytest.mark.parametrize("by_degree", [[0.5, 0, 0, 0, 0.5], [0.5, 0, 0, 0, 0, 0.5], [0.5, 0.5, 0, 0.5]])
+def test_a_large_distortion_is_found_beyond_degrees_that_do_not_help(by_degree):
+    chosen = solved(simulate(60, *by_degree, n_exposures=6), degree="auto").diagnostics.selection
+    assert chosen.degree == len(by_degree) - 1
 
 
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.AssumptionWarning")  # the alarm is not what is tested

@@ -22,8 +22,12 @@ AUTO = "auto"
 HIGHEST = 6
 #: Parts into which stars are divided; each is left out once. So few stars are left out one by one.
 N_FOLDS, FEW = 10, 30
-#: No further degree is tried when so many in a row are no better than one before.
-N_WORSE = 3
+#: No further degree is tried when so many in a row, of even and of odd modes, are no better than one with which the
+#: squares of stars left out are less than this times those of their errors: no large distortion is left. Cubic modes,
+#: the first that many optics have, are always tried.
+N_WORSE, EXPLAINED, CUBIC = 2, 2.0, 3
+#: Accuracy of the fits that are compared, in standard errors, rms over their unknowns.
+TRIAL = 0.03
 #: Of degrees whose scores differ by less than this part the lowest is taken.
 CLOSE = 0.005
 #: Excess of a degree's energy over its noise, in standard deviations of the latter, that raises the alarm.
@@ -42,7 +46,7 @@ def choose_degree(matches, fit, solution, *, clip, found):
     ----------
     matches : Matches
     fit : callable
-        ``fit(matches, degree, clip)``, a `legdistort.solving.single_fit.Fit`.
+        ``fit(matches, degree, clip, near)``, a `legdistort.solving.single_fit.Fit`; `near` is another to begin at.
     solution : callable
         ``solution(fit)``, the `Solution`.
     clip : float or None
@@ -108,7 +112,7 @@ class _Trials:
                 break
             self.scores = _scores(np.array(squares))
             self.degree = int(np.argmax(self.scores <= (1 + CLOSE) * self.scores.min()))
-            if tried - self.degree >= N_WORSE:
+            if tried >= max(self.degree + N_WORSE, CUBIC) and self.scores[self.degree] < EXPLAINED:
                 break
 
     def _squares(self, degree):
@@ -127,12 +131,12 @@ class _Trials:
     def fitted(self, degree):
         """The fit with some degree to all of these matches."""
         if degree not in self._fits:
-            self._fits[degree] = self._fit(self.matches, degree, None)
+            self._fits[degree] = self._fit(self.matches, degree, None, self._fits.get(degree - 1))
         return self._fits[degree]
 
     def sound(self, matches, clip):
         """The given matches without what contradicts a fit with the best degree."""
-        found = self._fit(matches, self.degree, clip)
+        found = self._fit(matches, self.degree, clip, self._fits.get(self.degree))
         return held_out.only_rows(found.matches, found.problem.in_table_order(found.used))
 
 
