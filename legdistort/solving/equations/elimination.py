@@ -106,11 +106,16 @@ def reduced_matrix(problem, blocks):
     for factor in star_factors(problem, blocks):
         factor = unknowns.gather(factor.reshape(*blocks.g_exposure.shape, -1))
         out = dsyrk(-1.0, factor.T, trans=1, beta=1.0, c=out.T, lower=1, overwrite_c=1).T  # its upper triangle
-    for i in range(0, len(out), _TILE):
+    return mirrored(out)
+
+
+def mirrored(matrix):
+    """The symmetric matrix (n, n) that the upper triangle of a matrix stands for; takes its place."""
+    for i in range(0, len(matrix), _TILE):
         part = slice(i, i + _TILE)
-        out[i + _TILE :, part] = out[part, i + _TILE :].T
-        out[part, part] = np.triu(out[part, part]) + np.triu(out[part, part], 1).T
-    return out
+        matrix[i + _TILE :, part] = matrix[part, i + _TILE :].T
+        matrix[part, part] = np.triu(matrix[part, part]) + np.triu(matrix[part, part], 1).T
+    return matrix
 
 
 def star_factors(problem, blocks, *, n_block=512):

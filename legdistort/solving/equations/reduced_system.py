@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotri
 
 from ...exceptions import SolveError
 from . import elimination
@@ -223,8 +224,10 @@ class Direct(Reduced):
 
     def covariance(self):
         """Covariance of the coefficients of all exposures in the gauge, shape (n_exposures * 2 n_modes,) squared."""
-        full = self._apply_inverse(np.eye(len(self._unit)))
-        out = full - self._lifted @ self._border @ self._lifted.T
+        out = elimination.mirrored(dpotri(self._factor[0], lower=1)[0].T)  # a third of solving for every unit vector
+        out *= self._unit[:, None]
+        out *= self._unit
+        out -= self._lifted @ self._border @ self._lifted.T
         return self.unknowns.covariance((out + out.T) / 2)
 
 
