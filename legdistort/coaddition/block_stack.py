@@ -17,6 +17,7 @@ from .weights import Weight
 _SAMPLES = 1 << 23  # pixels of all exposures that are stacked at a time
 _SIDES = 64, 320  # of blocks, px
 _BITS = 32  # exposures in a plane of the context
+_IN_MEMORY = 1 << 27  # bytes of planes up to which they need not go to the disk
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -79,6 +80,8 @@ class Recipe:
         Whether extrapolated pixels are left out.
     widths : tuple or None
         The smallest and the largest FWHM of all exposures, if known.
+    compiled : bool
+        Whether there are so many pixels that compiled loops combine them.
     """
 
     shape: tuple
@@ -88,6 +91,7 @@ class Recipe:
     level: float
     mask: bool
     widths: tuple | None
+    compiled: bool
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -106,7 +110,7 @@ def assemble(layers, recipe, folder, share):
     layers : list of Layer
     recipe : Recipe
     folder : path
-        The planes are arrays on the disk of this folder.
+        The planes are arrays on the disk of this folder, but for small ones.
     share : callable
         `legdistort.runtime.parallel.map_items`, which shares the work among threads or processes.
 
@@ -115,10 +119,11 @@ def assemble(layers, recipe, folder, share):
     list of ndarray
         Data, variance, weight, count, flags, context and shares, as `stack` gives them for a block.
     """
-    planes = [spill(recipe.shape, np.float32, value, folder) for value in (np.nan, np.nan, 0)]
-    planes += [spill(recipe.shape, dtype, 0, folder) for dtype in (np.int32, np.uint8)]
-    planes += [spill((n_planes(len(layers)), *recipe.shape), np.uint32, 0, folder)]
-    planes += [spill(recipe.shape, np.uint8, 0, folder) for _ in range(2)]
+    small, context = n_bytes(recipe.shape, len(layers)) <= _IN_MEMORY, (n_planes(len(layers)), *recipe.shape)
+    empty = np.full if small else partial(spill, folder=folder)
+    planes = [empty(recipe.shape, value, np.float32) for value in (np.nan, np.nan, 0)]
+    planes += [empty(recipe.shape, 0, dtype) for dtype in (np.int32, np.uint8)]
+    planes += [empty(context, 0, np.uint32), *(empty(recipe.shape, 0, np.uint8) for _ in range(2))]
     pieces = list(blocks(layers, recipe))
     work = partial(stack, recipe=recipe, n_exposures=len(layers))
     for block, values in zip(pieces, share(work, pieces, description="co-adding", unit="block"), strict=True):
@@ -219,6 +224,7 @@ def stack(block, *, recipe, n_exposures):
         spare=spare if spare.any() else None,
         fwhm=None if recipe.widths is None else [layer.fwhm for layer in met],
         widths=recipe.widths,
+        compiled=recipe.compiled,
     )
     keep = combined.keep[:, *inner]
     doubt = doubt[:n] * combined.keep

@@ -56,7 +56,19 @@ class Combined:
         return f"<Combined: {nx} x {ny} px, {k} exposures>"
 
 
-def combine(data, variance, weight, *, method="mean", level=0.0, photons=None, spare=None, fwhm=None, widths=None):
+def combine(
+    data,
+    variance,
+    weight,
+    *,
+    method="mean",
+    level=0.0,
+    photons=None,
+    spare=None,
+    fwhm=None,
+    widths=None,
+    compiled=False,
+):
     """Combine exposures on a block of the output grid.
 
     Parameters
@@ -78,6 +90,8 @@ def combine(data, variance, weight, *, method="mean", level=0.0, photons=None, s
         Pixels that are used only where no exposure has others, such as saturated ones.
     fwhm, widths
         As for `confirmed`.
+    compiled : bool
+        By the loops of `legdistort.coaddition.compiled_combination`; all arrays are then of float32.
 
     Returns
     -------
@@ -92,8 +106,14 @@ def combine(data, variance, weight, *, method="mean", level=0.0, photons=None, s
     weight = np.broadcast_to(np.asarray(weight, dtype=np.float32), data.shape)
     if method == "median":
         return _median(data, variance, weight, use, level=level, photons=photons)
-    clipped = method == "clipped"
-    keep = confirmed(data, variance, use, level=level, fwhm=fwhm, widths=widths) if clipped else use
+    keep = use
+    if method == "clipped":
+        keep = confirmed(data, variance, use, level=level, fwhm=fwhm, widths=widths, compiled=compiled)
+    if compiled:
+        from . import compiled_combination
+
+        growth = np.zeros(len(data), np.float32) if photons is None else np.asarray(photons, dtype=np.float32)
+        return Combined(*compiled_combination.weighted_mean(data, variance, weight, keep, growth, level), keep)
     total, mean, spread = np.zeros((3, *data.shape[1:]))
     with np.errstate(invalid="ignore", divide="ignore"):
         for w, d, k in zip(weight, data, keep, strict=True):
@@ -146,7 +166,7 @@ def _median(data, variance, weight, use, *, level, photons):
     return Combined(centre.astype(np.float32), spread.astype(np.float32), np.where(use, weight, 0).sum(axis=0), use)
 
 
-def confirmed(data, variance, use, *, level=0.0, fwhm=None, widths=None):
+def confirmed(data, variance, use, *, level=0.0, fwhm=None, widths=None, compiled=False):
     """Which pixels of exposures the others confirm: cosmic rays, hot pixels and trails are not.
 
     Where at least three exposures meet, what differs from their median (of an even number, the lower of the
@@ -172,6 +192,8 @@ def confirmed(data, variance, use, *, level=0.0, fwhm=None, widths=None):
         cosmic rays on them that are fainter than the star.
     widths : tuple, optional
         The smallest and the largest FWHM of all exposures, if there are others elsewhere.
+    compiled : bool
+        As for `combine`.
 
     Returns
     -------
@@ -183,10 +205,7 @@ def confirmed(data, variance, use, *, level=0.0, fwhm=None, widths=None):
         return use
     if widths is None and fwhm is not None:
         widths = np.min(fwhm), np.max(fwhm)
-    centre = _ranked(data, count, low=True)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        noise = np.where(use, 1 / np.sqrt(variance), 0).sum(axis=0)
-        noise = (np.sqrt(np.pi / 2 * count) / noise).astype(np.float32)  # of the median
+    centre, noise = _median_and_noise(data, variance, use, count, compiled)
     slope = _SLOPE + 2.5 * ((_UNKNOWN if widths is None else widths[1] / widths[0]) - 1)
     rise, fall = _steps(centre, noise, _reach(widths))
     which, excess, sigma = _outlying(data, np.broadcast_to(variance, data.shape), use & (count >= 3), centre, noise)
@@ -208,6 +227,18 @@ def confirmed(data, variance, use, *, level=0.0, fwhm=None, widths=None):
         bad |= near.reshape(len(near), -1)[which] & (excess > _GROW_SIGMA * sigma)
         keep.reshape(len(keep), -1)[which[0][bad], which[1][bad]] = False
     return keep | (use & ~keep.any(axis=0))
+
+
+def _median_and_noise(data, variance, use, count, compiled):
+    """Lower median of what is used, `count` of them, and the error of a median with these variances."""
+    if compiled:
+        from . import compiled_combination
+
+        if len(data) <= compiled_combination.MOST:
+            return compiled_combination.median_and_noise(data, variance, use)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        noise = np.where(use, 1 / np.sqrt(variance), 0).sum(axis=0)
+        return _ranked(data, count, low=True), (np.sqrt(np.pi / 2 * count) / noise).astype(np.float32)
 
 
 def _outlying(data, variance, use, centre, noise):

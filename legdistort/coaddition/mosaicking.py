@@ -213,7 +213,8 @@ def _layers(frames, prepared, maps, factors, solution, output, options):
     fwhm = stellar_widths(solution, list(noise))
     flux = options.conserve == "flux"
     area = {f.name: _area(maps[f.name]) if flux else 1.0 for f in frames}
-    resampling = options.resampling(sum(np.prod(f.shape) for f in frames))
+    n_pixels = sum(np.prod(f.shape) for f in frames)
+    resampling = options.resampling(n_pixels)
     layers = [
         Layer(
             index=i,
@@ -236,7 +237,8 @@ def _layers(frames, prepared, maps, factors, solution, output, options):
         level *= float(np.mean(list(area.values())))
     widths = (min(fwhm.values()), max(fwhm.values())) if fwhm else None
     mask = options.extrapolated == "mask"
-    return layers, Recipe(output.shape, resampling, options.method, options.conserve, level, mask, widths)
+    how = {"level": level, "mask": mask, "widths": widths, "compiled": n_pixels >= engines.COMPILED_FROM}
+    return layers, Recipe(output.shape, resampling, options.method, options.conserve, **how)
 
 
 def _photons(frame, prepared, factor, variance):

@@ -107,14 +107,14 @@ class _Shared(mmap.mmap):
     """
 
 
-def spill(shape, dtype, value, folder):
+def spill(shape, value, dtype, folder):
     """An array on disk, all of one value; its file has no name and is gone when the array is.
 
     Parameters
     ----------
     shape : tuple
-    dtype : dtype
     value : number
+    dtype : dtype
     folder : path
 
     Returns

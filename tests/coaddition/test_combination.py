@@ -240,3 +240,27 @@ class TestStatistics:
         assert np.isnan(got.data).sum() == np.isnan(got.variance).sum() == 15
         assert got.count.sum() == 3
         assert repr(got) == "<Combined: 4 x 4 px, 3 exposures>"
+
+
+@pytest.mark.parametrize("method", ["mean", "clipped"])
+@pytest.mark.parametrize("k", [1, 2, 3, 8, 11, 40])
+def test_compiled_loops_agree_with_plain_ones(k, method):
+    """Holes, saturated pixels, cosmic rays, unequal weights, photons, and pixels that no exposure has."""
+    rng = np.random.default_rng(k)
+    signal = 500 * moffat(((np.indices((40, 50)) - 20.3) ** 2).sum(axis=0), 4) + 10
+    variance = rng.uniform(0.5, 2, (k, *signal.shape)).astype(np.float32)
+    data = (signal + rng.normal(size=variance.shape) * np.sqrt(variance)).astype(np.float32)
+    data[rng.random(data.shape) < 0.01] += 50
+    data[rng.random(data.shape) < 0.1] = np.nan
+    data[:, :3, :4] = np.nan
+    weight = rng.uniform(0.5, 2, (k, 1, 1))
+    known = {"photons": rng.uniform(0, 0.1, k), "spare": rng.random(data.shape) < 0.05, "fwhm": rng.uniform(3, 4, k)}
+    for given in ({}, known):
+        plain, found = (
+            combine(data, variance, weight, method=method, level=10, compiled=compiled, **given)
+            for compiled in (False, True)
+        )
+        assert np.array_equal(plain.keep, found.keep)
+        assert method == "mean" or k < 3 or np.count_nonzero(np.isfinite(data) & ~found.keep) > k
+        for plane in ("data", "variance", "weight"):
+            np.testing.assert_allclose(getattr(found, plane), getattr(plain, plane), rtol=1e-6, equal_nan=True)

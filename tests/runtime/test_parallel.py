@@ -411,7 +411,7 @@ class TestScratch:
         assert not any(tmp_path.iterdir())
 
     def test_spilled_arrays_may_be_forgotten(self, tmp_path):
-        array = scratch.spill((3, 700, 1000), np.float32, np.nan, tmp_path)
+        array = scratch.spill((3, 700, 1000), np.nan, np.float32, tmp_path)
         assert np.isnan(array).all()
         array[1, 5:9] = 7
         resident = _resident()
@@ -439,7 +439,7 @@ class TestScratch:
             pytest.raises(DiskFullError, match=r"No space left on the disk of .* give another folder as scratch="),
             scratch.scratch_folder(tmp_path, 1) as folder,
         ):
-            scratch.spill((10, 10), np.float32, 0, folder)
+            scratch.spill((10, 10), 0, np.float32, folder)
 
     def test_a_disk_too_small_is_told_before(self, tmp_path):
         with (
