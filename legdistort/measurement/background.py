@@ -51,7 +51,13 @@ def sky_and_noise(data, mask, mesh, *, steep=False):
         for exclude in (50.0, 100.0):
             try:
                 found = Background2D(
-                    data, (high, box[1]), mask=mask, sigma_clip=clip, exclude_percentile=exclude, filter_size=1
+                    data,
+                    (high, box[1]),
+                    mask=mask,
+                    sigma_clip=clip,
+                    exclude_percentile=exclude,
+                    filter_size=1,
+                    bkg_estimator=_mode,
                 )
             except ValueError:
                 log.debug("background: too few good pixels with exclude_percentile=%g", exclude)
@@ -62,6 +68,22 @@ def sky_and_noise(data, mask, mesh, *, steep=False):
                 return _enlarge(sky, box, shape, degree=3 if steep else 2), _enlarge(rms, box, shape).clip(rms.min())
     values = clip(data[~mask] if not mask.all() else data.ravel(), masked=False)
     return tuple(np.full(shape, value, dtype=data.dtype) for value in (np.median(values), np.std(values)))
+
+
+def _mode(values, axis=None):
+    """The estimate of `photutils.background.SExtractorBackground`, in a fifth of the time.
+
+    2.5 medians less 1.5 means; the median where these differ by more than 0.3 standard deviations. NaN do not count.
+    `numpy.nanmedian` would loop over the meshes in Python.
+    """
+    axes = range(values.ndim) if axis is None else np.atleast_1d(axis)
+    ordered = np.moveaxis(values, axes, range(-len(axes), 0))
+    ordered = np.sort(ordered.reshape(*ordered.shape[: -len(axes)], -1))  # NaN come last
+    n, mean, std = np.count_nonzero(~np.isnan(ordered), axis=-1), np.nanmean(values, axis), np.nanstd(values, axis)
+    middle = (np.take_along_axis(ordered, np.maximum(k, 0)[..., None], -1)[..., 0] for k in ((n - 1) // 2, n // 2))
+    median = sum(middle) / 2
+    mode = np.where(np.abs(mean - median) / std >= 0.3, median, 2.5 * median - 1.5 * mean)
+    return np.where(std == 0, mean, mode)
 
 
 def is_steep(sky, rms, mesh):
@@ -234,14 +256,8 @@ def sky_variance(residual, filtered, light, good, *, start, noise, photon, mesh,
         As given, or as estimated.
     """
     step = 1 if residual.size < _ENOUGH else 2
-    thin = np.s_[::step, ::step]
-    square, filtered, light, good, variance = (
-        residual[thin] ** 2,
-        filtered[thin] ** 2,
-        light[thin],
-        good[thin],
-        start[thin],
-    )
+    square, filtered = residual[::step, ::step] ** 2, filtered[::step, ::step] ** 2
+    light, good, variance = (np.ascontiguousarray(each[::step, ::step]) for each in (light, good, start))
     mesh, slope = mesh // step, photon or 0.0
     for _ in range(_ROUNDS):
         total = np.maximum(variance + slope * light, 0.25 * variance)

@@ -3,6 +3,9 @@
 import numpy as np
 
 _TRUNCATED = 3.0  # standard deviations
+#: Pixels of all frames from which compiled loops are used; below, loading numba takes longer than it saves.
+COMPILED_FROM = 1 << 24
+_loops = None  # the compiled ones, if there were so many
 _ROWS = 64  # of an image at a time: they stay in the cache, and it takes a third of the time of scipy.ndimage
 
 
@@ -32,11 +35,10 @@ def gaussian_sums(image, sigma, powers=((0, 0),)):
         band[begin - first + half : end - first + half, half : half + nx] = image[begin:end]
         rows = min(_ROWS, ny - first)
         for i in sorted({i for i, _ in powers}):
-            _correlate([band[k : k + rows] for k in range(2 * half + 1)], weights[i], i, down[:rows], spare[:rows])
-            columns = [down[:rows, k : k + nx] for k in range(2 * half + 1)]
+            _correlate(band[: rows + 2 * half], weights[i], True, down[:rows], spare[:rows])
             for sums, (along_y, j) in zip(out, powers, strict=True):
                 if along_y == i:
-                    _correlate(columns, weights[j], j, sums[first : first + rows], spare[:rows, :nx])
+                    _correlate(down[:rows], weights[j], False, sums[first : first + rows], spare[:rows, :nx])
     return out
 
 
@@ -48,11 +50,46 @@ def gaussian(sigma, power=0):
     return weight / weight.sum() * offset**power
 
 
-def _correlate(shifted, weights, power, out, spare):
-    """Sum of weights * images into `out`; the weights are even or odd, as the power is."""
-    combine, half = np.subtract if power % 2 else np.add, len(weights) // 2
+def _correlate(image, weights, down, out, spare):
+    """Sum of weights * images, each a pixel further down or to the right, into `out`; the weights are even or odd."""
+    half = len(weights) // 2
+    odd, (rows, n) = weights[0] != weights[-1], out.shape
+    if _loops is not None:
+        _loops(image, weights, odd, down, out)
+        return
+    shifted = [image[k : k + rows] if down else image[:, k : k + n] for k in range(2 * half + 1)]
     np.multiply(shifted[half], weights[half], out=out)
     for k in range(half):
-        combine(shifted[-1 - k], shifted[k], out=spare)
+        (np.subtract if odd else np.add)(shifted[-1 - k], shifted[k], out=spare)
         spare *= weights[-1 - k]
         out += spare
+
+
+def use_compiled_loops(n_pixels):
+    """Compiled loops from now on, in this process and its copies, if it pays to load numba for so many pixels.
+
+    They give the same numbers to the last bit, in a third of the time.
+    """
+    global _loops
+    if n_pixels >= COMPILED_FROM and _loops is None:
+        from ..runtime.compiling import compiled_loop
+
+        _loops = compiled_loop(nogil=True)(_to_be_compiled)
+
+
+def _to_be_compiled(image, weights, odd, down, out):
+    half, n = len(weights) // 2, out.shape[1]
+    for r in range(out.shape[0]):
+        sums, middle = out[r], image[r + half] if down else image[r, half : half + n]
+        for c in range(n):
+            sums[c] = middle[c] * weights[half]
+        for k in range(half):
+            last = 2 * half - k
+            before = image[r + k] if down else image[r, k : k + n]
+            behind = image[r + last] if down else image[r, last : last + n]
+            if odd:
+                for c in range(n):
+                    sums[c] += (behind[c] - before[c]) * weights[last]
+            else:
+                for c in range(n):
+                    sums[c] += (behind[c] + before[c]) * weights[last]

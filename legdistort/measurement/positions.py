@@ -23,6 +23,7 @@ from .crowding import crowding, is_deformed
 from .effective import frame_psf
 from .effective.building import STARS_NEEDED
 from .effective.model import EffectivePSF
+from .filters import use_compiled_loops
 from .flags import LEAST, UNUSABLE, Flag
 from .injection import calibrate_frame
 from .options import MeasureOptions
@@ -260,6 +261,7 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
     progress : bool
     """
     share = partial(map_items, workers=workers, progress=progress)
+    use_compiled_loops(sum(np.prod(exposure.shape) for exposure in exposures))
     gains = {} if options.gain else _camera_gains(exposures, options, share)
 
     def measured(which, options):

@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from photutils.background import SExtractorBackground
 from scipy.ndimage import correlate
 from scipy.spatial import cKDTree
 from star_images import GAIN, ladder, observe, positions, scattered, usable
@@ -11,7 +12,8 @@ from star_images import image as render
 
 from legdistort.exceptions import InputError
 from legdistort.inputs.exposures import Exposure
-from legdistort.measurement.background import smooth_light
+from legdistort.measurement import filters
+from legdistort.measurement.background import _mode, smooth_light
 from legdistort.measurement.crowding import is_isolated
 from legdistort.measurement.detection import detect, prepare
 from legdistort.measurement.filters import gaussian_sums
@@ -161,8 +163,47 @@ def test_a_width_that_no_star_has_is_an_error_within_seconds():
     assert time.process_time() - start < 5
 
 
+@pytest.fixture
+def plain_filters(monkeypatch):
+    """Filters as they are before there were many pixels."""
+    monkeypatch.setattr(filters, "_loops", None)
+
+
 @pytest.mark.parametrize("shape", [(150, 70), (3, 200), (64, 1)])
 @pytest.mark.parametrize("sigma", [0.1, 0.9, 2.5])
+@pytest.mark.parametrize("dtype", ["f", "d"])
+def test_compiled_sums_are_the_plain_ones(shape, sigma, dtype, plain_filters):
+    """To the last bit: results do not depend on how many frames there are."""
+    image = np.random.default_rng(1).normal(size=shape).astype(dtype)
+    powers = (0, 0), (1, 0), (0, 1), (1, 1), (0, 2)
+    plain = gaussian_sums(image, sigma, powers)
+    filters.use_compiled_loops(filters.COMPILED_FROM - 1)
+    assert filters._loops is None
+    filters.use_compiled_loops(filters.COMPILED_FROM)
+    assert filters._loops is not None
+    for sums, expected in zip(gaussian_sums(image, sigma, powers), plain, strict=True):
+        np.testing.assert_array_equal(sums, expected)
+
+
+@pytest.mark.filterwarnings("ignore:(Mean|Degrees|All-NaN|invalid)")
+@pytest.mark.parametrize(
+    ("shape", "axis"), [((8, 9, 64), -1), ((8, 9, 33), -1), ((5, 7, 6, 4), (1, 3)), ((40, 30), None)]
+)
+@pytest.mark.parametrize("dtype", ["f", "d"])
+def test_the_sky_of_a_mesh_is_that_of_photutils(shape, axis, dtype):
+    """To the last bit, with holes; of nothing it is NaN, of constants the constant, of a skew mesh the median."""
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=shape).astype(dtype)
+    values[rng.random(shape) < 0.1] = np.nan
+    if axis == -1:
+        values[0, 0], values[1, 1], values[2, 2, 1:] = np.nan, 3, np.nan
+        values[3] = np.exp(2 * values[3])
+    np.testing.assert_array_equal(_mode(values, axis=axis), SExtractorBackground(sigma_clip=None)(values, axis=axis))
+
+
+@pytest.mark.parametrize("shape", [(150, 70), (3, 200), (64, 1)])
+@pytest.mark.parametrize("sigma", [0.1, 0.9, 2.5])
+@pytest.mark.usefixtures("plain_filters")
 def test_gaussian_sums_are_those_of_scipy(shape, sigma):
     """Over more rows than are in the cache at a time, fewer than the weights reach, and a single column."""
     image = np.random.default_rng(1).normal(size=shape)
