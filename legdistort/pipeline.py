@@ -225,12 +225,12 @@ def run(
                 comparison, stacks = _compared(matches, solution, solving, quality and mosaic, kept, coadding)
         summary = summarise(solution, timings=timings) | _assessed(solution, kept, quality, comparison, stacks, truth)
         shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
-        report = partial(_write_report, target, solution, summary, shown)
-        with timed(timings, "report"), parallel.beside(report, workers=workers), timed(timings, "write"):
-            write_results(solution, target, psfs=psfs, mosaic=mosaic, progress=progress)
-            write_detections(target / "detections.ecsv", detections, exposures, Path(out), **reading)
-            write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
-        summary = _written_summary(target, summary, timings)
+        with parallel.beside(partial(_write_report, target, solution, summary, shown), workers=workers) as report:
+            with timed(timings, "write"):
+                write_results(solution, target, psfs=psfs, mosaic=mosaic, progress=progress)
+                write_detections(target / "detections.ecsv", detections, exposures, Path(out), **reading)
+                write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
+            summary = _written_summary(target, summary, timings, report)
     return Run(Path(out), solution, mosaic, summary)
 
 
@@ -240,9 +240,10 @@ def _write_report(target, solution, summary, shown):
     write_report(target / "report.html", solution, summary=summary, **shown, files=files)
 
 
-def _written_summary(target, summary, timings):
-    """The summary with all times and what there is to check the files by, which it is written with."""
-    timings["report"] -= timings["write"]  # what is waited for beyond that
+def _written_summary(target, summary, timings, report):
+    """The summary with all times, once the report is there, and what there is to check the files by; writes it."""
+    with timed(timings, "report"):
+        report()
     summary = summary | {"timings": _rounded(timings)} | listed_files(target)
     write_summary(target / "summary.json", summary)
     return summary

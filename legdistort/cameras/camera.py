@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.gsaoi import GSAOI_SIZE, GsaoiMap
+from ..inputs import column_contract
 from ..inputs.file_images import of_files
 from ..runtime.notebook import ShownAsPrinted
 from . import storage
@@ -160,32 +161,27 @@ class Camera(ShownAsPrinted):
         if "x_detector" in table.colnames:
             return table
         table, detector = table.copy(), self.ids(table)
-        x, y, x_err, y_err = (table[name].to_value(u.pix) for name in ("x", "y", "x_err", "y_err"))
-        both = (np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else 0) * x_err * y_err
-        xy, covariance = np.stack([x, y], axis=1), np.moveaxis(np.array([[x_err**2, both], [both, y_err**2]]), 2, 0)
+        xy = np.stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)], axis=1)
+        covariance = column_contract.covariance(table)
         for key in np.unique(detector):
             rows = detector == key
             xy[rows], covariance[rows] = self[key].to_focal_plane(xy[rows], covariance[rows])
         table["x_detector"], table["y_detector"] = table["x"], table["y"]
         table["x"], table["y"] = xy.T * u.pix
-        table["x_err"], table["y_err"] = np.sqrt(covariance[:, [0, 1], [0, 1]]).T * u.pix
-        table["xy_corr"] = covariance[:, 0, 1] / np.sqrt(covariance[:, 0, 0] * covariance[:, 1, 1])
+        column_contract.set_covariance(table, covariance)
         return table
 
     def on_detectors(self, table: QTable) -> QTable:
         """A table that `in_focal_plane` made, as it was before."""
         table, detector = table.copy(), self.ids(table)
         f = np.stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)], axis=1)
-        x_err, y_err = table["x_err"].to_value(u.pix), table["y_err"].to_value(u.pix)
-        both = np.asarray(table["xy_corr"]) * x_err * y_err
-        covariance = np.moveaxis(np.array([[x_err**2, both], [both, y_err**2]]), 2, 0)
+        covariance = column_contract.covariance(table)
         for key in np.unique(detector):
             rows = detector == key
             slope = self[key].slope(f[rows])
             covariance[rows] = slope @ covariance[rows] @ slope.mT
         table["x"], table["y"] = table["x_detector"], table["y_detector"]
-        table["x_err"], table["y_err"] = np.sqrt(covariance[:, [0, 1], [0, 1]]).T * u.pix
-        table["xy_corr"] = covariance[:, 0, 1] / np.sqrt(covariance[:, 0, 0] * covariance[:, 1, 1])
+        column_contract.set_covariance(table, covariance)
         table.remove_columns(["x_detector", "y_detector"])
         return table
 

@@ -141,6 +141,19 @@ def values(table, column, unit=None):
         raise InputError(f"column {column!r} cannot be read as numbers in {unit or 'no unit'}: {error}") from None
 
 
+def covariance(table):
+    """Covariance (n, 2, 2) [px^2] of the positions of a table that keeps a contract; without ``xy_corr`` diagonal."""
+    x_err, y_err = (table[name].to_value(u.pix) for name in ("x_err", "y_err"))
+    both = (np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else 0.0) * x_err * y_err
+    return np.moveaxis(np.array([[x_err**2, both], [both, y_err**2]]), 2, 0)
+
+
+def set_covariance(table, blocks):
+    """Give a table ``x_err``, ``y_err`` and ``xy_corr`` of positions with these covariances (n, 2, 2) [px^2]."""
+    table["x_err"], table["y_err"] = np.sqrt(np.einsum("nkk->kn", blocks)) * u.pix
+    table["xy_corr"] = blocks[:, 0, 1] / np.sqrt(blocks[:, 0, 0] * blocks[:, 1, 1])
+
+
 def labels(table, column):
     """A column of names (str) or serials (int) as a plain array."""
     missing = np.ma.getmaskarray(table[column]) if np.ma.isMaskedArray(table[column]) else np.zeros(len(table), bool)

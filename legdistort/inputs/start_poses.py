@@ -100,9 +100,9 @@ def _refine_poses(pose_list, rows, star, xy, weighted, n_sweeps=3):
 
 def _means(pose_list, rows, star, xy, weighted):
     """Mean position (n_stars, 2) of every star in the exposures with weight."""
-    voices = np.flatnonzero(weighted)
-    back = np.concatenate([similarity.apply(similarity.invert(pose_list[i]), xy[rows[i]]) for i in voices])
-    return star_means(back, star[np.concatenate([rows[i] for i in voices])], star.max() + 1)
+    used = np.flatnonzero(weighted)
+    back = np.concatenate([similarity.apply(similarity.invert(pose_list[i]), xy[rows[i]]) for i in used])
+    return star_means(back, star[np.concatenate([rows[i] for i in used])], star.max() + 1)
 
 
 def _far_off(pose_list, rows, star, xy):

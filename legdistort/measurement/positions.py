@@ -274,7 +274,8 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
         chosen = "effective" if np.mean(votes) > 0.5 else "moffat"
         again = [i for i, one in enumerate(found) if one.verdict.decided and one.verdict.psf != chosen]
         anew = measured([exposures[i] for i in again], replace(options, psf=chosen))
-        found = [anew[again.index(i)] if i in again else one for i, one in enumerate(found)]
+        for i, one in zip(again, anew, strict=True):
+            found[i] = one
     names = [exposure.name for exposure in exposures]
     _warn_of_gain({name: one.photon for name, one in zip(names, found, strict=True)})
     verdicts = {name: one.verdict for name, one in zip(names, found, strict=True)}

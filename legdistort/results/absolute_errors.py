@@ -28,7 +28,11 @@ def relative_variance(gauge, uncertainty, xy):
 
     That under the convention of the gauge, and the part of the common map that is of second order.
     """
-    blocks = relative_blocks(gauge, uncertainty, xy)
+    return variances(relative_blocks(gauge, uncertainty, xy))
+
+
+def variances(blocks):
+    """Covariances (n, 2, 2), or larger ones that begin with them, as xx, yy, xy (3, n)."""
     return np.stack([blocks[:, 0, 0], blocks[:, 1, 1], blocks[:, 0, 1]])
 
 
@@ -104,8 +108,7 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
     """
     if gauge.plane is not None:
         return np.full_like(uncertainty.stars, np.nan)
-    blocks = absolute_blocks(gauge, uncertainty, xy)
-    out = np.stack([blocks[:, 0, 0], blocks[:, 1, 1], blocks[:, 0, 1]])
+    out = variances(absolute_blocks(gauge, uncertainty, xy))
     if gauge.tie is not None:
         out = out + gauge.tie.shared
     if not without_unknown:

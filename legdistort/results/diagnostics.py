@@ -322,8 +322,7 @@ class Diagnostics:
         Returns
         -------
         dict
-            ``{"errors" | "widths" | "modes" | "degree" | "motion" | "kept": sentence}``, those
-            that apply.
+            ``{"errors" | "widths" | "modes" | "degree" | "motion" | "kept": sentence}``, those that apply.
         """
         found = self.error_law or self.correlated
         words = {} if found is None else {"errors": str(found)}

@@ -91,18 +91,22 @@ def movement(solution, name, stars, epoch, n):
     return Movement(np.array([order[each] for each in names.tolist()], dtype=int), there - here)
 
 
+def correct(solution, name, pixels, moved=None):
+    """Positions (n, 2) of pixels of the focal plane, carried to another time by a `Movement`; undistorted ones too."""
+    distortion = solution.distortion(name)
+    distortion.check_fold()
+    q = distortion.invert(pixels)
+    corrected = similarity.apply(similarity.invert(solution.poses[name]), q)
+    return corrected if moved is None else corrected + moved.displacement(solution.motions), q
+
+
 def correct_with_errors(solution, name, xy, errors, detector=None, moved=None):
     """`Solution.correct` with errors, carried to another time by a `Movement`; see there."""
     pixels = np.atleast_2d(to_pixels(xy))
     measured = _covariance(errors, len(pixels))
     if detector is not None:
         pixels, measured = solution.camera[detector].to_focal_plane(pixels, measured)
-    distortion = solution.distortion(name)
-    distortion.check_fold()
-    q = distortion.invert(pixels)
-    corrected = similarity.apply(similarity.invert(solution.poses[name]), q)
-    if moved is not None:
-        corrected = corrected + moved.displacement(solution.motions)
+    corrected, q = correct(solution, name, pixels, moved)
     relative, absolute = covariances(solution, name, q, measured, moved, detector)
     if isinstance(xy, u.Quantity):
         relative, absolute = relative * u.pix**2, absolute * u.pix**2
@@ -243,10 +247,8 @@ def correct_table(solution, table, epoch=None):
             "another time"
         )
     exposures = np.asarray(table["exposure"]).astype(str)
-    pixels, x_err, y_err = (table[name].to_value(u.pix) for name in ("x", "x_err", "y_err"))
-    pixels = np.column_stack([pixels, table["y"].to_value(u.pix)])
-    corr = np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else 0.0
-    measured = _blocks(np.stack([x_err**2, y_err**2, corr * x_err * y_err]))
+    pixels = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
+    measured = column_contract.covariance(table)
     xy, relative, absolute = np.empty_like(pixels), np.empty_like(measured), np.empty_like(measured)
     for name in dict.fromkeys(exposures.tolist()):
         mine = exposures == name
@@ -257,24 +259,13 @@ def correct_table(solution, table, epoch=None):
         )
     out = table.copy()
     out["x"], out["y"] = xy.T * u.pix
-    for suffix, each in (("err", relative), ("err_abs", absolute)):
-        out[f"x_{suffix}"], out[f"y_{suffix}"] = np.sqrt(np.einsum("nkk->kn", each)) * u.pix
-    out["xy_corr"] = relative[:, 0, 1] / np.sqrt(relative[:, 0, 0] * relative[:, 1, 1])
+    out["x_err_abs"], out["y_err_abs"] = np.sqrt(np.einsum("nkk->kn", absolute)) * u.pix
+    column_contract.set_covariance(out, relative)
     if solution.sky is not None:
-        add_sky(out, solution.sky, xy, _variances(relative), _variances(absolute))
+        add_sky(out, solution.sky, xy, absolute_errors.variances(relative), absolute_errors.variances(absolute))
     if epoch is not None:
         out.meta["epoch"] = year(epoch)
     return column_contract.describe_stars(out)
-
-
-def _blocks(variances):
-    """Variances xx, yy, xy (3, n) as covariances (n, 2, 2)."""
-    xx, yy, xy = variances
-    return np.stack([np.stack([xx, xy]), np.stack([xy, yy])]).transpose(2, 0, 1)
-
-
-def _variances(blocks):
-    return np.stack([blocks[:, 0, 0], blocks[:, 1, 1], blocks[:, 0, 1]])
 
 
 def add_sky(table, sky, xy, relative, absolute):

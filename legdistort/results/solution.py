@@ -202,13 +202,9 @@ class Solution(ShownAsPrinted):
         parallaxes the mean parallax: nothing but a reference determines these. NaN where a star is seen at one epoch
         only.
         """
-        table = QTable({"star": self.star_names, "x": self.positions[:, 0] * u.pix, "y": self.positions[:, 1] * u.pix})
         variance = absolute_errors.relative_variance(self.gauge, self.uncertainty, self.positions)
-        absolute, known = self._absolute(False), self._absolute(True)
-        for suffix, each in (("err", variance), ("err_abs", absolute), ("err_known", known)):
-            for k, axis in enumerate("xy"):
-                table[f"{axis}_{suffix}"] = np.sqrt(each[k]) * u.pix
-        table["xy_corr"] = variance[2] / np.sqrt(variance[0] * variance[1])
+        absolute = self._absolute(False)
+        table = self._places(self.positions, err=variance, err_abs=absolute, err_known=self._absolute(True))
         used = self.observations[self.observations["used"]]
         index = np.searchsorted(self.star_names, used["star"])
         table["n"] = np.bincount(index, minlength=len(table))
@@ -227,6 +223,15 @@ class Solution(ShownAsPrinted):
                 )  # fmt: skip
         table.meta = self._stars_meta()
         return column_contract.describe_stars(table)
+
+    def _places(self, xy, **variances):
+        """Table of the stars at positions (n_stars, 2), with errors of variances xx, yy, xy (3, n_stars) by suffix."""
+        table = QTable({"star": self.star_names, "x": xy[:, 0] * u.pix, "y": xy[:, 1] * u.pix})
+        for suffix, each in variances.items():
+            table[f"x_{suffix}"], table[f"y_{suffix}"] = np.sqrt(each[:2]) * u.pix
+        xx, yy, both = variances["err"]
+        table["xy_corr"] = both / np.sqrt(xx * yy)
+        return table
 
     @property
     def epoch(self) -> float | None:
@@ -294,11 +299,7 @@ class Solution(ShownAsPrinted):
         xy, epoch = self.positions_at(epoch), year(epoch)
         moved = [self.motions.carried(each, epoch, self.sky) for each in self._unknowns]
         moved[1][:, np.isnan(self._absolute(False)[0])] = np.nan
-        table = QTable({"star": self.star_names, "x": xy[:, 0] * u.pix, "y": xy[:, 1] * u.pix})
-        for suffix, each in zip(("err", "err_abs"), moved, strict=True):
-            for k, axis in enumerate("xy"):
-                table[f"{axis}_{suffix}"] = np.sqrt(each[k]) * u.pix
-        table["xy_corr"] = moved[0][2] / np.sqrt(moved[0][0] * moved[0][1])
+        table = self._places(xy, err=moved[0], err_abs=moved[1])
         if self.sky is not None:
             new_positions.add_sky(table, self.sky, xy, *moved)
             obstime = Time(epoch, format="jyear")
@@ -447,11 +448,8 @@ class Solution(ShownAsPrinted):
         moved = new_positions.movement(self, name, stars, epoch, len(pixels))
         if errors is not None:
             return new_positions.correct_with_errors(self, name, xy, errors, detector, moved)
-        distortion = self.distortion(name)
-        distortion.check_fold()
-        q = distortion.invert(pixels if chip is None else chip.to_focal_plane(pixels))
-        corrected = similarity.apply(similarity.invert(self.poses[name]), q)
-        return like(xy, corrected if moved is None else corrected + moved.displacement(self.motions))
+        pixels = pixels if chip is None else chip.to_focal_plane(pixels)
+        return like(xy, new_positions.correct(self, name, pixels, moved)[0])
 
     def correct_table(self, table: Table, *, epoch: float | Time | None = None) -> QTable:
         """Positions measured in any exposures -> the reference plane and the sky, with their errors, as a table.

@@ -15,6 +15,7 @@ from contextlib import contextmanager, nullcontext
 from functools import cache, partial
 from logging.handlers import QueueHandler
 from multiprocessing import get_context
+from numbers import Integral
 from queue import SimpleQueue
 
 import scipy.linalg  # noqa: F401  (it comes with a linear algebra library of its own, which is to be loaded by then)
@@ -100,7 +101,7 @@ def check_workers(workers):
     """The number of workers, None standing for 1; `InputError` if it is not a positive integer."""
     if workers is None:
         return 1
-    if isinstance(workers, bool) or workers != int(workers) or workers < 1:
+    if isinstance(workers, bool) or not isinstance(workers, Integral) or workers < 1:
         raise InputError(f"workers must be a positive integer, or None for one, got {workers!r}")
     return int(workers)
 
@@ -164,12 +165,16 @@ def _executor(workers, threads, client):
 def _may_fork():
     """Whether other processes can begin as copies of this one, which spares them all imports.
 
-    A copy has one thread: what others were at would never be finished there. OpenBLAS ends its own before a copy is
-    made, and starts them again when they are needed.
+    A copy has one thread: what others were at would never be finished there. OpenBLAS, where its threads are its own,
+    ends them before a copy is made, and starts them again when they are needed.
     """
     if not os.path.isdir(_THREADS) or threading.active_count() > 1:
         return False
-    known = sum(library["num_threads"] - 1 for library in _libraries().info() if library["internal_api"] == "openblas")
+    known = sum(
+        library["num_threads"] - 1
+        for library in _libraries().info()
+        if library["internal_api"] == "openblas" and library["threading_layer"] == "pthreads"
+    )
     for _ in range(_PATIENCE):  # a thread that has ended is still listed for a moment
         if len(os.listdir(_THREADS)) - 1 <= known:
             return True
@@ -189,49 +194,52 @@ def _serve(master):
 
 @contextmanager
 def beside(function, *, workers=None):
-    """Call a function while the block runs, in a copy of this process; after the block where there is no second core.
+    """Call a function in a copy of this process, while the block runs.
 
     Parameters
     ----------
     function : callable
-        Without arguments; what it returns is lost, files that it writes stay. It sees this process as it is before the
-        block.
+        Without arguments. It sees this process as it is before the block; what it is to leave are files.
     workers : int, optional
         Cores to use, as for `map_items`.
 
-    Raises
+    Yields
     ------
-    LegdistortError
-        If the copy dies. What the function raises comes at the end of the block.
+    callable
+        To be called in the block: it waits for the copy, returns what the function returns and raises what it raises;
+        `LegdistortError` if the copy dies. Where there is no second core it is the function itself. A copy that is not
+        waited for ends with the block.
     """
-    if workers is None or workers < 2 or not _may_fork():
-        yield
-        function()
+    if check_workers(workers) < 2 or not _may_fork():
+        yield function
         return
     context = get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
-
-    def work():
-        _serve(master)
-        sender.send(_attempt(lambda _: function(), None))
-
-    master, process = os.getpid(), context.Process(target=work)
+    process = context.Process(target=_send_attempt, args=(function, sender, os.getpid()))
     process.start()
     sender.close()
     try:
-        yield
-        attempt = receiver.recv()
-        process.join()
-    except EOFError:
-        raise LegdistortError("a worker process died: it ran out of memory; give workers=1") from None
+        yield partial(_receive, receiver)
     finally:
         process.kill()
         process.join()
         receiver.close()
-    _finish((None, *attempt[1:]))
 
 
-def _attempt(function, item):
+def _send_attempt(function, sender, master):
+    _serve(master)
+    sender.send(_attempt(function))
+
+
+def _receive(receiver):
+    try:
+        attempt = receiver.recv()
+    except (EOFError, OSError):  # before an answer, or in the middle of it
+        raise LegdistortError("a worker process died: it ran out of memory; give workers=1") from None
+    return _finish(attempt)
+
+
+def _attempt(function, *arguments):
     """Result, error, warnings and log records of a call, to be passed on from a worker process."""
     records, result, raised = SimpleQueue(), None, None
     log = logging.getLogger("legdistort")
@@ -239,7 +247,7 @@ def _attempt(function, item):
     log.setLevel(logging.INFO)
     with warnings.catch_warnings(record=True, action="always") as warned:
         try:
-            result = function(item)
+            result = function(*arguments)
         except Exception as error:
             raised = error
     return result, raised, [w.message for w in warned], [records.get() for _ in range(records.qsize())]

@@ -234,14 +234,12 @@ def _rebuilt(model, shape):
         return CompoundModel(model.op, _rebuilt(model.left, shape), right, name=model.name)
     if not isinstance(model, models.Legendre2D):
         return model.copy()
-    domains = {}
-    for axis, n in zip("xy", shape[::-1], strict=True):
-        domains[f"{axis}_domain"] = getattr(model, f"{axis}_domain")
-        if domains[f"{axis}_domain"] is None:
-            if np.any(model.parameters):
-                raise InputError(
-                    f"a Legendre2D of the model has coefficients but no {axis}_domain: state which pixels they are "
-                    f"meant for, as {axis}_domain=(-0.5, {n - 0.5}) for the whole detector"
-                )
-            domains[f"{axis}_domain"] = (-0.5, n - 0.5)
-    return rebuilt(FastLegendre2D, model, **domains)
+    whole = {f"{axis}_domain": (-0.5, float(n) - 0.5) for axis, n in zip("xy", shape[::-1], strict=True)}
+    missing = {name: domain for name, domain in whole.items() if getattr(model, name) is None}
+    if missing and np.any(model.parameters):
+        name, domain = next(iter(missing.items()))
+        raise InputError(
+            f"a Legendre2D of the model has coefficients but no {name}: state which pixels they are meant for, as "
+            f"{name}={domain} for the whole detector"
+        )
+    return rebuilt(FastLegendre2D, model, **missing)

@@ -254,6 +254,20 @@ def test_timings_are_what_one_waits_for(whole):
     assert f"start {timings['start']:.2f} s, read" in (whole.out / "report.html").read_text()
 
 
+def test_two_workers_leave_the_same(whole, night, tmp_path):
+    """In a process of its own, where workers are copies, one of which draws the report while files are written."""
+    frames, out = [*night, whole.out.parent / "empty.fits"], tmp_path / "out"
+    line = ["run", *frames, "--out", out, "--degree", "1", "--quiet", "--workers", "2"]
+    subprocess.run([sys.executable, "-m", "legdistort", *line], check=True)
+    own = re.compile('<th scope="row">(Command|Solved|Time)</th>')
+    one, two = ((folder / "report.html").read_text().splitlines() for folder in (whole.out, out))
+    assert [line for line in two if not own.search(line)] == [line for line in one if not own.search(line)]
+    one, two = (json.loads((folder / "summary.json").read_text()) for folder in (whole.out, out))
+    assert two["timings"].keys() == one["timings"].keys()
+    assert two["files"].keys() == one["files"].keys()
+    assert two["files"]["stars.ecsv"] == one["files"]["stars.ecsv"]
+
+
 @pytest.mark.parametrize(("megabytes", "given", "workers"), [(5, None, 1), (40, None, 3), (40, 2, 2), (5, 2, 2)])
 def test_all_cores_work_where_it_is_worth_it(tmp_path, monkeypatch, megabytes, given, workers):
     monkeypatch.setattr(commands.parallel, "n_cores", lambda: 3)

@@ -148,7 +148,7 @@ class TestEach:
         assert time.monotonic() - begin < 30
         assert set(multiprocessing.active_children()) <= before
 
-    @pytest.mark.parametrize("workers", [0, -1, 1.5, True])
+    @pytest.mark.parametrize("workers", [0, -1, 1.5, True, "two", np.nan])
     def test_bad_numbers_of_workers(self, workers):
         with pytest.raises(InputError, match="workers must be a positive integer, or None for one, got"):
             list(map_items(abs, [1], workers=workers))
@@ -193,12 +193,14 @@ class TestCopies:
             def work():
                 warnings.warn("three is assumed", AssumptionWarning)
                 (out / "process").write_text(str(os.getpid()))
+                return 7
             def refuse():
                 raise InputError("no such thing")
             with warnings.catch_warnings(record=True, action="always") as caught:
-                with beside(work, workers=2):
+                with beside(work, workers=2) as finish:
                     while not (out / "process").exists():
                         time.sleep(0.01)
+                    assert finish() == 7
             assert [str(w.message) for w in caught] == ["three is assumed"]
             assert int((out / "process").read_text() or 0) != os.getpid()
             for function, error, words in (
@@ -206,21 +208,23 @@ class TestCopies:
                 (lambda: os.kill(os.getpid(), 9), LegdistortError, "a worker process died"),
             ):
                 try:
-                    with beside(function, workers=2):
-                        pass
+                    with beside(function, workers=2) as finish:
+                        finish()
                 except error as raised:
                     assert words in str(raised)
                 else:
                     raise AssertionError(words)
             begin = time.monotonic()
-            try:
-                with beside(lambda: time.sleep(60), workers=2):
-                    raise InputError("of the block")
-            except InputError as raised:
-                assert str(raised) == "of the block"
+            for error in (InputError, EOFError):
+                try:
+                    with beside(lambda: time.sleep(60), workers=2):
+                        raise error("of the block")
+                except error as raised:
+                    assert str(raised) == "of the block"
             assert time.monotonic() - begin < 20
-            with beside(work, workers=1):
+            with beside(work, workers=1) as finish:
                 assert (out / "process").read_text() != str(os.getpid())
+                assert finish() == 7
             assert (out / "process").read_text() == str(os.getpid())
         """
         in_a_new_process(script, tmp_path)
