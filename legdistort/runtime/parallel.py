@@ -207,23 +207,34 @@ def beside(function, *, workers=None):
     ------
     callable
         To be called in the block: it waits for the copy, returns what the function returns and raises what it raises;
-        `LegdistortError` if the copy dies. Where there is no second core it is the function itself. A copy that is not
-        waited for ends with the block.
+        `LegdistortError` if the copy dies. Where there is no second core, or no memory for a copy, it is the function
+        itself. A copy that is not waited for ends with the block.
     """
-    if check_workers(workers) < 2 or not _may_fork():
+    copy = _copied(function) if check_workers(workers) > 1 and _may_fork() else None
+    if copy is None:
         yield function
         return
+    process, receiver = copy
+    with receiver:
+        try:
+            yield partial(_receive, receiver)
+        finally:
+            process.kill()
+            process.join()
+
+
+def _copied(function):
+    """A copy of this process that calls a function, and where its answer comes in; None without memory for it."""
     context = get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_send_attempt, args=(function, sender, os.getpid()))
-    process.start()
-    sender.close()
-    try:
-        yield partial(_receive, receiver)
-    finally:
-        process.kill()
-        process.join()
-        receiver.close()
+    with sender:
+        try:
+            process.start()
+        except OSError:
+            receiver.close()
+            return None
+    return process, receiver
 
 
 def _send_attempt(function, sender, master):

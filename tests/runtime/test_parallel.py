@@ -222,10 +222,15 @@ class TestCopies:
                 except error as raised:
                     assert str(raised) == "of the block"
             assert time.monotonic() - begin < 20
-            with beside(work, workers=1) as finish:
-                assert (out / "process").read_text() != str(os.getpid())
-                assert finish() == 7
-            assert (out / "process").read_text() == str(os.getpid())
+            def no_memory():
+                raise OSError(12, "Cannot allocate memory")
+            for workers in (1, 2):
+                with beside(work, workers=workers) as finish:
+                    assert (out / "process").read_text() != str(os.getpid())
+                    assert finish() == 7
+                assert (out / "process").read_text() == str(os.getpid())
+                (out / "process").write_text("")
+                os.fork = no_memory
         """
         in_a_new_process(script, tmp_path)
 

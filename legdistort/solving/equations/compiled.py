@@ -12,7 +12,7 @@ import itertools
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numba import get_num_threads
+from numba import config
 
 from ...geometry import basis
 from ...runtime.compiling import compiled_loop
@@ -31,7 +31,7 @@ def _chunks(problem, weight=1):
     `weight` is how many times more a loop needs than `_linearise`.
     """
     start = problem.start
-    n = get_num_threads() if start[-1] >= weight * THREADS_FROM else 1
+    n = config.NUMBA_NUM_THREADS if start[-1] >= weight * THREADS_FROM else 1
     inner = np.searchsorted(start, start[-1] * np.arange(1, n) // n).tolist()
     return list(itertools.pairwise([0, *inner, len(start) - 1]))
 
