@@ -76,6 +76,8 @@ def _mode(values, axis=None):
     2.5 medians less 1.5 means; the median where these differ by more than 0.3 standard deviations. NaN do not count.
     `numpy.nanmedian` would loop over the meshes in Python.
     """
+    if not values.size:  # of a corner without a good pixel clipping leaves nothing
+        return np.nan
     axes = range(values.ndim) if axis is None else np.atleast_1d(axis)
     ordered = np.moveaxis(values, axes, range(-len(axes), 0))
     ordered = np.sort(ordered.reshape(*ordered.shape[: -len(axes)], -1))  # NaN come last

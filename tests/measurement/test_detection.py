@@ -13,7 +13,7 @@ from star_images import image as render
 from legdistort.exceptions import InputError
 from legdistort.inputs.exposures import Exposure
 from legdistort.measurement import filters
-from legdistort.measurement.background import _mode, smooth_light
+from legdistort.measurement.background import _mode, sky_and_noise, smooth_light
 from legdistort.measurement.crowding import is_isolated
 from legdistort.measurement.detection import detect, prepare
 from legdistort.measurement.filters import gaussian_sums
@@ -187,7 +187,7 @@ def test_compiled_sums_are_the_plain_ones(shape, sigma, dtype, plain_filters):
 
 @pytest.mark.filterwarnings("ignore:(Mean|Degrees|All-NaN|invalid)")
 @pytest.mark.parametrize(
-    ("shape", "axis"), [((8, 9, 64), -1), ((8, 9, 33), -1), ((5, 7, 6, 4), (1, 3)), ((40, 30), None)]
+    ("shape", "axis"), [((8, 9, 64), -1), ((8, 9, 33), -1), ((5, 7, 6, 4), (1, 3)), ((40, 30), None), ((0,), None)]
 )
 @pytest.mark.parametrize("dtype", ["f", "d"])
 def test_the_sky_of_a_mesh_is_that_of_photutils(shape, axis, dtype):
@@ -199,6 +199,14 @@ def test_the_sky_of_a_mesh_is_that_of_photutils(shape, axis, dtype):
         values[0, 0], values[1, 1], values[2, 2, 1:] = np.nan, 3, np.nan
         values[3] = np.exp(2 * values[3])
     np.testing.assert_array_equal(_mode(values, axis=axis), SExtractorBackground(sigma_clip=None)(values, axis=axis))
+
+
+def test_a_corner_without_pixels_has_the_sky_of_its_neighbours():
+    data, mask = np.random.default_rng(0).normal(10, 1, (200, 210)).astype("f"), np.zeros((200, 210), dtype=bool)
+    mask[192:, 192:] = True
+    sky, rms = sky_and_noise(data, mask, 64)
+    np.testing.assert_allclose(sky[192:, 192:], 10, atol=0.2)
+    np.testing.assert_allclose(rms[192:, 192:], 1, atol=0.1)
 
 
 @pytest.mark.parametrize("shape", [(150, 70), (3, 200), (64, 1)])
