@@ -54,10 +54,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: What `write_results` leaves of every solution.
+SOLVED = "solution.asdf", "stars.ecsv", "wcs/*.asdf"
 #: What `run` and the command ``solve`` leave in their folder, and replace or remove there.
 RESULTS = (
-    "solution.asdf", "stars.ecsv", "wcs/*.asdf", "psf/*.fits", "mosaic.fits", "report.html", "summary.json",
-    "detections.ecsv", "matched.ecsv",
+    *SOLVED, "psf/*.fits", "mosaic.fits", "report.html", "summary.json", "detections.ecsv", "matched.ecsv",
 )  # fmt: skip
 
 _begun: ContextVar[float | None] = ContextVar("_begun", default=None)

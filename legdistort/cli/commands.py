@@ -159,6 +159,7 @@ def do_solve(a):
     """``legdistort solve``."""
     from ..pipeline import (
         RESULTS,
+        SOLVED,
         check_results,
         linked_files,
         listed_files,
@@ -190,7 +191,7 @@ def do_solve(a):
             summary = summarise(solution)
         with timed({}, "write"):
             write_results(solution, target, progress=wants_progress(a))
-        files = linked_files(("solution.asdf", "stars.ecsv", "wcs/*.asdf", "summary.json"))
+        files = linked_files((*SOLVED, "summary.json"))
         write_report(target / "report.html", solution, summary=summary, files=files)
         write_summary(target / "summary.json", summary := summary | listed_files(target))
     _report(a, solution, summary)
