@@ -48,8 +48,8 @@ class Operations:
     """Counts what is done to files below a folder from the moment on it is armed; kills the process at one of them."""
 
     def __init__(self, folder):
-        self.folder, self.count, self.killed_at, self.fork_at = str(folder), 0, None, None
-        self.first_write = None
+        self.folder, self.count, self.killed_at = str(folder), 0, None
+        self.serve = self.tell = self.first_write = None
         self.armed = False
 
     def install(self):
@@ -74,8 +74,7 @@ class Operations:
     def step(self, half=None):
         """One operation; `half` does a part of it before the process dies."""
         self.count += 1
-        if self.count == self.fork_at:
-            self.fork_at = None
+        if self.count == self.first_write and self.serve:
             self.serve()
         if self.count == self.killed_at:
             if half is not None:
@@ -86,8 +85,8 @@ class Operations:
         inside = isinstance(file, (str, os.PathLike)) and os.path.abspath(os.fspath(file)).startswith(self.folder)
         if not (self.armed and inside and set(mode) & set("wxa")):
             return self.real_open(file, mode, *args, **options)
+        self.first_write = self.first_write or self.count + 1
         self.step()
-        self.first_write = self.first_write or self.count
         raw = _Raw(file, mode.replace("b", "").replace("t", ""), self)
         buffered = io.BufferedWriter(raw)
         if "b" in mode:
@@ -178,35 +177,22 @@ class Case:
         self.before = state(self.out)
         self.saved = Path(tempfile.mkdtemp(dir=self.root.parent)) / "saved"
         shutil.copytree(self.root, self.saved, symlinks=True)
-        total, first = self._count()
         self.after = None
-        spread = n_kills // 2  # over all operations; the others over the last, among which the commit is
-        places = {round(1 + i * (total - 1) / max(spread - 1, 1)) for i in range(spread)}
-        last = sorted(set(range(max(1, total - _LAST), total + 1)) - places)
-        n_last = min(n_kills - len(places), len(last))
-        places = sorted(places | {last[(2 * i + 1) * len(last) // (2 * n_last)] for i in range(n_last)})
-        self._restore(self.saved)
         operations = Operations(self.root)
-        operations.fork_at = first
-        operations.serve = lambda: self._serve(operations, [k for k in places if k >= first])
-        for k in (k for k in places if k < first):
+        operations.serve = lambda: self._serve(operations, n_kills)
+        reading, self._pipe = os.pipe()
+        status = in_child(lambda: self._working(operations))
+        os.close(self._pipe)
+        with os.fdopen(reading) as file:
+            total, early = json.loads(file.readline())
+            for line in file:
+                self._note(*json.loads(line))
+        assert status == 0, f"{self.name}: the server ended with {status}"
+        for k in early:
+            self._restore(self.saved)
             fresh = Operations(self.root)
             fresh.killed_at = k
             self._judge(k, in_child(lambda fresh=fresh: self._working(fresh)))
-            self._restore(self.saved)
-        reading, writing = os.pipe()
-
-        def server():
-            self._working(operations)
-
-        self._pipe = writing
-        status = in_child(server)
-        os.close(writing)
-        with os.fdopen(reading) as file:
-            for line in file:
-                k, verdict, fault = json.loads(line)
-                self._note(k, verdict, fault)
-        assert status == 0, f"{self.name}: the server ended with {status}"
         return total
 
     def _working(self, operations):
@@ -214,37 +200,38 @@ class Case:
         operations.armed = True
         status = self.call()
         operations.armed = False
+        if operations.tell:
+            operations.tell()
         return status
 
-    def _count(self):
-        """Number of operations of a whole call, and at which of them the first file is written."""
-        reading, writing = os.pipe()
-
-        def whole():
-            operations = Operations(self.root)
-            status = self._working(operations)
-            os.write(writing, json.dumps([operations.count, operations.first_write]).encode())
-            return status
-
-        status = in_child(whole)
-        os.close(writing)
-        assert status == 0, f"{self.name}: exit status {status}"
-        with os.fdopen(reading) as file:
-            return json.loads(file.read())
+    def _places(self, total, n_kills):
+        """At which operations of a whole call it is killed."""
+        spread = n_kills // 2  # over all operations; the others over the last, among which the commit is
+        places = {round(1 + i * (total - 1) / max(spread - 1, 1)) for i in range(spread)}
+        last = sorted(set(range(max(1, total - _LAST), total + 1)) - places)
+        n_last = min(n_kills - len(places), len(last))
+        return sorted(places | {last[(2 * i + 1) * len(last) // (2 * n_last)] for i in range(n_last)})
 
     def _restore(self, saved):
         shutil.rmtree(self.root)
         shutil.copytree(saved, self.root, symlinks=True)
 
-    def _serve(self, operations, places):
-        """At the first write: one child for every kill, all from the same state of the disk. Only children return."""
+    def _serve(self, operations, n_kills):
+        """At the first write: one child for every kill, all from the same state of the disk. Only children return.
+
+        The first is not killed: its result is the new one, and it counts the operations. Kills before the first write
+        are left to the master.
+        """
         operations.armed = False
         here = self.saved.with_name("here")
         shutil.copytree(self.root, here, symlinks=True)
+        reading, counted = os.pipe()
         held = open_locks()
         for descriptor in held:
             os.close(descriptor)  # shared with all children, or nobody would be dead
-        for k in [None, *places]:  # the first is not killed: its result is the new one
+        first, places = operations.count, [None]
+        while places:
+            k = places.pop(0)
             self._restore(here)
             child = os.fork()
             if child == 0:
@@ -255,14 +242,20 @@ class Case:
                     if again != descriptor:
                         os.close(again)
                 operations.armed, operations.killed_at = True, k
+                operations.serve = None
+                if k is None:
+                    operations.tell = lambda: os.write(counted, json.dumps(operations.count).encode())
                 return  # and the command goes on to its death
             status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-            if k is None:
-                assert status == 0 == in_child(lambda: self.read(self.out))
-                self.after = state(self.out)
+            if k is not None:
+                os.write(self._pipe, (json.dumps([k, *self._verdict(status)]) + "\n").encode())
                 continue
-            verdict, fault = self._verdict(status)
-            os.write(self._pipe, (json.dumps([k, verdict, fault]) + "\n").encode())
+            assert status == 0 == in_child(lambda: self.read(self.out))
+            self.after = state(self.out)
+            total = json.loads(os.read(reading, 100))
+            places = self._places(total, n_kills)
+            early, places = [k for k in places if k < first], [k for k in places if k >= first]
+            os.write(self._pipe, (json.dumps([total, early]) + "\n").encode())
         os._exit(0)
 
     def _judge(self, k, status):

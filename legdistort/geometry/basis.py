@@ -58,6 +58,14 @@ def norm(n):
     return np.sqrt((2 * np.asarray(n) + 1) / 2)
 
 
+@lru_cache
+def _scales(degree, dimensions):
+    """Of all polynomials up to a degree, `norm`, to multiply arrays of so many dimensions more; read-only."""
+    out = norm(np.arange(degree + 1)).reshape(-1, *[1] * dimensions)
+    out.setflags(write=False)
+    return out
+
+
 def legendre(degree, u, derivative=False):
     """Normalised Legendre polynomials of one variable.
 
@@ -83,10 +91,10 @@ def legendre(degree, u, derivative=False):
         p[1] = u
     for n in range(1, degree):
         # (n+1) P_{n+1} = (2n+1) u P_n - n P_{n-1}
-        np.multiply(u, p[n], out=p[n + 1, ...])
-        p[n + 1] *= (2 * n + 1) / (n + 1)
-        p[n + 1] -= n / (n + 1) * p[n - 1]
-    scale = norm(np.arange(degree + 1)).reshape(-1, *[1] * u.ndim)
+        following = np.multiply(u, p[n], out=p[n + 1, ...])
+        following *= (2 * n + 1) / (n + 1)
+        following -= n / (n + 1) * p[n - 1]
+    scale = _scales(degree, u.ndim)
     if not derivative:
         p *= scale
         return p

@@ -300,11 +300,11 @@ def test_command(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.AssumptionWarning")  # the headers tell no gain
-def test_scatter_of_real_stars_follows_the_curve(shared_data):
+def test_scatter_of_real_stars_follows_the_curve(microobservatory):
     """Twelve real, undersampled, drifting frames: solved, and the scatter of every star beside its curve."""
-    exposures = ld.read_exposures(str(shared_data / "microobs_hatp32" / "frames" / "*.fits.gz"))
+    exposures, detections = microobservatory
     curves = ld.calibrate_noise(exposures, fluxes=np.geomspace(30, 3000, 7), n_positions=30)
-    matches = ld.match(ld.measure(exposures), exposures=exposures)
+    matches = ld.match(detections, exposures=exposures)
     assert len(matches.names) == 12
     solution = ld.solve(matches, degree=2, clip=5.0)
     corrected = accuracy.corrected_positions(solution)

@@ -1,17 +1,20 @@
 """The README and the documentation say what is so: their Python runs, their commands are the ones checked."""
 
 import ast
+import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
-import time
 import tomllib
 from pathlib import Path
 
 import pytest
+import warm_process
 import yaml
+from filelock import FileLock
 
 import legdistort
 from legdistort.cli import parser
@@ -52,31 +55,77 @@ def test_few_blocks_cannot_run_here():
     assert all(len(reason.split()) >= 3 for reason in reasons)
 
 
-@pytest.mark.slow
-def test_every_block_of_every_page_runs_as_printed(tmp_path):
-    """In one empty folder, page after page, as a stranger would; the Python of a page is one session."""
-    place = tmp_path / "empty"
-    place.mkdir()
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+#: Pages whose results others use, and with what the names of these begin.
+LEAVING = {ROOT / "docs" / "first_mosaic.md": "tutorial", ROOT / "docs" / "imager_frames.md": "imager"}
+
+
+def running(page):
+    """Language and text of the blocks of a page that run."""
+    return [(language, code) for why, language, code in BLOCK.findall(page.read_text(encoding="utf-8")) if not why]
+
+
+def needed(page):
+    """Those of `LEAVING` whose results a page uses."""
+    text = "".join(code for _, code in running(page))
+    return [other for other, name in LEAVING.items() if other != page and re.search(rf"\b{name}\b", text)]
+
+
+def test_a_page_comes_after_those_that_it_needs():
+    order = reading_order()
+    assert all(order.index(other) < order.index(page) for page in order for other in needed(page))
+    assert sum(bool(needed(page)) for page in order) > 8
+
+
+@pytest.fixture(scope="module")
+def commands_of_a_stranger(tmp_path_factory):
+    """Folder of ``legdistort``, see `warm_process`."""
+    with warm_process.served(tmp_path_factory.mktemp("served")) as folder:
+        yield folder
+
+
+def run_page(page, place, tools):
+    """Run what is on a page, in a folder; the Python of a page is one session."""
+    lines = ["import subprocess", "names = {}"]
+    for language, code in running(page):
+        if language == "sh":
+            lines.append(f"subprocess.run(['bash', '-euc', {code!r}], check=True)")
+        else:
+            lines.append(f"exec(compile({code!r}, {page.name!r}, 'exec'), names)")
+    script = place.with_name(f"{place.name}.py")
+    script.write_text("\n".join(lines), encoding="utf-8")
+    path = os.pathsep.join([str(tools), str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = os.environ | {"PATH": path, "MPLBACKEND": "Agg"}
-    failed = []
-    for page in reading_order():
-        lines = ["import subprocess", "names = {}"]
-        for why, language, code in BLOCK.findall(page.read_text(encoding="utf-8")):
-            if not why and language == "sh":
-                lines.append(f"subprocess.run(['bash', '-euc', {code!r}], check=True)")
-            elif not why:
-                lines.append(f"exec(compile({code!r}, {page.name!r}, 'exec'), names)")
-        script = tmp_path / "page.py"
-        script.write_text("\n".join(lines), encoding="utf-8")
-        begun = time.monotonic()
-        run = subprocess.run(
-            [sys.executable, str(script)], cwd=place, env=environment, capture_output=True, text=True, check=False
-        )
-        print(f"{page.name}: {time.monotonic() - begun:.0f} s")
-        if run.returncode:
-            failed.append(f"{page.name}:\n{run.stderr[-1500:]}")
-    assert not failed, "\n\n".join(failed)
+    run = subprocess.run(
+        [tools / "legdistort-python", script], cwd=place, env=environment, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr[-1500:]
+
+
+def results(page, done, tools):
+    """Folder with what is there after a page, and what it needs, have been run: once for all tests."""
+    place = done / page.stem
+    with FileLock(done / f"{page.stem}.lock"):
+        if not (done / f"{page.stem}.json").exists():
+            shutil.rmtree(place, ignore_errors=True)  # of a run that failed
+            place.mkdir()
+            for other in needed(page):
+                shutil.copytree(results(other, done, tools), place, dirs_exist_ok=True)
+            before = set(os.listdir(place))
+            run_page(page, place, tools)
+            new = sorted(set(os.listdir(place)) - before)
+            (done / f"{page.stem}.json").write_text(json.dumps(new), encoding="utf-8")
+    return place
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in reading_order() if running(page)], ids=lambda page: page.stem)
+def test_every_block_of_every_page_runs_as_printed(page, common_folder, commands_of_a_stranger):
+    """In a folder with the results of the pages that it needs, as a stranger would, who does one page after another."""
+    done = common_folder / "pages"
+    done.mkdir(exist_ok=True)
+    results(page, done, commands_of_a_stranger)
+    made = [name for file in done.glob("*.json") for name in json.loads(file.read_text(encoding="utf-8"))]
+    assert len(made) == len(set(made)), f"made by two pages: {sorted(n for n in set(made) if made.count(n) > 1)}"
 
 
 def test_readme_example_is_six_lines():

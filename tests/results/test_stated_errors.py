@@ -11,10 +11,8 @@ from numpy.testing import assert_allclose
 from legdistort.exceptions import AssumptionWarning
 from legdistort.geometry import similarity
 from legdistort.geometry.distortion import Distortion
-from legdistort.inputs.exposure_files import read_exposures
 from legdistort.inputs.matches import Matches
 from legdistort.matching.matcher import match
-from legdistort.measurement.positions import measure
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy, new_positions
 from legdistort.simulation.observations import simulate_matches
@@ -182,11 +180,9 @@ def test_what_residuals_hardly_determine_stays_with_the_convention(monkeypatch, 
 
 
 @pytest.mark.slow
-def test_real_frames_of_one_telescope_have_one_scale(shared_data):
+def test_real_frames_of_one_telescope_have_one_scale(microobservatory):
     """Similarities between these frames leave 0.1 to 0.2 px, and their scales agree to 0.0005."""
-    exposures = read_exposures(sorted((shared_data / "microobs_hatp32" / "frames").glob("*.fits.gz")))
-    with warns_here(AssumptionWarning, match="no gain known"):
-        detections = measure(exposures)
+    exposures, detections = microobservatory
     matches = match(detections, exposures=exposures, min_exposures=4)
     for degree in (2, 3, 4, 5):
         with warnings.catch_warnings():

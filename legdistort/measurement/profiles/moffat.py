@@ -105,30 +105,46 @@ def evaluate(params, half, nodes, *, jacobian=False):
     ka, kb, kc = (k * q for q in _form(log_a, log_b, rho))
     n, size, kind = len(params), 2 * half + 1, params.dtype
     grid = np.arange(-half, half + 1, dtype=kind)
-    terms = np.zeros((n, 8 if jacobian else 1, size, size), dtype=kind)
+    y, x = np.repeat(grid, size), np.tile(grid, size)  # of all pixels: to broadcast rows of 15 pixels takes longer
+    columns = [x + kind.type(dx) - x0[:, None] for dx in nodes[0]]
+    squares = [ka[:, None] * u**2 for u in columns]
+    terms = np.zeros((8 if jacobian else 1, n, size**2), dtype=kind)
+    s, log_s, profile = np.empty((3, n, size**2), dtype=kind)
+    moments = np.empty((3, n, size**2), dtype=kind) if jacobian else ()
     for dy, wy in zip(*nodes, strict=True):
-        v = (grid + kind.type(dy) - y0[:, None])[:, :, None]
-        for dx, wx in zip(*nodes, strict=True):
-            u = (grid + kind.type(dx) - x0[:, None])[:, None, :]
-            s = u * (2 * kc[:, None, None] * v)
-            s += ka[:, None, None] * u**2
-            s += kb[:, None, None] * v**2 + 1
-            log_s = np.log(s)
-            profile = np.exp(log_s * -beta[:, None, None])
+        v = y + kind.type(dy) - y0[:, None]
+        slope, rest = 2 * kc[:, None] * v, kb[:, None] * v**2 + 1
+        if jacobian:
+            moments[:] = 0
+        for u, square, wx in zip(columns, squares, nodes[1], strict=True):
+            np.multiply(u, slope, out=s)
+            s += square
+            s += rest
+            np.log(s, out=log_s)
+            np.multiply(log_s, -beta[:, None], out=profile)
+            np.exp(profile, out=profile)
             profile *= kind.type(wy * wx)
-            terms[:, 0] += profile
+            terms[0] += profile
             if jacobian:
                 log_s *= profile
+                terms[1] += log_s
                 profile /= s
-                su, sv = profile * u, profile * v
-                for i, term in enumerate((log_s, su, sv, su * u, sv * v, su * v), start=1):
-                    terms[:, i] += term
-    terms = terms.reshape(n, terms.shape[1], size**2)
-    model = peak[:, None] * terms[:, 0]
+                moments[0] += profile
+                for moment in moments[1:]:
+                    profile *= u
+                    moment += profile
+        if jacobian:  # what v multiplies is the same for all columns
+            su, suu = moments[1:]
+            terms[2] += su
+            terms[4] += suu
+            for i, moment in ((3, moments[0]), (5, moments[0]), (6, su)):
+                moment *= v
+                terms[i] += moment
+    model = peak[:, None] * terms[0]
     if not jacobian:
         return model
-    terms[:, 7] = 1
-    return model, _derivatives(params) @ terms
+    terms[7] = 1
+    return model, _derivatives(params) @ terms.swapaxes(0, 1)
 
 
 def _form(log_a, log_b, rho):
