@@ -12,7 +12,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import warm_process
 import yaml
 from filelock import FileLock
 
@@ -76,14 +75,7 @@ def test_a_page_comes_after_those_that_it_needs():
     assert sum(bool(needed(page)) for page in order) > 8
 
 
-@pytest.fixture(scope="module")
-def commands_of_a_stranger(tmp_path_factory):
-    """Folder of ``legdistort``, see `warm_process`."""
-    with warm_process.served(tmp_path_factory.mktemp("served")) as folder:
-        yield folder
-
-
-def run_page(page, place, tools):
+def run_page(page, place):
     """Run what is on a page, in a folder; the Python of a page is one session."""
     lines = ["import subprocess", "names = {}"]
     for language, code in running(page):
@@ -91,17 +83,18 @@ def run_page(page, place, tools):
             lines.append(f"subprocess.run(['bash', '-euc', {code!r}], check=True)")
         else:
             lines.append(f"exec(compile({code!r}, {page.name!r}, 'exec'), names)")
-    script = place.with_name(f"{place.name}.py")
+    script = place.with_name(f"{place.name}.script") / "page.py"  # beside nothing that could be imported
+    script.parent.mkdir(exist_ok=True)
     script.write_text("\n".join(lines), encoding="utf-8")
-    path = os.pathsep.join([str(tools), str(Path(sys.executable).parent), os.environ["PATH"]])
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     environment = os.environ | {"PATH": path, "MPLBACKEND": "Agg"}
     run = subprocess.run(
-        [tools / "legdistort-python", script], cwd=place, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, script], cwd=place, env=environment, capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stderr[-1500:]
 
 
-def results(page, done, tools):
+def results(page, done):
     """Folder with what is there after a page, and what it needs, have been run: once for all tests."""
     place = done / page.stem
     with FileLock(done / f"{page.stem}.lock"):
@@ -109,9 +102,9 @@ def results(page, done, tools):
             shutil.rmtree(place, ignore_errors=True)  # of a run that failed
             place.mkdir()
             for other in needed(page):
-                shutil.copytree(results(other, done, tools), place, dirs_exist_ok=True)
+                shutil.copytree(results(other, done), place, dirs_exist_ok=True)
             before = set(os.listdir(place))
-            run_page(page, place, tools)
+            run_page(page, place)
             new = sorted(set(os.listdir(place)) - before)
             (done / f"{page.stem}.json").write_text(json.dumps(new), encoding="utf-8")
     return place
@@ -119,11 +112,11 @@ def results(page, done, tools):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in reading_order() if running(page)], ids=lambda page: page.stem)
-def test_every_block_of_every_page_runs_as_printed(page, common_folder, commands_of_a_stranger):
+def test_every_block_of_every_page_runs_as_printed(page, common_folder):
     """In a folder with the results of the pages that it needs, as a stranger would, who does one page after another."""
     done = common_folder / "pages"
     done.mkdir(exist_ok=True)
-    results(page, done, commands_of_a_stranger)
+    results(page, done)
     made = [name for file in done.glob("*.json") for name in json.loads(file.read_text(encoding="utf-8"))]
     assert len(made) == len(set(made)), f"made by two pages: {sorted(n for n in set(made) if made.count(n) > 1)}"
 
