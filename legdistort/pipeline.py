@@ -14,8 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from .assessment import baselines, run_checks, stack_quality
 from .assessment.truth import compare_with_truth
 from .cameras.camera import Camera
@@ -32,6 +30,7 @@ from .measurement.options import MeasureOptions
 from .measurement.positions import measure_with_psfs, write_psfs
 from .priors.prior import HEADER, HeaderPrior
 from .reporting.page import write_report
+from .reporting.summary import rounded, summarise
 from .results import accuracy
 from .results.check import Check
 from .runtime import checks, outputs, parallel, provenance
@@ -75,7 +74,7 @@ class Run(ShownAsPrinted):
     solution : Solution
     mosaic : Mosaic
     summary : dict
-        Plain numbers and strings, see `summarise`.
+        Plain numbers and strings, see `legdistort.reporting.summary.summarise`.
     """
 
     out: Path
@@ -245,7 +244,7 @@ def _written_summary(target, summary, timings, report):
     """The summary with all times, once the report is there, and what there is to check the files by; writes it."""
     with timed(timings, "report"):
         report()
-    summary = summary | {"timings": _rounded(timings)} | listed_files(target)
+    summary = summary | {"timings": rounded(timings)} | listed_files(target)
     write_summary(target / "summary.json", summary)
     return summary
 
@@ -393,38 +392,6 @@ def write_summary(path, summary):
     """Write figures as JSON, in the place of those that are there."""
     with outputs.replacing(path, overwrite=True) as file:
         file.write(f"{json.dumps(summary, indent=1)}\n".encode())
-
-
-def summarise(solution, *, timings=None):
-    """Figures of a solution as plain numbers and strings, as ``--json`` prints them.
-
-    ``rms_px``: unweighted rms residual per axis, used observations. ``sigma_px``: the paper's sigma (section 3.4) over
-    the fitted stars, per axis.
-    """
-    found, sigma = solution.diagnostics, accuracy.scatter(accuracy.corrected_positions(solution))
-    return {
-        "n_exposures": len(solution.names),
-        "n_stars": int(np.count_nonzero(np.isfinite(solution.positions[:, 0]))),
-        "n_observations": int(np.count_nonzero(solution.observations["used"])),
-        "chi2": float(solution.chi2),
-        "dof": int(solution.dof),
-        "rms_px": float(np.sqrt(np.mean(solution.rms**2))),
-        "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
-        "checks": [asdict(check) for check in solution.checks],
-        "gauge": solution.gauge.sentence,
-        "unknown": list(solution.gauge.unknown_names),
-        "sky": solution.sky_sentence,
-        "reference": found.reference and asdict(found.reference),
-        "max_inverse_error_px": float(solution.max_inverse_error),
-        "left_out": dict(solution.left_out),
-        "command": provenance.command_line(),
-        **found.summary(),
-        "timings": _rounded(timings or {}),
-    }
-
-
-def _rounded(timings):
-    return {step: round(seconds, 3) for step, seconds in timings.items()}
 
 
 def _compared(matches, solution, solving, mosaic, kept, coadding):

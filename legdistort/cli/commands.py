@@ -163,12 +163,12 @@ def do_solve(a):
         check_results,
         linked_files,
         listed_files,
-        summarise,
         timed,
         write_results,
         write_summary,
     )
     from ..reporting.page import write_report
+    from ..reporting.summary import summarise
 
     check_results(a.out, a.overwrite)
     _refuse_ignored(a)
@@ -282,7 +282,7 @@ def do_simulate(a):
 
 def do_show(a):
     """``legdistort show``."""
-    from ..pipeline import summarise
+    from ..reporting.summary import summarise
 
     solution = _solution(a)
     summary = summarise(solution)
@@ -308,8 +308,8 @@ def do_correct(a):
 
 def do_report(a):
     """``legdistort report``."""
-    from ..pipeline import summarise
     from ..reporting.page import write_report
+    from ..reporting.summary import summarise
 
     solution = _solution(a)
     write_report(a.out, solution, summary=summarise(solution), overwrite=a.overwrite)

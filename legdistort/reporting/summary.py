@@ -1,0 +1,41 @@
+"""A solution in figures, as ``summary.json`` has them."""
+
+from dataclasses import asdict
+
+import numpy as np
+
+from ..results import accuracy
+from ..runtime import provenance
+
+
+def summarise(solution, *, timings=None):
+    """Figures of a solution as plain numbers and strings, as ``--json`` prints them.
+
+    ``rms_px``: unweighted rms residual per axis, used observations. ``sigma_px``: the paper's sigma (section 3.4) over
+    the fitted stars, per axis.
+    """
+    found, sigma = solution.diagnostics, accuracy.scatter(accuracy.corrected_positions(solution))
+    return {
+        "n_exposures": len(solution.names),
+        "n_stars": int(np.count_nonzero(np.isfinite(solution.positions[:, 0]))),
+        "n_observations": int(np.count_nonzero(solution.observations["used"])),
+        "chi2": float(solution.chi2),
+        "dof": int(solution.dof),
+        "rms_px": float(np.sqrt(np.mean(solution.rms**2))),
+        "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
+        "checks": [asdict(check) for check in solution.checks],
+        "gauge": solution.gauge.sentence,
+        "unknown": list(solution.gauge.unknown_names),
+        "sky": solution.sky_sentence,
+        "reference": found.reference and asdict(found.reference),
+        "max_inverse_error_px": float(solution.max_inverse_error),
+        "left_out": dict(solution.left_out),
+        "command": provenance.command_line(),
+        **found.summary(),
+        "timings": rounded(timings or {}),
+    }
+
+
+def rounded(timings):
+    """Seconds by step, to milliseconds."""
+    return {step: round(seconds, 3) for step, seconds in timings.items()}
