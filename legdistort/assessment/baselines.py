@@ -225,7 +225,7 @@ def _fit_polynomials(problem, state, variance, *, weighted):
     coefficients, blocks = state.coefficients.copy(), []
     for i, name in enumerate(problem.names):
         part = problem.part(i)
-        own, (_, b, _) = problem.star[part], criterion.predict(problem, state, i)
+        own, (_, b, _) = problem.star[part], criterion.predict(problem, state, i, i + 1)
         offset = problem.xy[:, part] - similarity.apply(state.poses[i], state.positions[:, own].T).T
         covariance = np.zeros((2 * problem.n_modes, 2 * problem.n_modes))
         for axis in (0, 1):

@@ -1,5 +1,7 @@
 """Similarities of a detector, and all other modes, as Legendre coefficients."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from . import basis
@@ -8,32 +10,45 @@ from . import basis
 def similarity_basis(shape, n):
     """Orthonormal coefficient vectors of the similarities of a detector, shape (4 or 2, 2 * n_modes).
 
-    Shift in x and y, scale, rotation, as displacement fields; only the shifts if there are no linear modes.
+    Shift in x and y, scale, rotation, as displacement fields; only the shifts if there are no linear modes. Read-only.
     """
-    ny, nx = shape
+    return _similarities(*map(float, shape), n)
+
+
+@lru_cache
+def _similarities(ny, nx, n):
     rows = np.zeros((2 if n < 3 else 4, 2, n))
     rows[0, 0, 0] = rows[1, 1, 0] = 1
     if n >= 3:  # x = nx/2 u, and u = L_1(u) L_0 2/sqrt(3): modes 1 (along x) and 2 (along y)
         rows[2, 0, 1], rows[2, 1, 2] = nx, ny
         rows[3, 0, 2], rows[3, 1, 1] = -ny, nx
     rows = rows.reshape(len(rows), -1)
-    return rows / np.linalg.norm(rows, axis=1)[:, None]
+    return _kept(rows / np.linalg.norm(rows, axis=1)[:, None])
 
 
 def dynamic_basis(shape, n):
     """Orthonormal coefficient vectors of all but the similarities, shape (2 * n_modes - 4 or - 2, 2 * n_modes).
 
-    Two shears first, then the modes of degree 2 and more as they are, x before y.
+    Two shears first, then the modes of degree 2 and more as they are, x before y. Read-only.
     """
+    return _others(*map(float, shape), n)
+
+
+@lru_cache
+def _others(ny, nx, n):
     if n < 3:
-        return np.zeros((0, 2 * n))
-    ny, nx = shape
+        return _kept(np.zeros((0, 2 * n)))
     shears = np.zeros((2, 2, n))
     shears[0, 0, 1], shears[0, 1, 2] = ny, -nx
     shears[1, 0, 2], shears[1, 1, 1] = nx, ny
     shears = shears.reshape(2, -1) / np.hypot(nx, ny)
     unit = np.eye(2 * n).reshape(2 * n, 2, n)
-    return np.concatenate([shears, unit[np.r_[3:n, n + 3 : 2 * n]].reshape(-1, 2 * n)])
+    return _kept(np.concatenate([shears, unit[np.r_[3:n, n + 3 : 2 * n]].reshape(-1, 2 * n)]))
+
+
+def _kept(rows):
+    rows.setflags(write=False)
+    return rows
 
 
 def dynamic_degrees(n):

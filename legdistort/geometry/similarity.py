@@ -43,8 +43,10 @@ def check(pose, name="pose"):
     pose = np.asarray(pose, dtype=float)
     if pose.shape != (2, 3) or not np.all(np.isfinite(pose)):
         raise InputError(f"{name} must be a finite (2, 3) array [M | t], got shape {pose.shape}")
-    scale2 = abs(np.linalg.det(pose[:, :2]))
-    if scale2 == 0 or not np.allclose(pose[:, :2] @ pose[:, :2].T, scale2 * np.eye(2), rtol=0, atol=1e-6 * scale2):
+    (xx, xy), (yx, yy) = pose[:, :2].tolist()
+    scale2 = abs(xx * yy - xy * yx)
+    off = max(abs(xx * xx + xy * xy - scale2), abs(yx * yx + yy * yy - scale2), abs(xx * yx + xy * yy))
+    if scale2 == 0 or off > 1e-6 * scale2:
         raise InputError(
             f"{name} is not a similarity (rotation, flip, scale, shift): its linear part is {pose[:, :2].tolist()}; "
             "leave shear to the distortion"

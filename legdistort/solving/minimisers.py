@@ -158,8 +158,8 @@ def solve_joint(
         status,
         len(run.steps),
         run.factors,
-        run.system.n_weak,
-        run.system if declared else None,
+        run.system.n_weak if problem.unknowns.shared else 0,
+        run.made if declared else None,
     )
 
 
@@ -200,7 +200,14 @@ class _Descent:
             if self.rules.hold:
                 here = self.convention.violation(_departure(self.problem, self.state))
                 self.convention = replace(self.convention, values=here)
-        self.system = reduced_system.reduced_system(self.weighted, self.blocks, self.convention)
+        self.made = None
+
+    @property
+    def system(self):
+        """The reduced system at the current state; made when it is first asked for."""
+        if self.made is None:
+            self.made = reduced_system.reduced_system(self.weighted, self.blocks, self.convention)
+        return self.made
 
     def descend(self, max_iterations, tolerance):
         """Iterate until the next step would be below `tolerance`."""
@@ -217,7 +224,7 @@ class _Descent:
                 return
             if size > 0.1 * last:  # slow: exposures hang together weakly, and inner iterations must be more exact
                 accuracy = max(0.01 * accuracy, 1e-10)
-            cost, self.blocks, self.system = self.blocks.cost, None, None  # makes room for the next
+            cost, self.blocks, self.made = self.blocks.cost, None, None  # makes room for the next
             self.state, self.blocks = _advance(self.weighted, self.state, cost, d_star, d_exposure)
             if self.rules.loss != "linear":
                 self._reweight(self.blocks.residual)
@@ -229,7 +236,8 @@ class _Descent:
 
     def freer(self):
         """The same with further unknown maps left to the residuals; None if these determine none."""
-        if self.rules.common is not None or self.rules.hold:
+        unknown = any(each.degree > 1 for each in self.convention.unknown_maps)
+        if self.rules.common is not None or self.rules.hold or not unknown:
             return None
         more = determined_by_residuals(self.system, self.convention)
         if not more.shape[1]:

@@ -181,10 +181,10 @@ def moving_stars(problem, pose_list, q, weight):
 
 def mean_positions(problem, pose_list, q, weight):
     """Weighted mean (2, n_stars) of undistorted positions carried back to the reference plane."""
-    back = np.empty_like(q)
-    for i, pose in enumerate(pose_list):
-        part, inverse = problem.part(i), similarity.invert(pose)
-        back[:, part] = inverse[:, :2] @ q[:, part] + inverse[:, 2:]
-    total = np.bincount(problem.star, weight, problem.n_stars)
-    sums = np.stack([np.bincount(problem.star, weight * axis, problem.n_stars) for axis in back])
+    back, linear = np.empty_like(q), np.linalg.inv(pose_list[:, :, :2])
+    for i, (inverse, pose) in enumerate(zip(linear, pose_list, strict=True)):
+        part = problem.part(i)
+        np.matmul(inverse, q[:, part] - pose[:, 2:], out=back[:, part])
+    back *= weight
+    total, *sums = problem.by_star([weight, *back])
     return np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)

@@ -37,7 +37,7 @@ def solve_scipy(problem, state):
         data = np.empty((2, n, 2 + n_modes))
         for i in range(n_exposures):
             part = problem.part(i)
-            _, values, slope = criterion.predict(problem, current, i)
+            _, values, slope = criterion.predict(problem, current, i, i + 1)
             for axis in (0, 1):
                 data[axis, part, :2] = -(root[axis, part] * slope[axis]).T
                 data[axis, part, 2:] = -(root[axis, part] * values[:n_modes]).T

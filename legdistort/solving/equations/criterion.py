@@ -15,6 +15,7 @@ Phi' E (`legdistort.solving.equations.star_terms`).
 Arrays are ordered by exposure, coordinates first, so that every sweep reads memory once and in order.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,7 @@ from .star_terms import symmetric_times
 _HOLD = 1e4
 #: Smallest uncertainty of a static distortion that takes part in a fit, pixels.
 _SMALLEST = 1e-6
+_MANY = 8192  # observations that are done together, few enough for what is computed of them to stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,40 +103,45 @@ def complement(rows):
     return np.linalg.qr(rows.T, mode="complete")[0][:, len(rows) :].T
 
 
-def predict(problem, state, i, *, derivative=True):
-    """Model positions of the observations of exposure i, with what the normal equations need.
+def predict(problem, state, first=0, last=None, *, derivative=True):
+    """Model positions of the observations of exposures `first` to `last`, with what the normal equations need.
 
     Returns
     -------
-    position : ndarray, shape (2, n_i)
-    values : ndarray, shape (n_all, n_i)
+    position : ndarray, shape (2, n)
+    values : ndarray, shape (n_all, n)
         Basis values.
-    jacobian : ndarray, shape (2, 2, n_i)
+    jacobian : ndarray, shape (2, 2, n)
         dD/dX, detector axis first. Only if `derivative`.
     """
-    ny, nx = problem.shapes[i]
-    pose, a = state.poses[i], state.coefficients[i]
-    q = pose[:, :2] @ problem.terms.place(i, state.stars[:, problem.star[problem.part(i)]]) + pose[:, 2:]
+    last = problem.n_exposures if last is None else last
+    part = slice(problem.start[first], problem.start[last])
+    exposure, degree = problem.exposure[part], basis.degree_of(state.coefficients.shape[2])
+    xx, xy, x0, yx, yy, y0 = state.poses.reshape(-1, 6).T[:, exposure]
+    nx, ny = problem.size.T[:, exposure]
+    x, y = problem.placed_at(exposure, state.stars[:, problem.star[part]])
+    q = np.stack([xx * x + xy * y + x0, yx * x + yy * y + y0])
     u, v = (2 * q[0] + 1) / nx - 1, (2 * q[1] + 1) / ny - 1
-    degree = basis.degree_of(a.shape[1])
+    modes = np.stack(basis.gradients(degree, u, v)) if derivative else basis.values(degree, u, v)[None]
+    fields, start = np.empty((len(modes), 2, q.shape[1])), (problem.start[first : last + 1] - part.start).tolist()
+    for a, low, high in zip(state.coefficients[first:last], start, start[1:], strict=False):
+        np.matmul(a, modes[:, :, low:high], out=fields[:, :, low:high])
+    position, values = q + fields[0], modes[0]
     if not derivative:
-        values = basis.values(degree, u, v)
-        return q + a @ values, values
-    values, du, dv = basis.gradients(degree, u, v)
-    gx, gy = a @ du * (2 / nx), a @ dv * (2 / ny)  # columns of G - I
+        return position, values
+    gx, gy = fields[1] * (2 / nx), fields[2] * (2 / ny)  # columns of G - I
     gx[0] += 1
     gy[1] += 1
-    r = pose[:, :2]
-    jacobian = np.stack([gx * r[0, 0] + gy * r[1, 0], gx * r[0, 1] + gy * r[1, 1]], axis=1)
-    return q + a @ values, values, jacobian
+    return position, values, np.stack([gx * xx + gy * yx, gx * xy + gy * yy], axis=1)
 
 
 def residuals(problem, state):
     """``x_data - D(X)`` of every observation, shape (2, n) pixels, in the order of the problem."""
-    out = np.empty_like(problem.xy)
-    for i in range(problem.n_exposures):
-        part = problem.part(i)
-        out[:, part] = problem.xy[:, part] - predict(problem, state, i, derivative=False)[0]
+    out = problem.xy.copy()
+    ends = np.searchsorted(problem.start, np.arange(0, problem.start[-1] + _MANY, _MANY)).clip(max=problem.n_exposures)
+    for first, last in itertools.pairwise(np.unique(ends).tolist()):  # exposures of so many observations together
+        part = slice(problem.start[first], problem.start[last])
+        out[:, part] -= predict(problem, state, first, last, derivative=False)[0]
     return out
 
 
@@ -175,35 +182,26 @@ def linearise(problem, state):
 
 def _sums(problem, state):
     """The plain twin of `legdistort.solving.equations.compiled.linearise`."""
-    n_modes, n_exposures, n = problem.n_modes, problem.n_exposures, problem.xy.shape[1]
-    residual, values, coupling = np.empty((2, n)), np.empty((n_modes, n)), np.empty((2, 2, n))
-    terms, n_star = problem.terms, problem.n_star
-    v, g_star = np.zeros((n_star * (n_star + 1) // 2, problem.n_stars)), np.zeros((n_star, problem.n_stars))
-    u = np.empty((n_exposures, 2 * n_modes, 2 * n_modes))
-    g_exposure = np.empty((n_exposures, 2 * n_modes))
-    for i in range(n_exposures):
-        part = problem.part(i)
-        star, w = problem.star[part], problem.weight[:, part]
-        position, b, jac = predict(problem, state, i)
-        b = values[:, part] = b[:n_modes]
-        r = residual[:, part] = problem.xy[:, part] - position
-        f = coupling[:, :, part]
-        f[:, 0], f[:, 1] = jac[0] * w[0] + jac[1] * w[2], jac[0] * w[2] + jac[1] * w[1]
-        # a star stands once in an exposure, so plain indexed addition is right
-        m = np.stack([
-            f[0, 0] * jac[0, 0] + f[0, 1] * jac[1, 0],
-            f[1, 0] * jac[0, 1] + f[1, 1] * jac[1, 1],
-            f[0, 0] * jac[0, 1] + f[0, 1] * jac[1, 1],
-        ])  # fmt: skip
-        v[:3, star] += m
-        for k, column in enumerate(terms.columns[i].T):
-            moved = terms.pull(i, symmetric_times(m, column[:, None]))[: 3 + k]
-            first = (2 + k) * (3 + k) // 2
-            v[first : first + 3 + k, star] += moved
-        g_star[:, star] += terms.pull(i, f[:, 0] * r[0] + f[:, 1] * r[1])
-        wr = np.stack([w[0] * r[0] + w[2] * r[1], w[2] * r[0] + w[1] * r[1]])
-        g_exposure[i] = (wr @ b.T).ravel()
-        u[i, :n_modes, :n_modes] = (b * w[0]) @ b.T
-        u[i, n_modes:, n_modes:] = (b * w[1]) @ b.T if problem.unequal else u[i, :n_modes, :n_modes]
-        u[i, :n_modes, n_modes:] = u[i, n_modes:, :n_modes] = (b * w[2]) @ b.T if problem.unequal else 0.0
-    return values, coupling, residual, v, g_star, u, g_exposure
+    n, w, terms = problem.n_modes, problem.weight, problem.terms
+    position, values, jac = predict(problem, state)
+    b, r = values[:n], problem.xy - position
+    f = np.stack([jac[0] * w[0] + jac[1] * w[2], jac[0] * w[2] + jac[1] * w[1]], axis=1)
+    m = np.stack([
+        f[0, 0] * jac[0, 0] + f[0, 1] * jac[1, 0],
+        f[1, 0] * jac[0, 1] + f[1, 1] * jac[1, 1],
+        f[0, 0] * jac[0, 1] + f[0, 1] * jac[1, 1],
+    ])  # fmt: skip
+    v = [m]
+    for k, column in enumerate(terms.columns.transpose(2, 1, 0)):
+        v.append(problem.pulled(symmetric_times(m, column[:, problem.exposure]))[: 3 + k])
+    v = problem.by_star(np.concatenate(v))
+    g_star = problem.by_star(problem.pulled(f[:, 0] * r[0] + f[:, 1] * r[1]))
+    wr = np.stack([w[0] * r[0] + w[2] * r[1], w[2] * r[0] + w[1] * r[1]])
+    g_exposure = problem.by_exposure(wr, b).reshape(problem.n_exposures, -1)
+    xx, yy, xy = (problem.by_exposure(b * each, b) if problem.unequal or k == 0 else None for k, each in enumerate(w))
+    u = np.zeros((problem.n_exposures, 2 * n, 2 * n))
+    u[:, :n, :n] = xx
+    u[:, n:, n:] = yy if problem.unequal else xx
+    if problem.unequal:
+        u[:, :n, n:] = u[:, n:, :n] = xy
+    return b, f, r, v, g_star, u, g_exposure

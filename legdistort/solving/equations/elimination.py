@@ -72,14 +72,11 @@ def to_stars(problem, blocks, a):
         from . import compiled
 
         return compiled.to_stars(problem, blocks, a)
-    out = np.zeros((problem.n_star, problem.n_stars))
-    n_modes = problem.n_modes
-    for i in range(problem.n_exposures):
+    t, f = np.empty_like(problem.xy), blocks.coupling
+    for i, each in enumerate(a.reshape(problem.n_exposures, 2, -1)):
         part = problem.part(i)
-        t = a[i].reshape(2, n_modes) @ blocks.values[:, part]
-        f = blocks.coupling[:, :, part]
-        out[:, problem.star[part]] += problem.terms.pull(i, f[:, 0] * t[0] + f[:, 1] * t[1])
-    return out
+        np.matmul(each, blocks.values[:, part], out=t[:, part])
+    return problem.by_star(problem.pulled(f[:, 0] * t[0] + f[:, 1] * t[1]))
 
 
 def to_exposures(problem, blocks, y):
@@ -88,48 +85,56 @@ def to_exposures(problem, blocks, y):
         from . import compiled
 
         return compiled.to_exposures(problem, blocks, y)
-    out = np.empty((problem.n_exposures, 2 * problem.n_modes))
-    for i in range(problem.n_exposures):
-        part = problem.part(i)
-        z, f = problem.terms.place(i, y[:, problem.star[part]]), blocks.coupling[:, :, part]
-        out[i] = ((f[0] * z[0] + f[1] * z[1]) @ blocks.values[:, part].T).ravel()
-    return out
+    z, f = problem.placed(y), blocks.coupling
+    return problem.by_exposure(f[0] * z[0] + f[1] * z[1], blocks.values).reshape(problem.n_exposures, -1)
 
 
 def reduced_matrix(problem, blocks):
-    """Schur complement ``S = U - E' V^-1 E`` with the stars eliminated, shape (n_unknowns, n_unknowns).
+    """Schur complement ``S = U - E' V^-1 E`` with the stars eliminated, shape (n_unknowns, n_unknowns)."""
+    return mirrored(reduced_triangle(problem, blocks))
+
+
+def reduced_triangle(problem, blocks):
+    """The lower triangle of the Schur complement; what is above it means nothing.
 
     The product is taken over blocks of stars, each a dense matrix product.
     """
     unknowns = blocks.unknowns
-    out = unknowns.matrix(blocks.u)
+    out = unknowns.matrix(blocks.u).T
     for factor in star_factors(problem, blocks):
         factor = unknowns.gather(factor.reshape(*blocks.g_exposure.shape, -1))
-        out = dsyrk(-1.0, factor.T, trans=1, beta=1.0, c=out.T, lower=1, overwrite_c=1).T  # its upper triangle
-    return mirrored(out)
+        out = dsyrk(-1.0, factor, beta=1.0, c=out, lower=1, overwrite_c=1)
+    return out
 
 
 def mirrored(matrix):
-    """The symmetric matrix (n, n) that the upper triangle of a matrix stands for; takes its place."""
+    """The symmetric matrix (n, n) that the lower triangle of a matrix stands for; takes its place."""
     for i in range(0, len(matrix), _TILE):
         part = slice(i, i + _TILE)
-        matrix[i + _TILE :, part] = matrix[part, i + _TILE :].T
-        matrix[part, part] = np.triu(matrix[part, part]) + np.triu(matrix[part, part], 1).T
+        matrix[part, i + _TILE :] = matrix[i + _TILE :, part].T
+        matrix[part, part] = np.tril(matrix[part, part]) + np.tril(matrix[part, part], -1).T
     return matrix
 
 
 def star_factors(problem, blocks, *, n_block=512):
-    """Yield ``E' L`` for blocks of stars, with ``L L' = V^-1``: arrays (n_unknowns, (2 + k) n_block)."""
-    size, n_star = 2 * problem.n_modes, problem.n_star
-    roots = star_roots(blocks.v)
-    for first in range(0, problem.n_stars, n_block):
-        last = min(first + n_block, problem.n_stars)
-        factor = np.zeros((problem.n_exposures * size, n_star, last - first))
-        for i in range(problem.n_exposures):
-            lo, hi = problem.start[i] + np.searchsorted(problem.star[problem.part(i)], [first, last])
-            star, f, b = problem.star[lo:hi], blocks.coupling[:, :, lo:hi], blocks.values[:, lo:hi]
-            for k in range(n_star):
-                z = problem.terms.place(i, roots[:, k, star])
-                column = f[0] * z[0] + f[1] * z[1]  # (axis, n)
-                factor[i * size : (i + 1) * size, k, star - first] = (column[:, None, :] * b).reshape(size, -1)
-        yield factor.reshape(len(factor), -1)
+    """Yield ``E' L`` for blocks of stars, with ``L L' = V^-1``: arrays (n_unknowns, (2 + k) n_block), by columns."""
+    n_exposures, size, roots = problem.n_exposures, 2 * problem.n_modes, star_roots(blocks.v)
+    for first, rows in _blocks_of_stars(problem, n_block):
+        star, f, b = problem.star[rows], blocks.coupling[:, :, rows], blocks.values[:, rows]
+        z = problem.placed_at(problem.exposure[rows], roots[:, :, star])
+        place = (star - first) * n_exposures + problem.exposure[rows]
+        factor = np.zeros((problem.n_star, min(n_block, problem.n_stars - first) * n_exposures, size))
+        for k, each in enumerate(factor):
+            column = f[0] * z[0, k] + f[1] * z[1, k]  # (axis, n)
+            each[place] = (column[:, None] * b).reshape(size, -1).T
+        yield factor.reshape(-1, n_exposures * size).T
+
+
+def _blocks_of_stars(problem, n_block):
+    """Yield the first of so many stars, and the observations of these."""
+    if problem.n_stars <= n_block:
+        yield 0, slice(None)
+        return
+    order = np.argsort(problem.star, kind="stable")
+    first = np.arange(0, problem.n_stars, n_block)
+    yield from zip(first, np.split(order, np.searchsorted(problem.star[order], first[1:])), strict=True)

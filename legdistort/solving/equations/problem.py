@@ -1,5 +1,6 @@
 """The problem: matches, a degree and what is known beforehand as arrays, and the unknowns that are sought."""
 
+import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Real
@@ -102,8 +103,14 @@ class Problem:
 
     def placed(self, stars):
         """Values (2, n) at every observation of fields of the reference plane with star unknowns (2 + k, n_stars)."""
-        seen = (self.terms.place(i, stars[:, self.star[self.part(i)]]) for i in range(self.n_exposures))
-        return np.concatenate(list(seen), axis=1)
+        return self.placed_at(self.exposure, stars[:, self.star])
+
+    def placed_at(self, exposure, stars):
+        """Positions (2, ..., n) of observations of some exposures (n,), of stars with unknowns (2 + k, ..., n)."""
+        if not self.terms.n:
+            return stars
+        columns = np.moveaxis(self.terms.columns[exposure], 0, -1)
+        return stars[:2] + np.einsum("akn,k...n->a...n", columns, stars[2:])
 
     def pulled(self, values):
         """Gradients (2, ..., n) by the place of a star at every observation -> by its unknowns, (2 + k, ..., n)."""
@@ -120,6 +127,20 @@ class Problem:
     def exposure(self):
         """Exposure of every observation, ndarray of int, shape (n,)."""
         return np.repeat(np.arange(self.n_exposures), np.diff(self.start))
+
+    @cached_property
+    def size(self):
+        """Width and height of the detectors, pixels, of every exposure (n_exposures, 2)."""
+        return np.array(self.shapes, dtype=float)[:, ::-1]
+
+    def by_star(self, values):
+        """Sums over the observations of a star of values (k, n): (k, n_stars)."""
+        return np.stack([np.bincount(self.star, each, self.n_stars) for each in values])
+
+    def by_exposure(self, left, right):
+        """``left @ right.T`` by exposure, of values (k, n) and (m, n): (n_exposures, k, m)."""
+        parts = [slice(*ends) for ends in itertools.pairwise(self.start.tolist())]
+        return np.stack([left[:, part] @ right[:, part].T for part in parts])
 
     @cached_property
     def unknowns(self):

@@ -93,9 +93,9 @@ class Direct(Reduced):
 
     def __init__(self, problem, blocks, gauge, weak=None):
         super().__init__(problem, blocks, gauge)
-        s = elimination.reduced_matrix(problem, blocks)
+        s = elimination.reduced_triangle(problem, blocks)
         self.scale = np.mean(np.diag(s))
-        s += self.scale * self.rows.T @ self.rows  # lifts the gauge directions; undone by the multipliers
+        s += (self.scale * self.rows.T @ self.rows).T  # lifts the gauge directions; undone by the multipliers
         # unit diagonal: coefficients of bright and faint exposures then compare
         diagonal = np.diag(s).copy()
         if self.unknowns.shared:  # what is left of a common distortion without the stars may be rounding
@@ -212,7 +212,7 @@ class Direct(Reduced):
         columns = self.unknowns.gather(columns.reshape(*self.blocks.g_exposure.shape, -1))
         held = (self._lifted.T @ columns).reshape(len(self.rows), n, -1)
         free = columns * self._unit[:, None]
-        free = dtrsm(1.0, self._factor[0], free.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
+        free = dtrsm(1.0, self._factor[0], free, lower=1, overwrite_b=1)
         free = free.reshape(len(free), n, -1)
         out = np.empty((n, n, free.shape[2]))
         for a, b in np.ndindex(n, n):
@@ -224,7 +224,7 @@ class Direct(Reduced):
 
     def covariance(self):
         """Covariance of the coefficients of all exposures in the gauge, shape (n_exposures * 2 n_modes,) squared."""
-        out = elimination.mirrored(dpotri(self._factor[0], lower=1)[0].T)  # a third of solving for every unit vector
+        out = elimination.mirrored(dpotri(self._factor[0], lower=1)[0])  # a third of solving for every unit vector
         out *= self._unit[:, None]
         out *= self._unit
         out -= self._lifted @ self._border @ self._lifted.T

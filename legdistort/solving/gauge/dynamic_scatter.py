@@ -57,7 +57,7 @@ def dynamic_covariance(problem, state, error, moved, others, group, static):
         dof = np.maximum(counts.sum(axis=0) - leverage, 0.0)
         new = _pooled(_excess(left, variance, counts, dof), dof, np.mean(own**2))
         change, scatter2 = np.abs(new - scatter2).max(initial=0), new
-        if change < 1e-3 * new.max(initial=0):
+        if change <= 1e-3 * new.max(initial=0):  # equal where exposures do not scatter, as at a start
             break
     out = others.transpose(0, 2, 1) * scatter2 @ others
     for i in range(problem.n_exposures):

@@ -263,14 +263,10 @@ def determined_by_residuals(system, gauge):
     system : Direct or Iterative
         At convergence.
     gauge : Gauge
-        The convention in force.
+        The convention in force, with some unknown map beyond the shears.
     """
-    maps = (
-        np.stack([each.map for each in gauge.unknown_maps if each.degree > 1], axis=1, dtype=float)
-        if any(each.degree > 1 for each in gauge.unknown_maps)
-        else np.zeros((2 * gauge.n_modes, 0))
-    )
-    if not maps.shape[1] or system.dof <= 0 or system.blocks.chi2 < system.dof + 5 * np.sqrt(2 * system.dof):
+    maps = np.stack([each.map for each in gauge.unknown_maps if each.degree > 1], axis=1, dtype=float)
+    if system.dof <= 0 or system.blocks.chi2 < system.dof + 5 * np.sqrt(2 * system.dof):
         return maps[:, :0]
     moved = gauge.reach @ maps
     curvature, vectors = np.linalg.eigh(moved.T @ system.information @ moved)
