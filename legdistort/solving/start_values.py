@@ -73,21 +73,20 @@ def undistorted(problem):
     """Positions (2, n) with the prior distortion taken out to second order, which is enough for a start."""
     if not np.any(problem.prior_mean):
         return problem.xy
+    if problem.uses_compiled_loops:
+        from .equations import compiled
+
+        return compiled.undistorted(problem)
     q, n = np.empty_like(problem.xy), problem.n_exposures
     alike = [(shape, mean.tobytes()) for shape, mean in zip(problem.shapes, problem.prior_mean, strict=True)]
     ends = [i for i in range(1, n) if alike[i] != alike[i - 1]]
     for first, last in itertools.pairwise([0, *ends, n]):  # exposures of one prior are done together
         distortion = Distortion(problem.prior_mean[first], problem.shapes[first])
-        for part in _chunks(problem.start[first], problem.start[last]):
-            x = problem.xy[:, part].T
-            guess = 2 * x - distortion(x)
-            q[:, part] = (x - distortion(guess) + guess).T
+        part = slice(problem.start[first], problem.start[last])
+        x = problem.xy[:, part].T
+        guess = 2 * x - distortion(x)
+        q[:, part] = (x - distortion(guess) + guess).T
     return q
-
-
-def _chunks(first, last, size=4096):
-    """Slices of observations from `first` to `last`, small enough for what is computed of them to stay in the cache."""
-    return [slice(k, min(k + size, last)) for k in range(first, last, size)]
 
 
 def _median(values):

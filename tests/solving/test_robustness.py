@@ -291,6 +291,17 @@ def test_a_copy_of_a_copy_is_one_of_the_first():
     assert repetitions.copies(np.repeat([0, 1, 2], 20), np.tile(xy, (3, 1))) == {1: 0, 2: 0}
 
 
+@pytest.mark.parametrize(("n_common", "is_copy"), [(1000, True), (501, True), (500, False)])
+@pytest.mark.parametrize("digits", [None, 2])
+def test_copies_of_long_lists(n_common, is_copy, digits):
+    """Of which only a part is looked at first; positions rounded in the file are nothing but a few bits."""
+    xy = RNG(2).uniform(0, 2048, (5, 1000, 2))
+    xy = xy if digits is None else np.round(xy, digits)
+    xy[3, :n_common] = xy[1, RNG(3).permutation(1000)[:n_common]]
+    found = repetitions.copies(np.repeat(np.arange(5), 1000), xy.reshape(-1, 2))
+    assert found == ({3: 1} if is_copy else {})
+
+
 def test_an_only_exposure_and_its_copy_are_one():
     sim = precise(2)
     table = copied(sim, "exp00", "again")

@@ -19,7 +19,7 @@ from ...runtime.compiling import compiled_loop
 
 #: Number of observations from which they are shared out among threads, and couplings are kept in single precision.
 THREADS_FROM = 200_000
-_SHORT = 20  # times as many for loops that take a twentieth of the time
+_SHORT = 3  # times as many for loops that take less time
 _BATCH = 64
 _FAST = {"contract", "reassoc", "nsz"}  # sums may be reordered; NaN and infinity keep their meaning
 
@@ -251,6 +251,43 @@ def _to_exposures(low, high, out, start, star, values, coupling, columns, stars)
 
 
 @compiled_loop(nogil=True, fastmath=_FAST)
+def _displaced(a, orders, size, x, q, work):
+    """``x - A b(q)`` of a batch, into q (2, _BATCH)."""
+    pu, du, pv, dv, u = work
+    for o in range(_BATCH):
+        u[0, o], u[1, o] = (q[0, o] + 0.5) * (2.0 / size[1]) - 1.0, (q[1, o] + 0.5) * (2.0 / size[0]) - 1.0
+        q[0, o], q[1, o] = x[0, o], x[1, o]
+    _legendre(u[0], pu, du)
+    _legendre(u[1], pv, dv)
+    for m in range(orders.shape[1]):
+        i, j, ax, ay = orders[0, m], orders[1, m], a[0, m], a[1, m]
+        if ax != 0.0 or ay != 0.0:
+            for o in range(_BATCH):
+                value = pu[i, o] * pv[j, o]
+                q[0, o] -= ax * value
+                q[1, o] -= ay * value
+
+
+@compiled_loop(nogil=True, fastmath=_FAST)
+def _undistorted(low, high, out, start, xy, coefficients, sizes, orders):
+    top = orders.max() + 1
+    legendre, u, x, q = np.empty((4, top, _BATCH)), np.empty((2, _BATCH)), np.zeros((2, _BATCH)), np.empty((2, _BATCH))
+    work = (legendre[0], legendre[1], legendre[2], legendre[3], u)
+    for i in range(low, high):
+        for first in range(start[i], start[i + 1], _BATCH):
+            size = min(_BATCH, start[i + 1] - first)
+            for axis in range(2):
+                for o in range(size):
+                    x[axis, o] = xy[axis, first + o]
+            q[:] = x
+            _displaced(coefficients[i], orders, sizes[i], x, q, work)
+            _displaced(coefficients[i], orders, sizes[i], x, q, work)
+            for axis in range(2):
+                for o in range(size):
+                    out[axis, first + o] = q[axis, o]
+
+
+@compiled_loop(nogil=True, fastmath=_FAST)
 def _distances(low, high, out, start, star, q, poses, positions):
     for i in range(low, high):
         pose = poses[i]
@@ -295,7 +332,7 @@ def linearise(problem, state):
     residual, chunks = np.empty((2, n)), _chunks(problem)
     sums = np.zeros((len(chunks), problem.n_stars, n_star * (n_star + 3) // 2))
     moving = np.ascontiguousarray(state.stars), problem.terms.columns
-    model = state.coefficients, state.poses, np.array(problem.shapes, dtype=float), orders
+    model = state.coefficients, state.poses, np.ascontiguousarray(problem.size[:, ::-1]), orders
     given = problem.start, problem.star, problem.xy, problem.weight, problem.unequal, moving, model
     made = residual, values, coupling, parts, gradient
     chi2 = sum(_shared_out(lambda *chunk: _linearise(*chunk, *given, made), chunks, sums))
@@ -322,6 +359,15 @@ def to_exposures(problem, blocks, y):
     out = np.zeros((problem.n_exposures, 2, problem.n_modes))
     _shared_out(lambda *chunk: _to_exposures(*chunk, out, *given), _chunks(problem, _SHORT))
     return out.reshape(len(out), -1)
+
+
+def undistorted(problem):
+    """Twin of `legdistort.solving.start_values.undistorted`."""
+    orders = np.stack(basis.orders(basis.degree_of(problem.prior_mean.shape[2])))
+    out, sizes = np.empty_like(problem.xy), np.ascontiguousarray(problem.size[:, ::-1])
+    given = out, problem.start, problem.xy, problem.prior_mean, sizes, orders
+    _shared_out(lambda *chunk: _undistorted(*chunk, *given), _chunks(problem, _SHORT))
+    return out
 
 
 def distances(problem, pose_list, q, positions):

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.linalg.blas import dtrsm
+from scipy.linalg.blas import dgemm, dtrsm
 from scipy.linalg.lapack import dpotri
 
 from ...exceptions import SolveError
@@ -210,7 +210,8 @@ class Direct(Reduced):
         Without C itself: ``S^-1 = (L L')^-1``, and half the multiplications of a product with it.
         """
         columns = self.unknowns.gather(columns.reshape(*self.blocks.g_exposure.shape, -1))
-        held = (self._lifted.T @ columns).reshape(len(self.rows), n, -1)
+        # not numpy's product, whose threads would wait beside those of dtrsm and slow them down
+        held = dgemm(1.0, self._lifted, columns, trans_a=1).reshape(len(self.rows), n, -1)
         free = columns * self._unit[:, None]
         free = dtrsm(1.0, self._factor[0], free, lower=1, overwrite_b=1)
         free = free.reshape(len(free), n, -1)
