@@ -197,12 +197,11 @@ def folding(solution, degree, higher):
     normal = float((flat * np.linalg.solve(covariance, flat)).sum())
     energy = np.sum(departure**2)
     beyond = np.sqrt(max(1 - variance / max(energy, 1e-300), 0))
-    folded = np.stack(
-        [_fold(solution, name, low, high) @ a.T for name, a in zip(solution.names, departure, strict=True)]
-    )
+    folds = np.stack([_fold(solution, name, low, high) for name in solution.names])
+    folded = folds @ departure.mT
     orders = np.array(basis.orders(higher)).T
     strongest = int(np.argmax((departure**2).sum(axis=(0, 1))))
-    alone = np.mean([_fold(solution, name, low, high)[:, strongest] ** 2 for name in solution.names], axis=0)
+    alone = np.mean(folds[:, :, strongest] ** 2, axis=0)
     size = beyond * np.sqrt((folded**2).mean(axis=(0, 2)))  # per mode: rms over exposures and axes
     degrees = orders[:low].sum(axis=1)
     found = float(np.sqrt((departure**2).mean(axis=(0, 1)).sum()) / 2)  # rms over the detector, exposures and axes
@@ -228,7 +227,8 @@ def _covariances(solution, high):
 
 def _fold(solution, name, low, high):
     """Regression (n_low, n_high) of higher modes on the lower ones at the stars of an exposure."""
-    rows = solution.observations[(solution.observations["exposure"] == name) & solution.observations["used"]]
+    rows = solution.observations
+    rows = rows[(rows["exposure"] == name) & rows["used"]]
     star = np.searchsorted(solution.star_names, rows["star"])
     q = similarity.apply(solution.poses[name], solution.positions[star])
     b = basis.values(solution.degree, *basis.normalize(q, solution.shapes[name]))
