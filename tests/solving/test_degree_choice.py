@@ -217,6 +217,22 @@ def test_stars_subtracted_from_one_fit_are_as_if_it_had_not_had_them(degree, dir
     assert_allclose(quick[:, 0], slow[:, 0], rtol=0.1, atol=0.1 * np.median(slow[:, 0]))
 
 
+@pytest.mark.parametrize(("by_degree", "best"), [((0.0,), 0), ((0.5, 0.5, 0.5), 2)])
+def test_the_registration_of_degree_zero_is_made_without_the_stars_left_out_where_it_matters(
+    by_degree, best, monkeypatch
+):
+    sim = simulate(40, *by_degree, n_exposures=6)
+    options, calls = SolveOptions(prior=Prior(sim.truth.static)), []
+    refitted = held_out.refitted_squares
+    monkeypatch.setattr(held_out, "refitted_squares", lambda *given: calls.append(1) or refitted(*given))
+    chosen = solve(sim.matches, prior=options.prior, degree="auto", clip=None).diagnostics.selection
+    assert chosen.degree == best
+    assert len(calls) == (best == 0)
+    folds = degree_choice._folds(sim.matches)
+    slow = refitted(lambda left: solve(left, prior=options.prior, degree=0, clip=None), sim.matches, folds)
+    assert chosen.scores[0] == pytest.approx(slow[:, 0].sum() / slow[:, 1].sum(), rel=1e-3 if best == 0 else 0.3)
+
+
 def test_of_equal_degrees_the_lowest():
     """With widths that are found, degrees that are not there change nothing."""
     sim = simulate(12, 0.5, 0.5, n_exposures=5)

@@ -101,28 +101,46 @@ class _Trials:
     def __init__(self, matches, fit, solution, *, found):
         self.matches, self.folds, self._found = matches, _folds(matches), found
         self._fit, self._solution = fit, solution
-        self.degree, self.scores, self.error, self._fits = 0, np.zeros(0), None, {}
-        squares = []
+        self.degree, self.scores, self.error, self._fits, self._is_sure = 0, np.zeros(0), None, {}, False
+        self._squares = []
         for tried in range(HIGHEST + 1):
             try:
-                squares.append(self._squares(tried))
+                self._try(tried)
             except LegdistortError as error:
                 log.debug("degree %d is beyond these stars: %s", tried, error)
                 self.error = error if tried == 0 else None
                 break
-            self.scores = _scores(np.array(squares))
-            self.degree = int(np.argmax(self.scores <= (1 + CLOSE) * self.scores.min()))
-            if tried >= max(self.degree + N_WORSE, CUBIC) and self.scores[self.degree] < EXPLAINED:
+            if self._is_enough():
+                self._make_sure()
+            if self._is_enough():
                 break
+        self._make_sure()
 
-    def _squares(self, degree):
-        """How stars left out scatter.
+    def _try(self, degree, refit=False):
+        """How stars left out scatter with a degree, and the best one then.
 
-        What the fit holds has to go without them as well: at degree 0 the registration, widths of a prior at others.
+        What the fit holds has to go without them as well, which takes a fit for every part of the stars: widths of a
+        prior do; the registration at degree 0 only if that would else be the best.
         """
-        if degree > 0 and not self._found:
-            return held_out.squares(self.fitted(degree), self.matches, self.folds)
+        if self._found or refit:
+            squares = self._refitted(degree)
+        else:
+            squares = held_out.squares(self.fitted(degree), self.matches, self.folds)
+        self._squares[degree : degree + 1] = [squares]
+        self.scores = _scores(np.array(self._squares))
+        self.degree = int(np.argmax(self.scores <= (1 + CLOSE) * self.scores.min()))
 
+    def _is_enough(self):
+        tried = len(self._squares) - 1
+        return tried >= max(self.degree + N_WORSE, CUBIC) and self.scores[self.degree] < EXPLAINED
+
+    def _make_sure(self):
+        """Degree 0 is the best only if it is with a registration that has not seen the stars left out."""
+        if self.degree == 0 and self._squares and not (self._found or self._is_sure):
+            self._is_sure = True
+            self._try(0, refit=True)
+
+    def _refitted(self, degree):
         def refit(left):
             return self._solution(self._fit(left, degree, None))
 
