@@ -37,12 +37,16 @@ def _chunks(problem, weight=1):
 
 
 def _shared_out(function, chunks, *outputs):
-    """Call ``function(low, high, *outputs[chunk])`` for every chunk, in a thread each; what it returns, as a list."""
-    calls = [(low, high, *each) for (low, high), *each in zip(chunks, *outputs, strict=True)]
-    if len(calls) == 1:
-        return [function(*calls[0])]
-    with ThreadPoolExecutor(len(calls)) as threads:
-        return list(threads.map(lambda call: function(*call), calls))
+    """Call ``function(low, high, *outputs[chunk])`` for every chunk; what it returns, as a list.
+
+    The first in this thread, the others in one each.
+    """
+    first, *others = [(low, high, *each) for (low, high), *each in zip(chunks, *outputs, strict=True)]
+    if not others:
+        return [function(*first)]
+    with ThreadPoolExecutor(len(others)) as threads:
+        later = [threads.submit(function, *call) for call in others]
+        return [function(*first), *(each.result() for each in later)]
 
 
 @compiled_loop(nogil=True, fastmath=_FAST)
