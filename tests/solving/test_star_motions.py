@@ -323,7 +323,7 @@ def test_fast_stars_among_mismatches():
 )
 def test_files_keep_motions(tmp_path, settings, tied):
     sim = field(60, FIVE, parallax=0.1)
-    solution = solve(sim.matches, reference=catalogue(sim, RNG) if tied else None, **settings)
+    solution = solve(sim.matches, reference=catalogue(sim, np.random.default_rng(1)) if tied else None, **settings)
     again = Solution.read(solution.write(tmp_path / "s.asdf"))
     assert str(again) == str(solution)
     assert str(again.gauge) == str(solution.gauge)
