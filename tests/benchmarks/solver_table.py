@@ -73,7 +73,7 @@ def measure(name, solver, n_exposures, n_stars):
 
 
 def ratios(n_exposures, n_stars):
-    """CPU time of plain solutions, of default ones, which look for gross errors, and of scipy, in turn, in seconds.
+    """Time of plain solutions, of default ones, which look for gross errors, and of scipy, in turn, in seconds.
 
     The default ones without and with gross errors of 3 pixels in one of a hundred observations. The least of several
     rounds, and that of the first plain solution in this process, which may load compiled loops.
@@ -105,9 +105,9 @@ def ratios(n_exposures, n_stars):
     for count in range(10):
         for way, function in ways.items():
             if way != "scipy" or count < (2 if len(table) > 1e5 else 5):
-                begin = time.process_time()
+                begin = time.perf_counter()
                 function()
-                times[way].append(time.process_time() - begin)
+                times[way].append(time.perf_counter() - begin)
     return len(table), *(min(each) for each in times.values()), times["plain"][0]
 
 
@@ -151,7 +151,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--row", nargs=4)
     parser.add_argument("--scaling", action="store_true")
-    parser.add_argument("--ratios", action="store_true", help="CPU time of scipy over ours, and of rejection")
+    parser.add_argument("--ratios", action="store_true", help="time of scipy over ours, and of rejection")
     parser.add_argument("--covariances", action="store_true", help="errors of all stars, many exposures or many stars")
     parser.add_argument("--degrees", action="store_true", help="CPU time of degree='auto' over a given degree")
     arguments = parser.parse_args()
