@@ -33,8 +33,8 @@ def halos():
 def crowd(request, halos):
     """The faint ones that are isolated: (x - truth) / error, and the light of the halos."""
     pulls, lights = [], []
-    for xy, image, light in halos:
-        table = usable(measure(Exposure("halos", image, gain=GAIN), psf=request.param))
+    for xy, data, light in halos:
+        table = usable(measure(Exposure("halos", data, gain=GAIN), psf=request.param))
         star = identify(table, xy)
         rows = (star >= 0) & (star < 70) & is_isolated(table)
         rows &= cKDTree(xy).query(xy, k=2)[0][star, 1] > 10
