@@ -62,10 +62,10 @@ class Moffat:
 
     def __call__(self, dx, dy):
         """Surface brightness [1 / pixel^2] at offsets (pixels) from the centre."""
-        along = dx * np.cos(self.angle) + dy * np.sin(self.angle)
-        across = dy * np.cos(self.angle) - dx * np.sin(self.angle)
-        squash = 1 - self.ellipticity
-        return self.peak * (1 + (along**2 * squash + across**2 / squash) / self.core**2) ** -self.beta
+        cos, sin, squash = np.cos(self.angle), np.sin(self.angle), 1 - self.ellipticity
+        xx, yy = squash * cos**2 + sin**2 / squash, squash * sin**2 + cos**2 / squash
+        xy = 2 * (squash - 1 / squash) * sin * cos
+        return self.peak * (1 + (xx * dx**2 + yy * dy**2 + (xy * dx) * dy) / self.core**2) ** -self.beta
 
     def reach(self, level):
         """Where the surface brightness along the major axis has fallen to `level` [1 / pixel^2], 4 FWHM at least."""
