@@ -16,6 +16,12 @@ matplotlib.use("Agg")
 gc.set_threshold(200_000, 20, 50)  # a tenth less time: hundreds of thousands of objects of modules stay anyway
 
 
+def pytest_collection_finish():
+    """Modules and tests stay to the end: no search for garbage looks at them again."""
+    gc.collect()
+    gc.freeze()
+
+
 def data_folder():
     """Folder of real data: ``LEGDISTORT_DATA``, or ``../shared/data`` beside the repository; None if absent."""
     candidates = [os.environ.get("LEGDISTORT_DATA"), Path(__file__).parents[2] / "shared" / "data"]

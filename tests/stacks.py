@@ -138,7 +138,7 @@ def fit_star(image, xy, flux, r=6):
         return norm * np.exp(-(p[3] * dx**2 + p[4] * dy**2 + 2 * p[5] * dx * dy) / 2) + p[6]
 
     start = [*xy, flux, 1 / SIGMA**2, 1 / SIGMA**2, 0, 0]
-    p = least_squares(lambda p: (model(p) - box).ravel(), start, x_scale=[1, 1, flux, 0.1, 0.1, 0.1, 1]).x
+    p = least_squares(lambda p: (model(p) - box).ravel(), start, x_scale=[1, 1, flux, 0.1, 0.1, 0.1, 1], method="lm").x
     ring = 9  # far enough for the sum to be the flux, and neighbours are farther
     return p[:2], image[iy - ring : iy + ring + 1, ix - ring : ix + ring + 1].sum()
 

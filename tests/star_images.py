@@ -13,8 +13,9 @@ SKY, GAIN, READ_NOISE = 100.0, 2.0, 10.0
 def profile(dx, dy, fwhm, beta, squash=1.2, theta=0.5):
     """Moffat profile of unit flux; axes fwhm * squash and fwhm / squash."""
     k = 2 ** (1 / beta) - 1
-    along, across = dx * np.cos(theta) + dy * np.sin(theta), dy * np.cos(theta) - dx * np.sin(theta)
-    r2 = (2 * along / (fwhm * squash)) ** 2 + (2 * across * squash / fwhm) ** 2
+    (c, s), wide, narrow = (np.cos(theta), np.sin(theta)), (2 / (fwhm * squash)) ** 2, (2 * squash / fwhm) ** 2
+    xx, yy, xy = wide * c**2 + narrow * s**2, wide * s**2 + narrow * c**2, 2 * (wide - narrow) * s * c
+    r2 = xx * dx**2 + yy * dy**2 + (xy * dx) * dy
     return (beta - 1) * 4 * k / (np.pi * fwhm**2) * (1 + k * r2) ** -beta
 
 
@@ -22,7 +23,8 @@ def on_pixels(x, y, columns, rows, *args, sub=5):
     """The profile averaged over sub x sub points of every pixel."""
     offsets = (np.arange(sub) + 0.5) / sub - 0.5
     fine_x, fine_y = (columns[:, None] + offsets).ravel() - x, (rows[:, None] + offsets).ravel() - y
-    return profile(fine_x, fine_y[:, None], *args).reshape(len(rows), sub, len(columns), sub).mean(axis=(1, 3))
+    along = profile(fine_x, fine_y[:, None], *args).reshape(-1, sub) @ np.full(sub, 1 / sub)
+    return along.reshape(len(rows), sub, len(columns)).mean(axis=1)
 
 
 def image(shape, xy, flux, fwhm, beta=3.0, half=None, **shapes):

@@ -211,7 +211,10 @@ class Distortion(ShownAsPrinted):
     def _corrected(self, tensors, p):
         """Detector pixels (n, 2) -> undistorted pixels by the displacement tensors of an inverse."""
         u, v = basis.normalize(p, self.shape)
-        return p + np.stack([np.polynomial.legendre.legval2d(u, v, t) for t in tensors], axis=-1)
+        norms = basis.norm(np.arange(np.shape(tensors)[1]))
+        along, across = (basis.legendre(len(norms) - 1, w) for w in (u, v))
+        normalised = np.asarray(tensors) / np.outer(norms, norms)
+        return p + np.stack([np.einsum("jn,jn->n", t.T @ along, across) for t in normalised], axis=-1)
 
     def _check_certificate(self, inverse):
         p = _check_points(self.shape)

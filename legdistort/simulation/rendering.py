@@ -21,6 +21,9 @@ from ..exceptions import InputError
 from .gridded_psf import GriddedPSF
 from .pupil import PupilPSF
 
+#: Three Gauss-Legendre nodes a pixel and axis: relative error below 1e-6 for a FWHM of 4.5 pixels.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+
 
 @dataclass(frozen=True)
 class Moffat:
@@ -59,10 +62,10 @@ class Moffat:
 
     def __call__(self, dx, dy):
         """Surface brightness [1 / pixel^2] at offsets (pixels) from the centre."""
-        along = dx * np.cos(self.angle) + dy * np.sin(self.angle)
-        across = dy * np.cos(self.angle) - dx * np.sin(self.angle)
-        squash = 1 - self.ellipticity
-        return self.peak * (1 + (along**2 * squash + across**2 / squash) / self.core**2) ** -self.beta
+        cos, sin, squash = np.cos(self.angle), np.sin(self.angle), 1 - self.ellipticity
+        xx, yy = squash * cos**2 + sin**2 / squash, squash * sin**2 + cos**2 / squash
+        xy = 2 * (squash - 1 / squash) * sin * cos
+        return self.peak * (1 + (xx * dx**2 + yy * dy**2 + (xy * dx) * dy) / self.core**2) ** -self.beta
 
     def reach(self, level):
         """Where the surface brightness along the major axis has fallen to `level` [1 / pixel^2], 4 FWHM at least."""
@@ -72,11 +75,9 @@ class Moffat:
 
     def on_pixels(self, columns, rows, xy):
         """Part of a star's light in every pixel, shape (rows, columns)."""
-        # three Gauss-Legendre nodes a pixel and axis: relative error below 1e-6 for a FWHM of 4.5 pixels
-        nodes, weights = np.polynomial.legendre.leggauss(3)
-        dx, dy = ((r[:, None] + nodes / 2 - c).ravel() for r, c in zip((columns, rows), xy, strict=True))
-        fine = self(dx[None, :], dy[:, None]).reshape(len(rows), 3, len(columns), 3)
-        return np.einsum("aibj,i,j->ab", fine, weights / 2, weights / 2, optimize=True)
+        dx, dy = ((r[:, None] + _NODES / 2 - c).ravel() for r, c in zip((columns, rows), xy, strict=True))
+        along = (self(dx[None, :], dy[:, None]).reshape(-1, 3) @ (_WEIGHTS / 2)).reshape(len(rows), 3, len(columns))
+        return _WEIGHTS / 2 @ along
 
     def varied(self, rng):
         """That of another exposure: width, ellipticity and angle drawn anew about these."""

@@ -14,6 +14,7 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 from numpy.polynomial import legendre
+from scipy.spatial import cKDTree
 
 from ..exceptions import InputError
 from ..geometry import parallax, similarity
@@ -267,7 +268,8 @@ def draw_stars(rng, n, region, inside, least, *, separation=0.0):
         if separation == 0:
             kept = np.vstack([kept, batch])
         else:
-            for xy in batch:
+            free = cKDTree(kept).query(batch)[0] >= separation if len(kept) else slice(None)
+            for xy in batch[free]:
                 if np.all(np.hypot(*(kept - xy).T) >= separation):
                     kept = np.vstack([kept, xy])
         if len(kept) >= n:

@@ -267,6 +267,7 @@ def test_errors_by_star_make_up_b():
     assert_allclose(design.T @ left, 0, atol=1e-8)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_report_has_the_comparison(compared):
     page = report.render(compared["all distortions solved"], comparison=compared)
     assert page.count("<h2>Corrections compared</h2>") == 1

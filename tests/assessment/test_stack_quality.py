@@ -295,6 +295,7 @@ def test_zooms_are_drawn_in_one_stretch(stacks):
     assert "[px]" in axes[-1, 0].get_xlabel()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_report_has_the_stacks(stacks, solution, monkeypatch):
     monkeypatch.setattr(report, "_pictures", lambda *args: {"steps": None, "pairs": []})
     made, _ = stacks

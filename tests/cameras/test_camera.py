@@ -730,6 +730,13 @@ class TestSimulation:
             simulate_gsaoi_matches(camera="gsaoi")
 
 
+@pytest.fixture(scope="module")
+def measured(frames):
+    """These exposures, and the stars measured on them."""
+    exposures = legdistort.read_exposures(f"{frames[0]}/*.fits", ext="SCI")
+    return exposures, legdistort.measure(exposures)
+
+
 class TestFrames:
     def test_reading(self, frames):
         folder, _, _ = frames
@@ -795,11 +802,11 @@ class TestFrames:
         with pytest.raises(InputError, match="is of detector 1, which its name does not contain"):
             camera.of_detectors([replace(apart[0], name="frame")])
 
-    def test_layout_by_headers(self, frames):
+    def test_layout_by_headers(self, frames, measured):
         """Without a camera the headers say how the detectors lie; here they know nothing of the distortion."""
-        folder, camera, _ = frames
-        exposures = legdistort.read_exposures(f"{folder}/*.fits", ext="SCI")
-        matches = legdistort.match(legdistort.measure(exposures), exposures=exposures, min_exposures=3)
+        _, camera, _ = frames
+        exposures, table = measured
+        matches = legdistort.match(table, exposures=exposures, min_exposures=3)
         found = matches.camera
         assert list(found.detectors) == ["1", "2"]
         middle = np.array([[99.5, 149.5]])
@@ -849,12 +856,10 @@ class TestFrames:
             matches = legdistort.match(legdistort.measure(exposures), exposures=exposures, min_exposures=3)
             assert list(matches.camera.detectors) == ["1", "2", "3"]
 
-    def test_a_camera_of_another_instrument(self, frames, gsaoi):
-        folder, _, _ = frames
-        exposures = legdistort.read_exposures(f"{folder}/*.fits", ext="SCI")
-        table = legdistort.measure(exposures[:3])
+    def test_a_camera_of_another_instrument(self, measured, gsaoi):
+        exposures, table = measured
         with pytest.raises(InputError, match="is it a camera of another instrument"):
-            legdistort.match(table, exposures=exposures[:3], camera=gsaoi, min_exposures=2)
+            legdistort.match(table, exposures=exposures, camera=gsaoi, min_exposures=2)
 
 
 def to_nearest(found, true):

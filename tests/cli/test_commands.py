@@ -162,6 +162,7 @@ def test_json_is_alone_on_stdout(whole):
     assert json.loads(whole.printed)["n_exposures"] == 6
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_steps_one_by_one(steps, tmp_path, capsys):
     solution = str(steps / "out" / "solution.asdf")
     for step in (
@@ -655,6 +656,7 @@ def test_the_ending_of_a_mosaic_is_looked_at_first(demo, tmp_path, capsys, monke
     failed(capsys, main(_coadd(demo, tmp_path / "m.png")), "m.png: the ending selects the format of a mosaic")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_keck_lists_by_the_command_line(shared_data, tmp_path, capsys):
     lists = [str(shared_data / "keck_nirc2_onc_bn" / f"{letter}.lis") for letter in "ABCD"]
     matched, out = str(tmp_path / "matched.ecsv"), str(tmp_path / "out")

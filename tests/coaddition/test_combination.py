@@ -1,5 +1,7 @@
 """Combination of stacks: cosmic rays go, stars stay, blocks and order do not matter."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -28,8 +30,20 @@ def stars(seed=0):
     return xy, 10 ** rng.uniform(4, 6, len(xy))
 
 
-def scene(fwhm, profile=gaussian, *, hits=None, order=3, seed=0):
+def scene(fwhm, *, hits=None):
     """Resampled exposures of one field, of widths `fwhm`; ``hits(i, image, place)`` spoils them."""
+    return clean_scene(tuple(fwhm)) if hits is None else made_scene(fwhm, hits)
+
+
+@cache
+def clean_scene(fwhm):
+    data, variance, xy, flux = made_scene(fwhm)
+    for array in (data, variance):
+        array.setflags(write=False)
+    return data, variance, xy, flux
+
+
+def made_scene(fwhm, hits=None, *, profile=gaussian, order=3, seed=0):
     rng = np.random.default_rng(seed)
     xy, flux = stars()
     gy, gx = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)

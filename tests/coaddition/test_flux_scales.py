@@ -438,7 +438,7 @@ def test_photons_of_stars_are_in_the_variance_if_the_gain_is_known(settings):
     clean = [e.data for e in expose(solution, stars, flux)]
     grid = {"grid": _turned(solution, settings["grid"])} if "grid" in settings else {}
     draws = []
-    for _ in range(14):
+    for _ in range(10):
         frames = [
             Exposure(f"frame{i}", rng.poisson((image + 50) * gain) / gain, gain=gain) for i, image in enumerate(clean)
         ]

@@ -146,6 +146,7 @@ def test_measure_and_match_leave_bad_files_out(tmp_path, night, capsys):
     assert json.loads(capsys.readouterr().out)["left_out"].keys() >= reasons.keys()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_run_leaves_bad_files_out(tmp_path, night):
     bad, reasons = bad_files(tmp_path)
     with warns_here(AssumptionWarning, match="4 of 10 frames cannot be used"):

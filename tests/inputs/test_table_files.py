@@ -392,6 +392,7 @@ def reads_or_refuses(path):
 # --- in the shell --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_from_lists_to_stars_in_the_shell(tmp_path, capsys):
     """LDAC lists without any option, solved, their checksums in the solution, its stars as FITS."""
     sim = simulate_matches(n_stars=30, n_exposures=4, degree=1, shape=(600, 700), dither=20, sigma=0.02, seed=5)

@@ -108,7 +108,7 @@ def test_few_stars_half_of_them_missing_or_false():
 
 
 def test_without_fluxes():
-    table = make_field(200, *six_poses(30, 300), seed=5)
+    table = make_field(120, *six_poses(30, 300), seed=5)
     table.remove_column("flux")
     matches = match(table, shape=SHAPE)
     assert_good(table, matches)
@@ -154,9 +154,9 @@ def test_noise_frame_is_left_out_by_name():
 
 
 def test_bad_frame_of_many_detections_poisons_nothing():
-    table = make_field(200, *six_poses(0.5, 100), seed=1)
+    table = make_field(100, *six_poses(0.5, 100), seed=1)
     clean = match(table, shape=SHAPE)
-    xy = np.random.default_rng(9).uniform(0, 2047, (400, 2))
+    xy = np.random.default_rng(9).uniform(0, 2047, (200, 2))
     matches = match(vstack([table, detections("bad", xy, flux=1.0, truth=-1)]), shape=SHAPE)
     assert list(matches.left_out) == ["bad"]
     assert len(matches.table) == len(clean.table)

@@ -662,6 +662,7 @@ def test_picture(psf):
     assert len(plot_psf(psf.named(residual=None), fig=Figure(layout="constrained"))[1]) == 1 + 9
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_shows_the_psf(psf):
     from legdistort.reporting.page import render
 

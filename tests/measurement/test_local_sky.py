@@ -15,23 +15,32 @@ from legdistort.simulation.rendering import render as render_psf
 FWHM, SIZE, N = 3.5, 400, 100
 
 
-@pytest.fixture(scope="module", params=["moffat", "effective"])
-def crowd(request):
-    """Isolated faint stars among bright ones with halos: (x - truth) / error, and the light of the halos."""
-    psf, shape, pulls, lights = as_psf(PupilPSF(strehl=0.3, resolution=3.9), (SIZE, SIZE)), (SIZE, SIZE), [], []
+@pytest.fixture(scope="module")
+def halos():
+    """Faint stars among bright ones with halos: positions, image, and the light of the halos at the faint ones."""
+    psf, shape, made = as_psf(PupilPSF(strehl=0.3, resolution=3.9), (SIZE, SIZE)), (SIZE, SIZE), []
+    centre = render_psf((41, 41), [[20, 20]], [1.0], psf=psf)[20, 20]
     for seed in range(6):
         rng = np.random.default_rng([24, seed])
         xy, flux = rng.uniform(8, SIZE - 9, (100, 2)), np.append(rng.uniform(3e3, 1.5e4, 70), rng.uniform(3e4, 1e6, 30))
         light = render_psf(shape, xy, flux, psf=psf, sky=SKY)
-        table = usable(measure(Exposure("halos", observe(light, rng), gain=GAIN), psf=request.param))
+        x, y = np.round(xy).astype(int).T
+        made.append((xy, observe(light, rng), light[y, x] - SKY - centre * flux))
+    return made
+
+
+@pytest.fixture(scope="module", params=["moffat", "effective"])
+def crowd(request, halos):
+    """The faint ones that are isolated: (x - truth) / error, and the light of the halos."""
+    pulls, lights = [], []
+    for xy, data, light in halos:
+        table = usable(measure(Exposure("halos", data, gain=GAIN), psf=request.param))
         star = identify(table, xy)
         rows = (star >= 0) & (star < 70) & is_isolated(table)
         rows &= cKDTree(xy).query(xy, k=2)[0][star, 1] > 10
         star = star[rows]
         pulls.append((positions(table)[rows] - xy[star]) / errors(table)[rows])
-        own = render_psf((41, 41), [[20, 20]], [1.0], psf=psf)[20, 20] * flux[star]
-        x, y = np.round(xy[star]).astype(int).T
-        lights.append(light[y, x] - SKY - own)
+        lights.append(light[star])
     return np.concatenate(pulls), np.concatenate(lights)
 
 

@@ -154,6 +154,7 @@ def test_by_detector(sim):
 # -- what is said
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_it_is_said_once_that_absolute_positions_are_not_known(sim, declared, caplog):
     with caplog.at_level(logging.WARNING, logger="legdistort"):
         free = ld.solve(sim.matches)
@@ -171,6 +172,7 @@ def test_it_is_said_once_that_absolute_positions_are_not_known(sim, declared, ca
     assert "Relative error of the correction" in render(free)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_solve_command(sim, tmp_path, capsys):
     table = QTable(sim.matches.table)
     table.meta |= sim.matches.to_meta()

@@ -521,6 +521,7 @@ def test_command(tmp_path, nirc2, capsys):
     assert "gsaoi-3 (astropy model) has no frame; leave --frame out" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_prior_of_another_field(tmp_path, capsys):
     """A solution serves as prior, by itself or from a prior.asdf, in the command as in Python."""
     sim = simulate_matches(n_exposures=4, n_stars=30, degree=2, seed=1)

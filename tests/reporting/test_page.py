@@ -258,6 +258,7 @@ def test_two_exposures_without_flux_prior_or_mosaic(degree):
     assert len(page.pictures) == 7 - (degree == 1)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_strong_distortion_is_magnified_less():
     solution = make_solution(2, 30, 2)
     solution.coefficients[:, 0, 3] = 40
@@ -265,6 +266,7 @@ def test_strong_distortion_is_magnified_less():
     assert "magnified 2 times" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_many_exposures_are_listed_and_the_dozen_that_departs_most_is_drawn():
     solution = make_solution(14, 10)
     solution.coefficients[5] = solution.prior_mean[5]

@@ -371,6 +371,7 @@ def written_by(kind):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 @pytest.mark.parametrize("kind", ["solution", "stars", "report", "prior", "camera", "psf"])
+@pytest.mark.usefixtures("undrawn")
 def test_a_disk_that_takes_nothing(tmp_path, monkeypatch, kind):
     """What is written goes to ``/dev/full``, which says ENOSPC itself."""
     write_to, usual = written_by(kind), locks.temporary_folder

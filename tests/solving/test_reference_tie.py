@@ -461,6 +461,7 @@ def test_stars_without_motion_serve_at_their_own_epoch_only(night):
         reference.subset(mask[np.arange(len(table)) != 1]).at(2021.0)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_file_and_its_command(night, tied, tmp_path, capsys):
     gaia(night).write(tmp_path / "gaia.ecsv")
     matched = night.matches.table.copy()

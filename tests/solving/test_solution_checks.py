@@ -396,6 +396,7 @@ def _too_precise(table):
     return table
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_report_leads_with_the_verdict():
     page = render(solved(spoiled("chi2")))
     assert page.index("Something should be looked at") < page.index("Degrees of freedom".lower())

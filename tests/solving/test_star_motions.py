@@ -452,6 +452,7 @@ def test_pictures_of_motions(sky):
         motion_plots.plot_motions(solve(field(60).matches))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_shows_motions(tmp_path):
     solution = solve(field(60).matches, motion="auto")
     page = write_report(tmp_path / "report.html", solution).read_text()

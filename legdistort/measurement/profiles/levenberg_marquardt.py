@@ -234,8 +234,9 @@ def _step(params, gradient, hessian, damping, bounds):
     (low, high), common = bounds, len(bounds[0])
     last, slope = params[:, -common:], gradient[:, -common:]
     held = ((last <= low) & (slope < 0)) | ((last >= high) & (slope > 0))
-    free = np.pad(~held, ((0, 0), (params.shape[1] - common, 0)), constant_values=True)
-    gradient, hessian = gradient * free, hessian * free[:, :, None] * free[:, None, :]
+    if held.any():
+        free = np.pad(~held, ((0, 0), (params.shape[1] - common, 0)), constant_values=True)
+        gradient, hessian = gradient * free, hessian * free[:, :, None] * free[:, None, :]
     normal, scale = _normal(hessian, damping)
     step = np.linalg.solve(normal, (gradient / scale)[:, :, None])[:, :, 0] / scale
     return step, (gradient * step).sum(axis=1)
