@@ -32,6 +32,10 @@ class Reduced:
         rows = np.pad(rows, ((0, 0), (0, 0), (0, 0), (0, size - rows.shape[3]))).reshape(-1, n, 2 * size)
         return self.problem.unknowns.gather(rows.transpose(1, 2, 0)).T
 
+    def moved(self, problem, blocks):
+        """For steps from a state nearby, where weights may differ; None where another system costs no more."""
+        return
+
     def _couple(self, d):
         """E d, shape (2 + k, n_stars)."""
         return elimination.to_stars(self.problem, self.blocks, self.unknowns.spread(d))

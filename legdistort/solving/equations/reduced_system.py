@@ -8,6 +8,7 @@ gradients that never form S (`Iterative`): the same answer.
 
 import contextlib
 import logging
+from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -113,6 +114,15 @@ class Direct(Reduced):
             raise SolveError(_singular_message(problem, s)) from None
         self._lifted = self._apply_inverse(self.rows.T)
         self._border = np.linalg.inv(self.rows @ self._lifted)
+
+    def moved(self, problem, blocks):
+        """The same matrix with the gradients and the stars of a state nearby: steps from there lack a small part."""
+        out = copy(self)
+        for name in ("rhs", "information", "pull"):
+            vars(out).pop(name, None)
+        super(Direct, out).__init__(problem, blocks, self.gauge)
+        out.rows = self.rows
+        return out
 
     def _hold_weak(self, s, rows):
         """Hold what neither dithers nor rolls determine of a common distortion: more rows, that keep to the start.
