@@ -290,7 +290,7 @@ def check(table, contract, what):
     for name in table.colnames:
         unit = contract[name][0] if name in contract else None
         if name in ("exposure", "star", "detector"):
-            out[name] = labels(table, name)
+            out.add_column(labels(table, name).copy(), name=name, copy=False)
         elif name == "epoch" and name in contract:
             out[name] = years(table[name])
         elif name in contract:

@@ -74,8 +74,8 @@ class Observations:
         stars, star = _ranked(table["star"])
         x_err, y_err = table["x_err"].to_value(u.pix), table["y_err"].to_value(u.pix)
         corr = np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else np.zeros(len(table))
-        xy = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
-        covariance = np.column_stack([x_err**2, y_err**2, corr * x_err * y_err])
+        xy = np.stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)]).T  # columns that lie in one piece
+        covariance = np.stack([x_err**2, y_err**2, corr * x_err * y_err]).T
         return cls(table, names, stars, exposure, star, xy, covariance)
 
 
@@ -291,7 +291,8 @@ class Matches(ShownAsPrinted):
         if columns:
             table = column_contract.rename(table, columns)
         table = column_contract.check(table, column_contract.MATCHED, "the table of matched positions")
-        table["exposure"] = table["exposure"].astype(str)
+        if table["exposure"].dtype.kind != "U":
+            table["exposure"] = table["exposure"].astype(str)
         if camera is not None:
             table = in_focal_plane(table, camera)
             shape = camera.field

@@ -24,10 +24,8 @@ def copies(exposure, xy):
     dict of int to int
         ``{exposure: the first one that it repeats}``.
     """
-    bits = np.ascontiguousarray(xy + 0.0).view(np.uint64)  # -0.0 is 0.0
-    key = (
-        bits[:, 0] * np.uint64(0x9E3779B97F4A7C15) + bits[:, 1]
-    )  # wraps around; what falls together is looked at below
+    x, y = np.ascontiguousarray(xy.T + 0.0).view(np.uint64)  # -0.0 is 0.0
+    key = x * np.uint64(0x9E3779B97F4A7C15) + y  # wraps around; what falls together is looked at below
     counts = np.bincount(exposure)
     if (counts.min() >= _MANY and not _repeated(key[key < 2**61])) or _repeated(key) < FEWEST:
         return {}

@@ -370,7 +370,7 @@ def undistorted(problem):
     orders = np.stack(basis.orders(basis.degree_of(problem.prior_mean.shape[2])))
     out, sizes = np.empty_like(problem.xy), np.ascontiguousarray(problem.size[:, ::-1])
     given = out, problem.start, problem.xy, problem.prior_mean, sizes, orders
-    _shared_out(lambda *chunk: _undistorted(*chunk, *given), _chunks(problem, _SHORT))
+    _shared_out(lambda *chunk: _undistorted(*chunk, *given), _chunks(problem))
     return out
 
 
