@@ -23,9 +23,9 @@ def apply(pose, xy):
 
 
 def invert(pose):
-    """The pose of the opposite direction."""
-    inverse = np.linalg.inv(pose[:, :2])
-    return np.column_stack([inverse, -inverse @ pose[:, 2]])
+    """The pose of the opposite direction, or those of poses (..., 2, 3)."""
+    inverse = np.linalg.inv(pose[..., :2])
+    return np.concatenate([inverse, -inverse @ pose[..., 2:]], axis=-1)
 
 
 def apply_inverses(poses, xy):

@@ -73,10 +73,13 @@ class Observations:
         names, exposure = _first_seen(table["exposure"])
         stars, star = _ranked(table["star"])
         x_err, y_err = table["x_err"].to_value(u.pix), table["y_err"].to_value(u.pix)
-        corr = np.asarray(table["xy_corr"]) if "xy_corr" in table.colnames else np.zeros(len(table))
-        xy = np.stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)]).T  # columns that lie in one piece
-        covariance = np.stack([x_err**2, y_err**2, corr * x_err * y_err]).T
-        return cls(table, names, stars, exposure, star, xy, covariance)
+        xy, covariance = np.empty((2, len(table))), np.zeros((3, len(table)))  # columns that lie in one piece
+        xy[0], xy[1] = table["x"].to_value(u.pix), table["y"].to_value(u.pix)
+        np.square(x_err, out=covariance[0])
+        np.square(y_err, out=covariance[1])
+        if "xy_corr" in table.colnames:
+            covariance[2] = np.asarray(table["xy_corr"]) * x_err * y_err
+        return cls(table, names, stars, exposure, star, xy.T, covariance.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,13 +372,13 @@ def _ranked(column):
     """Distinct stars, sorted, and the rank of each row's star; a table look-up where stars are small integers."""
     column = np.asarray(column)
     if column.dtype.kind in "iu" and len(column) and column.min() >= 0 and column.max() < 4 * len(column) + 1000:
-        present = np.bincount(column.astype(np.int64)) > 0
+        present = np.bincount(column.astype(np.int64, copy=False)) > 0
         return np.flatnonzero(present).astype(column.dtype), (np.cumsum(present) - 1)[column]
     return np.unique(column, return_inverse=True)
 
 
 def _check_duplicates(seen):
-    table, key = seen.table, seen.exposure.astype(np.int64) * len(seen.stars) + seen.star
+    table, key = seen.table, seen.exposure.astype(np.int64, copy=False) * len(seen.stars) + seen.star
     if np.all(key[1:] > key[:-1]):
         return
     order = np.argsort(key, kind="stable")

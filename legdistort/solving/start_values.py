@@ -180,10 +180,18 @@ def moving_stars(problem, pose_list, q, weight):
 
 def mean_positions(problem, pose_list, q, weight):
     """Weighted mean (2, n_stars) of undistorted positions carried back to the reference plane."""
-    back, linear = np.empty_like(q), np.linalg.inv(pose_list[:, :, :2])
-    for i, (inverse, pose) in enumerate(zip(linear, pose_list, strict=True)):
-        part = problem.part(i)
-        np.matmul(inverse, q[:, part] - pose[:, 2:], out=back[:, part])
-    back *= weight
-    total, *sums = problem.by_star([weight, *back])
+    total, *sums = carried_back(problem, similarity.invert(pose_list), q, weight)
     return np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
+
+
+def carried_back(problem, inverses, q, weight):
+    """Sums (3, n_stars) over observations: of weights (n,), and of weighted positions q (2, n), poses taken back."""
+    if problem.uses_compiled_loops:
+        from .equations import compiled
+
+        return compiled.carried_back(problem, inverses, q, weight)
+    back = np.empty_like(q)
+    for i, inverse in enumerate(inverses):
+        part = problem.part(i)
+        back[:, part] = inverse[:, :2] @ q[:, part] + inverse[:, 2:]
+    return problem.by_star([weight, *(weight * back)])

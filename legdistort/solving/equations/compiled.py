@@ -292,6 +292,17 @@ def _undistorted(low, high, out, start, xy, coefficients, sizes, orders):
 
 
 @compiled_loop(nogil=True, fastmath=_FAST)
+def _carried_back(low, high, mine, start, star, q, inverses, weight):
+    for i in range(low, high):
+        back = inverses[i]
+        for k in range(start[i], start[i + 1]):
+            row, w, x, y = mine[star[k]], weight[k], q[0, k], q[1, k]
+            row[0] += w
+            row[1] += w * (back[0, 0] * x + back[0, 1] * y + back[0, 2])
+            row[2] += w * (back[1, 0] * x + back[1, 1] * y + back[1, 2])
+
+
+@compiled_loop(nogil=True, fastmath=_FAST)
 def _distances(low, high, out, start, star, q, poses, positions):
     for i in range(low, high):
         pose = poses[i]
@@ -372,6 +383,14 @@ def undistorted(problem):
     given = out, problem.start, problem.xy, problem.prior_mean, sizes, orders
     _shared_out(lambda *chunk: _undistorted(*chunk, *given), _chunks(problem))
     return out
+
+
+def carried_back(problem, inverses, q, weight):
+    """Twin of `legdistort.solving.start_values.carried_back`."""
+    chunks, given = _chunks(problem, _SHORT), (problem.start, problem.star, q, inverses, weight)
+    sums = np.zeros((len(chunks), problem.n_stars, 3))
+    _shared_out(lambda *chunk: _carried_back(*chunk, *given), chunks, sums)
+    return sums.sum(axis=0).T
 
 
 def distances(problem, pose_list, q, positions):

@@ -340,7 +340,7 @@ def _detectors(matches):
 
 def _order(obs):
     """Rows by exposure, then star; a slice of all of them where the table comes that way."""
-    key = obs.exposure.astype(np.int64) * (obs.star.max() + 1) + obs.star
+    key = obs.exposure.astype(np.int64, copy=False) * (obs.star.max() + 1) + obs.star
     return slice(None) if np.all(key[1:] > key[:-1]) else np.argsort(key, kind="stable")
 
 
