@@ -36,8 +36,8 @@ TOLERANCE = 5e-5
 _MADE = 20
 #: ... nor once a step is below so many standard errors, rms: what they are made from hardly changes then.
 _STEADY = 0.01
-#: ... or below so many and a small part of the step before, where little but the curvature of the model is left. A
-#: matrix that has been factorised is not made anew then either.
+#: ... or below so many and a small part of the step before, where little but the curvature of the model is left. What
+#: has been factorised is not made anew then either.
 _NEAR, _MUCH_SMALLER = 5.0, 0.1
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
 #: Counts the iterations of all fits that a solution takes.

@@ -362,3 +362,15 @@ def test_the_exposures_to_blame_are_named_the_worst_first():
     )
     told = reduced_system._singular_message(problem, np.eye(24) - np.outer(direction, direction))
     assert "above all in exposure c, f, b: lower the degree" in told
+
+
+@pytest.mark.parametrize("case", ["alike", "other weight in y", "correlated"])
+def test_inverses_of_exposure_blocks(case):
+    root = RNG.normal(size=(3, 5, 9))
+    u = np.zeros((3, 10, 10))
+    u[:, :5, :5] = u[:, 5:, 5:] = root @ root.mT
+    u[:, 5:, 5:] *= 2.0 if case == "other weight in y" else 1.0
+    if case == "correlated":
+        u[:, :5, 5:] = u[:, 5:, :5] = 0.3 * u[:, :5, :5]
+    found = elimination.inverse_exposure_blocks(u)
+    assert_allclose(found @ u, np.broadcast_to(np.eye(10), u.shape), atol=1e-9)

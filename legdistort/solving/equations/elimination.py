@@ -15,6 +15,17 @@ def inverse_star_blocks(v):
     return _inverted(v)[0]
 
 
+def inverse_exposure_blocks(u):
+    """Inverses of blocks (n_exposures, 2 n_modes, 2 n_modes); where both axes weigh the same, that of one is enough."""
+    n = u.shape[1] // 2
+    xx, yy = u[:, :n, :n], u[:, n:, n:]
+    if u[:, :n, n:].any() or not np.array_equal(xx, yy):
+        return np.linalg.inv(u)
+    out = np.zeros_like(u)
+    out[:, :n, :n] = out[:, n:, n:] = np.linalg.inv(xx)
+    return out
+
+
 def star_roots(v):
     """L of ``L L' = V^-1``, (2 + k, 2 + k, n_stars), from the blocks V."""
     inverse, columns = _inverted(v)

@@ -1,5 +1,6 @@
 """What the ways to solve the normal equations share, whichever side of them is eliminated."""
 
+from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -33,8 +34,13 @@ class Reduced:
         return self.problem.unknowns.gather(rows.transpose(1, 2, 0)).T
 
     def moved(self, problem, blocks):
-        """For steps from a state nearby, where weights may differ; None where another system costs no more."""
-        return
+        """The same factors with the gradients of a state nearby, where weights may differ: steps lack a small part."""
+        out = copy(self)
+        for name in ("rhs", "information", "pull", "moves"):
+            vars(out).pop(name, None)
+        Reduced.__init__(out, problem, blocks, self.gauge)
+        out.rows = self.rows
+        return out
 
     def _couple(self, d):
         """E d, shape (2 + k, n_stars)."""

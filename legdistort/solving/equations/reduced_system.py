@@ -8,7 +8,6 @@ gradients that never form S (`Iterative`): the same answer.
 
 import contextlib
 import logging
-from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -114,15 +113,6 @@ class Direct(Reduced):
             raise SolveError(_singular_message(problem, s)) from None
         self._lifted = self._apply_inverse(self.rows.T)
         self._border = np.linalg.inv(self.rows @ self._lifted)
-
-    def moved(self, problem, blocks):
-        """The same matrix with the gradients and the stars of a state nearby: steps from there lack a small part."""
-        out = copy(self)
-        for name in ("rhs", "information", "pull"):
-            vars(out).pop(name, None)
-        super(Direct, out).__init__(problem, blocks, self.gauge)
-        out.rows = self.rows
-        return out
 
     def _hold_weak(self, s, rows):
         """Hold what neither dithers nor rolls determine of a common distortion: more rows, that keep to the start.
@@ -265,7 +255,7 @@ class Iterative(Reduced):
 
     def __init__(self, problem, blocks, gauge):
         super().__init__(problem, blocks, gauge)
-        self._block_inverses = np.linalg.inv(blocks.u)
+        self._block_inverses = elimination.inverse_exposure_blocks(blocks.u)
         self.scale = np.einsum("iaa->", blocks.u) / self.unknowns.size
 
     def _block_solve(self, r):

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ...geometry.detector_modes import dynamic_degrees
+from ..equations.elimination import inverse_exposure_blocks
 
 _ROUNDS, _NEWTON = 20, 50  # at most
 #: Weights, in exposures, of the mean of a degree in the variance of its modes, and of the other degrees in that mean.
@@ -18,7 +19,7 @@ def conditional_errors(u_data):
     """C_i, covariance of the coefficients if the stars were known; huge where the data do not determine them."""
     size = u_data.shape[1]
     ridge = 1e-12 * np.trace(u_data, axis1=1, axis2=2)[:, None, None] / size + 1e-300
-    return np.linalg.inv(u_data + ridge * np.eye(size))
+    return inverse_exposure_blocks(u_data + ridge * np.eye(size))
 
 
 def dynamic_covariance(problem, state, error, moved, others, group, static):
