@@ -106,7 +106,7 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
             "with max_bytes= (--max-bytes)"
         ) from None
     except Exception as error:  # whatever a broken file provokes
-        raise InputError(f"{path} is not a readable ASDF file: {first_line(error)}") from None
+        raise InputError(f"{path} is not a readable ASDF file: {_fault(error)}") from None
 
 
 def schema_resources():
@@ -169,9 +169,16 @@ def _without_fits_arrays(path, content):
         comments = [line for line in content[: end.end()].splitlines() if line.startswith(b"#ASDF")]
         text = yaml.emit(kept, Dumper=_DUMPER, allow_unicode=True, width=1000).encode()
     except yaml.YAMLError as error:
-        raise InputError(f"{path} is not a readable ASDF file: {first_line(error)}") from None
+        raise InputError(f"{path} is not a readable ASDF file: {_fault(error)}") from None
     text = text if text.rstrip().endswith(b"...") else text.rstrip() + b"\n..."
     return b"\n".join(comments) + b"\n" + text.rstrip() + b"\n" + content[end.end() :]
+
+
+def _fault(error):
+    """What is wrong with a file, in one line; the first line of a message on its YAML says only what was being read."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
+        return f"{error.problem} (line {error.problem_mark.line + 1}, column {error.problem_mark.column + 1})"
+    return first_line(error)
 
 
 class _TooLargeError(Exception):

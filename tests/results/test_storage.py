@@ -566,7 +566,9 @@ BOMB = zlib.compress(bytes(50_000_000), 9)
         (file_of("a: !<tag:yaml.org,2002:python/name:os.system> x"), "tag .*python.*os.system' has no business"),
         (file_of("a: !<tag:astropy.org:astropy/fits/fits-1.1.0> []"), "tag .*fits.* has no business in such a file"),
         (file_of("a: !<tag:example.org:a/b-1.0.0> x"), "tag 'tag:example.org:a/b-1.0.0' has no business"),
-        (file_of("a: " + "[" * 5000 + "]" * 5000), "nested more than 100 levels deep"),
+        (file_of("a: " + "[" * 200 + "]" * 200), "nested more than 100 levels deep"),
+        # newer libyaml refuses it by itself
+        (file_of("a: " + "[" * 5000 + "]" * 5000), "nested more than 100 levels deep|maximum nesting depth .line "),
         (file_of("a: &a [1, *a]"), "alias .a of nothing, or within itself"),
         (
             file_of("a0: &a0 [1, 1]\n" + "\n".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]" for k in range(1, 40))),
