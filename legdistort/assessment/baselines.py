@@ -101,7 +101,7 @@ def solve_relative(matches, *, degree=3, reference=None, weighted=True, error_fl
     state = State(target, np.zeros((problem.n_exposures, 2, problem.n_modes)), _stacked(matches))
     state = State(target, state.coefficients, _fit_poses(problem, state, variance))
     state, covariance = _fit_polynomials(problem, state, variance, weighted=weighted)
-    state, _ = constraints.absorb_similarities(problem, state)
+    state = constraints.absorb_similarities(problem, state)
     fixed = np.zeros((problem.n_exposures, 1, 1))
     fixed[slice(None) if name is None else problem.names.index(name)] = 1
     convention = constraints.make("minimal", problem, state, criterion.linearise(problem, state))

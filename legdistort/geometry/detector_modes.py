@@ -57,29 +57,35 @@ def dynamic_degrees(n):
     return np.concatenate([[1, 1], degrees, degrees]) if n >= 3 else np.zeros(0, dtype=int)
 
 
-def similarity_part(coefficients, shapes):
+def similarity_part(coefficients, shape):
     """The similarity closest to ``q + A b(q)``, as a pose (..., 2, 3) in the detector's pixels.
 
     Parameters
     ----------
     coefficients : ndarray, shape (..., 2, n_modes)
-    shapes : tuple, or list of tuples
-        ``(ny, nx)``; one for all, or one for each.
+    shape : tuple
+        ``(ny, nx)`` of the detector.
     """
-    size = np.broadcast_to(np.array(shapes)[..., ::-1], (*coefficients.shape[:-2], 2)).astype(float)  # nx, ny
-    pose = np.zeros((*coefficients.shape[:-1], 3))
-    pose[..., 0, 0] = pose[..., 1, 1] = 1
-    pose[..., 2] = coefficients[..., 0] / 2  # b_0 = 1/2
-    if coefficients.shape[-1] >= 3:
-        # scale and rotation per pixel: coefficients s nx/sqrt(3), s ny/sqrt(3) in modes 1 (x) and 2 (y), by projection
-        (xx, xy), (yx, yy) = np.moveaxis(coefficients[..., 1:3], (-2, -1), (0, 1))
-        nx, ny = np.moveaxis(size, -1, 0)
-        norm = np.sqrt(3) / (nx**2 + ny**2)
-        scale, turn = (nx * xx + ny * yy) * norm, (nx * yx - ny * xy) * norm
-        pose[..., 0, 0] += scale
-        pose[..., 1, 1] += scale
-        pose[..., 0, 1], pose[..., 1, 0] = -turn, turn
-        middle = (size - 1) / 2
-        pose[..., 0, 2] -= scale * middle[..., 0] - turn * middle[..., 1]
-        pose[..., 1, 2] -= turn * middle[..., 0] + scale * middle[..., 1]
-    return pose
+    *several, _, n = coefficients.shape
+    flat = coefficients.reshape(*several, 2 * n)
+    return np.eye(2, 3) + (flat @ similarity_poses(shape, n).T).reshape(*several, 2, 3)
+
+
+def similarity_poses(shape, n):
+    """What the similarity part of coefficients adds to the pose that changes nothing, as a matrix (6, 2 * n_modes).
+
+    Read-only.
+    """
+    return _poses(*map(float, shape), n)
+
+
+@lru_cache
+def _poses(ny, nx, n):
+    rows = _similarities(ny, nx, n)
+    poses = np.zeros((len(rows), 2, 3))
+    poses[0, 0, 2] = poses[1, 1, 2] = 1 / 2  # b_0 = 1/2
+    if n >= 3:  # scale and rotation about the middle: L_1(u) L_0 = sqrt(3)/2 u, and u = (2 x + 1) / nx - 1
+        poses[2, 0, 0] = poses[2, 1, 1] = poses[3, 1, 0] = np.sqrt(3) / np.hypot(nx, ny)
+        poses[3, 0, 1] = -poses[3, 1, 0]
+        poses[2:, :, 2] = -poses[2:, :, :2] @ [(nx - 1) / 2, (ny - 1) / 2]
+    return _kept(poses.reshape(len(rows), 6).T @ rows)

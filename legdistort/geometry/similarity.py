@@ -34,8 +34,10 @@ def apply_inverses(poses, xy):
 
 
 def compose(second, first):
-    """The pose ``x -> second(first(x))``."""
-    return np.column_stack([second[:, :2] @ first[:, :2], apply(second, first[:, 2])])
+    """The pose ``x -> second(first(x))``, or those for poses `second` (..., 2, 3)."""
+    out = second[..., :2] @ first
+    out[..., 2] += second[..., 2]
+    return out
 
 
 def check(pose, name="pose"):

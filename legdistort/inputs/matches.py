@@ -457,6 +457,8 @@ def _check_connected(seen):
     np.minimum.at(first, seen.star, seen.exposure)
     tied = np.zeros((n, n), dtype=bool)
     tied[seen.exposure, first[seen.star]] = True
+    if tied[:, 0].all():  # as nearly always
+        return
     count, group = connected_components(tied, directed=False)
     if count > 1:
         groups = [[name for name, g in zip(seen.names, group, strict=True) if g == label] for label in range(count)]

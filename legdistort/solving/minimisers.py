@@ -20,8 +20,9 @@ from ..runtime.progress import Bar
 from ..runtime.words import LOSSES
 from .equations import criterion, elimination, reduced_system
 from .equations.problem import State
+from .equations.reduced_base import Reduced
 from .gauge import constraints
-from .gauge.hierarchy import determined_by_residuals, is_explained
+from .gauge.hierarchy import determined_by_residuals, is_explained, is_noise
 
 log = logging.getLogger(__name__)
 
@@ -34,11 +35,16 @@ TOLERANCE = 5e-5
 #: 20 stars, with 15 px of unknown static distortion, 21 never settled with 6, one with 12, none with 20. Not
 #: for ever: where few stars of a reference bend the plane by much, state and constraints may chase each other.
 _MADE = 20
-#: ... nor once a step is below so many standard errors, rms: what they are made from hardly changes then.
-_STEADY = 0.01
-#: ... or below so many and a small part of the step before, where little but the curvature of the model is left. What
-#: has been factorised is not made anew then either.
+#: ... nor once a step is below so many tolerances: what they are made from hardly changes then.
+_STEADY = 200.0
+#: ... or below so many standard errors, rms, and a small part of the step before, where little but the curvature of the
+#: model is left: if the static distortion is taken as exact, so that they are a convention and no estimate.
 _NEAR, _MUCH_SMALLER = 5.0, 0.1
+#: After a step below this part of the one before, what has been factorised serves the next one too if that turns out
+#: to be much smaller.
+_SMALLER = 0.5
+#: Up to so many observations one more pass over them at the start costs less than it saves.
+_BEGIN_UP_TO = 100_000
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
 #: Counts the iterations of all fits that a solution takes.
 _count = ContextVar("count", default=lambda: None)
@@ -89,16 +95,21 @@ def iterations_shown(progress):
             _count.reset(before)
 
 
-def loss_factors(squares, loss):
+def loss_factors(squares, loss, scale2=None):
     """Weight factors of iteratively reweighted least squares for the squared normalised residuals (n,).
 
-    The loss works at the observed scale if that is larger than the stated errors (median of the squares
-    against its expectation for two axes, 2 ln 2).
+    The loss works at the observed scale if that is larger than the stated errors (`observed_variance`), or at the given
+    one.
     """
-    seen = squares[squares > 0]
-    scale2 = max(1.0, np.median(seen) / (2 * np.log(2))) if len(seen) else 1.0
+    scale2 = observed_variance(squares) if scale2 is None else scale2
     s = squares / (scale2 * _TUNING[loss] ** 2)
     return 1 / np.maximum(1, np.sqrt(s)) if loss == "huber" else 1 / (1 + s)
+
+
+def observed_variance(squares):
+    """Variance over that of the stated errors, at least 1: the median of the squares over that of two axes, 2 ln 2."""
+    seen = squares[squares > 0]
+    return max(1.0, np.median(seen) / (2 * np.log(2))) if len(seen) else 1.0
 
 
 def solve_joint(
@@ -135,12 +146,12 @@ def solve_joint(
     """
     check_choice(loss, LOSSES, "loss")
     max_iterations = MAX_ITERATIONS if max_iterations is None else max_iterations
-    state, _ = constraints.absorb_similarities(problem, state)
-    run = _Descent(problem, state, _Rules(gauge, common, loss, hold))
-    run.descend(max_iterations, tolerance)
+    state = constraints.absorb_similarities(problem, state)
+    run = _Descent(problem, state, _Rules(gauge, common, loss, hold, tolerance))
+    run.descend(max_iterations)
     while run.converged and (freer := run.freer()) is not None:
         with contextlib.suppress(SolveError):
-            freer.descend(max_iterations, tolerance)
+            freer.descend(max_iterations)
         if not (freer.converged and is_explained(freer.blocks.chi2, run.system)):
             break
         run = freer
@@ -174,6 +185,7 @@ class _Rules:
     common: np.ndarray | None
     loss: str
     hold: bool
+    tolerance: float
 
 
 class _Descent:
@@ -185,7 +197,29 @@ class _Descent:
         self.n_made = 0
         self._reweight(criterion.residuals(problem, state) if rules.loss != "linear" else None)
         self.blocks = criterion.linearise(self.weighted, state)
+        self.stepping, self.size = None, self._begin()
         self._prepare()
+
+    def _begin(self):
+        """Fit the coefficients to the stars where they are, if modes are those of the prior yet; how far they move.
+
+        The scatter of exposures that the first gauge is made from is that of a solution then, and the reduced matrix,
+        where there is one, serves two steps.
+        """
+        problem, blocks = self.problem, self.blocks
+        plain = self.rules.loss == "linear" and not (problem.unknowns.shared or problem.terms.n)
+        if not plain or not problem.degree or problem.xy.shape[1] > _BEGIN_UP_TO:
+            return np.inf
+        highest = slice(basis.n_modes(problem.degree - 1), problem.n_modes)
+        departure = (self.state.coefficients - problem.prior_mean)[:, :, highest]
+        if np.any(departure) or reduced_system.is_singular(blocks.u):
+            return np.inf
+        d_exposure = np.linalg.solve(blocks.u, blocks.g_exposure[..., None])[..., 0]
+        size = _step_size(blocks, np.zeros_like(blocks.g_star), d_exposure)
+        log.debug("J = %.8g, coefficients move by %.2g standard errors", blocks.cost, size)
+        self.state = _moved(problem, self.state, 0.0, constraints.without_similarities(problem, d_exposure))
+        self.blocks = criterion.linearise(self.weighted, self.state)
+        return size
 
     def _reweight(self, residuals):
         if self.rules.loss == "linear":
@@ -196,8 +230,9 @@ class _Descent:
 
     def _prepare(self, step=np.inf, last=np.inf):
         """The gauge at the current state, and what steps from it, `step` after the `last` from where they were made."""
-        near = step < _NEAR and step < _MUCH_SMALLER * last
-        if self.n_made < _MADE and step > _STEADY and not near:
+        near = step < _NEAR and step < _MUCH_SMALLER * last < np.inf and self.convention.static == "exact"
+        self.on_trial = not near and step < _SMALLER * last and self.rules.loss == "linear"
+        if self.n_made < _MADE and step > _STEADY * self.rules.tolerance and not near:
             how = {"released": self.released, "common": self.rules.common, "all_drifts": self.rules.hold}
             self.convention = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks, **how)
             self.n_made += 1
@@ -205,7 +240,9 @@ class _Descent:
                 here = self.convention.violation(_departure(self.problem, self.state))
                 self.convention = replace(self.convention, values=here)
         self.made = None
-        self.stepping = self.stepping.moved(self.weighted, self.blocks) if near else None
+        self.stepping = (
+            self.stepping.moved(self.weighted, self.blocks, self.convention) if near or self.on_trial else None
+        )
 
     @property
     def system(self):
@@ -214,21 +251,29 @@ class _Descent:
             self.made = reduced_system.reduced_system(self.weighted, self.blocks, self.convention)
         return self.made
 
-    def descend(self, max_iterations, tolerance):
-        """Iterate until the next step would be below `tolerance`."""
-        accuracy, size = 1e-3 if self.blocks.coupling.dtype == np.float32 else 1e-5, np.inf
-        for _ in range(max_iterations):
+    def _step(self, target, accuracy):
+        """The next step of stars and coefficients, and its size."""
+        self.stepping = self.stepping or self.system
+        d_star, d_exposure = self.stepping.step(target, accuracy)
+        return d_star, d_exposure, _step_size(self.blocks, d_star, d_exposure)
+
+    def descend(self, max_iterations):
+        """Iterate until the next step would be below the tolerance."""
+        accuracy, size = 1e-3 if self.blocks.coupling.dtype == np.float32 else 1e-5, self.size
+        tolerance = self.rules.tolerance
+        for count in range(max_iterations):
             _count.get()()
-            target = -self.convention.violation(_departure(self.problem, self.state))
-            self.stepping = self.stepping or self.system
-            d_star, d_exposure = self.stepping.step(target, accuracy)
-            size, last = _step_size(self.blocks, d_star, d_exposure), size
+            target, last = -self.convention.violation(_departure(self.problem, self.state)), size
+            d_star, d_exposure, size = self._step(target, accuracy)
+            if self.on_trial and self.stepping is not self.made and size >= _MUCH_SMALLER * last:
+                self.stepping = None
+                d_star, d_exposure, size = self._step(target, accuracy)
             self.steps.append(size)
             log.debug("J = %.8g, step %.2g standard errors", self.blocks.cost, size)
             if size < tolerance:
                 self.converged = True
                 return
-            if size > 0.1 * last:  # slow: exposures hang together weakly, and inner iterations must be more exact
+            if count and size > 0.1 * last:  # slow: exposures hang together weakly; inner iterations must be more exact
                 accuracy = max(0.01 * accuracy, 1e-10)
             cost, self.blocks, self.made, self.stepping.blocks = self.blocks.cost, None, None, None  # makes room
             self.state, self.blocks = _advance(self.weighted, self.state, cost, d_star, d_exposure)
@@ -236,7 +281,7 @@ class _Descent:
                 self._reweight(self.blocks.residual)
                 self.blocks = criterion.linearise(self.weighted, self.state)
             self._prepare(size, last)
-            if size < _STEADY and size * size / last < 0.1 * tolerance:
+            if size < _STEADY * tolerance and size * size < 0.1 * tolerance * last < np.inf:
                 self.converged = True
                 return
 
@@ -244,6 +289,8 @@ class _Descent:
         """The same with further unknown maps left to the residuals; None if these determine none."""
         unknown = any(each.degree > 1 for each in self.convention.unknown_maps)
         if self.rules.common is not None or self.rules.hold or not unknown:
+            return None
+        if not self.problem.unknowns.shared and is_noise(Reduced(self.weighted, self.blocks, self.convention)):
             return None
         more = determined_by_residuals(self.system, self.convention)
         if not more.shape[1]:
@@ -290,15 +337,18 @@ def _step_size(blocks, d_star, d_exposure):
     return float(np.sqrt((stars + exposures) / (d_star.size + d_exposure.size)))
 
 
+def _moved(problem, state, d_star, d_exposure):
+    """The state after a step of stars (2 + k, n_stars) and coefficients (n_exposures, 2 n_modes)."""
+    coefficients, n_modes = state.coefficients.copy(), problem.n_modes
+    coefficients[:, :, :n_modes] += d_exposure.reshape(-1, 2, n_modes)
+    return State(state.stars + d_star, coefficients, state.poses)
+
+
 def _advance(problem, state, cost, d_star, d_exposure):
     """Take the step, halved while it makes J much larger, and hand the similarities to the poses."""
-    n_modes = problem.n_modes
     for halving in range(10):
         factor = 0.5**halving
-        coefficients = state.coefficients.copy()
-        coefficients[:, :, :n_modes] += factor * d_exposure.reshape(-1, 2, n_modes)
-        tried = State(state.stars + factor * d_star, coefficients, state.poses)
-        tried, _ = constraints.absorb_similarities(problem, tried)
+        tried = constraints.absorb_similarities(problem, _moved(problem, state, factor * d_star, factor * d_exposure))
         new = criterion.linearise(problem, tried)
         # the constraints may cost a little J along directions that are only nearly free
         if new.cost <= 1.5 * cost + 10 * problem.xy.size:
@@ -359,7 +409,7 @@ def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, t
             "drift along directions that the data do not determine; method='joint' fixes these"
         )
         warn(status, ConvergenceWarning)
-    state, _ = constraints.absorb_similarities(problem, state)
+    state = constraints.absorb_similarities(problem, state)
     blocks = criterion.linearise(problem, state)
     convention = constraints.make(gauge, problem, state, blocks)
     return Result(state, blocks, convention, converged, status, sweep, np.ones(problem.xy.shape[1]))

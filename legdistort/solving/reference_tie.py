@@ -345,14 +345,12 @@ def _pose(gauge, shift):
 
 def _moved(state, pose):
     """The same solution in a plane moved by a pose: exactly as good."""
-    back = similarity.invert(pose)
-    moved = np.stack([similarity.compose(own, back) for own in state.poses])
     stars = state.stars.copy()
     stars[:2] = similarity.apply(pose, state.positions.T).T
     if len(stars) > 2:
         stars[2:4] = pose[:, :2] @ state.stars[2:4]  # motions turn with the plane
         stars[4:] *= np.sqrt(np.linalg.det(pose[:, :2]))
-    return State(stars, state.coefficients, moved)
+    return State(stars, state.coefficients, similarity.compose(state.poses, similarity.invert(pose)))
 
 
 def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):

@@ -49,7 +49,7 @@ def start(problem, nominal, *, robust=False):
     distance2 = distances(problem, current, q, positions)
     typical = np.sqrt([_median(distance2[problem.part(i)]) for i in range(problem.n_exposures)])
     common = _common_similarity(problem, nominal, current, misplaced(problem, typical))
-    current = np.stack([similarity.compose(pose, common) for pose in current])
+    current = similarity.compose(current, common)
     if problem.terms.n:
         stars = moving_stars(problem, current, q, weight)
     else:
@@ -100,18 +100,32 @@ def _median(values):
 def refine(problem, pose_list, q, positions, weight):
     """Poses (n_exposures, 2, 3) that carry star positions (2, n_stars) to undistorted ones q (2, n), parity kept."""
     parity = np.where(np.linalg.det(pose_list[:, :, :2]) > 0, 1, -1)
+    fitted = similarity.similarity_of(*moments(problem, q, weight, positions), parity)
+    return np.where(np.isfinite(fitted).all(axis=(1, 2), keepdims=True), fitted, pose_list)
+
+
+def moments(problem, q, weight, positions):
+    """Moments of the similarities of all exposures that carry star positions (2, n_stars) to undistorted ones q (2, n).
+
+    Returns
+    -------
+    mean_s, mean_t : ndarray, shape (n_exposures, 2)
+    cross : ndarray, shape (n_exposures, 2, 2)
+        See `legdistort.geometry.similarity.similarity_of`; NaN where the stars lie at one place.
+    """
     if problem.uses_compiled_loops:
         from .equations import compiled
 
-        fitted = similarity.similarity_of(*compiled.moments(problem, q, weight, positions), parity)
-        return np.where(np.isfinite(fitted).all(axis=(1, 2), keepdims=True), fitted, pose_list)
-    out = pose_list.copy()
-    for i in range(problem.n_exposures):
-        part = problem.part(i)
-        source = positions[:, problem.star[part]].T
-        if np.count_nonzero(weight[part]) > 1:
-            out[i] = similarity.fit_similarity(source, q[:, part].T, weights=weight[part], parity=parity[i])
-    return out
+        return compiled.moments(problem, q, weight, positions)
+    first, source = problem.start[:-1], positions[:, problem.star]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = weight / np.add.reduceat(weight, first)[problem.exposure]
+        means = [np.add.reduceat(share * each, first, axis=1) for each in (source, q)]
+        s, t = (each - mean[:, problem.exposure] for each, mean in zip((source, q), means, strict=True))
+        cross = np.add.reduceat(weight * t[:, None] * s, first, axis=2) / np.add.reduceat(
+            weight * s**2, first, axis=1
+        ).sum(axis=0)
+    return means[0].T, means[1].T, np.moveaxis(cross, 2, 0)
 
 
 def _common_similarity(problem, nominal, refined, astray):
@@ -154,12 +168,17 @@ def distances(problem, pose_list, q, positions):
         from .equations import compiled
 
         return compiled.distances(problem, pose_list, q, positions)
-    distance2 = np.empty(q.shape[1])
+    return ((q - posed(problem, pose_list, positions[:, problem.star])) ** 2).sum(axis=0)
+
+
+def posed(problem, pose_list, xy):
+    """Positions (2, n) through the pose of their exposure."""
+    out = np.empty_like(xy)
     for i, pose in enumerate(pose_list):
         part = problem.part(i)
-        off = q[:, part].T - similarity.apply(pose, positions[:, problem.star[part]].T)
-        distance2[part] = (off**2).sum(axis=1)
-    return distance2
+        np.matmul(pose[:, :2], xy[:, part], out=out[:, part])
+        out[:, part] += pose[:, 2:]
+    return out
 
 
 def moving_stars(problem, pose_list, q, weight):
@@ -190,8 +209,4 @@ def carried_back(problem, inverses, q, weight):
         from .equations import compiled
 
         return compiled.carried_back(problem, inverses, q, weight)
-    back = np.empty_like(q)
-    for i, inverse in enumerate(inverses):
-        part = problem.part(i)
-        back[:, part] = inverse[:, :2] @ q[:, part] + inverse[:, 2:]
-    return problem.by_star([weight, *(weight * back)])
+    return problem.by_star([weight, *(weight * posed(problem, inverses, q))])

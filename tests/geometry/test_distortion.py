@@ -298,3 +298,19 @@ def test_models_do_not_depend_on_those_made_before():
             ("c0_0", "c1_0", "c0_1", "c1_1"), tensors[1].T.ravel(), strict=True)))  # fmt: skip
         assert series(20.0, 30.0) == alike(20.0, 30.0)
         series.parameters = 0.0  # which reaches no other
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 5, 8])
+def test_no_slope_exceeds_its_bound(degree):
+    """Beyond it the Jacobian need not be looked at for folds; one mode alone reaches it in a corner."""
+    rng = np.random.default_rng(degree)
+    t = np.linspace(-0.5, 299.5, 61)
+    q = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
+    for scale in (0.1, 3.0):
+        d = Distortion(rng.normal(0, scale, (2, basis.n_modes(degree))), (300, 300))
+        assert np.linalg.norm(d.jacobian(q) - np.eye(2), axis=(1, 2)).max() <= d._largest_slope * (1 + 1e-12)
+    alone = np.zeros((2, basis.n_modes(degree)))
+    alone[0, -1] = 2.0
+    d = Distortion(alone, (300, 300))
+    steepest = np.linalg.norm(d.jacobian(q) - np.eye(2), axis=(1, 2)).max()
+    assert steepest == pytest.approx(d._largest_slope)

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 
+from legdistort.geometry import similarity
 from legdistort.priors.prior import Prior
 from legdistort.runtime.progress import Bar
 from legdistort.simulation.observations import simulate_matches
@@ -44,8 +45,9 @@ def test_what_the_last_steps_keep_moves_no_star(direct, loss, monkeypatch):
     moved = minimisers.reduced_system.Reduced.moved
     monkeypatch.setattr(minimisers.reduced_system.Reduced, "moved", lambda *a: kept.append(a) or moved(*a))
     found = {}
-    for near in (0.0, minimisers._NEAR):
+    for near, smaller in ((0.0, 0.0), (minimisers._NEAR, minimisers._SMALLER)):
         monkeypatch.setattr(minimisers, "_NEAR", near)
+        monkeypatch.setattr(minimisers, "_SMALLER", smaller)
         assert not kept
         found[near] = solve(sim.matches, prior=Prior(sim.truth.static), loss=loss, clip=None)
     assert kept
@@ -54,3 +56,22 @@ def test_what_the_last_steps_keep_moves_no_star(direct, loss, monkeypatch):
     assert np.abs(np.asarray(off)).max() < 1e-3
     assert new.chi2 == pytest.approx(old.chi2, rel=1e-6)
     assert np.allclose(new.stars["x_err"], old.stars["x_err"], rtol=1e-4)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_coefficients_fitted_to_the_start_values_of_the_stars_save_steps_and_move_no_star(known, monkeypatch):
+    sim = simulate_matches(n_exposures=12, n_stars=80, seen=0.8, sigma=0.05, dither=150.0, seed=2)
+    prior, found = Prior(sim.truth.static) if known else None, {}
+    for up_to in (0, minimisers._BEGIN_UP_TO):
+        monkeypatch.setattr(minimisers, "_BEGIN_UP_TO", up_to)
+        found[up_to] = solve(sim.matches, prior=prior, clip=None)
+    old, new = found.values()
+    # the plane is that of the nominal poses to 1e-3 px, wherever the steps lead
+    assert np.abs(new.positions - old.positions).max() < 1e-3
+    pose = similarity.fit_similarity(new.positions, old.positions)
+    off = similarity.apply(pose, new.positions) - old.positions
+    errors = np.column_stack([old.stars["x_err"].value, old.stars["y_err"].value])
+    assert (np.abs(off) / errors).max() < 2e-3
+    steps = [int(re.search(r"after (\d+)", each.status).group(1)) for each in (old, new)]
+    assert steps[1] <= steps[0]
+    assert known or steps[1] < steps[0]

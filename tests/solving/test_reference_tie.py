@@ -260,7 +260,7 @@ def test_one_star_fixes_the_shift(sim):
     before = solve(sim.matches, prior=prior)
     solution = solve(sim.matches, prior=prior, reference=planar(sim, 1, 0.001))
     moved = solution.positions - before.positions
-    assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-9)
+    assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=2e-5)  # of the last step, 1e-4 standard errors
     rows = {line[:24].strip(): line for line in str(solution.gauge).splitlines()}
     assert rows["shift"].endswith("the reference")
     assert "not known" in rows["rotation, scale"]

@@ -165,8 +165,11 @@ def _linearise(low, high, mine, start, star, xy, weight, unequal, moving, model,
             size = min(_BATCH, start[i + 1] - first)
             _take(first, size, star, stars, weight, phi, pose, q, w)
             _model(coefficients[i], orders, sizes[i], q, work)
-            for o in range(size):
-                r[0, o], r[1, o] = xy[0, first + o] - q[0, o], xy[1, first + o] - q[1, o]
+            for axis in range(2):  # slices have no negative indices to be watched for: vector instructions serve
+                seen, kept = xy[axis, first : first + size], residual[axis, first : first + size]
+                for o in range(size):
+                    r[axis, o] = seen[o] - q[axis, o]
+                    kept[o] = r[axis, o]
             total = 0.0
             for o in range(_BATCH):
                 jxx, jxy = g[0, o] * r00 + g[1, o] * r10, g[0, o] * r01 + g[1, o] * r11
@@ -181,14 +184,15 @@ def _linearise(low, high, mine, start, star, xy, weight, unequal, moving, model,
                 wr[1, o] = w[2, o] * r[0, o] + w[1, o] * r[1, o]
                 total += r[0, o] * wr[0, o] + r[1, o] * wr[1, o]
             chi2 += total
-            for o in range(size):
-                k = first + o
-                residual[0, k], residual[1, k] = r[0, o], r[1, o]
-                coupling[0, 0, k], coupling[0, 1, k] = f[0, o], f[1, o]
-                coupling[1, 0, k], coupling[1, 1, k] = f[2, o], f[3, o]
+            for axis in range(2):
+                for other in range(2):
+                    out = coupling[axis, other, first : first + size]
+                    for o in range(size):
+                        out[o] = f[2 * axis + other, o]
             for m in range(n_modes):
+                out = values[m, first : first + size]
                 for o in range(size):
-                    values[m, first + o] = b[m, o]
+                    out[o] = b[m, o]
             for o in range(size):
                 row = mine[star[first + o]]
                 row[0] += j[0, o]
@@ -220,14 +224,15 @@ def _to_stars(low, high, mine, start, star, values, coupling, columns, a):
                 for o in range(size):
                     x[o] += ax * row[o]
                     y[o] += ay * row[o]
+            f, number = coupling[:, :, first : first + size], star[first : first + size]
             for o in range(size):
-                k = first + o
-                px = coupling[0, 0, k] * x[o] + coupling[0, 1, k] * y[o]
-                py = coupling[1, 0, k] * x[o] + coupling[1, 1, k] * y[o]
-                mine[star[k], 0] += px
-                mine[star[k], 1] += py
+                row = mine[number[o]]
+                px = f[0, 0, o] * x[o] + f[0, 1, o] * y[o]
+                py = f[1, 0, o] * x[o] + f[1, 1, o] * y[o]
+                row[0] += px
+                row[1] += py
                 for t in range(n_terms):
-                    mine[star[k], 2 + t] += columns[i, 0, t] * px + columns[i, 1, t] * py
+                    row[2 + t] += columns[i, 0, t] * px + columns[i, 1, t] * py
 
 
 @compiled_loop(nogil=True, fastmath=_FAST)
@@ -281,14 +286,16 @@ def _undistorted(low, high, out, start, xy, coefficients, sizes, orders):
         for first in range(start[i], start[i + 1], _BATCH):
             size = min(_BATCH, start[i + 1] - first)
             for axis in range(2):
+                seen = xy[axis, first : first + size]
                 for o in range(size):
-                    x[axis, o] = xy[axis, first + o]
+                    x[axis, o] = seen[o]
             q[:] = x
             _displaced(coefficients[i], orders, sizes[i], x, q, work)
             _displaced(coefficients[i], orders, sizes[i], x, q, work)
             for axis in range(2):
+                found = out[axis, first : first + size]
                 for o in range(size):
-                    out[axis, first + o] = q[axis, o]
+                    found[o] = q[axis, o]
 
 
 @compiled_loop(nogil=True, fastmath=_FAST)

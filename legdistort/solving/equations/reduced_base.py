@@ -19,6 +19,7 @@ class Reduced:
     """
 
     n_weak = 0  # unknowns that the exposures share and that they do not determine
+    takes_any_gauge = True  # whether what is factorised serves other constraints too
 
     def __init__(self, problem, blocks, gauge):
         self.problem, self.blocks, self.gauge = problem, blocks, gauge
@@ -29,17 +30,25 @@ class Reduced:
     def _on_unknowns(self, gauge):
         """The constraints as rows on the unknowns; those of the gauge act on the modes up to its own degree."""
         n, size = len(gauge.motion), self.problem.n_modes
+        if gauge.n_modes == size and not self.problem.unknowns.shared:
+            return gauge.orthonormal
         rows = gauge.orthonormal.reshape(gauge.n_constraints, n, 2, -1)
         rows = np.pad(rows, ((0, 0), (0, 0), (0, 0), (0, size - rows.shape[3]))).reshape(-1, n, 2 * size)
         return self.problem.unknowns.gather(rows.transpose(1, 2, 0)).T
 
-    def moved(self, problem, blocks):
-        """The same factors with the gradients of a state nearby, where weights may differ: steps lack a small part."""
+    def moved(self, problem, blocks, gauge):
+        """The same factors with the gradients of a state nearby, where weights may differ: steps lack a small part.
+
+        Under that gauge; None if another one needs other factors.
+        """
+        if gauge is not self.gauge and (self.n_weak or not self.takes_any_gauge):
+            return None
         out = copy(self)
         for name in ("rhs", "information", "pull", "moves"):
             vars(out).pop(name, None)
-        Reduced.__init__(out, problem, blocks, self.gauge)
-        out.rows = self.rows
+        Reduced.__init__(out, problem, blocks, gauge)
+        if gauge is self.gauge:
+            out.rows = self.rows
         return out
 
     def _couple(self, d):

@@ -41,12 +41,12 @@ def reduced_system(problem, blocks, gauge, weak=None):
     if large and has_few_stars(problem, _DIRECT_COST) and 2 * problem.n_star * problem.n_stars <= problem.unknowns.size:
         with contextlib.suppress(LinAlgError):
             return OnStars(problem, blocks, gauge)
-    if uses_direct(problem) or (not large and _is_singular(blocks.u)):  # which names the exposure with too few stars
+    if uses_direct(problem) or (not large and is_singular(blocks.u)):  # which names the exposure with too few stars
         return Direct(problem, blocks, gauge, weak)
     return Iterative(problem, blocks, gauge)
 
 
-def _is_singular(blocks):
+def is_singular(blocks):
     """Whether some block of an exposure (n, k, k) is singular, as where its stars lie on a line."""
     unit = np.sqrt(np.einsum("iaa->ia", blocks))
     if not unit.min() > 0:
@@ -111,8 +111,18 @@ class Direct(Reduced):
                 raise LinAlgError
         except (LinAlgError, ValueError):
             raise SolveError(_singular_message(problem, s)) from None
+        self._hold_rows()
+
+    def _hold_rows(self):
         self._lifted = self._apply_inverse(self.rows.T)
         self._border = np.linalg.inv(self.rows @ self._lifted)
+
+    def moved(self, problem, blocks, gauge):
+        """As for `Reduced`."""
+        out = super().moved(problem, blocks, gauge)
+        if out is not None and gauge is not self.gauge:
+            out._hold_rows()
+        return out
 
     def _hold_weak(self, s, rows):
         """Hold what neither dithers nor rolls determine of a common distortion: more rows, that keep to the start.
@@ -302,7 +312,8 @@ class Iterative(Reduced):
 
         None if it takes more than `limit` iterations.
         """
-        lifted = np.stack([self._block_solve(row) for row in rows], axis=1)
+        by_exposure = rows.T.reshape(*self._block_inverses.shape[:2], -1)
+        lifted = (self._block_inverses @ by_exposure).reshape(-1, len(rows))
         border = np.linalg.inv(rows @ lifted)
 
         def precondition(r):

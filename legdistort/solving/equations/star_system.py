@@ -41,6 +41,8 @@ class OnStars(Reduced):
         the gauge and the data do not determine all.
     """
 
+    takes_any_gauge = False
+
     def __init__(self, problem, blocks, gauge):
         super().__init__(problem, blocks, gauge)
         self.scale = np.einsum("iaa->", blocks.u) / self.unknowns.size

@@ -1,12 +1,13 @@
 """Making the gauge of a problem: constraints, their weights, and the poses that carry the similarities."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from ...exceptions import SolveError
 from ...geometry import basis, similarity
-from ...geometry.detector_modes import dynamic_basis, similarity_basis, similarity_part
+from ...geometry.detector_modes import dynamic_basis, similarity_basis, similarity_poses
 from ...results.gauge import Drift, Gauge
 from ...runtime.checks import check_choice
 from ...runtime.words import GAUGES
@@ -18,6 +19,7 @@ from .hierarchy import Hierarchy
 #: Below this the constraints of the "mean" gauge leave a direction free.
 _MEAN_LIMIT = 1e-3
 _SETTLED = 0.01  # of a map that an exposure cannot compensate: less, and the data hardly depend on it
+_NOTHING = 1e-9  # pixels
 _CORNERS = np.array([[-1, 1, 1, -1.0], [-1, -1, 1, 1.0]])
 
 
@@ -117,10 +119,10 @@ def _drifts(problem, motion, others, shared_shears, all_drifts):
     """
     terms, n = problem.terms, problem.n_modes
     free = np.flatnonzero(all_drifts | ~np.any(terms.precision, axis=1))
+    if not len(free):
+        return np.zeros((problem.n_exposures, 2 * n, 0)), np.zeros((0, 0)), np.zeros((0, 0))
     lift = terms.lift(n)[:, :, 2 * n :].reshape(problem.n_exposures, 2 * n, terms.n, n)
     drifting = motion @ lift[:, :, free].reshape(problem.n_exposures, 2 * n, -1)
-    if not len(free):
-        return drifting, np.zeros((0, 0)), np.zeros((0, 0))
     possible = np.eye(drifting.shape[2])
     if problem.fixed is not None:
         moved = np.concatenate([rows @ each for rows, each in zip(problem.fixed, drifting, strict=True)])
@@ -226,29 +228,29 @@ def reference_box(problem, state):
     """Centre and half size (2, 2) of the box of the reference plane that all detectors cover."""
     scale = np.sqrt(np.abs(np.linalg.det(state.poses[:, :, :2])))
     usual = np.abs(np.log(scale / np.median(scale))) < np.log(2)  # a mismatched exposure may have any scale
-    ends = _by_shape(lambda shape, _: basis.denormalize(_CORNERS[0], _CORNERS[1], shape), problem)[usual]
+    ends = _by_shape(_corners, problem)[usual]
     pose_list = state.poses[usual]
     corners = similarity.apply_inverses(pose_list, ends).reshape(-1, 2)
     low, high = corners.min(axis=0), corners.max(axis=0)
     return np.stack([(low + high) / 2, (high - low) / 2])
 
 
-def _by_shape(function, problem):
-    """``function(shape, n_modes)`` of every exposure, computed once a shape, stacked."""
-    number = {shape: k for k, shape in enumerate(dict.fromkeys(problem.shapes))}
-    made = np.stack([function(shape, problem.n_modes) for shape in number])
-    return made[[number[shape] for shape in problem.shapes]]
+def _by_shape(function, problem, n=None):
+    """``function(shape, n)`` of every exposure, by default of the number of modes, stacked; read-only."""
+    n, shapes = problem.n_modes if n is None else n, list(dict.fromkeys(problem.shapes))
+    made = [function(shape, n) for shape in shapes]
+    if len(made) == 1:
+        return np.broadcast_to(made[0], (len(problem.shapes), *made[0].shape))
+    return np.stack(made)[[shapes.index(shape) for shape in problem.shapes]]
 
 
 def _motion(problem, pose_list, box):
     """N_i, to first order in the distortion: a displacement g of the reference plane moves q by R g(T^-1 q)."""
     degree, size = problem.degree, problem.n_modes
-    u, v, w = basis.quadrature(degree)
-    nodes = _by_shape(lambda shape, _: basis.denormalize(u, v, shape), problem)
     linear = pose_list[:, :, :2]
-    back = similarity.apply_inverses(pose_list, nodes)
+    back = similarity.apply_inverses(pose_list, _by_shape(_nodes, problem, degree))
     reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
-    mixing = (basis.values(degree, u, v) * w) @ reference.transpose(1, 2, 0)
+    mixing = _projection(degree).T @ reference.transpose(1, 2, 0)
     return np.einsum("iab,imn->iambn", linear, mixing).reshape(-1, 2 * size, 2 * size)
 
 
@@ -274,30 +276,26 @@ def absorb_similarities(problem, state):
     Returns
     -------
     State
-    float
-        Largest move of a detector corner, pixels.
     """
     n_modes = problem.n_modes
     degree = basis.degree_of(state.coefficients.shape[2])
-    u, v, w = basis.quadrature(degree)
-    project = (basis.values(degree, u, v) * w).T
-    nodes = _by_shape(lambda shape, _: basis.denormalize(u, v, shape), problem)
-    ends = _by_shape(lambda shape, _: basis.denormalize(_CORNERS[0], _CORNERS[1], shape), problem)
-    pixels = np.array(problem.shapes)[:, None, ::-1]
-    coefficients, pose_list, largest = state.coefficients.copy(), state.poses, 0.0
+    nodes, project = _by_shape(_nodes, problem, degree), _projection(degree)
+    similar = _by_shape(similarity_poses, problem)
+    pixels = problem.size[:, None]
+    coefficients, pose_list = state.coefficients.copy(), state.poses
     for _ in range(4):
         departure = (coefficients - problem.prior_mean)[:, :, :n_modes]
-        shift = similarity_part(departure, problem.shapes)
-        move = float(np.abs(_apply(shift, ends) - ends).max())
-        largest = max(largest, move)
-        if move < 1e-9:
+        shift = (similar @ departure.reshape(len(departure), -1, 1)).reshape(-1, 2, 3)
+        # what shifts by so many pixels, and turns and stretches so little over the detector, stays
+        if max(np.abs(shift[:, :, 2]).max(), np.abs(shift[:, :, :2]).max() * pixels.max()) < _NOTHING:
             break
+        shift = np.eye(2, 3) + shift
         turned = shift[:, :, :2] @ pose_list
         turned[:, :, 2] += shift[:, :, 2]
         pose_list = turned
         if problem.unknowns.shared:  # what is common stays with the detector
-            similar = _by_shape(similarity_basis, problem)
-            own = np.einsum("ika,ikb,ib->ia", similar, similar, departure.reshape(len(departure), -1), optimize=True)
+            rows = _by_shape(similarity_basis, problem)
+            own = np.einsum("ika,ikb,ib->ia", rows, rows, departure.reshape(len(departure), -1), optimize=True)
             coefficients[:, :, :n_modes] -= own.reshape(departure.shape)
             continue
         linear = np.linalg.inv(shift[:, :, :2])
@@ -309,9 +307,29 @@ def absorb_similarities(problem, state):
         for a, mean, rows in zip(coefficients, problem.prior_mean, problem.fixed, strict=True):
             departure = (a - mean)[:, :n_modes].ravel()
             a[:, :n_modes] -= (rows.T @ (rows @ departure)).reshape(2, -1)
-    return State(state.stars, coefficients, pose_list), largest
+    return State(state.stars, coefficients, pose_list)
 
 
-def _apply(pose_list, xy):
-    """Poses (n, 2, 3) applied to positions (n, k, 2)."""
-    return xy @ pose_list[:, :, :2].transpose(0, 2, 1) + pose_list[:, None, :, 2]
+def without_similarities(problem, coefficients):
+    """Coefficients (n_exposures, 2 n_modes) without what poses carry."""
+    similar = _by_shape(similarity_basis, problem)
+    return coefficients - (similar.mT @ (similar @ coefficients[..., None]))[..., 0]
+
+
+@lru_cache
+def _nodes(shape, degree):
+    """Nodes of the quadrature of polynomials on a detector, pixels (k, 2)."""
+    u, v, _ = basis.quadrature(degree)
+    return basis.denormalize(u, v, shape)
+
+
+def _corners(shape, _):
+    """Corners of a detector, pixels (4, 2)."""
+    return basis.denormalize(*_CORNERS, shape)
+
+
+@lru_cache
+def _projection(degree):
+    """Values at the nodes of the quadrature -> coefficients, shape (k, n_modes)."""
+    u, v, w = basis.quadrature(degree)
+    return (basis.values(degree, u, v) * w).T

@@ -266,7 +266,7 @@ def determined_by_residuals(system, gauge):
         The convention in force, with some unknown map beyond the shears.
     """
     maps = np.stack([each.map for each in gauge.unknown_maps if each.degree > 1], axis=1, dtype=float)
-    if system.dof <= 0 or system.blocks.chi2 < system.dof + 5 * np.sqrt(2 * system.dof):
+    if is_noise(system):
         return maps[:, :0]
     moved = gauge.reach @ maps
     curvature, vectors = np.linalg.eigh(moved.T @ system.information @ moved)
@@ -277,6 +277,11 @@ def determined_by_residuals(system, gauge):
     if not is_explained(system.blocks.chi2 - gain.sum(), system):
         return maps[:, :0]
     return maps @ vectors[:, (gain > GAIN * scale) & (curvature * LIMIT**2 > scale)]
+
+
+def is_noise(system):
+    """Whether the errors explain the residuals."""
+    return system.dof <= 0 or system.blocks.chi2 < system.dof + 5 * np.sqrt(2 * system.dof)
 
 
 def is_explained(chi2, system):
