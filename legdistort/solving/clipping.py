@@ -3,14 +3,16 @@
 import contextlib
 import itertools
 import warnings
+from dataclasses import replace
 
 import numpy as np
 
 from ..exceptions import ConvergenceWarning, SolveError
 from ..geometry import basis
-from . import agreement, minimisers
+from . import agreement, minimisers, start_values
 from .equations import criterion
 from .equations.leverage import leverages
+from .equations.problem import State
 
 #: Deviations that chance brings about in this share of the sets with true errors give no cause to look for gross ones.
 BY_CHANCE = 0.01
@@ -22,6 +24,7 @@ SUSPECT = 2.0
 MOST = 0.8
 #: Least part of an observation that counts as not taken up by its own fit.
 LEAST_FREE = 0.1
+_SWEEPS = 5  # to robust means of stars: a wrong observation loses its weight quadratically
 
 
 def is_explained(problem, result, *, clip):
@@ -37,14 +40,51 @@ def is_explained(problem, result, *, clip):
     if not result.converged:
         return False
     squares, n = criterion.squares(problem, result.blocks.residual), problem.xy.shape[1]
-    hidden = 2 * basis.n_modes(problem.unknowns.gauge_degree)  # maps that the gauge holds are no unknowns
-    free = max(1 - (problem.n_star * problem.n_stars + problem.unknowns.size - hidden) / (2 * n), LEAST_FREE)
-    scale2 = np.median(squares) / (2 * np.log(2) * free)
+    scale2 = np.median(squares) / _usual(problem)
     if scale2 > SUSPECT**2:
         return False
     limit2 = max(clip**2, 2 * np.log(n / BY_CHANCE)) * max(1.0, scale2)
     rows = np.flatnonzero(squares > LEAST_FREE * limit2)
     return bool(np.all(deviations(problem, result.state, result.robust, result.blocks, rows) ** 2 <= limit2))
+
+
+def _usual(problem):
+    """Median of the squared residuals of a plain fit to observations with true errors."""
+    hidden = 2 * basis.n_modes(problem.unknowns.gauge_degree)  # maps that the gauge holds are no unknowns
+    n_free = problem.n_star * problem.n_stars + problem.unknowns.size - hidden
+    return 2 * np.log(2) * max(1 - n_free / (2 * problem.xy.shape[1]), LEAST_FREE)
+
+
+def start_from(problem, result):
+    """Start values from a plain fit that follows most observations of every exposure, its stars moved to robust means.
+
+    A star of which some observations are far off lies between these and the others in a plain fit.
+
+    Parameters
+    ----------
+    problem : Problem
+    result : Result or None
+        Of all its observations.
+
+    Returns
+    -------
+    State or None
+        None where gross errors moved the fit as a whole, or stars move.
+    """
+    if result is None or not result.converged or problem.terms.n:
+        return None
+    state, residual = result.state, result.blocks.residual
+    squares = criterion.squares(problem, residual)
+    followed, scale2 = squares <= SUSPECT**2 * _usual(problem), minimisers.observed_variance(squares)
+    if np.any(2 * np.add.reduceat(followed.astype(int), problem.start[:-1]) <= np.diff(problem.start)):
+        return None
+    weight, positions = problem.weight[:2].mean(axis=0), state.positions
+    q = start_values.posed(problem, state.poses, positions[:, problem.star]) + residual
+    for _ in range(_SWEEPS):
+        squares = weight * start_values.distances(problem, state.poses, q, positions)
+        factors = minimisers.loss_factors(squares, "cauchy", scale2)
+        positions = start_values.mean_positions(problem, state.poses, q, weight * factors)
+    return State(np.where(result.blocks.v[0] > 0, positions, state.positions), state.coefficients, state.poses)
 
 
 def solve_clipped(problem, start, *, clip, plain=None, gauge="minimal", loss="linear", max_iterations=None):
@@ -77,7 +117,7 @@ def solve_clipped(problem, start, *, clip, plain=None, gauge="minimal", loss="li
     result = _robust(problem, start, plain, gauge)
     good = used = np.ones(problem.xy.shape[1], dtype=bool)
     for count in itertools.count():
-        pull = deviations(problem, result.state, result.robust * used)
+        pull = deviations(problem, result.state, result.robust * used, fitted=result.blocks)
         changed = good
         if count == 1:  # the scale of few observations is not well known before most are fitted at full weight
             fair = pull <= clip * max(1.0, np.sqrt(np.mean(pull[used] ** 2) / 2))
@@ -117,7 +157,7 @@ def observed_scale(pull):
     return max(1.0, median if median <= SUSPECT else max(median, most))
 
 
-def deviations(problem, state, factor, blocks=None, rows=slice(None)):
+def deviations(problem, state, factor, blocks=None, rows=slice(None), *, fitted=None):
     """Deviation of observations from a fit, in standard errors of the residuals, shape (n,).
 
     ``t^2 = r' W r / ((1 - h_star) (1 - h_exposure))``, with the leverages of the star's and the exposure's part of the
@@ -137,9 +177,18 @@ def deviations(problem, state, factor, blocks=None, rows=slice(None)):
         Of the problem at this state, if all factors are 1 and they are known.
     rows : ndarray of int or slice
         Which observations, ascending; all if not given.
+    fitted : Blocks, optional
+        Of the problem with the factors at this state, if they are known.
     """
     full = criterion.linearise(problem, state) if blocks is None else blocks
-    fitted = criterion.linearise(problem.scaled(factor), state) if np.any(factor != 1) else full
+    if not np.any(factor != 1):
+        fitted = full
+    elif fitted is None:
+        fitted = criterion.linearise(problem.scaled(factor), state)
+    if np.any((factor > 0) & (factor < 1)):
+        # a star whose observations all have little weight since they contradict one another may not be anywhere
+        lost = fitted.v[:2].sum(axis=0) < LEAST_FREE * full.v[:2].sum(axis=0)
+        fitted = replace(fitted, v=np.where(lost, full.v, fitted.v))
     of_star, of_exposure = leverages(problem, fitted, at=full, rows=rows)
     sign = 1 - 2 * factor[rows]
     variance = np.maximum(1 + sign * of_star, 0) * np.maximum(1 + sign * of_exposure, 0)

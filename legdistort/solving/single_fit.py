@@ -199,9 +199,11 @@ def minimise(matches, options, *, judged=True, near=None, tolerance=minimisers.T
     plain = _plain(problem, start, common)
     if plain is not None and clipping.is_explained(problem, plain, clip=options.clip):
         return Fit(matches, problem, plain, everything, options)
-    start, typical = start_values.start(problem, nominal, robust=True)
-    if lost := _misplaced(problem, typical):
-        return minimise(matches.without(lost), options, judged=judged)
+    start = clipping.start_from(problem, plain)
+    if start is None:
+        start, typical = start_values.start(problem, nominal, robust=True)
+        if lost := _misplaced(problem, typical):
+            return minimise(matches.without(lost), options, judged=judged)
     result, used, unfollowed = clipping.solve_clipped(problem, start, clip=options.clip, plain=plain, **common)
     if unfollowed and not judged and plain is not None:
         return Fit(matches, problem, plain, everything, options, unfollowed=unfollowed)

@@ -21,6 +21,7 @@ from legdistort.results import accuracy
 from legdistort.simulation.observations import matches_from
 from legdistort.solving import agreement, clipping, single_fit, start_values
 from legdistort.solving.equations import criterion
+from legdistort.solving.equations.leverage import leverages
 from legdistort.solving.options import SolveOptions
 
 SHAPE = (2048, 2048)
@@ -500,3 +501,49 @@ def test_an_exposure_that_bends_more_than_others_does_not_contradict_them():
     solution = solve(matches, prior=Prior(truth.static, sigma="evidence"))
     assert solution.residuals["used"].all()
     assert not solution.left_out
+
+
+# --- where the search for gross errors begins --------------------------------------------------------------------
+
+
+@no_position
+@pytest.mark.parametrize(
+    ("share", "size", "serves"), [(0.01, 0.3, True), (0.02, 0.3, True), (0.04, 0.2, True), (0.3, 20.0, False)]
+)
+@pytest.mark.parametrize("compiled_from", [0, 20_000])
+def test_a_plain_fit_leads_to_the_same_observations_as_robust_start_values(
+    share, size, serves, compiled_from, monkeypatch
+):
+    monkeypatch.setattr("legdistort.solving.equations.problem.COMPILED_FROM", compiled_from)
+    sim = precise(10, n_stars=60)
+    matches = moved(sim, sim.matches.names, size, share=share, seed=3)
+    begun, start_from = [], clipping.start_from
+    monkeypatch.setattr(clipping, "start_from", lambda *a: begun.append(start_from(*a)) or begun[-1])
+    new = solve(matches, prior=Prior(sim.truth.static))
+    assert (begun[0] is not None) == serves  # many gross errors spoil the plain fit
+    monkeypatch.setattr(clipping, "start_from", lambda *a: None)
+    old, used = solve(matches, prior=Prior(sim.truth.static)), np.asarray(new.residuals["used"])
+    assert np.array_equal(used, old.residuals["used"])
+    assert not used.all()
+    clean = Matches.from_table(matches.table[used], shape=SHAPE, poses=sim.matches.poses)
+    clean = solve(clean, prior=Prior(sim.truth.static), clip=None)
+    seen = np.isin(new.star_names, clean.star_names)
+    for each, shifted in (
+        (new, 0.004),
+        (old, 0.04),
+    ):  # errors are 0.02 px; the plane of the nominal poses is a convention
+        assert np.abs(each.positions[seen] - clean.positions).max() < (shifted if serves else np.inf)
+        pose = similarity.fit_similarity(each.positions[seen], clean.positions)
+        assert np.abs(similarity.apply(pose, each.positions[seen]) - clean.positions).max() < 1e-4
+
+
+@pytest.mark.parametrize("unequal", [False, True])
+def test_leverages_of_some_observations_are_those_among_all(unequal):
+    sim = precise(6, sigma=RNG(0).uniform(0.02, 0.2, (6, 40, 2)) if unequal else 0.03)
+    problem, result = fitted(sim)
+    every = leverages(problem, result.blocks)
+    rows = np.sort(RNG(1).choice(problem.xy.shape[1], 50, replace=False))
+    for some, each in zip(leverages(problem, result.blocks, rows=rows), every, strict=True):
+        np.testing.assert_allclose(some, each[rows], rtol=1e-12)
+    # taken up by the stars and by the exposures: the traces of the projections on either, mean of the axes
+    np.testing.assert_allclose([each.sum() for each in every], [40, 6 * 10], rtol=1e-6)
