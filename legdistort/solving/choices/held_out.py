@@ -4,6 +4,8 @@ A star that is left out tests a fit: corrected with distortions in which it had 
 own errors and those of the distortions.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from astropy import units as u
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
@@ -247,27 +249,44 @@ def _about_stars(problem, blocks, residual):
     return np.column_stack([left, 2 * np.bincount(star, minlength=n) - known])
 
 
+def _part_of(problem, blocks, rows):
+    """What observations contribute to exposure blocks (n, 2 n_modes, 2 n_modes) and gradients (n, 2 n_modes)."""
+    stars, star = np.unique(problem.star[rows], return_inverse=True)
+    exposure, (n, size) = problem.exposure[rows], blocks.g_exposure.shape
+    w, r, b = problem.weight[:, rows], blocks.residual[:, rows], blocks.values[:, rows]
+    values = np.zeros((n, len(b), len(stars)))
+    values[exposure, :, star] = b.T
+    weight = np.zeros((3, n, 1, len(stars)))
+    weight[:, exposure, 0, star] = w
+    own = np.zeros((n, 2, len(b), 2, len(b)))
+    own[:, 0, :, 0] = (values * weight[0]) @ values.mT
+    own[:, 1, :, 1] = (values * weight[1]) @ values.mT if problem.unequal else own[:, 0, :, 0]
+    if problem.unequal:
+        own[:, 0, :, 1] = own[:, 1, :, 0] = (values * weight[2]) @ values.mT
+    gradient = np.zeros((n, 2, 1, len(stars)))
+    gradient[exposure, :, 0, star] = np.stack([w[0] * r[0] + w[2] * r[1], w[2] * r[0] + w[1] * r[1]]).T
+    return own.reshape(n, size, size), (values[:, None] * gradient).sum(axis=3).reshape(n, size)
+
+
 class _Solved:
-    """Steps (n_exposures, 2 n_modes) of the coefficients without the observations in some rows, by solving anew."""
+    """Steps (n_exposures, 2 n_modes) of the coefficients without stars, given all rows of theirs: by solving anew."""
 
     def __init__(self, fit):
-        self._fit = fit
+        self._problem, self._blocks, self._gauge = fit.weighted, fit.blocks, fit.result.gauge
 
     def step(self, rows):
         """The step."""
-        factor = np.ones(self._fit.problem.xy.shape[1])
-        factor[rows] = 0
-        problem, gauge = self._fit.weighted.scaled(factor), self._fit.result.gauge
-        blocks = criterion.linearise(problem, self._fit.result.state)
-        system = reduced_system.reduced_system(problem, blocks, gauge)
-        return system.step(np.zeros(gauge.n_constraints), _ACCURACY)[1]
+        problem, blocks = self._problem, self._blocks
+        v, g_star = blocks.v.copy(), blocks.g_star.copy()
+        v[:, problem.star[rows]] = g_star[:, problem.star[rows]] = 0
+        own, gradient = _part_of(problem, blocks, rows)
+        left = {"u": blocks.u - own, "g_exposure": blocks.g_exposure - gradient, "v": v, "g_star": g_star}
+        system = reduced_system.reduced_system(problem, replace(blocks, **left), self._gauge)
+        return system.step(np.zeros(self._gauge.n_constraints), _ACCURACY)[1]
 
 
 class _Subtracted:
-    """The same where the reduced matrix is small: the part of the stars in these rows is subtracted from it.
-
-    The rows have to be all of these stars.
-    """
+    """The same where the reduced matrix is small: the part of these stars is subtracted from it."""
 
     def __init__(self, fit):
         self._problem, self._blocks = fit.weighted, fit.blocks
@@ -280,19 +299,9 @@ class _Subtracted:
         """The step."""
         problem, blocks = self._problem, self._blocks
         stars, star = np.unique(problem.star[rows], return_inverse=True)
-        exposure, (n, size) = problem.exposure[rows], blocks.g_exposure.shape
-        w, r, b = problem.weight[:, rows], blocks.residual[:, rows], blocks.values[:, rows]
-        values = np.zeros((n, len(b), len(stars)))
-        values[exposure, :, star] = b.T
-        weight = np.zeros((3, n, 1, len(stars)))
-        weight[:, exposure, 0, star] = w
-        own = np.empty((n, 2, len(b), 2, len(b)))
-        for k, (x, y) in enumerate(((0, 0), (1, 1), (0, 1))):
-            own[:, x, :, y] = (values * weight[k]) @ values.mT
-        own[:, 1, :, 0] = own[:, 0, :, 1]
-        gradient = np.zeros((n, 2, 1, len(stars)))
-        gradient[exposure, :, 0, star] = np.stack([w[0] * r[0] + w[2] * r[1], w[2] * r[0] + w[1] * r[1]]).T
-        rhs = (values[:, None] * gradient).sum(axis=3).reshape(-1)
+        exposure, (n, size), b = problem.exposure[rows], blocks.g_exposure.shape, blocks.values[:, rows]
+        own, gradient = _part_of(problem, blocks, rows)
+        rhs = gradient.ravel()
         roots = elimination.star_roots(blocks.v[:, stars])
         pulled = problem.pulled_at(exposure, blocks.coupling[:, :, rows])
         coupling = np.einsum("can,ckn->nak", pulled, roots[:, :, star])
@@ -301,7 +310,7 @@ class _Subtracted:
         factor = factor.reshape(n * size, -1)
         rhs -= factor @ np.einsum("ckj,cj->kj", roots, blocks.g_star[:, stars]).ravel()
         matrix = self._matrix + factor @ factor.T
-        for i, block in enumerate(own.reshape(n, size, size)):
+        for i, block in enumerate(own):
             part = slice(i * size, (i + 1) * size)
             matrix[part, part] -= block
         unit = np.sqrt(np.abs(np.diag(matrix)))
