@@ -11,8 +11,8 @@ def drizzle(data, good, variances, pixel_map, resampling):
     Parameters
     ----------
     data : ndarray, shape (ny, nx)
-    good : ndarray of bool, shape (ny, nx)
-        Other pixels do not fall.
+    good : ndarray, shape (ny, nx)
+        Pixels that are false, or 0, do not fall.
     variances : sequence of ndarray, shape (ny, nx)
         Of independent pixels.
     pixel_map : `~legdistort.coaddition.resampling.pixel_maps.PixelMap`
@@ -47,12 +47,15 @@ def drizzle(data, good, variances, pixel_map, resampling):
         exptime=1.0,
         pixmap=centres,
         data2=[np.ascontiguousarray(v, dtype=np.float32) for v in variances] or None,
-        weight_map=good.astype(np.float32),
+        weight_map=good.astype(np.float32, copy=False),
         pixfrac=resampling.pixfrac,
         in_units="cps",
     )
     within = slice(-low[1], ny - low[1]), slice(-low[0], nx - low[0])
     coverage = onto.out_wht[within]
     empty = ~(np.abs(coverage) > _EMPTY * resampling.pixfrac**2) | ~pixel_map.inside
-    out = [np.where(empty, np.nan, plane[within]).astype(float) for plane in (onto.out_img, *(onto.out_img2 or ()))]
-    return out[0], out[1:], np.where(empty, 0, coverage)
+    out = [plane[within] for plane in (onto.out_img, *(onto.out_img2 or ()))]
+    for plane in out:
+        plane[empty] = np.nan
+    coverage[empty] = 0
+    return out[0], out[1:], coverage

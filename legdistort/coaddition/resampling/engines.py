@@ -54,6 +54,8 @@ class Resampling:
     @property
     def margin(self):
         """Pixels of an exposure, around those that are wanted, on which their values depend."""
+        if self.algorithm == "drizzle":
+            return 3  # drops reach no farther than their pixels
         return _FORGETS[self.order] if self.algorithm == "interp" else 10
 
 
@@ -260,7 +262,7 @@ def _hits(mask, pixel_map):
 
 def _drizzle(data, masks, variance, pixel_map, resampling):
     variances = np.broadcast_to(variance, (*np.shape(variance)[:-2], *data.shape))
-    good = ~masks.get("bad", np.zeros(data.shape, dtype=bool))
+    good = ~masks["bad"] if "bad" in masks else np.ones(data.shape, dtype=np.float32)
     value, spread, coverage = drizzle(data, good, variances.reshape(-1, *data.shape), pixel_map, resampling)
     has_full = "full" in masks
     full = drizzle(masks["full"], good, [], pixel_map, resampling)[0] > _BAD_WEIGHT if has_full else None
