@@ -1,12 +1,17 @@
 """All times in one table: ``python tests/benchmarks/speed_table.py [PART ...]``, on a machine that does nothing else.
 
-The parts are ``start`` (of a process, of a command), ``wcs`` (a WCS at many positions) and those of other tables, each
-with the accuracy that goes with its times: ``run`` (frames to mosaic, against SExtractor, SCAMP and SWarp),
-``measure``, ``match``, ``solve`` (against scipy), ``errors``, ``degree`` and ``coadd`` (against reproject, drizzle and
-SWarp). All if none is named, in half an hour.
+The parts are ``start`` (of a process, of a command), ``wcs`` (a WCS at many positions), ``profile`` (what the three
+slowest steps of a run spend their time on) and those of other tables, each with the accuracy that goes with its times:
+``run`` and ``ao`` (frames to mosaic, against SExtractor, SCAMP and SWarp), ``measure``, ``match``, ``solve`` (against
+scipy), ``sizes`` (to 7 million observations, with memory), ``errors``, ``degree`` and ``coadd`` (against reproject,
+drizzle and SWarp). All if none is named, in half an hour. ``--before PYTHON`` measures the same with another
+interpreter first, that of an environment with an earlier version.
 """
 
 import argparse
+import contextlib
+import cProfile
+import pstats
 import subprocess
 import sys
 import tempfile
@@ -18,9 +23,11 @@ import numpy as np
 HERE = Path(__file__).parent
 TABLES = {
     "run": ("run_table.py",),
+    "ao": ("run_table.py", "--ao"),
     "measure": ("measuring_table.py", "speed"),
     "match": ("matching_table.py", "--sizes"),
     "solve": ("solver_table.py", "--ratios"),
+    "sizes": ("solver_table.py", "--scaling"),
     "errors": ("solver_table.py", "--covariances"),
     "degree": ("solver_table.py", "--degrees"),
     "coadd": ("coadd_table.py",),
@@ -75,12 +82,44 @@ def wcs(n=4_200_000):
         print(f"{way:14s} {min(each):6.2f} s  within {apart:.1e} px of the stock gwcs in declination")
 
 
+def profile(most=8):
+    """Shares of the time of measuring, co-adding and writing files by function, on one core."""
+    import legdistort as ld
+    from legdistort.pipeline import write_results
+
+    with tempfile.TemporaryDirectory() as folder:
+        paths = ld.simulate_exposures(seed=0).write(Path(folder) / "frames")
+        done = ld.run(paths, out=Path(folder) / "out", degree=3)
+        exposures, solution, again = ld.read_exposures(paths), done.solution, Path(folder) / "again"
+        again.mkdir()
+        steps = {
+            "measuring": lambda: ld.measure(exposures),
+            "co-adding": lambda: ld.coadd(exposures, solution),
+            "writing": lambda: write_results(solution, again, mosaic=done.mosaic),
+        }
+        for step, function in steps.items():
+            with cProfile.Profile() as profiler, contextlib.redirect_stdout(sys.stderr):
+                function()
+            stats = pstats.Stats(profiler)
+            print(f"{step}: {stats.total_tt:.1f} s")
+            own = sorted(stats.stats.items(), key=lambda item: -item[1][2])[:most]
+            for (path, line, name), (_, calls, seconds, *_) in own:
+                where = name if path == "~" else f"{Path(path).stem}:{line} {name}"
+                print(f"  {100 * seconds / stats.total_tt:5.1f} %  {calls:7d} x  {where}")
+
+
 def main():
     """Print the parts that were asked for."""
-    parts = {"start": start, "wcs": wcs} | TABLES
+    parts = {"start": start, "wcs": wcs} | TABLES | {"profile": profile}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[[], *parts], metavar="PART")
-    for part in parser.parse_args().parts or parts:
+    parser.add_argument("--before", metavar="PYTHON", help="an interpreter with the version to compare with")
+    a = parser.parse_args()
+    if a.before:
+        print("# before", flush=True)
+        subprocess.run([a.before, __file__, *a.parts], check=False)
+        print("\n# now", flush=True)
+    for part in a.parts or parts:
         print(f"\n## {part}", flush=True)
         if part in TABLES:
             script, *arguments = TABLES[part]
