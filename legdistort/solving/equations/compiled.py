@@ -408,14 +408,7 @@ def distances(problem, pose_list, q, positions):
 
 
 def moments(problem, q, weight, positions):
-    """Moments of the similarities positions -> q of all exposures.
-
-    Returns
-    -------
-    mean_s, mean_t : ndarray, shape (n_exposures, 2)
-    cross : ndarray, shape (n_exposures, 2, 2)
-        See `legdistort.geometry.similarity.similarity_of`; NaN where the stars lie at one place.
-    """
+    """Twin of `legdistort.solving.start_values.moments`."""
     out, given = np.zeros((problem.n_exposures, 9)), (problem.start, problem.star, q, weight)
     positions = np.ascontiguousarray(positions)
     _shared_out(lambda *chunk: _moments(*chunk, out, *given, positions), _chunks(problem, _SHORT))
