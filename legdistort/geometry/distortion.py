@@ -175,7 +175,7 @@ class Distortion(ShownAsPrinted):
     def _largest_slope(self) -> float:
         """What no norm of the derivative of D - identity exceeds on the detector: every mode at its steepest."""
         i, j = basis.orders(self.degree)
-        slopes = np.stack([i * (i + 1), j * (j + 1)], axis=1)  # twice P_n'(1), by pixels of half a detector
+        slopes = np.stack([i * (i + 1), j * (j + 1)], axis=1)  # 2 P_n'(1), by pixels of the detector
         steepest = (basis.norm(i) * basis.norm(j))[:, None] * slopes
         return float(np.linalg.norm(np.abs(self.coefficients) @ (steepest / self.shape[::-1])))
 

@@ -45,7 +45,8 @@ def is_explained(problem, result, *, clip):
         return False
     limit2 = max(clip**2, 2 * np.log(n / BY_CHANCE)) * max(1.0, scale2)
     rows = np.flatnonzero(squares > LEAST_FREE * limit2)
-    return bool(np.all(deviations(problem, result.state, result.robust, result.blocks, rows) ** 2 <= limit2))
+    known = {"fitted": result.blocks, "blocks": result.blocks if np.all(result.robust == 1) else None}
+    return bool(np.all(deviations(problem, result.state, result.robust, rows=rows, **known) ** 2 <= limit2))
 
 
 def _usual(problem):
@@ -163,7 +164,8 @@ def deviations(problem, state, factor, blocks=None, rows=slice(None), *, fitted=
     ``t^2 = r' W r / ((1 - h_star) (1 - h_exposure))``, with the leverages of the star's and the exposure's part of the
     fit, mean of the axes: exact in a two-way table of means, where what both could do is counted once. Where an
     observation took no part, its residual is larger by what the fit errs there: 1 + h. The product is at least 0.1, so
-    that an observation that alone determines something is not blown up.
+    that an observation that alone determines something is not blown up. A star whose observations have next to no
+    weight left counts with all of it.
 
     Parameters
     ----------
@@ -187,7 +189,8 @@ def deviations(problem, state, factor, blocks=None, rows=slice(None), *, fitted=
         fitted = criterion.linearise(problem.scaled(factor), state)
     if np.any((factor > 0) & (factor < 1)):
         # a star whose observations all have little weight since they contradict one another may not be anywhere
-        lost = fitted.v[:2].sum(axis=0) < LEAST_FREE * full.v[:2].sum(axis=0)
+        left = fitted.v[:2].sum(axis=0)
+        lost = (left > 0) & (left < LEAST_FREE * full.v[:2].sum(axis=0))
         fitted = replace(fitted, v=np.where(lost, full.v, fitted.v))
     of_star, of_exposure = leverages(problem, fitted, at=full, rows=rows)
     sign = 1 - 2 * factor[rows]

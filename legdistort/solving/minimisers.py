@@ -40,8 +40,8 @@ _STEADY = 200.0
 #: ... or below so many standard errors, rms, and a small part of the step before, where little but the curvature of the
 #: model is left: if the static distortion is taken as exact, so that they are a convention and no estimate.
 _NEAR, _MUCH_SMALLER = 5.0, 0.1
-#: After a step below this part of the one before, what has been factorised serves the next one too if that turns out
-#: to be much smaller.
+#: After a first step, or one below this part of the one before, what has been factorised serves the next one too if
+#: that turns out to be much smaller.
 _SMALLER = 0.5
 #: Up to so many observations one more pass over them at the start costs less than it saves.
 _BEGIN_UP_TO = 100_000
@@ -201,7 +201,7 @@ class _Descent:
         self._prepare()
 
     def _begin(self):
-        """Fit the coefficients to the stars where they are, if modes are those of the prior yet; how far they move.
+        """Fit the coefficients to the stars where they are, if the highest are those of the prior; how far they move.
 
         The scatter of exposures that the first gauge is made from is that of a solution then, and the reduced matrix,
         where there is one, serves two steps.
@@ -265,7 +265,8 @@ class _Descent:
             _count.get()()
             target, last = -self.convention.violation(_departure(self.problem, self.state)), size
             d_star, d_exposure, size = self._step(target, accuracy)
-            if self.on_trial and self.stepping is not self.made and size >= _MUCH_SMALLER * last:
+            failed = size >= _MUCH_SMALLER * last and not self.stepping.moves_exactly
+            if failed and self.on_trial and self.stepping is not self.made:
                 self.stepping = None
                 d_star, d_exposure, size = self._step(target, accuracy)
             self.steps.append(size)

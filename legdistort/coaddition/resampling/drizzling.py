@@ -22,7 +22,7 @@ def drizzle(data, good, variances, pixel_map, resampling):
 
     Returns
     -------
-    data : ndarray, shape (my, mx)
+    data : ndarray of float32, shape (my, mx)
         NaN where nothing falls.
     variances : list of ndarray
         Of each output pixel by itself: with squared weights.

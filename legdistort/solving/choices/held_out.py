@@ -4,6 +4,7 @@ A star that is left out tests a fit: corrected with distortions in which it had 
 own errors and those of the distortions.
 """
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -250,22 +251,23 @@ def _about_stars(problem, blocks, residual):
 
 
 def _part_of(problem, blocks, rows):
-    """What observations contribute to exposure blocks (n, 2 n_modes, 2 n_modes) and gradients (n, 2 n_modes)."""
-    stars, star = np.unique(problem.star[rows], return_inverse=True)
-    exposure, (n, size) = problem.exposure[rows], blocks.g_exposure.shape
-    w, r, b = problem.weight[:, rows], blocks.residual[:, rows], blocks.values[:, rows]
-    values = np.zeros((n, len(b), len(stars)))
-    values[exposure, :, star] = b.T
-    weight = np.zeros((3, n, 1, len(stars)))
-    weight[:, exposure, 0, star] = w
-    own = np.zeros((n, 2, len(b), 2, len(b)))
-    own[:, 0, :, 0] = (values * weight[0]) @ values.mT
-    own[:, 1, :, 1] = (values * weight[1]) @ values.mT if problem.unequal else own[:, 0, :, 0]
-    if problem.unequal:
-        own[:, 0, :, 1] = own[:, 1, :, 0] = (values * weight[2]) @ values.mT
-    gradient = np.zeros((n, 2, 1, len(stars)))
-    gradient[exposure, :, 0, star] = np.stack([w[0] * r[0] + w[2] * r[1], w[2] * r[0] + w[1] * r[1]]).T
-    return own.reshape(n, size, size), (values[:, None] * gradient).sum(axis=3).reshape(n, size)
+    """What observations, ascending, add to exposure blocks (n, 2 n_modes, 2 n_modes) and gradients (n, 2 n_modes)."""
+    own, gradient, n = np.zeros_like(blocks.u), np.zeros_like(blocks.g_exposure), problem.n_modes
+    for i, (low, high) in enumerate(itertools.pairwise(np.searchsorted(rows, problem.start).tolist())):
+        mine = rows[low:high]
+        (wx, wy, wxy), (x, y), b = (
+            problem.weight[:, mine],
+            blocks.residual[:, mine],
+            blocks.values[:, mine].astype(float),
+        )
+        own[i, :n, :n] = (wx * b) @ b.T
+        own[i, n:, n:] = (wy * b) @ b.T if problem.unequal else own[i, :n, :n]
+        if problem.unequal:
+            own[i, :n, n:] = own[i, n:, :n] = (wxy * b) @ b.T
+        gradient[i] = np.concatenate([b @ (wx * x + wxy * y), b @ (wxy * x + wy * y)])
+        if problem.fixed is not None:
+            gradient[i] -= problem.fixed[i].T @ (problem.fixed[i] @ gradient[i])
+    return own, gradient
 
 
 class _Solved:

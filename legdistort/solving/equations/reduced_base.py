@@ -20,6 +20,7 @@ class Reduced:
 
     n_weak = 0  # unknowns that the exposures share and that they do not determine
     takes_any_gauge = True  # whether what is factorised serves other constraints too
+    moves_exactly = False  # whether steps of a moved one lack nothing
 
     def __init__(self, problem, blocks, gauge):
         self.problem, self.blocks, self.gauge = problem, blocks, gauge

@@ -263,6 +263,8 @@ class Iterative(Reduced):
     right-hand side nor the stars need a pass of their own.
     """
 
+    moves_exactly = True  # but for the preconditioner all is that of the new state
+
     def __init__(self, problem, blocks, gauge):
         super().__init__(problem, blocks, gauge)
         self._block_inverses = elimination.inverse_exposure_blocks(blocks.u)

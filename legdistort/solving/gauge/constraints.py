@@ -290,13 +290,10 @@ def absorb_similarities(problem, state):
         if max(np.abs(shift[:, :, 2]).max(), np.abs(shift[:, :, :2]).max() * pixels.max()) < _NOTHING:
             break
         shift = np.eye(2, 3) + shift
-        turned = shift[:, :, :2] @ pose_list
-        turned[:, :, 2] += shift[:, :, 2]
-        pose_list = turned
+        pose_list = similarity.compose(shift, pose_list)
         if problem.unknowns.shared:  # what is common stays with the detector
-            rows = _by_shape(similarity_basis, problem)
-            own = np.einsum("ika,ikb,ib->ia", rows, rows, departure.reshape(len(departure), -1), optimize=True)
-            coefficients[:, :, :n_modes] -= own.reshape(departure.shape)
+            left = without_similarities(problem, departure.reshape(len(departure), -1)).reshape(departure.shape)
+            coefficients[:, :, :n_modes] += left - departure
             continue
         linear = np.linalg.inv(shift[:, :, :2])
         old = (nodes - shift[:, None, :, 2]) @ linear.transpose(0, 2, 1)
