@@ -9,8 +9,6 @@ import numpy as np
 
 from ..exceptions import InputError
 
-_COMPLEX = np.array([1, 1j])  # x + iy of positions
-
 
 def identity():
     """The pose that changes nothing, shape (2, 3)."""
@@ -88,23 +86,8 @@ def fit_similarity(source, target, *, weights=None, parity=None):
     InputError
         With fewer than two distinct points.
     """
-    source, target = np.asarray(source, float), np.asarray(target, float)
     w = np.ones(len(source)) if weights is None else np.asarray(weights, float)
-    if len(source) < 2 or np.count_nonzero(w) < 2:
-        raise InputError(f"a similarity needs at least two points, got {np.count_nonzero(w)}")
-    w = w / w.sum()
-    mean_s, mean_t = w @ source, w @ target
-    ds, dt = (source - mean_s) @ _COMPLEX, (target - mean_t) @ _COMPLEX
-    power = w @ (ds.real**2 + ds.imag**2)
-    if power == 0:
-        raise InputError("a similarity needs at least two distinct points, all are at the same place")
-    dt *= w / power
-    keep, flip = np.vdot(ds, dt), ds @ dt  # scale and rotation that leave least of dt, without and with a flip of y
-    if parity is None:
-        parity = 1 if abs(keep) >= abs(flip) else -1
-    turn = keep if parity > 0 else flip
-    m = np.array([[turn.real, -turn.imag * parity], [turn.imag, turn.real * parity]])
-    return np.column_stack([m, mean_t - m @ mean_s])
+    return _pose(*_fit(_complex(source), _complex(target), w, parity))
 
 
 def robust_similarity(source, target, *, weights=None, n_iterations=10):
@@ -113,18 +96,56 @@ def robust_similarity(source, target, *, weights=None, n_iterations=10):
     Parameters as for `fit_similarity`. The scale is the median residual; when it
     stands to 1e-4 of its square the weights do.
     """
-    base = np.ones(len(source)) if weights is None else weights
+    s, t = _complex(source), _complex(target)
+    base = np.ones(len(s)) if weights is None else np.asarray(weights, float)
     w, before = base, np.inf
     for _ in range(n_iterations):
-        pose = fit_similarity(source, target, weights=w)
-        r2 = ((apply(pose, source) - target) ** 2).sum(axis=1)
-        scale2 = np.median(r2)
-        if scale2 <= 1e-20 * np.ptp(target, axis=0).max() ** 2:
-            break
-        if abs(scale2 - before) < 1e-4 * scale2:
+        turn, shift, parity = _fit(s, t, w, None)
+        off = turn * (s if parity > 0 else s.conj())
+        off += shift - t
+        r2 = off.real**2 + off.imag**2
+        scale2 = median(r2)
+        if scale2 <= 1e-20 * max(np.ptp(t.real), np.ptp(t.imag)) ** 2 or abs(scale2 - before) < 1e-4 * scale2:
             break
         w, before = base / (1 + r2 / (2 * scale2)), scale2
-    return pose
+    return _pose(turn, shift, parity)
+
+
+def _complex(xy):
+    """Positions (n, 2) as complex numbers x + iy, (n,)."""
+    return np.ascontiguousarray(xy, dtype=float).view(complex)[:, 0]
+
+
+def _fit(s, t, w, parity):
+    """Similarity ``turn * s + shift``, of the conjugate of s where parity is -1; `parity` None: the one that fits."""
+    if len(s) < 2 or np.count_nonzero(w) < 2:
+        raise InputError(f"a similarity needs at least two points, got {np.count_nonzero(w)}")
+    w = w / w.sum()
+    mean_s, mean_t = w @ s, w @ t
+    ds, dt = s - mean_s, t - mean_t
+    power = w @ (ds.real**2 + ds.imag**2)
+    if power == 0:
+        raise InputError("a similarity needs at least two distinct points, all are at the same place")
+    dt *= w / power
+    keep, flip = np.vdot(ds, dt), ds @ dt  # scale and rotation that leave least of dt, without and with a flip of y
+    if parity is None:
+        parity = 1 if abs(keep) >= abs(flip) else -1
+    turn, mean_s = (keep, mean_s) if parity > 0 else (flip, mean_s.conjugate())
+    return turn, mean_t - turn * mean_s, parity
+
+
+def _pose(turn, shift, parity):
+    """The pose of a similarity of complex numbers."""
+    a, b = turn.real, turn.imag
+    return np.array([[a, -b * parity, shift.real], [b, a * parity, shift.imag]])
+
+
+def median(values):
+    """`numpy.median` of one array without what that does beside, which for short arrays is most of its time."""
+    half = len(values) // 2
+    if len(values) % 2:
+        return np.partition(values, half)[half]
+    return np.partition(values, (half - 1, half))[half - 1 : half + 1].mean()
 
 
 def similarity_of(mean_s, mean_t, cross, parity):

@@ -120,13 +120,14 @@ def standing(lists, group, *, radius=0.6, moved=1.5):
     tree = cKDTree(np.concatenate([lists[i].xy for i in members]))
     for i in members:
         xy = lists[i].xy
-        away = np.linalg.norm(_carried(poses, group.poses[i], xy) - xy, axis=2) > moved
         near = tree.query_ball_point(xy, radius)
         star = np.repeat(np.arange(len(xy)), [len(rows) for rows in near])
         here = np.zeros((len(members), len(xy)), bool)
         here[whose[np.concatenate(near).astype(int)], star] = True
-        same = np.count_nonzero(here & away, axis=0)
-        out[i] = (same >= 3) & (same >= 0.5 * np.count_nonzero(away, axis=0))
+        several = np.flatnonzero(np.count_nonzero(here, axis=0) > 3)  # three and itself
+        away = np.hypot(*(_carried(poses, group.poses[i], xy[several]) - xy[several].T[:, None])) > moved
+        same = np.count_nonzero(here[:, several] & away, axis=0)
+        out[i][several] = (same >= 3) & (same >= 0.5 * np.count_nonzero(away, axis=0))
     return out
 
 
@@ -143,9 +144,9 @@ def without(group, dropped):
 
 
 def _carried(poses, own, xy):
-    """Positions (n, 2) of an exposure of pose `own` in exposures of several `poses`, (n_poses, n, 2)."""
+    """Positions (n, 2) of an exposure of pose `own` in exposures of several `poses`, (2, n_poses, n)."""
     plane = similarity.apply(similarity.invert(own), xy)
-    return plane @ poses[:, :, :2].swapaxes(1, 2) + poses[:, None, :, 2]
+    return np.tensordot(poses[:, :, :2].swapaxes(0, 1), plane, axes=(2, 1)) + poses.T[2][:, :, None]
 
 
 def interlink(lists, group, *, tolerance=None, progress=False):
@@ -196,11 +197,11 @@ def _overlaps(lists, rough):
     """Number of stars that the poses let two exposures share at most, for every pair of them."""
     out, members = {}, sorted(rough)
     poses = np.array([rough[i] for i in members])
-    sizes = np.array([lists[i].shape[::-1] for i in members])[:, None]
+    sizes = np.array([lists[i].shape[::-1] for i in members]).T[:, :, None]
     stars = np.array([len(lists[i]) for i in members])
     for k, i in enumerate(members[:-1]):
         there = _carried(poses[k + 1 :], rough[i], lists[i].xy)
-        part = np.mean(np.all((there > -0.5) & (there < sizes[k + 1 :] - 0.5), axis=2), axis=1)
+        part = np.mean(np.all((there > -0.5) & (there < sizes[:, k + 1 :] - 0.5), axis=0), axis=1)
         shared = part * np.minimum(stars[k], stars[k + 1 :])
         out.update(zip(((i, j) for j in members[k + 1 :]), shared.tolist(), strict=True))
     return out

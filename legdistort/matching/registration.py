@@ -173,7 +173,7 @@ def continue_from_pairs(source, target, rows, columns, *, tolerance=None):
     for _ in range(4):
         warp = fit_warp(p, q, source.shape, degree, weights=weights, width=1.0, parity=parity)
         distance = np.linalg.norm(warp(p) - q, axis=1)
-        before, scatter = scatter, np.median(distance) / 1.18 + 1e-6
+        before, scatter = scatter, similarity.median(distance) / 1.18 + 1e-6
         if abs(scatter - before) < 0.1 * scatter:
             break
         weights = 1 / (1 + (distance / (2 * scatter)) ** 2)
@@ -303,7 +303,7 @@ def _fit_near(source, chosen, tree, warp, width, degree, parity):
     w = np.where(near, np.exp(-0.5 * (np.where(near, distance, 0) / width) ** 2), 0)
     w /= w.sum(axis=1, keepdims=True) + 0.3
     i, k = np.nonzero(near)
-    if len(np.unique(i)) < 3:
+    if np.count_nonzero(near[:, 0]) < 3:
         return None
     p, q, w = xy[i], tree.data[row[i, k]], w[i, k]
     degree = min(degree, allowed_degree(w.sum()))
@@ -312,14 +312,19 @@ def _fit_near(source, chosen, tree, warp, width, degree, parity):
 
 def _best_radius(predicted, tree, width, n_modes):
     some = predicted[:: len(predicted) // 500 + 1]
-    strengths = {factor * width: _strength(some, tree, factor * width, n_modes) for factor in (0.5, 1, 2.5)}
+    radii = [factor * width for factor in (0.5, 1, 2.5)]
+    nearest = tree.query(some, distance_upper_bound=radii[-1])
+    strengths = {radius: _strength(some, tree, nearest, radius, n_modes) for radius in radii}
     return max(strengths.items(), key=lambda item: item[1])
 
 
-def _strength(predicted, tree, radius, n_modes):
-    """How far the number of hits is above chance; local densities of the target allow for crowded places."""
-    distance, row = tree.query(predicted, distance_upper_bound=radius)
-    hits = len(np.unique(row[np.isfinite(distance)])) - n_modes
+def _strength(predicted, tree, nearest, radius, n_modes):
+    """How far the number of hits is above chance; local densities of the target allow for crowded places.
+
+    `nearest` holds the distances and rows of the target's stars nearest to those predicted, within the radius at least.
+    """
+    distance, row = nearest
+    hits = len(np.unique(row[distance < radius])) - n_modes
     some = predicted[:: len(predicted) // 200 + 1]
     around = tree.query_ball_point(some, 8 * radius, return_length=True).sum() * len(predicted) / len(some)
     around = max(around - hits, 1) / 64
@@ -345,7 +350,7 @@ def settle(source, target, warp, reach, *, tolerance=None):
     most = _farthest(target)
     some = _thinned(source)
     limit = min(reach, most)
-    pairs = _mutual(warp, some, target, limit, most)
+    pairs = _mutual(warp.with_leverage(some.xy), some, target, limit, most)
     highest = allowed_degree(len(pairs[0]))
     found = []
     # with few pairs a lower degree can be the more significant one
@@ -368,10 +373,10 @@ def _settle(source, target, some, warp, pairs, limit, tolerance, degree):
     most = _farthest(target)
     parity = np.sign(np.linalg.det(np.diff(warp(np.array([[0.0, 0], [1, 0], [0, 1]])), axis=0)))
     for sweep in range(4):
-        i, j, distance = _mutual(warp, some, target, limit, most) if sweep else pairs
+        i, j, distance = _mutual(warp.with_leverage(some.xy), some, target, limit, most) if sweep else pairs
         if len(i) < 3 or allowed_degree(len(i)) < degree:
             return None
-        scatter = np.median(distance) / 1.18  # the median distance is 1.18 times the scatter per axis
+        scatter = similarity.median(distance) / 1.18  # the median distance is 1.18 times the scatter per axis
         w = 1 / (1 + (distance / (2 * scatter + 1e-9)) ** 2)
         warp = fit_warp(some.xy[i], target.xy[j], source.shape, degree, weights=w, width=scatter, parity=parity)
         before, limit = limit, min(max(5 * scatter, 0.5), most, 1.5 * limit)
@@ -388,21 +393,24 @@ def _farthest(target):
 def _judged(source, target, warp, limit, tolerance):
     """Registration of all stars by a map, the limit replaced by a tolerance that is given; None if it is none."""
     limit = limit if tolerance is None else tolerance
-    predicted = warp(source.xy)
-    i, j, distance = _mutual(warp, source, target, limit, max(_farthest(target), limit), lone=True)
-    strength = _strength(predicted, target.tree, limit, len(warp.coefficients))
+    mapped = warp.with_leverage(source.xy)
+    i, j, distance = _mutual(mapped, source, target, limit, max(_farthest(target), limit), lone=True)
+    predicted, _ = mapped
+    nearest = target.tree.query(predicted, distance_upper_bound=limit)
+    strength = _strength(predicted, target.tree, nearest, limit, len(warp.coefficients))
     possible = np.mean(target.on_detector(predicted)) * min(len(source), len(target))
     if strength < MIN_STRENGTH or len(i) < max(5, MIN_SHARE * possible):
         return None
     return Registration(i, j, distance, warp, float(limit), float(strength), len(i) / possible)
 
 
-def _mutual(warp, source, target, limit, most, lone=False):
+def _mutual(mapped, source, target, limit, most, lone=False):
     """Rows of mutual nearest neighbours and their distances; `lone` leaves out those with a second neighbour.
 
-    Where the map extrapolates and errors are large, neighbours may be farther apart than `limit`, never than `most`.
+    `mapped` is what `Warp.with_leverage` gives for the source. Where the map extrapolates and errors are large,
+    neighbours may be farther apart than `limit`, never than `most`.
     """
-    predicted = warp(source.xy)
+    predicted, leverage = mapped
     forward, j = target.tree.query(predicted, k=2, distance_upper_bound=max(limit, most))
     rows = np.flatnonzero(np.isfinite(forward[:, 0]))
     backward, i = cKDTree(predicted, balanced_tree=False, compact_nodes=False).query(
@@ -411,7 +419,7 @@ def _mutual(warp, source, target, limit, most, lone=False):
     mutual = i[:, 0] == rows
     rows, backward = rows[mutual], backward[mutual]
     cols, distance = j[rows, 0], forward[rows, 0]
-    spread = limit**2 * (1 + warp.leverage(source.xy[rows]))
+    spread = limit**2 * (1 + leverage[rows])
     good = distance <= np.minimum(np.sqrt(spread + 16 * (source.error[rows] ** 2 + target.error[cols] ** 2)), most)
     if lone:
         good &= (forward[rows, 1] > limit) & (backward[:, 1] > limit)

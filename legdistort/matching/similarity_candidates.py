@@ -41,27 +41,30 @@ def offset_candidates(source, target, *, size, n_best=3):
     -------
     iterator of ndarray, each (2,)
     """
-    differences = (target[None] - source[:, None]).reshape(-1, 2)
-    low, high = differences.min(axis=0), differences.max(axis=0)
+    differences = (target.T[:, None] - source.T[:, :, None]).reshape(2, -1)
+    low, high = differences.min(axis=1), differences.max(axis=1)
     spans = [(np.maximum(np.ptp(target[:, k]), 1), np.maximum(np.ptp(source[:, k]), 1)) for k in (0, 1)]
     for cell in (0.005 * size, 0.015 * size):
         if np.prod((high - low) / cell + 3) > _MOST_CELLS:
             continue  # of lists so unlike in extent no shift stands out
         bins = [np.arange(lo - cell, hi + 2 * cell, cell) for lo, hi in zip(low, high, strict=True)]
-        cells = ((differences - [b[0] for b in bins]) / cell).astype(int)
-        shape = [len(b) for b in bins]
-        held = np.bincount(np.ravel_multi_index(cells.T, shape), minlength=shape[0] * shape[1]).reshape(shape)
-        i, j = np.nonzero(held)
-        votes = sum(held[i + a, j + b] for a in (-1, 0, 1) for b in (-1, 0, 1))
+        cells = ((differences - [[b[0]] for b in bins]) / cell).astype(int)
+        wide = len(bins[1])
+        held = np.bincount(cells[0] * wide + cells[1], minlength=len(bins[0]) * wide)
+        taken = np.flatnonzero(held > 0)
+        votes = sum(held[taken + a * wide + b] for a in (-1, 0, 1) for b in (-1, 0, 1))
+        taken, votes = taken[votes > 2], votes[votes > 2]
+        i, j = np.divmod(taken, wide)
         # the difference of two uniform variables has a trapezium as its density
         profiles = [_trapezium(b + cell / 2, b_lo, *s) for b, b_lo, s in zip(bins, low, spans, strict=True)]
-        expected = 9 * cell**2 * len(differences) * profiles[0][i] * profiles[1][j]
+        expected = 9 * cell**2 * differences.shape[1] * profiles[0][i] * profiles[1][j]
         contrast = (votes - expected) / np.sqrt(expected + 1)
         order = np.argsort(-contrast, kind="stable")
         for k, m in _peaks(np.column_stack([i, j])[order], n_best):
-            near = np.all(np.abs(differences - [bins[0][k] + cell / 2, bins[1][m] + cell / 2]) <= 1.5 * cell, axis=1)
+            middle = [[bins[0][k] + cell / 2], [bins[1][m] + cell / 2]]
+            near = np.all(np.abs(differences - middle) <= 1.5 * cell, axis=0)
             if near.sum() >= 3:
-                yield np.median(differences[near], axis=0)
+                yield np.median(differences[:, near], axis=1)
 
 
 def _peaks(cells, n_best):

@@ -73,12 +73,15 @@ class Warp:
         """Map positions (n, 2)."""
         return self._design(xy) @ self.coefficients
 
-    def leverage(self, xy):
-        """Variance of mapped positions (n,) over that of the positions fitted; large where the map extrapolates."""
-        if self.covariance is None:
-            return np.zeros(len(xy))
+    def with_leverage(self, xy):
+        """Mapped positions (n, 2) and their variance (n,) over that of the positions fitted.
+
+        The variance is large where the map extrapolates, and 0 where it is not known.
+        """
         design = self._design(xy)
-        return np.einsum("ij,ij->i", design @ self.covariance, design)
+        if self.covariance is None:
+            return design @ self.coefficients, np.zeros(len(xy))
+        return design @ self.coefficients, np.einsum("ij,ij->i", design @ self.covariance, design)
 
     def _design(self, xy):
         return basis.values(basis.degree_of(len(self.coefficients)), *basis.normalize(xy, self.shape)).T

@@ -47,7 +47,7 @@ def start(problem, nominal, *, robust=False):
             weight = full / (1 + distance2 / (2 * np.median(distance2) + 1e-12))
         current = refine(problem, current, q, positions, weight)
     distance2 = distances(problem, current, q, positions)
-    typical = np.sqrt([_median(distance2[problem.part(i)]) for i in range(problem.n_exposures)])
+    typical = np.sqrt([similarity.median(distance2[problem.part(i)]) for i in range(problem.n_exposures)])
     common = _common_similarity(problem, nominal, current, misplaced(problem, typical))
     current = similarity.compose(current, common)
     if problem.terms.n:
@@ -87,14 +87,6 @@ def undistorted(problem):
         guess = 2 * x - distortion(x)
         q[:, part] = (x - distortion(guess) + guess).T
     return q
-
-
-def _median(values):
-    """`numpy.median` without what that does beside, for many short arrays."""
-    half = len(values) // 2
-    if len(values) % 2:
-        return np.partition(values, half)[half]
-    return np.partition(values, (half - 1, half))[half - 1 : half + 1].mean()
 
 
 def refine(problem, pose_list, q, positions, weight):
