@@ -24,6 +24,8 @@ SUSPECT = 2.0
 MOST = 0.8
 #: Least part of an observation that counts as not taken up by its own fit.
 LEAST_FREE = 0.1
+#: Accuracy in standard errors, rms over its unknowns, of the robust fit that identifies gross errors.
+ENOUGH = 0.1
 _SWEEPS = 5  # to robust means of stars: a wrong observation loses its weight quadratically
 
 
@@ -116,9 +118,10 @@ def solve_clipped(problem, start, *, clip, plain=None, gauge="minimal", loss="li
         ``{exposure: reason}`` of exposures that the fit cannot follow.
     """
     result = _robust(problem, start, plain, gauge)
+    full = plain.blocks if plain is not None and plain.converged and np.all(plain.robust == 1) else None
     good = used = np.ones(problem.xy.shape[1], dtype=bool)
     for count in itertools.count():
-        pull = deviations(problem, result.state, result.robust * used, fitted=result.blocks)
+        pull = deviations(problem, result.state, result.robust * used, full, fitted=result.blocks)
         changed = good
         if count == 1:  # the scale of few observations is not well known before most are fitted at full weight
             fair = pull <= clip * max(1.0, np.sqrt(np.mean(pull[used] ** 2) / 2))
@@ -144,7 +147,7 @@ def _robust(problem, start, plain, gauge):
     """The fit with the Cauchy loss; the plain one, if there is one, where it has no answer."""
     with warnings.catch_warnings(), contextlib.suppress(*[SolveError] * (plain is not None)):
         warnings.simplefilter("ignore", ConvergenceWarning)  # a start, good to a fraction of the errors, is enough
-        return minimisers.solve_joint(problem, start, gauge=gauge, loss="cauchy", max_iterations=20, tolerance=0.02)
+        return minimisers.solve_joint(problem, start, gauge=gauge, loss="cauchy", max_iterations=20, tolerance=ENOUGH)
     return plain
 
 
@@ -154,7 +157,8 @@ def observed_scale(pull):
     From the median; far above the stated errors it is the model that does not fit, in parts of the field more than in
     others, and the larger scale of four fifths of the observations keeps these parts from being taken for gross errors.
     """
-    median, most = (np.quantile(pull, q) / np.sqrt(-2 * np.log(1 - q)) for q in (0.5, MOST))
+    shares = np.array([0.5, MOST])
+    median, most = (np.quantile(pull, shares) / np.sqrt(-2 * np.log(1 - shares))).tolist()
     return max(1.0, median if median <= SUSPECT else max(median, most))
 
 
@@ -176,17 +180,15 @@ def deviations(problem, state, factor, blocks=None, rows=slice(None), *, fitted=
     factor : ndarray, shape (n,)
         On the weights in the fit, 0 to 1.
     blocks : Blocks, optional
-        Of the problem at this state, if all factors are 1 and they are known.
+        Of the problem, with factors 1, at this state or one nearby, if they are known.
     rows : ndarray of int or slice
         Which observations, ascending; all if not given.
     fitted : Blocks, optional
         Of the problem with the factors at this state, if they are known.
     """
     full = criterion.linearise(problem, state) if blocks is None else blocks
-    if not np.any(factor != 1):
-        fitted = full
-    elif fitted is None:
-        fitted = criterion.linearise(problem.scaled(factor), state)
+    if fitted is None:
+        fitted = criterion.linearise(problem.scaled(factor), state) if np.any(factor != 1) else full
     if np.any((factor > 0) & (factor < 1)):
         # a star whose observations all have little weight since they contradict one another may not be anywhere
         left = fitted.v[:2].sum(axis=0)
@@ -195,4 +197,4 @@ def deviations(problem, state, factor, blocks=None, rows=slice(None), *, fitted=
     of_star, of_exposure = leverages(problem, fitted, at=full, rows=rows)
     sign = 1 - 2 * factor[rows]
     variance = np.maximum(1 + sign * of_star, 0) * np.maximum(1 + sign * of_exposure, 0)
-    return np.sqrt(criterion.squares(problem, full.residual)[rows] / np.maximum(variance, LEAST_FREE))
+    return np.sqrt(criterion.squares(problem, fitted.residual)[rows] / np.maximum(variance, LEAST_FREE))
