@@ -195,8 +195,9 @@ class _Descent:
         self.problem, self.state, self.rules = problem, state, rules
         self.released, self.steps, self.converged = released, list(steps), False
         self.n_made = 0
-        self._reweight(criterion.residuals(problem, state) if rules.loss != "linear" else None)
-        self.blocks = criterion.linearise(self.weighted, state)
+        self.factors, self.weighted = np.ones(problem.xy.shape[1]), problem
+        self.blocks = criterion.linearise(problem, state)
+        self._reweight()
         self.stepping, self.size = None, self._begin()
         self._prepare()
 
@@ -221,12 +222,12 @@ class _Descent:
         self.blocks = criterion.linearise(self.weighted, self.state)
         return size
 
-    def _reweight(self, residuals):
-        if self.rules.loss == "linear":
-            self.factors, self.weighted = np.ones(self.problem.xy.shape[1]), self.problem
-            return
-        self.factors = loss_factors(criterion.squares(self.problem, residuals), self.rules.loss)
-        self.weighted = self.problem.scaled(self.factors)
+    def _reweight(self):
+        """Weights, and normal equations with them, by the residuals of the state, unless the loss is linear."""
+        if self.rules.loss != "linear":
+            self.factors = loss_factors(criterion.squares(self.problem, self.blocks.residual), self.rules.loss)
+            self.weighted = self.problem.scaled(self.factors)
+            self.blocks = criterion.linearise(self.weighted, self.state)
 
     def _prepare(self, step=np.inf, last=np.inf):
         """The gauge at the current state, and what steps from it, `step` after the `last` from where they were made."""
@@ -278,9 +279,7 @@ class _Descent:
                 accuracy = max(0.01 * accuracy, 1e-10)
             cost, self.blocks, self.made, self.stepping.blocks = self.blocks.cost, None, None, None  # makes room
             self.state, self.blocks = _advance(self.weighted, self.state, cost, d_star, d_exposure)
-            if self.rules.loss != "linear":
-                self._reweight(self.blocks.residual)
-                self.blocks = criterion.linearise(self.weighted, self.state)
+            self._reweight()
             self._prepare(size, last)
             if size < _STEADY * tolerance and size * size < 0.1 * tolerance * last < np.inf:
                 self.converged = True

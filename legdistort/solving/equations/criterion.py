@@ -15,7 +15,6 @@ Phi' E (`legdistort.solving.equations.star_terms`).
 Arrays are ordered by exposure, coordinates first, so that every sweep reads memory once and in order.
 """
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +26,6 @@ from .star_terms import symmetric_times
 _HOLD = 1e4
 #: Smallest uncertainty of a static distortion that takes part in a fit, pixels.
 _SMALLEST = 1e-6
-_MANY = 8192  # observations that are done together, few enough for what is computed of them to stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +101,7 @@ def complement(rows):
     return np.linalg.qr(rows.T, mode="complete")[0][:, len(rows) :].T
 
 
-def predict(problem, state, first=0, last=None, *, derivative=True):
+def predict(problem, state, first=0, last=None):
     """Model positions of the observations of exposures `first` to `last`, with what the normal equations need.
 
     Returns
@@ -112,7 +110,7 @@ def predict(problem, state, first=0, last=None, *, derivative=True):
     values : ndarray, shape (n_all, n)
         Basis values.
     jacobian : ndarray, shape (2, 2, n)
-        dD/dX, detector axis first. Only if `derivative`.
+        dD/dX, detector axis first.
     """
     last = problem.n_exposures if last is None else last
     part = slice(problem.start[first], problem.start[last])
@@ -122,27 +120,15 @@ def predict(problem, state, first=0, last=None, *, derivative=True):
     x, y = problem.placed_at(exposure, state.stars[:, problem.star[part]])
     q = np.stack([xx * x + xy * y + x0, yx * x + yy * y + y0])
     u, v = (2 * q[0] + 1) / nx - 1, (2 * q[1] + 1) / ny - 1
-    modes = np.stack(basis.gradients(degree, u, v)) if derivative else basis.values(degree, u, v)[None]
-    fields, start = np.empty((len(modes), 2, q.shape[1])), (problem.start[first : last + 1] - part.start).tolist()
+    modes = np.stack(basis.gradients(degree, u, v))
+    fields, start = np.empty((3, 2, q.shape[1])), (problem.start[first : last + 1] - part.start).tolist()
     for a, low, high in zip(state.coefficients[first:last], start, start[1:], strict=False):
         np.matmul(a, modes[:, :, low:high], out=fields[:, :, low:high])
     position, values = q + fields[0], modes[0]
-    if not derivative:
-        return position, values
     gx, gy = fields[1] * (2 / nx), fields[2] * (2 / ny)  # columns of G - I
     gx[0] += 1
     gy[1] += 1
     return position, values, np.stack([gx * xx + gy * yx, gx * xy + gy * yy], axis=1)
-
-
-def residuals(problem, state):
-    """``x_data - D(X)`` of every observation, shape (2, n) pixels, in the order of the problem."""
-    out = problem.xy.copy()
-    ends = np.searchsorted(problem.start, np.arange(0, problem.start[-1] + _MANY, _MANY)).clip(max=problem.n_exposures)
-    for first, last in itertools.pairwise(np.unique(ends).tolist()):  # exposures of so many observations together
-        part = slice(problem.start[first], problem.start[last])
-        out[:, part] -= predict(problem, state, first, last, derivative=False)[0]
-    return out
 
 
 def squares(problem, residual):
