@@ -11,6 +11,7 @@ from astropy.wcs import WCS
 
 from ..exceptions import InputError, without_astropy_warnings
 from ..geometry.tangent_plane import TangentPlane
+from ..runtime.checks import check_is_file
 from ..runtime.fits_bytes import open_fits
 
 
@@ -156,8 +157,7 @@ def read_grid(path):
         If the file is neither of these, or its WCS cannot be read.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    check_is_file(path)
     with path.open("rb") as file:
         start = file.read(2880)
     packed = start.startswith((b"\x1f\x8b", b"BZh"))

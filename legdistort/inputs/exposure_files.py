@@ -20,6 +20,7 @@ from astropy.wcs import WCS
 
 from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, without_astropy_warnings
 from ..runtime.asdf_files import ARCHIVES, read_tree
+from ..runtime.checks import check_is_file
 from ..runtime.fits_bytes import open_fits, readable
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.outputs import settle_for
@@ -441,8 +442,7 @@ def _check_no_extension(path, ext):
 
 def _file(path):
     """A file, open; `InputError` if there is none."""
-    if not path.is_file():
-        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    check_is_file(path)
     return path.open("rb")
 
 

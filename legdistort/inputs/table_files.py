@@ -12,6 +12,7 @@ from astropy.table import QTable
 
 from ..exceptions import InputError
 from ..runtime import outputs, provenance
+from ..runtime.checks import check_is_file
 from . import column_contract, exposure_names
 from .star_lists import dialects, formats
 
@@ -58,8 +59,7 @@ def read_table(path, *, columns=None, origin=None, error=None):
     if error is not None and not (isinstance(error, Real) and 0 < error < np.inf):
         raise InputError(f"error must be a positive number of pixels, got {error!r}")
     outputs.settle_for(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    check_is_file(path)
     try:
         with provenance.unchanged(path):
             found, own = formats.read(path), provenance.checksums(path)

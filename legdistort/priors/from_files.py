@@ -20,6 +20,7 @@ from ..geometry import basis
 from ..geometry.gsaoi import GSAOI_SIZE, gsaoi_static
 from ..inputs.exposure_files import read_exposures
 from ..runtime.asdf_files import ARCHIVES, read_tree
+from ..runtime.checks import check_is_file
 from ..runtime.fits_bytes import open_fits
 from ..runtime.words import DIRECTIONS
 from .from_objects import as_source, of_model
@@ -69,11 +70,7 @@ def read_source(where, *, ext=None, frame=None):
     if text.startswith("siaf:"):
         return _refuse(as_source(_aperture(text), frame=frame, name=text), ext=ext)
     path = Path(where)
-    if not path.is_file():
-        raise InputError(
-            f"{path}: {'not a file' if path.exists() else 'no such file'}; give a file, gsaoi-1 ... gsaoi-4, or "
-            "siaf:INSTRUMENT/APERTURE"
-        )
+    check_is_file(path, "give a file, gsaoi-1 ... gsaoi-4, or siaf:INSTRUMENT/APERTURE")
     # files are often a little off the standard; what matters is checked here
     with without_astropy_warnings():
         return _read_file(path, ext, frame)

@@ -28,7 +28,7 @@ from asdf.resource import DirectoryResourceMapping
 from asdf.tags.core.ndarray import asdf_datatype_to_numpy_dtype
 
 from ..exceptions import InputError
-from .checks import first_line
+from .checks import check_is_file, first_line
 from .outputs import settle_for
 
 #: Version of the ASDF standard that is written.
@@ -86,10 +86,7 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
         content = _without_fits_arrays(path, content)
     if not inside:
         settle_for(path)
-    if not inside and not Path(path).exists():
-        raise InputError(f"{path}: no such file")
-    if not inside and not Path(path).is_file():
-        raise InputError(f"{path} is not a readable ASDF file: not a file")
+        check_is_file(path)
     try:
         # absolute, since asdf takes ~x for somebody's home
         quiet = warnings.catch_warnings(action="ignore", category=asdf.exceptions.AsdfWarning)  # the schema decides

@@ -1,6 +1,7 @@
 """Checks of arguments that more than one function has."""
 
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +22,20 @@ def check_counts(**counts):
     for name, value in counts.items():
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
             raise InputError(f"{name} must be a positive integer, got {value!r}")
+
+
+def check_is_file(path, instead=None):
+    """Raise `InputError`, which says what to give `instead`, if a path is none of a file."""
+    path = Path(path)
+    if path.is_file():
+        return
+    if not path.exists():
+        fault = "no such file"
+    elif path.is_dir():
+        fault, instead = "is not a file but a folder", instead or f"name the files in it ({path}/*)"
+    else:
+        fault = "is not a file"
+    raise InputError(f"{path}: {fault}" + (f"; {instead}" if instead else ""))
 
 
 def first_line(error):

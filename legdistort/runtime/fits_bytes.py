@@ -22,6 +22,7 @@ import numpy as np
 from astropy.io import fits
 
 from ..exceptions import DamagedError, InputError, LegdistortError, without_astropy_warnings
+from .checks import check_is_file
 
 BLOCK = 2880
 _CARD = 80
@@ -56,8 +57,7 @@ def read_bytes(path):
         If the file is missing, damaged or not FITS.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    check_is_file(path)
     raw = path.read_bytes()
     pack = next((packer for magic, packer in _PACKERS.items() if raw.startswith(magic)), bytes)
     try:

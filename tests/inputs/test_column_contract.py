@@ -169,5 +169,7 @@ def test_bad_files_are_named(tmp_path, name, content, message):
 
 
 def test_absent_file_is_named(tmp_path):
+    with pytest.raises(InputError, match="is not a file but a folder"):
+        read_table(tmp_path)
     with pytest.raises(InputError, match=r"none\.csv: no such file"):
         read_table(tmp_path / "none.csv")

@@ -263,7 +263,7 @@ def test_not_fits(tmp_path):
             read_exposures(tmp_path / name)
     with pytest.raises(InputError, match=r"nowhere.fits: no such file"):
         read_exposures(tmp_path / "nowhere.fits")
-    with pytest.raises(InputError, match="is not a file"):
+    with pytest.raises(InputError, match=r"is not a file but a folder; name the files in it \(.*/\*\)"):
         read_exposures(tmp_path)
     with pytest.raises(InputError, match="must be a path, an HDUList or an NDData, got int"):
         read_exposures([3])
