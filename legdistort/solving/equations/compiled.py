@@ -19,19 +19,17 @@ from ...runtime.compiling import compiled_loop
 
 #: Number of observations from which they are shared out among threads, and couplings are kept in single precision.
 THREADS_FROM = 200_000
-_SHORT = 3  # times as many for loops that take less time
 _BATCH = 64
 _FAST = {"contract", "reassoc", "nsz"}  # sums may be reordered; NaN and infinity keep their meaning
 
 
-def _chunks(problem, weight=1):
+def _chunks(problem):
     """Numbers of exposures ``[(low, high), ...]`` of about as many observations, one chunk for each thread.
 
     One alone for few observations: they are done before threads have met, above all on a machine with other work.
-    `weight` is how many times more a loop needs than `_linearise`.
     """
     start = problem.start
-    n = config.NUMBA_NUM_THREADS if start[-1] >= weight * THREADS_FROM else 1
+    n = config.NUMBA_NUM_THREADS if start[-1] >= THREADS_FROM else 1
     inner = np.searchsorted(start, start[-1] * np.arange(1, n) // n).tolist()
     return list(itertools.pairwise([0, *inner, len(start) - 1]))
 
@@ -368,7 +366,7 @@ def linearise(problem, state):
 def to_stars(problem, blocks, a):
     """Twin of `legdistort.solving.equations.elimination.to_stars`."""
     given = problem.start, problem.star, blocks.values, blocks.coupling, problem.terms.columns, a
-    chunks = _chunks(problem, _SHORT)
+    chunks = _chunks(problem)
     sums = np.zeros((len(chunks), problem.n_stars, problem.n_star))
     _shared_out(lambda *chunk: _to_stars(*chunk, *given), chunks, sums)
     return sums.sum(axis=0).T.copy()
@@ -379,7 +377,7 @@ def to_exposures(problem, blocks, y):
     terms = blocks.values, blocks.coupling, problem.terms.columns
     given = problem.start, problem.star, *terms, np.ascontiguousarray(y)
     out = np.zeros((problem.n_exposures, 2, problem.n_modes))
-    _shared_out(lambda *chunk: _to_exposures(*chunk, out, *given), _chunks(problem, _SHORT))
+    _shared_out(lambda *chunk: _to_exposures(*chunk, out, *given), _chunks(problem))
     return out.reshape(len(out), -1)
 
 
@@ -394,7 +392,7 @@ def undistorted(problem):
 
 def carried_back(problem, inverses, q, weight):
     """Twin of `legdistort.solving.start_values.carried_back`."""
-    chunks, given = _chunks(problem, _SHORT), (problem.start, problem.star, q, inverses, weight)
+    chunks, given = _chunks(problem), (problem.start, problem.star, q, inverses, weight)
     sums = np.zeros((len(chunks), problem.n_stars, 3))
     _shared_out(lambda *chunk: _carried_back(*chunk, *given), chunks, sums)
     return sums.sum(axis=0).T
@@ -403,7 +401,7 @@ def carried_back(problem, inverses, q, weight):
 def distances(problem, pose_list, q, positions):
     """Twin of `legdistort.solving.start_values.distances`."""
     out, given = np.empty(q.shape[1]), (problem.start, problem.star, q, pose_list, np.ascontiguousarray(positions))
-    _shared_out(lambda *chunk: _distances(*chunk, out, *given), _chunks(problem, _SHORT))
+    _shared_out(lambda *chunk: _distances(*chunk, out, *given), _chunks(problem))
     return out
 
 
@@ -411,6 +409,6 @@ def moments(problem, q, weight, positions):
     """Twin of `legdistort.solving.start_values.moments`."""
     out, given = np.zeros((problem.n_exposures, 9)), (problem.start, problem.star, q, weight)
     positions = np.ascontiguousarray(positions)
-    _shared_out(lambda *chunk: _moments(*chunk, out, *given, positions), _chunks(problem, _SHORT))
+    _shared_out(lambda *chunk: _moments(*chunk, out, *given, positions), _chunks(problem))
     with np.errstate(divide="ignore", invalid="ignore"):
         return out[:, :2], out[:, 2:4], (out[:, 4:8] / out[:, 8:]).reshape(-1, 2, 2)
