@@ -15,6 +15,7 @@ from ..coaddition.grids import given_grid, read_grid
 from ..coaddition.mosaic import check_ending
 from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
+from ..inputs.exposure_names import detector_name
 from ..inputs.star_lists.formats import stack
 from ..inputs.table_files import read_table, write_stars
 from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
@@ -145,9 +146,11 @@ def do_match(a):
     known |= {"exposures": exposures, "progress": wants_progress(a)}
     with timed({}, "match"):
         matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
-    empty = {name: "no star was detected in it" for name in shapes if name not in names}
+    pairs = [pair for t in tables if "detector" in t.colnames for pair in zip(t["exposure"], t["detector"], strict=True)]
+    seen = {*names, *(detector_name(*pair) for pair in dict.fromkeys(pairs))}
+    empty = {name: "no star was detected in it" for name in shapes if name not in seen}
     bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
-    bad = {name: reason for name, reason in bad.items() if name not in names}
+    bad = {name: reason for name, reason in bad.items() if name not in seen}
     matches = replace(matches, left_out=bad | matches.left_out | empty)
     inputs = {name: checksum for each in tables for name, checksum in each.meta["inputs"].items()}
     write_matched(a.out, matches, inputs, overwrite=a.overwrite)

@@ -783,6 +783,20 @@ class TestFrames:
                         assert np.abs((found - true) * 3600 / 0.05).max() < 2e-3
                         assert np.abs(np.stack(view.wcs(f"{name}-{key}")(*xy.T), axis=1) - true).max() * 72000 < 1e-5
 
+    def test_step_by_step_no_detector_is_missed(self, frames, tmp_path):
+        """Tables of positions name exposures and detectors, their meta data both in one; only what is dark is left out."""
+        folder, camera, _ = frames
+        camera.write(tmp_path / "camera.asdf")
+        measured, matched = str(tmp_path / "measured.ecsv"), str(tmp_path / "matched.ecsv")
+        assert main(["measure", f"{folder}/*.fits", "--ext", "SCI", "--out", measured, "--quiet"]) == 0
+        given = ["--camera", str(tmp_path / "camera.asdf"), "--min-exposures", "3"]
+        assert main(["match", measured, *given, "--out", matched, "--quiet"]) == 0
+        assert QTable.read(matched).meta["left_out"] == {}
+        table = QTable.read(measured)
+        table[(table["exposure"] != "exp1") | (table["detector"] != "2")].write(measured, overwrite=True)
+        assert main(["match", measured, *given, "--out", matched, "--quiet", "--overwrite"]) == 0
+        assert QTable.read(matched).meta["left_out"] == {"exp1-2": "no star was detected in it"}
+
     def test_one_file_for_every_detector(self, frames, tmp_path):
         """The same table of positions as from files with both."""
         folder, camera, _ = frames

@@ -325,6 +325,29 @@ def test_noise_is_no_energy():
     assert max(np.abs(excess)) < degree_choice.ALARM
 
 
+def test_a_convention_is_no_energy():
+    """Without a prior all exposures depart alike, by what the convention makes of their common map; degree 3 is all."""
+    excess = []
+    for seed in range(8):
+        sim = simulate_matches(n_exposures=6, n_stars=36, degree=3, seed=seed)
+        chosen = solve(sim.matches, degree="auto").diagnostics.selection
+        assert chosen.degree == 3
+        excess += [each.excess for each in chosen.aliasing]
+    assert len(excess) == 16
+    assert abs(np.mean(excess)) < 1
+    assert max(np.abs(excess)) < 3
+
+
+def test_where_similarities_are_in_the_poses_no_energy_is_missed():
+    """Above degree 0 come shears alone: rotation and scale are no coefficients."""
+    excess = []
+    for seed in range(8):
+        sim = simulate_matches(n_exposures=8, n_stars=60, degree=1, dynamic=0, seed=seed)
+        excess += [degree_choice.folding(solved(sim, degree=2), 0, higher).excess for higher in (1, 2)]
+    assert abs(np.mean(excess)) < 1
+    assert max(np.abs(excess)) < degree_choice.ALARM
+
+
 def test_alarm_is_raised():
     """Sixteen stars, precise, with more distortion than they can be fitted with at degree 3."""
     sim = simulate(16, 0.5, 0.5, 0.5, 0.3, 0.3, sigma=0.01, seed=2)

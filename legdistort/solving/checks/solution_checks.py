@@ -118,13 +118,17 @@ def errors_check(solution, residuals):
     """Do residuals scatter as the stated errors lead to expect?"""
     chi2, dof = _stated(solution, residuals)
     if dof < 1:
-        return Check("chi2", "unknown", None, None, "no degrees of freedom are left to judge the errors by",
+        held = solution.dof - dof
+        beside = f" beside {'that' if held == 1 else f'the {held:.0f}'} of the common map that is held" * (held >= 1)
+        return Check("chi2", "unknown", None, None, f"no degrees of freedom are left to judge the errors by{beside}",
                      "lower the degree, or add stars or exposures")  # fmt: skip
-    ratio = chi2 / dof
+    ratio, whole = chi2 / dof, solution.chi2 / solution.dof
     low, high = (special.chdtri(dof, p) / dof for p in (1 - FALSE_ALARM / 2, FALSE_ALARM / 2))
     low, high = min(low, (1 - NEGLIGIBLE) ** 2), max(high, (1 + NEGLIGIBLE) ** 2)
     floor, scale = solution.diagnostics.error_floor, solution.diagnostics.error_scale
     found = f"chi2/dof {ratio:.3g} at the stated errors, {low:.2f} to {high:.2f} by chance"
+    if not solution.diagnostics.error_floor and abs(ratio - whole) > 5e-3 * ratio:
+        found += f" ({whole:.3g} with what holding the common map leaves in the residuals)"
     if floor:
         found += f"; a floor of {floor:.3g} px was added to them"
     elif scale != 1:
@@ -279,7 +283,8 @@ def absolute_check(solution):
         return Check("absolute", "unknown", len(unknown), 0, sentence, cure)
     stars = solution.stars
     error = float(np.sqrt(np.nanmean(stars["x_err_abs"].value ** 2 + stars["y_err_abs"].value ** 2) / 2))
-    return Check("absolute", "pass", error, None, f"absolute positions are known to {error:.2g} px rms per axis")
+    known = f"absolute positions of the stars are known to {error:.2g} px rms per axis"
+    return Check("absolute", "pass", error, None, known)
 
 
 def extrapolation_check(residuals):

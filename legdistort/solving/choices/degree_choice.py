@@ -10,8 +10,9 @@ from astropy import units as u
 
 from ...exceptions import InputError, LegdistortError
 from ...geometry import basis, similarity
-from ...results.coefficient_covariance import exposure_blocks
+from ...geometry.detector_modes import similarity_basis
 from ...results.diagnostics import AliasedDegree, DegreeChoice
+from ..equations.criterion import complement
 from . import held_out
 
 log = logging.getLogger(__name__)
@@ -32,6 +33,7 @@ TRIAL = 0.03
 CLOSE = 0.005
 #: Excess of a degree's energy over its noise, in standard deviations of the latter, that raises the alarm.
 ALARM = 5.0
+_SETTLED = 1e-6  # of the largest effect of a common map on an exposure
 _OUTLIER = 25.0  # times the usual squared scatter of a star, at every degree: mismatched, it has no weight
 
 
@@ -208,11 +210,7 @@ def folding(solution, degree, higher):
     AliasedDegree
     """
     low, high = basis.n_modes(degree), slice(basis.n_modes(higher - 1), basis.n_modes(higher))
-    departure = (solution.coefficients - solution.prior_mean)[:, :, high]
-    covariance = _covariances(solution, high)
-    variance = np.einsum("iaa->", covariance)
-    flat = departure.reshape(len(departure), -1, 1)
-    normal = float((flat * np.linalg.solve(covariance, flat)).sum())
+    departure, squares, dof, variance = _of_their_own(solution, high)
     energy = np.sum(departure**2)
     beyond = np.sqrt(max(1 - variance / max(energy, 1e-300), 0))
     folds = np.stack([_fold(solution, name, low, high) for name in solution.names])
@@ -227,7 +225,7 @@ def folding(solution, degree, higher):
         degree=int(higher),
         found=found,
         noise=float(found * np.sqrt(variance / max(energy, 1e-300))),
-        excess=float((normal - departure.size) / np.sqrt(2 * departure.size)),
+        excess=float((squares - dof) / np.sqrt(2 * dof)),
         energy=float(beyond * found),
         folds_into=tuple(float(np.sqrt(np.sum(size[degrees == d] ** 2)) / 2) for d in range(degree + 1)),
         mode=tuple(orders[high][strongest].tolist()),
@@ -235,12 +233,48 @@ def folding(solution, degree, higher):
     )
 
 
-def _covariances(solution, high):
-    """Covariance (n_exposures, 2 n, 2 n) of some modes of every exposure, x before y."""
-    blocks = exposure_blocks(solution.uncertainty.coefficients, len(solution.names))
-    size = 2 * basis.n_modes(solution.degree)
-    rows = np.arange(size).reshape(2, -1)[:, high].ravel()
-    return blocks[:, rows[:, None], rows]
+def _of_their_own(solution, high):
+    """Departures of the exposures from the prior in some modes, without the map of these that all have in common.
+
+    That one the stars take up: what it is follows from the convention, of which distortions of low degree are part.
+
+    Returns
+    -------
+    departure : ndarray, shape (n_exposures, 2, n)
+    squares, dof : float, int
+        Of the departures over their errors, and how many these are by chance.
+    variance : float
+        Of all departures together, by their errors.
+    """
+    departure, n = (solution.coefficients - solution.prior_mean)[:, :, high], len(solution.names)
+    modes = np.arange(2 * basis.n_modes(solution.degree)).reshape(2, -1)[:, high].ravel()
+    rows = np.arange(2 * solution.gauge.n_modes).reshape(2, -1)[:, high].ravel()
+    turn = np.stack([_not_similar(solution.shapes[name], solution.degree, modes) for name in solution.names])
+    motion = turn @ solution.gauge.motion[:, rows[:, None], rows]
+    columns, size, _ = np.linalg.svd(motion.reshape(-1, len(rows)), full_matrices=False)
+    common = columns[:, size > _SETTLED * size.max()]
+    own = (turn @ departure.reshape(n, -1, 1)).ravel()
+    own -= common @ (common.T @ own)
+    covariance = solution.uncertainty.coefficients
+    if covariance.ndim == 3:  # one block an exposure, as if the stars were known
+        errors = turn @ covariance[:, modes[:, None], modes] @ turn.mT
+        squares = np.sum(own.reshape(n, -1, 1) * np.linalg.solve(errors, own.reshape(n, -1, 1)))
+        variance = np.einsum("iaa->", errors) * (1 - common.shape[1] / own.size)
+    else:
+        every = covariance.reshape(n, -1, n, covariance.shape[1] // n)[:, modes][..., modes]
+        errors = np.einsum("iac,icjd,jbd->iajb", turn, every, turn, optimize=True).reshape(own.size, -1)
+        errors -= common @ (common.T @ errors)
+        errors -= (errors @ common) @ common.T
+        variance = np.trace(errors)
+        squares = own @ np.linalg.solve(errors + variance / own.size * common @ common.T, own)
+    departure = turn.mT @ own.reshape(n, -1, 1)
+    return departure.reshape(n, 2, -1), float(squares), own.size - common.shape[1], float(variance)
+
+
+def _not_similar(shape, degree, modes):
+    """Orthonormal rows (k, n): what of some modes of a detector no similarity is, which the poses carry."""
+    rows = similarity_basis(shape, basis.n_modes(degree))[:, modes]
+    return complement(rows[np.linalg.norm(rows, axis=1) > 0.5])
 
 
 def _fold(solution, name, low, high):
