@@ -146,8 +146,8 @@ def do_match(a):
     known |= {"exposures": exposures, "progress": wants_progress(a)}
     with timed({}, "match"):
         matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
-    pairs = [pair for t in tables if "detector" in t.colnames for pair in zip(t["exposure"], t["detector"], strict=True)]
-    seen = {*names, *(detector_name(*pair) for pair in dict.fromkeys(pairs))}
+    several = [table for table in tables if "detector" in table.colnames]
+    seen = {*names, *(detector_name(*pair) for t in several for pair in zip(t["exposure"], t["detector"], strict=True))}
     empty = {name: "no star was detected in it" for name in shapes if name not in seen}
     bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
     bad = {name: reason for name, reason in bad.items() if name not in seen}

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.star_hull import support
+from ..inputs.sky_wcs import leads_elsewhere, warn_of_another_field
 from ..results.solution import Solution
 from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
@@ -194,7 +195,7 @@ def _coadd(exposures, solution, options, share):
         factors, origin = flux_scales(frames, options.scale, solution, areas)
         layers, recipe = _layers(frames, prepared, maps, factors, solution, output, options)
         planes = assemble(layers, recipe, folder.parent, share)
-    _warn_of_misuse(frames, maps, options.algorithm)
+    _warn_of_misuse(frames, maps, options.algorithm, solution)
     correlation = noise_gain.noise_correlation(layers[0].map, layers[0].gain, recipe.resampling)
     header = mosaic_header(frames, left_out, factors, _settings(options, recipe, origin, correlation))
     names = tuple(f.name for f in frames)
@@ -294,8 +295,10 @@ def _reasons(left_out):
     return "; ".join(f"{some_of(same, 5)}: {reason}" for reason, same in names.items())
 
 
-def _warn_of_misuse(frames, maps, algorithm):
-    """Of light that is lost between pixels, and of units that do not go together."""
+def _warn_of_misuse(frames, maps, algorithm, solution):
+    """Of another field, of light that is lost between pixels, and of units that do not go together."""
+    if solution.sky is not None:
+        warn_of_another_field([f.name for f in frames if leads_elsewhere(f.wcs, solution.wcs(f.name), f.shape)])
     scale = max(maps[f.name].scale for f in frames)
     if algorithm == "interp" and scale > _COARSE:
         warn(

@@ -15,7 +15,7 @@ from astropy.wcs.utils import proj_plane_pixel_scales, wcs_to_celestial_frame
 from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS, HighLevelWCSWrapper
 from astropy.wcs.wcsapi.high_level_api import values_to_high_level_objects
 
-from ..exceptions import InputError
+from ..exceptions import AssumptionWarning, InputError, warn
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ PIXEL_SCALES = (0.0001 / 3600, 0.1)
 REFERENCE_DISTANCE = 20
 
 
-def believable_wcs(wcs, shape, name=""):
+def believable_wcs(wcs, shape, name="", *, level=logging.INFO):
     """The celestial part of a WCS, or None with a log entry if it is not plausible.
 
     Believable is a WCS that has two celestial axes, a pixel scale in `PIXEL_SCALES` that is the same in x
@@ -40,6 +40,8 @@ def believable_wcs(wcs, shape, name=""):
         ``(ny, nx)``.
     name : str, optional
         For the log.
+    level : int
+        Of the log entry.
 
     Raises
     ------
@@ -59,9 +61,18 @@ def believable_wcs(wcs, shape, name=""):
             f"{type(wcs).__name__}"
         )
     if reason:
-        log.info("%s: WCS of the header not used: %s", name, reason)
+        log.log(level, "%s: WCS of the header not used: %s", name, reason)
         return None
     return wcs
+
+
+def header_wcs(header, hdulist, shape, name, *, level=logging.INFO):
+    """The believable WCS of a header of a file, or None with a log entry."""
+    try:
+        return believable_wcs(WCS(header, fobj=hdulist), shape, name, level=level)
+    except Exception as error:  # wcslib raises many kinds; a header WCS is a hint, never a must
+        log.log(level, "%s: WCS of the header not used: %s", name, error)
+        return None
 
 
 def to_icrs(wcs, xy, *, distortion=True):
@@ -85,6 +96,27 @@ def to_icrs(wcs, xy, *, distortion=True):
     else:
         sky = _place(wcs.pixel_to_world(x, y)).icrs
     return np.stack([sky.ra.deg, sky.dec.deg])
+
+
+def leads_elsewhere(wcs, expected, shape):
+    """Whether a believable WCS, or None, leads farther from where another one leads than the frame is large."""
+    ny, nx = shape
+    if wcs is None:
+        return False
+    middle, corner = ((nx - 1) / 2, (ny - 1) / 2), (0, 0)
+    here, edge = SkyCoord(*to_icrs(expected, [middle, corner]), unit="deg")
+    (there,) = SkyCoord(*to_icrs(wcs, [middle]), unit="deg")
+    return bool(here.separation(there) > 2 * here.separation(edge))
+
+
+def warn_of_another_field(names):
+    """Warn of frames of which `leads_elsewhere` holds, if there are any."""
+    if names:
+        warn(
+            f"{', '.join(names)}: headers place this more than a frame away from where the solution has it; are these "
+            "frames of another field with the same names?",
+            AssumptionWarning,
+        )
 
 
 def _place(found):

@@ -16,6 +16,7 @@ from astropy.io import fits
 
 from ..exceptions import ExportError, InputError
 from ..inputs import exposure_files, exposure_names, file_images
+from ..inputs.sky_wcs import header_wcs, leads_elsewhere, warn_of_another_field
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, readable, splice
@@ -128,6 +129,7 @@ def attach(
     for path, target in zip(Bar(paths, desc="attaching", unit="frame", disable=not progress), targets, strict=True):
         plan = _plan(solution.by_detector, path, target, kind=kind, max_error=max_error, ext=ext, overwrite=overwrite)
         plans += [plan] if plan.headers else []
+    warn_of_another_field([name for plan in plans for name in plan.elsewhere])
     if not plans:
         raise InputError("none of the frames is part of the solution; give those it was made from")
     with replacing_folders(dict.fromkeys(plan.target.parent for plan in plans)) as folders:
@@ -139,13 +141,17 @@ def attach(
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """What is to be done to one file: headers ``{exposure: Header or None}`` and edits of its bytes."""
+    """What is to be done to one file: headers ``{exposure: Header or None}`` and edits of its bytes.
+
+    And the names of the exposures that the headers place `elsewhere`.
+    """
 
     path: Path
     target: Path
     crc: int
     headers: dict
     edits: list
+    elsewhere: list
 
     def write(self, file):
         raw, pack = read_bytes(self.path)
@@ -191,6 +197,7 @@ def _plan(solution, path, target, *, kind, max_error, ext, overwrite):
     headers, edits = {}, []
     with readable(path), open_bytes(raw) as hdulist:
         images = _images(solution, hdulist, path, ext)
+        elsewhere = [name for name, image in images.items() if _is_elsewhere(solution, name, hdulist, hdulist[image])]
         for name, image in images.items():
             headers[name] = None
             if kind is not None:
@@ -202,7 +209,15 @@ def _plan(solution, path, target, *, kind, max_error, ext, overwrite):
                     edits.append((start, data, new))
         if images:
             edits += _asdf_edits(solution, images, spans, *_tables(hdulist, spans, path, overwrite))
-    return _Plan(path, target, zlib.crc32(raw), headers, edits)
+    return _Plan(path, target, zlib.crc32(raw), headers, edits, elsewhere)
+
+
+def _is_elsewhere(solution, name, hdulist, hdu):
+    """Whether the header of an image leads far from where the solution has it."""
+    if solution.sky is None:
+        return False
+    wcs = header_wcs(hdu.header, hdulist, hdu.shape, name, level=logging.DEBUG)
+    return leads_elsewhere(wcs, solution.wcs(name), hdu.shape)
 
 
 def _header(solution, name, kind, max_error):

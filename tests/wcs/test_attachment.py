@@ -272,7 +272,7 @@ def test_packed_files_stay_packed(one, frame, tmp_path, suffix, module):
 def test_attaching_again_replaces(one, frame):
     for kind in ("sip", "tpv"):
         attach(one, frame, in_place=True, kind=kind)
-    turned = dataclasses.replace(one, sky=TangentPlane(50.0, 5.0, one.sky.matrix))
+    turned = dataclasses.replace(one, sky=TangentPlane(one.sky.lon + 1e-4, one.sky.lat, one.sky.matrix))
     attach(turned, frame, in_place=True)
     assert names_in(frame) == ["PRIMARY", "PACKED", "", "ERR", "ASDF"]
     header = fits.getheader(frame)
@@ -306,7 +306,7 @@ def test_its_own_extension_is_known_wherever_it_stands(one, tmp_path, start, the
     moved(frame, start)
     attach(one, frame, in_place=True)
     moved(frame, then)
-    turned = dataclasses.replace(one, sky=TangentPlane(50.0, 5.0, one.sky.matrix))
+    turned = dataclasses.replace(one, sky=TangentPlane(one.sky.lon + 1e-4, one.sky.lat, one.sky.matrix))
     attach(turned, frame, in_place=True)
     assert [name for name in names_in(frame) if name in ("ASDF", "LOG")] == ["LOG", "ASDF"]
     assert_allclose(wcs_in(frame)(3.0, 4.0), turned.wcs("frame")(3.0, 4.0), rtol=0, atol=1e-12)
@@ -320,7 +320,7 @@ def test_fpack_and_back(one, tmp_path):
     fits.PrimaryHDU(pixels().astype("int16")).writeto(frame)
     attach(one, frame, in_place=True)
     subprocess.run(["fpack", "-D", "-Y", frame], check=True)
-    turned = dataclasses.replace(one, sky=TangentPlane(50.0, 5.0, one.sky.matrix))
+    turned = dataclasses.replace(one, sky=TangentPlane(one.sky.lon + 1e-4, one.sky.lat, one.sky.matrix))
     (done,) = attach(turned, f"{frame}.fz", in_place=True)
     assert names_in(done.path).count("ASDF") == 1
     assert_allclose(wcs_in(done.path)(3.0, 4.0), turned.wcs("frame")(3.0, 4.0), rtol=0, atol=1e-12)
@@ -605,6 +605,20 @@ def test_no_sky(one, frame):
     (done,) = attach(blind, frame, in_place=True, kind=None)
     assert repr(done) == f"<Attachment: frame in {frame}: ASDF>"
     assert wcs_in(frame).available_frames == ["detector", "undistorted", "reference"]
+
+
+def test_a_frame_of_another_field_is_named(one, tmp_path, recwarn):
+    """Names of exposures are those of files, and exp00 there is every night."""
+    ny, nx = SHAPE
+    for off, told in ((0.0, 0), (0.4, 0), (3.0, 1)):  # frames in which the headers lead elsewhere
+        header = one.header("frame")
+        header["CRPIX1"] += off * nx
+        path = tmp_path / "frame.fits"
+        fits.PrimaryHDU(pixels().astype("int16"), header).writeto(path, overwrite=True)
+        recwarn.clear()
+        attach(one, path, in_place=True, kind=None)
+        assert sum("frames of another field with the same names" in str(each.message) for each in recwarn) == told
+        assert all(str(each.message).startswith("frame: headers place this") for each in recwarn)
 
 
 def test_frames_left_out_are_skipped_by_name(one, frame, tmp_path, caplog):
