@@ -784,7 +784,7 @@ class TestFrames:
                         assert np.abs(np.stack(view.wcs(f"{name}-{key}")(*xy.T), axis=1) - true).max() * 72000 < 1e-5
 
     def test_step_by_step_no_detector_is_missed(self, frames, tmp_path):
-        """Tables of positions name exposures and detectors, their meta data both in one; only what is dark is left out."""
+        """Tables name exposures and detectors, their meta data both in one; only what is dark is left out."""
         folder, camera, _ = frames
         camera.write(tmp_path / "camera.asdf")
         measured, matched = str(tmp_path / "measured.ecsv"), str(tmp_path / "matched.ecsv")
