@@ -15,6 +15,7 @@ from .camera_plots import outline_detectors
 #: Panels of one figure of small multiples.
 PANELS = 12
 _MAX_ARROWS = 3000
+_NOTHING = 1e-3  # of the largest coefficient
 _PARTS = {"total": "distortion", "nonlinear": "distortion of degree 2 and more", "dynamic": "dynamic distortion"}
 
 
@@ -194,10 +195,11 @@ def plot_coefficients(solution, name=None, *, lowest=0, fig=None):
         If there is no such exposure, or no mode of that degree.
     """
     first = basis.n_modes(lowest - 1) if lowest else 0
-    n = solution.coefficients.shape[2] - first
+    values, prior, label, bars = _coefficients(solution, name)
+    n = _n_shown(values, first, solution.degree) - first
     if n < 1:
         raise InputError(f"lowest is {lowest}, but the distortion has modes up to degree {solution.degree} only")
-    values, prior, label, bars = _coefficients(solution, name)
+    shown = slice(first, first + n)
     has_prior = prior is not None and np.any(prior)
     fig = elements.new_figure(fig, (max(6.4, 0.34 * n + 1.2), 4.8))
     panels = list(fig.subplots(2, 1, sharex=True, sharey=True))
@@ -206,18 +208,18 @@ def plot_coefficients(solution, name=None, *, lowest=0, fig=None):
         ax.axhline(0, color="black", linewidth=0.6)
         at = np.arange(n)
         if has_prior:
-            ax.bar(at - width / 2, prior[axis, first:], width, color=elements.ORANGE, label="prior")
+            ax.bar(at - width / 2, prior[axis, shown], width, color=elements.ORANGE, label="prior")
             at = at + width / 2
-        ax.bar(at, values[axis, first:], width, color=elements.BLUE, label=label)
+        ax.bar(at, values[axis, shown], width, color=elements.BLUE, label=label)
         for k, (words, (colour, size)) in enumerate(bars.items()):
             shift = (k - (len(bars) - 1) / 2) * width / 2
-            ax.errorbar(at + shift, values[axis, first:], size[axis, first:], fmt="none", ecolor=colour, capsize=2,
+            ax.errorbar(at + shift, values[axis, shown], size[axis, shown], fmt="none", ecolor=colour, capsize=2,
                         elinewidth=1, label=words)  # fmt: skip
         ax.set_ylabel(f"along {'xy'[axis]} [px]")
         ax.grid(axis="y", linewidth=0.3)
         ax.set_axisbelow(True)
-    largest = np.max([size[:, first:] for _, size in bars.values()], initial=0.0)
-    if 0 < 20 * largest < np.abs(values[:, first:]).max():
+    largest = np.max([size[:, shown] for _, size in bars.values()], initial=0.0)
+    if 0 < 20 * largest < np.abs(values[:, shown]).max():
         panels[0].set_yscale("symlog", linthresh=elements.round_down(largest))
         panels[0].yaxis.set_major_formatter("{x:g}")
     orders = list(zip(*basis.orders(basis.degree_of(n + first)), strict=True))[first:]
@@ -230,6 +232,13 @@ def plot_coefficients(solution, name=None, *, lowest=0, fig=None):
         text.set_parse_math(False)
     elements.set_title(panels[0], "Distortion coefficients" if not first else f"Coefficients of degree {lowest} and up")
     return panels
+
+
+def _n_shown(values, first, fitted):
+    """Modes up to the degree that was fitted, or a higher one that a prior has, if it is more than next to nothing."""
+    size = np.abs(values).max(axis=0)
+    seen = np.flatnonzero(size > _NOTHING * size[first:].max(initial=0))
+    return basis.n_modes(max(fitted, int(np.add(*basis.orders(basis.degree_of(len(size))))[seen].max(initial=0))))
 
 
 def _coefficients(solution, name):
