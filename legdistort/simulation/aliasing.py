@@ -12,6 +12,7 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis
+from ..results.absolute_errors import relative_variance
 from ..results.coefficient_covariance import times
 from ..solving.equations import criterion, elimination
 from ..solving.equations.covariances import Uncertainty
@@ -57,6 +58,8 @@ def spectrum_of(given, degree, name="spectrum"):
             raise InputError(f"{name} must be a dict {{degree: pixels}}, (n_modes,) or (2, n_modes), got {given!r}")
         top = max(degree, basis.degree_of(values.shape[-1]))
         out = basis.change_degree(np.broadcast_to(values, (2, values.shape[-1])), top)
+        if np.isnan(values[..., 1:]).all():  # nothing is known of modes that are fitted, those of a higher degree too
+            out[:, values.shape[-1] : n_fit] = np.nan
     if np.any(out < 0) or np.any(np.isinf(out)):
         raise InputError(f"{name} holds standard deviations in pixels, finite and not negative, got {given!r}")
     out[:, 0] = 0
@@ -96,7 +99,7 @@ class Aliasing:
         Of (unmodelled minus estimated) coefficients of all degrees, px^2, x modes first: what is left in the
         corrected positions.
     stars : ndarray, shape (2, n_stars)
-        Variance of the reference positions, x and y, px^2.
+        Variance of the reference positions under the convention of the gauge, x and y, px^2.
     folded : ndarray, shape (2, n_fitted)
         Rms error of the fitted coefficients, over the exposures, pixels: where the energy goes.
     """
@@ -143,6 +146,7 @@ def alias(problem, state, gauge, covariance, *, independent, common):
     together = left.reshape(len(left), n_exposures, -1).sum(axis=1)
     factor = np.hstack([left * np.tile(independent, n_exposures), together * common])
     spread = Uncertainty(full, blocks, gauge, coefficients=factor @ factor.T)
-    stars = spread.stars[:2] - elimination.inverse_star_blocks(blocks.v)[:2]  # without noise of their own
+    noise = Uncertainty(full, blocks, gauge, coefficients=np.zeros_like(normal))
+    all_errors, own = (relative_variance(gauge, each, state.positions.T)[:2] for each in (spread, noise))
     folded = np.einsum("kc,kc->k", factor, factor)[fitted].reshape(n_exposures, 2, n_fit)
-    return Aliasing(spread.coefficients, stars, np.sqrt(folded.mean(axis=0)))
+    return Aliasing(spread.coefficients, all_errors - own, np.sqrt(folded.mean(axis=0)))

@@ -16,7 +16,7 @@ from astropy.table import Table
 from ..exceptions import LegdistortError
 from ..geometry import basis
 from ..results import accuracy
-from ..results.absolute_errors import relative_blocks
+from ..results.absolute_errors import relative_blocks, relative_variance
 from ..results.solution import Solution
 from ..runtime.notebook import ShownAsPrinted
 from ..solving import star_motions
@@ -369,7 +369,7 @@ def _predict(plan):
     return Prediction(
         solution=solution,
         sigma_meas=layout.sigma,
-        b=accuracy.expected_bias(solution),
+        b=finite_rms(np.sqrt(relative_variance(solution.gauge, solution.uncertainty, solution.positions)[:2])),
         b_abs=accuracy.expected_bias(solution, absolute=True) if known or solution.gauge.prior else np.nan,
         sigma=finite_rms(noise[inside]),
         sigma_field=finite_rms(noise),

@@ -54,8 +54,8 @@ def test_few_blocks_cannot_run_here():
     assert all(len(reason.split()) >= 3 for reason in reasons)
 
 
-#: Pages whose results others use, and with what the names of these begin.
-LEAVING = {ROOT / "docs" / "first_mosaic.md": "tutorial", ROOT / "docs" / "imager_frames.md": "imager"}
+#: The page that makes a folder for others, which state how; all else that a page uses it makes itself.
+LEAVING = {ROOT / "docs" / "first_mosaic.md": "tutorial"}
 
 
 def running(page):
@@ -73,6 +73,15 @@ def test_a_page_comes_after_those_that_it_needs():
     order = reading_order()
     assert all(order.index(other) < order.index(page) for page in order for other in needed(page))
     assert sum(bool(needed(page)) for page in order) > 8
+
+
+def test_a_page_states_how_the_folders_that_it_needs_are_made():
+    for page in reading_order():
+        prose = " ".join(BLOCK.sub("", page.read_text(encoding="utf-8")).split())
+        for other in needed(page):
+            shell = "".join(blocks(other, "sh"))
+            (make,) = re.findall(rf"^legdistort demo .*--out {LEAVING[other]}$", shell, re.MULTILINE)
+            assert f"`{make}`" in prose, f"{page.name}: {make}"
 
 
 def run_page(page, place):
@@ -95,14 +104,14 @@ def run_page(page, place):
 
 
 def results(page, done):
-    """Folder with what is there after a page, and what it needs, have been run: once for all tests."""
+    """Folder in which a page has been run, with the folders of `LEAVING` that it needs: once for all tests."""
     place = done / page.stem
     with FileLock(done / f"{page.stem}.lock"):
         if not (done / f"{page.stem}.json").exists():
             shutil.rmtree(place, ignore_errors=True)  # of a run that failed
             place.mkdir()
             for other in needed(page):
-                shutil.copytree(results(other, done), place, dirs_exist_ok=True)
+                shutil.copytree(results(other, done) / LEAVING[other], place / LEAVING[other])
             before = set(os.listdir(place))
             run_page(page, place)
             new = sorted(set(os.listdir(place)) - before)
@@ -113,7 +122,7 @@ def results(page, done):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in reading_order() if running(page)], ids=lambda page: page.stem)
 def test_every_block_of_every_page_runs_as_printed(page, common_folder):
-    """In a folder with the results of the pages that it needs, as a stranger would, who does one page after another."""
+    """In a folder with nothing but what the page names, as someone would who opens this page first."""
     done = common_folder / "pages"
     done.mkdir(exist_ok=True)
     results(page, done)

@@ -439,6 +439,28 @@ def test_what_was_asked_for_stays_as_it_was():
         settings.degree = 2
 
 
+def test_relative_errors_do_not_depend_on_what_is_known_of_the_common_map():
+    """Without a prior the assumed scatter makes the constraints; positions relative to one another do not change."""
+    given = {"n_exposures": 11, "n_stars": 80, "sigma": 0.02, "degree": 3, "dithers": 200.0, "seed": 1}
+    spectrum = {1: 0.5, 2: 0.4, 3: 0.2, 4: 0.05, 5: 0.02}
+    nothing, scatter, all_of_it = predict(**given), predict(**given, dynamic=0.3), predict(**given, spectrum=spectrum)
+    exact = predict(**given, spectrum=spectrum, prior=Prior(np.zeros((2, 1))))
+    assert scatter.solution.gauge.convention is not None
+    for plan in (scatter, all_of_it, exact):
+        assert plan.b == pytest.approx(nothing.b, rel=0.02)
+        stars = plan.solution.stars
+        assert plan.b == pytest.approx(np.sqrt(np.mean([stars["x_err"].value ** 2, stars["y_err"].value ** 2])))
+    assert all_of_it.b_alias == pytest.approx(exact.b_alias, rel=0.02)
+    assert all_of_it.b_abs > 1.5 * exact.b_abs
+
+
+def test_a_degree_higher_than_that_of_the_widths_of_a_prior():
+    prior = Prior(np.zeros((2, 21)), sigma=0.3, static_sigma=0.01)
+    table = predict(n_exposures=11, n_stars=80, sigma=0.02, prior=prior).alternatives()
+    assert table.meta["failed"] == {}
+    assert 4 in table["degree"]
+
+
 def test_alternatives():
     p = predict(n_exposures=8, n_stars=14, sigma=0.02, dynamic=0.4, dithers=40.0)
     table = p.alternatives()
