@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from .assessment import baselines, run_checks, stack_quality
 from .assessment.truth import compare_with_truth
 from .cameras.camera import Camera
+from .coaddition.mosaic_header import is_mosaic
 from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
 from .exceptions import InputError, MatchError
@@ -207,7 +208,7 @@ def run(
             exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, **reading)
             solving = _known_of(exposures, solving, prior, reading["camera"])
         with timed(timings, "measure"):
-            detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, measuring, **share)
+            detections, psfs = _detected(exposures, before, measuring, share)
         with timed(timings, "match"):
             matches = match(detections, exposures=exposures, camera=reading["camera"], **vars(matching))
             matches = replace(matches, left_out=bad | matches.left_out)
@@ -438,16 +439,33 @@ def _check_exposures(exposures, min_exposures, bad):
     for exposure in exposures:
         first = detectors.setdefault(exposure.detector, exposure)
         if exposure.shape != first.shape:
+            mosaics = [each.path or each.name for each in (exposure, first) if is_mosaic(each.header)]
             raise InputError(
                 f"exposure {exposure.name} has shape {exposure.shape}, {first.name} has {first.shape} (ny, nx): "
-                "give frames of one detector, or solve their tables with a shape for each"
+                + (
+                    f"{mosaics[0]} is no frame but a mosaic that legdistort made; leave it out"
+                    if mosaics
+                    else "give frames of one detector, or solve their tables with a shape for each"
+                )
             )
     if min_exposures > n_frames:
         good = "usable exposures" if bad else "exposures"
         raise InputError(
-            f"min_exposures is {min_exposures}, but there are {n_frames} {good}: "
+            f"a star must be in {min_exposures} exposures, but there are only {n_frames} {good}: "
             f"give min_exposures={n_frames} (--min-exposures) or less"
         )
+
+
+def _detected(exposures, before, measuring, share):
+    """Detections and PSFs, from an earlier run or measured now; `InputError` if there is no star at all."""
+    detections, psfs = before.of(exposures) if before else measure_with_psfs(exposures, measuring, **share)
+    if len(detections) == 0:
+        raise InputError(
+            f"no star was detected in any of the {len(exposures)} frames: look at one of them; if there are stars, "
+            "lower the limit of detection (default 5), measuring={'threshold': 3} (--threshold 3), or give the width "
+            "of the stars in pixels, measuring={'fwhm': ...} (--fwhm PIXELS)"
+        )
+    return detections, psfs
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from legdistort.cli.parser import main
 from legdistort.exceptions import InputError
 
 KINDS = {
-    "measuring": ({"threshold": 1}, "threshold must be at least 2"),
+    "measuring": ({"threshold": 1}, "threshold must be a number of at least 2"),
     "matching": ({"tolerance": -1}, "tolerance must be a positive number of pixels"),
     "solving": ({"gauge": "maximal"}, "gauge must be one of 'minimal', 'mean', got 'maximal'"),
     "coadding": ({"order": 9}, "order must be an integer from 0 to 5"),
@@ -63,10 +63,16 @@ def test_other_arguments_are_refused_before_a_frame_is_read(bad, words, tmp_path
         pipeline.run("a.fits", out=tmp_path, **bad)
 
 
+@pytest.mark.parametrize("out", [None, 3])
+def test_a_folder_for_the_results_is_needed(out):
+    with pytest.raises(InputError, match=f"out must be a path, that of the folder for the results, got {out}"):
+        pipeline.run("a.fits", out=out)
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("run --threshold 1", "measuring: threshold must be at least 2"),
+        ("run --threshold 1", "measuring: threshold must be a number of at least 2"),
         ("run --isolation -1", "matching: isolation must be"),
         ("run --error-floor -1", "solving: error_floor must"),
         ("run --pixfrac 2 --algorithm drizzle", "coadding: pixfrac must"),
@@ -74,7 +80,7 @@ def test_other_arguments_are_refused_before_a_frame_is_read(bad, words, tmp_path
         ("run --min-exposures 1", "min_exposures must be"),
         ("run --pixel-scale -1", "--pixel-scale is for the catalogue of --reference"),
         ("run --workers 0", "workers must be"),
-        ("measure --fwhm 0", "fwhm must lie between"),
+        ("measure --fwhm 0", "fwhm must be a number between"),
         ("measure --workers 0", "workers must be"),
         ("noise --gain -1", "gain must be a positive number"),
         ("noise --fluxes -1", "fluxes must be positive numbers"),

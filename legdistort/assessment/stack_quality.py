@@ -230,7 +230,7 @@ class _Sample:
                 )
             fwhm = float(np.nanmedian(column_contract.values(method.observations, "fwhm", "pix")))
         if not (np.isfinite(fwhm) and 0.5 <= fwhm <= 200):
-            raise InputError(f"fwhm must lie between 0.5 and 200 pixels, got {fwhm!r}")
+            raise InputError(f"fwhm must be a number between 0.5 and 200 pixels, got {fwhm!r}")
         if max_stars < 1:
             raise InputError(f"max_stars must be at least 1, got {max_stars!r}")
         good = np.isfinite(method.positions).all(axis=1)

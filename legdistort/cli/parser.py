@@ -21,7 +21,10 @@ def main(argv=None):
     begun = time.perf_counter()
     arguments, unknown = _parser().parse_known_args(argv)
     if unknown:
-        arguments.parser.error(f"no option or place for {' '.join(unknown)}")
+        hint = ""
+        if arguments.command == "solve" and not unknown[0].startswith("-"):
+            hint = ": solve takes one table of matched positions, and lists of exposures go to legdistort match first"
+        arguments.parser.error(f"no option or place for {' '.join(unknown)}{hint}")
     from .running import run_command
 
     arguments.begun = begun

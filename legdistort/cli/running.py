@@ -17,6 +17,9 @@ from .arguments import check_paths, wants_progress
 
 log = logging.getLogger("legdistort")
 
+#: The value of an argument as messages write it in Python: a dict, a tuple, a text, or a word or number.
+_VALUE = r"(?:\{[^{}]*\}|\([^()]*\)|'[^']*'|[^\s(){}',]*)"
+
 
 def run_command(arguments):
     """Run a command of a parsed command line; returns the exit status."""
@@ -54,11 +57,18 @@ def run_command(arguments):
 
 def in_shell_words(text):
     """A message with arguments of Python as the options of the shell, ``clip=None`` as ``--clip 0`` and the like."""
-    text = re.sub(r"\b\w+=\S*,? \((--[^()]*)\)", r"\1", text)  # overwrite=True (--overwrite)
-    text = re.sub(r"\b\w+=\{[^{}]*\} or (?=--)", "", text)  # columns={...} or --columns
-    text = re.sub(r"\(\w+=, (--[^()]*)\)", r"(\1)", text)  # (earlier=, --from)
+    text = re.sub(r"\b\w+\([\w.=]*\) \((legdistort \w+)\)", r"\1", text)  # match(table) (legdistort match)
+    text = re.sub(rf"\b(?:\w+={_VALUE} or )*\w+=({_VALUE}),? \((--[^()]*)\)", _named_option, text)
+    text = re.sub(r"\b(?:\w+=\{[^{}]*\}|\w+\(\w+=\.\.\.\)) or (?=--)", "", text)  # columns={...} or --columns
+    text = re.sub(rf"\(\w+={_VALUE}, (--[^()]*)\)", r"(\1)", text)  # (earlier=, --from)
     text = re.sub(r"(?<![-\w])([a-z_]+)=(?:'([\w-]+)'|(\d[\d.]*))", _as_option, text)
     return re.sub(r"(?<!\w)'([\w.,-]+)'(?!\w)", r"\1", text)
+
+
+def _named_option(found):
+    """``overwrite=True (--overwrite)`` as ``--overwrite``, ``min_exposures=6 (--min-exposures)`` with its number."""
+    value, flag = found.groups()
+    return f"{flag} {value}" if re.fullmatch(r"\d[\d.]*", value) and " " not in flag else flag
 
 
 def _as_option(found):

@@ -52,6 +52,11 @@ def mosaic_header(frames, left_out, factors, settings):
     return header
 
 
+def is_mosaic(header):
+    """Whether the header is that of a mosaic, as `mosaic_header` makes it, whatever the version."""
+    return str(header.get("CREATOR", "")).startswith("legdistort ") and "NCOMBINE" in header
+
+
 def exposure_start(header):
     """Start of an exposure by its header, a `~astropy.time.Time` (UTC), or None."""
     for key in _DATES:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..exceptions import FoldError, InputError
 from ..runtime.notebook import ShownAsPrinted
-from . import basis
+from . import basis, similarity
 from .models import CHUNK, correction_model
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ class Distortion(ShownAsPrinted):
         FoldError
             Naming the worst place, if some points do not converge.
         """
-        p = np.asarray(p, dtype=float)
+        p = similarity.as_positions(p)
         size = CHUNK // 2
         blocks = [self._newton(p[k : k + size], tolerance, max_iterations) for k in range(0, len(p), size)]
         q = np.concatenate(blocks) if blocks else p.copy()

@@ -128,13 +128,13 @@ def leaves(model):
 
 
 def to_pixels(x):
-    """Plain float array of positions given as numbers, or as a quantity in pixels; `InputError` for another unit."""
-    if not isinstance(x, u.Quantity):
-        return np.asarray(x, dtype=float)
+    """Plain float array of positions given as numbers, or as a quantity in pixels; `InputError` for anything else."""
     try:
-        return np.asarray(x.to_value(u.pix), dtype=float)
+        return np.asarray(x.to_value(u.pix) if isinstance(x, u.Quantity) else x, dtype=float)
     except u.UnitConversionError:
         raise InputError(f"positions must be in pixels, got {x.unit}") from None
+    except (TypeError, ValueError) as error:
+        raise InputError(f"positions must be numbers, in pixels: {error}") from None
 
 
 def like(given, pixels):

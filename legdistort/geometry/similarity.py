@@ -17,7 +17,15 @@ def identity():
 
 def apply(pose, xy):
     """Map positions (..., 2) through a pose."""
-    return np.asarray(xy, dtype=float) @ pose[:, :2].T + pose[:, 2]
+    return as_positions(xy) @ pose[:, :2].T + pose[:, 2]
+
+
+def as_positions(xy):
+    """Positions (..., 2) as an array of floats; `InputError` for anything else."""
+    xy = np.asarray(xy, dtype=float)
+    if xy.shape[-1:] != (2,):
+        raise InputError(f"positions must be x and y in pixels, an array of shape (n, 2), got shape {xy.shape}")
+    return xy
 
 
 def invert(pose):

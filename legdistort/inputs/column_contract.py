@@ -222,8 +222,11 @@ _RULES = (
 )
 
 
+#: Description of a column `exposure` that the file of a table does not have.
+OF_FILE = "name of the file"
+_UNMATCHED = "find out first which positions are of the same star: match(table) (legdistort match); "
 _NO_ERRORS = (
-    "; where a list has no errors, give one for all: read_table(error=...), --error PIXELS, and let solve find them "
+    "; where a list has no errors, give one for all, read_table(error=...) or --error PIXELS, and let solve find them "
     "with errors='by-brightness')"
 )
 
@@ -278,14 +281,17 @@ def check(table, contract, what):
     """
     table = as_table(table, what)
     missing = [name for name, (_, required) in contract.items() if required and name not in table.colnames]
-    if missing:
+    if missing and table.colnames:
+        present = [name for name in table.colnames if table[name].info.description != OF_FILE]
         raise InputError(
-            f"{what} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}; it has "
-            f"{', '.join(table.colnames)} (map names: columns={{'{missing[0]}': ...}} or --columns {missing[0]}=..."
+            f"{what} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
+            + _UNMATCHED * ("star" in missing)
+            + f"it has {', '.join(present)} (map names: columns={{'{missing[0]}': ...}} or --columns {missing[0]}=..."
             + (_NO_ERRORS if {"x_err", "y_err"} & set(missing) else ")")
         )
     if len(table) == 0:
-        raise InputError(f"{what} is empty")
+        needed = f" the columns {', '.join(missing)} and" if missing else ""
+        raise InputError(f"{what} is empty: give one with{needed} a row for each position")
     out = QTable()
     for name in table.colnames:
         unit = contract[name][0] if name in contract else None

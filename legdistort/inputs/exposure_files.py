@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.io import fits
-from astropy.wcs import WCS
 
 from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, without_astropy_warnings
 from ..runtime.asdf_files import ARCHIVES, read_tree
@@ -32,7 +31,7 @@ from .exposures import LEAVE_OUT, Exposure, known_from_header
 from .file_images import find_image, images_of_detectors, is_image, named_images, of_detector
 from .foreign_images import from_nddata, is_nddata, read_roman
 from .pixel_flags import bad_pixels, good_bits
-from .sky_wcs import believable_wcs
+from .sky_wcs import believable_wcs, header_wcs
 
 if TYPE_CHECKING:
     from astropy.wcs.wcsapi import BaseHighLevelWCS
@@ -45,6 +44,7 @@ log = logging.getLogger(__name__)
 UNCERTAINTY_NAMES = {"ERR": "StdDev", "UNCERT": "StdDev", "VAR": "Variance", "VARIANCE": "Variance"}
 MASK_NAMES = ("DQ", "MASK")
 _FILTERS = threading.Lock()  # warning filters belong to the process, not to the thread that changes them
+_NO_FRAME = "tables of positions go to match(table) (legdistort match)"
 _DAMAGED = "truncated or damaged, its image cannot be read"
 _UNREADABLE = (OSError, EOFError, TypeError, ValueError, KeyError, IndexError, zlib.error, fits.VerifyError)
 
@@ -255,7 +255,7 @@ def _tell_bad(bad, n_good, stop_at_bad):
         raise InputError(f"{unusable}; repair them, or leave them out")
     if n_good < 2:
         raise InputError(f"{unusable}; {'one good frame is' if n_good else 'no good frame is'} left, give at least two")
-    warn(f"{unusable}; they are left out (--stop-at-bad, stop_at_bad=True, refuses them)", AssumptionWarning)
+    warn(f"{unusable}; they are left out; stop_at_bad=True (--stop-at-bad) refuses them", AssumptionWarning)
 
 
 def _read_each(paths, read, ext, progress, bad=None, copies=None):
@@ -384,7 +384,7 @@ class _OpenFile(contextlib.ExitStack):
 
     @cached_property
     def hdulist(self):
-        return self.enter_context(open_fits(self.file, self.path))
+        return self.enter_context(open_fits(self.file, self.path, _NO_FRAME))
 
     @cached_property
     def checksum(self):
@@ -474,7 +474,7 @@ def _told(sentence):
 @contextlib.contextmanager
 def _opened(path):
     """A FITS file as an HDUList."""
-    with _file(path) as file, open_fits(file, path) as hdulist:
+    with _file(path) as file, open_fits(file, path, _NO_FRAME) as hdulist:
         yield hdulist
 
 
@@ -486,11 +486,7 @@ def _from_hdulist(hdulist, ext, label, path, good=None):
         integer = hdu.header.get("BITPIX", -32) > 0  # before the data are touched: scaling changes it
         planes = _planes(hdulist, hdu, good)
     name = exposure_name(label, ext)
-    try:
-        wcs = believable_wcs(WCS(header, fobj=hdulist), hdu.shape, name)
-    except Exception as error:  # wcslib raises many kinds; a header WCS is a hint, never a must
-        log.info("%s: WCS of the header not used: %s", name, error)
-        wcs = None
+    wcs = header_wcs(header, hdulist, hdu.shape, name)
     known = known_from_header(header, planes["data"], integer=integer)
     tables = [other for other in hdulist if other.name == "ASDF"]
     if len(tables) == 1:

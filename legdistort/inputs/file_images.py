@@ -204,4 +204,7 @@ def _listed_images(hdulist, images):
     name, comma, version = forms[0].partition(",")
     python = f"({name!r}, {version})" if comma else name
     listed_so = f"{len(images)} images, {', '.join(named)}{more} (ny, nx)"
-    return f"{listed_so}: choose one with ext, as in ext={python} (--ext {forms[0]})"
+    advice = f"choose one, such as ext={python} (--ext {forms[0]})"
+    if all(hdu.name == images[0].name != "" for hdu in images) and comma:
+        advice += f", or take all as the detectors of one camera, ext={name!r} (--ext {name})"
+    return f"{listed_so}: {advice}"

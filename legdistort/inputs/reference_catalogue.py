@@ -100,7 +100,7 @@ class Reference:
         if epoch is None:
             raise InputError(
                 f"{self.label} has proper motions, but the epoch of the exposures is not known (no MJD-OBS or DATE-OBS "
-                "in their headers): give epoch=, a decimal year or an astropy Time (--epoch)"
+                "in their headers): give epoch= (--epoch), a decimal year or an astropy Time"
             )
         years = epoch - self.epoch
         known = np.isfinite(self.motion[:, :2]).all(axis=1) & np.isfinite(self.covariance[:, :4, :4]).all(axis=(1, 2))

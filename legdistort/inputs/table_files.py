@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
-from astropy.table import QTable
+from astropy.table import Column, QTable
 
 from ..exceptions import InputError
 from ..runtime import outputs, provenance
@@ -81,7 +81,7 @@ def _united(parts, path):
         if "exposure" not in table.colnames:
             name = exposure_names.exposure_name(stem) + (f"_{number}" if number is not None else "")
             exposure_names.check_exposure_name(name, path)
-            table["exposure"] = np.full(len(table), name)
+            table["exposure"] = Column(np.full(len(table), name), description=column_contract.OF_FILE)
             if "shape" in table.meta:
                 shapes[name] = table.meta.pop("shape")
     out = formats.stack(list(parts.values())) if len(parts) > 1 else next(iter(parts.values()))

@@ -224,8 +224,8 @@ def _check_names(table, names, min_exposures):
         raise MatchError(f"only one exposure ({names[0]}): give at least two of the same field")
     if len(names) < min_exposures:
         raise InputError(
-            f"{len(names)} exposures were given and stars must be in min_exposures={min_exposures} of them; "
-            f"use min_exposures={len(names)} or fewer (--min-exposures)"
+            f"a star must be in {min_exposures} exposures, but there are only {len(names)} exposures: "
+            f"give min_exposures={len(names)} (--min-exposures) or less"
         )
 
 
@@ -236,7 +236,7 @@ def _shapes(table, names, named, shape):
         shape = tuple(int(np.ceil(table[c].to_value(u.pix).max() + 0.5)) for c in ("y", "x"))
         warn(
             f"no shape given: every exposure is taken as {shape[1]} x {shape[0]} pixels, the extent of the positions; "
-            "pass shape=(ny, nx) or exposures=",
+            "give shape=(ny, nx) or exposures= (--shape NY NX)",
             AssumptionWarning,
         )
     return shapes_by_exposure(shape, names)

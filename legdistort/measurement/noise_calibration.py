@@ -138,7 +138,7 @@ def check_injection(fluxes=None, fwhm=None, n_positions=100, seed=0):
     if fwhm is not None:
         widths = np.unique(np.asarray(fwhm, dtype=float)).tolist()
         if not widths or not all(0.5 <= width <= 200 for width in widths):
-            raise InputError(f"fwhm must lie between 0.5 and 200 pixels, got {fwhm!r}")
+            raise InputError(f"fwhm must be a number between 0.5 and 200 pixels, got {fwhm!r}")
     if int(n_positions) != n_positions or n_positions < 10:
         raise InputError(f"n_positions must be an integer of at least 10, got {n_positions!r}")
     if isinstance(seed, bool) or int(seed) != seed or seed < 0:

@@ -37,9 +37,11 @@ class MeasureOptions:
 
     def __post_init__(self):
         if self.fwhm is not None and not (isinstance(self.fwhm, Real) and 0.5 <= self.fwhm <= 200):
-            raise InputError(f"fwhm must lie between 0.5 and 200 pixels, got {self.fwhm!r}")
+            raise InputError(f"fwhm must be a number between 0.5 and 200 pixels, got {self.fwhm!r}")
         if not (isinstance(self.threshold, Real) and self.threshold >= 2):
-            raise InputError(f"threshold must be at least 2 (signal-to-noise ratio), got {self.threshold!r}")
+            raise InputError(
+                f"threshold must be a number of at least 2 (signal-to-noise ratio), got {self.threshold!r}"
+            )
         if self.max_stars is not None and not (isinstance(self.max_stars, Integral) and self.max_stars >= 1):
             raise InputError(f"max_stars must be at least 1, and an integer, got {self.max_stars!r}")
         if self.box is not None and not (isinstance(self.box, Integral) and self.box >= 5 and self.box % 2 == 1):

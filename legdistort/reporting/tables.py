@@ -122,10 +122,9 @@ def detectors_table(camera):
     head = {"detector": "", "centre x": "px", "centre y": "px", "rotation": "deg", "scale": "", "static": "rms, px"}
     rows = []
     for key, each in camera.detectors.items():
-        place, errors = each.place, each.place.errors or ("", "", "")
-        errors = ["" if e == "" else " ± unknown" if np.isinf(e) else f" ± {e:.2g}" for e in errors]
-        values = f"{place.x:.3f}", f"{place.y:.3f}", f"{place.rotation:.5f}"
-        cells = [value + error for value, error in zip(values, errors, strict=True)]
+        place, errors = each.place, each.place.errors or (None, None, None)
+        values = (place.x, 3), (place.y, 3), (place.rotation, 5)
+        cells = [_with_error(*value, error) for value, error in zip(values, errors, strict=True)]
         rows.append(Row([key, *cells, f"{place.scale:.6f}", f"{each.rms:.3f}"]))
     return Table(
         head,
@@ -145,6 +144,17 @@ def sizes(solution):
         static = np.mean(solution.coefficients, axis=0)
     parts = solution.coefficients, solution.coefficients - static
     return [np.sqrt(np.sum(part[:, :, 1:] ** 2, axis=(1, 2))) / 2 for part in parts]
+
+
+def _with_error(value, digits, error):
+    """A value and its error with the same decimals, two significant digits of the error; without one so many digits."""
+    if error is None:
+        return f"{value:.{digits}f}"
+    if not np.isfinite(error):
+        return f"{value:.{digits}f} ± unknown"
+    if error > 0:
+        digits = max(0, 1 - int(f"{error:.1e}".partition("e")[2]))  # of the error as it is rounded
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 def _number(value, digits=4):

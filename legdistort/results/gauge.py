@@ -463,7 +463,7 @@ class Gauge(ShownAsPrinted):
         dynamic = np.sqrt(np.sum(self.scatter**2) / 8)
         lines.append(
             f"Absolute errors (rms over the field, per axis) come from {_STATIC[self.static][1]}; single exposures "
-            f"depart from its mean by {dynamic:.2g} px rms per axis. "
+            f"depart from their mean by {dynamic:.2g} px rms per axis. "
             + ("No external reference was used." if self.tie is None else self.tie.statement)
         )
         return "\n".join(lines)

@@ -117,7 +117,7 @@ def readable(name):
 
 
 @contextmanager
-def open_fits(file, name):
+def open_fits(file, name, instead=None):
     """An HDUList of an open file, unpacked if it is packed, in which nothing claims more than there may be.
 
     Parameters
@@ -125,6 +125,8 @@ def open_fits(file, name):
     file : binary file
     name : str or path
         For messages.
+    instead : str, optional
+        What to do with a file that is not FITS at all, for the message.
 
     Raises
     ------
@@ -139,11 +141,21 @@ def open_fits(file, name):
         _check_counts(content, size, name)
         content.seek(0)
         with without_astropy_warnings():
-            hdulist = fits.open(content, memmap=False)
+            hdulist = _opened(content, name, instead)
             for i, hdu in enumerate(hdulist):
                 _check_claim(i, hdu, size, name)
         with hdulist:
             yield hdulist
+
+
+def _opened(content, name, instead):
+    try:
+        return fits.open(content, memmap=False)
+    except OSError as error:
+        if "SIMPLE" not in str(error):
+            raise
+        fault = "cannot be read as FITS, damaged or something else (it has no card SIMPLE)"  # the advice there is none
+        raise DamagedError(f"{name}: {fault}" + (f"; {instead}" if instead else "")) from None
 
 
 def _check_counts(content, size, name):

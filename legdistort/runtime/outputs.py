@@ -80,8 +80,10 @@ def check_folder(out):
     Raises
     ------
     InputError
-        If `out` is a file, or cannot be written.
+        If `out` is no path or a file, or cannot be written.
     """
+    if not isinstance(out, (str, Path)):
+        raise InputError(f"out must be a path, that of the folder for the results, got {out!r}")
     out = Path(out)
     existing = next(place for place in (out, *out.absolute().parents) if place.exists())
     if not existing.is_dir():

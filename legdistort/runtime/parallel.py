@@ -102,7 +102,7 @@ def check_workers(workers):
     if workers is None:
         return 1
     if isinstance(workers, bool) or not isinstance(workers, Integral) or workers < 1:
-        raise InputError(f"workers must be a positive integer, or None for one, got {workers!r}")
+        raise InputError(f"workers must be a positive integer, got {workers!r}")
     return int(workers)
 
 

@@ -278,13 +278,13 @@ def header(truth, name, night, index, detector=None):
     cd = sky.matrix[:, :2] @ np.linalg.inv(pose[:, :2])
     start = datetime(2014, 12, 8, 3) + index * timedelta(seconds=night.cadence)
     if truth.years is not None:
-        start = Time(truth.years[index], format="jyear", scale="utc").to_datetime()
+        start = Time(Time(truth.years[index], format="jyear", scale="utc").isot, scale="utc").to_datetime()  # ms
     return fits.Header(
         [
             ("FILENAME", f"{name}.fits"),
             ("OBJECT", "SIMULATED", "simulated star field"),
             *([("CCDCHIP", int(detector))] if detector else []),
-            ("DATE-OBS", start.isoformat()),
+            ("DATE-OBS", start.isoformat(timespec="auto" if truth.years is None else "milliseconds")),
             ("MJD-OBS", round((start - datetime(1858, 11, 17)) / timedelta(days=1), 8)),
             ("EXPTIME", night.exptime, "[s]"),
             ("GAIN", night.gain, "[electron/adu]"),

@@ -19,6 +19,7 @@ from ..inputs import column_contract
 from ..priors.prior import Prior
 from ..runtime.checks import check_choice, check_counts
 from ..runtime.words import GAUGES
+from ..solving.equations.problem import as_given
 from . import observations, truth
 
 
@@ -61,7 +62,7 @@ class Plan:
         object.__setattr__(self, "degree", basis.check_degree(self.degree))
         check_choice(self.gauge, GAUGES, "gauge")
         if not isinstance(self.prior, Prior | None):
-            raise InputError(f"prior must be a Prior, got {type(self.prior).__name__}")
+            raise InputError(f"prior must be a Prior, got {as_given(self.prior)}")
         if np.shape(self.shape) != (2,):
             raise InputError(f"shape must be (ny, nx) of the detector, got {self.shape!r}")
         check_counts(**dict(zip(("ny in shape", "nx in shape"), self.shape, strict=True)))

@@ -274,9 +274,12 @@ def draw_stars(rng, n, region, inside, least, *, separation=0.0):
                     kept = np.vstack([kept, xy])
         if len(kept) >= n:
             return kept[:n]
+    found = f"only {len(kept)} of {n} stars found a place on {least} exposures or more"
+    if separation:
+        raise InputError(f"{found}, {separation:.0f} px apart: ask for fewer stars, or for smaller dithers")
     raise InputError(
-        f"only {len(kept)} of {n} stars found a place on at least {least} exposures, {separation:.0f} px apart: "
-        "ask for fewer stars, smaller dithers or fewer exposures of each"
+        f"{found}: the dithers, and a margin if there is one, leave too little of the detector that {least} exposures "
+        "share; make them smaller, or (in Python) give a smaller min_exposures"
     )
 
 

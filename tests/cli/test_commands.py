@@ -205,6 +205,10 @@ def test_noise_frame_is_left_out_by_name(whole):
         (["slove", "m.ecsv"], r"legdistort: .*invalid choice: slove .*; did you mean solve\?"),
         (["solve", "m.ecsv", "--degre", "3", "--out", "x"], r"legdistort solve: .* --degre 3; did you mean --degree\?"),
         (["run", "a.fits", "--over", "--out", "x"], r"legdistort run: .* --over; did you mean --overwrite\?"),
+        (
+            ["solve", "a.lis", "b.lis", "--out", "x"],
+            r".* no option or place for b.lis: .* go to legdistort match first",
+        ),
         (["solve"], r"legdistort solve: the following arguments are required: TABLE, --out \("),
     ],
 )
@@ -376,7 +380,7 @@ def test_missing_column_tells_how_to_map_it(tmp_path, capsys):
     table.rename_column("star", "id")
     table.write(tmp_path / "t.ecsv")
     arguments = ["solve", str(tmp_path / "t.ecsv"), "--shape", "512", "512", "--out", str(tmp_path / "out")]
-    failed(capsys, main(arguments), "lacks the column star", "--columns star=")
+    failed(capsys, main(arguments), "lacks the column star", "legdistort match;", "--columns star=")
 
 
 def test_wrong_usage_exits_with_2(capsys):
@@ -847,6 +851,14 @@ def test_outputs_are_tried_and_not_only_permitted(night, tmp_path, capsys, monke
         ("a catalogue (reference=, --reference)", "a catalogue (--reference)"),
         ("errors='floor' finds the error floor", "--errors floor finds the error floor"),
         ("min_exposures=4 of them", "--min-exposures 4 of them"),
+        ("give min_exposures=6 (--min-exposures) or less", "give --min-exposures 6 or less"),
+        ("by their name (ext='SCI', --ext SCI), or", "by their name (--ext SCI), or"),
+        ("ext=('SCI', 1) (--ext SCI,1)", "--ext SCI,1"),
+        ("give shape=(ny, nx) or exposures= (--shape NY NX)", "give --shape NY NX"),
+        ("give one, read_table(error=...) or --error PIXELS", "give one, --error PIXELS"),
+        ("call match(table) (legdistort match) first", "call legdistort match first"),
+        ("lower it, measuring={'threshold': 3} (--threshold 3)", "lower it, --threshold 3"),
+        ("columns={'star': ...} or --columns star=...", "--columns star=..."),
         ("must be one of 'joint', 'alternating', got 'x'", "must be one of joint, alternating, got x"),
         ("it's the star's own", "it's the star's own"),
     ],

@@ -32,6 +32,12 @@ def test_apply_is_mx_plus_t(a):
     assert_allclose(similarity.apply(a, XY)[3], a[:, :2] @ XY[3] + a[:, 2])
 
 
+@pytest.mark.parametrize("xy", [[[1.0, 2.0, 3.0]], [1.0], 2.0])
+def test_what_is_no_position_is_refused(xy):
+    with pytest.raises(InputError, match=r"positions must be x and y in pixels, an array of shape \(n, 2\), got"):
+        similarity.apply(similarity.identity(), xy)
+
+
 @given(similarities())
 def test_inverse_undoes(a):
     assert_allclose(similarity.apply(similarity.invert(a), similarity.apply(a, XY)), XY, atol=1e-8)

@@ -57,6 +57,7 @@ def test_text_in_a_column_of_numbers():
     [
         ({"x_err": None}, r"the table lacks the column x_err; it has exposure, star, .*--columns x_err=\.\.\."),
         ({"x_err": None, "star": None}, "the table lacks the columns star, x_err"),
+        ({"star": None}, r"the column star; find out first which .*: match\(table\) \(legdistort match\); it has"),
         ({"x": [1.0, np.nan, 3.0]}, r"x is not finite in 1 of 3 rows; the first is row 1 \(exposure a, star 2\)"),
         ({"y": [1.0, np.inf, np.nan]}, "y is not finite in 2 of 3 rows; the first is row 1"),
         (

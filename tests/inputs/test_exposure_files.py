@@ -33,9 +33,9 @@ def test_a_file_is_opened_once_for_all_its_detectors(tmp_path, monkeypatch, pack
     path = mosaic_file(tmp_path / f"a.fits{packed}", *((name, v) for v in (1, 2, 3, 4) for name in ("SCI", "DQ")))
     opened = []
 
-    def counted(file, name):
+    def counted(file, name, instead):
         opened.append(name)
-        return fits_bytes.open_fits(file, name)
+        return fits_bytes.open_fits(file, name, instead)
 
     monkeypatch.setattr(exposure_files, "open_fits", counted)
     exposures = ld.open_exposures(path, ext="SCI")
@@ -154,6 +154,26 @@ def test_run_leaves_bad_files_out(tmp_path, night):
     assert made.solution.left_out.keys() == reasons.keys() == made.summary["left_out"].keys()
     with pytest.raises(InputError, match="4 of 10 frames cannot be used"):
         ld.run([*night, *bad], out=tmp_path / "none", stop_at_bad=True)
-    with pytest.warns(AssumptionWarning), pytest.raises(InputError, match="is 4, but there are 3 usable exposures"):
+    with pytest.warns(AssumptionWarning), pytest.raises(InputError, match="but there are only 3 usable exposures"):
         ld.run([*night[:3], *bad], out=tmp_path / "none")
     assert not (tmp_path / "none").exists()
+
+
+def test_frames_without_a_star_are_named(tmp_path):
+    for k in range(4):
+        fits.PrimaryHDU(pixels(k)).writeto(tmp_path / f"f{k}.fits")
+    with pytest.raises(InputError, match=r"no star was detected in any of the 4 frames: .*\(--threshold 3\)"):
+        ld.run(str(tmp_path / "*.fits"), out=tmp_path / "out")
+
+
+def test_a_mosaic_among_the_frames_is_told(tmp_path, night):
+    """Results may stand beside the frames, and ``*.fits`` names them all."""
+    header = fits.Header([("NCOMBINE", 4), ("CREATOR", "legdistort 0.1.0")])
+    path = tmp_path / "mosaic.fits"
+    fits.PrimaryHDU(pixels(9, (600, 700)), header).writeto(path)
+    for frames in ([*night, path], [path, *night]):
+        with pytest.raises(InputError, match=r"mosaic\.fits is no frame but a mosaic that legdistort made; leave it"):
+            ld.run(frames, out=tmp_path / "out")
+    fits.PrimaryHDU(pixels(9, (600, 700))).writeto(path, overwrite=True)
+    with pytest.raises(InputError, match="give frames of one detector"):
+        ld.run([*night, path], out=tmp_path / "out")

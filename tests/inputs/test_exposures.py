@@ -261,6 +261,8 @@ def test_not_fits(tmp_path):
     for name in ("text.fits", "empty.fits", "noise.fits.gz"):
         with pytest.raises(InputError, match=f"{name}: cannot be read as FITS"):
             read_exposures(tmp_path / name)
+    with pytest.raises(InputError, match=r"text.fits: .* \(it has no card SIMPLE\); tables of positions go to match\("):
+        read_exposures(tmp_path / "text.fits")
     with pytest.raises(InputError, match=r"nowhere.fits: no such file"):
         read_exposures(tmp_path / "nowhere.fits")
     with pytest.raises(InputError, match=r"is not a file but a folder; name the files in it \(.*/\*\)"):

@@ -38,8 +38,9 @@ def test_several_images_are_refused_with_their_list(tmp_path, read, names, told,
     with pytest.raises(InputError) as error:
         read(path)
     message = str(error.value)
-    assert message.startswith(f"{path} holds {told} (ny, nx): choose one with ext")
+    assert message.startswith(f"{path} holds {told} (ny, nx): choose one, such as ext=")
     assert "(--ext " in message
+    assert ("as the detectors of one camera, ext='SCI' (--ext SCI)" in message) == (names[0][0] == "SCI")
     (chosen,) = read(path, ext=ext)
     assert np.array_equal(chosen.read().data, pixels(2 if len(names) == 4 else 1))
 
@@ -82,5 +83,9 @@ def test_the_command_names_the_way_out(tmp_path, capsys):
     assert main(["measure", str(path), "--out", str(tmp_path / "a.ecsv"), "--quiet"]) == 1
     told = capsys.readouterr().err
     assert "mef.fits holds 2 images, SCI,1" in told
-    option = told.split("(--ext ")[1].split(")")[0]
-    assert main(["measure", str(path), "--out", str(tmp_path / "a.ecsv"), "--quiet", "--ext", option]) == 0
+    one, every = (part.split()[0].strip(",") for part in told.split("--ext ")[1:])
+    assert (one, every) == ("SCI,1", "SCI")
+    assert "ext=" not in told
+    for option in (one, every):
+        given = ["--out", str(tmp_path / "a.ecsv"), "--quiet", "--overwrite", "--ext", option]
+        assert main(["measure", str(path), *given]) == 0

@@ -226,7 +226,7 @@ def test_votable_in(tmp_path):
         ("image.fits", None, r"image\.fits: it has no table \(1 HDUs, all images\)"),
         ("broken.ldac", b"no", r"broken\.ldac: cannot be read as a table"),
         ("broken.vot", b"<VOTABLE><", r"broken\.vot: cannot be read as a table"),
-        ("empty.cat", b"", r"empty\.cat: cannot be read as a table"),
+        ("empty.cat", b"", r"empty\.cat: the file is empty"),
         ("binary.txt", bytes(range(256)), r"binary\.txt: "),
     ],
 )

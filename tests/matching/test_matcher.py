@@ -326,10 +326,17 @@ def test_flags():
     assert np.any(match(table, shape=SHAPE, reject_flags=1).table["flags"] == 2)
 
 
+def test_an_empty_table_is_told_from_one_without_columns():
+    with pytest.raises(InputError, match="is empty: give one with the columns exposure, x, y, x_err, y_err and a row"):
+        match(Table())
+    with pytest.raises(InputError, match="is empty: give one with a row for each position"):
+        match(make_field(40, *six_poses(0.5, 100), seed=1)[:0], shape=SHAPE)
+
+
 def test_bad_arguments():
     table = make_field(40, *six_poses(0.5, 100), seed=1)
     three = table[np.isin(table["exposure"], ["e00", "e01", "e02"])]
-    with pytest.raises(InputError, match=r"3 exposures .* use min_exposures=3"):
+    with pytest.raises(InputError, match=r"only 3 exposures: give min_exposures=3 \(--min-exposures\)"):
         match(three, shape=SHAPE)
     with pytest.raises(MatchError, match="only one exposure"):
         match(table[table["exposure"] == "e00"], shape=SHAPE)

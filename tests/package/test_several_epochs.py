@@ -1,5 +1,7 @@
 """Nights of several epochs: simulated, solved, and seen at another time."""
 
+import re
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -56,6 +58,7 @@ def test_a_night_in_the_shell_with_its_truth(tmp_path, capsys):
     assert truth.meta["epoch"] == pytest.approx((2015 + 2015 + 2016.2 + 2017.9) / 4, abs=1e-4)
     header = fits.getheader(tmp_path / "night" / "exp03.fits")
     assert header["DATE-OBS"].startswith("2017-11")
+    assert re.fullmatch(r"[-\d]+T[:\d]+\.\d{3}", header["DATE-OBS"])  # whole milliseconds
     assert truth.meta["exp03"]["epoch"] == pytest.approx(2017.9, abs=1e-4)
 
 

@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
 from time import process_time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from matplotlib import pyplot, style
 from PIL import Image
 
 from legdistort.assessment.pulls import pulls_of
+from legdistort.cameras.detector import Place
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
 from legdistort.inputs.exposures import Exposure, observed
@@ -24,6 +26,7 @@ from legdistort.plots import elements
 from legdistort.reporting import page as report
 from legdistort.reporting.pictures import Picture
 from legdistort.reporting.svg import STYLE, detached_figure, svg_of
+from legdistort.reporting.tables import detectors_table
 from legdistort.simulation import observations
 from legdistort.solving.estimation import solve
 
@@ -332,3 +335,18 @@ def test_solved_set_gives_a_page(tmp_path):
     assert page.row("Gauge")[1] == solution.gauge.sentence
     assert "#000000" not in path.read_text(encoding="utf-8")
     assert pyplot.get_fignums() == before
+
+
+@pytest.mark.parametrize(
+    ("errors", "cells"),
+    [
+        (None, ["136.158", "-0.752", "0.01492"]),
+        ((0.0095, 0.013, 0.00012), ["136.1582 ± 0.0095", "-0.752 ± 0.013", "0.01492 ± 0.00012"]),
+        ((0.00996, 1.25, 0.01), ["136.158 ± 0.010", "-0.8 ± 1.2", "0.015 ± 0.010"]),
+        ((37.0, np.inf, 0.0), ["136 ± 37", "-0.752 ± unknown", "0.01492 ± 0.00000"]),
+    ],
+)
+def test_values_of_detectors_have_the_digits_of_their_errors(errors, cells):
+    detector = SimpleNamespace(place=Place(136.15819, -0.7524, 0.014917, 1.0, errors), rms=0.1)
+    (row,) = detectors_table(SimpleNamespace(detectors={"1": detector})).rows
+    assert row.cells[1:4] == cells

@@ -328,6 +328,13 @@ def test_bad_tables_are_named(solution):
         solution.correct_table(table)
 
 
+@pytest.mark.parametrize("xy", [[[1, 2, 3]], [1, 2, 3], [[1]], "here"])
+def test_what_are_no_positions_is_refused(solution, xy):
+    for given in ({}, {"errors": np.zeros((1, 2))}):
+        with pytest.raises(InputError, match=r"positions must be (x and y in pixels, an array .*, got shape|numbers)"):
+            solution.correct(solution.names[0], xy, **given)
+
+
 def test_command(solution, tmp_path, capsys):
     solution.write(tmp_path / "solution.asdf")
     measured(solution).write(tmp_path / "new.ecsv")

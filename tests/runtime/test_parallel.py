@@ -150,7 +150,7 @@ class TestEach:
 
     @pytest.mark.parametrize("workers", [0, -1, 1.5, True, "two", np.nan])
     def test_bad_numbers_of_workers(self, workers):
-        with pytest.raises(InputError, match="workers must be a positive integer, or None for one, got"):
+        with pytest.raises(InputError, match="workers must be a positive integer, got"):
             list(map_items(abs, [1], workers=workers))
 
 

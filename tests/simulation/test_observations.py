@@ -215,7 +215,8 @@ def test_rotation_turns_about_the_middle_of_the_detector():
         ({"rotations": [0.0, 1.0]}, "rotations must have one value for each of the 10 exposures"),
         ({"seen": 0.0}, "seen=0.0"),
         ({"corr": 1.0}, "corr=1.0"),
-        ({"margin": 1100.0}, "only 0 of 30 stars found a place"),
+        ({"margin": 1100.0}, "only 0 of 30 stars found a place on 4 exposures or more: the dithers"),
+        ({"dither": 20000.0}, "leave too little of the detector that 4 exposures share; make them smaller"),
     ],
 )
 def test_bad_arguments(settings, message):

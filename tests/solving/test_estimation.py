@@ -271,6 +271,7 @@ def test_robust_losses_resist_outliers(loss):
         ({"error_floor": -0.1}, r"error_floor must be a finite number of pixels, 0 or more, got -0\.1"),
         ({"method": "alternating", "clip": 5}, "takes neither loss nor clip"),
         ({"prior": 3}, "prior must be a Prior or a dict of them, got int"),
+        ({"prior": "gsaoi-2"}, r"got 'gsaoi-2': give Prior\.from_file\('gsaoi-2'\)"),
     ],
 )
 def test_bad_options_are_named(arguments, message):

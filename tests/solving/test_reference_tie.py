@@ -578,7 +578,7 @@ def test_most_stars_elsewhere():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, r"the epoch of the exposures is not known .* give epoch=, a decimal year or an astropy Time \(--epoch\)"),
+        ({}, r"the epoch of the exposures is not known .* give epoch= \(--epoch\), a decimal year or an astropy Time"),
         ({"epoch": 20}, "epoch must be a decimal year, such as 2013.25, or one astropy Time, got 20"),
         ({"epoch": "2020"}, "epoch must be a decimal year"),
         ({"epoch": 2021, "pixel_scale": -1}, "pixel_scale must be a positive number of arcsec, got -1"),

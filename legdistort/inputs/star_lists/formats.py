@@ -55,6 +55,8 @@ def read(path):
     except OSError as error:
         raise InputError(f"cannot be read as a table: damaged ({error})") from None
     content, name = file.getvalue(), path if file is plain else Path(path.stem)
+    if not content.strip():
+        raise InputError("the file is empty")
     suffix = name.suffix.lower()
     try:
         if content.startswith(b"SIMPLE") or suffix in (".fits", ".fit", ".fts", ".ldac"):

@@ -4,6 +4,7 @@ import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Real
+from pathlib import Path
 
 import numpy as np
 
@@ -219,7 +220,14 @@ def check_error_floor(error_floor):
 def check_prior(prior):
     """Raise `InputError` for what is neither a `Prior`, a dict, nor None."""
     if not isinstance(prior, Prior | dict | None):
-        raise InputError(f"prior must be a Prior or a dict of them, got {type(prior).__name__}")
+        raise InputError(f"prior must be a Prior or a dict of them, got {as_given(prior)}")
+
+
+def as_given(prior):
+    """What was given in the place of a `Prior`, in words; names and files are read by `Prior.from_file`."""
+    if isinstance(prior, (str, Path)):
+        return f"{str(prior)!r}: give Prior.from_file({str(prior)!r})"
+    return type(prior).__name__
 
 
 def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=None, motion=None):
