@@ -4,6 +4,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.sparse import csr_array
 
+from legdistort.geometry import basis
 from legdistort.solving.equations import criterion
 from legdistort.solving.equations.problem import State
 
@@ -30,7 +31,7 @@ def solve_scipy(problem, state):
         return State(x[: 2 * n_stars].reshape(2, -1), coefficients, state.poses)
 
     def residuals(x):
-        return (root * criterion.residuals(problem, unpack(x))).ravel()
+        return (root * _residuals(problem, unpack(x))).ravel()
 
     def jacobian(x):
         current = unpack(x)
@@ -46,3 +47,13 @@ def solve_scipy(problem, state):
     start = np.concatenate([state.positions.ravel(), state.coefficients[:, :, :n_modes].ravel()])
     result = least_squares(residuals, start, jac=jacobian, method="trf", x_scale="jac", tr_solver="lsmr")
     return unpack(result.x), 2 * result.cost
+
+
+def _residuals(problem, state):
+    """Measured less model positions (2, n), an exposure at a time: what is computed of one stays in the cache."""
+    out, degree = problem.xy.copy(), basis.degree_of(state.coefficients.shape[2])
+    for i, (pose, coefficients) in enumerate(zip(state.poses, state.coefficients, strict=True)):
+        part = problem.part(i)
+        q = pose[:, :2] @ state.positions[:, problem.star[part]] + pose[:, 2:]
+        out[:, part] -= q + coefficients @ basis.values(degree, *basis.normalize(q.T, problem.shapes[i]))
+    return out
