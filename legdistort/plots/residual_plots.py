@@ -217,14 +217,12 @@ def plot_pulls(pulls, *, against="brightness", ax=None):
     sums = pulls.by_star() if by_star else pulls.by_exposure()
     shown = np.flatnonzero((sums.freedom > 0.5) & np.isfinite(sums.at))
     rms, free, at = (each[shown] for each in (sums.rms, sums.freedom, sums.at))
-    order = np.argsort(at, kind="stable")
     low, high = (np.sqrt(chdtri(free, p) / free) for p in (0.5 + _BAND / 2, 0.5 - _BAND / 2))
-    if len(order) > 30:  # a band that follows the number of observations, not each star
-        at_band, low = elements.running_median(at, low)
-        high = elements.running_median(at, high)[1]
-    else:
-        at_band, low, high = at[order], low[order], high[order]
-    ax.fill_between(at_band, low, high, color=elements.BLUE, alpha=0.15, linewidth=0, label="95 % by chance")
+    if len(at):  # a band that follows the number of observations, not that of each star, from the first to the last
+        (at_band, low), (_, high) = (elements.running_median(at, each) for each in (low, high))
+        at_band = np.concatenate([[at.min()], at_band, [at.max()]])
+        low, high = (np.pad(each, 1, mode="edge") for each in (low, high))
+        ax.fill_between(at_band, low, high, color=elements.BLUE, alpha=0.15, linewidth=0, label="95 % by chance")
     ax.axhline(1, color="black", linewidth=0.6)
     dots = ax.scatter(at, rms, s=16, color=elements.BLUE, linewidths=0, alpha=0.8)
     dots.set_rasterized(len(shown) > _DENSE)
