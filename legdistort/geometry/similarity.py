@@ -23,7 +23,7 @@ def apply(pose, xy):
 def as_positions(xy):
     """Positions (..., 2) as an array of floats; `InputError` for anything else."""
     xy = np.asarray(xy, dtype=float)
-    if xy.shape[-1:] != (2,):
+    if xy.size and xy.shape[-1:] != (2,):
         raise InputError(f"positions must be x and y in pixels, an array of shape (n, 2), got shape {xy.shape}")
     return xy
 

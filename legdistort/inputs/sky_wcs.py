@@ -15,7 +15,7 @@ from astropy.wcs.utils import proj_plane_pixel_scales, wcs_to_celestial_frame
 from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS, HighLevelWCSWrapper
 from astropy.wcs.wcsapi.high_level_api import values_to_high_level_objects
 
-from ..exceptions import AssumptionWarning, InputError, warn
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 
 log = logging.getLogger(__name__)
 
@@ -113,8 +113,8 @@ def warn_of_another_field(names):
     """Warn of frames of which `leads_elsewhere` holds, if there are any."""
     if names:
         warn(
-            f"{', '.join(names)}: headers place this more than a frame away from where the solution has it; are these "
-            "frames of another field with the same names?",
+            f"{some_of(names, 3)}: by the header more than a frame away from where the solution has it; is this "
+            "another field with the same names of frames, or is the pointing in the header that wrong?",
             AssumptionWarning,
         )
 

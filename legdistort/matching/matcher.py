@@ -311,7 +311,8 @@ def _keep_common(table, star, min_exposures, left_out):
         if not keep.any():
             most = np.max(count[inverse][star >= 0], initial=0)
             raise MatchError(
-                f"no star was found in min_exposures={min_exposures} exposures, the best in {most}; lower min_exposures"
+                f"no star was found in {min_exposures} exposures or more, the best in {most}; "
+                f"give min_exposures={most} (--min-exposures) or less"
                 + (f"; left out: {_reasons(left_out)}" if left_out else "")
             )
         left_out.update(

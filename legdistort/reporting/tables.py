@@ -153,7 +153,7 @@ def _with_error(value, digits, error):
     if not np.isfinite(error):
         return f"{value:.{digits}f} ± unknown"
     if error > 0:
-        digits = max(0, 1 - int(f"{error:.1e}".partition("e")[2]))  # of the error as it is rounded
+        digits = min(max(0, 1 - int(f"{error:.1e}".partition("e")[2])), 9)  # of the error as it is rounded
     return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 

@@ -32,7 +32,7 @@ def check_is_file(path, instead=None):
     if not path.exists():
         fault = "no such file"
     elif path.is_dir():
-        fault, instead = "is not a file but a folder", instead or f"name the files in it ({path}/*)"
+        fault, instead = "is not a file but a folder", instead or "name a file in it"
     else:
         fault = "is not a file"
     raise InputError(f"{path}: {fault}" + (f"; {instead}" if instead else ""))

@@ -82,7 +82,7 @@ def check_folder(out):
     InputError
         If `out` is no path or a file, or cannot be written.
     """
-    if not isinstance(out, (str, Path)):
+    if not isinstance(out, (str, os.PathLike)):
         raise InputError(f"out must be a path, that of the folder for the results, got {out!r}")
     out = Path(out)
     existing = next(place for place in (out, *out.absolute().parents) if place.exists())

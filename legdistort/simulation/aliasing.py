@@ -58,7 +58,7 @@ def spectrum_of(given, degree, name="spectrum"):
             raise InputError(f"{name} must be a dict {{degree: pixels}}, (n_modes,) or (2, n_modes), got {given!r}")
         top = max(degree, basis.degree_of(values.shape[-1]))
         out = basis.change_degree(np.broadcast_to(values, (2, values.shape[-1])), top)
-        if np.isnan(values[..., 1:]).all():  # nothing is known of modes that are fitted, those of a higher degree too
+        if values.shape[-1] > 1 and np.isnan(values[..., 1:]).all():  # nothing is known of modes that are fitted
             out[:, values.shape[-1] : n_fit] = np.nan
     if np.any(out < 0) or np.any(np.isinf(out)):
         raise InputError(f"{name} holds standard deviations in pixels, finite and not negative, got {given!r}")

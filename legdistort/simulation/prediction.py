@@ -51,7 +51,7 @@ class Prediction(ShownAsPrinted):
     sigma_meas : float
         Error of one measured position: rms over all, and that of new positions.
     b : float
-        Expected error of the reference positions, relative (in the gauge).
+        Expected error of the reference positions, relative: under the convention of the gauge, as ``x_err``.
     b_abs : float
         With the common map: mean dynamic distortion of the set, uncertainty of the static one; pointing, rotation and
         scale of the field aside, and what is unknown (``solution.gauge.unknown``: without a prior, shears at least).

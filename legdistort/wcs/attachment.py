@@ -14,7 +14,7 @@ import asdf
 import numpy as np
 from astropy.io import fits
 
-from ..exceptions import ExportError, InputError
+from ..exceptions import ExportError, InputError, without_astropy_warnings
 from ..inputs import exposure_files, exposure_names, file_images
 from ..inputs.sky_wcs import header_wcs, leads_elsewhere, warn_of_another_field
 from ..runtime import provenance
@@ -216,7 +216,8 @@ def _is_elsewhere(solution, name, hdulist, hdu):
     """Whether the header of an image leads far from where the solution has it."""
     if solution.sky is None:
         return False
-    wcs = header_wcs(hdu.header, hdulist, hdu.shape, name, level=logging.DEBUG)
+    with without_astropy_warnings():
+        wcs = header_wcs(hdu.header, hdulist, hdu.shape, name, level=logging.DEBUG)
     return leads_elsewhere(wcs, solution.wcs(name), hdu.shape)
 
 

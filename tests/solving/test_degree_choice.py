@@ -1,6 +1,8 @@
 """Stars kept out of the fit: the choice of the degree, the aliasing alarm, and the test of the errors."""
 
+import itertools
 import json
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -328,14 +330,35 @@ def test_noise_is_no_energy():
 def test_a_convention_is_no_energy():
     """Without a prior all exposures depart alike, by what the convention makes of their common map; degree 3 is all."""
     excess = []
-    for seed in range(8):
-        sim = simulate_matches(n_exposures=6, n_stars=36, degree=3, seed=seed)
+    for seed, settings in itertools.product(range(4), ({}, {"dither": 200}, {"rotations": 60.0 * np.arange(6)})):
+        sim = simulate_matches(n_exposures=6, n_stars=60, degree=3, seed=seed, **settings)
         chosen = solve(sim.matches, degree="auto").diagnostics.selection
         assert chosen.degree == 3
         excess += [each.excess for each in chosen.aliasing]
-    assert len(excess) == 16
+    assert len(excess) == 24
     assert abs(np.mean(excess)) < 1
     assert max(np.abs(excess)) < 3
+
+
+@pytest.mark.parametrize("limit", [8000, 1])
+def test_energy_of_its_own_is_seen_beside_a_common_map(monkeypatch, limit):
+    """Quartic modes of every exposure count, however errors differ, in both forms of the covariance of coefficients."""
+    monkeypatch.setattr("legdistort.solving.equations.covariances.DENSE_LIMIT", limit)
+    excess = {}
+    for quartic in (0.0, 0.1):
+        width = np.zeros(15)
+        width[3:10], width[10:] = 0.3, quartic
+        sigma = np.where(np.arange(8) == 3, 0.4, 0.02)[:, None]
+        sim = simulate_matches(n_exposures=8, n_stars=80, dynamic=width, sigma=sigma, dither=200, degree=4, seed=3)
+        with warnings.catch_warnings(action="ignore"):
+            excess[quartic] = degree_choice.folding(solve(sim.matches, degree=4, clip=None), 3, 4).excess
+    assert abs(excess[0.0]) < degree_choice.ALARM
+    assert excess[0.1] > 10 * degree_choice.ALARM
+
+
+def test_two_exposures_say_nothing_of_a_common_map():
+    sim = simulate_matches(n_exposures=2, n_stars=60, degree=3, seed=1)
+    assert degree_choice.folding(solve(sim.matches, degree=4, clip=None), 3, 4).excess == pytest.approx(0, abs=3)
 
 
 def test_where_similarities_are_in_the_poses_no_energy_is_missed():

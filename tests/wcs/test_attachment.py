@@ -617,8 +617,8 @@ def test_a_frame_of_another_field_is_named(one, tmp_path, recwarn):
         fits.PrimaryHDU(pixels().astype("int16"), header).writeto(path, overwrite=True)
         recwarn.clear()
         attach(one, path, in_place=True, kind=None)
-        assert sum("frames of another field with the same names" in str(each.message) for each in recwarn) == told
-        assert all(str(each.message).startswith("frame: headers place this") for each in recwarn)
+        assert sum("another field with the same names of frames" in str(each.message) for each in recwarn) == told
+        assert all(str(each.message).startswith("frame: by the header more than a frame away") for each in recwarn)
 
 
 def test_frames_left_out_are_skipped_by_name(one, frame, tmp_path, caplog):

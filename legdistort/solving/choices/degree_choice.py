@@ -225,7 +225,7 @@ def folding(solution, degree, higher):
         degree=int(higher),
         found=found,
         noise=float(found * np.sqrt(variance / max(energy, 1e-300))),
-        excess=float((squares - dof) / np.sqrt(2 * dof)),
+        excess=float((squares - dof) / np.sqrt(2 * max(dof, 1))),
         energy=float(beyond * found),
         folds_into=tuple(float(np.sqrt(np.sum(size[degrees == d] ** 2)) / 2) for d in range(degree + 1)),
         mode=tuple(orders[high][strongest].tolist()),
@@ -234,9 +234,10 @@ def folding(solution, degree, higher):
 
 
 def _of_their_own(solution, high):
-    """Departures of the exposures from the prior in some modes, without the map of these that all have in common.
+    """Departures of the exposures from the prior in the modes of a degree, without what common maps do to these.
 
-    That one the stars take up: what it is follows from the convention, of which distortions of low degree are part.
+    Maps of that degree and of higher ones, which dithers bring down to it: the stars take them up, and what they are
+    follows from the convention, of which distortions of low degree are part.
 
     Returns
     -------
@@ -248,27 +249,30 @@ def _of_their_own(solution, high):
     """
     departure, n = (solution.coefficients - solution.prior_mean)[:, :, high], len(solution.names)
     modes = np.arange(2 * basis.n_modes(solution.degree)).reshape(2, -1)[:, high].ravel()
-    rows = np.arange(2 * solution.gauge.n_modes).reshape(2, -1)[:, high].ravel()
+    maps = np.arange(2 * solution.gauge.n_modes).reshape(2, -1)
     turn = np.stack([_not_similar(solution.shapes[name], solution.degree, modes) for name in solution.names])
-    motion = turn @ solution.gauge.motion[:, rows[:, None], rows]
-    columns, size, _ = np.linalg.svd(motion.reshape(-1, len(rows)), full_matrices=False)
+    motion = turn @ solution.gauge.motion[:, maps[:, high].reshape(-1, 1), maps[:, high.start :].ravel()]
+    columns, size, _ = np.linalg.svd(motion.reshape(-1, motion.shape[2]), full_matrices=False)
     common = columns[:, size > _SETTLED * size.max()]
-    own = (turn @ departure.reshape(n, -1, 1)).ravel()
-    own -= common @ (common.T @ own)
+    given = (turn @ departure.reshape(n, -1, 1)).ravel()
+    own, dof = given - common @ (common.T @ given), given.size - common.shape[1]
     covariance = solution.uncertainty.coefficients
     if covariance.ndim == 3:  # one block an exposure, as if the stars were known
         errors = turn @ covariance[:, modes[:, None], modes] @ turn.mT
-        squares = np.sum(own.reshape(n, -1, 1) * np.linalg.solve(errors, own.reshape(n, -1, 1)))
-        variance = np.einsum("iaa->", errors) * (1 - common.shape[1] / own.size)
+        both = np.column_stack([common, given]).reshape(n, errors.shape[1], -1)
+        shared = both[:, :, :-1]
+        variance = np.einsum("iaa->", errors) - np.einsum("iac,iab,ibc->", shared, errors, shared, optimize=True)
+        normal = np.einsum("iac,iad->cd", both, np.linalg.solve(errors, both))
+        squares = normal[-1, -1] - normal[-1, :-1] @ np.linalg.solve(normal[:-1, :-1], normal[:-1, -1])
     else:
         every = covariance.reshape(n, -1, n, covariance.shape[1] // n)[:, modes][..., modes]
         errors = np.einsum("iac,icjd,jbd->iajb", turn, every, turn, optimize=True).reshape(own.size, -1)
         errors -= common @ (common.T @ errors)
         errors -= (errors @ common) @ common.T
         variance = np.trace(errors)
-        squares = own @ np.linalg.solve(errors + variance / own.size * common @ common.T, own)
+        squares = own @ np.linalg.solve(errors + variance / own.size * common @ common.T, own) if dof else 0.0
     departure = turn.mT @ own.reshape(n, -1, 1)
-    return departure.reshape(n, 2, -1), float(squares), own.size - common.shape[1], float(variance)
+    return departure.reshape(n, 2, -1), float(squares), dof, float(variance)
 
 
 def _not_similar(shape, degree, modes):
