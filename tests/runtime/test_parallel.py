@@ -1,6 +1,7 @@
 """Work on many cores: the same results, bit for bit, in bounded memory, and nothing left when it fails."""
 
 import _thread
+import gc
 import io
 import json
 import logging
@@ -97,9 +98,14 @@ def client(cluster):
 
 @pytest.fixture
 def interruptible():
-    """Ctrl-C as in a terminal: what a shell starts in the background ignores it."""
+    """Ctrl-C as in a terminal: what a shell starts in the background ignores it.
+
+    And no search for garbage, during which functions that others have registered would swallow it.
+    """
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    gc.disable()
     yield
+    gc.enable()
     signal.signal(signal.SIGINT, before)
 
 
