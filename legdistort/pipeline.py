@@ -25,7 +25,7 @@ from .inputs import exposure_files, table_files
 from .inputs.exposure_names import detector_name
 from .inputs.exposures import observed
 from .matching.matcher import match
-from .matching.options import MatchOptions
+from .matching.options import MatchOptions, check_enough
 from .measurement.earlier import EarlierRun, write_detections
 from .measurement.options import MeasureOptions
 from .measurement.positions import measure_with_psfs, write_psfs
@@ -448,12 +448,7 @@ def _check_exposures(exposures, min_exposures, bad):
                     else "give frames of one detector, or solve their tables with a shape for each"
                 )
             )
-    if min_exposures > n_frames:
-        good = "usable exposures" if bad else "exposures"
-        raise InputError(
-            f"a star must be in {min_exposures} exposures, but there are only {n_frames} {good}: "
-            f"give min_exposures={n_frames} (--min-exposures) or less"
-        )
+    check_enough(n_frames, min_exposures, "usable exposures" if bad else "exposures")
 
 
 def _detected(exposures, before, measuring, share):

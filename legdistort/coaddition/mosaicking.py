@@ -297,8 +297,7 @@ def _reasons(left_out):
 
 def _warn_of_misuse(frames, maps, algorithm, solution):
     """Of another field, of light that is lost between pixels, and of units that do not go together."""
-    if solution.sky is not None:
-        warn_of_another_field([f.name for f in frames if leads_elsewhere(f.wcs, solution.wcs(f.name), f.shape)])
+    warn_of_another_field([f.name for f in frames if leads_elsewhere(f.wcs, solution, f.name)])
     scale = max(maps[f.name].scale for f in frames)
     if algorithm == "interp" and scale > _COARSE:
         warn(

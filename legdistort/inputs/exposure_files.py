@@ -442,7 +442,7 @@ def _check_no_extension(path, ext):
 
 def _file(path):
     """A file, open; `InputError` if there is none."""
-    check_is_file(path, f"name the files in it ({path}/*)" if path.is_dir() else None)
+    check_is_file(path, of_folder=f"name the files in it ({path}/*)")
     return path.open("rb")
 
 

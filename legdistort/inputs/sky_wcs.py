@@ -98,14 +98,14 @@ def to_icrs(wcs, xy, *, distortion=True):
     return np.stack([sky.ra.deg, sky.dec.deg])
 
 
-def leads_elsewhere(wcs, expected, shape):
-    """Whether a believable WCS, or None, leads farther from where another one leads than the frame is large."""
-    ny, nx = shape
-    if wcs is None:
+def leads_elsewhere(wcs, solution, name):
+    """Whether a believable WCS, or None, leads farther than a frame is large from where a solution has the exposure."""
+    if wcs is None or solution.sky is None:
         return False
-    middle, corner = ((nx - 1) / 2, (ny - 1) / 2), (0, 0)
-    here, edge = SkyCoord(*to_icrs(expected, [middle, corner]), unit="deg")
-    (there,) = SkyCoord(*to_icrs(wcs, [middle]), unit="deg")
+    ny, nx = solution.shapes[name]
+    xy = np.array([[(nx - 1) / 2, (ny - 1) / 2], [0.0, 0.0]])
+    here, edge = solution.sky.to_sky(solution.correct(name, xy))
+    (there,) = SkyCoord(*to_icrs(wcs, xy[:1]), unit="deg")
     return bool(here.separation(there) > 2 * here.separation(edge))
 
 

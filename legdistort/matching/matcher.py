@@ -26,7 +26,7 @@ from ..priors.from_headers import describe, header_distortions
 from . import detector_layout
 from .exposure_groups import interlink, link, standing, unite, without
 from .header_poses import HeaderPoses
-from .options import MatchOptions
+from .options import MatchOptions, check_enough
 from .star_labels import label_stars
 from .star_lists import StarList
 
@@ -222,11 +222,7 @@ def _check_names(table, names, min_exposures):
         )
     if len(names) == 1:
         raise MatchError(f"only one exposure ({names[0]}): give at least two of the same field")
-    if len(names) < min_exposures:
-        raise InputError(
-            f"a star must be in {min_exposures} exposures, but there are only {len(names)} exposures: "
-            f"give min_exposures={len(names)} (--min-exposures) or less"
-        )
+    check_enough(len(names), min_exposures)
 
 
 def _shapes(table, names, named, shape):

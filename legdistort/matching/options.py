@@ -9,6 +9,15 @@ from ..measurement.flags import UNUSABLE
 from ..runtime.checks import LARGEST
 
 
+def check_enough(n_exposures, min_exposures, kind="exposures"):
+    """Raise `InputError` if there are fewer exposures than every star must be in."""
+    if n_exposures < min_exposures:
+        raise InputError(
+            f"a star must be in {min_exposures} exposures, but there are only {n_exposures} {kind}: "
+            f"give min_exposures={n_exposures} (--min-exposures) or less"
+        )
+
+
 @dataclass(frozen=True)
 class MatchOptions:
     """How to match; the fields are arguments of `legdistort.match`, which explains them.

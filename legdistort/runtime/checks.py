@@ -24,15 +24,15 @@ def check_counts(**counts):
             raise InputError(f"{name} must be a positive integer, got {value!r}")
 
 
-def check_is_file(path, instead=None):
-    """Raise `InputError`, which says what to give `instead`, if a path is none of a file."""
+def check_is_file(path, instead="", *, of_folder="name a file in it"):
+    """Raise `InputError`, which says what to give `instead`, or `of_folder`, if a path is none of a file."""
     path = Path(path)
     if path.is_file():
         return
     if not path.exists():
         fault = "no such file"
     elif path.is_dir():
-        fault, instead = "is not a file but a folder", instead or "name a file in it"
+        fault, instead = "is not a file but a folder", instead or of_folder
     else:
         fault = "is not a file"
     raise InputError(f"{path}: {fault}" + (f"; {instead}" if instead else ""))

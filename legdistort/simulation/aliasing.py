@@ -146,7 +146,7 @@ def alias(problem, state, gauge, covariance, *, independent, common):
     together = left.reshape(len(left), n_exposures, -1).sum(axis=1)
     factor = np.hstack([left * np.tile(independent, n_exposures), together * common])
     spread = Uncertainty(full, blocks, gauge, coefficients=factor @ factor.T)
-    noise = Uncertainty(full, blocks, gauge, coefficients=np.zeros_like(normal))
+    noise = Uncertainty(full, blocks, gauge, coefficients=np.zeros_like(blocks.u))
     all_errors, own = (relative_variance(gauge, each, state.positions.T)[:2] for each in (spread, noise))
     folded = np.einsum("kc,kc->k", factor, factor)[fitted].reshape(n_exposures, 2, n_fit)
     return Aliasing(spread.coefficients, all_errors - own, np.sqrt(folded.mean(axis=0)))

@@ -214,11 +214,9 @@ def _plan(solution, path, target, *, kind, max_error, ext, overwrite):
 
 def _is_elsewhere(solution, name, hdulist, hdu):
     """Whether the header of an image leads far from where the solution has it."""
-    if solution.sky is None:
-        return False
     with without_astropy_warnings():
         wcs = header_wcs(hdu.header, hdulist, hdu.shape, name, level=logging.DEBUG)
-    return leads_elsewhere(wcs, solution.wcs(name), hdu.shape)
+    return leads_elsewhere(wcs, solution, name)
 
 
 def _header(solution, name, kind, max_error):

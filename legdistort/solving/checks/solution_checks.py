@@ -127,7 +127,7 @@ def errors_check(solution, residuals):
     low, high = min(low, (1 - NEGLIGIBLE) ** 2), max(high, (1 + NEGLIGIBLE) ** 2)
     floor, scale = solution.diagnostics.error_floor, solution.diagnostics.error_scale
     found = f"chi2/dof {ratio:.3g} at the stated errors, {low:.2f} to {high:.2f} by chance"
-    if not solution.diagnostics.error_floor and abs(ratio - whole) > 5e-3 * ratio:
+    if not floor and abs(ratio - whole) > 5e-3 * ratio:
         found += f" ({whole:.3g} with what holding the common map leaves in the residuals)"
     if floor:
         found += f"; a floor of {floor:.3g} px was added to them"

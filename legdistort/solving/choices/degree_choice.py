@@ -10,9 +10,8 @@ from astropy import units as u
 
 from ...exceptions import InputError, LegdistortError
 from ...geometry import basis, similarity
-from ...geometry.detector_modes import similarity_basis
+from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...results.diagnostics import AliasedDegree, DegreeChoice
-from ..equations.criterion import complement
 from . import held_out
 
 log = logging.getLogger(__name__)
@@ -250,7 +249,10 @@ def _of_their_own(solution, high):
     departure, n = (solution.coefficients - solution.prior_mean)[:, :, high], len(solution.names)
     modes = np.arange(2 * basis.n_modes(solution.degree)).reshape(2, -1)[:, high].ravel()
     maps = np.arange(2 * solution.gauge.n_modes).reshape(2, -1)
-    turn = np.stack([_not_similar(solution.shapes[name], solution.degree, modes) for name in solution.names])
+    # shears in the place of linear modes: similarities are in the poses
+    of_degree = dynamic_degrees(basis.n_modes(solution.degree)) == basis.degree_of(high.stop)
+    turn = np.stack([dynamic_basis(solution.shapes[name], basis.n_modes(solution.degree)) for name in solution.names])
+    turn = turn[:, of_degree][:, :, modes]
     motion = turn @ solution.gauge.motion[:, maps[:, high].reshape(-1, 1), maps[:, high.start :].ravel()]
     columns, size, _ = np.linalg.svd(motion.reshape(-1, motion.shape[2]), full_matrices=False)
     common = columns[:, size > _SETTLED * size.max()]
@@ -273,12 +275,6 @@ def _of_their_own(solution, high):
         squares = own @ np.linalg.solve(errors + variance / own.size * common @ common.T, own) if dof else 0.0
     departure = turn.mT @ own.reshape(n, -1, 1)
     return departure.reshape(n, 2, -1), float(squares), dof, float(variance)
-
-
-def _not_similar(shape, degree, modes):
-    """Orthonormal rows (k, n): what of some modes of a detector no similarity is, which the poses carry."""
-    rows = similarity_basis(shape, basis.n_modes(degree))[:, modes]
-    return complement(rows[np.linalg.norm(rows, axis=1) > 0.5])
 
 
 def _fold(solution, name, low, high):
