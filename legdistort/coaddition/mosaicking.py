@@ -100,7 +100,7 @@ def coadd(
     pixfrac, kernel
         For 'drizzle': side of the drops as a fraction of a pixel, and their shape, 'square', 'turbo' or 'point'.
     workers : int, optional
-        Threads that share the work. None = the current ``dask.distributed.Client`` if there is one, else this one. The
+        Threads that share the work; processes for 'drizzle', whose package keeps Python's lock. None = the current ``dask.distributed.Client`` if there is one, else this one. The
         mosaic is the same, bit for bit.
     scratch : str or path, optional
         Folder for the pixels of the exposures while work goes on, 4 to 11 bytes for each (17 in double precision), and
@@ -194,7 +194,8 @@ def _coadd(exposures, solution, options, share):
         areas = None if options.conserve == "flux" else {f.name: _area(maps[f.name]) for f in frames}
         factors, origin = flux_scales(frames, options.scale, solution, areas)
         layers, recipe = _layers(frames, prepared, maps, factors, solution, output, options)
-        planes = assemble(layers, recipe, folder.parent, share)
+        held = options.algorithm == "drizzle"  # its package keeps Python's lock, so that threads would wait for it
+        planes = assemble(layers, recipe, folder.parent, partial(share, threads=not held))
     _warn_of_misuse(frames, maps, options.algorithm, solution)
     correlation = noise_gain.noise_correlation(layers[0].map, layers[0].gain, recipe.resampling)
     header = mosaic_header(frames, left_out, factors, _settings(options, recipe, origin, correlation))

@@ -21,7 +21,7 @@ from . import minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, with_errors_times
 from .choices import prior_widths
-from .choices.degree_choice import TRIAL, choose_degree
+from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
 from .equations import effective_modes
 from .motion_choice import resolve as resolve_motion
@@ -338,7 +338,7 @@ def _choose_degree(matches, options):
 
     def fit(part, degree, clip, near=None):
         asked = replace(options, degree=degree, clip=clip)
-        return single_fit.estimate(part, asked, near=near, tolerance=TRIAL)
+        return single_fit.estimate(part, asked, near=near, trial=True)
 
     def solution(trial):
         settings = Settings(trial.options.degree, method=options.method)

@@ -113,7 +113,16 @@ def observed_variance(squares):
 
 
 def solve_joint(
-    problem, state, *, gauge="minimal", common=None, hold=False, loss="linear", max_iterations=None, tolerance=TOLERANCE
+    problem,
+    state,
+    *,
+    gauge="minimal",
+    common=None,
+    hold=False,
+    loss="linear",
+    max_iterations=None,
+    tolerance=TOLERANCE,
+    settled=False,
 ):
     """Gauss-Newton on all unknowns under the constraints of the gauge.
 
@@ -134,6 +143,9 @@ def solve_joint(
     tolerance : float
         Converged when the next step would be below this many standard errors, rms over the unknowns; it is not taken,
         nor made where the last two show that it would be far below.
+    settled : bool
+        Hold the plane, as `hold` does, by the convention alone: nothing is estimated of it, as for a fit of which only
+        the residuals matter.
 
     Returns
     -------
@@ -147,7 +159,7 @@ def solve_joint(
     check_choice(loss, LOSSES, "loss")
     max_iterations = MAX_ITERATIONS if max_iterations is None else max_iterations
     state = constraints.absorb_similarities(problem, state)
-    run = _Descent(problem, state, _Rules(gauge, common, loss, hold, tolerance))
+    run = _Descent(problem, state, _Rules(gauge, common, loss, hold or settled, tolerance, settled))
     run.descend(max_iterations)
     while run.converged and (freer := run.freer()) is not None:
         with contextlib.suppress(SolveError):
@@ -155,7 +167,7 @@ def solve_joint(
         if not (freer.converged and is_explained(freer.blocks.chi2, run.system)):
             break
         run = freer
-    declared = hold or (run.released is None and not problem.terms.is_held)
+    declared = run.rules.hold or (run.released is None and not problem.terms.is_held)
     convention = run.convention if declared else run.declared()
     status = f"converged after {len(run.steps)} iterations"
     if not run.converged:
@@ -186,6 +198,7 @@ class _Rules:
     loss: str
     hold: bool
     tolerance: float
+    settled: bool
 
 
 class _Descent:
@@ -235,6 +248,7 @@ class _Descent:
         self.on_trial = not near and step < _SMALLER * last and self.rules.loss == "linear"
         if self.n_made < _MADE and step > _STEADY * self.rules.tolerance and not near:
             how = {"released": self.released, "common": self.rules.common, "all_drifts": self.rules.hold}
+            how |= {"settled": self.rules.settled}
             self.convention = constraints.make(self.rules.gauge, self.weighted, self.state, self.blocks, **how)
             self.n_made += 1
             if self.rules.hold:

@@ -24,6 +24,9 @@ log = logging.getLogger(__name__)
 _MANY_EXPOSURES = 50
 #: An error floor is found when chi2 is its degrees of freedom to this part; fits that are made at most to find it.
 _EQUAL, _REFITS = 0.005, 4
+#: Accuracy of fits on trial, in standard errors, rms over their unknowns; squares of residuals over those of the errors
+#: below which one leaves nothing that the reference plane could be estimated from.
+TRIAL, EXPLAINED = 0.03, 2.0
 
 
 def threads(matches):
@@ -164,12 +167,13 @@ def _with_plain_widths(matches, options):
     return explained
 
 
-def minimise(matches, options, *, judged=True, near=None, tolerance=minimisers.TOLERANCE):
+def minimise(matches, options, *, judged=True, near=None, trial=False):
     """Minimise; exposures that contradict the others are left out, with the reason, and the rest is solved again.
 
     With ``clip`` the fit is a plain one as long as chance explains what it leaves. Exposures that the fit cannot follow
     stay in one that is not `judged`. It begins at the fit `near`, whatever its degree, if that is one to the same
-    matches; `tolerance`, see `legdistort.solving.minimisers.solve_joint`, is that of a fit without ``clip``.
+    matches. One on `trial`, without ``clip``, is for comparison with others: `TRIAL` is accurate enough, and where
+    `near` explains the observations its plane is kept.
     """
     problem = build_problem(
         matches,
@@ -180,7 +184,8 @@ def minimise(matches, options, *, judged=True, near=None, tolerance=minimisers.T
         motion=star_motions.terms_of(options),
     )
     nominal = np.stack([matches.poses[name] for name in matches.names])
-    if near is not None and near.matches is matches and near.result.converged:
+    near_by = near is not None and near.matches is matches and near.result.converged
+    if near_by:
         start, typical = _from(near, problem), np.zeros(problem.n_exposures)
     else:
         start, typical = start_values.start(problem, nominal, robust=options.loss != "linear")
@@ -192,7 +197,10 @@ def minimise(matches, options, *, judged=True, near=None, tolerance=minimisers.T
     if options.clip is None:
         if options.loss != "linear" and (lost := _misplaced(problem, typical)):
             return minimise(matches.without(lost), options, judged=judged)
-        result = minimisers.solve_joint(problem, start, **common, tolerance=tolerance)
+        if trial:
+            explained = near is not None and near.chi2 < EXPLAINED * problem.xy.size
+            common |= {"tolerance": TRIAL, "settled": near_by and explained}
+        result = minimisers.solve_joint(problem, start, **common)
         return Fit(matches, problem, result, everything, options)
     if start_values.far_off(problem, typical).any() and (astray := agreement.astray(problem)):
         return minimise(matches.without(astray), options, judged=judged)

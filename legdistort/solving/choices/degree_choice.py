@@ -4,14 +4,17 @@ A degree too low leaves distortion in their positions, one too high follows the 
 """
 
 import logging
+from itertools import pairwise
+from math import ceil
 
 import numpy as np
-from astropy import units as u
+from scipy.sparse.linalg import LinearOperator, cg
 
 from ...exceptions import InputError, LegdistortError
-from ...geometry import basis, similarity
+from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...results.diagnostics import AliasedDegree, DegreeChoice
+from ..equations import elimination
 from . import held_out
 
 log = logging.getLogger(__name__)
@@ -26,13 +29,13 @@ N_FOLDS, FEW = 10, 30
 #: squares of stars left out are less than this times those of their errors: no large distortion is left. Cubic modes,
 #: the first that many optics have, are always tried.
 N_WORSE, EXPLAINED, CUBIC = 2, 2.0, 3
-#: Accuracy of the fits that are compared, in standard errors, rms over their unknowns.
-TRIAL = 0.03
 #: Of degrees whose scores differ by less than this part the lowest is taken.
 CLOSE = 0.005
 #: Excess of a degree's energy over its noise, in standard deviations of the latter, that raises the alarm.
 ALARM = 5.0
 _SETTLED = 1e-6  # of the largest effect of a common map on an exposure
+_PROBED = 600  # directions times samples from which the variance of departures is estimated
+_ACCURACY = 1e-3  # of departures over their errors
 _OUTLIER = 25.0  # times the usual squared scatter of a star, at every degree: mismatched, it has no weight
 
 
@@ -75,7 +78,7 @@ def choose_degree(matches, fit, solution, *, clip, found):
     if trials.error is not None:
         raise trials.error
     degree, scores = trials.degree, trials.scores
-    aliasing = _aliasing(lambda top: solution(trials.fitted(top)), degree)
+    aliasing = _aliasing(trials.fitted, degree)
     return DegreeChoice(
         degree=degree,
         degrees=tuple(range(len(scores))),
@@ -156,6 +159,8 @@ class _Trials:
     def sound(self, matches, clip):
         """The given matches without what contradicts a fit with the best degree."""
         found = self._fit(matches, self.degree, clip, self._fits.get(self.degree))
+        if found.matches is matches and found.used.all():
+            return matches
         return held_out.only_rows(found.matches, found.problem.in_table_order(found.used))
 
 
@@ -183,14 +188,13 @@ def _aliasing(fit, degree):
     """`folding` for the two degrees beyond the one chosen, as far as the stars allow; ``fit(degree)`` takes all."""
     for top in (degree + 2, degree + 1):
         try:
-            solution = fit(top)
-            return tuple(folding(solution, degree, d) for d in range(degree + 1, top + 1))
+            return tuple(folding(fit(top), degree, higher) for higher in range(degree + 1, top + 1))
         except LegdistortError as error:
             log.debug("degree %d is beyond these stars: %s", top, error)
     return ()
 
 
-def folding(solution, degree, higher):
+def folding(fit, degree, higher):
     """What modes of a higher degree do to a fit of a lower one (paper, section 4.3).
 
     The fit of the lower degree takes part of them for modes that it has: at the stars of an exposure they look alike.
@@ -198,7 +202,7 @@ def folding(solution, degree, higher):
 
     Parameters
     ----------
-    solution : Solution
+    fit : `legdistort.solving.single_fit.Fit`
         Of a degree that includes `higher`.
     degree : int
         Of the fit that lacks them.
@@ -209,10 +213,10 @@ def folding(solution, degree, higher):
     AliasedDegree
     """
     low, high = basis.n_modes(degree), slice(basis.n_modes(higher - 1), basis.n_modes(higher))
-    departure, squares, dof, variance = _of_their_own(solution, high)
+    departure, squares, dof, variance = _of_their_own(fit, high)
     energy = np.sum(departure**2)
     beyond = np.sqrt(max(1 - variance / max(energy, 1e-300), 0))
-    folds = np.stack([_fold(solution, name, low, high) for name in solution.names])
+    folds = _folds_at_stars(fit, low, high)
     folded = folds @ departure.mT
     orders = np.array(basis.orders(higher)).T
     strongest = int(np.argmax((departure**2).sum(axis=(0, 1))))
@@ -232,7 +236,7 @@ def folding(solution, degree, higher):
     )
 
 
-def _of_their_own(solution, high):
+def _of_their_own(fit, high):
     """Departures of the exposures from the prior in the modes of a degree, without what common maps do to these.
 
     Maps of that degree and of higher ones, which dithers bring down to it: the stars take them up, and what they are
@@ -244,48 +248,50 @@ def _of_their_own(solution, high):
     squares, dof : float, int
         Of the departures over their errors, and how many these are by chance.
     variance : float
-        Of all departures together, by their errors.
+        Of all departures together, by their errors; from samples, to a tenth.
     """
-    departure, n = (solution.coefficients - solution.prior_mean)[:, :, high], len(solution.names)
-    modes = np.arange(2 * basis.n_modes(solution.degree)).reshape(2, -1)[:, high].ravel()
-    maps = np.arange(2 * solution.gauge.n_modes).reshape(2, -1)
+    problem, gauge, system, n = fit.problem, fit.result.gauge, fit.uncertainty.system, fit.problem.n_exposures
+    departure = (fit.result.state.coefficients - problem.prior_mean)[:, :, high]
+    modes = np.arange(2 * problem.n_modes).reshape(2, -1)[:, high].ravel()
+    maps = np.arange(2 * gauge.n_modes).reshape(2, -1)
     # shears in the place of linear modes: similarities are in the poses
-    of_degree = dynamic_degrees(basis.n_modes(solution.degree)) == basis.degree_of(high.stop)
-    turn = np.stack([dynamic_basis(solution.shapes[name], basis.n_modes(solution.degree)) for name in solution.names])
-    turn = turn[:, of_degree][:, :, modes]
-    motion = turn @ solution.gauge.motion[:, maps[:, high].reshape(-1, 1), maps[:, high.start :].ravel()]
+    of_degree = dynamic_degrees(problem.n_modes) == basis.degree_of(high.stop)
+    turn = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])[:, of_degree]
+    motion = turn[:, :, modes] @ gauge.motion[:, maps[:, high].reshape(-1, 1), maps[:, high.start :].ravel()]
     columns, size, _ = np.linalg.svd(motion.reshape(-1, motion.shape[2]), full_matrices=False)
-    common = columns[:, size > _SETTLED * size.max()]
-    given = (turn @ departure.reshape(n, -1, 1)).ravel()
-    own, dof = given - common @ (common.T @ given), given.size - common.shape[1]
-    covariance = solution.uncertainty.coefficients
-    if covariance.ndim == 3:  # one block an exposure, as if the stars were known
-        errors = turn @ covariance[:, modes[:, None], modes] @ turn.mT
-        both = np.column_stack([common, given]).reshape(n, errors.shape[1], -1)
-        shared = both[:, :, :-1]
-        variance = np.einsum("iaa->", errors) - np.einsum("iac,iab,ibc->", shared, errors, shared, optimize=True)
-        normal = np.einsum("iac,iad->cd", both, np.linalg.solve(errors, both))
-        squares = normal[-1, -1] - normal[-1, :-1] @ np.linalg.solve(normal[:-1, :-1], normal[:-1, -1])
-    else:
-        every = covariance.reshape(n, -1, n, covariance.shape[1] // n)[:, modes][..., modes]
-        errors = np.einsum("iac,icjd,jbd->iajb", turn, every, turn, optimize=True).reshape(own.size, -1)
-        errors -= common @ (common.T @ errors)
-        errors -= (errors @ common) @ common.T
-        variance = np.trace(errors)
-        squares = own @ np.linalg.solve(errors + variance / own.size * common @ common.T, own) if dof else 0.0
-    departure = turn.mT @ own.reshape(n, -1, 1)
-    return departure.reshape(n, 2, -1), float(squares), dof, float(variance)
+    common, still = columns[:, size > _SETTLED * size.max()], np.zeros_like(fit.blocks.g_star)
+
+    def own(each):
+        return each - common @ (each @ common)
+
+    def covariance(each):
+        gradient = own(each).reshape(n, 1, -1) @ turn
+        return own((turn @ system.settle(gradient[:, 0], still)[1][:, :, None]).ravel())
+
+    given = own((turn[:, :, modes] @ departure.reshape(n, -1, 1)).ravel())
+    dof, square = given.size - common.shape[1], (given.size, given.size)
+    known = turn @ elimination.inverse_exposure_blocks(fit.blocks.u) @ turn.mT  # if the stars were
+
+    def conditioned(each):
+        return own(np.linalg.solve(known, own(each).reshape(n, -1, 1)).ravel())
+
+    solved, _ = cg(LinearOperator(square, covariance), given, rtol=_ACCURACY, M=LinearOperator(square, conditioned))
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (ceil(_PROBED / given.size), given.size))
+    variance = np.mean([each @ covariance(each) for each in signs])
+    departure = turn[:, :, modes].mT @ given.reshape(n, -1, 1)
+    return departure.reshape(n, 2, -1), float(given @ solved), dof, float(variance)
 
 
-def _fold(solution, name, low, high):
-    """Regression (n_low, n_high) of higher modes on the lower ones at the stars of an exposure."""
-    rows = solution.observations
-    rows = rows[(rows["exposure"] == name) & rows["used"]]
-    star = np.searchsorted(solution.star_names, rows["star"])
-    q = similarity.apply(solution.poses[name], solution.positions[star])
-    b = basis.values(solution.degree, *basis.normalize(q, solution.shapes[name]))
-    weight = 1 / np.hypot(rows["x_err"].to_value(u.pix), rows["y_err"].to_value(u.pix))
-    return np.linalg.lstsq((b[:low] * weight).T, (b[high] * weight).T, rcond=None)[0]
+def _folds_at_stars(fit, low, high):
+    """Regression (n_exposures, n_low, n_high) of higher modes on the lower ones at the stars of each exposure."""
+    problem, values = fit.weighted, fit.blocks.values
+    weight = np.sqrt(problem.weight[:2].sum(axis=0))
+    return np.stack(
+        [
+            np.linalg.lstsq((values[:low, i:j] * weight[i:j]).T, (values[high, i:j] * weight[i:j]).T, rcond=None)[0]
+            for i, j in pairwise(problem.start)
+        ]
+    )
 
 
 def _sentence(degree, scores, aliasing):

@@ -9,18 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 from astropy import units as u
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from ...exceptions import InputError, SolveError
 from ...inputs.matches import Matches
 from ...results import accuracy
 from ...results.diagnostics import Validation
 from ..equations import criterion, elimination, reduced_system
-from ..equations.reduced_base import Reduced
 from ..equations.star_terms import packed, symmetric_times
 
-#: Least pivot of normal equations with unit diagonal; below it the stars that are left determine too little.
-_LEAST_PIVOT = 1e-7
 #: Part of the normal equations of a star below which they do not determine an unknown of its motion.
 _UNDETERMINED = 1e-9
 _ACCURACY = 1e-3  # of a step that conjugate gradients take
@@ -176,12 +172,11 @@ def squares(fit, matches, folds):
     mine = np.searchsorted(np.asarray(matches.stars), np.asarray(fit.matches.stars))
     of_row = fold[mine][problem.star]
     _check_left(problem, fit.used, of_row, len(folds))
-    without = _Subtracted(fit) if reduced_system.uses_direct(problem) else _Solved(fit)
     blocks = fit.blocks if fit.weighted is problem else criterion.linearise(problem, fit.result.state)
     left = np.zeros_like(blocks.residual)
     for k in range(len(folds)):
         rows = np.flatnonzero(of_row == k)
-        change = without.step(rows).reshape(problem.n_exposures, 2, -1)[problem.exposure[rows]]
+        change = _step_without(fit, rows).reshape(problem.n_exposures, 2, -1)[problem.exposure[rows]]
         left[:, rows] = blocks.residual[:, rows] - np.einsum("nam,mn->an", change, blocks.values[:, rows])
     out = np.zeros((len(fold), 2))
     out[mine] = _about_stars(problem, blocks, left)
@@ -253,73 +248,28 @@ def _about_stars(problem, blocks, residual):
 def _part_of(problem, blocks, rows):
     """What observations, ascending, add to exposure blocks (n, 2 n_modes, 2 n_modes) and gradients (n, 2 n_modes)."""
     own, gradient, n = np.zeros_like(blocks.u), np.zeros_like(blocks.g_exposure), problem.n_modes
+    (wx, wy, wxy), (x, y), b = problem.weight[:, rows], blocks.residual[:, rows], blocks.values[:, rows].astype(float)
+    pull, weighted = np.stack([wx * x + wxy * y, wxy * x + wy * y]), wx * b
     for i, (low, high) in enumerate(itertools.pairwise(np.searchsorted(rows, problem.start).tolist())):
-        mine = rows[low:high]
-        (wx, wy, wxy), (x, y), b = (
-            problem.weight[:, mine],
-            blocks.residual[:, mine],
-            blocks.values[:, mine].astype(float),
-        )
-        own[i, :n, :n] = (wx * b) @ b.T
-        own[i, n:, n:] = (wy * b) @ b.T if problem.unequal else own[i, :n, :n]
+        mine, of_modes = slice(low, high), b[:, low:high].T
+        own[i, :n, :n] = own[i, n:, n:] = weighted[:, mine] @ of_modes
         if problem.unequal:
-            own[i, :n, n:] = own[i, n:, :n] = (wxy * b) @ b.T
-        gradient[i] = np.concatenate([b @ (wx * x + wxy * y), b @ (wxy * x + wy * y)])
+            own[i, n:, n:] = (wy[mine] * b[:, mine]) @ of_modes
+            own[i, :n, n:] = own[i, n:, :n] = (wxy[mine] * b[:, mine]) @ of_modes
+        gradient[i] = (pull[:, mine] @ of_modes).ravel()
         if problem.fixed is not None:
             gradient[i] -= problem.fixed[i].T @ (problem.fixed[i] @ gradient[i])
     return own, gradient
 
 
-class _Solved:
-    """Steps (n_exposures, 2 n_modes) of the coefficients without stars, given all rows of theirs: by solving anew."""
-
-    def __init__(self, fit):
-        self._problem, self._blocks, self._gauge = fit.weighted, fit.blocks, fit.result.gauge
-
-    def step(self, rows):
-        """The step."""
-        problem, blocks = self._problem, self._blocks
-        v, g_star = blocks.v.copy(), blocks.g_star.copy()
-        v[:, problem.star[rows]] = g_star[:, problem.star[rows]] = 0
-        own, gradient = _part_of(problem, blocks, rows)
-        left = {"u": blocks.u - own, "g_exposure": blocks.g_exposure - gradient, "v": v, "g_star": g_star}
-        system = reduced_system.reduced_system(problem, replace(blocks, **left), self._gauge)
-        return system.step(np.zeros(self._gauge.n_constraints), _ACCURACY)[1]
-
-
-class _Subtracted:
-    """The same where the reduced matrix is small: the part of these stars is subtracted from it."""
-
-    def __init__(self, fit):
-        self._problem, self._blocks = fit.weighted, fit.blocks
-        whole = Reduced(self._problem, self._blocks, fit.result.gauge)
-        self._matrix, self._rhs = elimination.reduced_matrix(self._problem, self._blocks), whole.rhs
-        # lifts the gauge directions, along which the residuals of stars do not change
-        self._matrix += np.mean(np.diag(self._matrix)) * whole.rows.T @ whole.rows
-
-    def step(self, rows):
-        """The step."""
-        problem, blocks = self._problem, self._blocks
-        stars, star = np.unique(problem.star[rows], return_inverse=True)
-        exposure, (n, size), b = problem.exposure[rows], blocks.g_exposure.shape, blocks.values[:, rows]
-        own, gradient = _part_of(problem, blocks, rows)
-        rhs = gradient.ravel()
-        roots = elimination.star_roots(blocks.v[:, stars])
-        pulled = problem.pulled_at(exposure, blocks.coupling[:, :, rows])
-        coupling = np.einsum("can,ckn->nak", pulled, roots[:, :, star])
-        factor = np.zeros((n, 2, len(b), len(roots), len(stars)))
-        factor[exposure, ..., star] = coupling[:, :, None] * b.T[:, None, :, None]
-        factor = factor.reshape(n * size, -1)
-        rhs -= factor @ np.einsum("ckj,cj->kj", roots, blocks.g_star[:, stars]).ravel()
-        matrix = self._matrix + factor @ factor.T
-        for i, block in enumerate(own):
-            part = slice(i * size, (i + 1) * size)
-            matrix[part, part] -= block
-        unit = np.sqrt(np.abs(np.diag(matrix)))
-        try:
-            root = cho_factor(matrix, lower=True, overwrite_a=True)
-            if (np.diag(root[0]) / unit).min() < _LEAST_PIVOT:
-                raise LinAlgError
-        except LinAlgError:
-            raise SolveError("the stars that are left do not determine the distortion of this degree") from None
-        return cho_solve(root, self._rhs - rhs)
+def _step_without(fit, rows):
+    """Step (n_exposures, 2 n_modes) of the coefficients without stars, given all rows of theirs."""
+    problem, blocks, gauge = fit.weighted, fit.blocks, fit.result.gauge
+    v, g_star = blocks.v.copy(), blocks.g_star.copy()
+    v[:, problem.star[rows]] = g_star[:, problem.star[rows]] = 0
+    own, gradient = _part_of(problem, blocks, rows)
+    left = replace(blocks, u=blocks.u - own, g_exposure=blocks.g_exposure - gradient, v=v, g_star=g_star)
+    if reduced_system.is_singular(left.u):
+        raise SolveError("the stars that are left do not determine the distortion of this degree")
+    # few iterations serve, as the solution with these stars is near; factors would take longer
+    return reduced_system.Iterative(problem, left, gauge).step(np.zeros(gauge.n_constraints), _ACCURACY)[1]

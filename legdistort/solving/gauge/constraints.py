@@ -23,7 +23,7 @@ _NOTHING = 1e-9  # pixels
 _CORNERS = np.array([[-1, 1, 1, -1.0], [-1, -1, 1, 1.0]])
 
 
-def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=None, all_drifts=False):
+def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=None, all_drifts=False, settled=False):
     """The gauge at a state, its weights from the blocks of the criterion and the scatter seen there.
 
     Parameters
@@ -40,6 +40,8 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         Covariance of single exposures; estimated if not given.
     all_drifts : bool
         Hold those maps that change with time, too, that what is known of the motions of stars determines.
+    settled : bool
+        The convention as if the static distortion were exact and all modes scattered alike: nothing is estimated.
 
     Raises
     ------
@@ -62,6 +64,8 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     error = conditional_errors(blocks.u_data)
     maps = _taken_back(problem, motion, box, shared_shears)
     static = _static_variance(problem, others, group, shared)
+    if settled:
+        static, dynamic = np.zeros_like(static), np.broadcast_to(np.eye(motion.shape[1]), motion.shape)
     drifting, drifts, rates = _drifts(problem, motion, others, shared_shears, all_drifts)
     if dynamic is None:
         moved = np.concatenate([others @ motion @ maps.T, others @ drifting @ drifts.T], axis=2)
