@@ -100,8 +100,8 @@ def coadd(
     pixfrac, kernel
         For 'drizzle': side of the drops as a fraction of a pixel, and their shape, 'square', 'turbo' or 'point'.
     workers : int, optional
-        Threads that share the work; processes for 'drizzle', whose package keeps Python's lock. None = the current ``dask.distributed.Client`` if there is one, else this one. The
-        mosaic is the same, bit for bit.
+        Threads that share the work; processes for 'drizzle', whose package keeps Python's lock. None = the current
+        ``dask.distributed.Client`` if there is one, else this one. The mosaic is the same, bit for bit.
     scratch : str or path, optional
         Folder for the pixels of the exposures while work goes on, 4 to 11 bytes for each (17 in double precision), and
         for those of the mosaic, 21 or more, as long as it is in use; the workers of a cluster must see it. The default

@@ -529,6 +529,15 @@ class TestMosaicInBlocks:
             assert_same(ld.coadd(exposures, solution, workers=workers, **settings), one)
         assert not any(tmp_path.iterdir())
 
+    @pytest.mark.parametrize("method", ["mean", "clipped"])
+    def test_drizzle_in_processes_gives_the_same_bits(self, monkeypatch, method):
+        pytest.importorskip("drizzle")
+        solution, exposures = night(uncertainty=np.full(SHAPE, 8.0))
+        monkeypatch.setattr(block_stack, "_SAMPLES", 1 << 16)
+        settings = {"method": method, "algorithm": "drizzle"}
+        one = ld.coadd(exposures, solution, workers=1, **settings)
+        assert_same(ld.coadd(exposures, solution, workers=2, **settings), one)
+
     @pytest.mark.slow
     @COMPILED
     def test_two_hundred_times_the_same(self, monkeypatch, compiled_from):
