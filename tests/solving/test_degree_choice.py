@@ -363,6 +363,9 @@ def test_energy_of_its_own_is_seen_beside_a_common_map(monkeypatch, limit):
 def test_two_exposures_say_nothing_of_a_common_map():
     sim = simulate_matches(n_exposures=2, n_stars=60, degree=3, seed=1)
     assert folding(sim, 3, 4).excess == pytest.approx(0, abs=3)
+    assert folding(sim, 3, 4, top=5).excess == pytest.approx(0, abs=3)
+    turned = simulate_matches(n_exposures=2, n_stars=80, degree=3, rotations=[0, 60.0], seed=1)
+    assert folding(turned, 3, 4, top=5).excess == 0  # common maps of degrees 4 and 5 explain any departure of the two
 
 
 def test_where_similarities_are_in_the_poses_no_energy_is_missed():

@@ -279,7 +279,7 @@ def _of_their_own(fit, high):
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (ceil(_PROBED / given.size), given.size))
     variance = np.mean([each @ covariance(each) for each in signs])
     departure = turn[:, :, modes].mT @ given.reshape(n, -1, 1)
-    return departure.reshape(n, 2, -1), float(given @ solved), dof, float(variance)
+    return departure.reshape(n, 2, -1), float(given @ solved) if dof else 0.0, dof, float(variance)
 
 
 def _folds_at_stars(fit, low, high):
