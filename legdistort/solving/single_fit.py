@@ -198,8 +198,7 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         if options.loss != "linear" and (lost := _misplaced(problem, typical)):
             return minimise(matches.without(lost), options, judged=judged)
         if trial:
-            explained = near is not None and near.chi2 < EXPLAINED * problem.xy.size
-            common |= {"tolerance": TRIAL, "settled": near_by and explained}
+            common |= {"tolerance": TRIAL, "settled": near_by and near.chi2 < EXPLAINED * problem.xy.size}
         result = minimisers.solve_joint(problem, start, **common)
         return Fit(matches, problem, result, everything, options)
     if start_values.far_off(problem, typical).any() and (astray := agreement.astray(problem)):

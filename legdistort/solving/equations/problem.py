@@ -115,13 +115,9 @@ class Problem:
 
     def pulled(self, values):
         """Gradients (2, ..., n) by the place of a star at every observation -> by its unknowns, (2 + k, ..., n)."""
-        return self.pulled_at(self.exposure, values)
-
-    def pulled_at(self, exposure, values):
-        """The same for observations of some exposures (n,)."""
         if not self.terms.n:
             return values
-        columns = np.moveaxis(self.terms.columns[exposure], 0, -1)
+        columns = np.moveaxis(self.terms.columns[self.exposure], 0, -1)
         return np.concatenate([values, np.einsum("akn,a...n->k...n", columns, values)])
 
     @cached_property
