@@ -346,9 +346,9 @@ def shapes_by_exposure(shape, names):
 
 def _check_spread(seen):
     """Positions on one line do not constrain anything across it."""
-    off = np.stack([column - column.mean() for column in seen.xy.T])
-    smaller, larger = np.linalg.eigvalsh(off @ off.T)
-    if smaller < 1e-12 * larger and np.linalg.matrix_rank(off) < 2:
+    x, y = (column - column.mean() for column in seen.xy.T)
+    smaller, larger = np.linalg.eigvalsh([[x @ x, x @ y], [x @ y, y @ y]])
+    if smaller < 1e-12 * larger and np.linalg.matrix_rank([x, y]) < 2:
         raise InputError("all positions lie on one line: give stars all over the field, or look at the columns x, y")
 
 

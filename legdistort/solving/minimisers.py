@@ -43,6 +43,8 @@ _NEAR, _MUCH_SMALLER = 5.0, 0.1
 #: After a first step, or one below this part of the one before, what has been factorised serves the next one too if
 #: that turns out to be much smaller.
 _SMALLER = 0.5
+#: Inner iterations stop so far below the tolerance.
+_ENOUGH = 0.2
 #: Up to so many observations one more pass over them at the start costs less than it saves.
 _BEGIN_UP_TO = 100_000
 _TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
@@ -266,31 +268,31 @@ class _Descent:
             self.made = reduced_system.reduced_system(self.weighted, self.blocks, self.convention)
         return self.made
 
-    def _step(self, target, accuracy):
+    def _step(self, *how):
         """The next step of stars and coefficients, and its size."""
         self.stepping = self.stepping or self.system
-        d_star, d_exposure = self.stepping.step(target, accuracy)
+        d_star, d_exposure = self.stepping.step(*how)
         return d_star, d_exposure, _step_size(self.blocks, d_star, d_exposure)
 
     def descend(self, max_iterations):
         """Iterate until the next step would be below the tolerance."""
         accuracy, size = 1e-3 if self.blocks.coupling.dtype == np.float32 else 1e-5, self.size
-        tolerance = self.rules.tolerance
+        tolerance, enough = self.rules.tolerance, _ENOUGH * self.rules.tolerance
         for count in range(max_iterations):
             _count.get()()
             target, last = -self.convention.violation(_departure(self.problem, self.state)), size
-            d_star, d_exposure, size = self._step(target, accuracy)
+            d_star, d_exposure, size = self._step(target, accuracy, enough)
             failed = size >= _MUCH_SMALLER * last and not self.stepping.moves_exactly
             if failed and self.on_trial and self.stepping is not self.made:
                 self.stepping = None
-                d_star, d_exposure, size = self._step(target, accuracy)
+                d_star, d_exposure, size = self._step(target, accuracy, enough)
             self.steps.append(size)
             log.debug("J = %.8g, step %.2g standard errors", self.blocks.cost, size)
             if size < tolerance:
                 self.converged = True
                 return
             if count and size > 0.1 * last:  # slow: exposures hang together weakly; inner iterations must be more exact
-                accuracy = max(0.01 * accuracy, 1e-10)
+                accuracy, enough = max(0.01 * accuracy, 1e-10), 0.01 * enough
             cost, self.blocks, self.made, self.stepping.blocks = self.blocks.cost, None, None, None  # makes room
             self.state, self.blocks = _advance(self.weighted, self.state, cost, d_star, d_exposure)
             self._reweight()

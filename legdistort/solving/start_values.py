@@ -48,7 +48,7 @@ def start(problem, nominal, *, robust=False):
         current = refine(problem, current, q, positions, weight)
     distance2 = distances(problem, current, q, positions)
     typical = np.sqrt([similarity.median(distance2[problem.part(i)]) for i in range(problem.n_exposures)])
-    common = _common_similarity(problem, nominal, current, misplaced(problem, typical))
+    common = _common_similarity(problem, nominal, current, full, misplaced(problem, typical))
     current = similarity.compose(current, common)
     if problem.terms.n:
         stars = moving_stars(problem, current, q, weight)
@@ -120,12 +120,13 @@ def moments(problem, q, weight, positions):
     return means[0].T, means[1].T, np.moveaxis(cross, 2, 0)
 
 
-def _common_similarity(problem, nominal, refined, astray):
+def _common_similarity(problem, nominal, refined, weight, astray):
     """The similarity of the reference plane that brings refined poses back, in the mean, to the nominal ones.
 
-    Exposures of like quality count equally, bad ones less, misplaced ones not at all.
+    Exposures of like quality, by the weights (n,) of their observations, count equally, bad ones less, misplaced ones
+    not at all.
     """
-    variance = 1 / np.add.reduceat(problem.weight[:2].sum(axis=0), problem.start[:-1])
+    variance = 1 / np.add.reduceat(weight, problem.start[:-1])
     weight = 1 / (variance + 10 * np.median(variance))
     weight[astray] = 0
     corners = np.array(problem.shapes)[:, None, ::-1] * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 0.5

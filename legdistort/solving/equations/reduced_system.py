@@ -172,7 +172,7 @@ class Direct(Reduced):
         target = np.pad(target, (0, self.n_weak))
         return free - self._lifted @ (self._border @ (self.rows @ free - target))
 
-    def step(self, target, accuracy):
+    def step(self, target, accuracy, enough=0.0):
         """Gauss-Newton step under the constraints of the gauge; exact whatever the accuracy asked for.
 
         That of the coefficients has the similarities for the poses in it, which take along what they carry.
@@ -183,6 +183,8 @@ class Direct(Reduced):
             What is still lacking to the values of the orthonormal constraints.
         accuracy : float
             Where conjugate gradients may stop, relative to the size of the step.
+        enough : float
+            ... or so many standard errors before its end, rms over the unknowns, by the blocks of the exposures.
 
         Returns
         -------
@@ -300,16 +302,16 @@ class Iterative(Reduced):
         """As for `Direct`."""
         return self.moves @ self.rhs
 
-    def step(self, target, accuracy):
+    def step(self, target, accuracy, enough=0.0):
         """As for `Direct`."""
         gradients = self.blocks.g_exposure, self.blocks.g_star
         limit = _FAST_STEPS if _is_small(self.problem, _DIRECT_COST) else None
-        found = self._solve(*gradients, self.rows, target, accuracy, limit=limit)
+        found = self._solve(*gradients, self.rows, target, accuracy, enough, limit=limit)
         if found is None:  # exposures hang together weakly
             return Direct(self.problem, self.blocks, self.gauge).step(target, accuracy)
         return found[0], self.unknowns.spread(found[1])
 
-    def _solve(self, g_exposure, g_star, rows, target, tolerance, *, max_iterations=1000, limit=None):
+    def _solve(self, g_exposure, g_star, rows, target, tolerance, enough=0.0, *, max_iterations=1000, limit=None):
         """Star step (2 + k, n_stars) and step of the unknown coefficients for gradients, with rows d = target.
 
         None if it takes more than `limit` iterations.
@@ -323,11 +325,13 @@ class Iterative(Reduced):
             return z - lifted @ (border @ (rows @ z))
 
         d = lifted @ (border @ target)
-        stars = g_star - self._couple(d)
-        r = self._gradient(g_exposure - self._own(d), stars)
+        if target.any():
+            g_exposure, g_star = g_exposure - self._own(d), g_star - self._couple(d)
+        stars, r = g_star, self._gradient(g_exposure, g_star)
         z = precondition(r)
         p, rz = z, r @ z
-        goal = max(tolerance**2 * rz, 1e-16 * len(r))  # r'z is in units of chi2: below, only rounding is left
+        # r'z is in units of chi2: below 1e-16, only rounding is left
+        goal = max(tolerance**2 * rz, enough**2 * (len(r) + g_star.size), 1e-16 * len(r))
         for count in range(max_iterations):
             if rz <= goal:
                 log.debug("conjugate gradients: %d steps", count)

@@ -117,7 +117,7 @@ class OnStars(Reduced):
         """U^-1 of gradients (n_exposures, 2 n_modes)."""
         return np.einsum("iab,icb,ic->ia", self._roots, self._roots, own, optimize=True)
 
-    def step(self, target, accuracy):
+    def step(self, target, accuracy, enough=0.0):
         """As for `Direct`; exact whatever the accuracy asked for."""
         return self._solve(self.blocks.g_exposure, self.blocks.g_star, target)[:2]
 
