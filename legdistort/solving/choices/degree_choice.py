@@ -4,7 +4,6 @@ A degree too low leaves distortion in their positions, one too high follows the 
 """
 
 import logging
-from itertools import pairwise
 from math import ceil
 
 import numpy as np
@@ -266,7 +265,7 @@ def _of_their_own(fit, high):
 
     def covariance(each):
         gradient = own(each).reshape(n, 1, -1) @ turn
-        return own((turn @ system.settle(gradient[:, 0], still)[1][:, :, None]).ravel())
+        return own((turn @ system.settle(gradient[:, 0], still, 0.1 * _ACCURACY)[1][:, :, None]).ravel())
 
     given = own((turn[:, :, modes] @ departure.reshape(n, -1, 1)).ravel())
     dof, square = given.size - common.shape[1], (given.size, given.size)
@@ -284,14 +283,9 @@ def _of_their_own(fit, high):
 
 def _folds_at_stars(fit, low, high):
     """Regression (n_exposures, n_low, n_high) of higher modes on the lower ones at the stars of each exposure."""
-    problem, values = fit.weighted, fit.blocks.values
-    weight = np.sqrt(problem.weight[:2].sum(axis=0))
-    return np.stack(
-        [
-            np.linalg.lstsq((values[:low, i:j] * weight[i:j]).T, (values[high, i:j] * weight[i:j]).T, rcond=None)[0]
-            for i, j in pairwise(problem.start)
-        ]
-    )
+    n, u = fit.problem.n_modes, fit.blocks.u_data
+    products = u[:, :n, :n] + u[:, n:, n:]  # both axes count
+    return np.linalg.pinv(products[:, :low, :low], hermitian=True) @ products[:, :low, high]
 
 
 def _sentence(degree, scores, aliasing):

@@ -194,13 +194,15 @@ class Direct(Reduced):
         d = self.solve(self.rhs, target)
         return self._stars(self.blocks.g_star - self._couple(d)), self.problem.unknowns.spread(d)
 
-    def settle(self, own, stars):
+    def settle(self, own, stars, accuracy=1e-8):
         """What stars (2 + k, n_stars) and coefficients (n_exposures, 2 n_modes) do about gradients, in the gauge.
 
         Parameters
         ----------
         own : ndarray, shape (n_exposures, 2 n_modes)
         stars : ndarray, shape (2 + k, n_stars)
+        accuracy : float
+            As for `step`.
         """
         d = self.solve(self._gradient(own, stars), np.zeros(self.gauge.n_constraints))
         return self._stars(stars - self._couple(d)), self.problem.unknowns.spread(d)
@@ -276,7 +278,7 @@ class Iterative(Reduced):
         return np.einsum("iab,ib->ia", self._block_inverses, r.reshape(self.blocks.g_exposure.shape)).ravel()
 
     def settle(self, own, stars, accuracy=1e-8):
-        """As for `Direct`, to an accuracy relative to the size of the step."""
+        """As for `Direct`."""
         stars, d = self._solve(own, stars, self.rows, np.zeros(len(self.rows)), accuracy)
         return stars, self.unknowns.spread(d)
 

@@ -121,7 +121,7 @@ class OnStars(Reduced):
         """As for `Direct`; exact whatever the accuracy asked for."""
         return self._solve(self.blocks.g_exposure, self.blocks.g_star, target)[:2]
 
-    def settle(self, own, stars):
+    def settle(self, own, stars, accuracy=1e-8):
         """As for `Direct`."""
         return self._solve(own, stars, np.zeros(len(self.rows)))[:2]
 
