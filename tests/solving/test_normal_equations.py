@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, eigh, null_space
 
+from legdistort import Matches, solve
 from legdistort.exceptions import AssumptionWarning, SolveError
 from legdistort.geometry.detector_modes import similarity_basis
 from legdistort.priors.prior import Prior
@@ -272,6 +273,24 @@ def test_star_errors_need_no_covariance_of_the_coefficients(case):
     quick = Uncertainty(problem, blocks, gauge, scale=1.5)
     whole = Uncertainty(problem, blocks, gauge, scale=1.5, coefficients=quick.coefficients)
     assert_allclose(quick.star_unknowns, whole.star_unknowns, rtol=1e-9)
+
+
+def test_many_exposures_of_few_stars_are_solved_on_the_stars(monkeypatch):
+    """The same solution and errors; not where an exposure has hardly more stars than modes: digits would be lost."""
+    sim = simulate_matches(n_exposures=40, n_stars=25, seen=0.9, sigma=0.05, dither=100.0, seed=4)
+    stars_of_first = sim.matches.table["exposure"] == sim.matches.names[0]
+    few = sim.matches.table[~stars_of_first | (np.cumsum(stars_of_first) <= 11)]
+    few = Matches.from_table(few, shape=sim.matches.shapes, poses=sim.matches.poses)
+    for matches, made in ((sim.matches, OnStars), (few, Direct)):
+        found = solve(matches, prior=Prior(sim.truth.static), clip=None)
+        assert isinstance(found.uncertainty.system, made)
+        with monkeypatch.context() as patch:
+            patch.setattr(reduced_system, "STARS_FROM", np.inf)
+            other = solve(matches, prior=Prior(sim.truth.static), clip=None)
+            assert isinstance(other.uncertainty.system, Direct)
+            errors = np.sqrt(other.uncertainty.stars[:2].T)
+        assert np.abs((found.positions - other.positions) / errors).max() < 1e-3
+        assert_allclose(np.sqrt(found.uncertainty.stars[:2].T), errors, rtol=1e-5)
 
 
 def test_exposures_to_blame_are_named_where_steps_are_iterated(case, monkeypatch):

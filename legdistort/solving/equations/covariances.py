@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.linalg import LinAlgError
 
 from ...exceptions import AssumptionWarning, warn
 from ...results.coefficient_covariance import times
@@ -107,12 +105,9 @@ class Uncertainty:
             return None
         if isinstance(system, OnStars):
             return system
-        n = problem.n_exposures * 2 * problem.n_modes
-        few = n > reduced_system.DIRECT_LIMIT and problem.n_star * problem.n_stars <= n / 2
-        if (few or not self._is_dense) and reduced_system.has_few_stars(problem):
-            with contextlib.suppress(LinAlgError):
-                return OnStars(problem, self._blocks, self._gauge)
-        return None
+        if self._is_dense and not reduced_system.has_fewer_stars(problem):
+            return None
+        return reduced_system.solved_on_stars(problem, self._blocks, self._gauge, self._is_dense)
 
     @cached_property
     def _approximated(self):

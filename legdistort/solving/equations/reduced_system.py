@@ -24,24 +24,27 @@ log = logging.getLogger(__name__)
 
 #: Up to this many unknown coefficients the reduced matrix is factorised; beyond, conjugate gradients.
 DIRECT_LIMIT = 3000
-#: Up to this many unknowns of stars their own matrix is.
+#: From so many on the coefficients are eliminated instead where the stars have no more than half as many unknowns.
+STARS_FROM = 600
+#: Up to this many unknowns of stars their own matrix is factorised.
 STAR_LIMIT = 8000
 #: ... and while building it costs no more than this many multiplications.
 _DIRECT_COST = 4e9
 #: ... or this many, where compiled loops make the steps of conjugate gradients cheap; there are so many of these before
 #: the matrix is factorised after all.
 _FAST_DIRECT_COST, _FAST_STEPS = 1e8, 60
+_CLEAR_PIVOT = 0.03  # of an exposure whose stars determine its coefficients well
 _LEAST_PIVOT = 1e-7  # of the normalised equations, below which they count as singular
 _WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not determined
 
 
 def reduced_system(problem, blocks, gauge, weak=None):
     """`Direct`, `OnStars` or `Iterative`, by the size of the problem."""
-    large = problem.unknowns.size > DIRECT_LIMIT
-    if large and has_few_stars(problem, _DIRECT_COST) and 2 * problem.n_star * problem.n_stars <= problem.unknowns.size:
-        with contextlib.suppress(LinAlgError):
-            return OnStars(problem, blocks, gauge)
-    if uses_direct(problem) or (not large and is_singular(blocks.u)):  # which names the exposure with too few stars
+    small, direct = problem.unknowns.size <= DIRECT_LIMIT, uses_direct(problem)
+    on_stars = has_fewer_stars(problem) and (direct or not small)
+    if on_stars and (made := solved_on_stars(problem, blocks, gauge, small, _DIRECT_COST)) is not None:
+        return made
+    if direct or (small and is_singular(blocks.u)):  # which names the exposure with too few stars
         return Direct(problem, blocks, gauge, weak)
     return Iterative(problem, blocks, gauge)
 
@@ -70,10 +73,23 @@ def _is_small(problem, cost):
     return n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= cost
 
 
-def has_few_stars(problem, cost=np.inf):
-    """Whether `OnStars` serves a problem, at no more than some multiplications."""
+def has_fewer_stars(problem):
+    """Whether there are many coefficients, and the stars have no more than half as many unknowns."""
+    n = problem.unknowns.size
+    return n >= STARS_FROM and 2 * problem.n_star * problem.n_stars <= n
+
+
+def solved_on_stars(problem, blocks, gauge, only_clear, cost=np.inf):
+    """`OnStars`, if it serves a problem, at no more than some multiplications; else None.
+
+    With `only_clear` not for exposures of hardly more stars than modes, of which it loses digits that `Direct` keeps.
+    """
     n = problem.n_star * problem.n_stars
-    return not problem.unknowns.shared and n <= STAR_LIMIT and n * n * float(problem.unknowns.size) <= cost
+    if problem.unknowns.shared or n > STAR_LIMIT or n * n * float(problem.unknowns.size) > cost:
+        return None
+    with contextlib.suppress(LinAlgError):
+        return OnStars(problem, blocks, gauge, **{"least_pivot": _CLEAR_PIVOT} if only_clear else {})
+    return None
 
 
 class Direct(Reduced):

@@ -22,8 +22,8 @@ from .star_terms import packed, unpacked
 
 #: Numbers held at once while exposures are eliminated.
 _BLOCK = 2**23
-#: Reciprocal condition below which K, and least pivot below which a block of U, counts as singular.
-_SINGULAR, _LEAST_PIVOT = 1e-14, 1e-4
+#: Reciprocal condition below which K counts as singular.
+_SINGULAR = 1e-14
 #: Part of the information on a star, left when exposures with hardly more stars than modes are free, that is rounding.
 _LOST = 1e-8
 
@@ -34,6 +34,12 @@ class OnStars(Reduced):
     For problems in which exposures share nothing. Methods are those of
     `legdistort.solving.equations.reduced_system.Direct`.
 
+    Parameters
+    ----------
+    problem, blocks, gauge
+    least_pivot : float
+        Of the normalised block of an exposure, below which it counts as singular.
+
     Raises
     ------
     LinAlgError
@@ -43,7 +49,7 @@ class OnStars(Reduced):
 
     takes_any_gauge = False
 
-    def __init__(self, problem, blocks, gauge):
+    def __init__(self, problem, blocks, gauge, least_pivot=1e-4):
         super().__init__(problem, blocks, gauge)
         self.scale = np.einsum("iaa->", blocks.u) / self.unknowns.size
         unit = np.einsum("iaa->ia", blocks.u)
@@ -51,7 +57,7 @@ class OnStars(Reduced):
             raise LinAlgError
         unit = 1 / np.sqrt(unit)
         lower = np.linalg.cholesky(unit[:, :, None] * blocks.u * unit[:, None, :])
-        if np.einsum("iaa->ia", lower).min() < _LEAST_PIVOT:
+        if np.einsum("iaa->ia", lower).min() < least_pivot:
             raise LinAlgError
         self._roots = unit[:, :, None] * np.linalg.inv(lower).mT  # U^-1 = root root'
         self._determined = self.inverse[np.diag(packed(problem.n_star))] > 0
