@@ -6,6 +6,7 @@ best of three after a first call (which loads compiled code); memory is what the
 
 import argparse
 import json
+import logging
 import resource
 import subprocess
 import sys
@@ -155,6 +156,7 @@ def main():
     parser.add_argument("--covariances", action="store_true", help="errors of all stars, many exposures or many stars")
     parser.add_argument("--degrees", action="store_true", help="CPU time of degree='auto' over a given degree")
     arguments = parser.parse_args()
+    logging.disable(logging.WARNING)  # of what is not known without a prior
     sys.path.insert(0, str(Path(__file__).parent))
     if arguments.row:
         name, solver, n_exposures, n_stars = arguments.row

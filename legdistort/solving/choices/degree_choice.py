@@ -14,6 +14,7 @@ from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...results.diagnostics import AliasedDegree, DegreeChoice
 from ..equations import elimination
+from ..gauge import constraints
 from . import held_out
 
 log = logging.getLogger(__name__)
@@ -213,6 +214,9 @@ def folding(fit, degree, higher):
     """
     low, high = basis.n_modes(degree), slice(basis.n_modes(higher - 1), basis.n_modes(higher))
     departure, squares, dof, variance = _of_their_own(fit, high)
+    excess = _excess(squares, dof)
+    if excess > ALARM and np.any(fit.problem.mean_sigma):  # the static distortion was not given exactly
+        excess = _excess(*_of_their_own(fit, high, carried=low)[1:3])
     energy = np.sum(departure**2)
     beyond = np.sqrt(max(1 - variance / max(energy, 1e-300), 0))
     folds = _folds_at_stars(fit, low, high)
@@ -227,7 +231,7 @@ def folding(fit, degree, higher):
         degree=int(higher),
         found=found,
         noise=float(found * np.sqrt(variance / max(energy, 1e-300))),
-        excess=float((squares - dof) / np.sqrt(2 * max(dof, 1))),
+        excess=excess,
         energy=float(beyond * found),
         folds_into=tuple(float(np.sqrt(np.sum(size[degrees == d] ** 2)) / 2) for d in range(degree + 1)),
         mode=tuple(orders[high][strongest].tolist()),
@@ -235,11 +239,17 @@ def folding(fit, degree, higher):
     )
 
 
-def _of_their_own(fit, high):
+def _excess(squares, dof):
+    """Squares beyond their degrees of freedom, in standard deviations of what these are by chance."""
+    return float((squares - dof) / np.sqrt(2 * max(dof, 1)))
+
+
+def _of_their_own(fit, high, *, carried=0):
     """Departures of the exposures from the prior in the modes of a degree, without what common maps do to these.
 
     Maps of that degree and of higher ones, which dithers bring down to it: the stars take them up, and what they are
-    follows from the convention, of which distortions of low degree are part.
+    follows from the convention, of which distortions of low degree are part. With the first modes `carried` to other
+    places by common maps of any degree as well, as they are to second order where some pixels of these are not known.
 
     Returns
     -------
@@ -256,7 +266,13 @@ def _of_their_own(fit, high):
     # shears in the place of linear modes: similarities are in the poses
     of_degree = dynamic_degrees(problem.n_modes) == basis.degree_of(high.stop)
     turn = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])[:, of_degree]
-    motion = turn[:, :, modes] @ gauge.motion[:, maps[:, high].reshape(-1, 1), maps[:, high.start :].ravel()]
+    motion, causes = gauge.motion, maps[:, high.start :]
+    if carried:
+        coefficients = problem.prior_mean.copy()
+        coefficients[:, :, :carried] = fit.result.state.coefficients[:, :, :carried]
+        motion = constraints.motion_with_distortion(problem, fit.result.state.poses, coefficients, gauge.box)
+        causes = maps[:, basis.n_modes(1) :]
+    motion = turn[:, :, modes] @ motion[:, maps[:, high].reshape(-1, 1), causes.ravel()]
     columns, size, _ = np.linalg.svd(motion.reshape(-1, motion.shape[2]), full_matrices=False)
     common, still = columns[:, size > _SETTLED * size.max()], np.zeros_like(fit.blocks.g_star)
 

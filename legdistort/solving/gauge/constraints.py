@@ -258,6 +258,20 @@ def _motion(problem, pose_list, box):
     return np.einsum("iab,imn->iambn", linear, mixing).reshape(-1, 2 * size, 2 * size)
 
 
+def motion_with_distortion(problem, pose_list, coefficients, box):
+    """N_i where a distortion d, A_i (n_exposures, 2, n_all), carries q to a place that moves by (I + grad d) R g."""
+    degree, n = problem.degree, problem.n_modes
+    u, v, w = basis.quadrature(2 * degree)
+    by_u, by_v = basis.gradients(basis.degree_of(coefficients.shape[2]), u, v)[1:]
+    slope = np.stack([coefficients @ by_u, coefficients @ by_v], axis=2)  # (exposure, axis, along, node)
+    moved = np.eye(2)[:, :, None] + slope * (2 / problem.size)[:, None, :, None]
+    moved = np.einsum("iack,icb->iabk", moved, pose_list[:, :, :2])
+    back = similarity.apply_inverses(pose_list, _by_shape(_nodes, problem, 2 * degree))
+    reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
+    modes = basis.values(degree, u, v) * w
+    return np.einsum("mk,iabk,nik->iambn", modes, moved, reference, optimize=True).reshape(-1, 2 * n, 2 * n)
+
+
 def _check_mean(motion):
     """Refuse the "mean" gauge where the mean of N_i loses a direction that single exposures have."""
     mean = motion.mean(axis=0)
