@@ -347,7 +347,9 @@ def shapes_by_exposure(shape, names):
 def _check_spread(seen):
     """Positions on one line do not constrain anything across it."""
     x, y = (column - column.mean() for column in seen.xy.T)
-    smaller, larger = np.linalg.eigvalsh([[x @ x, x @ y], [x @ y, y @ y]])
+    # not by the linear algebra library, whose threads would be in the way of what comes next
+    xx, xy, yy = (np.einsum("n,n", *pair) for pair in ((x, x), (x, y), (y, y)))
+    smaller, larger = np.linalg.eigvalsh([[xx, xy], [xy, yy]])
     if smaller < 1e-12 * larger and np.linalg.matrix_rank([x, y]) < 2:
         raise InputError("all positions lie on one line: give stars all over the field, or look at the columns x, y")
 
