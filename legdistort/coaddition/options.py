@@ -9,6 +9,7 @@ from astropy.wcs import WCS
 
 from ..exceptions import InputError
 from ..runtime.checks import check_choice
+from ..runtime.scratch import scratch_folder
 from ..runtime.words import ALGORITHMS, COMBINATIONS, CONSERVE, EXTRAPOLATED, KERNELS, ORDERS, PLANES, SCALES, WEIGHTS
 from .grids import checked_wcs
 from .resampling.engines import Resampling, uses_compiled_splines
@@ -67,6 +68,9 @@ class CoaddOptions:
             object.__setattr__(self, "planes", planes)
         if self.grid is not None:
             checked_wcs(self.grid)
+        if self.scratch is not None:
+            with scratch_folder(self.scratch, 0):  # tried before hours of work
+                pass
         if self.algorithm == "drizzle":
             self._check_drops()
 

@@ -100,7 +100,7 @@ class LegendreDistortionFitter(Fitter):
             Naming the coefficients that the positions do not determine.
         """
         if clip is not None and not (isinstance(clip, Real) and clip > 1):
-            raise InputError(f"clip must be a number of standard errors above 1, got {clip!r}")
+            raise InputError(f"clip must be a number of standard errors above 1, got {clip!r}; None keeps all")
         free = free_coefficients(model)
         x, y, data, weight = _check_arrays(x, y, (x_data, y_data), weights)
         constant, columns = linear_parts(model, x, y, free)

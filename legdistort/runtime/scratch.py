@@ -56,7 +56,7 @@ def scratch_folder(parent, need, what="the pixels"):
         If the disk is full.
     """
     place = Path(tempfile.gettempdir() if parent is None else parent)
-    advice = "give another folder as scratch= (or in the environment, TMPDIR)"
+    advice = "give another folder as scratch=... (--scratch), or in the environment as TMPDIR"
     with ExitStack() as stack:
         try:
             folder, _ = stack.enter_context(locks.temporary_folder(place, "legdistort-", mode=0o700))

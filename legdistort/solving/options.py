@@ -60,7 +60,9 @@ class SolveOptions(Settings):
             raise InputError(f"max_iterations must be a positive integer, got {self.max_iterations!r}")
         self._check_motion()
         if self.clip is not None and not (isinstance(self.clip, Real) and 1 < self.clip < LARGEST):
-            raise InputError(f"clip must be a number of standard errors above 1, got {self.clip!r}")
+            raise InputError(
+                f"clip must be a number of standard errors above 1, got {self.clip!r}; clip=None (--clip 0) keeps all"
+            )
 
     def _check_motion(self):
         """What is sought of the motions of stars, and what is known of them beforehand."""

@@ -218,9 +218,12 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         _check_majority(matches, options, unfollowed)
     if lost := unfollowed or agreement.starved(problem, used):
         return minimise(matches.without(lost), options, judged=judged)
+    fit = Fit(matches, problem, result, used, options)
+    if plain is not None and plain.converged and not used.all() and fit.dof < 1:  # nothing tells what is wrong then
+        return Fit(matches, problem, plain, everything, options)
     if result is plain and not plain.converged:
         warn(plain.status, ConvergenceWarning)
-    return Fit(matches, problem, result, used, options)
+    return fit
 
 
 def _from(near, problem):

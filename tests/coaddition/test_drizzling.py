@@ -130,3 +130,10 @@ def test_without_the_package(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", absent)
     with pytest.raises(InputError, match=r"needs the package drizzle: pip install legdistort\[drizzle\]"):
         CoaddOptions(algorithm="drizzle")
+
+
+def test_a_scratch_folder_is_tried_before_there_are_frames(tmp_path):
+    with pytest.raises(InputError, match=r"no scratch folder can be made in .*absent .*give another .*\(--scratch\)"):
+        CoaddOptions(scratch=tmp_path / "absent")
+    CoaddOptions(scratch=tmp_path)
+    assert not list(tmp_path.iterdir())

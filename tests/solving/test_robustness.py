@@ -226,6 +226,18 @@ def test_clean_data_are_solved_as_without_clipping(n_exposures, noise):
     np.testing.assert_array_equal(solution.positions, plain.positions)
 
 
+def test_no_more_is_left_out_than_leaves_something_to_judge_by():
+    """Two wrong positions, four degrees of freedom: without the two anything fits, and nothing tells what is wrong."""
+    sim = simulate_matches(n_exposures=6, n_stars=7, degree=2, sigma=0.01, seen=0.93, seed=34)
+    table = sim.matches.table.copy()
+    table["x"][[3, 20]] += 1 * u.pix
+    matches = Matches.from_table(table, shape=sim.matches.shapes, poses=sim.matches.poses)
+    solution = solve(matches, degree=2, prior=Prior(sim.truth.static))
+    assert solution.observations["used"].all()
+    assert solution.dof == 4
+    assert {check.name: check.state for check in solution.checks}["chi2"] == "fail"
+
+
 def test_it_yields_to_the_published_scheme():
     sim = precise(5, n_stars=20)
     with warns_here(ConvergenceWarning, match="stopped after 3 sweeps"):

@@ -462,3 +462,15 @@ def test_a_trailed_frame_is_seen_in_a_run(tmp_path):
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert {check["name"] for check in summary["checks"]} >= {"chi2", "images", "sharpness", "inverse"}
     assert "exp02 are unlike" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_without_degrees_of_freedom_residuals_tell_nothing():
+    """As many observations as unknowns: every solution fits them."""
+    sim = ld.simulate_matches(n_exposures=6, n_stars=7, degree=2, sigma=0.003, static=3.0, seen=0.93, seed=52)
+    solution = ld.solve(sim.matches, degree=2)
+    assert solution.dof == 0
+    states = {check.name: check.state for check in solution.checks}
+    assert {name for name, state in states.items() if state == "unknown"} == {
+        "chi2", "exposures", "place", "time", "degree", "absolute"
+    }  # fmt: skip
+    assert "no degrees of freedom are left to judge it by" in str(solution.checks[1])

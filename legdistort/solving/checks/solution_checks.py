@@ -24,6 +24,8 @@ NEGLIGIBLE = 0.05
 GROSS_ERRORS = 0.05
 #: What else may be behind a check that does not pass.
 _CAUSES = {"time": ("degree",)} | dict.fromkeys(("exposures", "brightness", "place", "duplicates"), ("degree", "time"))
+#: What only residuals tell, and what to do where they tell nothing.
+_BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
 _TOO_MUCH = 0.5  # of a frame without stars around
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
 
@@ -64,7 +66,15 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
         duplicates_check(solution, residuals),
         header_check(header_distortion),
     ]
-    return _causes_first([check for check in made if check is not None])
+    made = [check for check in made if check is not None]
+    if residuals.dof < 1:
+        made = [_unjudged(check) if check.name in _BY_RESIDUALS else check for check in made]
+    return _causes_first(made)
+
+
+def _unjudged(check):
+    """A check that only residuals could tell, where they have no degrees of freedom."""
+    return Check(check.name, "unknown", None, None, "no degrees of freedom are left to judge it by", _MORE)
 
 
 def _causes_first(checks):
@@ -120,8 +130,8 @@ def errors_check(solution, residuals):
     if dof < 1:
         held = solution.dof - dof
         beside = f" beside {'that' if held == 1 else f'the {held:.0f}'} of the common map that is held" * (held >= 1)
-        return Check("chi2", "unknown", None, None, f"no degrees of freedom are left to judge the errors by{beside}",
-                     "lower the degree, or add stars or exposures")  # fmt: skip
+        found = f"no degrees of freedom are left to judge the errors by{beside}"
+        return Check("chi2", "unknown", None, None, found, _MORE)
     ratio, whole = chi2 / dof, solution.chi2 / solution.dof
     low, high = (special.chdtri(dof, p) / dof for p in (1 - FALSE_ALARM / 2, FALSE_ALARM / 2))
     low, high = min(low, (1 - NEGLIGIBLE) ** 2), max(high, (1 + NEGLIGIBLE) ** 2)
