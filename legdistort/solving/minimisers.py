@@ -43,7 +43,7 @@ _NEAR, _MUCH_SMALLER = 5.0, 0.1
 #: After a first step, or one below this part of the one before, what has been factorised serves the next one too if
 #: that turns out to be much smaller.
 _SMALLER = 0.5
-#: Inner iterations stop so far below the tolerance.
+#: Inner iterations stop at this part of the tolerance.
 _ENOUGH = 0.2
 #: Up to so many observations one more pass over them at the start costs less than it saves.
 _BEGIN_UP_TO = 100_000
@@ -268,10 +268,10 @@ class _Descent:
             self.made = reduced_system.reduced_system(self.weighted, self.blocks, self.convention)
         return self.made
 
-    def _step(self, *how):
+    def _step(self, target, accuracy, enough):
         """The next step of stars and coefficients, and its size."""
         self.stepping = self.stepping or self.system
-        d_star, d_exposure = self.stepping.step(*how)
+        d_star, d_exposure = self.stepping.step(target, accuracy, enough)
         return d_star, d_exposure, _step_size(self.blocks, d_star, d_exposure)
 
     def descend(self, max_iterations):

@@ -120,13 +120,13 @@ def moments(problem, q, weight, positions):
     return means[0].T, means[1].T, np.moveaxis(cross, 2, 0)
 
 
-def _common_similarity(problem, nominal, refined, weight, astray):
+def _common_similarity(problem, nominal, refined, weights, astray):
     """The similarity of the reference plane that brings refined poses back, in the mean, to the nominal ones.
 
     Exposures of like quality, by the weights (n,) of their observations, count equally, bad ones less, misplaced ones
     not at all.
     """
-    variance = 1 / np.add.reduceat(weight, problem.start[:-1])
+    variance = 1 / np.add.reduceat(weights, problem.start[:-1])
     weight = 1 / (variance + 10 * np.median(variance))
     weight[astray] = 0
     corners = np.array(problem.shapes)[:, None, ::-1] * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 0.5

@@ -64,7 +64,6 @@ class Uncertainty:
         self._problem, self._blocks, self._gauge, self._scale = problem, blocks, gauge, scale
         self._given, self._shared = coefficients, 0.0 if shared_errors is None else shared_errors
         self.camera: CameraErrors | None = None if camera is None else camera.scaled(scale)
-        self._made = system
         if system is not None:
             self.system = system
 
@@ -100,14 +99,14 @@ class Uncertainty:
     @cached_property
     def _on_stars(self):
         """The equations with the coefficients eliminated, where that is less work; None elsewhere."""
-        problem, system = self._problem, self._made
+        problem = self._problem
         if self._given is not None:
             return None
-        if isinstance(system, OnStars):
-            return system
+        if isinstance(self.system, OnStars):
+            return self.system
         if self._is_dense and not reduced_system.has_fewer_stars(problem):
             return None
-        return reduced_system.solved_on_stars(problem, self._blocks, self._gauge, self._is_dense)
+        return reduced_system.solved_on_stars(problem, self._blocks, self._gauge)
 
     @cached_property
     def _approximated(self):

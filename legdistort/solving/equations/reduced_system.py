@@ -11,14 +11,14 @@ import logging
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigvalsh_tridiagonal
 from scipy.linalg.blas import dgemm, dtrsm
 from scipy.linalg.lapack import dpotri
 
 from ...exceptions import SolveError
 from . import elimination
 from .reduced_base import Reduced
-from .star_system import OnStars
+from .star_system import LEAST_PIVOT, OnStars
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ def reduced_system(problem, blocks, gauge, weak=None):
     """`Direct`, `OnStars` or `Iterative`, by the size of the problem."""
     small, direct = problem.unknowns.size <= DIRECT_LIMIT, uses_direct(problem)
     on_stars = has_fewer_stars(problem) and (direct or not small)
-    if on_stars and (made := solved_on_stars(problem, blocks, gauge, small, _DIRECT_COST)) is not None:
+    if on_stars and (made := solved_on_stars(problem, blocks, gauge, _DIRECT_COST)) is not None:
         return made
     if direct or (small and is_singular(blocks.u)):  # which names the exposure with too few stars
         return Direct(problem, blocks, gauge, weak)
@@ -79,16 +79,16 @@ def has_fewer_stars(problem):
     return n >= STARS_FROM and 2 * problem.n_star * problem.n_stars <= n
 
 
-def solved_on_stars(problem, blocks, gauge, only_clear, cost=np.inf):
+def solved_on_stars(problem, blocks, gauge, cost=np.inf):
     """`OnStars`, if it serves a problem, at no more than some multiplications; else None.
 
-    With `only_clear` not for exposures of hardly more stars than modes, of which it loses digits that `Direct` keeps.
+    Where `Direct` serves as well, not for exposures of hardly more stars than modes, of which it loses digits.
     """
-    n = problem.n_star * problem.n_stars
-    if problem.unknowns.shared or n > STAR_LIMIT or n * n * float(problem.unknowns.size) > cost:
+    n, n_coefficients = problem.n_star * problem.n_stars, problem.unknowns.size
+    if problem.unknowns.shared or n > STAR_LIMIT or n * n * float(n_coefficients) > cost:
         return None
     with contextlib.suppress(LinAlgError):
-        return OnStars(problem, blocks, gauge, **{"least_pivot": _CLEAR_PIVOT} if only_clear else {})
+        return OnStars(problem, blocks, gauge, _CLEAR_PIVOT if n_coefficients <= DIRECT_LIMIT else LEAST_PIVOT)
     return None
 
 
@@ -284,6 +284,7 @@ class Iterative(Reduced):
     """
 
     moves_exactly = True  # but for the preconditioner all is that of the new state
+    _met = 0.0  # see `_weakest`
 
     def __init__(self, problem, blocks, gauge):
         super().__init__(problem, blocks, gauge)
@@ -348,10 +349,10 @@ class Iterative(Reduced):
         stars, r = g_star, self._gradient(g_exposure, g_star)
         z = precondition(r)
         p, rz = z, r @ z
-        # r'z is in units of chi2: below 1e-16, only rounding is left
-        goal = max(tolerance**2 * rz, enough**2 * (len(r) + g_star.size), 1e-16 * len(r))
+        goal = max(tolerance**2 * rz, 1e-16 * len(r))  # r'z is in units of chi2: below, only rounding is left
+        enough2, lengths, ratios = enough**2 * (len(r) + g_star.size), [], []
         for count in range(max_iterations):
-            if rz <= goal:
+            if rz <= goal or (rz <= enough2 and rz <= enough2 * self._weakest(lengths, ratios) ** 2):
                 log.debug("conjugate gradients: %d steps", count)
                 break
             if count == limit:
@@ -365,6 +366,24 @@ class Iterative(Reduced):
             z = precondition(r)
             rz, old = r @ z, rz
             p = z + rz / old * p
+            lengths.append(length)
+            ratios.append(rz / old)
         else:
             log.info("conjugate gradients stopped after %d steps at %.1e of the start", max_iterations, np.sqrt(rz))
+        if enough:
+            self._weakest(lengths, ratios)  # for the next step
         return self._stars(stars), d
+
+    def _weakest(self, lengths, ratios):
+        """The smallest eigenvalue of the preconditioned matrix that conjugate gradients have met: 0 before the first.
+
+        Of Lanczos' matrix, which follows from the lengths of their steps and the ratios of squares (Golub & Van Loan
+        2013, section 11.3): by its inverse a step is larger than the gradient tells.
+        """
+        if lengths:
+            inverse, ratios = 1 / np.array(lengths), np.array(ratios)
+            diagonal = inverse + np.append(0.0, (ratios * inverse)[:-1])
+            off = (np.sqrt(ratios) * inverse)[:-1]
+            least = eigvalsh_tridiagonal(diagonal, off, select="i", select_range=(0, 0))[0]
+            self._met = min(max(least, 0.0), self._met or np.inf)
+        return self._met

@@ -22,8 +22,8 @@ from .star_terms import packed, unpacked
 
 #: Numbers held at once while exposures are eliminated.
 _BLOCK = 2**23
-#: Reciprocal condition below which K counts as singular.
-_SINGULAR = 1e-14
+#: Reciprocal condition below which K, and least pivot below which a block of U, counts as singular.
+_SINGULAR, LEAST_PIVOT = 1e-14, 1e-4
 #: Part of the information on a star, left when exposures with hardly more stars than modes are free, that is rounding.
 _LOST = 1e-8
 
@@ -49,7 +49,7 @@ class OnStars(Reduced):
 
     takes_any_gauge = False
 
-    def __init__(self, problem, blocks, gauge, least_pivot=1e-4):
+    def __init__(self, problem, blocks, gauge, least_pivot=LEAST_PIVOT):
         super().__init__(problem, blocks, gauge)
         self.scale = np.einsum("iaa->", blocks.u) / self.unknowns.size
         unit = np.einsum("iaa->ia", blocks.u)
