@@ -26,7 +26,8 @@ class AliasedDegree:
     found, noise : float
         Rms of its modes over the field, per axis, and what their errors explain of it, pixels.
     excess : float
-        Of the energy over that of noise, in standard deviations.
+        Of the energy over that of noise, in standard deviations. Where it would raise the alarm and the static
+        distortion is not given exactly, what unknown common maps do to second order counts as noise, here alone.
     energy : float
         Rms beyond the noise, pixels.
     folds_into : tuple of float

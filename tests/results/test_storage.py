@@ -120,6 +120,20 @@ def test_geometry_survives(with_sky, tmp_path):
     assert back.max_inverse_error == with_sky.max_inverse_error
 
 
+def test_covariances_as_blocks_survive(tmp_path, monkeypatch):
+    """One block an exposure, as for more than 8000 coefficients."""
+    for place in ("covariances.DENSE_LIMIT", "reduced_system.DIRECT_LIMIT"):
+        monkeypatch.setattr(f"legdistort.solving.equations.{place}", 100)
+    sim = simulate_matches(n_exposures=8, n_stars=25, seed=3)
+    solution = solve(sim.matches, prior=Prior(sim.truth.static))
+    assert solution.uncertainty.coefficients.shape == (8, 20, 20)
+    for name in ("solution.asdf", "solution.fits"):
+        solution.write(tmp_path / name)
+        again = Solution.read(tmp_path / name)
+        assert_array_equal(again.uncertainty.coefficients, solution.uncertainty.coefficients)
+        assert_array_equal(again.stars["x_err"], solution.stars["x_err"])
+
+
 def test_masked_extra_columns(tmp_path):
     """Columns beyond the contract may have holes, and stay what they are: numbers, integers, text, with units."""
     given = small(

@@ -360,6 +360,17 @@ def test_a_common_map_that_nobody_knew_is_no_energy_where_stars_are_many(quartic
     assert np.all(np.abs(fifth) < degree_choice.ALARM)
 
 
+@pytest.mark.parametrize("n_exposures", [2, 3])
+def test_energy_beyond_what_an_unknown_map_can_do_is_seen_in_few_exposures(n_exposures):
+    """A map that would explain 0.1 px in the end would have to be a hundred pixels large."""
+    static, width = np.repeat([1.5, 0], [10, 5]), np.repeat([0.9, 0.1], [10, 5])
+    for seed in (1, 2):
+        sim = simulate_matches(n_exposures=n_exposures, n_stars=300, degree=4, static=static, dynamic=width,
+                               sigma=0.02, zero_mean=False, dither=100.0, seed=seed)  # fmt: skip
+        with warnings.catch_warnings(action="ignore"):
+            assert folding(sim, 3, 4, top=n_exposures + 2).excess > 2 * degree_choice.ALARM
+
+
 @pytest.mark.parametrize("direct", [True, False])
 def test_energy_of_its_own_is_seen_beside_a_common_map(monkeypatch, direct):
     """Quartic modes of every exposure count, however errors differ, whether the equations are factorised or not."""

@@ -36,6 +36,7 @@ ALARM = 5.0
 _SETTLED = 1e-6  # of the largest effect of a common map on an exposure
 _PROBED = 600  # directions times samples from which the variance of departures is estimated
 _ACCURACY = 1e-3  # of departures over their errors
+_UNKNOWN = 10.0  # pixels, each mode of a common map at most
 _OUTLIER = 25.0  # times the usual squared scatter of a star, at every degree: mismatched, it has no weight
 
 
@@ -248,8 +249,9 @@ def _of_their_own(fit, high, *, carried=0):
     """Departures of the exposures from the prior in the modes of a degree, without what common maps do to these.
 
     Maps of that degree and of higher ones, which dithers bring down to it: the stars take them up, and what they are
-    follows from the convention, of which distortions of low degree are part. With the first modes `carried` to other
-    places by common maps of any degree as well, as they are to second order where some pixels of these are not known.
+    follows from the convention, of which distortions of low degree are part. To second order every common map matters,
+    as it carries the distortion of an exposure, its first modes `carried`, to other places: where the static distortion
+    is not given exactly, that is an error of the departures, for maps of `_UNKNOWN` pixels.
 
     Returns
     -------
@@ -266,22 +268,29 @@ def _of_their_own(fit, high, *, carried=0):
     # shears in the place of linear modes: similarities are in the poses
     of_degree = dynamic_degrees(problem.n_modes) == basis.degree_of(high.stop)
     turn = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])[:, of_degree]
-    motion, causes = gauge.motion, maps[:, high.start :]
+
+    def seen(motion, causes):
+        """What common maps do to the departures, (n_exposures K, m)."""
+        out = turn[:, :, modes] @ motion[:, maps[:, high].reshape(-1, 1), causes.ravel()]
+        return out.reshape(-1, out.shape[2])
+
+    motion, carrying = seen(gauge.motion, maps[:, high.start :]), np.zeros((n * turn.shape[1], 0))
     if carried:
-        coefficients = problem.prior_mean.copy()
+        coefficients, bent = problem.prior_mean.copy(), slice(basis.n_modes(1), None)
         coefficients[:, :, :carried] = fit.result.state.coefficients[:, :, :carried]
-        motion = constraints.motion_with_distortion(problem, fit.result.state.poses, coefficients, gauge.box)
-        causes = maps[:, basis.n_modes(1) :]
-    motion = turn[:, :, modes] @ motion[:, maps[:, high].reshape(-1, 1), causes.ravel()]
-    columns, size, _ = np.linalg.svd(motion.reshape(-1, motion.shape[2]), full_matrices=False)
+        whole = constraints.motion_with_distortion(problem, fit.result.state.poses, coefficients, gauge.box)
+        size = np.minimum(problem.mean_sigma.max(axis=0), _UNKNOWN)[:, bent]
+        carrying = seen(whole - gauge.motion, maps[:, bent]) * size.ravel()
+    columns, size, _ = np.linalg.svd(motion, full_matrices=False)
     common, still = columns[:, size > _SETTLED * size.max()], np.zeros_like(fit.blocks.g_star)
 
     def own(each):
         return each - common @ (each @ common)
 
     def covariance(each):
-        gradient = own(each).reshape(n, 1, -1) @ turn
-        return own((turn @ system.settle(gradient[:, 0], still, 0.1 * _ACCURACY)[1][:, :, None]).ravel())
+        each = own(each)
+        settled = system.settle((each.reshape(n, 1, -1) @ turn)[:, 0], still, 0.1 * _ACCURACY)[1]
+        return own((turn @ settled[:, :, None]).ravel() + carrying @ (each @ carrying))
 
     given = own((turn[:, :, modes] @ departure.reshape(n, -1, 1)).ravel())
     dof, square = given.size - common.shape[1], (given.size, given.size)
