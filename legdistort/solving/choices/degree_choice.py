@@ -259,7 +259,7 @@ def _of_their_own(fit, high, *, carried=0):
     squares, dof : float, int
         Of the departures over their errors, and how many these are by chance.
     variance : float
-        Of all departures together, by their errors; from samples, to a tenth.
+        Of all departures together, by their errors; from samples, to a tenth. NaN for those `carried`.
     """
     problem, gauge, system, n = fit.problem, fit.result.gauge, fit.uncertainty.system, fit.problem.n_exposures
     departure = (fit.result.state.coefficients - problem.prior_mean)[:, :, high]
@@ -274,13 +274,9 @@ def _of_their_own(fit, high, *, carried=0):
         out = turn[:, :, modes] @ motion[:, maps[:, high].reshape(-1, 1), causes.ravel()]
         return out.reshape(-1, out.shape[2])
 
-    motion, carrying = seen(gauge.motion, maps[:, high.start :]), np.zeros((n * turn.shape[1], 0))
+    motion, carrying = seen(gauge.motion, maps[:, high.start :]), np.zeros((n * turn.shape[1], 1))
     if carried:
-        coefficients, bent = problem.prior_mean.copy(), slice(basis.n_modes(1), None)
-        coefficients[:, :, :carried] = fit.result.state.coefficients[:, :, :carried]
-        whole = constraints.motion_with_distortion(problem, fit.result.state.poses, coefficients, gauge.box)
-        size = np.minimum(problem.mean_sigma.max(axis=0), _UNKNOWN)[:, bent]
-        carrying = seen(whole - gauge.motion, maps[:, bent]) * size.ravel()
+        carrying = seen(_second_order(fit, carried), maps[:, basis.n_modes(1) :])
     columns, size, _ = np.linalg.svd(motion, full_matrices=False)
     common, still = columns[:, size > _SETTLED * size.max()], np.zeros_like(fit.blocks.g_star)
 
@@ -295,15 +291,29 @@ def _of_their_own(fit, high, *, carried=0):
     given = own((turn[:, :, modes] @ departure.reshape(n, -1, 1)).ravel())
     dof, square = given.size - common.shape[1], (given.size, given.size)
     known = turn @ elimination.inverse_exposure_blocks(fit.blocks.u) @ turn.mT  # if the stars were
+    lifted = np.linalg.solve(known, carrying.reshape(n, turn.shape[1], -1)).reshape(carrying.shape)
+    lifted = lifted @ np.linalg.inv(np.linalg.cholesky(np.eye(carrying.shape[1]) + carrying.T @ lifted)).T  # Woodbury
 
     def conditioned(each):
-        return own(np.linalg.solve(known, own(each).reshape(n, -1, 1)).ravel())
+        return own(np.linalg.solve(known, own(each).reshape(n, -1, 1)).ravel() - lifted @ (lifted.T @ own(each)))
 
     solved, _ = cg(LinearOperator(square, covariance), given, rtol=_ACCURACY, M=LinearOperator(square, conditioned))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (ceil(_PROBED / given.size), given.size))
-    variance = np.mean([each @ covariance(each) for each in signs])
+    variance = np.nan if carried else np.mean([each @ covariance(each) for each in signs])
     departure = turn[:, :, modes].mT @ given.reshape(n, -1, 1)
     return departure.reshape(n, 2, -1), float(given @ solved) if dof else 0.0, dof, float(variance)
+
+
+def _second_order(fit, carried):
+    """What common maps of `_UNKNOWN` pixels do by carrying the first modes of every exposure to other places.
+
+    Beyond `Gauge.motion`, (n_exposures, 2 n_modes, 2 n_modes); less for maps that are known better.
+    """
+    problem, state, gauge = fit.problem, fit.result.state, fit.result.gauge
+    coefficients = problem.prior_mean.copy()
+    coefficients[:, :, :carried] = state.coefficients[:, :, :carried]
+    whole = constraints.motion_with_distortion(problem, state.poses, coefficients, gauge.box)
+    return (whole - gauge.motion) * np.minimum(problem.mean_sigma.max(axis=0), _UNKNOWN).ravel()
 
 
 def _folds_at_stars(fit, low, high):

@@ -260,16 +260,17 @@ def _motion(problem, pose_list, box):
 
 def motion_with_distortion(problem, pose_list, coefficients, box):
     """N_i where a distortion d, A_i (n_exposures, 2, n_all), carries q to a place that moves by (I + grad d) R g."""
-    degree, n = problem.degree, problem.n_modes
-    u, v, w = basis.quadrature(2 * degree)
-    by_u, by_v = basis.gradients(basis.degree_of(coefficients.shape[2]), u, v)[1:]
+    degree, n, top = problem.degree, problem.n_modes, basis.degree_of(coefficients.shape[2])
+    exact = degree + top // 2  # for products of a mode, a map and a slope
+    u, v, w = basis.quadrature(exact)
+    by_u, by_v = basis.gradients(top, u, v)[1:]
     slope = np.stack([coefficients @ by_u, coefficients @ by_v], axis=2)  # (exposure, axis, along, node)
     moved = np.eye(2)[:, :, None] + slope * (2 / problem.size)[:, None, :, None]
     moved = np.einsum("iack,icb->iabk", moved, pose_list[:, :, :2])
-    back = similarity.apply_inverses(pose_list, _by_shape(_nodes, problem, 2 * degree))
-    reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
-    modes = basis.values(degree, u, v) * w
-    return np.einsum("mk,iabk,nik->iambn", modes, moved, reference, optimize=True).reshape(-1, 2 * n, 2 * n)
+    back = similarity.apply_inverses(pose_list, _by_shape(_nodes, problem, exact))
+    reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0)).transpose(1, 2, 0)
+    out = (basis.values(degree, u, v) * w * moved[:, :, :, None]) @ reference[:, None, None]
+    return out.swapaxes(2, 3).reshape(-1, 2 * n, 2 * n)
 
 
 def _check_mean(motion):
