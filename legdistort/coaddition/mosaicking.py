@@ -281,7 +281,8 @@ def _select(exposures, solution):
         else:
             frames.append(frame)
     if not frames:
-        raise InputError(f"no exposure to co-add: {_reasons(left_out) or 'the list is empty'}")
+        known = f"; the solution has {some_of(list(solution.poses), 5)}" if left_out else ""
+        raise InputError(f"no exposure to co-add: {_reasons(left_out) or 'the list is empty'}{known}")
     _warn(left_out)
     return frames, left_out
 

@@ -381,9 +381,9 @@ class Iterative(Reduced):
         2013, section 11.3): by its inverse a step is larger than the gradient tells.
         """
         if lengths:
-            inverse, ratios = 1 / np.array(lengths), np.array(ratios)
-            diagonal = inverse + np.append(0.0, (ratios * inverse)[:-1])
-            off = (np.sqrt(ratios) * inverse)[:-1]
+            inverse, ratios = 1 / np.array(lengths), np.array(ratios[:-1])  # the last may be rounding
+            diagonal = inverse + np.append(0.0, ratios * inverse[:-1])
+            off = np.sqrt(ratios) * inverse[:-1]
             least = eigvalsh_tridiagonal(diagonal, off, select="i", select_range=(0, 0))[0]
             self._met = min(max(least, 0.0), self._met or np.inf)
         return self._met
