@@ -214,10 +214,10 @@ def folding(fit, degree, higher):
     AliasedDegree
     """
     low, high = basis.n_modes(degree), slice(basis.n_modes(higher - 1), basis.n_modes(higher))
-    departure, squares, dof, variance = _of_their_own(fit, high)
-    excess = _excess(squares, dof)
+    departure, variance, excess_beside = _of_their_own(fit, high)
+    excess = excess_beside()
     if excess > ALARM and np.any(fit.problem.mean_sigma):  # the static distortion was not given exactly
-        excess = _excess(*_of_their_own(fit, high, carried=low)[1:3])
+        excess = excess_beside(_second_order(fit, low))
     energy = np.sum(departure**2)
     beyond = np.sqrt(max(1 - variance / max(energy, 1e-300), 0))
     folds = _folds_at_stars(fit, low, high)
@@ -240,26 +240,21 @@ def folding(fit, degree, higher):
     )
 
 
-def _excess(squares, dof):
-    """Squares beyond their degrees of freedom, in standard deviations of what these are by chance."""
-    return float((squares - dof) / np.sqrt(2 * max(dof, 1)))
-
-
-def _of_their_own(fit, high, *, carried=0):
+def _of_their_own(fit, high):
     """Departures of the exposures from the prior in the modes of a degree, without what common maps do to these.
 
     Maps of that degree and of higher ones, which dithers bring down to it: the stars take them up, and what they are
-    follows from the convention, of which distortions of low degree are part. To second order every common map matters,
-    as it carries the distortion of an exposure, its first modes `carried`, to other places: where the static distortion
-    is not given exactly, that is an error of the departures, for maps of `_UNKNOWN` pixels.
+    follows from the convention, of which distortions of low degree are part.
 
     Returns
     -------
     departure : ndarray, shape (n_exposures, 2, n)
-    squares, dof : float, int
-        Of the departures over their errors, and how many these are by chance.
     variance : float
-        Of all departures together, by their errors; from samples, to a tenth. NaN for those `carried`.
+        Of all departures together, by their errors; from samples, to a tenth.
+    excess : callable
+        ``excess(effects)``: their squares over their errors beyond the degrees of freedom, in standard deviations of
+        what these are by chance. What common maps do besides, `effects` (n_exposures, 2 n_modes, 2 n_modes) for one
+        standard deviation of each, counts as an error.
     """
     problem, gauge, system, n = fit.problem, fit.result.gauge, fit.uncertainty.system, fit.problem.n_exposures
     departure = (fit.result.state.coefficients - problem.prior_mean)[:, :, high]
@@ -274,34 +269,36 @@ def _of_their_own(fit, high, *, carried=0):
         out = turn[:, :, modes] @ motion[:, maps[:, high].reshape(-1, 1), causes.ravel()]
         return out.reshape(-1, out.shape[2])
 
-    motion, carrying = seen(gauge.motion, maps[:, high.start :]), np.zeros((n * turn.shape[1], 1))
-    if carried:
-        carrying = seen(_second_order(fit, carried), maps[:, basis.n_modes(1) :])
-    columns, size, _ = np.linalg.svd(motion, full_matrices=False)
+    columns, size, _ = np.linalg.svd(seen(gauge.motion, maps[:, high.start :]), full_matrices=False)
     common, still = columns[:, size > _SETTLED * size.max()], np.zeros_like(fit.blocks.g_star)
 
     def own(each):
-        return each - common @ (each @ common)
+        return each - common @ (common.T @ each)
 
     def covariance(each):
-        each = own(each)
-        settled = system.settle((each.reshape(n, 1, -1) @ turn)[:, 0], still, 0.1 * _ACCURACY)[1]
-        return own((turn @ settled[:, :, None]).ravel() + carrying @ (each @ carrying))
+        gradient = own(each).reshape(n, 1, -1) @ turn
+        return own((turn @ system.settle(gradient[:, 0], still, 0.1 * _ACCURACY)[1][:, :, None]).ravel())
 
     given = own((turn[:, :, modes] @ departure.reshape(n, -1, 1)).ravel())
     dof, square = given.size - common.shape[1], (given.size, given.size)
     known = turn @ elimination.inverse_exposure_blocks(fit.blocks.u) @ turn.mT  # if the stars were
-    lifted = np.linalg.solve(known, carrying.reshape(n, turn.shape[1], -1)).reshape(carrying.shape)
-    lifted = lifted @ np.linalg.inv(np.linalg.cholesky(np.eye(carrying.shape[1]) + carrying.T @ lifted)).T  # Woodbury
 
-    def conditioned(each):
-        return own(np.linalg.solve(known, own(each).reshape(n, -1, 1)).ravel() - lifted @ (lifted.T @ own(each)))
+    def excess(effects=None):
+        beside = np.zeros((given.size, 1)) if effects is None else own(seen(effects, maps[:, basis.n_modes(1) :]))
+        lifted = np.linalg.solve(known, beside.reshape(n, turn.shape[1], -1)).reshape(beside.shape)
+        lifted = lifted @ np.linalg.inv(np.linalg.cholesky(np.eye(beside.shape[1]) + beside.T @ lifted)).T  # Woodbury
 
-    solved, _ = cg(LinearOperator(square, covariance), given, rtol=_ACCURACY, M=LinearOperator(square, conditioned))
+        def conditioned(each):
+            return own(np.linalg.solve(known, own(each).reshape(n, -1, 1)).ravel() - lifted @ (lifted.T @ own(each)))
+
+        whole = LinearOperator(square, lambda each: covariance(each) + beside @ (each @ beside))
+        solved, _ = cg(whole, given, rtol=_ACCURACY, M=LinearOperator(square, conditioned))
+        return float((given @ solved - dof) / np.sqrt(2 * dof)) if dof else 0.0
+
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (ceil(_PROBED / given.size), given.size))
-    variance = np.nan if carried else np.mean([each @ covariance(each) for each in signs])
+    variance = np.mean([each @ covariance(each) for each in signs])
     departure = turn[:, :, modes].mT @ given.reshape(n, -1, 1)
-    return departure.reshape(n, 2, -1), float(given @ solved) if dof else 0.0, dof, float(variance)
+    return departure.reshape(n, 2, -1), float(variance), excess
 
 
 def _second_order(fit, carried):
