@@ -19,7 +19,9 @@ from ...runtime.compiling import compiled_loop
 
 #: Number of observations from which they are shared out among threads, and couplings are kept in single precision.
 THREADS_FROM = 200_000
-_BATCH = 64
+_BATCH = 128
+#: Bytes of a line of the cache. A vector that crosses the end of one takes twice as long to load or store.
+_LINE = 64
 _FAST = {"contract", "reassoc", "nsz"}  # sums may be reordered; NaN and infinity keep their meaning
 
 
@@ -47,8 +49,29 @@ def _shared_out(function, chunks, *outputs):
         return [function(*first), *(each.result() for each in later)]
 
 
+@compiled_loop(nogil=True)
+def _workspace(rows):
+    """An array (rows, _BATCH) that begins with a line of the cache."""
+    whole = np.empty((rows + 1) * _BATCH)
+    first = (-whole.ctypes.data % _LINE) // whole.itemsize
+    return whole[first : first + rows * _BATCH].reshape(rows, _BATCH)
+
+
+@compiled_loop(nogil=True)
+def _recurrence(top):
+    """Factors that lead from orders k and k - 1 to k + 1 < top, see `_legendre`; (top, 4).
+
+    Of the usual polynomials (k + 1) P_{k+1} = (2k + 1) u P_k - k P_{k-1} and P'_{k+1} = P'_{k-1} + (2k + 1) P_k.
+    """
+    out = np.zeros((top, 4))
+    for k in range(1, top - 1):
+        one, two = np.sqrt((2 * k + 3) / (2 * k + 1)), np.sqrt((2 * k + 3) / (2 * k - 1))
+        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = (2 * k + 1) / (k + 1) * one, k / (k + 1) * two, (2 * k + 1) * one, two
+    return out
+
+
 @compiled_loop(nogil=True, fastmath=_FAST)
-def _legendre(u, p, d):
+def _legendre(u, factors, p, d):
     """Normalised Legendre polynomials and derivatives at u (_BATCH,), into p and d (top, _BATCH)."""
     top = len(p)
     for o in range(_BATCH):
@@ -57,24 +80,24 @@ def _legendre(u, p, d):
         for o in range(_BATCH):
             p[1, o], d[1, o] = np.sqrt(1.5) * u[o], np.sqrt(1.5)
     for k in range(1, top - 1):
-        # of the usual ones (k + 1) P_{k+1} = (2k + 1) u P_k - k P_{k-1} and P'_{k+1} = P'_{k-1} + (2k + 1) P_k
-        one, two = np.sqrt((2 * k + 3) / (2 * k + 1)), np.sqrt((2 * k + 3) / (2 * k - 1))
-        forward, back, rise = (2 * k + 1) / (k + 1) * one, k / (k + 1) * two, (2 * k + 1) * one
+        forward, back, rise, two = factors[k, 0], factors[k, 1], factors[k, 2], factors[k, 3]
+        before, here, after, slope_before, slope_after = p[k - 1], p[k], p[k + 1], d[k - 1], d[k + 1]
         for o in range(_BATCH):
-            p[k + 1, o] = forward * u[o] * p[k, o] - back * p[k - 1, o]
-            d[k + 1, o] = two * d[k - 1, o] + rise * p[k, o]
+            after[o] = forward * u[o] * here[o] - back * before[o]
+        for o in range(_BATCH):
+            slope_after[o] = two * slope_before[o] + rise * here[o]
 
 
 @compiled_loop(nogil=True, fastmath=_FAST)
 def _model(a, orders, size, q, work):
     """Distorted positions and I + A grad b of a batch; q (2, _BATCH) is overwritten with the positions."""
-    pu, du, pv, dv, u, b, g = work
+    factors, pu, du, pv, dv, u, b, g = work
     su, sv = 2.0 / size[1], 2.0 / size[0]
     for o in range(_BATCH):
         u[0, o], u[1, o] = (q[0, o] + 0.5) * su - 1.0, (q[1, o] + 0.5) * sv - 1.0
         g[0, o], g[1, o], g[2, o], g[3, o] = 1.0, 0.0, 0.0, 1.0
-    _legendre(u[0], pu, du)
-    _legendre(u[1], pv, dv)
+    _legendre(u[0], factors, pu, du)
+    _legendre(u[1], factors, pv, dv)
     for m in range(orders.shape[1]):
         i, j, ax, ay = orders[0, m], orders[1, m], a[0, m], a[1, m]
         aux, auy, avx, avy = ax * su, ay * su, ax * sv, ay * sv
@@ -151,11 +174,10 @@ def _linearise(low, high, mine, start, star, xy, weight, unequal, moving, model,
     residual, values, coupling, u_blocks, gradient = made
     n_all, n_terms, n_modes, top = orders.shape[1], columns.shape[2], len(values), orders.max() + 1
     n_block = (2 + n_terms) * (3 + n_terms) // 2
-    q, w, r, wr = np.zeros((2, _BATCH)), np.zeros((3, _BATCH)), np.zeros((2, _BATCH)), np.zeros((2, _BATCH))
-    legendre, u, b = np.empty((4, top, _BATCH)), np.empty((2, _BATCH)), np.empty((n_all, _BATCH))
-    g, f, j = np.empty((4, _BATCH)), np.empty((4, _BATCH)), np.empty((3, _BATCH))
-    weighted, chi2 = np.empty(_BATCH), 0.0
-    work = (legendre[0], legendre[1], legendre[2], legendre[3], u, b, g)
+    q, w, r, wr, u, b = _workspace(2), _workspace(3), _workspace(2), _workspace(2), _workspace(2), _workspace(n_all)
+    g, f, j, weighted, chi2 = _workspace(4), _workspace(4), _workspace(5), _workspace(1)[0], 0.0
+    work = (_recurrence(top), _workspace(top), _workspace(top), _workspace(top), _workspace(top), u, b, g)
+    r[:] = 0.0
     for i in range(low, high):
         pose, phi = poses[i], columns[i]
         r00, r01, r10, r11 = pose[0, 0], pose[0, 1], pose[1, 0], pose[1, 1]
@@ -178,6 +200,7 @@ def _linearise(low, high, mine, start, star, xy, weight, unequal, moving, model,
                 g[0, o], g[1, o], g[2, o], g[3, o] = jxx, jxy, jyx, jyy
                 j[0, o], j[1, o] = fxx * jxx + fxy * jyx, fyx * jxy + fyy * jyy
                 j[2, o] = fxx * jxy + fxy * jyy
+                j[3, o], j[4, o] = fxx * r[0, o] + fxy * r[1, o], fyx * r[0, o] + fyy * r[1, o]
                 wr[0, o] = w[0, o] * r[0, o] + w[2, o] * r[1, o]
                 wr[1, o] = w[2, o] * r[0, o] + w[1, o] * r[1, o]
                 total += r[0, o] * wr[0, o] + r[1, o] * wr[1, o]
@@ -191,15 +214,17 @@ def _linearise(low, high, mine, start, star, xy, weight, unequal, moving, model,
                 out = values[m, first : first + size]
                 for o in range(size):
                     out[o] = b[m, o]
+            number = star[first : first + size]
             for o in range(size):
-                row = mine[star[first + o]]
+                row = mine[number[o]]
                 row[0] += j[0, o]
                 row[1] += j[1, o]
                 row[2] += j[2, o]
-                row[n_block] += f[0, o] * r[0, o] + f[1, o] * r[1, o]
-                row[n_block + 1] += f[2, o] * r[0, o] + f[3, o] * r[1, o]
-                if n_terms:
-                    _terms(row, n_block, phi, f[:, o], g[:, o], r[:, o])
+                row[n_block] += j[3, o]
+                row[n_block + 1] += j[4, o]
+            if n_terms:
+                for o in range(size):
+                    _terms(mine[number[o]], n_block, phi, f[:, o], g[:, o], r[:, o])
             _normal_block(w[0], b, weighted, u_blocks[i, 0])
             if unequal:
                 _normal_block(w[1], b, weighted, u_blocks[i, 1])
@@ -212,7 +237,7 @@ def _linearise(low, high, mine, start, star, xy, weight, unequal, moving, model,
 @compiled_loop(nogil=True, fastmath=_FAST)
 def _to_stars(low, high, mine, start, star, values, coupling, columns, a):
     n_modes, n_terms = len(values), columns.shape[2]
-    x, y = np.empty(_BATCH), np.empty(_BATCH)
+    x, y = _workspace(1)[0], _workspace(1)[0]
     for i in range(low, high):
         for first in range(start[i], start[i + 1], _BATCH):
             size = min(_BATCH, start[i + 1] - first)
@@ -236,7 +261,7 @@ def _to_stars(low, high, mine, start, star, values, coupling, columns, a):
 @compiled_loop(nogil=True, fastmath=_FAST)
 def _to_exposures(low, high, out, start, star, values, coupling, columns, stars):
     n_modes, n_terms = len(values), columns.shape[2]
-    x, y = np.empty(_BATCH), np.empty(_BATCH)
+    x, y = _workspace(1)[0], _workspace(1)[0]
     for i in range(low, high):
         for first in range(start[i], start[i + 1], _BATCH):
             size = min(_BATCH, start[i + 1] - first)
@@ -260,12 +285,12 @@ def _to_exposures(low, high, out, start, star, values, coupling, columns, stars)
 @compiled_loop(nogil=True, fastmath=_FAST)
 def _displaced(a, orders, size, x, q, work):
     """``x - A b(q)`` of a batch, into q (2, _BATCH)."""
-    pu, du, pv, dv, u = work
+    factors, pu, du, pv, dv, u = work
     for o in range(_BATCH):
         u[0, o], u[1, o] = (q[0, o] + 0.5) * (2.0 / size[1]) - 1.0, (q[1, o] + 0.5) * (2.0 / size[0]) - 1.0
         q[0, o], q[1, o] = x[0, o], x[1, o]
-    _legendre(u[0], pu, du)
-    _legendre(u[1], pv, dv)
+    _legendre(u[0], factors, pu, du)
+    _legendre(u[1], factors, pv, dv)
     for m in range(orders.shape[1]):
         i, j, ax, ay = orders[0, m], orders[1, m], a[0, m], a[1, m]
         if ax != 0.0 or ay != 0.0:
@@ -278,8 +303,9 @@ def _displaced(a, orders, size, x, q, work):
 @compiled_loop(nogil=True, fastmath=_FAST)
 def _undistorted(low, high, out, start, xy, coefficients, sizes, orders):
     top = orders.max() + 1
-    legendre, u, x, q = np.empty((4, top, _BATCH)), np.empty((2, _BATCH)), np.zeros((2, _BATCH)), np.empty((2, _BATCH))
-    work = (legendre[0], legendre[1], legendre[2], legendre[3], u)
+    x, q = _workspace(2), _workspace(2)
+    work = (_recurrence(top), _workspace(top), _workspace(top), _workspace(top), _workspace(top), _workspace(2))
+    x[:] = 0.0
     for i in range(low, high):
         for first in range(start[i], start[i + 1], _BATCH):
             size = min(_BATCH, start[i + 1] - first)
