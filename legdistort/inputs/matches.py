@@ -67,6 +67,16 @@ class Observations:
     xy: np.ndarray
     covariance: np.ndarray
 
+    @cached_property
+    def key(self) -> np.ndarray:
+        """A number (n,) of every pair of exposure and star, which ascends with exposure, then star."""
+        return self.exposure.astype(np.int64, copy=False) * len(self.stars) + self.star
+
+    @cached_property
+    def is_sorted(self) -> bool:
+        """Whether rows come by exposure, then star, and no star twice in an exposure."""
+        return bool(np.all(self.key[1:] > self.key[:-1]))
+
     @classmethod
     def of(cls, table: Table) -> Observations:
         """Those of a table that keeps the contract of matched positions."""
@@ -380,9 +390,9 @@ def _ranked(column):
 
 
 def _check_duplicates(seen):
-    table, key = seen.table, seen.exposure.astype(np.int64, copy=False) * len(seen.stars) + seen.star
-    if np.all(key[1:] > key[:-1]):
+    if seen.is_sorted:
         return
+    table, key = seen.table, seen.key
     order = np.argsort(key, kind="stable")
     same = np.flatnonzero(np.diff(key[order]) == 0)
     if len(same):

@@ -24,10 +24,12 @@ def copies(exposure, xy):
     dict of int to int
         ``{exposure: the first one that it repeats}``.
     """
-    x, y = np.ascontiguousarray(xy.T + 0.0).view(np.uint64)  # -0.0 is 0.0
-    key = x * np.uint64(0x9E3779B97F4A7C15) + y  # wraps around; what falls together is looked at below
-    counts = np.bincount(exposure)
-    if (counts.min() >= _MANY and not _repeated(key[key < 2**61])) or _repeated(key) < FEWEST:
+    counts, x = np.bincount(exposure), _bits(xy[:, 0]) * np.uint64(0x9E3779B97F4A7C15)  # wraps around
+    some = np.flatnonzero(x < 2**61) if counts.min() >= _MANY else slice(None)
+    if not _repeated(x[some] + _bits(xy[some, 1])):
+        return {}
+    key = x + _bits(xy[:, 1])  # what falls together is looked at below
+    if _repeated(key) < FEWEST:
         return {}
     order = np.argsort(key)
     again = key[order[1:]] == key[order[:-1]]
@@ -45,6 +47,10 @@ def copies(exposure, xy):
         if one not in out and other not in out and n >= FEWEST and n > min(counts[one], counts[other]) / 2:
             out[other] = one
     return out
+
+
+def _bits(values):
+    return (values + 0.0).view(np.uint64)  # -0.0 is 0.0
 
 
 def _repeated(keys):

@@ -371,6 +371,8 @@ def _tell(fit, matches):
 def _tell_lost_stars(fit):
     """Warn of stars whose observations contradict one another, so that none of them is used."""
     star, used = fit.problem.star, fit.used
+    if used.all():
+        return
     lost = np.flatnonzero((np.bincount(star) > 0) & (np.bincount(star, used) == 0))
     if not len(lost):
         return

@@ -11,6 +11,9 @@ from .equations.elimination import inverse_star_blocks
 from .equations.problem import State
 from .equations.star_terms import outer_packed, packed, symmetric_times
 
+#: Distances that the typical one of an exposure is found from.
+_ENOUGH = 1000
+
 
 def start(problem, nominal, *, robust=False):
     """Start values: coefficients at the prior mean, poses refined to one another, positions their weighted mean.
@@ -26,7 +29,8 @@ def start(problem, nominal, *, robust=False):
     -------
     State
     ndarray, shape (n_exposures,)
-        Median distance of the stars of an exposure from their mean positions, detector pixels.
+        Median distance of the stars of an exposure, or of about a thousand of them, from their mean positions,
+        detector pixels.
 
     Raises
     ------
@@ -47,7 +51,7 @@ def start(problem, nominal, *, robust=False):
             weight = full / (1 + distance2 / (2 * np.median(distance2) + 1e-12))
         current = refine(problem, current, q, positions, weight)
     distance2 = distances(problem, current, q, positions)
-    typical = np.sqrt([similarity.median(distance2[problem.part(i)]) for i in range(problem.n_exposures)])
+    typical = np.sqrt([similarity.median(_some(distance2[problem.part(i)])) for i in range(problem.n_exposures)])
     common = _common_similarity(problem, nominal, current, full, misplaced(problem, typical))
     current = similarity.compose(current, common)
     if problem.terms.n:
@@ -55,6 +59,11 @@ def start(problem, nominal, *, robust=False):
     else:
         stars = similarity.apply(similarity.invert(common), positions.T).T
     return State(stars, problem.prior_mean.copy(), current), typical
+
+
+def _some(values):
+    """About a thousand of many values, evenly taken: enough for a typical one."""
+    return values[:: max(1, len(values) // _ENOUGH)]
 
 
 def _check_prior(problem):

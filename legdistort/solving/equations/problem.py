@@ -181,6 +181,8 @@ class Problem:
 
     def in_table_order(self, values):
         """Values of the observations (..., n), in the order of the rows of the table."""
+        if isinstance(self.order, slice):
+            return values
         out = np.empty_like(values)
         out[..., self.order] = values
         return out
@@ -256,10 +258,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
     obs = matches.observations
     order = _order(obs)
     counts = np.bincount(obs.exposure, minlength=len(matches.names))
-    var_x, var_y, cov = (column[order] for column in obs.covariance.T)
-    var_x, var_y = var_x + error_floor**2, var_y + error_floor**2
-    determinant = var_x * var_y - cov**2
-    weight = np.stack([var_y / determinant, var_x / determinant, -cov / determinant])
+    weight = _weights(obs.covariance.T[:, order], error_floor)
     priors = by_exposure(matches, prior)
     for name, p in zip(matches.names, priors, strict=True):
         if p is not None and p.shape is not None and tuple(p.shape) != tuple(matches.shapes[name]):
@@ -298,7 +297,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         order=order,
         start=np.concatenate([[0], np.cumsum(counts)]),
         star=obs.star[order],
-        xy=np.stack([column[order] for column in obs.xy.T]),
+        xy=np.ascontiguousarray(obs.xy.T[:, order]),
         weight=weight,
         prior_mean=mean,
         prior_sigma=None if free.all() else sigma,
@@ -310,6 +309,18 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
     if motion is None:
         return problem
     return replace(problem, moving=motion(matches, problem.in_table_order(weight[:2].mean(axis=0))))
+
+
+def _weights(covariance, error_floor):
+    """Inverse covariance: xx, yy, xy (3, n) of variances and covariances xx, yy, xy (3, n)."""
+    variance, weight = covariance[:2] + error_floor**2, np.zeros(covariance.shape)
+    if np.any(covariance[2]):
+        determinant = variance[0] * variance[1] - covariance[2] ** 2
+        weight[0], weight[1] = variance[1] / determinant, variance[0] / determinant
+        weight[2] = -covariance[2] / determinant
+    else:
+        np.divide(1, variance, out=weight[:2])
+    return weight
 
 
 def _groups(matches):
@@ -344,8 +355,7 @@ def _detectors(matches):
 
 def _order(obs):
     """Rows by exposure, then star; a slice of all of them where the table comes that way."""
-    key = obs.exposure.astype(np.int64, copy=False) * (obs.star.max() + 1) + obs.star
-    return slice(None) if np.all(key[1:] > key[:-1]) else np.argsort(key, kind="stable")
+    return slice(None) if obs.is_sorted else np.argsort(obs.key, kind="stable")
 
 
 def _static_sigma(priors, degree):
