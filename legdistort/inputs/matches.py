@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 MARGIN = 0.1
 #: Where more than this part of the positions of an exposure does not, its shape is taken for wrong.
 STRAY = 0.1
+#: About so many rows of a long table are looked at before all are.
+_SOME = 50_000
 #: Rows that a message names.
 _MOST_NAMED = 6
 
@@ -356,12 +358,21 @@ def shapes_by_exposure(shape, names):
 
 def _check_spread(seen):
     """Positions on one line do not constrain anything across it."""
-    x, y = (column - column.mean() for column in seen.xy.T)
-    # not by the linear algebra library, whose threads would be in the way of what comes next
-    xx, xy, yy = (np.einsum("n,n", *pair) for pair in ((x, x), (x, y), (y, y)))
-    smaller, larger = np.linalg.eigvalsh([[xx, xy], [xy, yy]])
-    if smaller < 1e-12 * larger and np.linalg.matrix_rank([x, y]) < 2:
-        raise InputError("all positions lie on one line: give stars all over the field, or look at the columns x, y")
+    for rows in _some_then_all(len(seen.xy)):
+        x, y = (column - column.mean() for column in seen.xy[rows].T)
+        # not by the linear algebra library, whose threads would be in the way of what comes next
+        xx, xy, yy = (np.einsum("n,n", *pair) for pair in ((x, x), (x, y), (y, y)))
+        smaller, larger = np.linalg.eigvalsh([[xx, xy], [xy, yy]])
+        if smaller >= 1e-12 * larger or np.linalg.matrix_rank([x, y]) == 2:
+            return
+    raise InputError("all positions lie on one line: give stars all over the field, or look at the columns x, y")
+
+
+def _some_then_all(n):
+    """Rows of a table to look at: some of very many, which nearly always tell that all is well, then all."""
+    if n > 2 * _SOME:
+        yield slice(None, None, n // _SOME)
+    yield slice(None)
 
 
 def _check_poses(given, names):
@@ -464,13 +475,14 @@ def _check_connected(seen):
             f"only one exposure ({seen.names[0]}): the distortion is found from the differences between exposures, "
             "give at least two of the same field"
         )
-    # tie every exposure to the first one of each of its stars: the same groups as all pairs, in a small graph
-    first = np.full(len(seen.stars), n)
-    np.minimum.at(first, seen.star, seen.exposure)
-    tied = np.zeros((n, n), dtype=bool)
-    tied[seen.exposure, first[seen.star]] = True
-    if tied[:, 0].all():  # as nearly always
-        return
+    for rows in _some_then_all(len(seen.star)):
+        # tie every exposure to the first one of each of its stars: the same groups as all pairs, in a small graph
+        star, exposure, first = seen.star[rows], seen.exposure[rows], np.full(len(seen.stars), n)
+        np.minimum.at(first, star, exposure)
+        tied = np.zeros((n, n), dtype=bool)
+        tied[exposure, first[star]] = True
+        if tied[:, 0].all():  # as nearly always
+            return
     count, group = connected_components(tied, directed=False)
     if count > 1:
         groups = [[name for name, g in zip(seen.names, group, strict=True) if g == label] for label in range(count)]

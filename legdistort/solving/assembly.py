@@ -45,7 +45,7 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
     Solution
     """
     table = QTable(matches.table, copy=False)
-    table["dx"], table["dy"] = problem.in_table_order(blocks.residual) * u.pix
+    table["dx"], table["dy"] = u.Quantity(problem.in_table_order(blocks.residual), u.pix, copy=False)
     table["used"] = problem.in_table_order(problem.weight[0] > 0)
     motions = _motions(problem, state, blocks) if problem.terms.n else None
     positions = state.positions.T.copy()

@@ -313,7 +313,9 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
 
 def _weights(covariance, error_floor):
     """Inverse covariance: xx, yy, xy (3, n) of variances and covariances xx, yy, xy (3, n)."""
-    variance, weight = covariance[:2] + error_floor**2, np.zeros(covariance.shape)
+    variance, weight = covariance[:2], np.zeros(covariance.shape)
+    if error_floor:
+        variance = variance + error_floor**2
     if np.any(covariance[2]):
         determinant = variance[0] * variance[1] - covariance[2] ** 2
         weight[0], weight[1] = variance[1] / determinant, variance[0] / determinant
