@@ -173,11 +173,13 @@ def squares(fit, matches, folds):
     of_row = fold[mine][problem.star]
     _check_left(problem, fit.used, of_row, len(folds))
     blocks = fit.blocks if fit.weighted is problem else criterion.linearise(problem, fit.result.state)
-    left = np.zeros_like(blocks.residual)
-    for k in range(len(folds)):
-        rows = np.flatnonzero(of_row == k)
-        change = _step_without(fit, rows).reshape(problem.n_exposures, 2, -1)[problem.exposure[rows]]
-        left[:, rows] = blocks.residual[:, rows] - np.einsum("nam,mn->an", change, blocks.values[:, rows])
+    following = _with_stars_following(fit.weighted, fit.blocks)
+    changes = np.stack([_step_without(fit, np.flatnonzero(of_row == k), *following) for k in range(len(folds))])
+    left = blocks.residual.copy()
+    for i in range(problem.n_exposures):
+        part = problem.part(i)
+        moved = changes[:, i].reshape(len(folds), 2, -1) @ blocks.values[:, part]
+        left[:, part] -= moved[of_row[part], :, np.arange(moved.shape[2])].T
     out = np.zeros((len(fold), 2))
     out[mine] = _about_stars(problem, blocks, left)
     out[fold < 0] = 0
@@ -245,11 +247,19 @@ def _about_stars(problem, blocks, residual):
     return np.column_stack([left, 2 * np.bincount(star, minlength=n) - known])
 
 
-def _part_of(problem, blocks, rows):
+def _with_stars_following(problem, blocks):
+    """Gradients (n, 2 n_modes) where the stars follow, and what every observation adds to them: its pull (2, n)."""
+    step = symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
+    (wx, wy, wxy), (x, y), f, z = problem.weight, blocks.residual, blocks.coupling, problem.placed(step)
+    pull = np.stack([wx * x + wxy * y, wxy * x + wy * y]) - f[0] * z[0] - f[1] * z[1]
+    return blocks.g_exposure - elimination.to_exposures(problem, blocks, step), pull
+
+
+def _part_of(problem, blocks, pull, rows):
     """What observations, ascending, add to exposure blocks (n, 2 n_modes, 2 n_modes) and gradients (n, 2 n_modes)."""
     own, gradient, n = np.zeros_like(blocks.u), np.zeros_like(blocks.g_exposure), problem.n_modes
-    (wx, wy, wxy), (x, y), b = problem.weight[:, rows], blocks.residual[:, rows], blocks.values[:, rows].astype(float)
-    pull, weighted = np.stack([wx * x + wxy * y, wxy * x + wy * y]), wx * b
+    (wx, wy, wxy), pull, b = problem.weight[:, rows], pull[:, rows], blocks.values[:, rows].astype(float)
+    weighted = wx * b
     for i, (low, high) in enumerate(itertools.pairwise(np.searchsorted(rows, problem.start).tolist())):
         mine, of_modes = slice(low, high), b[:, low:high].T
         own[i, :n, :n] = own[i, n:, n:] = weighted[:, mine] @ of_modes
@@ -262,14 +272,17 @@ def _part_of(problem, blocks, rows):
     return own, gradient
 
 
-def _step_without(fit, rows):
-    """Step (n_exposures, 2 n_modes) of the coefficients without stars, given all rows of theirs."""
-    problem, blocks, gauge = fit.weighted, fit.blocks, fit.result.gauge
-    v, g_star = blocks.v.copy(), blocks.g_star.copy()
-    v[:, problem.star[rows]] = g_star[:, problem.star[rows]] = 0
-    own, gradient = _part_of(problem, blocks, rows)
-    left = replace(blocks, u=blocks.u - own, g_exposure=blocks.g_exposure - gradient, v=v, g_star=g_star)
+def _step_without(fit, rows, gradient, pull):
+    """Step (n_exposures, 2 n_modes) of the coefficients without stars, given all rows of theirs.
+
+    `gradient` and `pull` as `_with_stars_following` gives them.
+    """
+    problem, blocks, v = fit.weighted, fit.blocks, fit.blocks.v.copy()
+    v[:, problem.star[rows]] = 0
+    u, part = _part_of(problem, blocks, pull, rows)
+    left = replace(blocks, u=blocks.u - u, v=v)
     if reduced_system.is_singular(left.u):
         raise SolveError("the stars that are left do not determine the distortion of this degree")
     # few iterations serve, as the solution with these stars is near; factors would take longer
-    return reduced_system.Iterative(problem, left, gauge).step(np.zeros(gauge.n_constraints), _ACCURACY)[1]
+    system = reduced_system.Iterative(problem, left, fit.result.gauge)
+    return system.settle(gradient - part, np.zeros_like(blocks.g_star), _ACCURACY)[1]

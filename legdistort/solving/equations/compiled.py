@@ -30,8 +30,9 @@ def _chunks(problem):
 
     One alone for few observations: they are done before threads have met, above all on a machine with other work.
     """
-    start = problem.start
-    n = config.NUMBA_NUM_THREADS if start[-1] >= THREADS_FROM else 1
+    start, n = problem.start, config.NUMBA_NUM_THREADS
+    if start[-1] < THREADS_FROM:
+        return [(0, len(start) - 1)]
     inner = np.searchsorted(start, start[-1] * np.arange(1, n) // n).tolist()
     return list(itertools.pairwise([0, *inner, len(start) - 1]))
 
@@ -61,12 +62,14 @@ def _workspace(rows):
 def _recurrence(top):
     """Factors that lead from orders k and k - 1 to k + 1 < top, see `_legendre`; (top, 4).
 
-    Of the usual polynomials (k + 1) P_{k+1} = (2k + 1) u P_k - k P_{k-1} and P'_{k+1} = P'_{k-1} + (2k + 1) P_k.
+    Of the usual polynomials (k + 1) P_{k+1} = (2k + 1) u P_k - k P_{k-1} and P'_{k+1} = P'_{k-1} + (2k + 1) P_k. Beside
+    the loops over observations, where a compiler that may reorder sums would divide anew for each of these.
     """
     out = np.zeros((top, 4))
     for k in range(1, top - 1):
         one, two = np.sqrt((2 * k + 3) / (2 * k + 1)), np.sqrt((2 * k + 3) / (2 * k - 1))
-        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = (2 * k + 1) / (k + 1) * one, k / (k + 1) * two, (2 * k + 1) * one, two
+        out[k, 0], out[k, 1] = (2 * k + 1) / (k + 1) * one, k / (k + 1) * two
+        out[k, 2], out[k, 3] = (2 * k + 1) * one, two
     return out
 
 
@@ -133,6 +136,18 @@ def _dots(b, x, out):
         for o in range(_BATCH):
             total += b[m, o] * x[o]
         out[m] += total
+
+
+@compiled_loop(nogil=True, fastmath=_FAST)
+def _to_star_sums(number, j, n_block, mine):
+    """Add the blocks and gradients of the positions of a batch, j (5, _BATCH), to the sums of the stars."""
+    for o in range(len(number)):
+        row = mine[number[o]]
+        row[0] += j[0, o]
+        row[1] += j[1, o]
+        row[2] += j[2, o]
+        row[n_block] += j[3, o]
+        row[n_block + 1] += j[4, o]
 
 
 @compiled_loop(nogil=True, fastmath=_FAST)
@@ -215,13 +230,7 @@ def _linearise(low, high, mine, start, star, xy, weight, unequal, moving, model,
                 for o in range(size):
                     out[o] = b[m, o]
             number = star[first : first + size]
-            for o in range(size):
-                row = mine[number[o]]
-                row[0] += j[0, o]
-                row[1] += j[1, o]
-                row[2] += j[2, o]
-                row[n_block] += j[3, o]
-                row[n_block + 1] += j[4, o]
+            _to_star_sums(number, j, n_block, mine)
             if n_terms:
                 for o in range(size):
                     _terms(mine[number[o]], n_block, phi, f[:, o], g[:, o], r[:, o])

@@ -15,14 +15,23 @@ def inverse_star_blocks(v):
     return _inverted(v)[0]
 
 
-def inverse_exposure_blocks(u):
-    """Inverses of blocks (n_exposures, 2 n_modes, 2 n_modes); where both axes weigh the same, that of one is enough."""
+def of_one_axis(u):
+    """Blocks (n_exposures, n_modes, n_modes) of one axis of the given ones (n_exposures, 2 n_modes, 2 n_modes).
+
+    Where both axes weigh the same and do not hang together; else the given ones.
+    """
     n = u.shape[1] // 2
     xx, yy = u[:, :n, :n], u[:, n:, n:]
-    if u[:, :n, n:].any() or not np.array_equal(xx, yy):
-        return np.linalg.inv(u)
+    return u if u[:, :n, n:].any() or not np.array_equal(xx, yy) else xx
+
+
+def inverse_exposure_blocks(u):
+    """Inverses of blocks (n_exposures, 2 n_modes, 2 n_modes); where both axes weigh the same, that of one is enough."""
+    inverse, n = np.linalg.inv(of_one_axis(u)), u.shape[1] // 2
+    if inverse.shape == u.shape:
+        return inverse
     out = np.zeros_like(u)
-    out[:, :n, :n] = out[:, n:, n:] = np.linalg.inv(xx)
+    out[:, :n, :n] = out[:, n:, n:] = inverse
     return out
 
 

@@ -58,6 +58,8 @@ class Reduced:
 
     def _gradient(self, own, stars):
         """``own - E' V^-1 stars``, shape (n,)."""
+        if not stars.any():
+            return self.unknowns.gather(own)
         moved = elimination.symmetric_times(self.inverse, stars)
         return self.unknowns.gather(own - elimination.to_exposures(self.problem, self.blocks, moved))
 
