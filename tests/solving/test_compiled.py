@@ -16,14 +16,14 @@ RNG = np.random.default_rng(0)
 
 def _set(**settings):
     sim = simulate_matches(
-        n_exposures=9, n_stars=120, seen=0.7, dither=100.0, rotations=RNG.uniform(-50, 50, 9), **settings
+        n_exposures=9, n_stars=300, seen=0.7, dither=100.0, rotations=RNG.uniform(-50, 50, 9), **settings
     )
     # a prior of higher degree than the fit, so that modes that stay fixed are in play
     return sim, Prior(np.pad(sim.truth.static, ((0, 0), (0, 5))) + 0.01)
 
 
 @pytest.mark.parametrize("threads_from", [0, 30_000])
-@pytest.mark.parametrize("settings", [{"sigma": 0.05}, {"sigma": RNG.uniform(0.02, 0.2, (9, 120, 2)), "corr": 0.4}])
+@pytest.mark.parametrize("settings", [{"sigma": 0.05}, {"sigma": RNG.uniform(0.02, 0.2, (9, 300, 2)), "corr": 0.4}])
 def test_compiled_sums_are_the_plain_ones(monkeypatch, settings, threads_from):
     monkeypatch.setattr("legdistort.solving.equations.compiled.THREADS_FROM", threads_from)
     sim, prior = _set(**settings)
@@ -70,3 +70,14 @@ def test_compiled_start_is_the_plain_one(monkeypatch, robust):
     assert_allclose(fast.poses, plain.poses, atol=1e-8)
     assert_allclose(also_astray, astray, atol=1e-8)
     assert astray.max() < 5
+
+
+def test_typical_distances_are_those_of_all_stars(monkeypatch):
+    sim, prior = _set(sigma=0.05)
+    problem = build_problem(sim.matches, 3, prior=prior)
+    nominal = np.stack([sim.matches.poses[name] for name in sim.matches.names])
+    of_all = start_values.start(problem, nominal)[1]
+    monkeypatch.setattr(start_values, "_ENOUGH", 50)  # of 210
+    of_some = start_values.start(problem, nominal)[1]
+    assert np.any(of_some != of_all)
+    assert_allclose(of_some, of_all, rtol=0.3)

@@ -417,3 +417,22 @@ def test_inverses_of_exposure_blocks(case):
         u[:, :5, 5:] = u[:, 5:, :5] = 0.3 * u[:, :5, :5]
     found = elimination.inverse_exposure_blocks(u)
     assert_allclose(found @ u, np.broadcast_to(np.eye(10), u.shape), atol=1e-9)
+
+
+@pytest.mark.parametrize("corr", [0.0, 0.4])
+@pytest.mark.parametrize("floor", [0.0, 0.03])
+@pytest.mark.parametrize("shuffled", [True, False])
+def test_weights_are_the_inverse_covariances_of_the_rows(corr, floor, shuffled):
+    rng = np.random.default_rng(5)
+    sim = simulate_matches(n_stars=M, n_exposures=N, sigma=rng.uniform(0.05, 0.2, (N, M, 2)), corr=corr, seed=3)
+    table = sim.matches.table
+    table = table[rng.permutation(len(table))] if shuffled else table
+    matches = Matches.from_table(table, shape=sim.matches.shapes, poses=sim.matches.poses)
+    problem = build_problem(matches, 1, error_floor=floor)
+    sx, sy = matches.table["x_err"].value, matches.table["y_err"].value
+    off = corr * sx * sy
+    covariance = np.stack([np.stack([sx**2 + floor**2, off]), np.stack([off, sy**2 + floor**2])]).transpose(2, 0, 1)
+    xx, yy, xy = problem.weight
+    found = problem.in_table_order(np.stack([[xx, xy], [xy, yy]])).transpose(2, 0, 1)
+    assert_allclose(found @ covariance, np.broadcast_to(np.eye(2), found.shape), atol=1e-12)
+    assert_allclose(problem.in_table_order(problem.xy).T, matches.observations.xy)
