@@ -23,6 +23,7 @@ from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
 from ..priors.from_headers import describe, header_distortions
+from ..runtime import parallel
 from . import detector_layout
 from .exposure_groups import interlink, link, standing, unite, without
 from .header_poses import HeaderPoses
@@ -158,7 +159,8 @@ def match(
     left_out = {n: f"only {len(r)} usable detections of at least {FEWEST}" for n, r in rows.items() if len(r) < FEWEST}
     kept = [name for name in names if name not in left_out]
     lists = [_star_list(table[rows[name]], shapes[name]) for name in kept]
-    stars = _associate(lists, kept, headers, left_out, options)
+    with parallel.one_blas_thread():  # matrices are small
+        stars = _associate(lists, kept, headers, left_out, options)
     star = np.full(len(table), -1)
     for name, labels in stars.items():
         star[rows[name]] = labels
