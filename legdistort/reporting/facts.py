@@ -25,7 +25,7 @@ def facts_of(solution, summary):
     """Figures of the solution, replaced and completed by those of a summary."""
     facts = {
         "n_exposures": len(solution.names),
-        "n_stars": len(solution.star_names),
+        "n_stars": int(np.count_nonzero(np.isfinite(solution.positions[:, 0]))),
         "n_observations": int(np.count_nonzero(solution.residuals["used"])),
         "chi2": solution.chi2,
         "dof": solution.dof,
@@ -58,9 +58,11 @@ def observed_rows(solution, facts):
 def solution_rows(solution, facts):
     """Figures of the solution: ``{name: text}``."""
     not_used = len(solution.residuals) - np.count_nonzero(solution.residuals["used"])
+    lost = np.count_nonzero(np.isnan(solution.positions[:, 0]))
+    stars = Markup("{} <small>({} more without a position)</small>").format(facts["n_stars"], lost)
     rows = {
         "Exposures": facts["n_exposures"],
-        "Stars": facts["n_stars"],
+        "Stars": stars if lost else facts["n_stars"],
         "Positions used": Markup("{} <small>({} not used)</small>").format(facts["n_observations"], not_used),
         "χ² / degrees of freedom": Markup(
             "{:.1f} / {} = {} <small>(1 where the stated errors are right)</small>"

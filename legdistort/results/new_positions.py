@@ -12,13 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from astropy import units as u
 
-from ..exceptions import InputError, some_of
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import basis, similarity
 from ..geometry.epochs import year
 from ..geometry.models import like, to_pixels
 from ..inputs import column_contract
 from . import absolute_errors
 from .motions import fitted
+
+#: Positions that a warning names.
+_MOST_NAMED = 3
 
 
 class Corrected(NamedTuple):
@@ -257,6 +260,7 @@ def correct_table(solution, table, epoch=None):
         xy[mine], relative[mine], absolute[mine] = correct_with_errors(
             solution, name, pixels[mine], measured[mine], moved=moved
         )
+    _warn_of_extrapolation(solution, table, exposures)
     out = table.copy()
     out["x"], out["y"] = xy.T * u.pix
     out["x_err_abs"], out["y_err_abs"] = np.sqrt(np.einsum("nkk->kn", absolute)) * u.pix
@@ -266,6 +270,24 @@ def correct_table(solution, table, epoch=None):
     if epoch is not None:
         out.meta["epoch"] = year(epoch)
     return column_contract.describe_stars(out)
+
+
+def _warn_of_extrapolation(solution, table, exposures):
+    """Warn of positions that lie off their detector."""
+    camera, at = solution.camera, ("x", "y") if solution.camera is None else ("x_detector", "y_detector")
+    if camera is None:
+        shapes = [solution.shapes[name] for name in exposures]
+    else:
+        shapes = [camera[key].shape for key in camera.ids(table)]
+    xy, size = np.column_stack([table[name].to_value(u.pix) for name in at]), np.array(shapes)[:, ::-1]
+    rows = np.flatnonzero(((xy < -0.5) | (xy > size - 0.5)).any(axis=1))
+    if len(rows):
+        named = [f"row {k}, ({xy[k, 0]:.0f}, {xy[k, 1]:.0f}) in {exposures[k]}" for k in rows]
+        warn(
+            f"{len(rows)} of {len(xy)} positions lie off their detector, where the correction is extrapolated: "
+            f"{some_of(named, _MOST_NAMED)}",
+            AssumptionWarning,
+        )
 
 
 def add_sky(table, sky, xy, relative, absolute):

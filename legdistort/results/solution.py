@@ -474,6 +474,11 @@ class Solution(ShownAsPrinted):
         InputError
             For a table that lacks columns or has bad values, or names an exposure or, with `epoch`, a star that the
             solution does not have; with `epoch` if motions were not fitted.
+
+        Warns
+        -----
+        AssumptionWarning
+            Of positions off their detector, where the correction is extrapolated.
         """
         return new_positions.correct_table(self, table, epoch)
 
@@ -688,8 +693,10 @@ class Solution(ShownAsPrinted):
         return f"{words}{', ' * bool(source)}{source}{tied}"
 
     def __repr__(self) -> str:
+        lost = np.count_nonzero(np.isnan(self.positions[:, 0]))
+        stars = f"{len(self.star_names)} stars{f' ({lost} without a position)' if lost else ''}"
         return (
-            f"<Solution: {len(self.names)} exposures, {len(self.star_names)} stars, degree {self.degree}, "
+            f"<Solution: {len(self.names)} exposures, {stars}, degree {self.degree}, "
             f"chi2 {self.chi2:.1f} for {self.dof} degrees of freedom>"
         )
 

@@ -245,6 +245,12 @@ def test_summary_replaces_what_follows_from_the_solution(solution, tables_only):
     assert page.row("Positions used")[1].startswith("500 ")
 
 
+def test_stars_without_a_position_do_not_count(tables_only):
+    solution = make_solution(5, 40)
+    solution.positions[7] = np.nan
+    assert Page(report.render(solution)).row("Stars")[1] == "39 (1 more without a position)"
+
+
 def test_outlying_exposures_are_marked(tables_only):
     solution = make_solution(5, 40)
     solution.residuals["dy"][solution.residuals["exposure"] == solution.names[3]] *= 4

@@ -1,5 +1,6 @@
 """Errors of positions that took no part in the solution: what moves them, limits, tables, and calibration by truth."""
 
+import warnings
 from dataclasses import replace
 
 import new_positions_table
@@ -12,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import legdistort as ld
 from legdistort.assessment.baselines import solve_shifts
 from legdistort.cli.parser import main
-from legdistort.exceptions import InputError
+from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.results import absolute_errors, new_positions
@@ -325,6 +326,20 @@ def test_bad_tables_are_named(solution):
     table = measured(solution)
     table["y_err"][2] = 0 * u.pix
     with pytest.raises(InputError, match="y_err is not a positive finite number in 1 of 4 rows; the first is row 2"):
+        solution.correct_table(table)
+
+
+def test_positions_off_the_detector_are_warned_of(solution):
+    table = measured(solution)
+    nx = solution.shapes[solution.names[3]][1]
+    table["x"][2], table["y"][3] = (nx - 0.4) * u.pix, -0.6 * u.pix
+    words = rf"2 of 4 positions lie off their detector, .* row 2, \({nx}, .*\) in {solution.names[3]}, row 3, \("
+    with pytest.warns(AssumptionWarning, match=words):
+        out = solution.correct_table(table)
+    assert np.isfinite(out["x"].value).all()
+    table["x"][2], table["y"][3] = (nx - 0.6) * u.pix, -0.4 * u.pix
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         solution.correct_table(table)
 
 

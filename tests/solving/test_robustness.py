@@ -161,6 +161,7 @@ def test_a_star_seen_twice_that_contradicts_itself_has_no_position():
     assert solution.residuals["used"][solution.residuals["star"] != 7].all()
     assert np.isnan(solution.positions[7]).all()
     assert np.isfinite(np.delete(solution.positions, 7, axis=0)).all()
+    assert f"{len(matches.stars)} stars (1 without a position)" in repr(solution)
 
 
 @pytest.mark.parametrize(("n_wrong", "has_position"), [(1, True), (2, False)])
