@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MARGIN = 0.1
 #: Where more than this part of the positions of an exposure does not, its shape is taken for wrong.
 STRAY = 0.1
-#: About so many rows of a long table are looked at before all are.
+#: About so many rows of a long table, those of some of its stars, are looked at before all are.
 _SOME = 50_000
 #: Rows that a message names.
 _MOST_NAMED = 6
@@ -69,7 +69,7 @@ class Observations:
     xy: np.ndarray
     covariance: np.ndarray
 
-    @cached_property
+    @property
     def key(self) -> np.ndarray:
         """A number (n,) of every pair of exposure and star, which ascends with exposure, then star."""
         return self.exposure.astype(np.int64, copy=False) * len(self.stars) + self.star
@@ -77,7 +77,8 @@ class Observations:
     @cached_property
     def is_sorted(self) -> bool:
         """Whether rows come by exposure, then star, and no star twice in an exposure."""
-        return bool(np.all(self.key[1:] > self.key[:-1]))
+        key = self.key
+        return bool(np.all(key[1:] > key[:-1]))
 
     @classmethod
     def of(cls, table: Table) -> Observations:
@@ -358,7 +359,7 @@ def shapes_by_exposure(shape, names):
 
 def _check_spread(seen):
     """Positions on one line do not constrain anything across it."""
-    for rows in _some_then_all(len(seen.xy)):
+    for rows in _some_then_all(seen):
         x, y = (column - column.mean() for column in seen.xy[rows].T)
         # not by the linear algebra library, whose threads would be in the way of what comes next
         xx, xy, yy = (np.einsum("n,n", *pair) for pair in ((x, x), (x, y), (y, y)))
@@ -368,10 +369,10 @@ def _check_spread(seen):
     raise InputError("all positions lie on one line: give stars all over the field, or look at the columns x, y")
 
 
-def _some_then_all(n):
-    """Rows of a table to look at: some of very many, which nearly always tell that all is well, then all."""
-    if n > 2 * _SOME:
-        yield slice(None, None, n // _SOME)
+def _some_then_all(seen):
+    """Rows to look at: of very many those of some stars, which nearly always tell that all is well, then all."""
+    if len(seen.star) > 2 * _SOME:
+        yield np.flatnonzero(seen.star < len(seen.stars) * _SOME // len(seen.star))
     yield slice(None)
 
 
@@ -475,7 +476,7 @@ def _check_connected(seen):
             f"only one exposure ({seen.names[0]}): the distortion is found from the differences between exposures, "
             "give at least two of the same field"
         )
-    for rows in _some_then_all(len(seen.star)):
+    for rows in _some_then_all(seen):
         # tie every exposure to the first one of each of its stars: the same groups as all pairs, in a small graph
         star, exposure, first = seen.star[rows], seen.exposure[rows], np.full(len(seen.stars), n)
         np.minimum.at(first, star, exposure)

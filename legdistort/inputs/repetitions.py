@@ -7,7 +7,7 @@ from ..exceptions import AssumptionWarning, warn
 #: Positions that must agree, and they are more than half of those of the exposure that has fewer.
 FEWEST = 5
 #: From so many positions on in every exposure an eighth of them is looked at first; that none of the positions of a
-#: copy is among them happens once in 10^11 times.
+#: copy is among them happens once in 10^11 times, if they have values of x of their own.
 _MANY = 400
 
 
@@ -25,8 +25,8 @@ def copies(exposure, xy):
         ``{exposure: the first one that it repeats}``.
     """
     counts, x = np.bincount(exposure), _bits(xy[:, 0]) * np.uint64(0x9E3779B97F4A7C15)  # wraps around
-    some = np.flatnonzero(x < 2**61) if counts.min() >= _MANY else slice(None)
-    if not _repeated(x[some] + _bits(xy[some, 1])):
+    some = np.flatnonzero(x < 2**61)
+    if counts.min() >= _MANY and len(some) and not _repeated(x[some] + _bits(xy[some, 1])):
         return {}
     key = x + _bits(xy[:, 1])  # what falls together is looked at below
     if _repeated(key) < FEWEST:

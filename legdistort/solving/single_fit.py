@@ -172,8 +172,8 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
 
     With ``clip`` the fit is a plain one as long as chance explains what it leaves. Exposures that the fit cannot follow
     stay in one that is not `judged`. It begins at the fit `near`, whatever its degree, if that is one to the same
-    matches. One on `trial` is for comparison with others: `TRIAL` is accurate enough, so that `near` serves as the
-    plain fit if it has the same options, and where it explains the observations its plane is kept.
+    matches. One on `trial` is for comparison with others, of which `near` is one: `TRIAL` is accurate enough, so that
+    `near` serves as the plain fit of the same degree, and where it explains the observations its plane is kept.
     """
     problem = build_problem(
         matches,
@@ -203,7 +203,7 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         return Fit(matches, problem, result, everything, options)
     if start_values.far_off(problem, typical).any() and (astray := agreement.astray(problem)):
         return minimise(matches.without(astray), options, judged=judged)
-    as_near = trial and near_by and near.options == replace(options, clip=None)
+    as_near = trial and near_by and (near.options.degree, near.options.clip) == (options.degree, None)
     plain = near.result if as_near else _plain(problem, start, common)
     if plain is not None and clipping.is_explained(problem, plain, clip=options.clip):
         return Fit(matches, problem, plain, everything, options)

@@ -6,8 +6,10 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
+import oracle
 import pytest
 from astropy import units as u
+from astropy.table import Table, vstack
 from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 
@@ -205,6 +207,16 @@ def test_no_more_than_the_stars_allow():
     assert chosen.degrees == (0, 1, 2)
 
 
+@pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")
+def test_degree_zero_alone_has_an_alarm_too():
+    """Where no more than degree 1 is possible beyond it, which maps that are not known cannot bend."""
+    sim = simulate_matches(n_stars=120, n_exposures=8, degree=3, dither=1100.0, seen=0.5, min_exposures=2, seed=12)
+    chosen = solve(sim.matches, degree="auto").diagnostics.selection
+    assert (chosen.degree, chosen.degrees) == (0, (0, 1))
+    assert [each.degree for each in chosen.aliasing] == [1]
+    assert chosen.alarm
+
+
 @pytest.mark.parametrize("degree", [1, 3])
 def test_stars_subtracted_from_one_fit_are_as_if_it_had_not_had_them(degree):
     """The squares of stars left out, by one step from the fit of all, against fits without them."""
@@ -220,6 +232,37 @@ def test_stars_subtracted_from_one_fit_are_as_if_it_had_not_had_them(degree):
     assert quick[:, 0].sum() == pytest.approx(slow[:, 0].sum(), rel=0.02)
     # the start of those fits is their own
     assert_allclose(quick[:, 0], slow[:, 0], rtol=0.1, atol=0.1 * np.median(slow[:, 0]))
+
+
+def strip(n_exposures, n_seen, share, seed):
+    """Matches of exposures along a strip, each of which has `share` of its stars in common with the next."""
+    rng, step = np.random.default_rng(seed), SHAPE[1] * (1 - share)
+    n_stars = round(n_seen * (1 + (n_exposures - 1) * (1 - share)))
+    stars = rng.uniform(0, (SHAPE[1] + (n_exposures - 1) * step, SHAPE[0]), (n_stars, 2))
+    parts, poses = [], {}
+    for i in range(n_exposures):
+        q = stars - [i * step, 0]
+        seen = np.flatnonzero((q[:, 0] > 0) & (q[:, 0] < SHAPE[1]))
+        xy = oracle.predict(q[seen], rng.normal(0, 0.3, (2, 6)), np.eye(2, 3), SHAPE)
+        part = Table({"exposure": np.repeat(f"e{i}", len(seen)), "star": seen})
+        part["x"], part["y"] = (xy + rng.normal(0, 0.05, xy.shape)).T
+        part["x_err"] = part["y_err"] = 0.05
+        parts.append(part)
+        poses[f"e{i}"] = np.array([[1.0, 0, -i * step], [0, 1, 0]])
+    return Matches.from_table(vstack(parts), shape=SHAPE, poses=poses)
+
+
+@pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")
+@pytest.mark.parametrize(("n_exposures", "n_seen", "share"), [(8, 45, 0.4), (10, 45, 0.35)])
+def test_stars_left_out_of_exposures_that_hang_together_weakly(n_exposures, n_seen, share, monkeypatch):
+    """Steps along directions that hardly anything determines count, which no few conjugate gradients find."""
+    matches = strip(n_exposures, n_seen, share, 1)
+    fit = single_fit.estimate(matches, SolveOptions(degree=3, clip=None))
+    folds = degree_choice._folds(matches)
+    found = held_out.squares(fit, matches, folds)
+    monkeypatch.setattr(held_out.reduced_system, "Iterative", held_out.reduced_system.Direct)
+    exact = held_out.squares(fit, matches, folds)
+    assert_allclose(found, exact, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize(("by_degree", "best"), [((0.0,), 0), ((0.5, 0.5, 0.5), 2)])

@@ -216,7 +216,8 @@ def folding(fit, degree, higher):
     low, high = basis.n_modes(degree), slice(basis.n_modes(higher - 1), basis.n_modes(higher))
     departure, variance, excess_beside = _of_their_own(fit, high)
     excess = excess_beside()
-    if excess > ALARM and np.any(fit.problem.mean_sigma):  # the static distortion was not given exactly
+    curved = fit.problem.degree > 1 and np.any(fit.problem.mean_sigma)  # maps that are not known exactly
+    if excess > ALARM and curved:
         excess = excess_beside(_second_order(fit, low))
     energy = np.sum(departure**2)
     beyond = np.sqrt(max(1 - variance / max(energy, 1e-300), 0))

@@ -175,7 +175,7 @@ def squares(fit, matches, folds):
     blocks = fit.blocks if fit.weighted is problem else criterion.linearise(problem, fit.result.state)
     following = _with_stars_following(fit.weighted, fit.blocks)
     changes = np.stack([_step_without(fit, np.flatnonzero(of_row == k), *following) for k in range(len(folds))])
-    left = blocks.residual.copy()
+    left = blocks.residual.copy()  # of stars that are in no fold they mean nothing, see below
     for i in range(problem.n_exposures):
         part = problem.part(i)
         moved = changes[:, i].reshape(len(folds), 2, -1) @ blocks.values[:, part]
@@ -280,9 +280,10 @@ def _step_without(fit, rows, gradient, pull):
     problem, blocks, v = fit.weighted, fit.blocks, fit.blocks.v.copy()
     v[:, problem.star[rows]] = 0
     u, part = _part_of(problem, blocks, pull, rows)
-    left = replace(blocks, u=blocks.u - u, v=v)
+    left = replace(blocks, u=blocks.u - u, v=v, g_exposure=gradient - part, g_star=np.zeros_like(blocks.g_star))
     if reduced_system.is_singular(left.u):
         raise SolveError("the stars that are left do not determine the distortion of this degree")
-    # few iterations serve, as the solution with these stars is near; factors would take longer
-    system = reduced_system.Iterative(problem, left, fit.result.gauge)
-    return system.settle(gradient - part, np.zeros_like(blocks.g_star), _ACCURACY)[1]
+    gauge = fit.result.gauge
+    # few iterations serve, as the solution with these stars is near, and factors would take longer; where exposures
+    # hang together weakly these serve after all
+    return reduced_system.Iterative(problem, left, gauge).step(np.zeros(gauge.n_constraints), _ACCURACY)[1]

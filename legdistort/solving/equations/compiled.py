@@ -52,7 +52,7 @@ def _shared_out(function, chunks, *outputs):
 
 @compiled_loop(nogil=True)
 def _workspace(rows):
-    """An array (rows, _BATCH) that begins with a line of the cache."""
+    """An array (rows, _BATCH) of anything, which begins with a line of the cache."""
     whole = np.empty((rows + 1) * _BATCH)
     first = (-whole.ctypes.data % _LINE) // whole.itemsize
     return whole[first : first + rows * _BATCH].reshape(rows, _BATCH)
@@ -62,8 +62,8 @@ def _workspace(rows):
 def _recurrence(top):
     """Factors that lead from orders k and k - 1 to k + 1 < top, see `_legendre`; (top, 4).
 
-    Of the usual polynomials (k + 1) P_{k+1} = (2k + 1) u P_k - k P_{k-1} and P'_{k+1} = P'_{k-1} + (2k + 1) P_k. Beside
-    the loops over observations, where a compiler that may reorder sums would divide anew for each of these.
+    Of the usual polynomials (k + 1) P_{k+1} = (2k + 1) u P_k - k P_{k-1} and P'_{k+1} = P'_{k-1} + (2k + 1) P_k.
+    Outside the loops over observations, where a compiler that may reorder sums would divide anew for each of these.
     """
     out = np.zeros((top, 4))
     for k in range(1, top - 1):
@@ -192,7 +192,7 @@ def _linearise(low, high, mine, start, star, xy, weight, unequal, moving, model,
     q, w, r, wr, u, b = _workspace(2), _workspace(3), _workspace(2), _workspace(2), _workspace(2), _workspace(n_all)
     g, f, j, weighted, chi2 = _workspace(4), _workspace(4), _workspace(5), _workspace(1)[0], 0.0
     work = (_recurrence(top), _workspace(top), _workspace(top), _workspace(top), _workspace(top), u, b, g)
-    r[:] = 0.0
+    r[:] = 0.0  # what fills up a batch has no weight, and must be finite
     for i in range(low, high):
         pose, phi = poses[i], columns[i]
         r00, r01, r10, r11 = pose[0, 0], pose[0, 1], pose[1, 0], pose[1, 1]
@@ -314,7 +314,7 @@ def _undistorted(low, high, out, start, xy, coefficients, sizes, orders):
     top = orders.max() + 1
     x, q = _workspace(2), _workspace(2)
     work = (_recurrence(top), _workspace(top), _workspace(top), _workspace(top), _workspace(top), _workspace(2))
-    x[:] = 0.0
+    x[:] = 0.0  # what fills up a batch must be finite
     for i in range(low, high):
         for first in range(start[i], start[i + 1], _BATCH):
             size = min(_BATCH, start[i + 1] - first)

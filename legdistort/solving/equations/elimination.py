@@ -27,11 +27,11 @@ def of_one_axis(u):
 
 def inverse_exposure_blocks(u):
     """Inverses of blocks (n_exposures, 2 n_modes, 2 n_modes); where both axes weigh the same, that of one is enough."""
-    inverse, n = np.linalg.inv(of_one_axis(u)), u.shape[1] // 2
-    if inverse.shape == u.shape:
-        return inverse
+    one, n = of_one_axis(u), u.shape[1] // 2
+    if one is u:
+        return np.linalg.inv(u)
     out = np.zeros_like(u)
-    out[:, :n, :n] = out[:, n:, n:] = inverse
+    out[:, :n, :n] = out[:, n:, n:] = np.linalg.inv(one)
     return out
 
 

@@ -180,7 +180,7 @@ class Problem:
         return slice(self.start[i], self.start[i + 1])
 
     def in_table_order(self, values):
-        """Values of the observations (..., n), in the order of the rows of the table."""
+        """Values of the observations (..., n), in the order of the rows of the table: those given if it is the same."""
         if isinstance(self.order, slice):
             return values
         out = np.empty_like(values)
@@ -297,7 +297,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         order=order,
         start=np.concatenate([[0], np.cumsum(counts)]),
         star=obs.star[order],
-        xy=np.ascontiguousarray(obs.xy.T[:, order]),
+        xy=np.array(obs.xy.T[:, order], order="C"),
         weight=weight,
         prior_mean=mean,
         prior_sigma=None if free.all() else sigma,

@@ -50,7 +50,7 @@ def reduced_system(problem, blocks, gauge, weak=None):
 
 
 def is_singular(blocks):
-    """Whether some block of an exposure (n, k, k) is singular, as where its stars lie on a line."""
+    """Whether some block of an exposure (n, 2 n_modes, 2 n_modes) is singular, as where its stars lie on a line."""
     blocks = elimination.of_one_axis(blocks)
     unit = np.sqrt(np.einsum("iaa->ia", blocks))
     if not unit.min() > 0:
