@@ -316,6 +316,17 @@ def test_copies_of_long_lists(n_common, is_copy, digits):
     assert found == ({3: 1} if is_copy else {})
 
 
+@pytest.mark.parametrize("columns", [1, 21])
+def test_copies_of_long_lists_whose_stars_stand_in_columns(columns):
+    """Some of which are looked at first are perhaps none."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        x = rng.choice(rng.uniform(0, 2048, columns), (3, 1000))
+        xy = np.stack([x, rng.uniform(0, 2048, x.shape)], axis=2)
+        xy[2] = xy[0]
+        assert repetitions.copies(np.repeat(np.arange(3), 1000), xy.reshape(-1, 2)) == {2: 0}
+
+
 def test_an_only_exposure_and_its_copy_are_one():
     sim = precise(2)
     table = copied(sim, "exp00", "again")
