@@ -5,6 +5,8 @@ reference plane) to undistorted pixels of one exposure, ``q = M X + t``; M is a
 rotation, possibly with a flip, times a scale.
 """
 
+import math
+
 import numpy as np
 
 from ..exceptions import InputError
@@ -49,7 +51,7 @@ def compose(second, first):
 def check(pose, name="pose"):
     """Return `pose` as a (2, 3) float array; raise `InputError` if it is not a similarity."""
     pose = np.asarray(pose, dtype=float)
-    if pose.shape != (2, 3) or not np.all(np.isfinite(pose)):
+    if pose.shape != (2, 3) or not all(map(math.isfinite, pose.ravel().tolist())):
         raise InputError(f"{name} must be a finite (2, 3) array [M | t], got shape {pose.shape}")
     (xx, xy), (yx, yy) = pose[:, :2].tolist()
     scale2 = abs(xx * yy - xy * yx)

@@ -12,7 +12,7 @@ from .equations.problem import State
 from .equations.star_terms import outer_packed, packed, symmetric_times
 
 #: Distances that the typical one of an exposure is found from.
-_ENOUGH = 1000
+_ENOUGH = 300
 
 
 def start(problem, nominal, *, robust=False):
@@ -29,7 +29,7 @@ def start(problem, nominal, *, robust=False):
     -------
     State
     ndarray, shape (n_exposures,)
-        Median distance of the stars of an exposure, or of about a thousand of them, from their mean positions,
+        Median distance of the stars of an exposure, or of some hundreds of them, from their mean positions,
         detector pixels.
 
     Raises
@@ -62,7 +62,7 @@ def start(problem, nominal, *, robust=False):
 
 
 def _some(values):
-    """About a thousand of many values, evenly taken: enough for a typical one."""
+    """Some hundreds of many values, evenly taken: enough for a typical one."""
     return values[:: max(1, len(values) // _ENOUGH)]
 
 
