@@ -7,7 +7,7 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..runtime import provenance
-from ..runtime.asdf_files import ASDF_STANDARD, check_tree, read_tree, understood
+from ..runtime.asdf_files import ASDF_STANDARD, check_layout, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
 from .detector import Detector
 
@@ -60,7 +60,6 @@ def read_camera(path, kind):
     tree = read_tree(path).get("legdistort_camera")
     if not isinstance(tree, dict) or "layout" not in tree:
         raise InputError(f"{path} holds no legdistort camera (no entry 'legdistort_camera'); write one: Camera.write")
-    if tree["layout"] != LAYOUT:
-        raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
+    check_layout(tree["layout"], LAYOUT, path)
     check_tree({"legdistort_camera": tree}, "camera-1.0.0", path)
     return understood(path, partial(from_tree, kind=kind), tree)

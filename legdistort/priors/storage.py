@@ -13,7 +13,7 @@ from ..geometry import similarity
 from ..geometry.basis import check_degree
 from ..results.solution import Solution
 from ..runtime import provenance
-from ..runtime.asdf_files import ASDF_STANDARD, check_tree, read_tree
+from ..runtime.asdf_files import ASDF_STANDARD, check_layout, check_tree, read_tree
 from ..runtime.outputs import replacing, settle_for
 from .from_files import read_source
 
@@ -50,8 +50,7 @@ def read_prior(path, kind):
     tree = read_tree(path).get("legdistort_prior")
     if not isinstance(tree, dict) or "layout" not in tree:
         raise InputError(f"{path} holds no legdistort prior (no entry 'legdistort_prior'); make one: legdistort prior")
-    if tree["layout"] != LAYOUT:
-        raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
+    check_layout(tree["layout"], LAYOUT, path)
     check_tree({"legdistort_prior": tree}, "prior-1.0.0", path)
     try:
         given = ((key, tree[key]) for key in ("coefficients", "sigma", "static_sigma", "plane"))

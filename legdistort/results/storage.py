@@ -22,7 +22,7 @@ from ..geometry.distortion import Inverse
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from ..inputs.plain_columns import plain, plain_columns, restored
-from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_tree, read_tree, understood
+from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_layout, check_tree, read_tree, understood
 from ..runtime.outputs import replacing, settle_for
 from ..runtime.provenance import checksums, unchanged
 from .camera_errors import CameraErrors
@@ -138,8 +138,7 @@ def read_solution(path, kind, *, max_bytes=None):
         (checksum,) = checksums(path).values()
     if not isinstance(tree, dict) or "layout" not in tree:
         raise InputError(f"{path} holds no legdistort solution (no entry 'legdistort'); give a solution.asdf")
-    if tree["layout"] != LAYOUT:
-        raise InputError(f"{path} has layout {tree['layout']!r}, this version reads {LAYOUT}; update legdistort")
+    check_layout(tree["layout"], LAYOUT, path)
     check_tree({"legdistort": tree}, "solution-1.0.0", path)
     return understood(path, partial(_from_tree, kind, checksum), tree)
 

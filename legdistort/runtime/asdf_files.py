@@ -111,6 +111,14 @@ def schema_resources():
     return [DirectoryResourceMapping(resources.files("legdistort") / "data" / "schemas", SCHEMAS)]
 
 
+def check_layout(layout, known, path):
+    """Raise `InputError` for a file of another layout than the one that this version knows."""
+    if hasattr(layout, "shape"):
+        raise InputError(f"{path} is damaged: its layout is an array, not a number")
+    if layout != known:
+        raise InputError(f"{path} has layout {layout!r}, this version reads {known}; update legdistort")
+
+
 def check_tree(tree, schema, path):
     """Check a tree against a schema of the package.
 

@@ -485,6 +485,7 @@ def test_written_and_read(tmp_path):
     ("changes", "message"),
     [
         ({"layout": 2}, "has layout 2, this version reads 1; update legdistort"),
+        ({"layout": np.zeros(3)}, "is damaged: its layout is an array, not a number"),
         ({"coefficients": np.zeros((2, 7))}, "damaged: n = 7 is not a number of modes"),
         ({"coefficients": np.full((2, 3), np.nan)}, "damaged: mean has values that are not finite"),
         ({"coefficients": np.zeros((2, 561))}, "damaged: degree must be an integer from 0 to 30"),

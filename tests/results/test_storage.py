@@ -294,6 +294,7 @@ def test_cut_files_are_refused(solution, tmp_path, share):
     ("change", "message"),
     [
         (lambda t: t.update(layout=99), "has layout 99, this version reads 1; update legdistort"),
+        (lambda t: t.update(layout=np.zeros(3)), "is damaged: its layout is an array, not a number"),
         (lambda t: t.pop("gauge"), "is damaged: entry legdistort: 'gauge' is a required property$"),
         (
             lambda t: t.update(exposures=[]),
