@@ -22,7 +22,6 @@ from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
 from .exceptions import InputError, MatchError
 from .inputs import exposure_files, table_files
-from .inputs.exposure_names import detector_name
 from .inputs.exposures import observed
 from .matching.matcher import match
 from .matching.options import MatchOptions, check_enough
@@ -219,7 +218,7 @@ def run(
             kept = [exposure for exposure in exposures if (exposure.frame or exposure.name) in solution.names]
             mosaic = coadd(kept, solution, **vars(coadding), **share)
         with timed(timings, "assess"):
-            quality = _if_possible(stack_quality.assess, mosaic, solution.by_detector, exposures=kept)
+            quality = _if_possible(stack_quality.assess, mosaic, solution, exposures=kept)
         comparison = stacks = None
         if compare:
             with timed(timings, "compare"):
@@ -366,10 +365,9 @@ def write_results(solution, target, *, psfs=None, mosaic=None, progress=False):
     solution.write(target / "solution.asdf")
     table_files.write_stars(solution, target / "stars.ecsv")
     (target / "wcs").mkdir()
-    for name in Bar(solution.names, desc="writing", unit="WCS", disable=not progress):
-        for detector in solution.camera.detectors if solution.camera else [None]:
-            file = f"{name}.asdf" if detector is None else f"{detector_name(name, detector)}.asdf"
-            write_wcs(solution, name, target / "wcs" / file, detector=detector)
+    for view in Bar(list(solution), desc="writing", unit="WCS", disable=not progress):
+        for part in view.parts:
+            write_wcs(part, target / "wcs" / f"{part.label}.asdf")
     write_psfs(psfs or {}, target / "psf")
     if mosaic is not None:
         mosaic.write(target / "mosaic.fits")

@@ -132,11 +132,11 @@ def compare(matches, solution, *, prior=None):
         ``{name: Solution}``: "shift", "static + shift", "relative polynomial", "all distortions solved". A
         correction that fails on these data is left out, with a warning in the log that gives the reason.
     """
-    table = solution.observations[solution.observations["used"]]
+    table = solution.residuals[solution.residuals["used"]]
     table = table[matches.table.colnames]
     kept = {name: matches.poses[name] for name in solution.names}
     known = {"poses": kept, "sky": matches.sky, "allow_copies": True, "camera": matches.camera}
-    same = Matches.from_table(table, shape=solution.shapes, **known)
+    same = Matches.from_table(table, shape=solution.estimate.shapes, **known)
     floor = solution.diagnostics.error_floor
     calls = {
         "shift": lambda: solve_shifts(same),

@@ -86,9 +86,9 @@ def pulls_of(solution):
     -------
     Pulls
     """
-    table = solution.observations[np.asarray(solution.observations["used"], dtype=bool)]
+    table = solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]
     exposure = _exposures(solution, table)
-    star = np.searchsorted(solution.star_names, table["star"])
+    star = np.searchsorted(solution.estimate.star_names, table["star"])
     found = solution.diagnostics
     dx, dy, x_err, y_err = (column_contract.values(table, c, "pix") for c in ("dx", "dy", "x_err", "y_err"))
     a, b = (found.error_scale * np.hypot(each, found.error_floor) for each in (x_err, y_err))
@@ -110,7 +110,7 @@ def _freedom(solution, table, exposure, star, weight):
     for i, name in enumerate(solution.names):
         mine = np.flatnonzero(exposure == i)
         values = basis.values(solution.degree, *basis.normalize(np.column_stack([x[mine], y[mine]]),
-                                                                solution.shapes[name]))  # fmt: skip
+                                                                solution.estimate.shapes[name]))  # fmt: skip
         root = values * np.sqrt(weight[mine])
         vectors = np.linalg.svd(root, full_matrices=False)[2] if len(mine) else root
         of_exposure[mine] = np.sum(vectors**2, axis=0)
@@ -120,7 +120,7 @@ def _freedom(solution, table, exposure, star, weight):
 
 
 def _brightness(solution, table, star, error):
-    n = np.maximum(np.bincount(star, minlength=len(solution.star_names)), 1)
+    n = np.maximum(np.bincount(star, minlength=len(solution.estimate.star_names)), 1)
     if "flux" in table.colnames:
         flux = np.bincount(star, np.nan_to_num(column_contract.values(table, "flux")), len(n)) / n
         if np.any(flux > 0):

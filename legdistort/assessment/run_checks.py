@@ -5,6 +5,7 @@ from scipy import special
 
 from ..exceptions import FoldError
 from ..results.check import Check
+from ..results.in_tables import largest_inverse_error
 
 #: A stack whose stars are this much wider than those of single exposures has lost sharpness that can be seen.
 BLURRED = 1.05
@@ -29,7 +30,11 @@ def check_run(solution, quality=None):
     -------
     tuple of Check
     """
-    return (image_check(quality), stack_check(quality, moving=solution.motions is not None), inverse_check(solution))
+    return (
+        image_check(quality),
+        stack_check(quality, moving=solution.estimate.motions is not None),
+        inverse_check(solution),
+    )
 
 
 def image_check(quality):
@@ -91,7 +96,7 @@ def stack_check(quality, *, moving=False):
 def inverse_check(solution):
     """Do the WCSs invert?"""
     try:
-        error = solution.max_inverse_error
+        error = largest_inverse_error(solution)
     except FoldError as fold:
         return Check("inverse", "fail", None, None, str(fold), "lower --degree, or give a prior")
     return Check("inverse", "pass", error, None, f"every WCS inverts to {error:.1e} px")

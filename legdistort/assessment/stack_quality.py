@@ -14,6 +14,7 @@ from ..exceptions import InputError
 from ..geometry import basis
 from ..inputs import column_contract
 from ..results import accuracy
+from ..results.view import image_view
 from ..runtime.notebook import ShownAsPrinted
 from . import baselines
 from .star_shapes import measure_shapes
@@ -224,31 +225,33 @@ class _Sample:
         """The brightest isolated stars that all solutions have; the last one knows fluxes and widths."""
         method = solutions[-1]
         if fwhm is None:
-            if "fwhm" not in method.observations.colnames:
+            if "fwhm" not in method.residuals.colnames:
                 raise InputError(
                     "the positions came without a column fwhm: give fwhm=, the width of the stars in pixels"
                 )
-            fwhm = float(np.nanmedian(column_contract.values(method.observations, "fwhm", "pix")))
+            fwhm = float(np.nanmedian(column_contract.values(method.residuals, "fwhm", "pix")))
         if not (np.isfinite(fwhm) and 0.5 <= fwhm <= 200):
             raise InputError(f"fwhm must be a number between 0.5 and 200 pixels, got {fwhm!r}")
         if max_stars < 1:
             raise InputError(f"max_stars must be at least 1, got {max_stars!r}")
-        good = np.isfinite(method.positions).all(axis=1)
+        good = np.isfinite(method.estimate.positions).all(axis=1)
         for solution in solutions[:-1]:
-            good &= np.isin(method.star_names, solution.star_names[np.isfinite(solution.positions[:, 0])])
+            good &= np.isin(
+                method.estimate.star_names, solution.estimate.star_names[np.isfinite(solution.estimate.positions[:, 0])]
+            )
         flux = column_contract.values(method.stars, "flux") if "flux" in method.stars.colnames else np.ones(len(good))
         bright = good & (flux >= np.nanmedian(flux[good])) if good.any() else good
         chosen = np.flatnonzero(bright)
-        tree = KDTree(method.positions[np.isfinite(method.positions).all(axis=1)])
+        tree = KDTree(method.estimate.positions[np.isfinite(method.estimate.positions).all(axis=1)])
         if len(chosen) and tree.n > 1:
-            isolated = tree.query(method.positions[chosen], k=2)[0][:, 1] > 3 * fwhm + 1
+            isolated = tree.query(method.estimate.positions[chosen], k=2)[0][:, 1] > 3 * fwhm + 1
             chosen = chosen[isolated] if np.count_nonzero(isolated) >= _FEW else chosen
         chosen = chosen[np.argsort(-flux[chosen], kind="stable")[:max_stars]]
-        return cls(np.asarray(method.star_names)[np.sort(chosen)], float(fwhm))
+        return cls(np.asarray(method.estimate.star_names)[np.sort(chosen)], float(fwhm))
 
     def positions(self, solution):
         """Reference positions (n, 2) of the stars, in the plane of a solution."""
-        return solution.positions[np.searchsorted(solution.star_names, self.stars)]
+        return solution.estimate.positions[np.searchsorted(solution.estimate.star_names, self.stars)]
 
     def of_mosaic(self, mosaic, solution):
         """`measure_shapes` of a mosaic, positions on the reference plane."""
@@ -264,18 +267,19 @@ class _Sample:
 
         A star that is saturated, or cannot be measured for another reason, in every exposure is NaN.
         """
-        table, shapes, offsets, medians = solution.observations, [], [], {}
+        shapes, offsets, medians = [], [], {}
         for handle in exposures:
-            if handle.name not in solution.poses:
+            view = image_view(solution, handle)
+            if view is None:
                 continue
-            exposure = handle.read()
-            rows = table[(table["exposure"] == exposure.name) & table["used"] & np.isin(table["star"], self.stars)]
+            exposure, rows = handle.read(), view.residuals
+            rows = rows[rows["used"] & np.isin(rows["star"], self.stars)]
             xy = np.full((len(self.stars), 2), np.nan)
             xy[np.searchsorted(self.stars, rows["star"])] = np.column_stack([rows["x"].value, rows["y"].value])
             found = measure_shapes(exposure.data, xy, fwhm=self.fwhm, bad=exposure.mask, saturation=exposure.saturation)
             seen = np.isfinite(found[:, 0])
             offset = np.full_like(xy, np.nan)
-            offset[seen] = solution.correct(exposure.name, found[seen, :2]) - self.positions(solution)[seen]
+            offset[seen] = view.correct(found[seen, :2]) - self.positions(solution)[seen]
             shapes.append(found[:, :5])
             if seen.any():
                 stretch = found[seen, 3] * np.exp(2j * np.radians(found[seen, 5]))

@@ -297,7 +297,11 @@ def do_stars(a):
     """``legdistort stars``."""
     solution = _solution(a)
     write_stars(solution, a.out, epoch=a.epoch, overwrite=a.overwrite)
-    _say(a, f"{len(solution.star_names)} stars in {a.out}", {"n_stars": len(solution.star_names), "out": str(a.out)})
+    _say(
+        a,
+        f"{len(solution.estimate.star_names)} stars in {a.out}",
+        {"n_stars": len(solution.estimate.star_names), "out": str(a.out)},
+    )
 
 
 def do_correct(a):
@@ -330,7 +334,8 @@ def _report(a, solution, summary):
             if check["state"] in ("warn", "fail"):
                 print(Check(**check), file=sys.stderr)
     else:
-        print(replace(solution, checked=tuple(Check(**check) for check in summary["checks"])))
+        checked = tuple(Check(**check) for check in summary["checks"])
+        print(replace(solution, estimate=replace(solution.estimate, checked=checked)))
 
 
 def _refuse(given, reason):
@@ -429,7 +434,7 @@ def _grid(path, solution):
         return None
     grid = read_grid(path)
     try:
-        given_grid(grid, solution)
+        given_grid(grid, solution.sky)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return grid

@@ -106,13 +106,14 @@ def _block_medians(data):
     return np.median(blocks.reshape(ny, nx, -1), axis=2)
 
 
-def match_backgrounds(backgrounds, solution, output, factors):
+def match_backgrounds(backgrounds, views, output, factors):
     """Background level of every exposure, by differences of block medians where exposures overlap.
 
     Parameters
     ----------
     backgrounds : sequence of Background
-    solution : Solution
+    views : dict
+        ``{name: View}``.
     output : `legdistort.coaddition.grids.Grid`
     factors : dict
         Flux scale of each exposure; the levels are at this scale.
@@ -132,7 +133,7 @@ def match_backgrounds(backgrounds, solution, output, factors):
     for i, each in enumerate(backgrounds):
         blocks = factors[each.name] * each.medians
         own[i] = np.median(blocks)
-        xy = trace(points, each.name, solution, output)[:, :2]
+        xy = trace(points, views[each.name], output)[:, :2]
         inside = np.all((xy >= -0.5) & (xy < np.array(each.shape[::-1]) - 0.5), axis=1)
         column, row = ((xy[inside] + 0.5) * np.array(blocks.shape[::-1]) / each.shape[::-1]).astype(int).T
         samples[i, inside] = blocks[row, column]

@@ -19,7 +19,7 @@ _SAME = 0.02  # by which fluxes of stars must differ from the exposure times to 
 _FEW = 5  # common stars that two exposures must have
 
 
-def flux_scales(frames, scale, solution, areas=None):
+def flux_scales(frames, scale, views, areas=None):
     """Factors that bring exposures, and the detectors of a camera, to one flux scale.
 
     Parameters
@@ -28,8 +28,9 @@ def flux_scales(frames, scale, solution, areas=None):
         Or handles; no pixels are read.
     scale : {'auto', 'exptime', 'stars', None} or dict
         See `legdistort.coadd`.
-    solution : Solution
-        Its observations have the fluxes of stars, if `legdistort.measure` made them.
+    views : dict
+        ``{name: View}`` of the frames, in their order; residuals have the fluxes of stars, if `legdistort.measure` made
+        them.
     areas : dict, optional
         Detector pixels in a pixel of the mosaic, by name, where it is to conserve surface brightness: stars then have
         their flux divided by these.
@@ -49,11 +50,11 @@ def flux_scales(frames, scale, solution, areas=None):
     names = [f.name for f in frames]
     if isinstance(scale, Mapping):
         return by_name("scale", scale, names), "given"
-    factors, origin = _factors(frames, scale, solution, areas or {})
+    factors, origin = _factors(frames, scale, views, areas or {})
     return dict(zip(names, factors.tolist(), strict=True)), origin
 
 
-def _factors(frames, scale, solution, areas):
+def _factors(frames, scale, views, areas):
     if scale is None:
         return np.ones(len(frames)), "none"
     if scale == "exptime":
@@ -62,7 +63,7 @@ def _factors(frames, scale, solution, areas):
     detectors = list(dict.fromkeys(f.detector for f in frames))
     place = np.array([(exposures.index(f.frame or f.name), detectors.index(f.detector)) for f in frames])
     first = [frames[k] for k in np.unique(place[:, 0], return_index=True)[1]]
-    stars = _star_scales([f.name for f in frames], place, solution, areas)
+    stars = _star_scales(views, place, areas)
     if stars is None and scale == "stars":
         raise InputError(
             f"scale='stars': the solution has no fluxes of {_FEW} common stars or more that join all exposures; "
@@ -104,7 +105,7 @@ def _time_scales(frames, times):
     return np.mean(times) / np.array(times, dtype=float)
 
 
-def _star_scales(names, place, solution, areas):
+def _star_scales(views, place, areas):
     """Logarithms of factors of exposures, and of detectors, by the fluxes of common stars, each with their errors.
 
     Exposures are compared where a detector sees the same stars in both; detectors by the stars that fall on one in an
@@ -112,29 +113,27 @@ def _star_scales(names, place, solution, areas):
 
     Parameters
     ----------
-    names : list of str
-        What is co-added, exposures or their detectors.
+    views, areas
+        As for `flux_scales`.
     place : ndarray of int, shape (n, 2)
         Exposure and detector of each.
-    solution, areas
-        As for `flux_scales`.
 
     Returns
     -------
     tuple of tuple of ndarray, or None
         None if stars do not join all exposures.
     """
-    rows = solution.observations
-    if "flux" not in rows.colnames:
+    seen = [view.residuals for view in views.values()]
+    if any("flux" not in rows.colnames for rows in seen):
         return None
-    flux, part = np.asarray(rows["flux"], dtype=float), np.asarray(rows["exposure"])
-    good = np.asarray(rows["used"]) & np.isfinite(flux) & (flux > 0) & np.isin(part, names)
-    stars, star = np.unique(np.asarray(rows["star"])[good], return_inverse=True)
+    part = np.repeat(np.arange(len(seen)), [len(rows) for rows in seen])
+    flux, used, star = (np.concatenate([np.asarray(rows[key]) for rows in seen]) for key in ("flux", "used", "star"))
+    good = used.astype(bool) & np.isfinite(flux) & (flux > 0)
+    stars, star = np.unique(star[good], return_inverse=True)
     if len(stars) < _FEW:
         return None
-    known = {name: i for i, name in enumerate(names)}
-    part = np.array([known[name] for name in part[good]])
-    logs = np.log(flux[good]) - np.log([areas.get(name, 1.0) for name in names])[part]
+    part = part[good]
+    logs = np.log(flux[good]) - np.log([areas.get(name, 1.0) for name in views])[part]
     exposure, detector = place[part].T
     on_detector = np.unique(np.stack([detector, star]), axis=1, return_inverse=True)[1].ravel()
     scales = _compared(exposure, on_detector, logs, len(set(place[:, 0])))

@@ -70,34 +70,40 @@ log = logging.getLogger(__name__)
 _FLAT = 1e6  # ratio of the sides of a pixel that is none
 
 
-def reference_grid(names, solution):
-    """The smallest grid of reference-plane pixels that holds all exposures named.
+def reference_grid(views, sky):
+    """The smallest grid of reference-plane pixels that holds all exposures.
+
+    Parameters
+    ----------
+    views : sequence of View
+    sky : TangentPlane or None
+        Where the reference plane lies on the sky.
 
     Returns
     -------
     Grid
         Its pixels are pixels of the reference plane, shifted by whole pixels.
     """
-    edges = np.concatenate([solution.correct(name, outline(solution.shapes[name])) for name in names])
+    edges = np.concatenate([view.correct(outline(view.shape)) for view in views])
     low = np.ceil(edges.min(axis=0) - 1e-6).astype(int)
     nx, ny = np.floor(edges.max(axis=0) + 1e-6).astype(int) - low + 1
     wcs = WCS(naxis=2)
     wcs.array_shape = (ny, nx)
-    if solution.sky is None:
+    if sky is None:
         wcs.wcs.ctype = ["LINEAR", "LINEAR"]
         wcs.wcs.crpix = 1 - low
         wcs.wcs.crval = [0, 0]
     else:
-        matrix = np.asarray(solution.sky.matrix, dtype=float)
+        matrix = np.asarray(sky.matrix, dtype=float)
         wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
         wcs.wcs.cunit = ["deg", "deg"]
         wcs.wcs.cd = matrix[:, :2]
-        wcs.wcs.crval = [solution.sky.lon, solution.sky.lat]
+        wcs.wcs.crval = [sky.lon, sky.lat]
         wcs.wcs.crpix = np.linalg.solve(matrix[:, :2], -matrix[:, 2]) - low + 1
         wcs.wcs.radesys = "ICRS"
     wcs.wcs.set()
     log.info("mosaic of %d x %d px on the reference plane", nx, ny)
-    return Grid((int(ny), int(nx)), wcs, (int(low[0]), int(low[1])), solution.sky)
+    return Grid((int(ny), int(nx)), wcs, (int(low[0]), int(low[1])), sky)
 
 
 def checked_wcs(grid):
@@ -120,7 +126,7 @@ def checked_wcs(grid):
     return wcs
 
 
-def given_grid(grid, solution):
+def given_grid(grid, sky):
     """The `Grid` of a celestial WCS or FITS header with a shape.
 
     Raises
@@ -129,12 +135,12 @@ def given_grid(grid, solution):
         If it is none, or the solution is not tied to the sky.
     """
     wcs = checked_wcs(grid)
-    if solution.sky is None:
+    if sky is None:
         raise InputError(
             "the solution is not tied to the sky, so it cannot be put on a celestial grid; "
             "measure frames with a header WCS, or give grid=None"
         )
-    return Grid(tuple(int(n) for n in wcs.array_shape), wcs, None, solution.sky)
+    return Grid(tuple(int(n) for n in wcs.array_shape), wcs, None, sky)
 
 
 def read_grid(path):

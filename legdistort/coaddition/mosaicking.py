@@ -13,6 +13,7 @@ from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.star_hull import support
 from ..inputs.sky_wcs import leads_elsewhere, warn_of_another_field
 from ..results.solution import Solution
+from ..results.view import image_view
 from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
 from ..runtime.words import PLANES
@@ -155,28 +156,28 @@ def coadd(
         planes=planes,
     )
     share = partial(map_items, workers=workers, threads=True, progress=progress)
-    return _coadd(exposures, solution.by_detector, options, share)
+    return _coadd(exposures, solution, options, share)
 
 
 def _check_order(exposures, solution):
     """Raise `InputError` for a solution in the place of exposures, and for anything else in the place of a solution."""
     if isinstance(exposures, Solution):
         raise InputError("coadd takes the exposures first and then the solution: call coadd(exposures, solution)")
-    if not hasattr(solution, "by_detector"):
+    if not isinstance(solution, Solution):
         kind = type(solution).__name__
         raise InputError(f"coadd takes a Solution after the exposures, as solve gives it, got {kind}")
 
 
 def _coadd(exposures, solution, options, share):
     """The mosaic; `share` is `map_items`, which shares the work among threads or processes."""
-    frames, left_out = _select(exposures, solution)
+    frames, views, left_out = _select(exposures, solution)
     options.check_names([*(f.name for f in frames), *left_out])
     if options.grid is None:
-        output = reference_grid([f.name for f in frames], solution)
+        output = reference_grid(list(views.values()), solution.sky)
     else:
-        output = given_grid(options.grid, solution)
+        output = given_grid(options.grid, solution.sky)
     corners = options.algorithm in ("exact", "drizzle")
-    maps = {f.name: pixel_maps.map_exposure(f.name, solution, output, corners=corners) for f in frames}
+    maps = {name: pixel_maps.map_exposure(view, output, corners=corners) for name, view in views.items()}
     left_out |= {name: "it does not meet the output grid" for name, found in maps.items() if found is None}
     frames = [f for f in frames if maps[f.name] is not None]
     need = n_bytes(output.shape, len(frames)) + _STORED * sum(int(np.prod(f.shape)) for f in frames)
@@ -192,11 +193,12 @@ def _coadd(exposures, solution, options, share):
         if not frames:
             raise InputError(f"no exposure meets the output grid: {_reasons(left_out)}")
         areas = None if options.conserve == "flux" else {f.name: _area(maps[f.name]) for f in frames}
-        factors, origin = flux_scales(frames, options.scale, solution, areas)
-        layers, recipe = _layers(frames, prepared, maps, factors, solution, output, options)
+        views = {f.name: views[f.name] for f in frames}
+        factors, origin = flux_scales(frames, options.scale, views, areas)
+        layers, recipe = _layers(frames, prepared, maps, factors, views, output, options)
         held = options.algorithm == "drizzle"  # its package keeps Python's lock, so that threads would wait for it
         planes = assemble(layers, recipe, folder.parent, partial(share, threads=not held))
-    _warn_of_misuse(frames, maps, options.algorithm, solution)
+    _warn_of_misuse(frames, maps, options.algorithm, views)
     correlation = noise_gain.noise_correlation(layers[0].map, layers[0].gain, recipe.resampling)
     header = mosaic_header(frames, left_out, factors, _settings(options, recipe, origin, correlation))
     names = tuple(f.name for f in frames)
@@ -206,13 +208,13 @@ def _coadd(exposures, solution, options, share):
     return Mosaic(*planes, wcs=output.wcs, **made, extrapolated=extrapolated, rejected=rejected)
 
 
-def _layers(frames, prepared, maps, factors, solution, output, options):
+def _layers(frames, prepared, maps, factors, views, output, options):
     """The layers, and how they become a mosaic."""
     backgrounds = [prepared[f.name].background for f in frames]
-    sky = match_backgrounds(backgrounds, solution, output, factors)
+    sky = match_backgrounds(backgrounds, views, output, factors)
     noise = {b.name: factors[b.name] * b.noise for b in backgrounds}
-    weights = make_weights(options.weights, noise, solution, times={f.name: f.exposure_time for f in frames})
-    fwhm = stellar_widths(solution, list(noise))
+    weights = make_weights(options.weights, noise, views, times={f.name: f.exposure_time for f in frames})
+    fwhm = stellar_widths(views)
     flux = options.conserve == "flux"
     area = {f.name: _area(maps[f.name]) if flux else 1.0 for f in frames}
     n_pixels = sum(np.prod(f.shape) for f in frames)
@@ -230,7 +232,7 @@ def _layers(frames, prepared, maps, factors, solution, output, options):
             fwhm=fwhm and fwhm[f.name],
             gain=engines.white_gain(maps[f.name], resampling),
             photons=_photons(f, prepared[f.name], factors[f.name], noise[f.name] ** 2 * area[f.name]),
-            support=support(f.name, solution) if options.extrapolated != "keep" else None,
+            support=support(views[f.name].residuals) if options.extrapolated != "keep" else None,
         )
         for i, f in enumerate(frames)
     ]
@@ -257,7 +259,7 @@ def _area(exposure_map):
 
 
 def _select(exposures, solution):
-    """Exposures that can be used, and the reasons why others cannot."""
+    """Exposures that can be used, their views by name, and the reasons why others cannot."""
     one = isinstance(exposures, str | Path) or not np.iterable(exposures)
     exposures = [exposures] if one else list(exposures)
     if not all(hasattr(e, "read") for e in exposures):
@@ -269,22 +271,25 @@ def _select(exposures, solution):
     twice = {n for n in names if names.count(n) > 1}
     if twice:
         raise InputError(f"exposures come twice: {', '.join(sorted(twice))}; names must differ")
-    frames, left_out = [], {}
+    frames, views, left_out = [], {}, {}
     for frame in exposures:
-        if frame.name not in solution.poses:
-            left_out[frame.name] = solution.left_out.get(frame.name, "it is not in the solution")
-        elif frame.shape != tuple(solution.shapes[frame.name]):
+        view = image_view(solution, frame)
+        if view is None:
+            whole = solution.left_out.get(frame.frame or frame.name, "it is not in the solution")
+            left_out[frame.name] = solution.left_out.get(frame.name, whole)
+        elif frame.shape != tuple(view.shape):
             raise InputError(
-                f"exposure {frame.name}: its shape {frame.shape} is not that of the solution, "
-                f"{tuple(solution.shapes[frame.name])}; a trimmed or binned image needs a solution of its own"
+                f"exposure {frame.name}: its shape {frame.shape} is not that of the solution, {tuple(view.shape)}; a "
+                "trimmed or binned image needs a solution of its own"
             )
         else:
             frames.append(frame)
+            views[frame.name] = view
     if not frames:
-        known = f"; the solution has {some_of(list(solution.poses), 5)}" if left_out else ""
+        known = f"; the solution has {some_of([v.label for view in solution for v in view.parts], 5)}" * bool(left_out)
         raise InputError(f"no exposure to co-add: {_reasons(left_out) or 'the list is empty'}{known}")
     _warn(left_out)
-    return frames, left_out
+    return frames, views, left_out
 
 
 def _warn(left_out):
@@ -297,9 +302,9 @@ def _reasons(left_out):
     return "; ".join(f"{some_of(same, 5)}: {reason}" for reason, same in names.items())
 
 
-def _warn_of_misuse(frames, maps, algorithm, solution):
+def _warn_of_misuse(frames, maps, algorithm, views):
     """Of another field, of light that is lost between pixels, and of units that do not go together."""
-    warn_of_another_field([f.name for f in frames if leads_elsewhere(f.wcs, solution, f.name)])
+    warn_of_another_field([f.name for f in frames if leads_elsewhere(f.wcs, views[f.name])])
     scale = max(maps[f.name].scale for f in frames)
     if algorithm == "interp" and scale > _COARSE:
         warn(

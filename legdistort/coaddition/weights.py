@@ -14,21 +14,21 @@ _OWN = 0.02  # error of the position of a star of signal-to-noise ratio 20, in u
 _FWHM = 3.0  # taken where it is not known, px
 
 
-def stellar_widths(solution, names):
+def stellar_widths(views):
     """FWHM [px] of the stars of each exposure, medians of what was measured, as a dict; None if any is not known.
 
     Parameters
     ----------
-    solution : Solution
-        With a column ``fwhm`` in its observations, if `legdistort.measure` made them.
-    names : sequence of str
+    views : dict
+        ``{name: View}``, with a column ``fwhm`` in their residuals, if `legdistort.measure` made them.
     """
-    rows = solution.observations
-    if "fwhm" not in rows.colnames:
-        return None
-    fwhm, exposure = u.Quantity(rows["fwhm"], u.pix).value, np.asarray(rows["exposure"])
-    good = np.asarray(rows["used"]) & np.isfinite(fwhm) & (fwhm > 0)
-    widths = {name: fwhm[good & (exposure == name)] for name in names}
+    widths = {}
+    for name, view in views.items():
+        rows = view.residuals
+        if "fwhm" not in rows.colnames:
+            return None
+        fwhm = u.Quantity(rows["fwhm"], u.pix).value[np.asarray(rows["used"], dtype=bool)]
+        widths[name] = fwhm[np.isfinite(fwhm) & (fwhm > 0)]
     return {name: float(np.median(w)) for name, w in widths.items()} if all(len(w) for w in widths.values()) else None
 
 
@@ -60,7 +60,7 @@ class Weight:
         return self.value * map_coordinates(factor, place, order=1, mode="nearest")
 
 
-def make_weights(weights, noise, solution, *, times=None):
+def make_weights(weights, noise, views, *, times=None):
     """The `Weight` of every exposure.
 
     Parameters
@@ -69,8 +69,8 @@ def make_weights(weights, noise, solution, *, times=None):
         See `legdistort.coadd`.
     noise : dict
         Of the background of each exposure, at its flux scale.
-    solution : Solution
-        Asked for widths of stars and error maps only where they are needed.
+    views : dict
+        ``{name: View}``, asked for widths of stars and error maps only where they are needed.
     times : dict, optional
         Exposure times.
 
@@ -98,17 +98,17 @@ def make_weights(weights, noise, solution, *, times=None):
     base = {name: (best / sigma) ** 2 if best > 0 else 1.0 for name, sigma in noise.items()}
     if weights in ("noise", "variance"):
         return {name: Weight(value, by_pixel=weights == "variance") for name, value in base.items()}
-    fwhm = stellar_widths(solution, list(noise))
+    fwhm = stellar_widths({name: views[name] for name in noise})
     if weights == "sigma_map":
         fwhm = fwhm or dict.fromkeys(noise, _FWHM)
-        return {name: Weight(value, map=_share(name, solution, fwhm[name])) for name, value in base.items()}
+        return {name: Weight(value, map=_share(views[name], fwhm[name])) for name, value in base.items()}
     if fwhm is None:
         raise InputError("weights='seeing': the solution has no FWHM of stars in every exposure; give a dict")
     return {name: Weight(value * (min(fwhm.values()) / fwhm[name]) ** 2) for name, value in base.items()}
 
 
-def _share(name, solution, fwhm):
+def _share(view, fwhm):
     """Map of the share that a star of signal-to-noise ratio 20 has in the variance of its corrected position."""
-    x, y, sigma = solution.sigma_map(name, support=False)
+    x, y, sigma = view.sigma_map(support=False)
     own = (_OWN * fwhm) ** 2
     return x, y, own / (own + (sigma**2).mean(axis=2))

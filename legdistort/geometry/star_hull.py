@@ -4,13 +4,13 @@ import numpy as np
 from astropy import units as u
 
 
-def support(name, solution):
+def support(rows):
     """Half-planes whose intersection is the hull of the stars used in an exposure.
 
     Parameters
     ----------
-    name : str
-    solution : Solution
+    rows : `~astropy.table.QTable`
+        Its positions, ``x``, ``y`` [pix] and ``used``, as a table of residuals has them.
 
     Returns
     -------
@@ -20,8 +20,7 @@ def support(name, solution):
     """
     from scipy.spatial import ConvexHull, QhullError
 
-    rows = solution.observations
-    rows = rows[(rows["exposure"] == name) & rows["used"]]
+    rows = rows[np.asarray(rows["used"], dtype=bool)]
     try:
         return ConvexHull(np.column_stack([rows["x"].to_value(u.pix), rows["y"].to_value(u.pix)])).equations
     except (QhullError, ValueError):

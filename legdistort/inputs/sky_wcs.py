@@ -98,13 +98,14 @@ def to_icrs(wcs, xy, *, distortion=True):
     return np.stack([sky.ra.deg, sky.dec.deg])
 
 
-def leads_elsewhere(wcs, solution, name):
-    """Whether a believable WCS, or None, leads farther than a frame is large from where a solution has the exposure."""
-    if wcs is None or solution.sky is None:
+def leads_elsewhere(wcs, view):
+    """Whether a believable WCS, or None, leads farther than a frame is large from where a view of a solution has it."""
+    sky = view.solution.sky
+    if wcs is None or sky is None:
         return False
-    ny, nx = solution.shapes[name]
+    ny, nx = view.shape
     xy = np.array([[(nx - 1) / 2, (ny - 1) / 2], [0.0, 0.0]])
-    here, edge = solution.sky.to_sky(solution.correct(name, xy))
+    here, edge = sky.to_sky(view.correct(xy))
     (there,) = SkyCoord(*to_icrs(wcs, xy[:1]), unit="deg")
     return bool(here.separation(there) > 2 * here.separation(edge))
 

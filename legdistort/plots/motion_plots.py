@@ -21,7 +21,7 @@ def _columns(solution):
     InputError
         If motions were not fitted.
     """
-    if solution.motions is None:
+    if solution.estimate.motions is None:
         raise InputError("the motions of the stars were not fitted: call solve with motion='proper'")
     table, names = solution.stars, _PLANE if solution.sky is None else _SKY
     unit = u.pix / u.yr if solution.sky is None else u.mas / u.yr

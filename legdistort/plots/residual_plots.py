@@ -40,9 +40,10 @@ def plot_steps(solution, *, scale=None, fig=None):
         If a distortion folds.
     """
     steps = {"Shift, rotation and scale only": (_aligned(solution), elements.RED)}
-    if np.any(solution.prior_mean):
+    if np.any(solution.estimate.prior_mean):
         steps["Known static distortion removed"] = _aligned(solution, static=True), elements.GREEN
-    steps["Every distortion solved"] = _by_star(solution, _at_epoch(solution, solution.correct)), elements.BLUE
+    solved = _at_epoch(solution, lambda name, xy: solution[name].to_reference(xy))
+    steps["Every distortion solved"] = _by_star(solution, solved), elements.BLUE
     fig = elements.new_figure(fig, (3.6 * len(steps) + 0.2, 4.3))
     panels = list(fig.subplots(1, len(steps), sharex=True, sharey=True, squeeze=False)[0])
     means = [_mean_positions(positions) for positions, _ in steps.values()]
@@ -94,13 +95,15 @@ def _aligned(solution, *, static=False):
 
     def to_plane(name, xy):
         if static:
-            xy = Distortion(solution.prior_mean[solution.index(name)], solution.shapes[name], name).invert(xy)
+            xy = Distortion(
+                solution.estimate.prior_mean[solution.names.index(name)], solution.estimate.shapes[name], name
+            ).invert(xy)
         return similarity.apply(similarity.invert(solution.poses[name]), xy)
 
     positions = _by_star(solution, _at_epoch(solution, to_plane))
     for each in positions:
-        seen = np.isfinite(each + solution.positions).all(axis=1)
-        z, wanted = (xy[seen, 0] + 1j * xy[seen, 1] for xy in (each, solution.positions))
+        seen = np.isfinite(each + solution.estimate.positions).all(axis=1)
+        z, wanted = (xy[seen, 0] + 1j * xy[seen, 1] for xy in (each, solution.estimate.positions))
         if len(z):
             fit = np.linalg.lstsq(np.stack([z, np.ones(len(z))], axis=1), wanted, rcond=None)[0]
             moved = np.stack([z, np.ones(len(z))], axis=1) @ fit
@@ -110,20 +113,20 @@ def _aligned(solution, *, static=False):
 
 def _at_epoch(solution, to_plane):
     """The same way to the reference plane, with stars whose motions were fitted carried to the epoch."""
-    if solution.motions is None:
+    if solution.estimate.motions is None:
         return lambda name, xy, star: to_plane(name, xy)
-    years = dict(zip(solution.names, solution.motions.years, strict=True))
-    moved = {name: solution.motions.displacement(years[name], solution.sky) for name in solution.names}
+    years = dict(zip(solution.names, solution.estimate.motions.years, strict=True))
+    moved = {name: solution.estimate.motions.displacement(years[name], solution.sky) for name in solution.names}
     return lambda name, xy, star: to_plane(name, xy) - moved[name][star]
 
 
 def _by_star(solution, to_plane):
     """Used positions (n_exposures, n_stars, 2) in the reference plane, NaN where a star was not used."""
-    table = solution.observations
+    table = solution.residuals
     table = table[np.asarray(table["used"], dtype=bool)]
     x, y = (column_contract.values(table, axis, "pix") for axis in "xy")
-    exposure, star = np.asarray(table["exposure"]), np.searchsorted(solution.star_names, table["star"])
-    out = np.full((len(solution.names), len(solution.star_names), 2), np.nan)
+    exposure, star = np.asarray(table["exposure"]), np.searchsorted(solution.estimate.star_names, table["star"])
+    out = np.full((len(solution.names), len(solution.estimate.star_names), 2), np.nan)
     for i, name in enumerate(solution.names):
         rows = np.flatnonzero(exposure == name)
         if not len(rows):
@@ -152,7 +155,7 @@ def plot_mean_residuals(solution, *, scale=None, ax=None):
 
     ax = elements.new_axes(ax, (6.0, 6.0))
     places, mean, error = _cells(solution)
-    ny, nx = np.max(list(solution.shapes.values()), axis=0)
+    ny, nx = np.max(list(solution.estimate.shapes.values()), axis=0)
     long = np.percentile([*np.hypot(*mean.T), *error], 90) if len(error) else 0
     scale = scale or elements.round_down(0.8 * max(nx, ny) / _CELLS / (long or 1))
     if solution.camera is not None:
@@ -175,7 +178,7 @@ def _cells(solution):
     x, y, dx, dy, a, b = (
         column_contract.values(table, c, "pix") for c in ("x", "y", "dx", "dy", "x_err", "y_err")
     )  # fmt: skip
-    ny, nx = np.max(list(solution.shapes.values()), axis=0)
+    ny, nx = np.max(list(solution.estimate.shapes.values()), axis=0)
     found = solution.diagnostics
     weight = 1 / (found.error_scale**2 * ((a**2 + b**2) / 2 + found.error_floor**2))
     n = int(np.clip(np.sqrt(len(table) / (2 * _PER_CELL)), 3, _CELLS))

@@ -19,19 +19,17 @@ _NOTHING = 1e-3  # of the largest coefficient
 _PARTS = {"total": "distortion", "nonlinear": "distortion of degree 2 and more", "dynamic": "dynamic distortion"}
 
 
-def plot_residuals(solution, name=None, *, scale=None, ax=None):
-    """Arrows of the residuals (measured minus model) over the detector; crosses mark positions not used.
+def plot_residuals(view, *, scale=None, ax=None):
+    """Arrows of the residuals (measured minus model) of an exposure; crosses mark positions not used.
 
-    Of a camera over its focal plane, in which the detectors are outlined.
+    Over the detector; of several detectors over the focal plane, in which they are outlined.
 
     Of more than 3000 arrows a random sample is drawn.
 
     Parameters
     ----------
-    solution : `~legdistort.results.solution.Solution`
+    view : `~legdistort.results.view.View`
         What is drawn.
-    name : str, optional
-        One exposure; by default all are drawn over each other.
     scale : float, optional
         Magnification; by default a round number that makes the longest tenth of the arrows 8 % of the detector.
     ax : `~matplotlib.axes.Axes`, optional
@@ -40,25 +38,21 @@ def plot_residuals(solution, name=None, *, scale=None, ax=None):
     Raises
     ------
     InputError
-        If the exposure is unknown or none of its positions was used.
+        If none of the positions was used.
     """
     ax = elements.new_axes(ax, (6.4, 6.4))
-    table = solution.residuals
-    if name is not None:
-        solution.index(name)  # refuses an unknown name
-        table = table[column_contract.labels(table, "exposure") == name]
+    table = view.residuals
     x, y, dx, dy = (column_contract.values(table, column, "pix") for column in ("x", "y", "dx", "dy"))
     used = np.asarray(table["used"], dtype=bool)
     rows = np.flatnonzero(used)
     if not len(rows):
-        raise InputError(f"nothing to draw: no position of {name or 'any exposure'} was used")
-    shapes = list(solution.shapes.values()) if name is None else [solution.shapes[name]]
-    ny, nx = np.max(shapes, axis=0)
+        raise InputError(f"nothing to draw: no position of {view.label} was used")
+    ny, nx = view.shape
     scale = scale or elements.round_down(0.08 * max(nx, ny) / (np.percentile(np.hypot(dx, dy)[rows], 90) or 1))
     if len(rows) > _MAX_ARROWS:
         rows = np.random.default_rng(0).choice(rows, _MAX_ARROWS, replace=False)
-    if solution.camera is not None:
-        outline_detectors(solution.camera, ax)
+    if view.chip is None and view.solution.camera is not None:
+        outline_detectors(view.solution.camera, ax)
     ax.plot(x[~used], y[~used], "x", color=elements.RED, markersize=4, label="not used", linestyle="none")
     arrows = ax.quiver(
         *(a[rows] for a in (x, y, dx, dy)),
@@ -73,7 +67,7 @@ def plot_residuals(solution, name=None, *, scale=None, ax=None):
     ax.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), xlabel="x [px]", ylabel="y [px]", aspect="equal")
     if not used.all():
         ax.legend(loc="upper right", fontsize="small")
-    elements.set_title(ax, f"{elements.shorten(name or 'All exposures')}: residuals × {scale:g}")
+    elements.set_title(ax, f"{elements.shorten(view.label)}: residuals × {scale:g}")
     return ax
 
 
@@ -102,7 +96,7 @@ def plot_distortion(solution, name, *, part="total", scale=50, ax=None):
     """
     ax = elements.new_axes(ax, (5.4, 5.4))
     coefficients, prior = _parts(solution, name, part)
-    shape = solution.shapes[name]
+    shape = solution.estimate.shapes[name]
     scale = scale or distortion_scale(solution, [name], part=part)
     elements.draw_grid(ax, shape, np.zeros_like(coefficients), color=elements.GREY, linewidth=0.5)
     if prior is not None:
@@ -142,7 +136,7 @@ def plot_distortions(solution, *, names=None, page=0, part="total", scale=50, fi
     scale = scale or distortion_scale(solution, shown, part=part)
     for i, (ax, name) in enumerate(zip(panels, shown, strict=False)):
         plot_distortion(solution, name, part=part, scale=scale, ax=ax)
-        elements.mark(ax, exposures=[solution.index(name)])
+        elements.mark(ax, exposures=[solution.names.index(name)])
         elements.set_title(ax, elements.shorten(name, 26), size="small")
         ax.set(xlabel="", ylabel="")
         ax.tick_params(labelsize="x-small")
@@ -159,7 +153,7 @@ def plot_distortions(solution, *, names=None, page=0, part="total", scale=50, fi
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     fig.supxlabel("x [px]", fontsize="medium")
     fig.supylabel("y [px]", fontsize="medium")
-    heading = _heading(part, scale, part != "dynamic" and np.any(solution.prior_mean))
+    heading = _heading(part, scale, part != "dynamic" and np.any(solution.estimate.prior_mean))
     fig.suptitle(heading.capitalize(), fontsize="medium")
     return panels[: len(shown)]
 
@@ -167,7 +161,7 @@ def plot_distortions(solution, *, names=None, page=0, part="total", scale=50, fi
 def distortion_scale(solution, names, *, part="total"):
     """Round magnification that makes the largest displacement of some exposures about a tenth of the detector."""
     peak = max(elements.peak(_parts(solution, name, part)[0]) for name in names)
-    size = max(max(solution.shapes[name]) for name in names)
+    size = max(max(solution.estimate.shapes[name]) for name in names)
     return elements.round_down(0.1 * size / peak) if peak > 0 else 1.0
 
 
@@ -246,7 +240,7 @@ def _coefficients(solution, name):
     if name is not None:
         values, prior = _parts(solution, name, "total")
         return values, prior, elements.shorten(name), {"1σ": ("black", _padded(solution, [name]))}
-    values, prior = np.mean(solution.coefficients, axis=0), np.mean(solution.prior_mean, axis=0)
+    values, prior = np.mean(solution.coefficients, axis=0), np.mean(solution.estimate.prior_mean, axis=0)
     bars = {"scatter": ("black", np.std(solution.coefficients, axis=0))}
     some = solution.names[:: -(-len(solution.names) // PANELS)]
     return values, prior, "mean", bars | {"1σ error": (elements.RED, _padded(solution, some))}
@@ -254,7 +248,7 @@ def _coefficients(solution, name):
 
 def _padded(solution, names):
     """Median over exposures of the errors of their coefficients (2, n_modes); 0 for what was not fitted."""
-    errors = np.median([solution.coefficient_errors(name, relative=True) for name in names], axis=0)
+    errors = np.median([solution[name].relative_errors for name in names], axis=0)
     return np.pad(np.nan_to_num(errors), [(0, 0), (0, solution.coefficients.shape[2] - errors.shape[1])])
 
 
@@ -304,7 +298,7 @@ def plot_scatter(solution, *, label="scatter of one star", color=elements.BLUE, 
 def plot_sigma_map(x, y, sigma, *, stars=None, ax=None):
     """Map of the error of a corrected position (the paper's Figure "ergrid").
 
-    Drawn by ``plot_sigma_map(*solution.sigma_map(name))``.
+    Drawn by ``plot_sigma_map(*view.sigma_map())``.
 
     Parameters
     ----------
@@ -355,12 +349,12 @@ def _heading(part, scale, has_prior):
 
 def _parts(solution, name, part):
     """Coefficients to draw and those of the prior behind them (None without one)."""
-    i = solution.index(name)
+    i = solution.names.index(name)
     if part not in _PARTS:
         raise InputError(f"part must be 'total', 'nonlinear' or 'dynamic', got {part!r}")
     if part == "dynamic":
-        return solution.coefficients[i] - solution.prior_mean[i], None
-    coefficients, prior = solution.coefficients[i].copy(), solution.prior_mean[i].copy()
+        return solution.coefficients[i] - solution.estimate.prior_mean[i], None
+    coefficients, prior = solution.coefficients[i].copy(), solution.estimate.prior_mean[i].copy()
     if part == "nonlinear":
         coefficients[:, :3] = prior[:, :3] = 0
     return coefficients, prior if np.any(prior) else None

@@ -55,9 +55,9 @@ def plot_comparison(solutions, *, noise=None, ax=None):
 
 def _abscissa(solution):
     """Mean flux (or stated error) and mean stated error of every star, and what the axis is called."""
-    table = solution.observations[np.asarray(solution.observations["used"], dtype=bool)]
-    star = np.searchsorted(solution.star_names, table["star"])
-    n = np.maximum(np.bincount(star, minlength=len(solution.star_names)), 1)
+    table = solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]
+    star = np.searchsorted(solution.estimate.star_names, table["star"])
+    n = np.maximum(np.bincount(star, minlength=len(solution.estimate.star_names)), 1)
 
     def mean(values):
         return np.bincount(star, values, len(n)) / n

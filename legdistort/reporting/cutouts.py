@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..exceptions import LegdistortError
+from ..results.view import image_view
 from .svg import grey
 
 log = logging.getLogger(__name__)
@@ -41,7 +42,7 @@ def cut_out(solution, mosaic, exposures, *, fwhm=4.0):
     Parameters
     ----------
     solution : `~legdistort.results.solution.Solution`
-        Of single detectors (`Solution.by_detector`).
+        What is shown.
     mosaic : `~legdistort.coaddition.mosaic.Mosaic`
         On the reference plane.
     exposures : sequence of Exposure or ExposureFile
@@ -58,38 +59,33 @@ def cut_out(solution, mosaic, exposures, *, fwhm=4.0):
     t = np.arange(-half, half + 1)
     grid = np.stack(np.meshgrid(t, t), axis=-1).astype(float)
     stars = _spread(solution, mosaic, half)
-    places = {star: np.rint(solution.positions[star]) + grid for star in stars}
+    places = {star: np.rint(solution.estimate.positions[star]) + grid for star in stars}
     shown = {star: _mosaic_at(mosaic, xy) for star, xy in places.items()}
     cuts = {star: [] for star in stars}
-    kept = [each for each in exposures if each.name in solution.names]
-    for exposure in kept[:: -(-len(kept) // EXPOSURES) or 1]:
+    kept = [(each, view) for each in exposures if (view := image_view(solution, each)) is not None]
+    for exposure, view in kept[:: -(-len(kept) // EXPOSURES) or 1]:
         try:
             data = exposure.read()
         except LegdistortError as error:
             log.warning("no cut-outs of %s: %s", exposure.name, error)
             continue
-        frame = exposure.frame or exposure.name
         for star, xy in places.items():
-            image = _sample(data, solution.distort(exposure.name, xy.reshape(-1, 2)))
+            image = _sample(data, view.distort(xy.reshape(-1, 2)))
             if np.isfinite(image).mean() > 0.8:
-                cuts[star].append((exposure.name, frame, _drawn(image.reshape(grid.shape[:2]))))
-    names = list(solution.names)
-    return [
-        Cutout(star, str(solution.star_names[star]), _drawn(shown[star]), [(names.index(n), f, p) for n, f, p in each])
-        for star, each in cuts.items()
-        if each
-    ]
+                cuts[star].append((view.index, view.name, _drawn(image.reshape(grid.shape[:2]))))
+    names = solution.estimate.star_names
+    return [Cutout(star, str(names[star]), _drawn(shown[star]), each) for star, each in cuts.items() if each]
 
 
 def _spread(solution, mosaic, half):
     """Indices of the brightest star of each cell of the mosaic, those without a neighbour in the cut-out."""
-    xy = solution.positions - np.asarray(mosaic.offset)
+    xy = solution.estimate.positions - np.asarray(mosaic.offset)
     ny, nx = np.shape(mosaic.data)
     inside = np.flatnonzero(np.all((xy > half) & (xy < np.array([nx, ny]) - 1 - half), axis=1))
-    used = solution.observations[np.asarray(solution.observations["used"], dtype=bool)]
+    used = solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]
     if "flux" not in used.colnames or not len(inside):
         return []
-    star = np.searchsorted(solution.star_names, used["star"])
+    star = np.searchsorted(solution.estimate.star_names, used["star"])
     n = np.maximum(np.bincount(star, minlength=len(xy)), 1)
     flux = np.bincount(star, np.nan_to_num(np.asarray(used["flux"], dtype=float)), len(xy)) / n
     cell = (xy[inside] * [4 / nx, 3 / ny]).astype(int) @ [1, 4]

@@ -6,6 +6,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from ..exceptions import FoldError
+from ..results import in_tables
 from .tables import count
 
 #: The paper whose method this is.
@@ -25,18 +26,18 @@ def facts_of(solution, summary):
     """Figures of the solution, replaced and completed by those of a summary."""
     facts = {
         "n_exposures": len(solution.names),
-        "n_stars": int(np.count_nonzero(np.isfinite(solution.positions[:, 0]))),
+        "n_stars": int(np.count_nonzero(np.isfinite(solution.estimate.positions[:, 0]))),
         "n_observations": int(np.count_nonzero(solution.residuals["used"])),
         "chi2": solution.chi2,
         "dof": solution.dof,
-        "rms_px": solution.rms,
+        "rms_px": in_tables.rms(solution),
         "left_out": solution.left_out,
         "checks": [asdict(check) for check in solution.checks],
         "observed": {},
     } | summary
     if "max_inverse_error_px" not in facts:
         try:
-            facts["max_inverse_error_px"] = solution.max_inverse_error
+            facts["max_inverse_error_px"] = in_tables.largest_inverse_error(solution)
         except FoldError as error:
             facts["max_inverse_error_px"] = str(error)
     return facts
@@ -58,7 +59,7 @@ def observed_rows(solution, facts):
 def solution_rows(solution, facts):
     """Figures of the solution: ``{name: text}``."""
     not_used = len(solution.residuals) - np.count_nonzero(solution.residuals["used"])
-    lost = np.count_nonzero(np.isnan(solution.positions[:, 0]))
+    lost = np.count_nonzero(np.isnan(solution.estimate.positions[:, 0]))
     stars = Markup("{} <small>({} more without a position)</small>").format(facts["n_stars"], lost)
     rows = {
         "Exposures": facts["n_exposures"],
@@ -77,12 +78,12 @@ def solution_rows(solution, facts):
     rows["Largest error of an inverse"] = error if isinstance(error, str) else f"{error:.1e} px"
     rows["Minimisation"] = solution.status
     if solution.camera is not None:
-        rows["Camera"] = solution.camera_sentence
+        rows["Camera"] = in_tables.camera_sentence(solution)
     rows["Gauge"] = solution.gauge.sentence
     rows |= {key.capitalize(): sentence for key, sentence in solution.diagnostics.in_words().items()}
-    if solution.motions is not None:
-        rows["Motions"] = solution.motions.sentence
-    rows["Sky"] = solution.sky_sentence
+    if solution.estimate.motions is not None:
+        rows["Motions"] = solution.estimate.motions.sentence
+    rows["Sky"] = in_tables.sky_sentence(solution)
     lines = [escape(f"{name}: {reason}") for name, reason in facts["left_out"].items()]
     rows["Left out"] = Markup("<br>").join(lines) if lines else "none"
     if facts.get("timings"):
@@ -114,7 +115,7 @@ def methods(solution, facts, *, stacked):
     what += f" (filter {seen['filter']})" if "filter" in seen else ""
     software = f"legdistort {solution.provenance.get('versions', {}).get('legdistort', '')}".strip()
     not_used = len(solution.residuals) - np.count_nonzero(solution.residuals["used"])
-    static = " around a static distortion known beforehand" if np.any(solution.prior_mean) else ""
+    static = " around a static distortion known beforehand" if np.any(solution.estimate.prior_mean) else ""
     parts = [
         f"Star positions were measured in {count(facts['n_exposures'], 'exposure')}{what}. Positions free of "
         f"distortion and the distortion of every exposure were determined together with {software}, by the method of "
@@ -130,8 +131,8 @@ def methods(solution, facts, *, stacked):
             f"Corrected positions of a star scatter by {per_axis(facts['sigma_px'])} (rms) over the exposures."
         )
     parts.append(f"Convention for what is common to all exposures: {solution.gauge.sentence}.")
-    if solution.motions is not None:
-        parts.append(f"Motions of the stars: {solution.motions.sentence}.")
+    if solution.estimate.motions is not None:
+        parts.append(f"Motions of the stars: {solution.estimate.motions.sentence}.")
     if stacked:
         quality = facts.get("quality")
         sharp = (

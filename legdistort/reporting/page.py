@@ -97,8 +97,8 @@ def render(solution, *, mosaic=None, psfs=None, summary=None, comparison=None, s
             "bibtex": BIBTEX,
             "files": list(files),
             "version": version("legdistort"),
-            "names": {"s": [str(n) for n in solution.star_names], "e": list(solution.names)},
-            "cutouts": cut_out(solution.by_detector, mosaic, exposures, fwhm=_fwhm(facts)),
+            "names": {"s": [str(n) for n in solution.estimate.star_names], "e": list(solution.names)},
+            "cutouts": cut_out(solution, mosaic, exposures, fwhm=_fwhm(facts)),
             **_pictures(gallery, solution, pulls, mosaic),
             **_details(gallery, solution, pulls, psfs, facts, comparison, stacks),
         }

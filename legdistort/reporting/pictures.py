@@ -8,6 +8,7 @@ from markupsafe import Markup
 from ..assessment.pulls import exposure_rms
 from ..exceptions import FoldError, LegdistortError
 from ..plots import motion_plots, psf_plots, residual_plots, solution_plots, stack_plots, trend_plots
+from ..results.view import error_map
 from .svg import detached_figure, svg_of
 from .tables import sizes
 
@@ -66,7 +67,7 @@ class Gallery:
         """The error of the correction over the exposure with the most stars; none where its distortion folds."""
         name = solution.names[int(np.argmax(exposure_rms(solution)[2]))]
         try:
-            drawn = solution.sigma_map(name)
+            drawn = error_map(solution[name])
         except FoldError:
             return None
         ax = solution_plots.plot_sigma_map(*drawn, ax=_quick_figure(6.4, 5.4).subplots())
@@ -116,8 +117,8 @@ class Gallery:
     def mosaic(self, solution, mosaic):
         """The co-added image."""
         stars = None
-        if getattr(mosaic, "offset", None) is not None and len(solution.star_names) <= 2000:
-            stars = solution.positions - mosaic.offset
+        if getattr(mosaic, "offset", None) is not None and len(solution.estimate.star_names) <= 2000:
+            stars = solution.estimate.positions - mosaic.offset
         ax = stack_plots.plot_mosaic(mosaic, stars=stars, max_size=800, ax=_quick_figure(7.5, 7.5).subplots())
         return self.add(
             ax.figure,
@@ -142,7 +143,7 @@ class Gallery:
             "an edge, would be worrying.",
             **_PANELS,
         )
-        if np.any(solution.prior_mean):
+        if np.any(solution.estimate.prior_mean):
             shown = {"names": names, "part": "dynamic", "scale": None}
             panels = solution_plots.plot_distortions(solution, **shown, fig=_quick_figure())
             yield self.add(
@@ -167,7 +168,7 @@ class Gallery:
 
     def motions(self, solution):
         """Proper motions, where they were fitted."""
-        if solution.motions is None or not np.isfinite(solution.motions.values).any():
+        if solution.estimate.motions is None or not np.isfinite(solution.estimate.motions.values).any():
             return
         origin = (
             "tied to those of the reference" if solution.gauge.drift.n_tied else "relative to the mean of the stars"

@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from ..results import accuracy
+from ..results import accuracy, in_tables
 from ..runtime import provenance
 
 
@@ -17,18 +17,18 @@ def summarise(solution, *, timings=None):
     found, sigma = solution.diagnostics, accuracy.scatter(accuracy.corrected_positions(solution))
     return {
         "n_exposures": len(solution.names),
-        "n_stars": int(np.count_nonzero(np.isfinite(solution.positions[:, 0]))),
-        "n_observations": int(np.count_nonzero(solution.observations["used"])),
+        "n_stars": int(np.count_nonzero(np.isfinite(solution.estimate.positions[:, 0]))),
+        "n_observations": int(np.count_nonzero(solution.residuals["used"])),
         "chi2": float(solution.chi2),
         "dof": int(solution.dof),
-        "rms_px": float(np.sqrt(np.mean(solution.rms**2))),
+        "rms_px": float(np.sqrt(np.mean(in_tables.rms(solution) ** 2))),
         "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
         "checks": [asdict(check) for check in solution.checks],
         "gauge": solution.gauge.sentence,
         "unknown": list(solution.gauge.unknown_names),
-        "sky": solution.sky_sentence,
+        "sky": in_tables.sky_sentence(solution),
         "reference": found.reference and asdict(found.reference),
-        "max_inverse_error_px": float(solution.max_inverse_error),
+        "max_inverse_error_px": float(in_tables.largest_inverse_error(solution)),
         "left_out": dict(solution.left_out),
         "command": provenance.command_line(),
         **found.summary(),

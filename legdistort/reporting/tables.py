@@ -84,7 +84,7 @@ def exposures_table(solution):
         ]
         high = tuple(k for k, rms in ((6, dx), (7, dy)) if np.isfinite(rms[i]) and rms[i] > _MARK * np.nanmedian(rms))
         rows.append(Row(cells, high, exposure=i))
-    reference = "static distortion" if np.any(solution.prior_mean) else "mean of the exposures"
+    reference = "static distortion" if np.any(solution.estimate.prior_mean) else "mean of the exposures"
     return Table(
         head,
         rows,
@@ -139,7 +139,7 @@ def sizes(solution):
 
     The basis is orthonormal on a square of area 4: the mean square is the sum of squared coefficients over 4.
     """
-    static = solution.prior_mean
+    static = solution.estimate.prior_mean
     if not np.any(static):
         static = np.mean(solution.coefficients, axis=0)
     parts = solution.coefficients, solution.coefficients - static

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity
-from .coefficient_covariance import exposure_blocks, times
+from .errors.coefficient_covariance import exposure_blocks, times
 
 #: Numbers held at once while expected scatters are computed.
 _BLOCK = 2**24
@@ -112,9 +112,11 @@ def relative_offsets(solution, xy):
 
 def _compared(solution, xy):
     """Stars (n,) that have a position in both."""
-    if xy.shape != solution.positions.shape:
-        raise InputError(f"xy must have one row for each of the {len(solution.positions)} stars, got shape {xy.shape}")
-    return np.isfinite(xy - solution.positions).all(axis=1)
+    if xy.shape != solution.estimate.positions.shape:
+        raise InputError(
+            f"xy must have one row for each of the {len(solution.estimate.positions)} stars, got shape {xy.shape}"
+        )
+    return np.isfinite(xy - solution.estimate.positions).all(axis=1)
 
 
 def _without_directions(solution, xy, similar, stars, moves, there):
@@ -128,9 +130,9 @@ def _without_directions(solution, xy, similar, stars, moves, there):
         raise InputError(
             f"{similar.shape[1] + m} directions cannot be taken off the offsets of {good.sum() // 2} stars"
         )
-    if m and not hasattr(type(solution.uncertainty), there):
+    if m and not hasattr(type(solution.estimate.uncertainty), there):
         raise InputError("a solution read from a file keeps no equations; call solve again")
-    values = (xy - solution.positions).T.ravel()[good]
+    values = (xy - solution.estimate.positions).T.ravel()[good]
     here = stars.transpose(1, 0, 2).reshape(2 * len(xy), m)
     design = np.hstack([similar, here[good]])
     amounts = np.linalg.lstsq(design, values, rcond=None)[0]
@@ -138,9 +140,9 @@ def _without_directions(solution, xy, similar, stars, moves, there):
         coefficients = solution.coefficients.copy()
         for amount, move in zip(amounts[-m:], moves, strict=True):
             coefficients[:, :, : move.shape[2]] += amount * move
-        positions = np.nan_to_num(solution.positions) + np.nan_to_num(stars) @ amounts[-m:]
+        positions = np.nan_to_num(solution.estimate.positions) + np.nan_to_num(stars) @ amounts[-m:]
         poses = np.stack([solution.poses[name] for name in solution.names])
-        moved = getattr(solution.uncertainty, there)(positions, coefficients, poses)
+        moved = getattr(solution.estimate.uncertainty, there)(positions, coefficients, poses)
         design = np.hstack([similar, (here + moved)[good] / 2])
         amounts = np.linalg.lstsq(design, values, rcond=None)[0]
     out = np.full(xy.shape, np.nan)
@@ -160,15 +162,19 @@ def expected_bias(solution, *, removed=None, absolute=False):
     absolute : bool
         Add what the gauge hides (mean dynamic distortion, static uncertainty).
     """
-    good = np.isfinite(solution.positions).all(axis=1)
-    xy = solution.positions[good]
-    if not hasattr(type(solution.uncertainty), "star_matrix"):  # of the class: to ask the object would compute it
+    good = np.isfinite(solution.estimate.positions).all(axis=1)
+    xy = solution.estimate.positions[good]
+    if not hasattr(
+        type(solution.estimate.uncertainty), "star_matrix"
+    ):  # of the class: to ask the object would compute it
         raise InputError("a solution read from a file keeps no covariances between stars; call solve again")
     if removed is None:  # each star by itself: the covariances between stars, a large matrix, are not needed
         blocks = solution.absolute_covariance(without_unknown=True) if absolute else None
-        variance = solution.uncertainty.stars[:2, good] if blocks is None else np.einsum("nkk->kn", blocks)[:, good]
+        variance = (
+            solution.estimate.uncertainty.stars[:2, good] if blocks is None else np.einsum("nkk->kn", blocks)[:, good]
+        )
         return float(np.sqrt(np.mean(variance)))
-    covariance = solution.uncertainty.star_matrix[np.ix_(np.tile(good, 2), np.tile(good, 2))]
+    covariance = solution.estimate.uncertainty.star_matrix[np.ix_(np.tile(good, 2), np.tile(good, 2))]
     if absolute:
         hidden = solution.gauge.absolute_covariance
         modes = np.kron(np.eye(2), solution.gauge.modes_at(xy, len(hidden) // 2)).T
@@ -227,14 +233,14 @@ def corrected_positions(solution):
 
     Those of stars whose motions were fitted are carried to the epoch of the solution.
     """
-    table = solution.observations
-    out = np.full((len(solution.names), len(solution.star_names), 2), np.nan)
+    table = solution.residuals
+    out = np.full((len(solution.names), len(solution.estimate.star_names), 2), np.nan)
     for i, name in enumerate(solution.names):
         rows = table[(table["exposure"] == name) & table["used"]]
         xy = np.column_stack([rows["x"].value, rows["y"].value])
-        out[i, np.searchsorted(solution.star_names, rows["star"])] = solution.correct(name, xy)
-        if solution.motions is not None:
-            out[i] -= solution.motions.displacement(solution.motions.years[i], solution.sky)
+        out[i, np.searchsorted(solution.estimate.star_names, rows["star"])] = solution[name].to_reference(xy)
+        if solution.estimate.motions is not None:
+            out[i] -= solution.estimate.motions.displacement(solution.estimate.motions.years[i], solution.sky)
     return out
 
 
@@ -272,7 +278,7 @@ def new_scatter(solution, distort, xy, sigma, *, seen=None, rng=None):
         measured = np.array(distort(name, xy[on]))
         if sigma:
             measured += sigma * rng.standard_normal(measured.shape)
-        corrected[i, on] = solution.correct(name, measured)
+        corrected[i, on] = solution[name].to_reference(measured)
     return scatter(corrected)
 
 
@@ -340,7 +346,7 @@ def expected_scatter(solution, xy, sigma, *, seen=None, covariance=None):
         Rms per axis; NaN where fewer than two exposures see the position.
     """
     xy = np.asarray(xy, dtype=float)
-    covariance = solution.uncertainty.coefficients if covariance is None else covariance
+    covariance = solution.estimate.uncertainty.coefficients if covariance is None else covariance
     sigma = np.broadcast_to(sigma, (len(solution.names), len(xy)))
     step = max(1, _BLOCK // (2 * len(covariance) * (1 if covariance.ndim == 2 else covariance.shape[1])))
     parts = [
@@ -361,15 +367,15 @@ def _expected_variance(solution, xy, sigma, seen, covariance):
     rows = np.zeros((n_exposures, len(xy), 2, size))
     own, noise, n = np.zeros(len(xy)), np.zeros(len(xy)), np.zeros(len(xy), dtype=int)
     for i, name in enumerate(solution.names):
-        distortion, pose = solution.distortion(name), solution.poses[name]
-        ny, nx = solution.shapes[name]
+        distortion, pose = solution[name].distortion, solution.poses[name]
+        ny, nx = solution.estimate.shapes[name]
         q = similarity.apply(pose, xy)
         if seen is None:
             on = (np.abs(distortion(q) - [(nx - 1) / 2, (ny - 1) / 2]) <= [nx / 2, ny / 2]).all(axis=1)
         else:
             on = seen[i]
         back = np.linalg.inv(distortion.jacobian(q[on]) @ pose[:, :2])
-        b = basis.values(degree, *basis.normalize(q[on], solution.shapes[name]))
+        b = basis.values(degree, *basis.normalize(q[on], solution.estimate.shapes[name]))
         rows[i, on] = mine = np.einsum("kac,mk->kacm", back, b).reshape(len(b.T), 2, size)
         own[on] += (mine @ blocks[i] * mine).sum(axis=(1, 2))
         noise[on] += sigma[i, on] ** 2 * (back**2).sum(axis=(1, 2))

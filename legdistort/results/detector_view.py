@@ -1,84 +1,124 @@
-"""A solution over the focal plane of a camera, seen from its detectors.
+"""A detector in the focal plane of a camera, as one exposure of a solution has it.
 
 Pose, distortion of the focal plane, layout and static distortion together are again a similarity and a Legendre series
 on the detector, of a degree that is raised until less than a millionth of a pixel is left out. So what serves exposures
-of one detector serves those of several: resampling, headers, pictures.
+of one detector serves those of several: resampling, headers, pictures. Its errors are those of the focal plane and of
+the camera, carried to the same series.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
+from astropy import units as u
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
-from ..inputs.exposure_names import detector_name
+from .errors import absolute_errors
 
 #: Largest error of the series [pix], and the degree beyond which it is not raised.
 TOLERANCE, HIGHEST = 1e-6, 16
 
 
-def by_detector(solution):
-    """The solution of a camera with every detector of every exposure as an exposure of its own.
+@dataclass(frozen=True, eq=False)
+class OnDetector:
+    """The whole map from the reference plane to the pixels of a detector.
 
-    Its errors are not those of single detectors: it is for positions alone.
+    Attributes
+    ----------
+    pose : ndarray, shape (2, 3)
+        Similarity from the reference plane to undistorted pixels of the detector.
+    coefficients : ndarray, shape (2, n_modes)
+        What is left, undistorted -> detector pixels: normalised Legendre modes, pixels.
+    """
+
+    pose: np.ndarray
+    coefficients: np.ndarray
+
+
+def on_detector(view):
+    """The `OnDetector` of a view of a detector in a focal plane.
+
+    Raises
+    ------
+    InputError
+        If the map is not smooth enough for a series of degree 16.
+    """
+    chip, common = view.chip, view.solution[view.name]
+    t = np.linspace(-1, 1, 33)
+    pixels = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), chip.shape)
+    there = similarity.apply(similarity.invert(common.pose), common.distortion.invert(chip.to_focal_plane(pixels)))
+    own = similarity.fit_similarity(there, pixels)
+    back = similarity.compose(common.pose, similarity.invert(own))
+
+    def shift(q):
+        return chip.to_pixels(common.distortion(similarity.apply(back, q))) - q
+
+    series = basis.project(lambda u, v: shift(basis.denormalize(u, v, chip.shape)).T, HIGHEST, HIGHEST + 6)
+    for degree in range(max(view.solution.degree, 1), HIGHEST + 1):
+        part = basis.change_degree(series, degree)
+        if np.abs(Distortion(part, chip.shape)(pixels) - pixels - shift(pixels)).max() < TOLERANCE:
+            return OnDetector(own, part)
+    raise InputError(
+        f"exposure {view.name}, detector {view.detector}: layout and distortions together are no smooth map of the "
+        "detector; lower the degree, or look at the camera"
+    )
+
+
+def own_rows(view, rows):
+    """Rows of the table of residuals of an exposure that are of a detector, in its pixels, residuals and errors too."""
+    camera, chip = view.solution.camera, view.chip
+    rows = rows[camera.ids(rows) == view.detector]
+    f = np.column_stack([rows["x"].to_value(u.pix), rows["y"].to_value(u.pix)])
+    shift = np.column_stack([rows["dx"].to_value(u.pix), rows["dy"].to_value(u.pix)])
+    rows = camera.on_detectors(rows)
+    rows["dx"], rows["dy"] = np.einsum("nab,nb->an", chip.slope(f), shift) * u.pix
+    return rows
+
+
+def covariance(view, block):
+    """Covariance (2 n_modes, 2 n_modes) of the coefficients of a detector, px^2.
 
     Parameters
     ----------
-    solution : `legdistort.Solution`
-        With a camera.
-
-    Returns
-    -------
-    Solution
-        Names are those of `detector_name`.
+    view : View
+        Of a detector in a focal plane.
+    block : ndarray
+        Covariance of the coefficients of the exposure, a camera taken as known.
     """
-    camera, made = solution.camera, {}
-    for name in solution.names:
-        for key, detector in camera.detectors.items():
-            made[detector_name(name, key)] = (detector.shape, *_together(solution, name, key))
-    degree = max(basis.degree_of(series.shape[1]) for _, _, series in made.values())
-    coefficients = np.stack([basis.change_degree(series, degree) for _, _, series in made.values()])
-    table = solution.observations.copy(copy_data=False)
-    table["exposure"] = [detector_name(*pair) for pair in zip(table["exposure"], table["detector"], strict=True)]
-    table["x"], table["y"] = table["x_detector"], table["y_detector"]
-    lost = {detector_name(name, key): why for name, why in solution.left_out.items() for key in camera.detectors}
-    return replace(
-        solution,
-        names=tuple(made),
-        degree=degree,
-        shapes={name: shape for name, (shape, _, _) in made.items()},
-        poses={name: pose for name, (_, pose, _) in made.items()},
-        coefficients=coefficients,
-        prior_mean=np.zeros_like(coefficients),
-        observations=table,
-        left_out=lost,
-        camera=None,
-        form=None,
-        checked=solution.checks,
-        inverses={},
-        file_checksum=solution.checksum,
-    )
+    by_modes, by_camera = _responses(view)
+    return by_modes @ block @ by_modes.T + by_camera @ by_camera.T
 
 
-def _together(solution, name, key):
-    """Pose (2, 3) from the reference plane to a detector, and what is left of the map as a Legendre series."""
-    detector, distortion, pose = solution.camera[key], solution.distortion(name), solution.poses[name]
-    t = np.linspace(-1, 1, 33)
-    pixels = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), detector.shape)
-    there = similarity.apply(similarity.invert(pose), distortion.invert(detector.to_focal_plane(pixels)))
-    own = similarity.fit_similarity(there, pixels)
-    back = similarity.invert(own)
+def coefficient_variance(view):
+    """Variance (2, n_modes) of the coefficients of a detector with the common map; NaN where that is not known."""
+    solution, i = view.solution, view.index
+    gauge, uncertainty = solution.gauge, solution.estimate.uncertainty
+    own = covariance(view, absolute_errors.own_coefficients(gauge, uncertainty, i))
+    by_modes, _ = _responses(view)
+    if view.chip.layout_sigma is not None and np.isinf(view.chip.layout_sigma).any():
+        return np.full(view.coefficients.shape, np.nan)
+    if gauge.plane is not None:
+        return np.diag(own).reshape(2, -1)
+    return absolute_errors.coefficient_variance(gauge, own, i, by_modes)
 
-    def shift(q):
-        return detector.to_pixels(distortion(similarity.apply(pose, similarity.apply(back, q)))) - q
 
-    series = basis.project(lambda u, v: shift(basis.denormalize(u, v, detector.shape)).T, HIGHEST, HIGHEST + 6)
-    for degree in range(max(solution.degree, 1), HIGHEST + 1):
-        part = basis.change_degree(series, degree)
-        if np.abs(Distortion(part, detector.shape)(pixels) - pixels - shift(pixels)).max() < TOLERANCE:
-            return own, part
-    raise InputError(
-        f"exposure {name}, detector {key}: layout and distortions together are no smooth map of the detector; lower "
-        "the degree, or look at the camera"
-    )
+def _responses(view):
+    """How the series of a detector follows the coefficients of its exposure and the unit errors of a camera.
+
+    Arrays (2 n_modes of the detector, 2 n_modes of the exposure) and (the same, r).
+    """
+    solution, chip, common = view.solution, view.chip, view.solution[view.name]
+    degree, errors = view.distortion.degree, solution.estimate.uncertainty.camera
+    back = similarity.compose(common.pose, similarity.invert(view.pose))
+    x, y, weights = basis.quadrature(max(degree, HIGHEST) + 2)
+    q = similarity.apply(back, basis.denormalize(x, y, chip.shape))
+    f = common.distortion(q)
+    slope, values = chip.slope(f), basis.values(solution.degree, *basis.normalize(q, common.shape))
+    moved = np.einsum("nac,mn->nacm", slope, values).reshape(len(q), 2, -1)
+    of_camera = np.zeros((len(q), 2, 0))
+    if errors is not None:
+        of_camera = moved @ errors.coefficients[view.index]
+        of_camera = of_camera - slope @ errors.in_focal_plane(solution.camera, f, view.detector)
+    modes = weights * basis.values(degree, x, y)
+    return tuple(np.einsum("mn,nak->amk", modes, each).reshape(2 * len(modes), -1) for each in (moved, of_camera))

@@ -26,7 +26,7 @@ from ..runtime.notebook import ShownAsPrinted
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from .catalogue_tie import Tie
+    from .errors.catalogue_tie import Tie
 
 _CONVENTIONS = {
     "minimal": "smallest dynamic part, weighted by its scatter and errors",
@@ -214,7 +214,7 @@ class Gauge(ShownAsPrinted):
         What the orthonormal constraints are held at: zero, but for what residuals or a reference determine.
     released : ndarray, shape (2 n_modes, r), or None
         Maps of the reference plane, as columns, that the residuals determine.
-    tie : `legdistort.results.catalogue_tie.Tie` or None
+    tie : `legdistort.results.errors.catalogue_tie.Tie` or None
         How a reference catalogue measured the common map.
     convention : ndarray, same shape as `constraint`, or None
         Rows of the convention by itself, where something else takes its place in `constraint`. Relative errors are

@@ -109,7 +109,7 @@ def add_motions(table, motions, relative, absolute, xy, sky):
     table : `~astropy.table.QTable`
     motions : StarMotions
     relative, absolute : ndarray, shape (n_stars, 2 + k, 2 + k)
-        Covariances of the unknowns of the stars, `legdistort.results.absolute_errors`.
+        Covariances of the unknowns of the stars, `legdistort.results.errors.absolute_errors`.
     xy : ndarray, shape (n_stars, 2)
     sky : TangentPlane or None
     """

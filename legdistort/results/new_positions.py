@@ -17,7 +17,7 @@ from ..geometry import basis, similarity
 from ..geometry.epochs import year
 from ..geometry.models import like, to_pixels
 from ..inputs import column_contract
-from . import absolute_errors
+from .errors import absolute_errors
 from .motions import fitted
 
 #: Positions that a warning names.
@@ -25,7 +25,7 @@ _MOST_NAMED = 3
 
 
 class Corrected(NamedTuple):
-    """Corrected positions with their errors, as `Solution.correct` gives them.
+    """Corrected positions with their errors, as `View.correct` gives them.
 
     Attributes
     ----------
@@ -77,43 +77,47 @@ def movement(solution, name, stars, epoch, n):
         )
     if epoch is None:
         return None
-    motions = fitted(solution.motions)
+    motions = fitted(solution.estimate.motions)
     try:
         names = np.asarray(stars).astype(str)
     except (TypeError, ValueError):
         names = np.empty(0)
     if names.shape != (n,):
         raise InputError(f"stars must name a star of the solution for each of the positions, of which there are {n}")
-    order = {each: row for row, each in enumerate(np.asarray(solution.star_names).astype(str).tolist())}
+    order = {each: row for row, each in enumerate(np.asarray(solution.estimate.star_names).astype(str).tolist())}
     if strange := sorted({each for each in names.tolist() if each not in order}):
         raise InputError(
             f"no motion is known of {some_of(strange, 6)}: the solution has no such stars, and a position is "
             "carried to another time by the motion of its star"
         )
-    there, here = motions.columns([year(epoch), motions.years[solution.index(name)]], solution.sky)
+    there, here = motions.columns([year(epoch), motions.years[solution.names.index(name)]], solution.sky)
     return Movement(np.array([order[each] for each in names.tolist()], dtype=int), there - here)
 
 
-def correct(solution, name, pixels, moved=None):
-    """Positions (n, 2) of pixels of the focal plane, carried to another time by a `Movement`; undistorted ones too."""
-    distortion = solution.distortion(name)
-    distortion.check_fold()
-    q = distortion.invert(pixels)
-    corrected = similarity.apply(similarity.invert(solution.poses[name]), q)
-    return corrected if moved is None else corrected + moved.displacement(solution.motions), q
+def correct(view, pixels, moved=None):
+    """Positions (n, 2) of pixels of an exposure, carried to another time by a `Movement`; undistorted pixels too."""
+    view.distortion.check_fold()
+    q = view.distortion.invert(pixels)
+    corrected = similarity.apply(similarity.invert(view.pose), q)
+    return corrected if moved is None else corrected + moved.displacement(view.solution.estimate.motions), q
 
 
-def correct_with_errors(solution, name, xy, errors, detector=None, moved=None):
-    """`Solution.correct` with errors, carried to another time by a `Movement`; see there."""
+def correct_with_errors(view, xy, errors, moved=None):
+    """`View.correct` with errors, carried to another time by a `Movement`; see there."""
     pixels = np.atleast_2d(to_pixels(xy))
     measured = _covariance(errors, len(pixels))
-    if detector is not None:
-        pixels, measured = solution.camera[detector].to_focal_plane(pixels, measured)
-    corrected, q = correct(solution, name, pixels, moved)
-    relative, absolute = covariances(solution, name, q, measured, moved, detector)
+    if view.chip is not None:
+        pixels, measured = view.chip.to_focal_plane(pixels, measured)
+    corrected, relative, absolute = _with_errors(view, pixels, measured, moved)
     if isinstance(xy, u.Quantity):
         relative, absolute = relative * u.pix**2, absolute * u.pix**2
     return Corrected(like(xy, corrected), relative, absolute)
+
+
+def _with_errors(view, pixels, measured, moved):
+    """`Corrected` of pixels of an exposure, of its focal plane if it has one, with their covariances (n, 2, 2)."""
+    corrected, q = correct(view.solution[view.name], pixels, moved)
+    return Corrected(corrected, *covariances(view, q, measured, moved))
 
 
 def _covariance(errors, n):
@@ -147,68 +151,73 @@ def _covariance(errors, n):
     return out
 
 
-def response(solution, name, q):
-    """How coefficients move corrected positions, up to the sign, (n, 2, 2 n_modes), and detector pixels, (n, 2, 2).
+def response(view, q):
+    """How coefficients move corrected positions, up to the sign, (n, 2, 2 n_modes), and pixels, (n, 2, 2).
 
-    `q` (n, 2) are undistorted pixels of an exposure.
+    `q` (n, 2) are undistorted pixels of an exposure, of its focal plane if it has one.
     """
-    back = np.linalg.inv(solution.distortion(name).jacobian(q) @ solution.poses[name][:, :2])
-    b = basis.values(solution.degree, *basis.normalize(q, solution.shapes[name]))
+    common, degree = view.solution[view.name], view.solution.degree
+    back = np.linalg.inv(common.distortion.jacobian(q) @ common.pose[:, :2])
+    b = basis.values(degree, *basis.normalize(q, common.shape))
     return np.einsum("nac,mn->nacm", back, b).reshape(len(q), 2, -1), back
 
 
-def covariances(solution, name, q, measured, moved=None, detector=None):
+def covariances(view, q, measured, moved=None):
     """Relative and absolute covariance (n, 2, 2) of positions corrected to undistorted pixels q (n, 2) of an exposure.
 
-    `measured` (n, 2, 2) is the covariance on the detector; a `Movement` carries the positions to another time. Of a
-    camera with errors they have those too: of the `detector`, its id, or of that on which each position falls.
+    `measured` (n, 2, 2) is the covariance in its pixels, those of the focal plane if it has one; a `Movement` carries
+    the positions to another time. Of a camera with errors they have those too: of the detector of the view, or of that
+    on which each position falls.
     """
-    gauge, i = solution.gauge, solution.index(name)
-    by_modes, back = response(solution, name, q)
-    noise = carried(back, measured) + by_camera(solution, name, q, by_modes, back, detector)
-    own = noise + carried(by_modes, absolute_errors.own_coefficients(gauge, solution.uncertainty, i))
+    solution, i = view.solution, view.index
+    gauge, uncertainty, positions = solution.gauge, solution.estimate.uncertainty, solution.estimate.positions
+    by_modes, back = response(view, q)
+    noise = carried(back, measured) + by_camera(view, q, by_modes, back)
+    own = noise + carried(by_modes, absolute_errors.own_coefficients(gauge, uncertainty, i))
     if gauge.plane is not None:
         return own, np.full_like(own, np.nan)
-    xy = similarity.apply(similarity.invert(solution.poses[name]), q)
+    xy = similarity.apply(similarity.invert(solution.poses[view.name]), q)
     hidden = gauge.absolute_covariance
     plain = absolute_errors.plain_directions(gauge, xy, len(hidden) // 2)
-    relative = noise + carried(by_modes, absolute_errors.relative_coefficients(gauge, solution.uncertainty, i))
+    relative = noise + carried(by_modes, absolute_errors.relative_coefficients(gauge, uncertainty, i))
     directions = plain
     if len(hidden) == 2 * gauge.n_modes:
         directions = by_modes @ widened(gauge.motion[i], solution.degree)
-        relative = relative + carried(directions - plain @ _taken_off(gauge, solution.positions), hidden)
+        relative = relative + carried(directions - plain @ _taken_off(gauge, positions), hidden)
     if gauge.drift is not None and len(hidden) == 2 * gauge.n_modes:  # at the time of this exposure
         directions, hidden = by_modes @ widened(gauge.all_motion[i], solution.degree), gauge.joint_covariance
     if moved is not None:
-        known, terms = (gauge, solution.uncertainty), (moved.rows, slice(2, None), slice(2, None))
-        relative = relative + carried(moved.columns, absolute_errors.relative_blocks(*known, solution.positions)[terms])
+        known, terms = (gauge, uncertainty), (moved.rows, slice(2, None), slice(2, None))
+        relative = relative + carried(moved.columns, absolute_errors.relative_blocks(*known, positions)[terms])
         own = own + carried(moved.columns, absolute_errors.own_blocks(*known)[terms])
-        directions = directions + moved.columns @ solution.uncertainty.drift_directions[terms[:2]]
+        directions = directions + moved.columns @ uncertainty.drift_directions[terms[:2]]
     absolute = own + carried(directions, hidden)
-    if (camera := solution.uncertainty.camera) is not None and solution.camera is not None:
-        absolute[camera.lost(solution.camera, solution.distortion(name)(q), detector)] = np.nan
+    if (camera := uncertainty.camera) is not None and solution.camera is not None:
+        f = solution[view.name].distortion(q)
+        absolute[camera.lost(solution.camera, f, view.detector)] = np.nan
     for each in gauge.unknown:
         moved = by_modes @ widened(each.coefficients[i].reshape(-1, 1), solution.degree)
         absolute[np.sum(moved**2, axis=(1, 2)) > np.trace(absolute, axis1=1, axis2=2)] = np.nan
     return relative, absolute
 
 
-def relative_errors(solution, name, q):
+def relative_errors(view, q):
     """Covariance (n, 2, 2) of the correction of positions q (n, 2) of an exposure under the convention of the gauge."""
-    by_modes, back = response(solution, name, q)
-    own = absolute_errors.relative_coefficients(solution.gauge, solution.uncertainty, solution.index(name))
-    return carried(by_modes, own) + by_camera(solution, name, q, by_modes, back)
+    by_modes, back = response(view, q)
+    own = absolute_errors.relative_coefficients(view.solution.gauge, view.solution.estimate.uncertainty, view.index)
+    return carried(by_modes, own) + by_camera(view, q, by_modes, back)
 
 
-def by_camera(solution, name, q, by_modes, back, detector=None):
+def by_camera(view, q, by_modes, back):
     """Covariance (n, 2, 2) of corrected positions by the errors of a camera that was fitted: its own, and what the
     coefficients make of them. Zero without.
     """
-    errors = solution.uncertainty.camera
+    solution = view.solution
+    errors = solution.estimate.uncertainty.camera
     if errors is None or solution.camera is None:
         return np.zeros((len(q), 2, 2))
-    seen = errors.in_focal_plane(solution.camera, solution.distortion(name)(q), detector)
-    through = back @ seen - by_modes @ errors.coefficients[solution.index(name)]
+    seen = errors.in_focal_plane(solution.camera, solution[view.name].distortion(q), view.detector)
+    through = back @ seen - by_modes @ errors.coefficients[view.index]
     return through @ through.mT
 
 
@@ -243,24 +252,22 @@ def correct_table(solution, table, epoch=None):
     if solution.camera is not None:
         table = solution.camera.in_focal_plane(table)
     if epoch is not None:
-        fitted(solution.motions)
+        fitted(solution.estimate.motions)
     if epoch is not None and "star" not in table.colnames:
         raise InputError(
             "the table of positions lacks the column star: it is the motion of its star that carries a position to "
             "another time"
         )
-    exposures = np.asarray(table["exposure"]).astype(str)
     pixels = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
     measured = column_contract.covariance(table)
     xy, relative, absolute = np.empty_like(pixels), np.empty_like(measured), np.empty_like(measured)
-    for name in dict.fromkeys(exposures.tolist()):
-        mine = exposures == name
-        stars = None if epoch is None else table["star"][mine]
-        moved = movement(solution, name, stars, epoch, np.count_nonzero(mine))
-        xy[mine], relative[mine], absolute[mine] = correct_with_errors(
-            solution, name, pixels[mine], measured[mine], moved=moved
-        )
-    _warn_of_extrapolation(solution, table, exposures)
+    off = np.zeros(len(table), dtype=bool)
+    for view, rows in _parts(solution, table):
+        stars = None if epoch is None else table["star"][rows]
+        moved = movement(solution, view.name, stars, epoch, len(rows))
+        xy[rows], relative[rows], absolute[rows] = _with_errors(view, pixels[rows], measured[rows], moved)
+        off[rows] = _is_off(view, table[rows])
+    _warn_of_extrapolation(table, np.flatnonzero(off))
     out = table.copy()
     out["x"], out["y"] = xy.T * u.pix
     out["x_err_abs"], out["y_err_abs"] = np.sqrt(np.einsum("nkk->kn", absolute)) * u.pix
@@ -272,22 +279,37 @@ def correct_table(solution, table, epoch=None):
     return column_contract.describe_stars(out)
 
 
-def _warn_of_extrapolation(solution, table, exposures):
-    """Warn of positions that lie off their detector."""
-    camera, at = solution.camera, ("x", "y") if solution.camera is None else ("x_detector", "y_detector")
-    if camera is None:
-        shapes = [solution.shapes[name] for name in exposures]
-    else:
-        shapes = [camera[key].shape for key in camera.ids(table)]
-    xy, size = np.column_stack([table[name].to_value(u.pix) for name in at]), np.array(shapes)[:, ::-1]
-    rows = np.flatnonzero(((xy < -0.5) | (xy > size - 0.5)).any(axis=1))
-    if len(rows):
-        named = [f"row {k}, ({xy[k, 0]:.0f}, {xy[k, 1]:.0f}) in {exposures[k]}" for k in rows]
-        warn(
-            f"{len(rows)} of {len(xy)} positions lie off their detector, where the correction is extrapolated: "
-            f"{some_of(named, _MOST_NAMED)}",
-            AssumptionWarning,
-        )
+def _parts(solution, table):
+    """Views and the rows of a table that are of them."""
+    exposures = np.asarray(table["exposure"]).astype(str)
+    for name in dict.fromkeys(exposures.tolist()):
+        rows = np.flatnonzero(exposures == name)
+        if solution.camera is None:
+            yield solution[name], rows
+            continue
+        detector = solution.camera.ids(table[rows])
+        yield from ((solution[name, key], rows[detector == key]) for key in dict.fromkeys(detector.tolist()))
+
+
+def _is_off(view, rows):
+    """Which positions lie off the detector of a view, bool (n,)."""
+    x, y = (rows[name if view.chip is None else f"{name}_detector"].to_value(u.pix) for name in "xy")
+    ny, nx = view.shape
+    return (x < -0.5) | (y < -0.5) | (x > nx - 0.5) | (y > ny - 0.5)
+
+
+def _warn_of_extrapolation(table, rows):
+    """Warn of positions, rows of a table, that lie off their detector."""
+    if not len(rows):
+        return
+    at = ("x_detector", "y_detector") if "x_detector" in table.colnames else ("x", "y")
+    x, y = (table[name].to_value(u.pix) for name in at)
+    named = [f"row {k}, ({x[k]:.0f}, {y[k]:.0f}) in {table['exposure'][k]}" for k in rows]
+    warn(
+        f"{len(rows)} of {len(table)} positions lie off their detector, where the correction is extrapolated: "
+        f"{some_of(named, _MOST_NAMED)}",
+        AssumptionWarning,
+    )
 
 
 def add_sky(table, sky, xy, relative, absolute):

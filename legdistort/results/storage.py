@@ -18,15 +18,13 @@ from ..cameras import storage as cameras
 from ..cameras.camera import Camera
 from ..exceptions import FoldError, InputError
 from ..geometry import basis
-from ..geometry.distortion import Inverse
+from ..geometry.distortion import Distortion, Inverse
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from ..inputs.plain_columns import plain, plain_columns, restored
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_layout, check_tree, read_tree, understood
 from ..runtime.outputs import replacing, settle_for
 from ..runtime.provenance import checksums, unchanged
-from .camera_errors import CameraErrors
-from .catalogue_tie import Tie
 from .check import Check
 from .diagnostics import (
     AliasedDegree,
@@ -38,6 +36,9 @@ from .diagnostics import (
     UsedReference,
     Validation,
 )
+from .errors.camera_errors import CameraErrors
+from .errors.catalogue_tie import Tie
+from .estimate import Estimate, StoredUncertainty
 from .gauge import Drift, Gauge, UnknownDirection, UnknownMap
 from .motions import StarMotions
 from .settings import Settings
@@ -46,26 +47,12 @@ from .settings import Settings
 LAYOUT = 1
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class StoredUncertainty:
-    """Covariances read from a file; see `legdistort.solving.equations.covariances.Uncertainty`."""
-
-    coefficients: np.ndarray
-    stars: np.ndarray
-    directions: np.ndarray
-    weak: tuple
-    bends: np.ndarray | None = None
-    star_unknowns: np.ndarray | None = None
-    drift_directions: np.ndarray | None = None
-    camera: CameraErrors | None = None
-
-
 def write_solution(solution, path, *, overwrite=False):
     """Write a `Solution`, its covariances included, to an ASDF file."""
-    table = plain_columns(solution.observations)
-    camera = solution.uncertainty.camera
+    estimate, table = solution.estimate, plain_columns(solution.residuals)
+    camera = estimate.uncertainty.camera
     covariances = ["coefficients", "stars", "directions", "bends"]
-    covariances += ["star_unknowns", "drift_directions"] if solution.motions is not None else []
+    covariances += ["star_unknowns", "drift_directions"] if estimate.motions is not None else []
     tree = {
         "layout": LAYOUT,
         "provenance": solution.provenance,
@@ -75,13 +62,13 @@ def write_solution(solution, path, *, overwrite=False):
         "degree": solution.degree,
         "chi2": float(solution.chi2),
         "dof": int(solution.dof),
-        "exposures": [_exposure_tree(solution, name) for name in solution.names],
-        "stars": {"star": np.asarray(solution.star_names), "position": solution.positions},
+        "exposures": [_exposure_tree(view) for view in solution],
+        "stars": {"star": np.asarray(estimate.star_names), "position": estimate.positions},
         "columns": table.colnames,  # their order: that of a mapping is lost in files
         "observations": {name: plain(table[name]) for name in table.colnames},
-        "motions": solution.motions and dataclasses.asdict(solution.motions),
-        "covariance": {key: getattr(solution.uncertainty, key) for key in covariances}
-        | {"weak": [dataclasses.asdict(each) for each in solution.uncertainty.weak]}
+        "motions": estimate.motions and dataclasses.asdict(estimate.motions),
+        "covariance": {key: getattr(estimate.uncertainty, key) for key in covariances}
+        | {"weak": [dataclasses.asdict(each) for each in estimate.uncertainty.weak]}
         | {"camera": camera and dataclasses.asdict(camera)},
         "gauge": _gauge_tree(solution.gauge),
         "sky": solution.sky and dataclasses.asdict(solution.sky),
@@ -107,10 +94,9 @@ def _gauge_tree(gauge):
     }
 
 
-def _exposure_tree(solution, name):
-    i = solution.index(name)
+def _exposure_tree(view):
     try:
-        inverse = solution.distortion(name).inverse
+        inverse = view.distortion.inverse
         certified = {
             "tensors": inverse.tensors,
             "error_px": inverse.error,
@@ -119,11 +105,11 @@ def _exposure_tree(solution, name):
     except FoldError:  # such a solution is worth a look, but has no WCS
         certified = None
     return {
-        "name": name,
-        "shape": [int(n) for n in solution.shapes[name]],
-        "pose": solution.poses[name],
-        "coefficients": solution.coefficients[i],
-        "prior_mean": solution.prior_mean[i],
+        "name": view.name,
+        "shape": [int(n) for n in view.shape],
+        "pose": view.pose,
+        "coefficients": view.coefficients,
+        "prior_mean": view.prior_mean,
         "inverse": certified,
     }
 
@@ -187,32 +173,43 @@ def _from_tree(kind, checksum, tree):
     solution = kind(
         names=tuple(e["name"] for e in exposures),
         degree=tree["degree"],
-        shapes={e["name"]: tuple(e["shape"]) for e in exposures},
         poses={e["name"]: np.array(e["pose"]) for e in exposures},
         coefficients=np.stack([np.array(e["coefficients"]) for e in exposures]),
-        prior_mean=np.stack([np.array(e["prior_mean"]) for e in exposures]),
-        star_names=np.array(tree["stars"]["star"]),
-        positions=np.array(tree["stars"]["position"]),
-        observations=table,
+        residuals=table,
         chi2=tree["chi2"],
         dof=tree["dof"],
         status=tree["status"],
         gauge=gauge,
-        uncertainty=uncertainty,
         settings=Settings(**tree["settings"]),
         diagnostics=_diagnostics(tree["diagnostics"], [e["name"] for e in exposures]),
         sky=_made(TangentPlane, tree["sky"]),
         left_out=dict(tree["left_out"]),
         provenance=dict(tree["provenance"]),
         camera=tree.get("camera") and cameras.from_tree(tree["camera"], Camera),
-        motions=_made(StarMotions, tree.get("motions")),
-        checked=tuple(Check(**each) for each in tree.get("checks", ())),
-        inverses={e["name"]: _inverse(e["inverse"]) for e in exposures if e["inverse"] is not None},
-        file_checksum=checksum,
+        estimate=Estimate(
+            star_names=np.array(tree["stars"]["star"]),
+            positions=np.array(tree["stars"]["position"]),
+            shapes={e["name"]: tuple(e["shape"]) for e in exposures},
+            prior_mean=np.stack([np.array(e["prior_mean"]) for e in exposures]),
+            uncertainty=uncertainty,
+            motions=_made(StarMotions, tree.get("motions")),
+            checked=tuple(Check(**each) for each in tree.get("checks", ())),
+        ),
+        checksum=checksum,
     )
     _check_consistent(solution)
-    solution.distortion(solution.names[0])  # checks the certificates of all
-    return solution
+    return dataclasses.replace(
+        solution, estimate=dataclasses.replace(solution.estimate, certified=_certified(solution, exposures))
+    )
+
+
+def _certified(solution, exposures):
+    """``{exposure: Distortion}`` with the inverses of a file, whose certificates are checked."""
+    views = {e["name"]: (solution[e["name"]], e["inverse"]) for e in exposures if e["inverse"] is not None}
+    return {
+        name: Distortion(view.coefficients, view.shape, name, _inverse(inverse))
+        for name, (view, inverse) in views.items()
+    }
 
 
 def _inverse(tree):
@@ -221,13 +218,14 @@ def _inverse(tree):
 
 def _check_consistent(solution):
     """Raise if parts of a solution do not fit together."""
-    n, n_modes, n_stars = len(solution.names), basis.n_modes(solution.degree), len(solution.star_names)
+    estimate = solution.estimate
+    n, n_modes, n_stars = len(solution.names), basis.n_modes(solution.degree), len(estimate.star_names)
     if len(set(solution.names)) < n:
         raise ValueError("two exposures have the same name")
     for name, pose in solution.poses.items():
         if pose.shape != (2, 3) or not np.isfinite(pose).all() or np.linalg.det(pose[:, :2]) == 0:
             raise ValueError(f"the pose of {name} should be a finite, invertible array (2, 3)")
-    own, gauge, moving = 2 * n_modes, solution.gauge, solution.motions
+    own, gauge, moving = 2 * n_modes, solution.gauge, estimate.motions
     if (gauge.drift is None) != (moving is None):
         raise ValueError("motions of stars and the maps common to them come together")
     k, q = (0, 0) if moving is None else (len(moving.names), gauge.drift.motion.shape[2])
@@ -235,18 +233,18 @@ def _check_consistent(solution):
     if modes != 2 * basis.n_modes(basis.degree_of(modes // 2)) or gauge.n_maps > modes:
         raise ValueError(f"the gauge cannot have {held} constraints on {modes} modes")
     for what, array, shape in (
-        ("positions", solution.positions, (n_stars, 2)),
-        ("prior means", solution.prior_mean, solution.coefficients.shape),
+        ("positions", estimate.positions, (n_stars, 2)),
+        ("prior means", estimate.prior_mean, solution.coefficients.shape),
         (
             "covariance of the coefficients",
-            solution.uncertainty.coefficients,
-            (n, own, own) if np.ndim(solution.uncertainty.coefficients) == 3 else (n * own, n * own),
+            estimate.uncertainty.coefficients,
+            (n, own, own) if np.ndim(estimate.uncertainty.coefficients) == 3 else (n * own, n * own),
         ),
-        ("covariance of the stars", solution.uncertainty.stars, (3, n_stars)),
-        ("directions", solution.uncertainty.directions, (n_stars, 2, modes)),
+        ("covariance of the stars", estimate.uncertainty.stars, (3, n_stars)),
+        ("directions", estimate.uncertainty.directions, (n_stars, 2, modes)),
         (
             "covariance of the stars with the bend to the convention",
-            solution.uncertainty.bends,
+            estimate.uncertainty.bends,
             (n_stars, 2 + k, modes),
         ),
         ("gauge.constraint", gauge.constraint, (held, n, modes)),
@@ -260,10 +258,10 @@ def _check_consistent(solution):
         ("motions", None if moving is None else moving.values, (n_stars, k)),
         (
             "covariance of the motions",
-            solution.uncertainty.star_unknowns if k else None,
+            estimate.uncertainty.star_unknowns if k else None,
             ((2 + k) * (3 + k) // 2, n_stars),
         ),
-        ("drift directions", solution.uncertainty.drift_directions if k else None, (n_stars, 2 + k, modes + q)),
+        ("drift directions", estimate.uncertainty.drift_directions if k else None, (n_stars, 2 + k, modes + q)),
         ("gauge.drift.motion", None if gauge.drift is None else gauge.drift.motion, (n, modes, q)),
         ("gauge.drift.covariance", None if gauge.drift is None else gauge.drift.covariance, (q, q)),
         ("gauge.drift.joint", None if gauge.drift is None else gauge.drift.joint, (modes + q, modes + q)),
@@ -271,11 +269,11 @@ def _check_consistent(solution):
     ):
         if array is not None and array.shape != shape:
             raise ValueError(f"the {what} should have shape {shape}, not {array.shape}")
-    table = column_contract.check(solution.observations, column_contract.MATCHED, "the table of residuals")
+    table = column_contract.check(solution.residuals, column_contract.MATCHED, "the table of residuals")
     for name in ("dx", "dy"):
         column_contract.values(table, name, u.pix)
     if np.asarray(table["used"]).dtype != bool:
         raise ValueError("the column 'used' should be of booleans")
-    for column, known in (("exposure", solution.names), ("star", solution.star_names)):
+    for column, known in (("exposure", solution.names), ("star", estimate.star_names)):
         if not np.isin(np.asarray(table[column]), known).all():
             raise ValueError(f"the table of residuals names {column}s that are not in the list of them")

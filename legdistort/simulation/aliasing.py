@@ -12,8 +12,8 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis
-from ..results.absolute_errors import relative_variance
-from ..results.coefficient_covariance import times
+from ..results.errors.absolute_errors import relative_variance
+from ..results.errors.coefficient_covariance import times
 from ..solving.equations import criterion, elimination
 from ..solving.equations.covariances import Uncertainty
 from ..solving.equations.problem import State

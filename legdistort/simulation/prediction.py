@@ -16,7 +16,7 @@ from astropy.table import Table
 from ..exceptions import LegdistortError
 from ..geometry import basis
 from ..results import accuracy
-from ..results.absolute_errors import relative_blocks, relative_variance
+from ..results.errors.absolute_errors import relative_blocks, relative_variance
 from ..results.solution import Solution
 from ..runtime.notebook import ShownAsPrinted
 from ..solving import star_motions
@@ -107,12 +107,12 @@ class Prediction(ShownAsPrinted):
     @property
     def n_stars(self) -> int:
         """Number of stars that serve."""
-        return len(self.solution.star_names)
+        return len(self.solution.estimate.star_names)
 
     @property
     def stars_per_exposure(self) -> np.ndarray:
         """Stars on every exposure, shape (n_exposures,)."""
-        table = self.solution.observations
+        table = self.solution.residuals
         return np.array([np.count_nonzero(table["exposure"] == name) for name in self.solution.names])
 
     @property
@@ -141,7 +141,7 @@ class Prediction(ShownAsPrinted):
 
         With the mean number of exposures of a star for n_im, and that of stars on an exposure for n_star.
         """
-        n = len(self.solution.observations)
+        n = len(self.solution.residuals)
         n_im, n_star = n / self.n_stars, n / self.n_exposures
         return n_im**-0.5, float(np.sqrt((1 - 1 / n_im) * (1 + basis.n_modes(self.degree) / n_star)))
 
@@ -151,9 +151,11 @@ class Prediction(ShownAsPrinted):
 
         ``{"motion" | "parallax": error}``, empty without epochs. ``solution.stars`` has them star by star.
         """
-        if self.solution.motions is None:
+        if self.solution.estimate.motions is None:
             return {}
-        relative = relative_blocks(self.solution.gauge, self.solution.uncertainty, self.solution.positions)
+        relative = relative_blocks(
+            self.solution.gauge, self.solution.estimate.uncertainty, self.solution.estimate.positions
+        )
         variance = np.einsum("jkk->kj", relative)
         out = {"motion": finite_rms(np.sqrt(variance[2:4]))}
         return out | ({"parallax": finite_rms(np.sqrt(variance[4]))} if len(variance) > 4 else {})
@@ -173,7 +175,7 @@ class Prediction(ShownAsPrinted):
         """
         from ..plots import elements, solution_plots
 
-        stars = self.solution.positions
+        stars = self.solution.estimate.positions
         total = np.hypot(self.error_map, self.alias_map)
         ax = solution_plots.plot_sigma_map(self.x, self.y, total, stars=stars if len(stars) <= 300 else None, ax=ax)
         (x0, y0), (x1, y1) = self.contour
@@ -359,17 +361,24 @@ def _predict(plan):
     aliased, folded, b_alias = np.where(np.isfinite(noise), 0.0, np.nan), np.zeros_like(fitted), 0.0
     if max(independent.shape[1], common.shape[1]) > problem.n_modes:
         aliasing = alias(
-            problem, state, solution.gauge, solution.uncertainty.coefficients, independent=independent, common=common
+            problem,
+            state,
+            solution.gauge,
+            solution.estimate.uncertainty.coefficients,
+            independent=independent,
+            common=common,
         )
         aliased = accuracy.expected_scatter(solution, grid, 0.0, covariance=aliasing.covariance)
         folded, b_alias = aliasing.folded, float(np.sqrt(np.mean(aliasing.stars)))
-    square = accuracy.contour(solution.positions)
+    square = accuracy.contour(solution.estimate.positions)
     inside = accuracy.in_contour(grid, square)
     drawn = {"stars": layout.positions, "n_stars": None, "density": None} if plan.stars is None else {}
     return Prediction(
         solution=solution,
         sigma_meas=layout.sigma,
-        b=finite_rms(np.sqrt(relative_variance(solution.gauge, solution.uncertainty, solution.positions)[:2])),
+        b=finite_rms(
+            np.sqrt(relative_variance(solution.gauge, solution.estimate.uncertainty, solution.estimate.positions)[:2])
+        ),
         b_abs=accuracy.expected_bias(solution, absolute=True) if known or solution.gauge.prior else np.nan,
         sigma=finite_rms(noise[inside]),
         sigma_field=finite_rms(noise),

@@ -21,7 +21,7 @@ def finite_rms(values):
 def describe(prediction):
     """A `Prediction` as ``print`` shows it: both criteria, aliasing where any is assumed, slopes and rules of thumb."""
     solution = prediction.solution
-    ny, nx = solution.shapes[solution.names[0]]
+    ny, nx = solution.estimate.shapes[solution.names[0]]
     low, high = prediction.stars_per_exposure.min(), prediction.stars_per_exposure.max()
     thumb_b, thumb_sigma = prediction.thumb
     aliased = np.any(prediction.folded != 0)  # NaN included

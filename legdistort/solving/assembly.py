@@ -9,6 +9,7 @@ from astropy.table import QTable
 
 from ..geometry.epochs import ONE_EPOCH
 from ..results.diagnostics import Diagnostics
+from ..results.estimate import Estimate
 from ..results.motions import StarMotions
 from ..results.solution import Solution
 from ..runtime import provenance
@@ -53,34 +54,36 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
     return Solution(
         names=problem.names,
         degree=problem.degree,
-        shapes=dict(matches.shapes),
         poses=dict(zip(problem.names, state.poses, strict=True)),
         coefficients=state.coefficients if form is None else form.hold(problem.names, state.coefficients),
-        prior_mean=problem.prior_mean,
-        star_names=np.asarray(matches.stars),
-        positions=positions,
-        observations=table,
+        residuals=table,
         chi2=blocks.chi2 if chi2 is None else chi2,
         dof=dof,
         status=status,
         gauge=replace(gauge, responses=uncertainty),
-        uncertainty=uncertainty,
         settings=settings,
         diagnostics=Diagnostics() if diagnostics is None else diagnostics,
         sky=matches.sky,
         left_out=dict(sorted(matches.left_out.items())),
         provenance=provenance.stamp(),
-        form=form,
         camera=matches.camera,
-        motions=motions,
-        checked=partial(
-            check_solution,
-            problem=problem,
-            state=state,
-            blocks=blocks,
+        estimate=Estimate(
+            star_names=np.asarray(matches.stars),
+            positions=positions,
+            shapes=dict(matches.shapes),
+            prior_mean=problem.prior_mean,
             uncertainty=uncertainty,
-            times=matches.times,
-            header_distortion=matches.header_distortion if np.all(np.isinf(problem.mean_sigma)) else None,
+            motions=motions,
+            form=form,
+            checked=partial(
+                check_solution,
+                problem=problem,
+                state=state,
+                blocks=blocks,
+                uncertainty=uncertainty,
+                times=matches.times,
+                header_distortion=matches.header_distortion if np.all(np.isinf(problem.mean_sigma)) else None,
+            ),
         ),
     )
 

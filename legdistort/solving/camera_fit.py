@@ -17,7 +17,7 @@ import numpy as np
 from ..cameras.detector import Detector, affine_of
 from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, warn
 from ..geometry import basis, similarity
-from ..results.camera_errors import CameraErrors, moved_by
+from ..results.errors.camera_errors import CameraErrors, moved_by
 from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA

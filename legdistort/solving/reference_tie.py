@@ -23,8 +23,8 @@ from ..geometry.detector_modes import similarity_basis
 from ..geometry.similarity import robust_similarity
 from ..inputs import column_contract
 from ..matching.cross_identification import identify
-from ..results.absolute_errors import plain_directions
 from ..results.diagnostics import UsedReference
+from ..results.errors.absolute_errors import plain_directions
 from . import minimisers
 from .equations import criterion, elimination
 from .equations.covariances import Uncertainty

@@ -54,7 +54,7 @@ class Fit:
         ``{exposure: reason}`` of exposures that the fit cannot follow, if it was not judged.
     shared_errors : ndarray, shape (3, n_stars), or None
         See `Uncertainty`.
-    camera_errors : `legdistort.results.camera_errors.CameraErrors` or None
+    camera_errors : `legdistort.results.errors.camera_errors.CameraErrors` or None
         Those of a camera that was fitted.
     shared_unknowns : float
         Number of unknowns of a camera that were fitted and that the data determine.

@@ -14,7 +14,7 @@ import asdf
 import numpy as np
 from astropy.io import fits
 
-from ..exceptions import ExportError, InputError, without_astropy_warnings
+from ..exceptions import ExportError, InputError, some_of, without_astropy_warnings
 from ..inputs import exposure_files, exposure_names, file_images
 from ..inputs.sky_wcs import header_wcs, leads_elsewhere, warn_of_another_field
 from ..runtime import provenance
@@ -26,6 +26,8 @@ from .storage import wcs_tree
 
 log = logging.getLogger(__name__)
 
+#: Names that a message lists.
+_MOST_NAMED = 6
 #: What the header of an image records of a WCS that was written into it; `attach` takes it for its own later.
 _HISTORY = "legdistort {} wrote the WCS of this image"
 #: Keywords of the primary WCS and its distortion, all of which give way; those of alternative WCSs end in a letter.
@@ -125,9 +127,9 @@ def attach(
         raise InputError("give either out= (--out), a folder for copies, or in_place=True (--in-place)")
     paths = _files(paths)
     targets = [path.resolve() for path in paths] if in_place else _targets(paths, Path(out), overwrite)
-    plans = []
+    plans, images = [], _Images.of(solution)
     for path, target in zip(Bar(paths, desc="attaching", unit="frame", disable=not progress), targets, strict=True):
-        plan = _plan(solution.by_detector, path, target, kind=kind, max_error=max_error, ext=ext, overwrite=overwrite)
+        plan = _plan(images, path, target, kind=kind, max_error=max_error, ext=ext, overwrite=overwrite)
         plans += [plan] if plan.headers else []
     warn_of_another_field([name for plan in plans for name in plan.elsewhere])
     if not plans:
@@ -137,6 +139,23 @@ def attach(
             with replacing(folders[plan.target.parent] / plan.target.name) as file:
                 plan.write(file)
     return [Attachment(plan.target, *item) for plan in plans for item in plan.headers.items()]
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """Views of a solution by the names of images, and why others were left out; ``SOLSHA`` of its file."""
+
+    views: dict
+    left_out: dict
+    checksum: str | None
+
+    @classmethod
+    def of(cls, solution):
+        left_out = dict(solution.left_out)
+        if solution.camera is not None:
+            ids = solution.camera.detectors
+            left_out = {exposure_names.detector_name(name, k): why for name, why in left_out.items() for k in ids}
+        return cls({part.label: part for view in solution for part in view.parts}, left_out, solution.checksum)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,42 +209,44 @@ def _targets(paths, out, overwrite):
     return targets
 
 
-def _plan(solution, path, target, *, kind, max_error, ext, overwrite):
+def _plan(known, path, target, *, kind, max_error, ext, overwrite):
     """The `_Plan` of one file; without headers if it was left out of the solution."""
     raw, _ = read_bytes(path)
     spans = locate(raw, path)
     headers, edits = {}, []
     with readable(path), open_bytes(raw) as hdulist:
-        images = _images(solution, hdulist, path, ext)
-        elsewhere = [name for name, image in images.items() if _is_elsewhere(solution, name, hdulist, hdulist[image])]
+        images = _images(known, hdulist, path, ext)
+        elsewhere = [
+            name for name, image in images.items() if _is_elsewhere(known.views[name], hdulist, hdulist[image])
+        ]
         for name, image in images.items():
             headers[name] = None
             if kind is not None:
-                headers[name] = _header(solution, name, kind, max_error)
+                headers[name] = _header(known, name, kind, max_error)
                 planes = file_images.planes_beside(hdulist, hdulist[image])
                 for number in (image, *(_number(hdulist, plane) for plane in planes)):
                     start, data, stop, _ = spans[number]
                     new = exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)
                     edits.append((start, data, new))
         if images:
-            edits += _asdf_edits(solution, images, spans, *_tables(hdulist, spans, path, overwrite))
+            edits += _asdf_edits(known, images, spans, *_tables(hdulist, spans, path, overwrite))
     return _Plan(path, target, zlib.crc32(raw), headers, edits, elsewhere)
 
 
-def _is_elsewhere(solution, name, hdulist, hdu):
+def _is_elsewhere(view, hdulist, hdu):
     """Whether the header of an image leads far from where the solution has it."""
     with without_astropy_warnings():
-        wcs = header_wcs(hdu.header, hdulist, hdu.shape, name, level=logging.DEBUG)
-    return leads_elsewhere(wcs, solution, name)
+        wcs = header_wcs(hdu.header, hdulist, hdu.shape, view.label, level=logging.DEBUG)
+    return leads_elsewhere(wcs, view)
 
 
-def _header(solution, name, kind, max_error):
+def _header(known, name, kind, max_error):
     try:
-        header = solution.header(name, kind=kind, max_error=max_error)
+        header = known.views[name].header(kind=kind, max_error=max_error)
     except (ExportError, InputError) as error:
         raise type(error)(f"{error}; kind=None (--asdf-only) attaches the exact WCS alone") from None
-    if solution.checksum is not None:
-        header["SOLSHA"] = solution.checksum  # no room for a comment
+    if known.checksum is not None:
+        header["SOLSHA"] = known.checksum  # no room for a comment
     header["HISTORY"] = f"{_HISTORY.format(version('legdistort'))}, {provenance.now()[:10]}"
     return header
 
@@ -234,23 +255,23 @@ def _number(hdulist, hdu):
     return next(i for i, other in enumerate(hdulist) if other is hdu)
 
 
-def _images(solution, hdulist, path, ext):
+def _images(known, hdulist, path, ext):
     """``{exposure: number of its HDU}`` of one file; empty if it was left out of the solution."""
     candidates = {exposure_names.exposure_name(path, ext): ext}
     if ext is None:
         candidates = file_images.extension_names(hdulist, path)
     candidates |= file_images.detector_names(hdulist, path, ext)
-    found = {name: form for name, form in candidates.items() if name in solution.names}
+    found = {name: form for name, form in candidates.items() if name in known.views}
     if not found:
-        return _nothing(solution, path, next((n for n in candidates if n in solution.left_out), next(iter(candidates))))
+        return _nothing(known, path, next((n for n in candidates if n in known.left_out), next(iter(candidates))))
     images = {}
     for name, form in found.items():
         # of several images the first, if the solution knows the file by its name alone
         hdu = file_images.find_image(hdulist, form, str(path), of_several=True)
-        if hdu.shape != tuple(solution.shapes[name]):
+        if hdu.shape != tuple(known.views[name].shape):
             raise InputError(
                 f"{path}: the image has shape {hdu.shape}, exposure {name} of the solution "
-                f"{tuple(solution.shapes[name])}; give the frames that the solution was made from"
+                f"{tuple(known.views[name].shape)}; give the frames that the solution was made from"
             )
         images[name] = _number(hdulist, hdu)
     if len(set(images.values())) < len(images):
@@ -258,13 +279,13 @@ def _images(solution, hdulist, path, ext):
     return images
 
 
-def _nothing(solution, path, name):
-    if name not in solution.left_out:
-        try:
-            solution.index(name)
-        except InputError as error:
-            raise InputError(f"{path}: {error}; frames are identified by their names") from None
-    log.warning("%s: skipped, it was left out of the solution (%s)", path, solution.left_out[name])
+def _nothing(known, path, name):
+    if name not in known.left_out:
+        raise InputError(
+            f"{path}: no exposure {name!r} in the solution; it has {some_of(list(known.views), _MOST_NAMED)}; frames "
+            "are identified by their names"
+        )
+    log.warning("%s: skipped, it was left out of the solution (%s)", path, known.left_out[name])
     return {}
 
 
@@ -293,7 +314,7 @@ def _tables(hdulist, spans, path, overwrite):
     return of_images, others
 
 
-def _asdf_edits(solution, images, spans, of_images, others):
+def _asdf_edits(known, images, spans, of_images, others):
     """Edits that replace or append the ASDF extensions of the images and remove the others."""
     edits = [(span.start, span.stop, b"") for span in others]
     numbers = {image: span.header.get("EXTVER", 1) for image, span in of_images.items()}
@@ -302,25 +323,25 @@ def _asdf_edits(solution, images, spans, of_images, others):
         if image not in numbers:
             numbers[image] = next(n for n in range(1, len(spans) + 2) if n not in numbers.values())
         start, stop = (of_images[image].start, of_images[image].stop) if image in of_images else (end, end)
-        edits.append((start, stop, _asdf_hdu(solution, name, numbers[image])))
+        edits.append((start, stop, _asdf_hdu(known.views[name], numbers[image])))
     return edits
 
 
-def _asdf_hdu(solution, name, number):
+def _asdf_hdu(view, number):
     """Bytes of the one-row table that holds the ASDF file of an exposure."""
     content, file = io.BytesIO(), io.BytesIO()
-    tree = wcs_tree(solution, name)
+    tree = wcs_tree(view)
     asdf.AsdfFile(tree, version=ASDF_STANDARD).write_to(content)
     row = np.frombuffer(content.getvalue(), np.uint8)[None]
     column = fits.Column(name="ASDF_METADATA", array=row, format=f"{row.size}B")
     hdu = fits.BinTableHDU.from_columns([column], name="ASDF", ver=number)
     header = hdu.header
-    header["EXPNAME"] = exposure_names.in_header(name)
+    header["EXPNAME"] = exposure_names.in_header(view.label)
     header["CREATOR"] = f"legdistort {version('legdistort')}"
     now = provenance.now()
     header["DATE"] = (now, "UTC, when this extension was made")
-    if solution.checksum is not None:
-        header["SOLSHA"] = solution.checksum  # no room for a comment
+    if view.solution.checksum is not None:
+        header["SOLSHA"] = view.solution.checksum  # no room for a comment
     made = tree["meta"]["provenance"]
     packages = ", ".join(f"{package} {each}" for package, each in made["versions"].items())
     made_by = f"The solution was made {made['created']} with {packages}. SOLSHA, if known, is the SHA-256 of its file."

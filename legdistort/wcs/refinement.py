@@ -18,26 +18,24 @@ from .exposure_wcs import ExposureWCS
 if TYPE_CHECKING:
     from gwcs import WCS as GWCS
 
-    from ..results.solution import Solution
+    from ..results.view import View
 
 log = logging.getLogger(__name__)
 
 
-def refine(wcs: GWCS, solution: Solution, name: str) -> GWCS:
+def refine(wcs: GWCS, view: View) -> GWCS:
     """A gwcs like the one given, but with the distortion and the pose that a solution found for an exposure.
 
     The frames stay: names, units, order, and the transforms between all but the first two (of JWST and Roman:
     ``v2v3`` -> ``world``, velocity aberration included). The transform out of the detector is replaced, so that pixels
-    end where `Solution.wcs` puts them on the sky. Only stock models go into files.
+    end where `View.wcs` puts them on the sky. Only stock models go into files.
 
     Parameters
     ----------
     wcs : `~gwcs.WCS`
         From the pixels of the exposure to ICRS, as ``model.meta.wcs`` of a pipeline. It is not changed.
-    solution : Solution
-        With a sky.
-    name : str
-        Exposure.
+    view : View
+        Of an exposure, ``solution["exp00"]``, or of a detector of it; the solution has a sky.
 
     Returns
     -------
@@ -49,11 +47,11 @@ def refine(wcs: GWCS, solution: Solution, name: str) -> GWCS:
     ------
     InputError
         If `wcs` is no such gwcs, is of another detector or place on the sky, or its later transforms cannot be
-        inverted; if the solution does not know the sky or the exposure.
+        inverted; if the solution does not know the sky; if it is none of a view.
 
     See Also
     --------
-    legdistort.Solution.wcs : A WCS made of the solution alone.
+    legdistort.results.view.View.wcs : A WCS made of the solution alone.
 
     Examples
     --------
@@ -61,13 +59,12 @@ def refine(wcs: GWCS, solution: Solution, name: str) -> GWCS:
     >>> night = ld.simulate_exposures(small=True, n_exposures=4, seed=1)
     >>> exposures = ld.read_exposures(list(night.hdus.values()))
     >>> solution = ld.solve(ld.match(ld.measure(exposures, psf="moffat"), exposures=exposures))
-    >>> ld.refine(solution.wcs("exp00"), solution, "exp00").available_frames[-1]
+    >>> ld.refine(solution["exp00"].wcs, solution["exp00"]).available_frames[-1]
     'icrs'
     """
-    solution.index(name)
-    _check(wcs, solution, name)
+    _check(wcs, view)
     frames = wcs.available_frames
-    new = solution.wcs(name)
+    new = view.wcs
     first = new.get_transform("detector", "icrs")
     if len(frames) > 2:
         later = wcs.get_transform(frames[1], frames[-1])
@@ -81,8 +78,13 @@ def refine(wcs: GWCS, solution: Solution, name: str) -> GWCS:
     return made
 
 
-def _check(wcs, solution, name):
+def _check(wcs, view):
     """Raise `InputError` unless a WCS is one of an exposure."""
+    if not hasattr(view, "solution"):
+        raise InputError(
+            "view must be that of an exposure, solution['exp00'], or of a detector, solution['exp00', '2'], got "
+            f"{type(view).__name__}"
+        )
     if not isinstance(wcs, gwcs.WCS):
         raise InputError(f"wcs must be a gwcs.WCS, such as model.meta.wcs of a pipeline, got {type(wcs).__name__}")
     output = wcs.output_frame
@@ -92,17 +94,17 @@ def _check(wcs, solution, name):
         raise InputError(f"the sky of wcs must be ICRS in degrees, got {output.reference_frame} in {output.unit}")
     if any(step.transform is not None and step.transform.uses_quantity for step in wcs.pipeline):
         raise InputError("the transforms of wcs take quantities; give a WCS whose models are without units")
-    if solution.sky is None:
+    if view.solution.sky is None:
         raise InputError(
             "the solution does not know the sky: solve frames whose headers have a WCS, or give a reference catalogue "
             "with ra and dec (reference=, --reference)"
         )
-    _check_place(wcs, solution, name)
+    _check_place(wcs, view)
 
 
-def _check_place(wcs, solution, name):
+def _check_place(wcs, view):
     """Raise `InputError` unless a WCS is of the detector and the place of an exposure."""
-    ny, nx = solution.shapes[name]
+    (ny, nx), name = view.wcs.array_shape, view.label
     if wcs.pixel_shape is not None and tuple(wcs.pixel_shape) != (nx, ny):
         raise InputError(f"wcs is of {wcs.pixel_shape} pixels (nx, ny), exposure {name} of {(nx, ny)}")
     box = wcs.bounding_box
@@ -114,7 +116,7 @@ def _check_place(wcs, solution, name):
                 f"exposure {name}"
             )
     corners = np.array([[-0.5, nx - 0.5, nx - 0.5, -0.5], [-0.5, -0.5, ny - 0.5, ny - 0.5]])
-    places = [SkyCoord(*w(*corners, with_bounding_box=False), unit="deg") for w in (wcs, solution.wcs(name))]
+    places = [SkyCoord(*w(*corners, with_bounding_box=False), unit="deg") for w in (wcs, view.wcs)]
     apart, size = places[0].separation(places[1]).max(), places[1][0].separation(places[1][2])
     if not apart < size:
         raise InputError(

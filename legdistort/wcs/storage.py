@@ -35,18 +35,17 @@ NOTE = (
 )
 
 
-def wcs_tree(solution, name, detector=None):
-    """The ASDF tree of one exposure, or of a detector of it: its gwcs at ``meta.wcs``, with the errors of inverses."""
-    distortion = solution.distortion(name)
-    origin = solution.provenance or provenance.stamp()
-    chip = None if detector is None else solution.camera[detector]
-    wcs = exposure_wcs(name, solution.poses[name], distortion, solution.sky, chip, shared=True)
-    meta = {"wcs": wcs, "exposure": name}
-    if detector is None:
-        meta |= _certificate(distortion.inverse)
+def wcs_tree(view):
+    """The ASDF tree of a view of one image: its gwcs at ``meta.wcs``, with the errors of inverses."""
+    common, chip = view.solution[view.name], view.chip
+    origin = view.solution.provenance or provenance.stamp()
+    wcs = exposure_wcs(view.name, common.pose, common.distortion, view.solution.sky, chip, shared=True)
+    meta = {"wcs": wcs, "exposure": view.name}
+    if chip is None:
+        meta |= _certificate(common.distortion.inverse)
     else:
-        meta |= {"detector": str(detector)} | _certificate(chip.distortion.inverse)
-        meta["focal_plane"] = _certificate(distortion.inverse)
+        meta |= {"detector": view.detector} | _certificate(chip.distortion.inverse)
+        meta["focal_plane"] = _certificate(common.distortion.inverse)
     meta |= {"provenance": {key: origin[key] for key in ("created", "versions")}, "note": NOTE}
     return {"meta": meta}
 
@@ -55,10 +54,10 @@ def _certificate(inverse):
     return {"inverse_error_px": inverse.error, "valid_undistorted_px": list(inverse.valid)}
 
 
-def write_wcs(solution, name, path, *, detector=None, overwrite=False):
-    """Write the gwcs of one exposure, or of a detector of it, with its measured inverse error, to an ASDF file."""
+def write_wcs(view, path, *, overwrite=False):
+    """Write the gwcs of a view, ``solution["exp00"]``, with its measured inverse error, to an ASDF file."""
     with replacing(path, overwrite=overwrite) as file:
-        asdf.AsdfFile(wcs_tree(solution, name, detector), version=ASDF_STANDARD).write_to(file)
+        asdf.AsdfFile(wcs_tree(view), version=ASDF_STANDARD).write_to(file)
     return Path(path)
 
 
@@ -86,14 +85,14 @@ def read_wcs(path: StrPath, *, max_bytes: int | None = None) -> GWCS:
 
     See Also
     --------
-    legdistort.Solution.wcs : The WCS of an exposure of a solution in memory.
+    legdistort.results.view.View.wcs : The WCS of an exposure of a solution in memory.
 
     Examples
     --------
     >>> import legdistort as ld
     >>> from legdistort.wcs.storage import write_wcs
     >>> solution = ld.solve(ld.simulate_matches(n_stars=40, seed=1).matches)
-    >>> path = write_wcs(solution, "exp00", "exp00.asdf")
+    >>> path = write_wcs(solution["exp00"], "exp00.asdf")
     >>> ld.read_wcs(path).available_frames
     ['detector', 'undistorted', 'reference']
     """

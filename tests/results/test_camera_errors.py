@@ -6,7 +6,7 @@ import pytest
 
 import legdistort
 from legdistort.geometry import basis, similarity
-from legdistort.results.absolute_errors import own_coefficients, relative_coefficients
+from legdistort.results.errors.absolute_errors import own_coefficients, relative_coefficients
 
 SIGMA = 0.01
 

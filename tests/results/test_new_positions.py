@@ -16,7 +16,8 @@ from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.tangent_plane import TangentPlane
-from legdistort.results import absolute_errors, new_positions
+from legdistort.results import new_positions
+from legdistort.results.errors import absolute_errors
 from legdistort.solving.equations import criterion
 from legdistort.solving.equations.covariances import Uncertainty
 from legdistort.solving.equations.problem import State, build_problem

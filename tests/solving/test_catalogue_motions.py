@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from legdistort.exceptions import InputError
 from legdistort.geometry.parallax import on_plane
-from legdistort.results.absolute_errors import absolute_blocks, relative_blocks
+from legdistort.results.errors.absolute_errors import absolute_blocks, relative_blocks
 from legdistort.solving.estimation import solve
 
 

@@ -14,7 +14,7 @@ from legdistort import Matches, solve
 from legdistort.exceptions import AssumptionWarning, SolveError
 from legdistort.geometry.detector_modes import similarity_basis
 from legdistort.priors.prior import Prior
-from legdistort.results.coefficient_covariance import exposure_blocks
+from legdistort.results.errors.coefficient_covariance import exposure_blocks
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving import start_values
 from legdistort.solving.equations import covariances, criterion, elimination, reduced_system

@@ -224,46 +224,44 @@ class ExposureMap:
         return PixelMap((rows, columns), planes[:2], inside, planes[2], wider, edges), part
 
 
-def map_exposure(name, solution, grid, *, corners=False):
+def map_exposure(view, grid, *, corners=False):
     """The `ExposureMap` of an exposure, or None where it does not meet the grid.
 
     Parameters
     ----------
-    name : str
-        Of the exposure.
-    solution : Solution
+    view : View
         With its pose, shape and distortion.
     grid : Grid
         The output grid.
     corners : bool
         Also map the corners of the detector pixels.
     """
-    xy = grid.from_reference(solution.correct(name, outline(solution.shapes[name])))
+    xy = grid.from_reference(view.correct(outline(view.shape)))
     low = np.maximum(np.floor(np.nanmin(xy, axis=0)), 0).astype(int)
     high = np.minimum(np.ceil(np.nanmax(xy, axis=0)) + 1, grid.shape[::-1]).astype(int)
     if np.any(high <= low):
         return None
-    shape = tuple(solution.shapes[name])
-    chain = partial(trace, name=name, solution=solution, grid=grid)
+    shape = tuple(view.shape)
+    chain = partial(trace, view=view, grid=grid)
     table = tabulate(chain, low, tuple(int(n) for n in (high - low)[::-1]))
     edges = None
     if corners:
-        back = partial(_trace_back, name=name, solution=solution, grid=grid)
+        back = partial(_trace_back, view=view, grid=grid)
         edges = tabulate(back, (0, 0), tuple(n + 1 for n in shape))
     window = (slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0])))
     ends = chain(np.stack(np.meshgrid(*np.array([low, high]).T), axis=-1).reshape(-1, 2).astype(float))
     scale = float(np.sqrt(max(1, np.nanmax(ends[:, 4], initial=1))))
-    return ExposureMap(shape, window, table, tuple(solution.distortion(name).inverse.valid), scale, edges)
+    return ExposureMap(shape, window, table, tuple(view.distortion.inverse.valid), scale, edges)
 
 
-def trace(xy, name, solution, grid):
+def trace(xy, view, grid):
     """Exact chain of one exposure at output pixels.
 
     Parameters
     ----------
     xy : ndarray, shape (n, 2)
         Output pixels.
-    name, solution, grid
+    view, grid
         As for `map_exposure`.
 
     Returns
@@ -272,14 +270,14 @@ def trace(xy, name, solution, grid):
         Detector x, y; undistorted x, y; detector pixels per output pixel. The distortion is not cut at the
         edge of its validity, so that it stays smooth.
     """
-    pose, distortion = solution.poses[name], solution.distortion(name)
+    pose, distortion = view.pose, view.distortion
     q = similarity.apply(pose, grid.to_reference(xy))
     j = distortion.jacobian(q)
     determinant = (j[:, 0, 0] * j[:, 1, 1] - j[:, 0, 1] * j[:, 1, 0]) * np.linalg.det(pose[:, :2])
     return np.column_stack([distortion(q), q, np.abs(determinant) * grid.pixel_area(xy)])
 
 
-def _trace_back(xy, name, solution, grid):
+def _trace_back(xy, view, grid):
     """Output pixels of the corners of detector pixels, counted from 0 at the first pixel's lower left."""
-    q = solution.distortion(name).invert(xy - 0.5)
-    return grid.from_reference(similarity.apply(similarity.invert(solution.poses[name]), q))
+    q = view.distortion.invert(xy - 0.5)
+    return grid.from_reference(similarity.apply(similarity.invert(view.pose), q))

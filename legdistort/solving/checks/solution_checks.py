@@ -116,7 +116,7 @@ def _stated(solution, residuals):
     """Chi2 at the stated errors, without floor or scale, and its degrees of freedom."""
     if not solution.diagnostics.error_floor:
         return residuals.chi2, residuals.dof
-    table = solution.observations
+    table = solution.residuals
     rows = np.asarray(table["used"])
     x, y, a, b = (table[name][rows].value for name in ("dx", "dy", "x_err", "y_err"))
     c = np.asarray(table["xy_corr"])[rows] if "xy_corr" in table.colnames else np.zeros(len(x))
@@ -170,7 +170,7 @@ def exposures_check(solution, residuals):
 
 def brightness_check(solution, residuals):
     """Are the errors of bright and of faint stars right alike?"""
-    table = solution.observations
+    table = solution.residuals
     if "flux" in table.colnames:
         key, what = -np.asarray(table["flux"], dtype=float), "brightest"
     else:
@@ -259,12 +259,12 @@ def _significance(solution, blocks, *, top_only=False):
     n, size = len(solution.names), blocks.u.shape[1] // 2
     best, scale = 1.0, max(1.0, solution.chi2 / max(solution.dof, 1)) * n / max(n - 1, 1)
     for i, name in enumerate(solution.names):
-        rows = dynamic_basis(solution.shapes[name], size)
+        rows = dynamic_basis(solution.estimate.shapes[name], size)
         if top_only:
             rows = rows[dynamic_degrees(size) == solution.degree]
         if not len(rows):
             continue
-        a = rows @ (solution.coefficients[i] - solution.prior_mean[i])[:, :size].ravel()
+        a = rows @ (solution.coefficients[i] - solution.estimate.prior_mean[i])[:, :size].ravel()
         t = a @ np.linalg.solve(rows @ np.linalg.inv(blocks.u[i]) @ rows.T, a) / scale
         best = min(best, n * special.chdtrc(len(rows), t))
     return best
@@ -275,7 +275,7 @@ def dynamic_check(solution, blocks):
     if solution.degree < 1 or solution.settings.static == "fit":
         return None
     p = _significance(solution, blocks)
-    static = "the static distortion" if np.any(solution.prior_mean) else "shift, rotation and scale"
+    static = "the static distortion" if np.any(solution.estimate.prior_mean) else "shift, rotation and scale"
     if p < FALSE_ALARM:
         return Check("dynamic part", "pass", p, FALSE_ALARM, f"exposures depart from {static} beyond noise")
     return Check("dynamic part", "warn", p, FALSE_ALARM,
@@ -338,7 +338,7 @@ def _within_reach(residuals, i):
 
 def rejection_check(solution):
     """Was much left out?"""
-    used = np.asarray(solution.observations["used"])
+    used = np.asarray(solution.residuals["used"])
     n, out = len(used), int(np.count_nonzero(~used))
     share, p = out / n, special.bdtrc(out - 1, n, GROSS_ERRORS) if out else 1.0
     lost = solution.left_out
@@ -359,9 +359,9 @@ def completeness_check(solution, residuals):
     """Does every exposure have the stars that lie on it?"""
     names, found = solution.names, np.diff(residuals.problem.start)
     expected = np.zeros(len(names), dtype=int)
-    common = solution.positions[np.isfinite(solution.positions[:, 0])]
+    common = solution.estimate.positions[np.isfinite(solution.estimate.positions[:, 0])]
     for i, name in enumerate(names):
-        ny, nx = solution.shapes[name]
+        ny, nx = solution.estimate.shapes[name]
         pose = solution.poses[name]
         q = common @ pose[:, :2].T + pose[:, 2]
         margin = 0.02 * max(nx, ny)

@@ -82,7 +82,7 @@ def corrected(solution, table):
     found = solution.diagnostics
     for i, name in enumerate(solution.names):
         rows = np.flatnonzero(table["exposure"] == name)
-        xy[i, star[rows]] = solution.correct(name, measured[rows])
+        xy[i, star[rows]] = solution[name].to_reference(measured[rows])
         sigma[i, star[rows]] = found.error_scale * np.hypot(error[rows], found.error_floor)
     return xy, sigma
 
@@ -213,7 +213,7 @@ def _about_places(solution, table):
     xy, sigma = corrected(solution, table)
     weight = np.where(np.isfinite(xy[:, :, 0]), sigma**-2, 0.0)
     xy = np.where(np.isfinite(xy), xy, 0.0)
-    rows, motions = np.tile(np.eye(2), (len(xy), 1, 1)), solution.motions  # unknowns of a star -> its place
+    rows, motions = np.tile(np.eye(2), (len(xy), 1, 1)), solution.estimate.motions  # unknowns of a star -> its place
     if motions is not None:
         rows = np.concatenate([rows, motions.columns(motions.years, solution.sky)], axis=2)
     normal = np.einsum("ij,iab,iac->jbc", weight, rows, rows)

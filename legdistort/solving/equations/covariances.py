@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...exceptions import AssumptionWarning, warn
-from ...results.coefficient_covariance import times
+from ...results.errors.coefficient_covariance import times
 from ...results.gauge import UnknownDirection
 from . import criterion, elimination, reduced_system
 from .problem import State
@@ -16,7 +16,7 @@ from .star_system import OnStars
 from .star_terms import packed, unpacked
 
 if TYPE_CHECKING:
-    from ...results.camera_errors import CameraErrors
+    from ...results.errors.camera_errors import CameraErrors
     from ...results.gauge import Gauge
 
 #: Beyond this many coefficients the dense covariance is replaced by its diagonal blocks.
@@ -43,7 +43,7 @@ class Uncertainty:
         Covariance of the coefficients, if they were found in another way than with the stars, `scale` in it.
     shared_errors : ndarray, shape (3, n_stars), optional
         Covariance xx, yy, xy of star positions by errors that exposures share, beside that of independent ones, px^2.
-    camera : `legdistort.results.camera_errors.CameraErrors`, optional
+    camera : `legdistort.results.errors.camera_errors.CameraErrors`, optional
         What the errors of a camera do to stars and coefficients, at the stated errors.
     system : Direct, OnStars or Iterative, optional
         The reduced system of these, if it is there already.
@@ -73,7 +73,7 @@ class Uncertainty:
 
         A camera is taken as known.
         Beyond `DENSE_LIMIT` one block an exposure, shape (n_exposures, 2 n_modes, 2 n_modes):
-        `legdistort.results.coefficient_covariance` reads both.
+        `legdistort.results.errors.coefficient_covariance` reads both.
         """
         if self._given is not None:
             return self._given

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...geometry.detector_modes import dynamic_basis
-from ...results.coefficient_covariance import exposure_blocks
+from ...results.errors.coefficient_covariance import exposure_blocks
 from . import criterion
 
 

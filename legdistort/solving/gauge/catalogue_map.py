@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from ...exceptions import InputError
-from ...results.catalogue_tie import Tie, map_parts
+from ...results.errors.catalogue_tie import Tie, map_parts
 from ..equations.criterion import complement
 from .hierarchy import LIMIT
 

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..geometry import basis, similarity
+from ...geometry import basis, similarity
 
 if TYPE_CHECKING:
-    from ..cameras.camera import Camera
+    from ...cameras.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)

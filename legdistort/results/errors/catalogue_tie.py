@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..geometry import basis
-from ..geometry.detector_modes import dynamic_basis, dynamic_degrees, similarity_basis
+from ...geometry import basis
+from ...geometry.detector_modes import dynamic_basis, dynamic_degrees, similarity_basis
 
 if TYPE_CHECKING:
-    from ..runtime.annotations import Shape
+    from ...runtime.annotations import Shape
 
 
 @dataclass(frozen=True, eq=False)

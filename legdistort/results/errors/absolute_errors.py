@@ -8,7 +8,7 @@ relative errors.
 
 import numpy as np
 
-from ..geometry import basis
+from ...geometry import basis
 from .coefficient_covariance import exposure_block
 
 
@@ -145,19 +145,23 @@ def relative_coefficients(gauge, uncertainty, i):
     return block - both - both.T + moved @ bend @ moved.T
 
 
-def coefficient_variance(gauge, block, i):
+def coefficient_variance(gauge, block, i, response=None):
     """Variance (2, n_modes) of the coefficients of exposure i from their covariance `block` in the gauge.
 
-    NaN for what an unknown direction of unit rms changes by more than the rest of the error.
+    NaN for what an unknown direction of unit rms changes by more than the rest of the error. Or of what follows these
+    coefficients by a `response` (k, 2 n_modes), with its covariance in the place of theirs.
     """
-    n, k = gauge.n_modes, len(block) // 2
-    moved = np.zeros((2, k, 2 * n))
+    n = gauge.n_modes
+    size = len(block) // 2 if response is None else response.shape[1] // 2
+    moved = np.zeros((2, size, 2 * n))
     moved[:, :n] = gauge.motion[i].reshape(2, n, -1)
-    moved = moved.reshape(2 * k, -1)
+    moved = moved.reshape(2 * size, -1)
+    follow = np.eye(2 * size) if response is None else response
+    moved = follow @ moved
     covariance = gauge.covariance if gauge.tie is None or len(gauge.tie.covariance) != 2 * n else gauge.tie.covariance
-    out = (np.diag(block) + np.einsum("ab,bc,ac->a", moved, covariance, moved)).reshape(2, k)
+    out = np.diag(block) + np.einsum("ab,bc,ac->a", moved, covariance, moved)
     for each in gauge.unknown:
-        change = np.zeros((2, k))
+        change = np.zeros((2, size))
         change[:, : each.coefficients.shape[2]] = each.coefficients[i]
-        out[change**2 > out] = np.nan
-    return out
+        out[(follow @ change.ravel()) ** 2 > out] = np.nan
+    return out.reshape(2, -1)

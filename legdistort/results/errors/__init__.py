@@ -1,0 +1,1 @@
+"""Errors of a solution: of stars, coefficients, common maps, cameras, what a catalogue ties."""

@@ -1,0 +1,74 @@
+"""The numbers behind a solution: arrays of stars and exposures, and their covariances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..geometry.distortion import Distortion
+from .errors.camera_errors import CameraErrors
+from .motions import StarMotions
+
+if TYPE_CHECKING:
+    from ..solving.equations.covariances import Uncertainty
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The numbers behind a `Solution`, in the order of its exposures and stars.
+
+    Attributes
+    ----------
+    star_names : ndarray, shape (n_stars,)
+        Sorted.
+    positions : ndarray, shape (n_stars, 2)
+        X_ref, reference-plane pixels; NaN for a star without a used observation.
+    shapes : dict
+        ``{exposure: (ny, nx)}``, of the focal plane where there is one.
+    prior_mean : ndarray, shape (n_exposures, 2, n_modes)
+        Static distortion A_0 around which the solution lies (zero without a prior).
+    uncertainty : Uncertainty
+        Covariances in the gauge.
+    motions : StarMotions or None
+        Motions of the stars, where they were fitted.
+    form : `legdistort.solving.model_forms.Form` or None
+        The model that was given to `solve`. Files do not keep it: of a solution that was read, `View.model` has the
+        usual form, which is the same function.
+    checked : callable or tuple of Check
+        The checks, or a function that makes them from the solution.
+    certified : dict
+        ``{exposure: Distortion}`` with inverses that were certified, as long as the coefficients are the same.
+    """
+
+    star_names: np.ndarray
+    positions: np.ndarray
+    shapes: dict[str, tuple[int, int]]
+    prior_mean: np.ndarray
+    uncertainty: Uncertainty
+    motions: StarMotions | None = None
+    form: object = None
+    checked: Any = field(default=(), repr=False)
+    certified: dict[str, Distortion] = field(default_factory=dict, repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredUncertainty:
+    """Covariances as files and pickles have them; see `legdistort.solving.equations.covariances.Uncertainty`."""
+
+    coefficients: np.ndarray
+    stars: np.ndarray
+    directions: np.ndarray
+    weak: tuple
+    bends: np.ndarray | None = None
+    star_unknowns: np.ndarray | None = None
+    drift_directions: np.ndarray | None = None
+    camera: CameraErrors | None = None
+
+
+def plain_covariances(estimate):
+    """The `StoredUncertainty` of an `Estimate`: numbers alone, without the equations that they came from."""
+    left_out = ("star_unknowns", "drift_directions") if estimate.motions is None else ()
+    names = [each.name for each in fields(StoredUncertainty) if each.name not in left_out]
+    return StoredUncertainty(**{name: getattr(estimate.uncertainty, name) for name in names})

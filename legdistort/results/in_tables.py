@@ -1,0 +1,205 @@
+"""A solution in tables and words: its stars, and what `print` shows of it."""
+
+import textwrap
+
+import numpy as np
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from astropy.time import Time
+
+from ..geometry import similarity
+from ..geometry.epochs import year
+from ..inputs import column_contract
+from . import motions as star_motions
+from . import new_positions
+from .check import in_lines
+from .errors import absolute_errors
+
+
+def stars(solution):
+    """`Solution.stars`; see there."""
+    estimate, sky = solution.estimate, solution.sky
+    variance = absolute_errors.relative_variance(solution.gauge, estimate.uncertainty, estimate.positions)
+    absolute = _absolute(solution, False)
+    table = _places(solution, estimate.positions, err=variance, err_abs=absolute, err_known=_absolute(solution, True))
+    used = solution.residuals[solution.residuals["used"]]
+    index = np.searchsorted(estimate.star_names, used["star"])
+    table["n"] = np.bincount(index, minlength=len(table))
+    if "flux" in used.colnames:
+        with np.errstate(invalid="ignore"):
+            table["flux"] = np.bincount(index, used["flux"], len(table)) / table["n"]
+    obstime = None if epoch(solution) is None else Time(epoch(solution), format="jyear")
+    if sky is not None:
+        new_positions.add_sky(table, sky, estimate.positions, variance, absolute)
+        table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=obstime)
+    if estimate.motions is not None:
+        star_motions.add_motions(table, estimate.motions, *_unknowns(solution), estimate.positions, sky)
+        if sky is not None:
+            moving = {"pm_ra_cosdec": table["pmra"], "pm_dec": table["pmdec"]}
+            table["sky"] = SkyCoord(table["ra"], table["dec"], **moving, frame="icrs", obstime=obstime)
+    table.meta = _meta(solution)
+    return column_contract.describe_stars(table)
+
+
+def stars_at(solution, time):
+    """`Solution.stars_at`; see there."""
+    estimate, sky, at = solution.estimate, solution.sky, year(time)
+    xy = estimate.positions + star_motions.fitted(estimate.motions).displacement(at, sky)
+    moved = [estimate.motions.carried(each, at, sky) for each in _unknowns(solution)]
+    moved[1][:, np.isnan(_absolute(solution, False)[0])] = np.nan
+    table = _places(solution, xy, err=moved[0], err_abs=moved[1])
+    if sky is not None:
+        new_positions.add_sky(table, sky, xy, *moved)
+        table["sky"] = SkyCoord(table["ra"], table["dec"], frame="icrs", obstime=Time(at, format="jyear"))
+    table.meta = _meta(solution) | {"epoch": at}
+    return column_contract.describe_stars(table)
+
+
+def epoch(solution):
+    """Julian year of the positions of the stars, or None."""
+    motions = solution.estimate.motions
+    return solution.diagnostics.epoch if motions is None else motions.epoch
+
+
+def _places(solution, xy, **variances):
+    """Table of the stars at positions (n_stars, 2), with errors of variances xx, yy, xy (3, n_stars) by suffix."""
+    table = QTable({"star": solution.estimate.star_names, "x": xy[:, 0] * u.pix, "y": xy[:, 1] * u.pix})
+    for suffix, each in variances.items():
+        table[f"x_{suffix}"], table[f"y_{suffix}"] = np.sqrt(each[:2]) * u.pix
+    xx, yy, both = variances["err"]
+    table["xy_corr"] = both / np.sqrt(xx * yy)
+    return table
+
+
+def _absolute(solution, without_unknown):
+    estimate = solution.estimate
+    return absolute_errors.absolute_variance(
+        solution.gauge, estimate.uncertainty, estimate.positions, without_unknown=without_unknown
+    )
+
+
+def _unknowns(solution):
+    """Relative and absolute covariance (n_stars, 2 + k, 2 + k) of positions, motions and parallaxes."""
+    known = solution.gauge, solution.estimate.uncertainty, solution.estimate.positions
+    return absolute_errors.relative_blocks(*known), absolute_errors.absolute_blocks(*known)
+
+
+def _meta(solution):
+    """What must be known of a table of stars by itself, in words and numbers that any file can hold."""
+    prior = solution.settings.prior
+    if isinstance(prior, dict):
+        prior = prior.get("source", "one for each detector or exposure")
+    if isinstance(prior, dict):
+        prior = prior.get("name", "")
+    meta = {
+        "frame": "reference plane" if solution.sky is None else "ICRS",
+        "epoch": epoch(solution),
+        "gauge": solution.gauge.kind,
+        "degree": solution.degree,
+        "prior": None if solution.settings.prior is None else str(prior or "given"),
+        "version": f"legdistort {solution.provenance.get('versions', {}).get('legdistort', '')}".strip(),
+    }
+    return {key: value for key, value in meta.items() if value is not None}
+
+
+def rms(solution):
+    """Unweighted rms residual (2,) per axis of the used observations, pixels."""
+    used = solution.residuals["used"]
+    return np.array([np.sqrt(np.mean(solution.residuals[d][used].to_value(u.pix) ** 2)) for d in ("dx", "dy")])
+
+
+def largest_inverse_error(solution):
+    """Largest certified round-trip error over all exposures, pixels."""
+    return max(view.distortion.inverse.error for view in solution)
+
+
+def sky_sentence(solution):
+    """Where the reference plane lies on the sky, and how that is known."""
+    sky = solution.sky
+    if sky is None:
+        return "not known: no WCS in the headers that proved right, no reference catalogue with ra, dec"
+    source = {"exposures": "from the headers", "reference": "from the reference"}.get(solution.diagnostics.sky, "")
+    tied = ", tied to the reference" if source and solution.gauge.tie is not None and "head" in source else ""
+    words = f"tangent point {sky.lon:.6f} {sky.lat:+.6f} deg, {sky.pixel_scale:.5g} arcsec/px"
+    return f"{words}{', ' * bool(source)}{source}{tied}"
+
+
+def camera_sentence(solution):
+    """Which camera it is, and what of it the exposures do not determine; empty without one."""
+    camera = solution.camera
+    if camera is None:
+        return ""
+    ny, nx = camera.field
+    ids = ", ".join(camera.detectors)
+    words = f"{camera.name}, detectors {ids}; positions in its focal plane, {nx} x {ny} px"
+    groups = camera.groups(solution.residuals[solution.residuals["used"]])
+    if len(groups) > 1:
+        words += f"; no star in common: {' | '.join(', '.join(group) for group in groups)}"
+        held = any(np.isinf(each.place.errors).any() for each in camera.detectors.values() if each.place.errors)
+        words += ", so that their places relative to each other are not determined" * held
+    common = camera.common_sigma
+    if common is not None and np.isinf(common[:, 1:3]).any() and "shear" in solution.gauge.unknown_names:
+        words += (
+            "; a shear of all detectors together is not determined: the exposures are not turned enough against one "
+            "another"
+        )
+    return words
+
+
+def printed(solution):
+    """What `print` shows: verdict, facts, a row for every exposure."""
+    used, motions = solution.residuals["used"], solution.estimate.motions
+    both = rms(solution)
+    lines = [
+        repr(solution)[1:-1],
+        *in_lines(solution.checks),
+        f"status  {solution.status}",
+        *_wrapped("camera", camera_sentence(solution)),
+        *_static_in_words(solution),
+        *_wrapped("gauge", solution.gauge.sentence),
+        f"sky     {sky_sentence(solution)}",
+        *(_wrapped("stars", motions.sentence) if motions is not None else []),
+        f"rms     {both[0]:.4f}, {both[1]:.4f} px in x, y; {np.count_nonzero(used)} of {len(used)} observations used",
+        *(line for key, text in solution.diagnostics.in_words().items() for line in _wrapped(key, text)),
+        "",
+        f"{'exposure':24s} {'stars':>5s} {'shift x':>9s} {'shift y':>9s} {'rotation':>9s} {'scale':>9s} "
+        f"{'rms x':>7s} {'rms y':>7s} {'distortion':>10s}{'' if solution.sky is None else _SKY_HEADS}",
+    ]
+    lines += [_row(view) for view in solution]
+    if solution.camera is not None:
+        lines += ["", *solution.camera.table_lines()]
+    lines += [f"left out {name}: {reason}" for name, reason in solution.left_out.items()]
+    return "\n".join(lines)
+
+
+_SKY_HEADS = f" {'PA [deg]':>9s} {'arcsec/px':>9s}"
+
+
+def _row(view):
+    """Line of an exposure in the printed table."""
+    table = view.solution.residuals
+    rows = table[table["used"] & (table["exposure"] == view.name)]
+    d = similarity.describe(view.pose)
+    rms = [np.sqrt(np.mean(rows[k].to_value(u.pix) ** 2)) if len(rows) else np.nan for k in ("dx", "dy")]
+    sky = ""
+    if view.solution.sky is not None:
+        angle, scale = view.orientation
+        sky = f" {angle:9.4f} {scale:9.6f}"
+    return (
+        f"{view.name[:24]:24s} {len(rows):5d} {d['dx']:9.2f} {d['dy']:9.2f} {d['rotation']:9.4f} {d['scale']:9.6f} "
+        f"{rms[0]:7.4f} {rms[1]:7.4f} {np.sqrt((view.coefficients**2).sum()) / 2:10.3f}{sky}"
+    )
+
+
+def _static_in_words(solution):
+    if solution.settings.static != "fit" or solution.camera is not None:
+        return []
+    own = solution.settings.exposure_degree
+    mine = f"modes up to degree {own}" if own else "its pose alone"
+    return [f"static  fitted: one distortion for all exposures of a detector, {mine} for every exposure"]
+
+
+def _wrapped(key, text):
+    """Lines of at most 110 characters that begin with a key; none for no text."""
+    return textwrap.wrap(text, 110, initial_indent=f"{key:8s}", subsequent_indent=" " * 8) if text else []
