@@ -110,7 +110,7 @@ def solve_relative(matches, *, degree=3, reference=None, weighted=True, error_fl
     convention = _convention(convention, "relative polynomial", plane, constraint=rows)
     state = State(_corrected_mean(matches, problem, state), state.coefficients, state.poses)
     weights = problem if weighted else _equal(problem)
-    return _solution(matches, (problem, weights), state, convention, covariance)
+    return _solution(matches, (problem, weights), state, convention, covariance, error_floor=float(error_floor))
 
 
 def compare(matches, solution, *, prior=None):
@@ -260,7 +260,7 @@ def _convention(gauge, name, plane, **changes):
     return replace(gauge, kind=name, plane=plane, unknown_maps=(), **changes)
 
 
-def _solution(matches, problems, state, gauge, covariance=None):
+def _solution(matches, problems, state, gauge, covariance=None, error_floor=0.0):
     """The frozen result: chi2 by the stated errors, reported errors scaled by what the weights in force leave.
 
     A `covariance` of the coefficients, one block an exposure, is that at the stated errors where each exposure was
@@ -279,7 +279,7 @@ def _solution(matches, problems, state, gauge, covariance=None):
         gauge,
         Uncertainty(problem, blocks, gauge, scale=scale, coefficients=coefficients),
         settings=Settings(problem.degree, method=gauge.kind, errors="scale"),
-        diagnostics=Diagnostics(error_scale=scale),
+        diagnostics=Diagnostics(error_floor=error_floor, error_scale=scale),
         status=f"{gauge.kind}: solved directly",
         dof=dof,
         chi2=float(criterion.squares(stated, blocks.residual).sum()),

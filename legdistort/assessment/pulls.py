@@ -89,16 +89,12 @@ def pulls_of(solution):
     table = solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]
     exposure = _exposures(solution, table)
     star = np.searchsorted(solution.estimate.star_names, table["star"])
-    found = solution.diagnostics
-    dx, dy, x_err, y_err = (column_contract.values(table, c, "pix") for c in ("dx", "dy", "x_err", "y_err"))
-    a, b = (found.error_scale * np.hypot(each, found.error_floor) for each in (x_err, y_err))
-    if found.error_law is not None and "flux" in table.colnames:
-        a = b = found.error_law.sigma(np.asarray(table["flux"], dtype=float), table["exposure"])
-        a = b = np.where(np.isfinite(a), a, np.hypot(x_err, y_err) / np.sqrt(2))
-    c = column_contract.values(table, "xy_corr") if "xy_corr" in table.colnames else np.zeros(len(a))
-    squares = ((dx / a) ** 2 + (dy / b) ** 2 - 2 * c * dx * dy / (a * b)) / (1 - c**2)
-    freedom = _freedom(solution, table, exposure, star, 2 / (a**2 + b**2))
-    brightness, label = _brightness(solution, table, star, np.sqrt((a**2 + b**2) / 2))
+    offset = np.stack([column_contract.values(table, c, "pix") for c in ("dx", "dy")], axis=1)
+    covariance = solution.diagnostics.errors_of(table)
+    squares = np.einsum("na,nab,nb->n", offset, np.linalg.inv(covariance), offset)
+    variance = np.einsum("nkk->n", covariance) / 2
+    freedom = _freedom(solution, table, exposure, star, 1 / variance)
+    brightness, label = _brightness(solution, table, star, np.sqrt(variance))
     return Pulls(squares, freedom, star, exposure, brightness, label, *_times(solution, table, exposure))
 
 

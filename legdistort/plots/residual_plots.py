@@ -175,12 +175,9 @@ def plot_mean_residuals(solution, *, scale=None, ax=None):
 def _cells(solution):
     """Centres (n, 2), weighted mean residuals (n, 2) and errors per axis (n,) of the cells of the detector."""
     table = solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]
-    x, y, dx, dy, a, b = (
-        column_contract.values(table, c, "pix") for c in ("x", "y", "dx", "dy", "x_err", "y_err")
-    )  # fmt: skip
+    x, y, dx, dy = (column_contract.values(table, c, "pix") for c in ("x", "y", "dx", "dy"))
     ny, nx = np.max(list(solution.estimate.shapes.values()), axis=0)
-    found = solution.diagnostics
-    weight = 1 / (found.error_scale**2 * ((a**2 + b**2) / 2 + found.error_floor**2))
+    weight = 2 / np.einsum("nkk->n", solution.diagnostics.errors_of(table))
     n = int(np.clip(np.sqrt(len(table) / (2 * _PER_CELL)), 3, _CELLS))
     side = max(nx, ny) / n
     columns, rows = -(-nx // side), -(-ny // side)

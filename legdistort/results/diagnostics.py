@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..inputs import column_contract
+
 if TYPE_CHECKING:
+    from astropy.table import QTable
     from numpy.typing import ArrayLike
 
 #: Twice the gain in the logarithm of the likelihood from which stars count as moving. Without motions it has the
@@ -149,6 +152,11 @@ class ErrorLaw:
         if exposure is None:
             return sigma
         return sigma * np.array([self.factors.get(name, 1.0) for name in np.asarray(exposure).tolist()])
+
+    def knows(self, flux: ArrayLike) -> np.ndarray:
+        """Of which positions the law gives errors: those with a positive flux, (n,) of bool."""
+        flux = np.asarray(flux, dtype=float)
+        return np.isfinite(flux) & (flux > 0)
 
     def scaled(self, factor: float) -> ErrorLaw:
         """The law with all errors multiplied."""
@@ -317,6 +325,51 @@ class Diagnostics:
     correlated: CorrelatedErrors | None = None
     motion_scatter: MotionScatter | None = None
 
+    def found_errors(
+        self,
+        covariance: np.ndarray,
+        *,
+        flux: ArrayLike | None = None,
+        exposure: ArrayLike | None = None,
+        axes: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Errors of measured positions as they count in this solution, from those that were stated.
+
+        ``scale^2 (covariance + floor^2 I)``. A law of brightness takes the place of the stated errors, whose
+        correlation of x and y stays; positions without a positive flux keep them. The floor of correlated errors holds
+        what neighbouring exposures share, as it does for the weights of the observations. Where the covariance is zero
+        it stays so: there is no measurement.
+
+        Parameters
+        ----------
+        covariance : ndarray, shape (n, 2, 2)
+            As stated, pixels^2.
+        flux : array_like, shape (n,), optional
+            In units of the flux of the observations.
+        exposure : array_like of str, shape (n,), optional
+            By default one of average errors by the law.
+        axes : ndarray, shape (2, 2) or (n, 2, 2), optional
+            Those of the reference plane on the detector. With them what exposures share differs from axis to axis.
+
+        Returns
+        -------
+        ndarray, shape (n, 2, 2)
+        """
+        out, law, shared = np.array(covariance, dtype=float), self.error_law, self.correlated
+        measured = out.any(axis=(1, 2))
+        if law is not None and flux is not None:
+            out = _by_law(out, law, flux, exposure)
+        independent, common = self.error_floor, np.zeros((2, 2))
+        if axes is not None and shared is not None and shared.along is not None:
+            independent, common = shared.floor, axes @ np.diag([shared.x**2, shared.y**2]) @ np.swapaxes(axes, -1, -2)
+        out = self.error_scale**2 * (out + independent**2 * np.eye(2) + common)
+        return np.where(measured[:, None, None], out, 0.0)
+
+    def errors_of(self, table: QTable, *, axes: np.ndarray | None = None) -> np.ndarray:
+        """`found_errors` (n, 2, 2) [pix^2] of positions in a table with ``x_err``, ``y_err`` and ``exposure``."""
+        flux = column_contract.values(table, "flux") if "flux" in table.colnames else None
+        return self.found_errors(column_contract.covariance(table), flux=flux, exposure=table["exposure"], axes=axes)
+
     def in_words(self) -> dict[str, str]:
         """Sentences on errors found, the widths of a prior, the degree chosen, and the stars that were kept out.
 
@@ -353,6 +406,17 @@ class Diagnostics:
         names = "widths", "effective_modes", "departure_ratio", "selection", "validation", "error_law", "correlated"
         names += ("motion_scatter",)
         return {name: found for name, found in asdict(self).items() if name in names and found is not None}
+
+
+def _by_law(covariance, law, flux, exposure):
+    """Covariances (n, 2, 2) with the variances of an `ErrorLaw`, where there is a flux (n,)."""
+    known = law.knows(flux)
+    names = None if exposure is None else np.asarray(exposure)[known]
+    variance = law.sigma(np.asarray(flux, dtype=float)[known], names) ** 2
+    out, (a, b) = covariance.copy(), np.einsum("nkk->kn", covariance[known])
+    correlation = np.divide(covariance[known, 0, 1], np.sqrt(a * b), out=np.zeros(len(a)), where=a * b > 0)
+    out[known] = variance[:, None, None] * (np.eye(2) + correlation[:, None, None] * np.eye(2)[::-1])
+    return out
 
 
 def _in_words(widths):

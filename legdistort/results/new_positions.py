@@ -1,5 +1,8 @@
 """Positions that took no part in the solution, corrected with it, and their errors.
 
+Stated errors of their measurement count as those of the observations do: with the floor, the scale or the law that were
+found (`Diagnostics.found_errors`). The errors of the coefficients have these already.
+
 A pixel p of exposure i is corrected to ``X = T_i^-1 D_i^-1(p)``. An error dp of its measurement and one dA_i of the
 coefficients move it by ``(D_i' T_i)^-1 (dp - B dA_i)``, B the basis there. A common map g of the plane changes A_i by
 ``-N_i g``, to first order in the distortion of this exposure alone. Measurement, coefficients in the gauge and common
@@ -102,12 +105,17 @@ def correct(view, pixels, moved=None):
     return corrected if moved is None else corrected + moved.displacement(view.solution.estimate.motions), q
 
 
-def correct_with_errors(view, xy, errors, moved=None):
+def correct_with_errors(view, xy, errors, moved=None, flux=None):
     """`View.correct` with errors, carried to another time by a `Movement`; see there."""
     pixels = np.atleast_2d(to_pixels(xy))
     measured = _covariance(errors, len(pixels))
+    flux = None if flux is None else _fluxes(flux, len(pixels))
     if view.chip is not None:
         pixels, measured = view.chip.to_focal_plane(pixels, measured)
+    if measured.any():
+        _warn_of_no_flux(view.solution, flux, len(pixels))
+    known = {"flux": flux, "exposure": np.full(len(pixels), view.name), "axes": _axes(view)}
+    measured = view.solution.diagnostics.found_errors(measured, **known)
     corrected, relative, absolute = _with_errors(view, pixels, measured, moved)
     if isinstance(xy, u.Quantity):
         relative, absolute = relative * u.pix**2, absolute * u.pix**2
@@ -151,6 +159,32 @@ def _covariance(errors, n):
     return out
 
 
+def _fluxes(flux, n):
+    """Fluxes (n,) of positions from what was given."""
+    try:
+        return np.array(np.broadcast_to(np.asarray(getattr(flux, "value", flux), dtype=float), (n,)))
+    except (TypeError, ValueError):
+        raise InputError(f"flux must be a number for each of the positions, of which there are {n}") from None
+
+
+def _axes(view):
+    """Axes (2, 2) of the reference plane in the pixels of an exposure, its columns."""
+    return view.solution.poses[view.name][:, :2]
+
+
+def _warn_of_no_flux(solution, flux, n):
+    """Warn of positions without a flux (n,), which a law of brightness says nothing of."""
+    law = solution.diagnostics.error_law
+    lost = 0 if law is None else n if flux is None else np.count_nonzero(~law.knows(flux))
+    if lost:
+        warn(
+            f"{lost} of {n} positions have no positive flux and keep the errors that were given: those of the solution "
+            "follow a law of brightness that took the place of the stated ones; give their flux (flux=, in tables a "
+            "column flux or mag)",
+            AssumptionWarning,
+        )
+
+
 def response(view, q):
     """How coefficients move corrected positions, up to the sign, (n, 2, 2 n_modes), and pixels, (n, 2, 2).
 
@@ -165,9 +199,9 @@ def response(view, q):
 def covariances(view, q, measured, moved=None):
     """Relative and absolute covariance (n, 2, 2) of positions corrected to undistorted pixels q (n, 2) of an exposure.
 
-    `measured` (n, 2, 2) is the covariance in its pixels, those of the focal plane if it has one; a `Movement` carries
-    the positions to another time. Of a camera with errors they have those too: of the detector of the view, or of that
-    on which each position falls.
+    `measured` (n, 2, 2) is the covariance in its pixels, those of the focal plane if it has one, with the errors that
+    were found; a `Movement` carries the positions to another time. Of a camera with errors they have those too: of the
+    detector of the view, or of that on which each position falls.
     """
     solution, i = view.solution, view.index
     gauge, uncertainty, positions = solution.gauge, solution.estimate.uncertainty, solution.estimate.positions
@@ -259,13 +293,14 @@ def correct_table(solution, table, epoch=None):
             "another time"
         )
     pixels = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
-    measured = column_contract.covariance(table)
-    xy, relative, absolute = np.empty_like(pixels), np.empty_like(measured), np.empty_like(measured)
+    _warn_of_no_flux(solution, table["flux"] if "flux" in table.colnames else None, len(table))
+    xy, relative, absolute = np.empty_like(pixels), *np.empty((2, len(table), 2, 2))
     off = np.zeros(len(table), dtype=bool)
     for view, rows in _parts(solution, table):
         stars = None if epoch is None else table["star"][rows]
         moved = movement(solution, view.name, stars, epoch, len(rows))
-        xy[rows], relative[rows], absolute[rows] = _with_errors(view, pixels[rows], measured[rows], moved)
+        measured = solution.diagnostics.errors_of(table[rows], axes=_axes(view))
+        xy[rows], relative[rows], absolute[rows] = _with_errors(view, pixels[rows], measured, moved)
         off[rows] = _is_off(view, table[rows])
     _warn_of_extrapolation(table, np.flatnonzero(off))
     out = table.copy()

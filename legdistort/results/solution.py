@@ -222,7 +222,9 @@ class Solution(ShownAsPrinted):
         ----------
         table : `~astropy.table.Table`
             Columns ``exposure``, ``x``, ``y``, ``x_err``, ``y_err`` [pix] and perhaps ``xy_corr``, of positions that
-            took no part in the solution; with `epoch` ``star`` too, a star of the solution.
+            took no part in the solution; with `epoch` ``star`` too, a star of the solution. Errors are those stated,
+            to which what the solution found of them is applied as in `correct`; where that is a law of brightness,
+            ``flux`` or ``mag`` too.
         epoch : float or `~astropy.time.Time`, optional
             A Julian year, to which the motions that were fitted carry all positions; it is then in the ``meta`` too.
 
@@ -242,7 +244,8 @@ class Solution(ShownAsPrinted):
         Warns
         -----
         AssumptionWarning
-            Of positions off their detector, where the correction is extrapolated.
+            Of positions off their detector, where the correction is extrapolated, and of such without a flux where a
+            law of brightness was found.
         """
         return new_positions.correct_table(self, table, epoch)
 

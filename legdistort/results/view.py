@@ -215,6 +215,7 @@ class View(ShownAsPrinted):
         errors: ArrayLike | None = None,
         epoch: float | Time | None = None,
         stars: Sequence[str] | None = None,
+        flux: ArrayLike | None = None,
     ) -> Any:
         """Pixels -> reference positions, exact (section 3.3, criterion J_3).
 
@@ -227,13 +228,17 @@ class View(ShownAsPrinted):
             Any pixels of the exposure. Or, with `y`, their x alone.
         y : array_like, optional
         errors : array_like, shape (n, 2) or (n, 2, 2), optional
-            Of the measurement: standard deviations per axis [pix], or covariances [pix^2]; zeros leave the errors of
-            the correction alone.
+            Of the measurement, as they are stated for the observations: standard deviations per axis [pix], or
+            covariances [pix^2]. The floor, scale or law of the errors that the solution found is applied to them
+            (`Diagnostics.found_errors`). Zeros stay zeros: they leave the errors of the correction alone.
         epoch : float or `~astropy.time.Time`, optional
             Another time, a Julian year, to which positions are carried. Stars without a motion stay where they are,
             with errors that are not known.
         stars : sequence of str, optional
             With `epoch`: to which stars of the solution the positions belong.
+        flux : array_like, shape (n,), optional
+            With `errors`, in the unit of the flux of the observations. It counts where a law of brightness was found,
+            which takes the place of `errors`; positions without a positive flux keep those given.
 
         Returns
         -------
@@ -247,11 +252,19 @@ class View(ShownAsPrinted):
         ------
         InputError
             If there is no such star, motions were not fitted, several detectors have pixels of their own, `errors` go
-            with x and y apart, or for errors of another shape, negative ones or such that are not finite.
+            with x and y apart, or for errors of another shape, negative ones or such that are not finite,
+            and for fluxes without errors.
         FoldError
             If the distortion folds.
+
+        Warns
+        -----
+        AssumptionWarning
+            Of positions with errors and without a flux, where a law of brightness was found.
         """
         view = self._pixels
+        if flux is not None and errors is None:
+            raise InputError("flux tells the errors of measured positions by a law of brightness: give errors too")
         if y is not None:
             if errors is not None:
                 raise InputError("errors go with points: give positions (n, 2) in the place of x and y")
@@ -259,7 +272,7 @@ class View(ShownAsPrinted):
         pixels = np.atleast_2d(to_pixels(x))
         moved = new_positions.movement(view.solution, view.name, stars, epoch, len(pixels))
         if errors is not None:
-            return new_positions.correct_with_errors(view, x, errors, moved)
+            return new_positions.correct_with_errors(view, x, errors, moved, flux)
         pixels = pixels if view.chip is None else view.chip.to_focal_plane(pixels)
         return like(x, new_positions.correct(view.solution[view.name], pixels, moved)[0])
 

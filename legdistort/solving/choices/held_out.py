@@ -72,18 +72,17 @@ def corrected(solution, table):
     xy : ndarray, shape (n_exposures, n_stars, 2)
         Reference-plane pixels; NaN where a star is not seen.
     sigma : ndarray, shape (n_exposures, n_stars)
-        Error of the measured position, rms of the axes, pixels; the floor and scale of the solution included.
+        Error of the measured position, rms of the axes, pixels, as it counts in the solution.
     """
     stars, star = np.unique(table["star"], return_inverse=True)
     xy = np.full((len(solution.names), len(stars), 2), np.nan)
     sigma = np.full(xy.shape[:2], np.nan)
     measured = np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
-    error = np.sqrt((table["x_err"].to_value(u.pix) ** 2 + table["y_err"].to_value(u.pix) ** 2) / 2)
-    found = solution.diagnostics
+    error = np.sqrt(np.einsum("nkk->n", solution.diagnostics.errors_of(table)) / 2)
     for i, name in enumerate(solution.names):
         rows = np.flatnonzero(table["exposure"] == name)
         xy[i, star[rows]] = solution[name].to_reference(measured[rows])
-        sigma[i, star[rows]] = found.error_scale * np.hypot(error[rows], found.error_floor)
+        sigma[i, star[rows]] = error[rows]
     return xy, sigma
 
 
