@@ -11,6 +11,8 @@ from numpy.polynomial import legendre
 from numpy.testing import assert_allclose, assert_array_equal
 
 import legdistort as ld
+from legdistort.assessment.baselines import solve_relative
+from legdistort.assessment.pulls import pulls_of
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.results.diagnostics import CorrelatedErrors, Diagnostics, ErrorLaw
 
@@ -219,3 +221,19 @@ def test_bad_fluxes_are_named(plain):
             plain[name].correct(PIXELS, errors=0.03, flux=flux)
     with pytest.raises(InputError, match=r"flux tells the errors .* give errors too"):
         plain[name].correct(PIXELS, flux=1e3)
+
+
+def test_pulls_are_those_of_the_errors_in_force(matches):
+    """Their squares sum to chi2 with a floor too, which leaves the covariance of x and y as it is."""
+    table = matches.table.copy()
+    table["xy_corr"] = 0.8
+    correlated = ld.Matches.from_table(table, shape=matches.shapes, poses=matches.poses)
+    solution = ld.solve(correlated, degree=1, clip=None, error_floor=0.03)
+    assert pulls_of(solution).squares.sum() == pytest.approx(solution.chi2, rel=1e-6)
+
+
+def test_a_relative_polynomial_has_its_floor(matches):
+    solution = solve_relative(matches, degree=1, error_floor=0.5)
+    found = solution[solution.names[1]].correct(PIXELS, errors=1e-6).relative
+    assert solution.diagnostics.error_floor == 0.5
+    assert np.all(found[:, 0, 0] > 0.9 * (solution.diagnostics.error_scale * 0.5) ** 2)
