@@ -24,6 +24,7 @@ from ..solving.equations import criterion
 from ..solving.equations.covariances import Uncertainty
 from ..solving.equations.problem import State, build_problem
 from ..solving.gauge import constraints
+from ..solving.single_detectors import by_detector
 
 log = logging.getLogger(__name__)
 
@@ -132,11 +133,7 @@ def compare(matches, solution, *, prior=None):
         ``{name: Solution}``: "shift", "static + shift", "relative polynomial", "all distortions solved". A
         correction that fails on these data is left out, with a warning in the log that gives the reason.
     """
-    table = solution.residuals[solution.residuals["used"]]
-    table = table[matches.table.colnames]
-    kept = {name: matches.poses[name] for name in solution.names}
-    known = {"poses": kept, "sky": matches.sky, "allow_copies": True, "camera": matches.camera}
-    same = Matches.from_table(table, shape=solution.estimate.shapes, **known)
+    same = used_matches(matches, solution)
     floor = solution.diagnostics.error_floor
     calls = {
         "shift": lambda: solve_shifts(same),
@@ -154,6 +151,20 @@ def compare(matches, solution, *, prior=None):
         except LegdistortError as error:
             log.warning("%s is left out of the comparison: %s", name, error)
     return out | {METHOD: solution}
+
+
+def used_matches(matches, solution):
+    """The matches that a solution used, of which it was made: without clipped observations and exposures.
+
+    Positions, errors and the camera are those of the solution.
+    """
+    if not set(solution.names) <= set(matches.names):
+        matches, _ = by_detector(matches, None)
+    rows = solution.residuals["used"]
+    table = solution.residuals[matches.table.colnames]
+    poses, left_out = {name: matches.poses[name] for name in solution.names}, dict(solution.left_out)
+    known = {"poses": poses, "shapes": dict(solution.estimate.shapes), "left_out": left_out, "camera": solution.camera}
+    return replace(matches, table=table, **known).keep(rows)
 
 
 # -- pieces

@@ -177,15 +177,15 @@ def do_solve(a):
     _refuse_ignored(a)
     with outputs.replacing_folder(a.out, former=RESULTS) as target:  # a mosaic there does not belong to this solution
         table = _read_table(a.table, a)
-        shape = tuple(a.shape) if a.shape else table.meta.get("shapes")
-        camera = _camera(a.camera, table.meta.get("camera"))
-        if camera is None:
+        known = legdistort.Matches.read_meta(table.meta, camera=legdistort.Camera.from_meta)
+        known |= {"shape": tuple(a.shape)} if a.shape else {}
+        known |= {"camera": _camera(a.camera)} if a.camera else {}
+        if known["camera"] is None:
             _refuse({"layout": a.layout}, "is for the detectors of a camera")
         else:
             _refuse({"shape": a.shape}, "comes from the camera")
-        if shape is None and camera is None:
+        if known["shape"] is None and known["camera"] is None:
             raise InputError(f"{a.table} does not state the size of the detectors: give --shape NY NX")
-        known = {"shape": shape, "camera": camera} | legdistort.Matches.read_meta(table.meta)
         matches = legdistort.Matches.from_table(table, **known)
         with timed({}, "solve"):
             solution = legdistort.solve(matches, **_solving(a, a.shape), progress=wants_progress(a))
@@ -417,10 +417,10 @@ def _read_table(path, a):
     return read_table(path, columns=dict(a.columns), origin=a.origin, error=a.error)
 
 
-def _camera(given, meta=None):
-    """The camera of ``--camera``, or else that of a table; None without one."""
+def _camera(given):
+    """The camera of ``--camera``; None without one."""
     if given is None:
-        return None if meta is None else legdistort.Camera.from_meta(meta)
+        return None
     return legdistort.Camera.gsaoi() if given == "gsaoi" else legdistort.Camera.read(given)
 
 

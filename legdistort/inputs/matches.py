@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +36,8 @@ _SOME = 50_000
 #: Rows that a message names.
 _MOST_NAMED = 6
 
+#: Metadata of fields of `Matches`: a dict with an entry for every exposure; what makes a value of that in a table file.
+BY_EXPOSURE, READ = "by_exposure", "read"
 
 #: Days: exposures whose headers have no more than the date of one night may have two.
 _NIGHT = 1.5
@@ -80,6 +82,20 @@ class Observations:
         key = self.key
         return bool(np.all(key[1:] > key[:-1]))
 
+    def check(self) -> None:
+        """Raise what `Matches.from_table` does where these do not determine distortions.
+
+        Raises
+        ------
+        InputError
+            For a star that stands twice in an exposure, or positions that all lie on one line.
+        MatchError
+            For one exposure only, or exposures in groups without a common star.
+        """
+        _check_duplicates(self)
+        _check_connected(self)
+        _check_spread(self)
+
     @classmethod
     def of(cls, table: Table) -> Observations:
         """Those of a table that keeps the contract of matched positions."""
@@ -95,9 +111,20 @@ class Observations:
         return cls(table, names, stars, exposure, star, xy.T, covariance.T)
 
 
+def _read_poses(meta):
+    return {name: np.array(pose) for name, pose in meta.items()}
+
+
+def _read_sky(meta):
+    return TangentPlane(meta["lon"], meta["lat"], np.array(meta["matrix"]))
+
+
 @dataclass(frozen=True, eq=False)
 class Matches(ShownAsPrinted):
     """Positions of the same stars in several exposures.
+
+    `keep` makes matches of some of the rows, `dataclasses.replace` others with changed fields; both keep what is not
+    changed, and `observations` follow the table.
 
     Attributes
     ----------
@@ -117,7 +144,7 @@ class Matches(ShownAsPrinted):
     header_distortion : str or None
         The largest distortion of the headers, in words, if they have one; it is not in the poses.
     observations : Observations
-        The table as plain arrays; need not be given.
+        The table as plain arrays; made of it, need not be given.
     camera : `legdistort.Camera` or None
         Where exposures have several detectors. Positions then are those in its focal plane; those on the detectors
         stand in ``x_detector``, ``y_detector``.
@@ -138,9 +165,9 @@ class Matches(ShownAsPrinted):
     """
 
     table: QTable
-    shapes: dict[str, tuple[int, int]]
-    poses: dict[str, np.ndarray]
-    sky: TangentPlane | None = None
+    shapes: dict[str, tuple[int, int]] = field(metadata={BY_EXPOSURE: True})
+    poses: dict[str, np.ndarray] = field(metadata={BY_EXPOSURE: True, READ: _read_poses})
+    sky: TangentPlane | None = field(default=None, metadata={READ: _read_sky})
     left_out: dict[str, str] = field(default_factory=dict)
     epoch: float | None = None
     header_distortion: str | None = None
@@ -202,6 +229,31 @@ class Matches(ShownAsPrinted):
             )
         return exposure_years(self.names, self.observations.exposure, column_contract.values(self.table, "epoch", u.yr))
 
+    def keep(self, rows: ArrayLike | slice) -> Matches:
+        """The same matches with some rows of the table; exposures without any go.
+
+        Parameters
+        ----------
+        rows : array_like of bool, shape (n,), slice, or array_like of int
+            As an index of the table.
+
+        Raises
+        ------
+        InputError
+            For another number of them, a row that comes twice, or positions on one line.
+        MatchError
+            If what is left is one exposure or none, or falls apart.
+        """
+        rows = rows if isinstance(rows, slice) else np.asarray(rows)
+        if not isinstance(rows, slice) and rows.dtype == bool and rows.shape != (len(self.table),):
+            raise InputError(f"rows must be one truth value a row ({len(self.table)}), got shape {rows.shape}")
+        table = self.table[rows]
+        if len(table) == 0:
+            raise MatchError("no position is left: keep those of two exposures at least")
+        seen = Observations.of(table)
+        seen.check()
+        return replace(self, table=table, observations=seen, **self._by_exposure(seen.names))
+
     def without(self, reasons: Mapping[str, str]) -> Matches:
         """The same matches without some exposures, ``{name: reason}``, which join `left_out`.
 
@@ -210,39 +262,41 @@ class Matches(ShownAsPrinted):
         MatchError
             If what is left is one exposure, or falls apart.
         """
-        table = self.table[~np.isin(self.table["exposure"], list(reasons))]
-        kept = {name: pose for name, pose in self.poses.items() if name not in reasons}
-        left_out = self.left_out | dict(reasons)
-        if len(table) == 0:
+        rows = ~np.isin(self.table["exposure"], list(reasons))
+        if not rows.any():
             raise MatchError(
                 "no exposure agrees with the others: " + "; ".join(f"{k}: {v}" for k, v in reasons.items())
             )
-        known = {"sky": self.sky, "left_out": left_out, "epoch": self.epoch, "allow_copies": True}
-        known["camera"] = self.camera
-        return type(self).from_table(table, shape=self.shapes, poses=kept, **known)
+        return replace(self.keep(rows), left_out=self.left_out | dict(reasons))
+
+    def _by_exposure(self, names):
+        """Fields that have an entry for every exposure, with those of these only."""
+        found = {each.name: getattr(self, each.name) for each in fields(self) if each.metadata.get(BY_EXPOSURE)}
+        return {key: {name: value[name] for name in names} for key, value in found.items()}
 
     def to_meta(self) -> dict[str, Any]:
-        """Shapes, poses and sky as plain lists, for the header of a table file; see `read_meta`."""
-        sky = self.sky
-        return {
-            "shapes": {name: list(self.shapes[name]) for name in self.names},
-            "poses": {name: self.poses[name].tolist() for name in self.names},
-            "sky": None if sky is None else {"lon": sky.lon, "lat": sky.lat, "matrix": sky.matrix.tolist()},
-            "left_out": dict(self.left_out),
-            "epoch": self.epoch,
-            "camera": None if self.camera is None else self.camera.to_meta(),
-        }
+        """All that is known beside the table as plain lists, for the header of a table file; see `read_meta`."""
+        known = {each.name: getattr(self, each.name) for each in _beside_the_table()}
+        return {key: _plain(value) for key, value in (known | self._by_exposure(self.names)).items()}
 
     @staticmethod
-    def read_meta(meta: Mapping[str, Any]) -> dict[str, Any]:
-        """What `to_meta` wrote, as arguments ``poses``, ``sky``, ``left_out``, ``epoch`` of `from_table`."""
-        given, sky = meta.get("poses"), meta.get("sky")
-        return {
-            "poses": None if given is None else {name: np.array(pose) for name, pose in given.items()},
-            "sky": None if sky is None else TangentPlane(sky["lon"], sky["lat"], np.array(sky["matrix"])),
-            "left_out": meta.get("left_out"),
-            "epoch": meta.get("epoch"),
-        }
+    def read_meta(meta: Mapping[str, Any], *, camera: Callable[[Any], Camera] | None = None) -> dict[str, Any]:
+        """What `to_meta` wrote, as arguments of `from_table`; None for what `meta` does not have.
+
+        Parameters
+        ----------
+        meta : dict
+            Header of a table, ours or another one.
+        camera : callable, optional
+            What reads a camera: `legdistort.Camera.from_meta`. Without it there is none among the arguments.
+        """
+        found = {}
+        for each in _beside_the_table():
+            value, read = meta.get(each.name), camera if each.name == "camera" else each.metadata.get(READ)
+            found[each.name] = value if value is None or read is None else read(value)
+        if camera is None:
+            del found["camera"]
+        return {"shape": found.pop("shapes"), **found}
 
     def __repr__(self) -> str:
         return f"<Matches: {len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures>"
@@ -258,6 +312,7 @@ class Matches(ShownAsPrinted):
         sky: TangentPlane | None = None,
         left_out: Mapping[str, str] | None = None,
         epoch: float | None = None,
+        header_distortion: str | None = None,
         allow_copies: bool = False,
         camera: Camera | None = None,
     ) -> Matches:
@@ -280,6 +335,8 @@ class Matches(ShownAsPrinted):
             Passed on.
         epoch : float, optional
             Mean of the exposures, a Julian year; by default that of a column ``epoch``, if there is one.
+        header_distortion : str, optional
+            The largest distortion of the headers, in words; `legdistort.solve` warns of it if no prior takes it.
         allow_copies : bool
             Keep exposures whose positions are those of another one to the last bit, as in simulations without noise;
             else they are left out with a warning: five stars or more, and over half of those of the shorter list.
@@ -324,9 +381,7 @@ class Matches(ShownAsPrinted):
         if not inside.all():
             table = table[inside]
             seen = Observations.of(table)
-        _check_duplicates(seen)
-        _check_connected(seen)
-        _check_spread(seen)
+        seen.check()
         if poses is None:
             found = start_poses.estimate_poses(seen.exposure, seen.star, seen.xy, names=seen.names)
             poses = dict(zip(seen.names, found, strict=True))
@@ -335,7 +390,25 @@ class Matches(ShownAsPrinted):
         if epoch is None and "epoch" in table.colnames:
             epochs = column_contract.values(table, "epoch", u.yr)
             epoch = float(np.nanmean(epochs)) if np.isfinite(epochs).any() else None
-        return cls(table, shapes, poses, sky, left_out, epoch, observations=seen, camera=camera)
+        return cls(table, shapes, poses, sky, left_out, epoch, header_distortion, observations=seen, camera=camera)
+
+
+def _beside_the_table():
+    """Fields of `Matches` that a file has in the header of its table."""
+    return [each for each in fields(Matches) if each.name not in ("table", "observations")]
+
+
+def _plain(value):
+    """Plain lists, dicts, numbers and strings of what `Matches` hold."""
+    if hasattr(value, "to_meta"):
+        return value.to_meta()
+    if is_dataclass(value):
+        value = {each.name: getattr(value, each.name) for each in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(each) for each in value]
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
 def shapes_by_exposure(shape, names):

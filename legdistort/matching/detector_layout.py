@@ -4,6 +4,8 @@ Every detector of every exposure is first matched as an exposure of its own. Sta
 another put all of them on one plane, and two detectors of one exposure then lie there as they do in the camera.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..cameras.camera import Camera
@@ -71,7 +73,9 @@ def match_parts(table, shapes, match):
     whole = {part_of[name][0] for name in matches.names}
     lost = {n: why for n, why in matches.left_out.items() if n in part_of and part_of[n][0] not in whole}
     lost = {part_of[name][0]: why for name, why in lost.items()}
-    return Matches.from_table(made, camera=camera, left_out=lost, epoch=matches.epoch, allow_copies=True)
+    found = Matches.from_table(made, camera=camera, allow_copies=True)
+    placed = {"table": found.table, "shapes": found.shapes, "poses": found.poses, "sky": None}  # on another plane
+    return replace(matches, **placed, left_out=lost, camera=camera)
 
 
 def _ids(table):

@@ -135,6 +135,7 @@ def match(
     if camera is None and detector_layout.is_needed(table, exposures):
         shapes = detector_layout.shapes_of(table, exposures, shape)
         log.info("neither a camera nor headers: how the detectors lie is sought in the dithers")
+        _add_epochs(table, {exposure.frame or exposure.name: exposure for exposure in exposures or ()})
         again = vars(replace(options, columns=None))
         return detector_layout.match_parts(table, shapes, lambda parts, shape: match(parts, shape=shape, **again))
     if camera is None and exposures is not None and any(e.detector is not None for e in exposures):
@@ -197,7 +198,7 @@ def _add_epochs(table, named):
     epochs = {name: header_epoch(exposure.header) for name, exposure in named.items()}
     if any(epoch is not None for epoch in epochs.values()) and "epoch" not in table.colnames:
         years = {name: np.nan if epoch is None else epoch for name, epoch in epochs.items()}
-        table["epoch"] = [years[name] for name in table["exposure"]] * u.yr
+        table["epoch"] = [years.get(name, np.nan) for name in table["exposure"]] * u.yr
 
 
 def _without_repetitions(table):

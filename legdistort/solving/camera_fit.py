@@ -271,7 +271,7 @@ def _tell_unknown(matches, step, unknown):
 def in_camera(matches, camera):
     """The same matches with positions in the focal plane of another camera with the same detectors."""
     table = camera.in_focal_plane(matches.camera.on_detectors(matches.table))
-    return replace(matches, table=table, camera=camera, observations=None)
+    return replace(matches, table=table, camera=camera)
 
 
 def camera_step(fit, sought, departure):

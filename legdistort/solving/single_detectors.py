@@ -1,10 +1,11 @@
 """Exposures of a camera as those of its single detectors, each with a pose and a distortion of its own."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..geometry import basis, similarity
 from ..inputs.exposure_names import detector_name
-from ..inputs.matches import Matches
 from ..priors.prior import Prior
 
 
@@ -26,20 +27,25 @@ def by_detector(matches, static):
         Exposures are named as by `legdistort.inputs.exposure_names.detector_name`.
     dict
         ``{detector: Prior}``.
+
+    Raises
+    ------
+    MatchError
+        If detectors have no star in common with others.
     """
     camera, table = matches.camera, matches.camera.on_detectors(matches.table)
     parts = list(dict.fromkeys(zip(table["exposure"], camera.ids(table), strict=True)))
     table["exposure"] = [detector_name(*part) for part in zip(table["exposure"], table["detector"], strict=True)]
     own = {key: _known(detector, static) for key, detector in camera.detectors.items()}
-    made = Matches.from_table(
-        table,
-        shape={detector_name(*part): camera[part[1]].shape for part in parts},
+    made = replace(
+        matches,
+        table=table,
+        shapes={detector_name(*part): camera[part[1]].shape for part in parts},
         poses={detector_name(*part): similarity.compose(own[part[1]][0], matches.poses[part[0]]) for part in parts},
-        sky=matches.sky,
         left_out={detector_name(name, key): why for name, why in matches.left_out.items() for key in own},
-        epoch=matches.epoch,
-        allow_copies=True,
+        camera=None,
     )
+    made.observations.check()
     return made, {key: prior for key, (_, prior) in own.items()}
 
 

@@ -15,6 +15,7 @@ from legdistort import pipeline
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
+from legdistort.inputs.table_files import read_table
 from legdistort.priors.from_headers import describe, header_distortions
 from legdistort.priors.prior import HeaderPrior
 from legdistort.wcs.attachment import attach
@@ -76,6 +77,19 @@ def positions(n=6, n_stars=180):
 @pytest.fixture(scope="module")
 def night(tmp_path_factory):
     return ld.simulate_exposures(small=True, seed=3).write(tmp_path_factory.mktemp("night"))
+
+
+@pytest.fixture(scope="module")
+def sip_night(night, tmp_path_factory):
+    """The frames with a SIP distortion in their headers."""
+    frames, folder = [], tmp_path_factory.mktemp("sip")
+    for path in night:
+        content, cards = fits.getdata(path), fits.getheader(path)
+        cards["CTYPE1"], cards["CTYPE2"] = "RA---TAN-SIP", "DEC--TAN-SIP"
+        cards.update({"A_ORDER": 2, "B_ORDER": 2, "A_2_0": 1e-5, "B_0_2": 1e-5})
+        frames.append(folder / path.name)
+        fits.writeto(frames[-1], content, cards)
+    return frames
 
 
 def test_the_prior_of_headers_is_that_of_the_file(tmp_path):
@@ -200,6 +214,51 @@ def test_a_distortion_that_is_not_used_is_said():
         ld.solve(ld.match(table, exposures=[exposure(k, sip=None) for k in range(6)]), degree=3)
 
 
+UNUSED = "the headers have a distortion .SIP, up to .* that is not used"
+
+
+def state_of(solution):
+    return next(check.state for check in solution.checks if check.name == "header distortion")
+
+
+@pytest.fixture(scope="module")
+def unused():
+    """Matches of frames whose headers have a distortion, one of them of positions that scatter by far more."""
+    table, _ = positions()
+    own = np.flatnonzero(table["exposure"] == "e5")
+    for name, noise in zip("xy", np.random.default_rng(5).normal(0, 1.5, (2, len(own))), strict=True):
+        table[name][own] += noise
+    return ld.match(table, exposures=[exposure(k) for k in range(6)], tolerance=8)
+
+
+@pytest.mark.parametrize("road", ["validate", "dropped", "file"])
+def test_a_distortion_that_is_not_used_is_said_on_every_road(road, unused, tmp_path):
+    matches, options = unused if road == "dropped" else unused.without({"e5": "by hand"}), {}
+    if road == "validate":
+        options = {"validate": 0.2}
+    elif road == "file":
+        pipeline.write_matched(tmp_path / "m.ecsv", matches, {})
+        table = read_table(tmp_path / "m.ecsv")
+        matches = ld.Matches.from_table(table, **ld.Matches.read_meta(table.meta))
+    with pytest.warns(AssumptionWarning) as caught:
+        solution = ld.solve(matches, **options)
+    said = [str(each.message) for each in caught]
+    assert re.search(UNUSED, said[0])
+    assert [word.startswith("exposure e5 is left out") for word in said[1:]] == [True] * (road == "dropped")
+    assert set(solution.left_out) == {"e5"}
+    assert state_of(solution) == "warn"
+
+
+def test_commands_one_after_the_other_say_it(tmp_path, sip_night, capsys):
+    found, matched, out = (str(tmp_path / name) for name in ("found.ecsv", "matched.ecsv", "out"))
+    assert main(["measure", *map(str, sip_night[:4]), "--out", found, "--psf", "moffat", "--quiet"]) == 0
+    assert main(["match", found, "--out", matched, "--quiet"]) == 0
+    assert "that is not used" not in capsys.readouterr().err
+    assert main(["solve", matched, "--out", out, "--degree", "2", "--quiet"]) == 0
+    assert re.search(UNUSED, capsys.readouterr().err)
+    assert state_of(ld.Solution.read(tmp_path / "out" / "solution.asdf")) == "warn"
+
+
 def test_the_sky_is_that_of_the_headers():
     """With their distortion as prior, stars are where the headers say, reference pixel off the centre or not."""
     table, sky = positions()
@@ -213,15 +272,8 @@ def test_the_sky_is_that_of_the_headers():
     assert np.abs(off).max() < 0.02
 
 
-def test_run_takes_the_prior_of_the_headers(tmp_path, night, monkeypatch):
-    frames = []
-    for path in night:
-        content, cards = fits.getdata(path), fits.getheader(path)
-        cards["CTYPE1"], cards["CTYPE2"] = "RA---TAN-SIP", "DEC--TAN-SIP"
-        cards.update({"A_ORDER": 2, "B_ORDER": 2, "A_2_0": 1e-5, "B_0_2": 1e-5})
-        frames.append(tmp_path / path.name)
-        fits.writeto(frames[-1], content, cards)
-    given = {}
+def test_run_takes_the_prior_of_the_headers(tmp_path, night, sip_night, monkeypatch):
+    frames, given = sip_night, {}
     monkeypatch.setattr(pipeline, "solve", lambda matches, **options: given.update(options) or pytest.skip("solved"))
     for prior, sigma in (("header", None), (HeaderPrior(sigma=0.3), 0.3)):
         with pytest.raises(pytest.skip.Exception):

@@ -40,9 +40,9 @@ def read(path):
     Returns
     -------
     list of `~astropy.table.Table`
-        One, or as many as an LDAC file has detections of images. ``meta`` has only what is understood: ``shapes``,
-        ``poses``, ``sky``, ``left_out``, ``epoch`` and ``inputs`` as `legdistort.inputs.matches.Matches.to_meta` writes
-        them; ``shape`` of the image; ``program``, "hst1pass" or "DAOPHOT", where the columns do not show it.
+        One, or as many as an LDAC file has detections of images. ``meta`` has only what is understood: ``inputs``, and
+        what `legdistort.inputs.matches.Matches.to_meta` writes; ``shape`` of the image; ``program``, "hst1pass" or
+        "DAOPHOT", where the columns do not show it.
 
     Raises
     ------

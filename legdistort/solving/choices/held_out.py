@@ -11,7 +11,6 @@ import numpy as np
 from astropy import units as u
 
 from ...exceptions import InputError, SolveError
-from ...inputs.matches import Matches
 from ...results import accuracy
 from ...results.diagnostics import Validation
 from ..equations import criterion, elimination, reduced_system
@@ -52,10 +51,14 @@ def hold_out(matches, fraction, *, seed=0):
 
 
 def only_rows(matches, rows):
-    """The same matches with some rows of the table."""
-    known = {"poses": matches.poses, "sky": matches.sky, "left_out": matches.left_out, "allow_copies": True}
-    known["camera"] = matches.camera
-    kept = Matches.from_table(matches.table[rows], shape=matches.shapes, **known)
+    """The same matches with some rows of the table (`Matches.keep`), some in every exposure.
+
+    Raises
+    ------
+    InputError
+        Naming an exposure without any.
+    """
+    kept = matches.keep(rows)
     lost = [name for name in matches.names if name not in kept.names]
     if lost:
         raise InputError(

@@ -78,7 +78,7 @@ def _with_errors(matches, sigma):
     table = matches.table.copy()
     for name in ("x_err", "y_err"):
         table[name] = sigma * u.pix
-    return replace(matches, table=table, observations=None)
+    return replace(matches, table=table)
 
 
 def _law(fit, before):
