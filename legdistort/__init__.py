@@ -19,8 +19,8 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` states the s
     from .inputs.exposure_files import open_exposures as open_exposures
     from .inputs.exposure_files import read_exposures as read_exposures
     from .inputs.exposures import Exposure as Exposure
-    from .inputs.matches import Matches as Matches
     from .matching.matcher import match as match
+    from .matching.matches import Matches as Matches
     from .measurement.effective.model import EffectivePSF as EffectivePSF
     from .measurement.noise_calibration import calibrate_noise as calibrate_noise
     from .measurement.positions import effective_psf as effective_psf
@@ -46,7 +46,7 @@ _PLACES = {
     "Exposure": "inputs.exposures",
     "LegdistortError": "exceptions",
     "LegdistortWarning": "exceptions",
-    "Matches": "inputs.matches",
+    "Matches": "matching.matches",
     "Mosaic": "coaddition.mosaic",
     "Prior": "priors.prior",
     "Solution": "results.solution",

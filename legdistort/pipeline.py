@@ -22,6 +22,7 @@ from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
 from .exceptions import InputError, MatchError
 from .inputs import exposure_files, table_files
+from .inputs.exposure_names import whole_name
 from .inputs.exposures import observed
 from .matching.matcher import match
 from .matching.options import MatchOptions, check_enough
@@ -215,7 +216,7 @@ def run(
             solution = solve(matches, **vars(solving), **tying, progress=progress)
             solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
         with timed(timings, "coadd"):
-            kept = [exposure for exposure in exposures if (exposure.frame or exposure.name) in solution.names]
+            kept = [exposure for exposure in exposures if whole_name(exposure) in solution.names]
             mosaic = coadd(kept, solution, **vars(coadding), **share)
         with timed(timings, "assess"):
             quality = _if_possible(stack_quality.assess, mosaic, solution, exposures=kept)
@@ -270,14 +271,14 @@ def _open_frames(paths, min_exposures, stop_at_bad, progress, *, ext, dq_good, c
     bad = {}
     options = {"ext": ext, "dq_good": dq_good, "stop_at_bad": stop_at_bad, "progress": progress}
     exposures = exposure_files.open_exposures(paths, left_out=bad, **options)
-    exposures = exposures if camera is None else camera.of_detectors(exposures)
+    exposures = camera.of_detectors(exposures) if camera else exposures
     _check_exposures(exposures, min_exposures, bad)
     return exposures, bad
 
 
 def _known_of(exposures, solving, prior, camera):
     """The options of `solve` with the prior of these exposures; choices about a camera are refused without one."""
-    several = camera is not None or any(exposure.frame for exposure in exposures)
+    several = camera.has_focal_plane if camera else any(exposure.exposure for exposure in exposures)
     check_detectors(several, solving.layout, solving.static, solving.dynamic)
     return replace(solving, prior=_known_prior(prior, exposures, solving.degree))
 
@@ -285,7 +286,7 @@ def _known_of(exposures, solving, prior, camera):
 def _where_to_begin(paths, earlier, measuring, **reading):
     """Frames, how they are read, and the earlier run that has measured them, or None."""
     camera = reading["camera"]
-    if camera is not None and not isinstance(camera, Camera):
+    if not isinstance(camera, Camera | None):
         raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
     if earlier is None and paths is None:
         raise InputError("give frames, or the folder of an earlier run to go on from (earlier=, --from)")
@@ -427,10 +428,10 @@ def check_results(out, overwrite):
 
 def _check_exposures(exposures, min_exposures, bad):
     """There are enough, and all show one detector: a run on a mixture would co-add nonsense."""
-    n_frames = len({exposure.frame or exposure.name for exposure in exposures})
+    n_frames = len({whole_name(exposure) for exposure in exposures})
     if n_frames < 2:
         raise MatchError(
-            f"only one exposure ({exposures[0].frame or exposures[0].name}): the distortion is found from the "
+            f"only one exposure ({whole_name(exposures[0])}): the distortion is found from the "
             "differences between exposures, give at least two of the same field"
         )
     detectors = {}

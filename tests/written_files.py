@@ -11,7 +11,7 @@ import numpy as np
 
 import legdistort
 from legdistort.geometry.tangent_plane import TangentPlane
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve

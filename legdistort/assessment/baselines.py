@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 from ..exceptions import InputError, LegdistortError, SolveError
 from ..geometry import similarity
 from ..geometry.distortion import Distortion
-from ..inputs.matches import Matches
+from ..matching.matches import Matches
 from ..priors.prior import means
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings

@@ -9,7 +9,7 @@ exposure adds to them is a distortion of the focal plane as a whole.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,10 +35,12 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from ..inputs.exposures import Exposure
-    from ..runtime.annotations import StrPath
+    from ..runtime.annotations import Shape, StrPath
 
 #: Detectors may lie on each other by this part of their area: layouts to begin with are not exact.
 OVERLAP = 0.05
+#: Name of the camera of plain images.
+IMAGE = "image"
 #: Degree of the series that stand for the published distortions of GSAOI: they differ by less than 1e-6 px.
 GSAOI_DEGREE = 6
 #: Size of a pixel of the focal plane of GSAOI [arcsec], about that of its detectors.
@@ -50,7 +52,11 @@ _SIDE = 32  # points along a side of a detector that are sought on others
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Camera(ShownAsPrinted):
-    """Detectors in one focal plane.
+    """Detectors in one focal plane, or the one detector of plain images.
+
+    One detector whose layout is the identity is a plain image: its pixels are those of the exposure, its static
+    distortion is the prior of `legdistort.solve`, and there is no focal plane beside it (`has_focal_plane`). Exposures
+    without a camera have such a one, of the id "1", which nobody needs to write.
 
     Parameters
     ----------
@@ -101,9 +107,16 @@ class Camera(ShownAsPrinted):
         for key in detectors:
             if not re.fullmatch(r"[\w.+-]+", key):
                 raise InputError(f"ids of detectors become part of file names: letters, digits, _ . + -; got {key!r}")
+        first, *others = detectors.values()
+        field = first.shape if self.field is None and first.is_plain and not others else self.field
+        object.__setattr__(self, "common_sigma", _common(self.common_sigma))
+        if first.is_plain and not others and self.common_sigma is None and field == first.shape:
+            object.__setattr__(self, "detectors", detectors)
+            object.__setattr__(self, "field", field)
+            return
+        detectors = {key: each.placed() for key, each in detectors.items()}
         edges = np.concatenate([each.outline for each in detectors.values()])
         low, high = edges.min(axis=0), edges.max(axis=0)
-        field = self.field
         if field is None:
             first = np.floor(low + 0.5)
             field = tuple(int(n) for n in np.ceil(high - first + 0.5))[::-1]
@@ -119,7 +132,6 @@ class Camera(ShownAsPrinted):
             )
         object.__setattr__(self, "detectors", detectors)
         object.__setattr__(self, "field", field)
-        object.__setattr__(self, "common_sigma", _common(self.common_sigma))
         self._check_overlaps()
 
     def _check_overlaps(self):
@@ -132,6 +144,24 @@ class Camera(ShownAsPrinted):
                         f"detectors {first} and {second} of camera {self.name} lie on each other by "
                         f"{100 * share:.0f} % of their area: correct the layouts (focal plane -> undistorted pixels)"
                     )
+
+    @classmethod
+    def of_images(cls, shapes: Iterable[Shape]) -> Camera:
+        """The camera of plain images: one detector, "1", as large as the largest of the shapes ``(ny, nx)``."""
+        shape = tuple(int(n) for n in np.max(list(shapes), axis=0))
+        return cls(IMAGE, {"1": Detector(shape)})
+
+    @property
+    def has_focal_plane(self) -> bool:
+        """Whether the detectors lie in a focal plane that is more than the pixels of one of them."""
+        first, *others = self.detectors.values()
+        return bool(others) or not first.is_plain or self.common_sigma is not None or self.field != first.shape
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is more to it than plain images have: a focal plane, a name, or a static distortion."""
+        static = [np.any(each.static) or each.static_sigma is not None for each in self.detectors.values()]
+        return self.has_focal_plane or self.name != IMAGE or any(static) or list(self.detectors) != ["1"]
 
     def __getitem__(self, key: str) -> Detector:
         """The `Detector` of an id."""
@@ -158,7 +188,7 @@ class Camera(ShownAsPrinted):
         InputError
             Without the column ``detector``, or for a detector that the camera does not have.
         """
-        if "x_detector" in table.colnames:
+        if not self.has_focal_plane or "x_detector" in table.colnames:
             return table
         table, detector = table.copy(), self.ids(table)
         xy = np.stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)], axis=1)
@@ -173,6 +203,8 @@ class Camera(ShownAsPrinted):
 
     def on_detectors(self, table: QTable) -> QTable:
         """A table that `in_focal_plane` made, as it was before."""
+        if not self.has_focal_plane:
+            return table
         table, detector = table.copy(), self.ids(table)
         f = np.stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)], axis=1)
         covariance = column_contract.covariance(table)
@@ -187,6 +219,8 @@ class Camera(ShownAsPrinted):
 
     def ids(self, table: Table) -> np.ndarray:
         """Detector of every row of a table, as strings; `InputError` if there is none, or one that is not known."""
+        if "detector" not in table.colnames and len(self.detectors) == 1:
+            return np.full(len(table), *self.detectors)
         if "detector" not in table.colnames:
             raise InputError(
                 f"the table has no column detector, which of {', '.join(self.detectors)} of camera {self.name}"
@@ -225,6 +259,8 @@ class Camera(ShownAsPrinted):
 
     def __repr__(self) -> str:
         ny, nx = self.field
+        if not self.has_focal_plane:
+            return f"<Camera {self.name}: one detector of {nx} x {ny} px>"
         return f"<Camera {self.name}: {len(self.detectors)} detectors in a focal plane of {nx} x {ny} px>"
 
     def __str__(self) -> str:
@@ -278,11 +314,11 @@ class Camera(ShownAsPrinted):
         return cls("GSAOI", detectors)
 
     def of_detectors(self, exposures: Sequence[Exposure]) -> list[Exposure]:
-        """Exposures whose detectors are in files of their own, with their `frame` and `detector`.
+        """Exposures whose detectors are in files of their own, with their `exposure` and `detector`.
 
         The detector is the one that the header names (``CCDCHIP``, ``DETECTOR``, ``CHIP``, ``EXTVER`` or ``EXTNAME``),
-        the frame the name of the file without it. Those read from one file by the name of its extensions are as they
-        were.
+        the exposure is the name of the file without it. Those read from one file by the name of its extensions are as
+        they were.
 
         Raises
         ------
@@ -290,6 +326,8 @@ class Camera(ShownAsPrinted):
             If a header names no detector of the camera, a file name does not have it, or one is not of this camera
             (`check`).
         """
+        if not self.has_focal_plane:
+            return list(exposures)
         exposures = of_files(exposures, self.detectors)
         for exposure in exposures:
             self.check(exposure)
@@ -321,12 +359,12 @@ class Camera(ShownAsPrinted):
         Parameters
         ----------
         exposures : list of Exposure
-            Of the same camera, with `frame` and `detector`.
+            Of the same camera, with `exposure` and `detector`.
         """
-        frames = {}
+        parts = {}
         for exposure in exposures:
-            frames.setdefault(exposure.frame, []).append(exposure)
-        return cls.from_exposures(max(frames.values(), key=len))
+            parts.setdefault(exposure.exposure, []).append(exposure)
+        return cls.from_exposures(max(parts.values(), key=len))
 
     @classmethod
     def from_exposures(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -65,11 +65,11 @@ class Detector(ShownAsPrinted):
     ----------
     shape : tuple
         ``(ny, nx)``.
-    layout : array_like, shape (2, 3)
-        Affine map ``[M | t]``: focal-plane pixels -> undistorted pixels of the detector.
+    layout : array_like, shape (2, 3), optional
+        Affine map ``[M | t]``: focal-plane pixels -> undistorted pixels of the detector; the identity if not given.
     static : Prior or array_like, shape (2, n_modes), optional
-        Static distortion, normalised Legendre modes, x then y, pixels (undistorted -> detector). Orders 0 and 1 belong
-        to the layout: what is given there is moved into it.
+        Static distortion, normalised Legendre modes, x then y, pixels (undistorted -> detector). Of a detector in a
+        focal plane orders 0 and 1 belong to the layout: what is given there is moved into it.
     layout_sigma : array_like, optional
         Standard deviation of the layout, as that of modes of orders 0 and 1 over the detector (constant, x, y), pixels:
         a number, (3,) or (2, 3); infinite where nothing is known. None takes it as exact.
@@ -99,7 +99,7 @@ class Detector(ShownAsPrinted):
 
     shape: tuple[int, int]
     _: KW_ONLY
-    layout: np.ndarray
+    layout: np.ndarray = field(default_factory=lambda: np.eye(2, 3))
     static: np.ndarray | None = None
     layout_sigma: np.ndarray | None = None
     static_sigma: np.ndarray | None = None
@@ -116,7 +116,8 @@ class Detector(ShownAsPrinted):
                 raise InputError(f"the prior is for a detector of shape {static.shape}, this one has {shape} (ny, nx)")
             static, sigma = static.mean, static.static_sigma if sigma is None else sigma
         static = np.zeros((2, 1)) if static is None else Distortion(static, shape).coefficients
-        static, layout = _split(static, shape, layout)
+        if not np.array_equal(layout, np.eye(2, 3)):
+            static, layout = _split(static, shape, layout)
         given = {"shape": shape, "layout": layout, "static": static}
         covariance = _covariance(self.layout_covariance)
         widths = self.layout_sigma if covariance is None else np.sqrt(np.diag(covariance)).reshape(2, 3)
@@ -124,6 +125,16 @@ class Detector(ShownAsPrinted):
         given["static_sigma"] = _widths(sigma, static.shape[1], "static_sigma")
         for key, value in given.items():
             object.__setattr__(self, key, value)
+
+    def placed(self) -> Detector:
+        """The same map with all of orders 0 and 1 in the layout, as detectors of a focal plane have it."""
+        static, layout = _split(self.static, self.shape, self.layout)
+        return replace(self, static=static, layout=layout) if np.any(self.static[:, :3]) else self
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether its layout is the identity, exactly: its undistorted pixels are those of the focal plane."""
+        return self.layout_sigma is None and np.array_equal(self.layout, np.eye(2, 3))
 
     @cached_property
     def distortion(self) -> Distortion:

@@ -29,10 +29,10 @@ def check_places(matches):
     Parameters
     ----------
     matches : Matches
-        With a camera or without.
+        Of a camera.
     """
     camera = matches.camera
-    if camera is None or len(camera.detectors) < 2:
+    if len(camera.detectors) < 2:
         return
     keys, detector = np.unique(camera.ids(matches.table), return_inverse=True)
     xy = np.stack([matches.table[f"{axis}_detector"].value for axis in "xy"], axis=1)

@@ -41,11 +41,12 @@ def focal_planes(camera, exposures):
     ----------
     camera : Camera
     exposures : list of Exposure
-        With `frame` and `detector`.
+        With `exposure` and `detector`.
 
     Returns
     -------
     list of FocalPlane
+        Or the exposures themselves where there is no focal plane beside their pixels.
 
     Raises
     ------
@@ -53,11 +54,13 @@ def focal_planes(camera, exposures):
         For an exposure that does not state its detector, a detector that the camera does not have, or one of another
         shape.
     """
-    frames = {}
+    if not camera.has_focal_plane:
+        return exposures
+    planes = {}
     for exposure in exposures:
         camera.check(exposure)
-        frames.setdefault(exposure.frame, []).append(exposure)
-    return [FocalPlane(name, camera.field, _wcs(camera, parts), parts[0].header) for name, parts in frames.items()]
+        planes.setdefault(exposure.exposure, []).append(exposure)
+    return [FocalPlane(name, camera.field, _wcs(camera, parts), parts[0].header) for name, parts in planes.items()]
 
 
 def _wcs(camera, parts):

@@ -128,7 +128,7 @@ def do_noise(a):
 
 def do_match(a):
     """``legdistort match``."""
-    if a.camera is not None:
+    if a.camera:
         _refuse({"shape": a.shape}, "comes from --camera")
     from ..measurement.earlier import measured_frames
     from ..pipeline import timed, write_matched
@@ -177,15 +177,15 @@ def do_solve(a):
     _refuse_ignored(a)
     with outputs.replacing_folder(a.out, former=RESULTS) as target:  # a mosaic there does not belong to this solution
         table = _read_table(a.table, a)
-        known = legdistort.Matches.read_meta(table.meta, camera=legdistort.Camera.from_meta)
+        known = legdistort.Matches.read_meta(table.meta)
         known |= {"shape": tuple(a.shape)} if a.shape else {}
         known |= {"camera": _camera(a.camera)} if a.camera else {}
-        if known["camera"] is None:
-            _refuse({"layout": a.layout}, "is for the detectors of a camera")
-        else:
+        if known["camera"]:
             _refuse({"shape": a.shape}, "comes from the camera")
-        if known["shape"] is None and known["camera"] is None:
-            raise InputError(f"{a.table} does not state the size of the detectors: give --shape NY NX")
+        else:
+            _refuse({"layout": a.layout}, "is for the detectors of a camera")
+            if known["shape"] is None:
+                raise InputError(f"{a.table} does not state the size of the detectors: give --shape NY NX")
         matches = legdistort.Matches.from_table(table, **known)
         with timed({}, "solve"):
             solution = legdistort.solve(matches, **_solving(a, a.shape), progress=wants_progress(a))
@@ -254,7 +254,7 @@ def do_predict(a):
         keywords["stars"] = _read_table(a.stars, a)
     else:
         _refuse({"columns": a.columns or None, "origin": a.origin, "error": a.error}, "is for the table of --stars")
-    if a.camera is not None:
+    if a.camera:
         _refuse({"shape": a.shape}, "comes from --camera")
     if a.shape is not None:
         keywords["shape"] = tuple(a.shape)
@@ -419,9 +419,7 @@ def _read_table(path, a):
 
 def _camera(given):
     """The camera of ``--camera``; None without one."""
-    if given is None:
-        return None
-    return legdistort.Camera.gsaoi() if given == "gsaoi" else legdistort.Camera.read(given)
+    return legdistort.Camera.gsaoi() if given == "gsaoi" else given and legdistort.Camera.read(given)
 
 
 def _solution(a):

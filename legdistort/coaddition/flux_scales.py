@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from ..exceptions import AssumptionWarning, InputError, warn
+from ..inputs.exposure_names import whole_name
 from .options import by_name
 from .pairs import median_differences, values_from_differences
 
@@ -59,9 +60,9 @@ def _factors(frames, scale, views, areas):
         return np.ones(len(frames)), "none"
     if scale == "exptime":
         return _time_scales(frames, [f.exposure_time or None for f in frames]), "exptime"
-    exposures = list(dict.fromkeys(f.frame or f.name for f in frames))
+    exposures = list(dict.fromkeys(whole_name(f) for f in frames))
     detectors = list(dict.fromkeys(f.detector for f in frames))
-    place = np.array([(exposures.index(f.frame or f.name), detectors.index(f.detector)) for f in frames])
+    place = np.array([(exposures.index(whole_name(f)), detectors.index(f.detector)) for f in frames])
     first = [frames[k] for k in np.unique(place[:, 0], return_index=True)[1]]
     stars = _star_scales(views, place, areas)
     if stars is None and scale == "stars":

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.star_hull import support
+from ..inputs.exposure_names import whole_name
 from ..inputs.sky_wcs import leads_elsewhere, warn_of_another_field
 from ..results.solution import Solution
 from ..results.view import image_view
@@ -275,7 +276,7 @@ def _select(exposures, solution):
     for frame in exposures:
         view = image_view(solution, frame)
         if view is None:
-            whole = solution.left_out.get(frame.frame or frame.name, "it is not in the solution")
+            whole = solution.left_out.get(whole_name(frame), "it is not in the solution")
             left_out[frame.name] = solution.left_out.get(frame.name, whole)
         elif frame.shape != tuple(view.shape):
             raise InputError(

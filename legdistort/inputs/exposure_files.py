@@ -56,7 +56,7 @@ class ExposureFile(ShownAsPrinted):
     Attributes
     ----------
     name, wcs, header, saturation, gain, read_noise, exposure_time, path
-        As those of the `Exposure`; so are `has_gwcs`, `frame` and `detector`.
+        As those of the `Exposure`; so are `has_gwcs`, `exposure` and `detector`.
     shape : tuple
         ``(ny, nx)``.
     checksum, pixels : str
@@ -84,7 +84,7 @@ class ExposureFile(ShownAsPrinted):
     ext: Extension | None = None
     has_gwcs: bool = False
     dq_good: int | None = None
-    frame: str | None = None
+    exposure: str | None = None
     detector: str | None = None
 
     def read(self) -> Exposure:
@@ -148,7 +148,7 @@ def read_exposures(
     ext : int, str or (str, int), optional
         Extension to read from every file; by default the image, ``SCI`` if one is named so. Planes beside it (``DQ``,
         ``WHT`` and the like) do not count. A name that several extensions have stands for all of them, the detectors of
-        a camera: each becomes an `Exposure` ``NAME-ID`` with the ``frame`` NAME and the ``detector`` ID, which is
+        a camera: each becomes an `Exposure` ``NAME-ID`` with the ``exposure`` NAME and the ``detector`` ID, which is
         ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header.
     dq_good : int, str or sequence of int, optional
         Flags of the DQ plane that are no reason to leave a pixel out, a sum of bits or ``"64,32"``; all others are.

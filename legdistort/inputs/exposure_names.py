@@ -18,9 +18,14 @@ def exposure_name(path, ext=None):
     return name if ext is None else f"{name}_{''.join(map(str, parts))}"
 
 
-def detector_name(frame, detector):
+def detector_name(exposure, detector):
     """Name of the part of an exposure that one detector of a camera took; no name of an extension looks like it."""
-    return f"{frame}-{detector}"
+    return f"{exposure}-{detector}"
+
+
+def whole_name(image):
+    """Name of the exposure that an image is of: the one that several detectors share, or its own."""
+    return image.exposure or image.name
 
 
 def in_header(name):

@@ -13,7 +13,7 @@ from astropy.io import fits
 
 from ..exceptions import DamagedError, InputError
 from ..runtime.notebook import ShownAsPrinted
-from .exposure_names import check_exposure_name
+from .exposure_names import check_exposure_name, whole_name
 
 if TYPE_CHECKING:
     from astropy.wcs.wcsapi import BaseHighLevelWCS
@@ -68,7 +68,7 @@ class Exposure(ShownAsPrinted):
     path : `~pathlib.Path` or None
     has_gwcs : bool
         Whether its file has an extension ``ASDF`` beside it, which may hold a gwcs.
-    frame, detector : str or None
+    exposure, detector : str or None
         Of a camera with several detectors: name of the exposure that they share, and id of the one that took this part.
 
     Raises
@@ -101,7 +101,7 @@ class Exposure(ShownAsPrinted):
     exposure_time: float | None = None
     path: Path | None = None
     has_gwcs: bool = False
-    frame: str | None = None
+    exposure: str | None = None
     detector: str | None = None
 
     def __post_init__(self) -> None:
@@ -170,7 +170,7 @@ def observed(exposures):
     dates = sorted(date for h in headers if re.match(r"\d{4}-\d\d-\d\d", date := str(h.get("DATE-OBS", ""))))
     if dates:
         found["dates"] = dates[0] if dates[0] == dates[-1] else f"{dates[0]} to {dates[-1]}"
-    frames = {exposure.frame or exposure.name: exposure.exposure_time for exposure in exposures}
+    frames = {whole_name(exposure): exposure.exposure_time for exposure in exposures}
     times = [time for time in frames.values() if time]
     if times and len(times) == len(frames):
         same = min(times) == max(times)

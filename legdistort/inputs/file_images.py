@@ -76,9 +76,9 @@ def every_id(images, ext):
 
 
 def of_files(exposures, ids):
-    """Exposures whose detectors are in files of their own, with `frame` and `detector`.
+    """Exposures whose detectors are in files of their own, with `exposure` and `detector`.
 
-    The detector is that of `ids` which the header names (`KEYWORDS`), the frame the name of the file without it.
+    The detector is that of `ids` which the header names (`KEYWORDS`), the exposure is the name of the file without it.
 
     Parameters
     ----------
@@ -103,22 +103,22 @@ def of_files(exposures, ids):
                 f"({', '.join(KEYWORDS)}): read all extensions of a file by their name (ext='SCI', --ext SCI), or "
                 "correct the ids of the camera"
             )
-        frame = re.sub(
+        whole = re.sub(
             rf"[-_.]?(?<![A-Za-z0-9]){re.escape(key)}(?![A-Za-z0-9])", "", exposure.name, flags=re.IGNORECASE
         )
-        if frame in ("", exposure.name):
+        if whole in ("", exposure.name):
             raise InputError(
                 f"{exposure.name} is of detector {key}, which its name does not contain: files of one exposure are "
                 f"those with one name but for the detector, such as {exposure.name}_{key}; rename them"
             )
-        out.append(replace(exposure, frame=frame, detector=key))
+        out.append(replace(exposure, exposure=whole, detector=key))
     return out
 
 
 def of_detector(exposure, ext, key):
     """An exposure that was read from one of several images of a file, named after its detector."""
-    frame = exposure.name.removesuffix(f"_{''.join(map(str, ext))}")
-    return replace(exposure, name=detector_name(frame, key), frame=frame, detector=key)
+    whole = exposure.name.removesuffix(f"_{''.join(map(str, ext))}")
+    return replace(exposure, name=detector_name(whole, key), exposure=whole, detector=key)
 
 
 def extension_names(hdulist, path):

@@ -13,7 +13,7 @@ from ..cameras.detector import Detector
 from ..exceptions import InputError, MatchError
 from ..geometry import basis, similarity
 from ..inputs.exposure_names import detector_name
-from ..inputs.matches import Matches
+from .matches import Matches
 
 
 def is_needed(table, exposures):

@@ -17,8 +17,8 @@ from ..exceptions import AssumptionWarning, InputError, MatchError, warn
 from ..geometry.epochs import header_epoch, mean_epoch
 from ..inputs import column_contract, repetitions
 from ..inputs.exposure_files import ExposureFile, listed
+from ..inputs.exposure_names import whole_name
 from ..inputs.exposures import Exposure
-from ..inputs.matches import Matches, in_focal_plane, shapes_by_exposure
 from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE
@@ -27,6 +27,7 @@ from ..runtime import parallel
 from . import detector_layout
 from .exposure_groups import interlink, link, standing, unite, without
 from .header_poses import HeaderPoses
+from .matches import Matches, in_focal_plane, shapes_by_exposure
 from .options import MatchOptions, check_enough
 from .star_labels import label_stars
 from .star_lists import StarList
@@ -132,16 +133,17 @@ def match(
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
     table["exposure"] = table["exposure"].astype(str)
     exposures = None if exposures is None else listed(exposures, "match")
-    if camera is None and detector_layout.is_needed(table, exposures):
-        shapes = detector_layout.shapes_of(table, exposures, shape)
-        log.info("neither a camera nor headers: how the detectors lie is sought in the dithers")
-        _add_epochs(table, {exposure.frame or exposure.name: exposure for exposure in exposures or ()})
-        again = vars(replace(options, columns=None))
-        return detector_layout.match_parts(table, shapes, lambda parts, shape: match(parts, shape=shape, **again))
-    if camera is None and exposures is not None and any(e.detector is not None for e in exposures):
-        camera = Camera.of_frames(exposures)
-        log.info("layout of the detectors by the headers: %s", camera)
-    if camera is not None:
+    if camera is None:
+        if detector_layout.is_needed(table, exposures):
+            shapes = detector_layout.shapes_of(table, exposures, shape)
+            log.info("neither a camera nor headers: how the detectors lie is sought in the dithers")
+            _add_epochs(table, {whole_name(exposure): exposure for exposure in exposures or ()})
+            again = vars(replace(options, columns=None))
+            return detector_layout.match_parts(table, shapes, lambda parts, shape: match(parts, shape=shape, **again))
+        if any(exposure.detector is not None for exposure in exposures or ()):
+            camera = Camera.of_frames(exposures)
+            log.info("layout of the detectors by the headers: %s", camera)
+    if camera:
         table = in_focal_plane(table, camera)
         shape = camera.field
         exposures = None if exposures is None else focal_planes(camera, exposures)
@@ -169,7 +171,8 @@ def match(
     if not isolated.all():
         log.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
         star[~isolated] = -1
-    _check_detectors(camera, table, star, shapes)
+    if camera:
+        _check_detectors(camera, table, star, shapes)
     table, star = _keep_common(table, star, min_exposures, left_out)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
     _add_epochs(table, named or {})
@@ -180,10 +183,9 @@ def match(
 
 def _check_detectors(camera, table, star, shapes):
     """`check_places` with all stars that were found twice: few of those that cross are in many exposures."""
-    if camera is not None:
-        table, star = _keep_common(table, star, 2, {})
-        table["star"] = star
-        check_places(replace(Matches.from_table(table, shape=shapes, allow_copies=True), camera=camera))
+    table, star = _keep_common(table, star, 2, {})
+    table["star"] = star
+    check_places(replace(Matches.from_table(table, shape=shapes, allow_copies=True), camera=camera))
 
 
 def _check_measured(detections):

@@ -10,6 +10,7 @@ from astropy.table import Table
 from ..cameras.camera import Camera
 from ..exceptions import AssumptionWarning, InputError, LegdistortError, some_of, warn
 from ..inputs.exposure_files import ExposureFile, file_checksums, open_exposures
+from ..inputs.exposure_names import whole_name
 from ..inputs.table_files import read_table, write_table
 from .effective.model import EffectivePSF
 
@@ -94,7 +95,7 @@ class EarlierRun:
                 )
             if measured[file] != checksum:
                 raise InputError(f"{file} is not as it was measured in {self.folder}: measure the frames again")
-        names = [exposure.frame or exposure.name for exposure in exposures]
+        names = [whole_name(exposure) for exposure in exposures]
         table = self.table[np.isin(self.table["exposure"], names)]
         table.meta = {}
         files = {exposure.name: self.folder / PSFS / f"{exposure.name}.fits" for exposure in exposures}
@@ -153,6 +154,6 @@ def write_detections(path, detections, exposures, out, *, ext=None, dq_good=None
         "shapes": {exposure.name: list(exposure.shape) for exposure in exposures},
         "ext": list(ext) if isinstance(ext, tuple) else ext,
         "dq_good": dq_good,
-        "camera": None if camera is None else camera.to_meta(),
+        "camera": camera and camera.to_meta(),
     }
     write_table(table, path, overwrite=overwrite)

@@ -289,7 +289,7 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
 def _of_frame(table, exposure):
     """The table of a detector of a camera with the columns exposure and detector."""
     if exposure.detector is not None:
-        table["exposure"] = np.full(len(table), exposure.frame)
+        table["exposure"] = np.full(len(table), exposure.exposure)
         table.add_column(np.full(len(table), exposure.detector), name="detector", index=1)
     return table
 

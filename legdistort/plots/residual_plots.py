@@ -158,7 +158,7 @@ def plot_mean_residuals(solution, *, scale=None, ax=None):
     ny, nx = np.max(list(solution.estimate.shapes.values()), axis=0)
     long = np.percentile([*np.hypot(*mean.T), *error], 90) if len(error) else 0
     scale = scale or elements.round_down(0.8 * max(nx, ny) / _CELLS / (long or 1))
-    if solution.camera is not None:
+    if solution.camera.has_focal_plane:
         outline_detectors(solution.camera, ax)
     size = 2 * scale * error
     ax.add_collection(

@@ -51,7 +51,7 @@ def plot_residuals(view, *, scale=None, ax=None):
     scale = scale or elements.round_down(0.08 * max(nx, ny) / (np.percentile(np.hypot(dx, dy)[rows], 90) or 1))
     if len(rows) > _MAX_ARROWS:
         rows = np.random.default_rng(0).choice(rows, _MAX_ARROWS, replace=False)
-    if view.chip is None and view.solution.camera is not None:
+    if view.chip is None and view.solution.camera.has_focal_plane:
         outline_detectors(view.solution.camera, ax)
     ax.plot(x[~used], y[~used], "x", color=elements.RED, markersize=4, label="not used", linestyle="none")
     arrows = ax.quiver(

@@ -77,8 +77,8 @@ def solution_rows(solution, facts):
     error = facts["max_inverse_error_px"]
     rows["Largest error of an inverse"] = error if isinstance(error, str) else f"{error:.1e} px"
     rows["Minimisation"] = solution.status
-    if solution.camera is not None:
-        rows["Camera"] = in_tables.camera_sentence(solution)
+    if camera := in_tables.camera_sentence(solution):
+        rows["Camera"] = camera
     rows["Gauge"] = solution.gauge.sentence
     rows |= {key.capitalize(): sentence for key, sentence in solution.diagnostics.in_words().items()}
     if solution.estimate.motions is not None:

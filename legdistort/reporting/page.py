@@ -133,7 +133,7 @@ def _details(gallery, solution, pulls, psfs, facts, comparison, stacks):
     first = next(iter((psfs or {}).items()), None)
     camera = solution.camera
     pictures = [
-        *([gallery.camera(camera)] if camera is not None else []),
+        *([gallery.camera(camera)] if camera.has_focal_plane else []),
         *gallery.distortions(solution),
         *([gallery.trends(solution, pulls, facts.get("quality"))] if len(solution.names) > 2 else []),
         *([gallery.psf(*first)] if first else []),
@@ -144,7 +144,7 @@ def _details(gallery, solution, pulls, psfs, facts, comparison, stacks):
             *([compared_stacks(stacks, gallery)] if stacks else []),
         ],
         "exposures": exposures_table(solution),
-        "detectors": None if camera is None else (camera.name, detectors_table(camera)),
+        "detectors": (camera.name, detectors_table(camera)) if camera.has_focal_plane else None,
         "stars": stars_table(solution, pulls),
         "more": pictures,
     }

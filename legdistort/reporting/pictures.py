@@ -80,7 +80,7 @@ class Gallery:
 
     def mean_residuals(self, solution):
         """Residuals over the detector."""
-        place = "on the detector" if solution.camera is None else "in the focal plane, with its detectors"
+        place = "on the detector" if not solution.camera.has_focal_plane else "in the focal plane, with its detectors"
         ax = residual_plots.plot_mean_residuals(solution, ax=_quick_figure(6.0, 6.0).subplots())
         return self.add(
             ax.figure,

@@ -128,7 +128,7 @@ def sky_sentence(solution):
 def camera_sentence(solution):
     """Which camera it is, and what of it the exposures do not determine; empty without one."""
     camera = solution.camera
-    if camera is None:
+    if not camera.has_focal_plane:
         return ""
     ny, nx = camera.field
     ids = ", ".join(camera.detectors)
@@ -167,7 +167,7 @@ def printed(solution):
         f"{'rms x':>7s} {'rms y':>7s} {'distortion':>10s}{'' if solution.sky is None else _SKY_HEADS}",
     ]
     lines += [_row(view) for view in solution]
-    if solution.camera is not None:
+    if solution.camera.has_focal_plane:
         lines += ["", *solution.camera.table_lines()]
     lines += [f"left out {name}: {reason}" for name, reason in solution.left_out.items()]
     return "\n".join(lines)
@@ -193,7 +193,7 @@ def _row(view):
 
 
 def _static_in_words(solution):
-    if solution.settings.static != "fit" or solution.camera is not None:
+    if solution.settings.static != "fit" or solution.camera.has_focal_plane:
         return []
     own = solution.settings.exposure_degree
     mine = f"modes up to degree {own}" if own else "its pose alone"

@@ -226,9 +226,9 @@ def covariances(view, q, measured, moved=None):
         own = own + carried(moved.columns, absolute_errors.own_blocks(*known)[terms])
         directions = directions + moved.columns @ uncertainty.drift_directions[terms[:2]]
     absolute = own + carried(directions, hidden)
-    if (camera := uncertainty.camera) is not None and solution.camera is not None:
+    if uncertainty.camera:
         f = solution[view.name].distortion(q)
-        absolute[camera.lost(solution.camera, f, view.detector)] = np.nan
+        absolute[uncertainty.camera.lost(solution.camera, f, view.detector)] = np.nan
     for each in gauge.unknown:
         moved = by_modes @ widened(each.coefficients[i].reshape(-1, 1), solution.degree)
         absolute[np.sum(moved**2, axis=(1, 2)) > np.trace(absolute, axis1=1, axis2=2)] = np.nan
@@ -248,7 +248,7 @@ def by_camera(view, q, by_modes, back):
     """
     solution = view.solution
     errors = solution.estimate.uncertainty.camera
-    if errors is None or solution.camera is None:
+    if errors is None:
         return np.zeros((len(q), 2, 2))
     seen = errors.in_focal_plane(solution.camera, solution[view.name].distortion(q), view.detector)
     through = back @ seen - by_modes @ errors.coefficients[view.index]
@@ -283,8 +283,7 @@ def _taken_off(gauge, positions):
 def correct_table(solution, table, epoch=None):
     """`Solution.correct_table`; see there."""
     table = column_contract.check(table, column_contract.DETECTED, "the table of positions")
-    if solution.camera is not None:
-        table = solution.camera.in_focal_plane(table)
+    table = solution.camera.in_focal_plane(table)
     if epoch is not None:
         fitted(solution.estimate.motions)
     if epoch is not None and "star" not in table.colnames:
@@ -319,7 +318,7 @@ def _parts(solution, table):
     exposures = np.asarray(table["exposure"]).astype(str)
     for name in dict.fromkeys(exposures.tolist()):
         rows = np.flatnonzero(exposures == name)
-        if solution.camera is None:
+        if not solution.camera.has_focal_plane:
             yield solution[name], rows
             continue
         detector = solution.camera.ids(table[rows])

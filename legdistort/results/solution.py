@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from astropy.table import QTable
 
+from ..cameras.camera import Camera
 from ..geometry.tangent_plane import TangentPlane
 from ..plots import residual_plots
 from ..runtime.notebook import ShownAsPrinted
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from astropy.time import Time
     from matplotlib.axes import Axes
 
-    from ..cameras.camera import Camera
     from ..runtime.annotations import StrPath
     from .check import Check
 
@@ -72,9 +72,9 @@ class Solution(ShownAsPrinted):
         ``{exposure: reason}``.
     provenance : dict
         ``created``, ``versions`` of packages and, if files went in, ``inputs`` ``{base name: SHA-256}``.
-    camera : `legdistort.Camera` or None
-        Where several detectors were solved as one focal plane: positions, shapes and distortions then are those of the
-        focal plane.
+    camera : `legdistort.Camera`
+        Of a camera with a focal plane (`Camera.has_focal_plane`) positions, shapes and distortions are those of that.
+        That of plain images has one detector, "1"; it need not be given.
     checksum : str or None
         SHA-256 of the file that it was read from, in hexadecimal digits.
 
@@ -116,8 +116,12 @@ class Solution(ShownAsPrinted):
     sky: TangentPlane | None = None
     left_out: dict[str, str] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
-    camera: Camera | None = None
+    camera: Camera = None
     checksum: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.camera is None:
+            object.__setattr__(self, "camera", Camera.of_images(self.estimate.shapes.values()))
 
     # -- exposures
 

@@ -73,7 +73,7 @@ def write_solution(solution, path, *, overwrite=False):
         "gauge": _gauge_tree(solution.gauge),
         "sky": solution.sky and dataclasses.asdict(solution.sky),
         "left_out": solution.left_out,
-        "camera": solution.camera and cameras.to_tree(solution.camera),
+        "camera": cameras.to_tree(solution.camera) if solution.camera.is_known else None,
         "checks": [dataclasses.asdict(each) for each in solution.checks],
     }
     content = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)

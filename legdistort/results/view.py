@@ -94,7 +94,10 @@ class View(ShownAsPrinted):
         """Ids of the detectors: all of the exposure, or the one that this view is of."""
         if self.detector is not None:
             return (self.detector,)
-        return ("1",) if self.solution.camera is None else tuple(self.solution.camera.detectors)
+        table, camera = self.solution.residuals, self.solution.camera
+        if camera.has_focal_plane or "detector" not in table.colnames:
+            return tuple(camera.detectors)
+        return tuple(dict.fromkeys(np.asarray(self.residuals["detector"]).astype(str).tolist()))
 
     @property
     def label(self) -> str:
@@ -104,7 +107,7 @@ class View(ShownAsPrinted):
     @property
     def parts(self) -> tuple[View, ...]:
         """Views whose pixels are those of images: this one, or those of all detectors of a focal plane."""
-        if self.chip is not None or self.solution.camera is None:
+        if self.chip is not None or not self.solution.camera.has_focal_plane:
             return (self,)
         return tuple(self.solution[self.name, key] for key in self.detectors)
 
@@ -112,7 +115,7 @@ class View(ShownAsPrinted):
     def chip(self) -> Detector | None:
         """The `Detector`, if this view is of one in a focal plane; else None."""
         camera = self.solution.camera
-        return None if camera is None or self.detector is None else camera[self.detector]
+        return camera[self.detector] if camera.has_focal_plane and self.detector is not None else None
 
     @property
     def _pixels(self) -> View:
@@ -386,7 +389,7 @@ class View(ShownAsPrinted):
         if self.chip is not None:
             return detector_view.covariance(self, block)
         camera = self.solution.estimate.uncertainty.camera
-        return block if camera is None else block + camera.of_coefficients(self.index)
+        return block + camera.of_coefficients(self.index) if camera else block
 
     def sigma_map(
         self, *, n: int = 64, support: bool = True, absolute: bool = False
@@ -474,7 +477,7 @@ class View(ShownAsPrinted):
     def __repr__(self) -> str:
         ny, nx = self.shape
         words = [f"{self.n_stars} stars", f"degree {self.distortion.degree}", f"{nx} x {ny} px"]
-        if self.detector is None and self.solution.camera is not None:
+        if self.chip is None and self.solution.camera.has_focal_plane:
             words[-1] = f"focal plane of {nx} x {ny} px, detectors {some_of(self.detectors, _MOST_NAMED)}"
         return f"<View of {self.label}: {', '.join(words)}>"
 
@@ -520,7 +523,7 @@ def check_key(solution, key):
 
 def image_view(solution, image):
     """The view of an image, an Exposure or ExposureFile, by its exposure and detector or by its name; None without."""
-    key = image.name if solution.camera is None else (image.frame, image.detector)
+    key = (image.exposure, image.detector) if solution.camera.has_focal_plane else image.name
     if key in solution:
         return solution[key]
     return None
@@ -534,8 +537,7 @@ def error_map(view, *, n=64, support=True, absolute=False):
     y = np.linspace(-0.5, ny - 0.5, max(2, round(ny / step)))
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     common = view.solution[view.name]
-    chip = None if view.detector is None or view.solution.camera is None else view.solution.camera[view.detector]
-    q = common.distortion.invert(grid if chip is None else chip.to_focal_plane(grid))
+    q = common.distortion.invert(grid if view.chip is None else view.chip.to_focal_plane(grid))
     if absolute:
         covariance = new_positions.covariances(view, q, np.zeros((len(q), 2, 2)))[1]
     else:

@@ -155,7 +155,7 @@ _OF_CAMERA = {False: {"n_stars": 300, "size": 1024, "dither": 125.0}, True: {"si
 
 def make_night(small, *, camera=None, **settings):
     """`SMALL_NIGHT` or the default `Night` with some attributes changed; `InputError` for what is none of them."""
-    if camera is not None:
+    if camera:
         settings = _OF_CAMERA[bool(small)] | settings | {"camera": camera}
     known = [field.name for field in fields(Night)]
     unknown = sorted(settings.keys() - known)
@@ -246,7 +246,7 @@ def _point_wrongly(rng, true_poses, error):
 def stars_inside(truth, night, xy):
     """Which positions lie at least 3 FWHM inside each exposure, on any detector, bool (n_exposures, n)."""
     margin = 3 * night.fwhm
-    if truth.camera is None:
+    if not truth.camera:
         return np.array([within(truth.distort(name, xy), truth.shape, margin) for name in truth.names])
     keys, size = truth.camera.detectors, (night.size, night.size)
     on = [[within(truth.on_detector(name, key, xy), size, margin) for key in keys] for name in truth.names]

@@ -16,8 +16,8 @@ from astropy.table import QTable
 
 from ..exceptions import InputError
 from ..geometry import similarity
-from ..inputs.matches import Matches
 from ..inputs.table_files import write_table
+from ..matching.matches import Matches
 from ..runtime import checks, outputs
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.progress import Bar
@@ -264,7 +264,7 @@ def simulate_exposures(
     hdus, psfs = {}, {}
     for i, name in enumerate(Bar(truth.names, desc="simulate", disable=not progress)):
         psfs[name] = psf = night.psf_of(i, rng)
-        if truth.camera is None:
+        if not truth.camera:
             xy = truth.distort(name, truth.place(name))
             image = _image(night, truth.shape, xy, truth.flux, psf, rng, noise)
             hdus[name] = fits.HDUList([fits.PrimaryHDU(image, gsaoi_night.header(truth, name, night, i))])

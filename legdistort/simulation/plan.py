@@ -86,7 +86,7 @@ class Plan:
             raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
         if shape is not None and tuple(shape) != camera.field:
             raise InputError("shape and camera both state the size of the field: leave shape out")
-        if self.prior is not None:
+        if self.prior is not None or not camera.has_focal_plane:
             return camera.field, self.prior
         widths = camera.common_sigma
         mean = np.zeros((2, 1) if widths is None else widths.shape)
@@ -103,6 +103,11 @@ class Plan:
             raise InputError(f"epochs must be the years of the {self.n_exposures} exposures, got {self.epochs!r}")
         if self.field is not None and not (isinstance(self.field, SkyCoord) and self.field.isscalar):
             raise InputError(f"field must be the place on the sky as one SkyCoord, got {self.field!r}")
+
+    @property
+    def has_focal_plane(self) -> bool:
+        """Whether detectors lie in a focal plane, see `Camera.has_focal_plane`."""
+        return bool(self.camera) and self.camera.has_focal_plane
 
     @property
     def motion(self) -> str | None:
@@ -191,7 +196,7 @@ def lay_out(plan):
 
     def inside(xy):
         placed = [similarity.apply(pose, xy) for pose in pose_list.values()]
-        if plan.camera is not None:
+        if plan.has_focal_plane:
             return np.array([np.any(plan.camera.sees(q), axis=0) for q in placed])
         return np.array([truth.within(q, shape) for q in placed])
 
@@ -201,7 +206,7 @@ def lay_out(plan):
     elif plan.n_stars is not None:
         positions = truth.draw_stars(star_rng, plan.n_stars, region, inside, plan.least)
     else:
-        sizes = [shape] if plan.camera is None else [each.shape for each in plan.camera.detectors.values()]
+        sizes = [each.shape for each in plan.camera.detectors.values()] if plan.has_focal_plane else [shape]
         count = round(plan.density * np.prod(region[1] - region[0]) / np.mean(np.prod(sizes, axis=1)))
         positions = star_rng.uniform(*region, size=(count, 2))
     observed = inside(positions)
@@ -213,7 +218,7 @@ def lay_out(plan):
         )
     years = None if plan.epochs is None else np.asarray(plan.epochs, dtype=float)
     errors = _errors(plan, len(positions))
-    if plan.camera is not None:
+    if plan.has_focal_plane:
         planes = [similarity.apply(pose, positions) for pose in pose_list.values()]
         errors = np.array([plan.camera.errors_in_focal_plane(f, e) for f, e in zip(planes, errors, strict=True)])
     return Layout(positions, pose_list, shape, observed, errors, years, plan.sky)

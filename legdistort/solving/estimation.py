@@ -13,7 +13,7 @@ import numpy as np
 
 from ..cameras.exchanged import check_places
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, some_of, warn
-from ..inputs.matches import Matches
+from ..matching.matches import Matches
 from ..priors.prior import Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
@@ -200,7 +200,7 @@ def solve(
     catalogue, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
     if model is None:
         _warn_of_header(matches, prior)
-    options, form = asked if matches.camera is None else replace(asked, static=None, layout=None), None
+    options, form = replace(asked, static=None, layout=None) if matches.camera.has_focal_plane else asked, None
     if model is not None:
         form = model_forms.read(model, matches, degree=degree, gauge=gauge)
         options = replace(options, degree=form.degree, model=None, prior=form.prior())
@@ -227,7 +227,7 @@ def solve(
 
 def _of_detectors(matches, prior, layout, static, dynamic):
     """The matches, of single detectors if they are asked for, what is known of these, and what to do about statics."""
-    check_detectors(matches.camera is not None, layout, static, dynamic)
+    check_detectors(matches.camera.has_focal_plane, layout, static, dynamic)
     if dynamic != "detector":
         return matches, prior, static
     if layout is not None:
@@ -252,7 +252,8 @@ def _of_camera(matches, prior, model, degree, layout, static, exposure_degree):
         For what is known of single detectors: the camera has it; for modes of exposures alone.
     """
     camera = matches.camera
-    if camera is None:
+    if not camera.has_focal_plane:
+        prior = _of_detector(camera, prior, model)
         each = prior.values() if isinstance(prior, dict) else [prior]
         if static == "fit" and any(_knows_nothing_of_a_mode(p) for p in each):
             raise InputError("static='fit' needs a finite static_sigma of the prior: make it finite, or leave it out")
@@ -275,6 +276,25 @@ def _of_camera(matches, prior, model, degree, layout, static, exposure_degree):
     if widths is None:
         return None, Prior(np.zeros((2, 1)), **known)
     return sought, Prior(np.zeros_like(widths), static_sigma=widths, **known)
+
+
+def _of_detector(camera, prior, model):
+    """The prior of plain images: what their one detector states of its static distortion, or else the one given.
+
+    Raises
+    ------
+    InputError
+        If both are there.
+    """
+    (detector,) = camera.detectors.values()
+    if not np.any(detector.static) and detector.static_sigma is None:
+        return prior
+    if prior is not None or model is not None:
+        raise InputError(
+            f"camera {camera.name} has a static distortion of its own: leave prior and model out, or take that off"
+        )
+    known = {"static_sigma": detector.static_sigma, "shape": detector.shape}
+    return Prior(detector.static, source=f"camera {camera.name}", **known)
 
 
 def _knows_nothing_of_a_mode(prior):

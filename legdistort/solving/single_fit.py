@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from ..exceptions import ConvergenceWarning, LegdistortError, SolveError, warn
-from ..inputs.matches import Matches
+from ..matching.matches import Matches
 from ..runtime import parallel
 from . import agreement, clipping, minimisers, star_motions, start_values
 from .choices import prior_widths

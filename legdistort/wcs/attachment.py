@@ -152,7 +152,7 @@ class _Images:
     @classmethod
     def of(cls, solution):
         left_out = dict(solution.left_out)
-        if solution.camera is not None:
+        if solution.camera.has_focal_plane:
             ids = solution.camera.detectors
             left_out = {exposure_names.detector_name(name, k): why for name, why in left_out.items() for k in ids}
         return cls({part.label: part for view in solution for part in view.parts}, left_out, solution.checksum)

@@ -12,7 +12,7 @@ from legdistort.assessment import baselines
 from legdistort.cli import parser
 from legdistort.exceptions import InputError, SolveError
 from legdistort.geometry import similarity
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.reporting import page as report
 from legdistort.reporting.comparison import plot_comparison

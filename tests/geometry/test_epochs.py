@@ -9,7 +9,7 @@ from astropy.time import Time
 
 from legdistort.exceptions import InputError
 from legdistort.geometry.epochs import header_epoch, years
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 
 YEARS = np.array([2015.5, 2016.5, 2019.25])
 

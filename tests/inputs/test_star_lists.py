@@ -12,7 +12,7 @@ import legdistort as ld
 from legdistort.cli import parser
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs import column_contract
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.inputs.reference_catalogue import read_reference
 from legdistort.inputs.table_files import read_table
 from legdistort.measurement.flags import Flag

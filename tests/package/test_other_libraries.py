@@ -20,7 +20,7 @@ from sky_chains import detector, geometries, pixels_of, sky_of
 
 from legdistort.exceptions import ExportError, InputError
 from legdistort.geometry.tangent_plane import TangentPlane
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve

@@ -18,7 +18,7 @@ from legdistort.exceptions import LegdistortError, LegdistortWarning
 from legdistort.geometry.basis import to_tensor
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.exposures import Exposure
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 from legdistort.solving.estimation import solve

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from legdistort.exceptions import AssumptionWarning
 from legdistort.geometry import similarity
 from legdistort.geometry.distortion import Distortion
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.matching.matcher import match
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy, new_positions

@@ -29,7 +29,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import legdistort
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.results.solution import Solution
 from legdistort.runtime import provenance

@@ -15,7 +15,7 @@ from oracle import predict as model
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError, MatchError, SolveError
 from legdistort.geometry import similarity
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches

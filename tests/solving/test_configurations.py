@@ -6,7 +6,7 @@ from astropy.table import Table, vstack
 from oracle import DenseOracle, predict
 
 from legdistort.exceptions import SolveError
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches

@@ -13,7 +13,7 @@ from oracle import DenseOracle, predict
 from legdistort.exceptions import AssumptionWarning, ConvergenceWarning, InputError, SolveError
 from legdistort.geometry import similarity
 from legdistort.geometry.detector_modes import similarity_part
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.runtime.checks import options_from

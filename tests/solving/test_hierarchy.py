@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from legdistort.exceptions import SolveError
 from legdistort.geometry.detector_modes import dynamic_basis, dynamic_degrees
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.results.gauge import UnknownMap
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve

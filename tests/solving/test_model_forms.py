@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from legdistort.exceptions import InputError, SolveError
 from legdistort.geometry import basis
 from legdistort.geometry.models import FastLegendre2D, leaves
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.results.solution import Solution
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.estimation import solve

@@ -21,7 +21,7 @@ from legdistort.exceptions import InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.models import FastLegendre2D
 from legdistort.geometry.tangent_plane import TangentPlane
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 from legdistort.solving.estimation import solve

@@ -41,7 +41,7 @@ def read(path):
     -------
     list of `~astropy.table.Table`
         One, or as many as an LDAC file has detections of images. ``meta`` has only what is understood: ``inputs``, and
-        what `legdistort.inputs.matches.Matches.to_meta` writes; ``shape`` of the image; ``program``, "hst1pass" or
+        what `legdistort.matching.matches.Matches.to_meta` writes; ``shape`` of the image; ``program``, "hst1pass" or
         "DAOPHOT", where the columns do not show it.
 
     Raises

@@ -114,8 +114,8 @@ def absolute_variance(gauge, uncertainty, xy, *, without_unknown=False):
     if not without_unknown:
         for each in gauge.unknown:
             out[:, np.sum(each.stars**2, axis=1) > out[0] + out[1]] = np.nan
-    if uncertainty.camera is not None:  # it is not one map that would have to be taken off, but detectors by themselves
-        for each in np.moveaxis(uncertainty.camera.unknown, 2, 0):
+    if camera := uncertainty.camera:  # it is not one map that would have to be taken off, but detectors by themselves
+        for each in np.moveaxis(camera.unknown, 2, 0):
             lost = np.sum(each**2, axis=1) > out[0] + out[1]
             out[:, lost] = np.inf if without_unknown else np.nan
     return out

@@ -229,7 +229,7 @@ def as_given(prior):
 
 
 def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=None, motion=None):
-    """The problem posed by `legdistort.inputs.matches.Matches`.
+    """The problem posed by `legdistort.matching.matches.Matches`.
 
     Parameters
     ----------
@@ -341,7 +341,7 @@ def _detectors(matches):
     InputError
         For an exposure with positions on several detectors.
     """
-    if "detector" not in matches.table.colnames or matches.camera is not None:
+    if "detector" not in matches.table.colnames or matches.camera.has_focal_plane:
         return {}
     detector, exposure = np.asarray(matches.table["detector"]), matches.observations.exposure
     first = np.unique(exposure, return_index=True)[1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,19 +12,19 @@ from astropy import units as u
 from astropy.table import QTable
 from scipy.sparse.csgraph import connected_components
 
+from ..cameras.camera import Camera
 from ..exceptions import AssumptionWarning, InputError, MatchError, some_of, warn
 from ..geometry import similarity
 from ..geometry.epochs import exposure_years
 from ..geometry.tangent_plane import TangentPlane
+from ..inputs import column_contract, exposure_names, repetitions, start_poses
 from ..runtime.checks import check_choice
 from ..runtime.notebook import ShownAsPrinted
-from . import column_contract, exposure_names, repetitions, start_poses
 
 if TYPE_CHECKING:
     from astropy.table import Table
     from numpy.typing import ArrayLike
 
-    from ..cameras.camera import Camera
     from ..runtime.annotations import Shape
 
 #: Positions belong on their detector, give or take this part of its size: distortions move stars over its edge.
@@ -145,9 +145,9 @@ class Matches(ShownAsPrinted):
         The largest distortion of the headers, in words, if they have one; it is not in the poses.
     observations : Observations
         The table as plain arrays; made of it, need not be given.
-    camera : `legdistort.Camera` or None
-        Where exposures have several detectors. Positions then are those in its focal plane; those on the detectors
-        stand in ``x_detector``, ``y_detector``.
+    camera : `legdistort.Camera`
+        Where it has a focal plane (`Camera.has_focal_plane`), positions are those in that, and those on the detectors
+        stand in ``x_detector``, ``y_detector``. That of plain images need not be given.
 
     See Also
     --------
@@ -172,9 +172,11 @@ class Matches(ShownAsPrinted):
     epoch: float | None = None
     header_distortion: str | None = None
     observations: Observations | None = None
-    camera: Camera | None = None
+    camera: Camera = field(default=None, metadata={READ: Camera.from_meta})
 
     def __post_init__(self) -> None:
+        if self.camera is None:
+            object.__setattr__(self, "camera", Camera.of_images(self.shapes.values()))
         if self.observations is None or self.observations.table is not self.table:
             object.__setattr__(self, "observations", Observations.of(self.table))
 
@@ -277,25 +279,22 @@ class Matches(ShownAsPrinted):
     def to_meta(self) -> dict[str, Any]:
         """All that is known beside the table as plain lists, for the header of a table file; see `read_meta`."""
         known = {each.name: getattr(self, each.name) for each in _beside_the_table()}
+        known["camera"] = self.camera if self.camera.is_known else None
         return {key: _plain(value) for key, value in (known | self._by_exposure(self.names)).items()}
 
     @staticmethod
-    def read_meta(meta: Mapping[str, Any], *, camera: Callable[[Any], Camera] | None = None) -> dict[str, Any]:
+    def read_meta(meta: Mapping[str, Any]) -> dict[str, Any]:
         """What `to_meta` wrote, as arguments of `from_table`; None for what `meta` does not have.
 
         Parameters
         ----------
         meta : dict
             Header of a table, ours or another one.
-        camera : callable, optional
-            What reads a camera: `legdistort.Camera.from_meta`. Without it there is none among the arguments.
         """
         found = {}
         for each in _beside_the_table():
-            value, read = meta.get(each.name), camera if each.name == "camera" else each.metadata.get(READ)
+            value, read = meta.get(each.name), each.metadata.get(READ)
             found[each.name] = value if value is None or read is None else read(value)
-        if camera is None:
-            del found["camera"]
         return {"shape": found.pop("shapes"), **found}
 
     def __repr__(self) -> str:
@@ -367,8 +366,7 @@ class Matches(ShownAsPrinted):
         if table["exposure"].dtype.kind != "U":
             table["exposure"] = table["exposure"].astype(str)
         if camera is not None:
-            table = in_focal_plane(table, camera)
-            shape = camera.field
+            table, shape = in_focal_plane(table, camera), camera.field
         seen, left_out = Observations.of(table), dict(left_out or {})
         check_choice(allow_copies, (True, False), "allow_copies")
         if not allow_copies and (copies := repetitions.reasons(seen.names, seen.exposure, seen.xy)):
@@ -530,8 +528,10 @@ def _inside(seen, shapes):
 
 def in_focal_plane(table, camera):
     """The table with positions in the focal plane of a camera, without those outside of their detector (`_inside`)."""
-    if not hasattr(camera, "in_focal_plane"):
+    if not isinstance(camera, Camera):
         raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
+    if not camera.has_focal_plane:
+        return table
     if "x_detector" not in table.colnames:
         detector, part = camera.ids(table), QTable(table, copy=False)
         if "star" not in table.colnames:

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from legdistort.exceptions import InputError, MatchError
 from legdistort.geometry import similarity
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.inputs.table_files import read_table
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 
@@ -108,7 +108,7 @@ def test_groups_without_a_common_star_are_listed(sim):
 @pytest.mark.parametrize("by", [["exposure", "star"], ["star", "exposure"]])
 def test_of_long_tables_some_rows_are_looked_at_first(sim, monkeypatch, by):
     """Those of some stars; where these lie on a line or are not in all exposures, the others may well do better."""
-    monkeypatch.setattr("legdistort.inputs.matches._SOME", 25)
+    monkeypatch.setattr("legdistort.matching.matches._SOME", 25)
     given = table_of(sim)
     given.sort(by)
     first = given["star"] < 5  # of 25
