@@ -3,6 +3,8 @@
 import gsaoi_images
 import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.time import Time
 
 import legdistort
 from legdistort.cameras.camera import GSAOI_SCALE
@@ -78,12 +80,19 @@ def test_shapes(night):
 
 
 def test_images_without_wcs(night, matches):
-    """Exposures whose headers have no WCS give shapes and names, no more."""
+    """Exposures whose headers have no WCS give shapes, names and times, no more."""
     table, _ = detections(night)
+    dates = {str(name): 59000.0 + 10 * k for k, name in enumerate(np.unique(table["exposure"]))}
     exposures = [
-        Exposure(f"{name}-{key}", np.broadcast_to(np.float32(0), (2048, 2048)), frame=str(name), detector=key)
-        for name in np.unique(table["exposure"])
+        Exposure(
+            f"{name}-{key}", np.broadcast_to(np.float32(0), (2048, 2048)), header=fits.Header({"MJD-OBS": date}),
+            frame=name, detector=key,
+        )
+        for name, date in dates.items()
         for key in "1234"
-    ]
+    ]  # fmt: skip
     again = legdistort.match(table, exposures=exposures, min_exposures=3)
     assert np.array_equal(again.table["star"], matches.table["star"])
+    assert again.times[1] == "days"
+    assert again.epoch == pytest.approx(np.mean(Time(list(dates.values()), format="mjd").jyear), abs=0.01)
+    assert matches.epoch is None

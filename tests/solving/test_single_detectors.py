@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import legdistort
+from legdistort.assessment import baselines
 from legdistort.cli.parser import main
 from legdistort.exceptions import InputError
 
@@ -95,6 +96,13 @@ def test_one_detector_is_as_without_camera(gsaoi):
     usual = legdistort.solve(legdistort.Matches.from_table(table, shape=(2048, 2048)), prior=prior)
     both = [gsaoi_images.without_common_map(s.positions, usual.positions, 3) for s in (found, usual)]
     assert np.sqrt(np.mean((both[0] - both[1]) ** 2)) < 0.1 * np.nanmedian(usual.stars["x_err"].value)
+
+
+def test_other_corrections_are_of_single_detectors_too(drawn, gsaoi):
+    _, table, solution = drawn
+    compared = baselines.compare(legdistort.Matches.from_table(table, camera=gsaoi), solution)
+    assert compared["shift"].names == solution.names
+    assert compared["shift"].chi2 > 100 * solution.chi2
 
 
 def test_the_whole_focal_plane_by_name(gsaoi):
