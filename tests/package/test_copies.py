@@ -24,7 +24,7 @@ from legdistort.exceptions import AssumptionWarning, InputError, MatchError
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.exposure_files import open_exposures, read_exposures
 from legdistort.inputs.exposures import Exposure
-from legdistort.inputs.matches import Matches
+from legdistort.matching.matches import Matches
 from legdistort.inputs.table_files import read_table
 from legdistort.measurement.injection import MoffatStars, inject
 from legdistort.measurement.options import MeasureOptions
@@ -96,7 +96,7 @@ def exposure():
     return Exposure(
         "night1-2", data, mask=mask, uncertainty=np.full(data.shape, 5.0), wcs=WCS(header()), header=header(),
         saturation=5e4, gain=2.0, read_noise=4.0, exposure_time=30.0, path=pipeline.Path("night1.fits"), has_gwcs=True,
-        frame="night1", detector="2",
+        exposure="night1", detector="2",
     )  # fmt: skip
 
 
@@ -110,13 +110,13 @@ def kept(given, path):
 def table_and_back(given, path):
     table = given.table.copy()
     table.meta = given.to_meta()
-    return Matches.from_table(table, **Matches.read_meta(table.meta, camera=Camera.from_meta))
+    return Matches.from_table(table, **Matches.read_meta(table.meta))
 
 
 def file_and_back(given, path):
     pipeline.write_matched(path, given, {})
     table = read_table(path)
-    return Matches.from_table(table, **Matches.read_meta(table.meta, camera=Camera.from_meta))
+    return Matches.from_table(table, **Matches.read_meta(table.meta))
 
 
 def compared(given, path):
@@ -359,7 +359,7 @@ def test_tables_of_before_are_read():
     """Without what is known of headers, and without a camera."""
     meta = matches().to_meta()
     del meta["header_distortion"], meta["camera"]
-    known = Matches.read_meta(meta, camera=Camera.from_meta)
+    known = Matches.read_meta(meta)
     assert known["header_distortion"] is None
     assert known["camera"] is None
     assert known["epoch"] == 2020.25
