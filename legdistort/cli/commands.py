@@ -140,7 +140,10 @@ def do_match(a):
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
-    known = {"shape": tuple(a.shape) if a.shape else shapes or None, "camera": _camera(a.camera)}
+    camera = _camera(a.camera) or _measured_with(tables)
+    if camera is not None:
+        _refuse({"shape": a.shape}, "comes from the camera of the run")
+    known = {"shape": tuple(a.shape) if a.shape else shapes or None, "camera": camera}
     if (exposures := measured_frames(read)) is not None:
         _refuse({"shape": a.shape}, "comes from the frames")
     known |= {"exposures": exposures, "progress": wants_progress(a)}
@@ -420,6 +423,14 @@ def _read_table(path, a):
 def _camera(given):
     """The camera of ``--camera``; None without one."""
     return legdistort.Camera.gsaoi() if given == "gsaoi" else given and legdistort.Camera.read(given)
+
+
+def _measured_with(tables):
+    """The camera that a run was given which left these tables; None if it was given none."""
+    metas = [each.meta["camera"] for each in tables if each.meta.get("camera") is not None]
+    if any(meta != metas[0] for meta in metas):
+        raise InputError("the tables come from runs with different cameras: give the one that holds, --camera")
+    return legdistort.Camera.from_meta(metas[0]) if metas else None
 
 
 def _solution(a):

@@ -122,7 +122,8 @@ def measured_frames(tables):
     for path, table in tables.items():
         earlier = EarlierRun(path.parent, table)
         try:
-            exposures += (opened := open_exposures(earlier.frames, **earlier.reading))
+            opened = open_exposures(earlier.frames, **earlier.reading)
+            exposures += opened if earlier.camera is None else earlier.camera.of_detectors(opened)
             earlier.of(opened)
         except LegdistortError as error:
             warn(f"{path}: matched without the headers of its frames, so without their sky: {error}", AssumptionWarning)

@@ -771,6 +771,9 @@ class TestFrames:
         left = to_nearest(solution.positions, sky)
         assert len(left) > 50
         assert np.sqrt(np.mean(left**2)) < 0.03
+        again = ["match", str(out / "detections.ecsv"), "--min-exposures", "3", "--out", str(tmp_path / "again.ecsv")]
+        assert main([*again, "--quiet"]) == 0  # with the camera of the run, not with that of the headers
+        assert QTable.read(tmp_path / "again.ecsv").meta["camera"] == camera.to_meta()
         mosaic = fits.getdata(out / "mosaic.fits")
         assert np.isfinite(mosaic[100:-100, 100:-100]).mean() > 0.97  # the gap of 15 px is filled
         assert main(["attach", str(out / "solution.asdf"), *paths[:2], "--out", str(tmp_path / "done"), "--quiet"]) == 0
@@ -800,6 +803,19 @@ class TestFrames:
         table[(table["exposure"] != "exp1") | (table["detector"] != "2")].write(measured, overwrite=True)
         assert main(["match", measured, *given, "--out", matched, "--quiet", "--overwrite"]) == 0
         assert QTable.read(matched).meta["left_out"] == {"exp1-2": "no star was detected in it"}
+
+    def test_tables_of_runs_with_a_camera(self, frames, tmp_path, capsys):
+        """What contradicts that camera is refused before anything is matched."""
+        _, camera, _ = frames
+        for k, each in enumerate((camera, replace(camera, name="other"))):
+            table = QTable({"exposure": [f"exp{k}"], "detector": ["1"], "x": [1.0], "y": [1.0]})
+            table.meta["camera"] = each.to_meta()
+            table.write(tmp_path / f"t{k}.ecsv")
+        paths, out = [str(tmp_path / f"t{k}.ecsv") for k in (0, 1)], ["--out", str(tmp_path / "m.ecsv"), "--quiet"]
+        assert main(["match", *paths, *out]) == 1
+        assert "the tables come from runs with different cameras: give the one that holds" in capsys.readouterr().err
+        assert main(["match", paths[0], "--shape", "100", "100", *out]) == 1
+        assert "--shape comes from the camera of the run: leave it out" in capsys.readouterr().err
 
     def test_one_file_for_every_detector(self, frames, tmp_path):
         """The same table of positions as from files with both."""
