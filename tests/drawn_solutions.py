@@ -54,7 +54,7 @@ def make_solution(
         diagnostics=Diagnostics(),
         left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},
     )
-    stars = {"star": solution.star_names, "x": positions[:, 0] * u.pix, "y": positions[:, 1] * u.pix}
+    stars = {"star": solution.estimate.star_names, "x": positions[:, 0] * u.pix, "y": positions[:, 1] * u.pix}
     stars |= {f"{axis}_{kind}": np.full(n_stars, 0.01) * u.pix for kind in ("err", "err_abs") for axis in "xy"}
     vars(solution)["stars"] = QTable(stars | {"n": np.full(n_stars, len(names))})  # without covariances
     return solution

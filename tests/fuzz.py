@@ -147,9 +147,9 @@ def use_solution(path):
     str(solution)
     for name in solution.names[:1]:
         with suppress(LegdistortError):
-            solution.wcs(name)(10.0, 10.0)
-            solution.correct(name, np.array([[5.0, 5.0]]), errors=np.array([[0.1, 0.1]]))
-            solution.sigma_map(name)
+            solution[name].wcs(10.0, 10.0)
+            solution[name].correct(np.array([[5.0, 5.0]]), errors=np.array([[0.1, 0.1]]))
+            solution[name].sigma_map()
     repr(solution.stars)
 
 

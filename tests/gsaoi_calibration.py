@@ -64,7 +64,9 @@ def calibrate(turn, draws):
     for seed in range(draws):
         matches = legdistort.Matches.from_table(field.table(sigma=SIGMA, seed=1000 + seed), camera=camera)
         solution = legdistort.solve(matches, degree=DEGREE, layout="fit", static="fit")
-        left = gsaoi_images.without_common_map(solution.positions, field.sky[solution.star_names], DEGREE)
+        left = gsaoi_images.without_common_map(
+            solution.estimate.positions, field.sky[solution.estimate.star_names], DEGREE
+        )
         parts = [p / GSAOI_SCALE for p in gsaoi_bounds.camera_error(solution.camera, DEGREE, GSAOI_SCALE)]
         errors.append([np.mean(left**2), *(np.mean(part**2) for part in parts)])
         reported = np.stack([solution.stars[name].value for name in ("x_err", "y_err")], axis=1)

@@ -27,7 +27,7 @@ class MovingOracle(DenseOracle):
     """The dense oracle with further unknowns of every star, ``X_j + sum_k c_jk phi_k(i)``; written here once more."""
 
     def __init__(self, matches, solution, phi):
-        super().__init__(matches, solution, solution.prior_mean)
+        super().__init__(matches, solution, solution.estimate.prior_mean)
         self.phi, self.k = phi, phi.shape[2]
         self.n_modes = solution.coefficients.shape[2]
         self.n_star_unknowns = (2 + self.k) * self.n_stars

@@ -75,21 +75,21 @@ def pixels_of(solution, name, ra, dec):
     plane = np.degrees(np.column_stack([xi, eta]))
     x = (plane - sky.matrix[:, 2]) @ np.linalg.inv(sky.matrix[:, :2]).T
     q = x @ pose[:, :2].T + pose[:, 2]
-    return q + displacement(solution.coefficients[solution.names.index(name)], q, solution.shapes[name])
+    return q + displacement(solution.coefficients[solution.names.index(name)], q, solution.estimate.shapes[name])
 
 
 def detector(solution, name):
     """Random pixels, many along the edges, and the corners, with their exact sky positions."""
-    ny, nx = solution.shapes[name]
+    ny, nx = solution.estimate.shapes[name]
     rng = np.random.default_rng(7)
     x, y = rng.uniform(-0.5, nx - 0.5, 900), rng.uniform(-0.5, ny - 0.5, 900)
     x[:100], x[100:200], y[200:300], y[300:400] = -0.5, nx - 0.5, -0.5, ny - 0.5
     x[400:404], y[400:404] = [-0.5, nx - 0.5, -0.5, nx - 0.5], [-0.5, -0.5, ny - 0.5, ny - 0.5]
     p = np.column_stack([x, y])
     pose = solution.poses[name]
-    q = solution.correct(name, p) @ pose[:, :2].T + pose[:, 2]
+    q = solution[name].correct(p) @ pose[:, :2].T + pose[:, 2]
     # the direct model vouches for the correction
-    direct = q + displacement(solution.coefficients[solution.names.index(name)], q, solution.shapes[name])
+    direct = q + displacement(solution.coefficients[solution.names.index(name)], q, solution.estimate.shapes[name])
     assert_allclose(direct, p, rtol=0, atol=1e-8)
     return p, *sky_of(solution, name, q)
 

@@ -112,7 +112,7 @@ def scene(n=4, *, peak=20.0, sky=SKY, rolls=(0, 2, -3, 40), spread=15.0, seed=1)
 def expose(solution, stars, flux, **changes):
     exposures = []
     for name in solution.poses:
-        seen = solution.distort(name, stars)
+        seen = solution[name].distort(stars)
         ok = np.isfinite(seen).all(axis=1)
         exposures.append(Exposure(name, star_image(seen[ok], flux[ok]), **changes))
     return exposures

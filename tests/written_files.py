@@ -28,7 +28,7 @@ def seen(solution, prior, wcs):
         "names": list(solution.names),
         "coefficients": solution.coefficients.tolist(),
         "x_err_abs": solution.stars["x_err_abs"].value.tolist(),
-        "corrected": solution.correct(name, PIXELS).tolist(),
+        "corrected": solution[name].correct(PIXELS).tolist(),
         "chi2": solution.chi2,
         "prior": prior.mean.tolist(),
         "prior_sigma": prior.sigma.tolist(),
@@ -49,7 +49,7 @@ def main():
     solution.write(folder / "solution.asdf", overwrite=True)
     prior.write(folder / "prior.asdf", overwrite=True)
     write_wcs(solution, solution.names[1], folder / "wcs.asdf", overwrite=True)
-    found = seen(solution, prior, solution.wcs(solution.names[1]))
+    found = seen(solution, prior, solution[solution.names[1]].wcs)
     (folder / "expected.json").write_text(json.dumps(found, indent=1) + "\n")
 
 

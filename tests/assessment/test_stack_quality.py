@@ -78,7 +78,7 @@ def exposures(night):
 def stack(solution, *shape, shift=(0, 0), theta=0.0):
     """A mosaic with stars of this shape, drawn where the solution has them."""
     flux = np.asarray(solution.stars["flux"])
-    image = gaussians((680, 700), solution.positions - OFFSET + shift, flux, *shape, theta=theta)
+    image = gaussians((680, 700), solution.estimate.positions - OFFSET + shift, flux, *shape, theta=theta)
     return Picture(image.astype(np.float32))
 
 
@@ -168,10 +168,10 @@ def test_positions_are_those_of_the_mosaic(night, solution):
     shifted = assess(stack(solution, SIGMA, shift=(0.3, -0.4)), solution, fwhm=FWHM)
     assert shifted.position == pytest.approx(0.5 / np.sqrt(2 * np.log(2)), rel=0.01)
     rng = np.random.default_rng(5)
-    scattered = stack(solution, SIGMA, shift=0.2 * rng.normal(size=solution.positions.shape))
+    scattered = stack(solution, SIGMA, shift=0.2 * rng.normal(size=solution.estimate.positions.shape))
     found = assess(scattered, solution, fwhm=FWHM)
     assert found.position == pytest.approx(0.2, rel=0.35)  # two dozen stars
-    jump = np.zeros_like(solution.positions)
+    jump = np.zeros_like(solution.estimate.positions)
     jump[np.argsort(solution.stars["flux"])[-2:]] = 2.5  # two blends do not count
     assert assess(stack(solution, SIGMA, shift=jump), solution, fwhm=FWHM).position < 2e-3
     assert np.isnan(found.fwhm_ratio)
@@ -197,7 +197,7 @@ def test_stars_lost_anywhere_are_lost_everywhere(night, solution, exposures, mon
     n = assess(whole, solution, exposures=exposures, fwhm=FWHM).n_stars
     holed = stack(solution, 2 * SIGMA)
     star = np.argmax(solution.stars["flux"])
-    x, y = np.round(solution.positions[star] - OFFSET).astype(int)
+    x, y = np.round(solution.estimate.positions[star] - OFFSET).astype(int)
     holed.data[y - 3 : y + 4, x - 3 : x + 4] = np.nan
     monkeypatch.setattr(stack_quality, "coadd", lambda frames, made, **options: holed)
     comparison = {"other": replace(solution), baselines.METHOD: solution}
@@ -272,7 +272,7 @@ def test_zooms_have_their_star_in_the_middle(stacks, solution):
     made, comparison = stacks
     assert len(made.zooms) == 3
     places = np.array([zoom.place for zoom in made.zooms])
-    middle = np.median(solution.positions, axis=0)
+    middle = np.median(solution.estimate.positions, axis=0)
     assert len({tuple(p > middle) for p in places}) == 3  # one a corner
     for zoom in made.zooms:
         assert list(zoom.cuts) == list(comparison)
@@ -280,7 +280,9 @@ def test_zooms_have_their_star_in_the_middle(stacks, solution):
         peak = np.unravel_index(np.argmax(image), image.shape)
         assert np.hypot(left + 0.5 + peak[1], bottom + 0.5 + peak[0]) < 1
         assert (right - left, top - bottom) == image.shape[::-1]
-        assert zoom.place == pytest.approx(solution.positions[list(solution.star_names).index(zoom.star)])
+        assert zoom.place == pytest.approx(
+            solution.estimate.positions[list(solution.estimate.star_names).index(zoom.star)]
+        )
         assert repr(zoom) == f"<Zoom: star {zoom.star} in 4 stacks>"
 
 

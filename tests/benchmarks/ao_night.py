@@ -66,9 +66,9 @@ def thirds(solution, flux):
 
 def with_flux(solution, truth):
     """The solution, with the true flux of its star in every observation, and the true positions of its stars."""
-    true = nearest(solution.positions, truth.positions)
+    true = nearest(solution.estimate.positions, truth.positions)
     star = np.array([np.flatnonzero((truth.positions == one).all(axis=1))[0] for one in true])
-    index = np.searchsorted(solution.star_names, solution.residuals["star"])
+    index = np.searchsorted(solution.estimate.star_names, solution.residuals["star"])
     solution.residuals["true_flux"] = truth.flux[star[index]]
     return solution, true, star
 
@@ -88,7 +88,7 @@ def show(folder, cell, name, seeds):
         seen &= seen.sum(axis=0) >= 4
         used = solution.residuals[solution.residuals["used"]]
         pair = np.zeros_like(seen)
-        rows = star[np.searchsorted(solution.star_names, used["star"])]
+        rows = star[np.searchsorted(solution.estimate.star_names, used["star"])]
         pair[[truth.names.index(exposure) for exposure in used["exposure"]], rows] = True
         sigma = np.sqrt(np.nan_to_num(np.einsum("nsaa->nsa", covariance), nan=1.0))
         ideal = matches_from(truth, seen, sigma, np.random.default_rng(seed), sky=truth.sky)
@@ -97,7 +97,7 @@ def show(folder, cell, name, seeds):
         figures.append(
             [
                 100 * np.count_nonzero(pair & seen) / np.count_nonzero(seen),
-                accuracy.bias(solution.positions[common], true[common], removed=3),
+                accuracy.bias(solution.estimate.positions[common], true[common], removed=3),
                 accuracy.expected_bias(bound, removed=3),
                 solution.chi2 / solution.dof,
                 *np.divide(thirds(solution, truth.flux), thirds(bound, truth.flux)),

@@ -206,7 +206,7 @@ def ties():
         settled += "not settled" not in solution.status
         pull = np.nan
         if not celestial:
-            left = accuracy.known_offsets(solution, sky[solution.star_names])
+            left = accuracy.known_offsets(solution, sky[solution.estimate.star_names])
             reported = np.einsum("nkk->n", solution.absolute_covariance(without_unknown=True)) / 2
             pull = np.sqrt(np.mean(left**2) / np.mean(reported))
         words = (
@@ -301,7 +301,7 @@ def expected(solution, true):
 
     Of the stars that have a position: one that contradicts itself has none.
     """
-    good = np.isfinite(solution.positions).all(axis=1)
+    good = np.isfinite(solution.estimate.positions).all(axis=1)
     both = np.tile(good, 2)
     known = np.einsum("nkk->nk", solution.absolute_covariance(without_unknown=True))[good]
     columns = [each.stars.T.reshape(-1, 1)[both] for each in solution.gauge.unknown]
@@ -310,7 +310,7 @@ def expected(solution, true):
     if not columns:
         return np.mean(known)
     maps = solution.gauge.directions[good].transpose(1, 0, 2).reshape(known.size, -1)
-    covariance = solution.uncertainty.star_matrix[np.ix_(both, both)]
+    covariance = solution.estimate.uncertainty.star_matrix[np.ix_(both, both)]
     hidden = solution.gauge.absolute_covariance
     if len(hidden) == maps.shape[1]:
         covariance = covariance + maps @ hidden @ maps.T
@@ -323,7 +323,7 @@ def one(seed, simulating, solving, *, with_ideal=False):
     matches, sky, common = simulated(seed, **simulating)
     rng = np.random.default_rng(1_000_000 + seed)
     solution = ld.solve(matches, **solving(matches, sky, common, rng))
-    star = solution.star_names
+    star = solution.estimate.star_names
     left = accuracy.known_offsets(solution, sky[star])
     reported = expected(solution, sky[star])
     unknown, best = solution.gauge.unknown, np.nan

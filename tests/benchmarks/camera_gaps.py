@@ -41,21 +41,23 @@ def mosaic_of(folder, *, seed=5, sensitivity=SENSITIVITY):
 def on_true(night, solution):
     """Number of the true star of each star of the solution, by where it lay on the detectors."""
     found, coarse = {}, gsaoi_images.SIZE / SIZE
-    for row in solution.observations:
+    for row in solution.residuals:
         xy = night.pixels[int(row["exposure"].removeprefix("frame"))][row["detector"]]
         there = np.array([row["x_detector"].value, row["y_detector"].value])
         distance = np.hypot(*((xy + 0.5) / coarse - 0.5 - there).T)
         if np.nanmin(distance) < 1:
             found[row["star"]] = int(np.nanargmin(distance))
-    return np.array([found.get(star, -1) for star in solution.star_names])
+    return np.array([found.get(star, -1) for star in solution.estimate.star_names])
 
 
 def judged(night, flux, run):
     """Detectors that a star fell on (a set each), FWHM [pix], and flux in the mosaic over the true one."""
     solution, mosaic = run.solution, run.mosaic
     fell, widths, parts = [], [], []
-    alone = KDTree(solution.positions).query(solution.positions, k=2)[0][:, 1] > APART
-    for star, xy, good in zip(on_true(night, solution), solution.positions - mosaic.offset, alone, strict=True):
+    alone = KDTree(solution.estimate.positions).query(solution.estimate.positions, k=2)[0][:, 1] > APART
+    for star, xy, good in zip(
+        on_true(night, solution), solution.estimate.positions - mosaic.offset, alone, strict=True
+    ):
         if not good or star < 0 or flux[star] < BRIGHT:
             continue
         x, y = np.round(xy).astype(int)

@@ -48,7 +48,7 @@ def main(n_sets):
             mine = mine[np.bincount(mine["star"])[mine["star"]] >= LEAST]
             alone, spent = solved(mine, ld.Camera(key, {key: camera[key]}))
             seconds["each alone"] += spent
-            stars, single = alone.star_names, bounds(night, mine)
+            stars, single = alone.estimate.star_names, bounds(night, mine)
             both = [best[0][np.searchsorted(best[1], star)] for star in stars]
             for name, solution, covariance in (
                 ("all detectors", whole, best[2][np.ix_(both, both)]),
@@ -129,8 +129,8 @@ def bounds(night, table):
 
 def compared(solution, sky, stars, covariance):
     """Error, bound and pull, each rms, of stars after a common map of degree 3 of these stars."""
-    rows = np.searchsorted(solution.star_names, stars)
-    left = gsaoi_images.without_common_map(solution.positions[rows], sky[stars], 3)
+    rows = np.searchsorted(solution.estimate.star_names, stars)
+    left = gsaoi_images.without_common_map(solution.estimate.positions[rows], sky[stars], 3)
     centred = gsaoi_images.without_common_map(np.eye(len(stars)), sky[stars], 3)
     best = np.sqrt(np.trace(centred @ covariance @ centred.T) / len(stars))
     errors = np.stack([solution.stars[name].value[rows] for name in ("x_err", "y_err")], axis=1)

@@ -65,14 +65,14 @@ def prepare(folder, small):
     header = mosaic.wcs.to_header()
     header["NAXIS1"], header["NAXIS2"] = mosaic.shape[::-1]
     fits.PrimaryHDU(header=header).header.totextfile(folder / "grid.txt", overwrite=True)
-    true = nearest(solution.positions, night.truth.positions)
+    true = nearest(solution.estimate.positions, night.truth.positions)
     index = [int(np.flatnonzero((night.truth.positions == xy).all(axis=1))[0]) for xy in true]
     np.savez(
         folder / "truth.npz",
-        grid=solution.positions - mosaic.offset,
+        grid=solution.estimate.positions - mosaic.offset,
         xy=true,
         flux=night.truth.flux[index],
-        fwhm=float(np.nanmedian(solution.observations["fwhm"].value)),
+        fwhm=float(np.nanmedian(solution.residuals["fwhm"].value)),
     )
 
 
@@ -216,7 +216,7 @@ def read(path):
 
 def unbounded(solution, path):
     """The gwcs without its bounding box, which would cost strips along the edges."""
-    wcs = solution.wcs(path.stem)
+    wcs = solution[path.stem].wcs
     wcs.bounding_box = None
     return wcs
 
@@ -254,7 +254,7 @@ def judge(folder):
     truth, solution = np.load(folder / "truth.npz"), Solution.read(folder / "solution.asdf")
     bright = truth["flux"] >= np.median(truth["flux"])
     grid, xy, fwhm = truth["grid"][bright], truth["xy"][bright], float(truth["fwhm"])
-    single = mean_fluxes(folder, solution, solution.star_names[bright], fwhm)
+    single = mean_fluxes(folder, solution, solution.estimate.star_names[bright], fwhm)
     found = {}
     for path in sorted(folder.glob("out_*.fits")):
         image = fits.getdata(path).astype(float)
@@ -290,7 +290,7 @@ def mean_fluxes(folder, solution, stars, fwhm):
     """Mean over the frames of the aperture fluxes of stars: the same photons as in the mosaic."""
     import numpy as np
 
-    table, fluxes = solution.observations, []
+    table, fluxes = solution.residuals, []
     for path in frames(folder):
         rows = table[(table["exposure"] == path.stem) & np.isin(table["star"], stars)]
         flux = np.full(len(stars), np.nan)

@@ -121,13 +121,13 @@ def pulls(solution, sky):
     The cubic is weighted by the errors of the measurement, and taken off the covariance of all stars too: what is left
     of that are errors without those of any convention.
     """
-    stars, true, n = solution.stars, sky[solution.star_names], len(solution.star_names)
+    stars, true, n = solution.stars, sky[solution.estimate.star_names], len(solution.estimate.star_names)
     offset = np.stack([stars["x"].value, stars["y"].value], axis=1) - true
-    index = np.searchsorted(solution.star_names, solution.observations["star"])
-    sigma = np.bincount(index, solution.observations["x_err"].value) / np.bincount(index)
+    index = np.searchsorted(solution.estimate.star_names, solution.residuals["star"])
+    sigma = np.bincount(index, solution.residuals["x_err"].value) / np.bincount(index)
     maps = np.linalg.qr(cubic(true) / sigma[:, None])[0]
     project = (np.eye(n) - maps @ maps.T) * sigma[:, None] / sigma
-    blocks = [solution.uncertainty.star_matrix[first : first + n, first : first + n] for first in (0, n)]
+    blocks = [solution.estimate.uncertainty.star_matrix[first : first + n, first : first + n] for first in (0, n)]
     reported = np.stack([np.einsum("jk,kl,jl->j", project, block, project, optimize=True) for block in blocks], axis=1)
     return (project @ offset) ** 2, reported, bright(sigma)
 
@@ -194,10 +194,12 @@ def halves(matches, whole, correlated):
         for chosen in (first, [name for name in names if name not in first]):
             rest = dict.fromkeys([name for name in names if name not in chosen], "other half")
             parts.append(solved(matches.without(rest), "floor"))
-        common = np.intersect1d(*[part.star_names[np.isfinite(part.positions[:, 0])] for part in parts])
-        index = [np.searchsorted(part.star_names, common) for part in parts]
+        common = np.intersect1d(
+            *[part.estimate.star_names[np.isfinite(part.estimate.positions[:, 0])] for part in parts]
+        )
+        index = [np.searchsorted(part.estimate.star_names, common) for part in parts]
         flux = parts[0].stars["flux"].value[index[0]]
-        a, b = (part.positions[i] for part, i in zip(parts, index, strict=True))
+        a, b = (part.estimate.positions[i] for part, i in zip(parts, index, strict=True))
         for name, extra in (("floor", 0.0), ("correlated", 1.0)):
             squares = []
             for k, axis in enumerate("xy"):
@@ -227,7 +229,7 @@ def _between(matches, parts, common, correlated, axis):
     for j, star in enumerate(common):
         place, part, floors = [], [], []
         for sign, solution in zip((1, -1), parts, strict=True):
-            rows = solution.observations[(solution.observations["star"] == star) & solution.observations["used"]]
+            rows = solution.residuals[(solution.residuals["star"] == star) & solution.residuals["used"]]
             floor = solution.diagnostics.error_floor
             weight = 1 / (rows["x_err"].value ** 2 + floor**2)
             part.append(sign * weight / weight.sum())

@@ -292,7 +292,7 @@ def closest_header(solution, kind):
     """The header of the exposure with the smallest error allowed that it can keep."""
     for allowed in (1e-3, 1e-2, 1e-1):  # strong distortions are beyond SIP and TPV
         with contextlib.suppress(ExportError):
-            return solution.header("a", kind=kind, max_error=allowed)
+            return solution["a"].header(kind=kind, max_error=allowed)
     raise Skip(f"no {kind.upper()} header keeps 0.1 px")
 
 
@@ -376,7 +376,7 @@ def apart(found, expected):
 def wcs_in_gwcs():
     """World to pixels by our class and by the stock class that files hold."""
     solution, p, sky = bent()
-    wcs = solution.wcs("a")
+    wcs = solution["a"].wcs
     yield Row("gwcs at the pole, 25 px, in memory", f"gwcs {gwcs.__version__}", apart(wcs.world_to_pixel(sky), p))
     stock = wcs.stock()
     yield Row("the same from a file", "gwcs", apart(stock.world_to_pixel(sky), p))
@@ -388,7 +388,7 @@ def wcs_in_reproject():
     """Where every pixel of a plain grid comes from, by an image whose values are its positions."""
     reproject = peer("reproject")
     solution, _, _ = bent()
-    ny, nx = solution.shapes["a"]
+    ny, nx = solution.estimate.shapes["a"]
     y, x = np.mgrid[:ny, :nx].astype(float)
     grid_ = WCS(naxis=2)
     grid_.wcs.ctype, grid_.wcs.crval, grid_.wcs.crpix = ["RA---TAN", "DEC--TAN"], [10.0, 90.0], [140.5, 100.5]
@@ -398,7 +398,7 @@ def wcs_in_reproject():
     well = ((came > 6) & (came < [nx - 7, ny - 7])).all(axis=1)
     for method in ("interp", "adaptive", "exact"):
         function = getattr(reproject, f"reproject_{method}")
-        found = [function((a, solution.wcs("a")), grid_, shape_out=(200, 280))[0].ravel()[well] for a in (x, y)]
+        found = [function((a, solution["a"].wcs), grid_, shape_out=(200, 280))[0].ravel()[well] for a in (x, y)]
         yield Row("gwcs at the pole, 25 px, resampled", f"reproject_{method}", apart(found, came[well]))
 
 
@@ -406,7 +406,7 @@ def wcs_in_photutils():
     """Apertures from the sky to pixels."""
     aperture = peer("photutils.aperture")
     solution, p, sky = bent()
-    found = aperture.SkyCircularAperture(sky, r=2 * u.arcsec).to_pixel(solution.wcs("a")).positions
+    found = aperture.SkyCircularAperture(sky, r=2 * u.arcsec).to_pixel(solution["a"].wcs).positions
     yield Row("sky apertures to pixels", "photutils", apart(found.T, p))
 
 
@@ -414,7 +414,7 @@ def wcs_in_ndcube():
     """The WCS of a part of a cube."""
     ndcube = peer("ndcube")
     solution, p, sky = bent()
-    part = ndcube.NDCube(np.zeros(solution.shapes["a"]), wcs=solution.wcs("a"))[30:, 50:]
+    part = ndcube.NDCube(np.zeros(solution.estimate.shapes["a"]), wcs=solution["a"].wcs)[30:, 50:]
     inside = (p > [50, 30]).all(axis=1)
     yield Row("a part of an image", "ndcube", apart(part.wcs.world_to_pixel(sky[inside]), p[inside] - [50, 30]))
 
@@ -423,7 +423,7 @@ def wcs_in_regions():
     """Regions from the sky to pixels."""
     regions = peer("regions")
     solution, p, sky = bent()
-    wcs = solution.wcs("a")
+    wcs = solution["a"].wcs
     found = [regions.CircleSkyRegion(s, 1 * u.arcsec).to_pixel(wcs).center.xy for s in sky[:50]]
     yield Row("sky regions to pixels", "regions", apart(np.transpose(found), p[:50]))
 
@@ -441,7 +441,7 @@ def wcs_in_pipelines():
         found = sky_chains.pixels_of(solution, "a", *corrector.det_to_world(*p.T))
         yield Row("refine(NIRCam), detector to sky", "tweakwcs", apart(found.T, p))
     with contextlib.suppress(Skip):
-        pixmap = peer("stcal.resample.utils").calc_pixmap(made, solution.fits_wcs("a"), shape=(2048, 2048))
+        pixmap = peer("stcal.resample.utils").calc_pixmap(made, solution["a"].fits_wcs(), shape=(2048, 2048))
         y, x = np.mgrid[:2048, :2048]
         off = np.hypot(pixmap[..., 0] - x, pixmap[..., 1] - y)
         yield Row("refine(NIRCam), map to our SIP", "stcal", float(off.max()))
@@ -461,7 +461,7 @@ def files_for_fitsverify():
     with tempfile.TemporaryDirectory() as folder:
         for kind in ("sip", "tpv"):
             frame = Path(folder, "a.fits")
-            fits.PrimaryHDU(np.zeros(solution.shapes["a"], np.int16)).writeto(frame, overwrite=True)
+            fits.PrimaryHDU(np.zeros(solution.estimate.shapes["a"], np.int16)).writeto(frame, overwrite=True)
             attach(solution, [frame], in_place=True, kind=kind, max_error=1.0)
             said = subprocess.run(["fitsverify", "-q", frame], capture_output=True, text=True, check=False).stdout
             counts = re.search(r"(\d+) warnings? and (\d+) errors?", said)
@@ -489,7 +489,7 @@ def called(folder, *command):
 
 def starry_frame(path, solution, kind, *, n_stars=120, seed=0):
     """A frame with Gaussian stars and our header; positions (n, 2)."""
-    ny, nx = solution.shapes["a"]
+    ny, nx = solution.estimate.shapes["a"]
     rng = np.random.default_rng(seed)
     places = np.mgrid[12 : nx - 12 : 24, 12 : ny - 12 : 24].reshape(2, -1).T
     p = rng.choice(places, n_stars, replace=False) + rng.uniform(-2, 2, (n_stars, 2))
@@ -535,7 +535,7 @@ def headers_in_swarp():
     """Where every pixel of SWarp's grid comes from, by frames whose values are positions."""
     swarp = program("SWarp", "swarp")
     solution = sky_chains.geometries()(3, 20)
-    ny, nx = solution.shapes["a"]
+    ny, nx = solution.estimate.shapes["a"]
     header = closest_header(solution, "tpv")
     with tempfile.TemporaryDirectory() as folder:
         found = []
@@ -597,7 +597,7 @@ def headers_in_scamp():
 def _reference_for_scamp(path, solution, p):
     """Catalogue (FITS LDAC) of the true places of stars."""
     pose = solution.poses["a"]
-    sky = sky_chains.sky_of(solution, "a", solution.correct("a", p) @ pose[:, :2].T + pose[:, 2])
+    sky = sky_chains.sky_of(solution, "a", solution["a"].correct(p) @ pose[:, :2].T + pose[:, 2])
     small = np.full(len(p), 1e-7)
     columns = dict(zip(("X_WORLD", "Y_WORLD"), sky, strict=True))
     columns |= {"ERRA_WORLD": small, "ERRB_WORLD": small, "ERRTHETA_WORLD": 0 * small, "MAG": 15 + 0 * small}
@@ -629,7 +629,7 @@ def headers_in_ds9():
     with tempfile.TemporaryDirectory() as folder:
         for kind in ("sip", "tpv"):
             header = closest_header(solution, kind)
-            fits.PrimaryHDU(np.zeros(solution.shapes["a"], np.uint8), header).writeto(
+            fits.PrimaryHDU(np.zeros(solution.estimate.shapes["a"], np.uint8), header).writeto(
                 Path(folder, "a.fits"), overwrite=True
             )
             lines = [f"image;point({x + 1:.9f},{y + 1:.9f})" for x, y in p]

@@ -21,10 +21,10 @@ def simulation_1(n_seeds=20):
     for seed in range(n_seeds):
         sim = simulate_matches(seed=seed)
         solution = solve(sim.matches, prior=sets.Prior(sim.truth.static))
-        b.append(accuracy.bias(solution.positions, sim.truth.positions[solution.star_names]))
+        b.append(accuracy.bias(solution.estimate.positions, sim.truth.positions[solution.estimate.star_names]))
         rng = np.random.default_rng(1000 + seed)
         noisy = [sim.truth.distort(name, grid) + 0.14 * rng.normal(size=grid.shape) for name in solution.names]
-        corrected = np.stack([solution.correct(name, xy) for name, xy in zip(solution.names, noisy, strict=True)])
+        corrected = np.stack([solution[name].correct(xy) for name, xy in zip(solution.names, noisy, strict=True)])
         sigma.append(rms(accuracy.scatter(corrected)))
     print(f"Simulation 1, {n_seeds} seeds, per axis: b {rms(b):.4f} px, sigma {rms(sigma):.4f} px")
 
@@ -36,12 +36,12 @@ def gsaoi(n_seeds=50):
     for seed in range(n_seeds):
         sim = simulate_gsaoi_matches(seed=seed)
         solution = solve(sim.matches, prior=prior)
-        true = sim.truth.positions[solution.star_names]
+        true = sim.truth.positions[solution.estimate.star_names]
         rows.append(
             [
-                accuracy.bias(solution.positions, true, removed=3),
+                accuracy.bias(solution.estimate.positions, true, removed=3),
                 accuracy.expected_bias(solution, removed=3),
-                accuracy.bias(solution.positions, true, removed="similarity"),
+                accuracy.bias(solution.estimate.positions, true, removed="similarity"),
                 accuracy.expected_bias(solution, removed="similarity", absolute=True),
             ]
         )

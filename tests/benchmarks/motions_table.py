@@ -22,6 +22,7 @@ import numpy as np
 
 import legdistort as ld
 from legdistort.exceptions import LegdistortWarning
+from legdistort.results import in_tables
 
 EPOCHS = np.repeat([2015.3, 2016.5, 2019.2], 4)
 DEGREE = 3
@@ -92,10 +93,10 @@ def rivals(n_sets):
         sim = field(seed)
         truth = sim.truth
         solution = ld.solve(sim.matches, motion="proper", clip=None)
-        stars, epoch = solution.stars, solution.epoch
+        stars, epoch = solution.stars, in_tables.epoch(solution)
         true = truth.positions + (epoch - truth.epoch) * truth.motions
         least = [np.hypot(stars[f"{a}_err"].value, stars[f"{b}_err"].value) / np.sqrt(2) for a, b in PAIRS]
-        made = {"one solution": (solution.positions, solution.motions.values, least)}
+        made = {"one solution": (solution.estimate.positions, solution.estimate.motions.values, least)}
         for rounds in (1, 3, 10):
             name = f"transformed, then lines, {rounds} round{'s' * (rounds > 1)}"
             made[name] = lines_through_transformed(sim.matches, epoch, rounds=rounds)

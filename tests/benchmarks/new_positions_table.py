@@ -58,7 +58,7 @@ def unknown_fields(solution, table):
     for i, name in enumerate(solution.names):
         mine = np.asarray(table["exposure"]) == name
         pixels = np.column_stack([table["x"].value, table["y"].value])[mine]
-        by_modes = new_positions.response(solution, name, solution.distortion(name).invert(pixels))[0]
+        by_modes = new_positions.response(solution, name, solution[name].distortion.invert(pixels))[0]
         for k, each in enumerate(solution.gauge.unknown):
             moved[k, mine] = by_modes @ each.coefficients[i].ravel()
     return [each.T.reshape(-1, 1) for each in moved]
@@ -75,8 +75,8 @@ def one(seed, simulating, kind):
     fields = np.hstack([cubic_fields(true), *unknown_fields(solution, table)]) / errors[:, None]
     relative = np.sum(sets.without(wrong / errors, fields) ** 2) / (len(wrong) - fields.shape[1])
     if solution.gauge.tie is None:
-        stars = sky[np.asarray(solution.star_names)]
-        offset = (solution.positions - stars).T.ravel()
+        stars = sky[np.asarray(solution.estimate.star_names)]
+        offset = (solution.estimate.positions - stars).T.ravel()
         amount = np.linalg.lstsq(sets.similarity_fields(stars), offset, rcond=None)[0]
         wrong = wrong - sets.similarity_fields(true, centre=stars.mean(axis=0)) @ amount
     return relative, np.mean(wrong**2), np.mean(absolute**2)

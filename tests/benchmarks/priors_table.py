@@ -50,7 +50,7 @@ def errors(solution, sim, *, noise=0.0):
     """b, similarity removed; scatter of new positions among the stars and over the field."""
     rng = np.random.default_rng(0)
     scatter = [accuracy.new_scatter(solution, sim.truth.distort, xy, noise, rng=rng) for xy in places(sim)]
-    b = accuracy.bias(solution.positions, sim.truth.positions, removed="similarity")
+    b = accuracy.bias(solution.estimate.positions, sim.truth.positions, removed="similarity")
     return np.array([b, *(np.sqrt(np.nanmean(s**2)) for s in scatter)])
 
 

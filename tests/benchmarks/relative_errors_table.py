@@ -54,9 +54,9 @@ def one(seed, degree, kind, **simulating):
     widths = np.where(np.arange((degree + 1) * (degree + 2) // 2) < 3, 0.0, 0.3)
     priors = {"none": None, "exact": sets.as_prior(common, rng), "stated": sets.as_prior(common, rng, widths)}
     solution = ld.solve(matches, degree=degree, prior=priors[kind])
-    true, good = sky[np.asarray(solution.stars["star"])], np.isfinite(solution.positions[:, 0])
-    wrong, both = (solution.positions - true)[good].T.ravel(), np.tile(good, 2)
-    noise = solution.uncertainty.star_matrix[np.ix_(both, both)]
+    true, good = sky[np.asarray(solution.stars["star"])], np.isfinite(solution.estimate.positions[:, 0])
+    wrong, both = (solution.estimate.positions - true)[good].T.ravel(), np.tile(good, 2)
+    noise = solution.estimate.uncertainty.star_matrix[np.ix_(both, both)]
     directions = solution.gauge.directions[good].transpose(1, 0, 2).reshape(len(wrong), -1)
     plain = polynomials(true[good], degree)
     whole = noise + directions @ solution.gauge.absolute_covariance @ directions.T

@@ -39,7 +39,7 @@ def measure(name, solver, n_exposures, n_stars):
         begin = time.perf_counter()
         if solver == "joint":
             solution = solve(Matches.from_table(table, shape=shape, poses=poses), prior=prior)
-            positions, chi2 = solution.positions, solution.chi2
+            positions, chi2 = solution.estimate.positions, solution.chi2
         else:
             problem, start = sets.problem(sim, prior)
             if solver == "scipy":
@@ -64,7 +64,7 @@ def measure(name, solver, n_exposures, n_stars):
     if solver == "joint":
         row["sigma"] = float(accuracy.scatter(accuracy.corrected_positions(solution)).mean())
         begin = time.perf_counter()
-        _ = solution.uncertainty.stars
+        _ = solution.estimate.uncertainty.stars
         row["covariance"] = time.perf_counter() - begin
         begin = time.perf_counter()
         _ = solution.stars  # with what common maps and unknown directions add

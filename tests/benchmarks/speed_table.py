@@ -64,7 +64,7 @@ def wcs(n=4_200_000):
         solution = ld.run(sim.write(folder), out=Path(folder) / "out", degree=3, psf="moffat").solution
     name = solution.names[0]
     x, y = np.random.default_rng(0).uniform(0, 511, (2, n))
-    exact, header = solution.wcs(name), solution.fits_wcs(name)
+    exact, header = solution[name].wcs, solution[name].fits_wcs()
     ways = {
         "ours": exact.pixel_to_world_values,
         "stock gwcs": exact.stock().pixel_to_world_values,

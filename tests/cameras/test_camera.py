@@ -20,6 +20,7 @@ from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry import models
 from legdistort.inputs.exposures import Exposure
 from legdistort.reporting.page import render
+from legdistort.results import in_tables
 from legdistort.simulation import gsaoi_night
 from legdistort.simulation.observations import simulate_gsaoi_matches
 from legdistort.wcs import storage
@@ -241,7 +242,7 @@ class TestSolution:
         for seed in range(4):
             drawn = night.table(sigma=SIGMA, seed=seed)
             solution = legdistort.solve(legdistort.Matches.from_table(drawn, camera=gsaoi), degree=3)
-            left.append(gsaoi_images.without_common_map(solution.positions, night.sky[stars], 3))
+            left.append(gsaoi_images.without_common_map(solution.estimate.positions, night.sky[stars], 3))
             errors = np.stack([solution.stars[name].value for name in ("x_err", "y_err")], axis=1)
             pulls.append(left[-1] / errors)
             ratios.append(solution.chi2 / solution.dof)
@@ -252,9 +253,9 @@ class TestSolution:
 
     def test_what_the_camera_knows_is_absolute(self, solution, night):
         """Without any common map but shift, rotation and scale the error is that of the mean dynamic part."""
-        numbers = solution.star_names
+        numbers = solution.estimate.star_names
         absolute = np.stack([solution.stars[name].value for name in ("x_err_abs", "y_err_abs")], axis=1)
-        z, w = solution.positions @ [1, 1j], night.sky[numbers] @ [1, 1j]
+        z, w = solution.estimate.positions @ [1, 1j], night.sky[numbers] @ [1, 1j]
         design = np.stack([w, np.ones(len(w))], axis=1)
         left = np.abs(z - design @ np.linalg.lstsq(design, z, rcond=None)[0])
         assert np.isfinite(absolute).all()
@@ -265,30 +266,32 @@ class TestSolution:
         rows = table[table["detector"] == "2"]
         rows = rows[np.bincount(rows["star"])[rows["star"]] >= 3]
         alone = legdistort.solve(legdistort.Matches.from_table(rows, camera=gsaoi), degree=3)
-        both = np.isin(solution.star_names, alone.star_names)
-        with_all = gsaoi_images.without_common_map(solution.positions[both], night.sky[solution.star_names[both]], 3)
-        by_itself = gsaoi_images.without_common_map(alone.positions, night.sky[alone.star_names], 3)
+        both = np.isin(solution.estimate.star_names, alone.estimate.star_names)
+        with_all = gsaoi_images.without_common_map(
+            solution.estimate.positions[both], night.sky[solution.estimate.star_names[both]], 3
+        )
+        by_itself = gsaoi_images.without_common_map(alone.estimate.positions, night.sky[alone.estimate.star_names], 3)
         assert np.sqrt(np.mean(by_itself**2)) > 1.05 * np.sqrt(np.mean(with_all**2))
 
     @pytest.mark.parametrize("key", ["1", "2", "3", "4"])
     def test_wcs_of_a_detector(self, solution, night, key):
         """True pixels of stars lead to their positions, through the gwcs and back."""
         xy = night.pixels[0][key]
-        numbers = np.flatnonzero(np.isin(np.arange(len(xy)), solution.star_names) & np.isfinite(xy[:, 0]))
-        wcs = solution.wcs("frame00", key)
+        numbers = np.flatnonzero(np.isin(np.arange(len(xy)), solution.estimate.star_names) & np.isfinite(xy[:, 0]))
+        wcs = solution["frame00", key].wcs
         assert wcs.available_frames == ["detector", "undistorted", "focal_plane", "reference"]
         found = np.stack(wcs(*xy[numbers].T), axis=1)
-        there = solution.positions[np.searchsorted(solution.star_names, numbers)]
+        there = solution.estimate.positions[np.searchsorted(solution.estimate.star_names, numbers)]
         assert np.sqrt(np.mean((found - there) ** 2)) < SIGMA
         assert np.abs(np.stack(wcs.invert(*found.T), axis=1) - xy[numbers]).max() < 1e-5
-        assert np.allclose(solution.correct("frame00", xy[numbers], detector=key), found, atol=1e-5)
-        assert np.allclose(solution.distort("frame00", found, detector=key), xy[numbers], atol=1e-5)
+        assert np.allclose(solution["frame00", key].correct(xy[numbers]), found, atol=1e-5)
+        assert np.allclose(solution["frame00", key].distort(found), xy[numbers], atol=1e-5)
 
     def test_new_positions(self, solution, night, table):
         """Errors of positions that took no part are those of the stars but for the mean over the exposures."""
         xy = night.pixels[0]["3"]
         xy = xy[np.isfinite(xy[:, 0])][:20]
-        there, relative, _ = solution.correct("frame00", xy, errors=np.full((20, 2), SIGMA), detector="3")
+        there, relative, _ = solution["frame00", "3"].correct(xy, errors=np.full((20, 2), SIGMA))
         new = QTable({"exposure": ["frame00"] * 20, "detector": ["3"] * 20, "x": xy[:, 0], "y": xy[:, 1]})
         new["x_err"] = new["y_err"] = np.full(20, SIGMA)
         corrected = solution.correct_table(new)
@@ -304,7 +307,7 @@ class TestSolution:
         again = legdistort.Solution.read(solution.write(tmp_path / "solution.asdf"))
         assert list(again.camera.detectors) == list(solution.camera.detectors)
         xy = pixels(5)
-        assert np.array_equal(again.correct("frame01", xy, detector="4"), solution.correct("frame01", xy, detector="4"))
+        assert np.array_equal(again["frame01", "4"].correct(xy), solution["frame01", "4"].correct(xy))
 
     def test_matches_keep_the_camera(self, table, gsaoi):
         matches = legdistort.Matches.from_table(table, camera=gsaoi)
@@ -325,7 +328,7 @@ class TestSolution:
         usual = legdistort.solve(
             legdistort.Matches.from_table(rows, shape=size), prior=legdistort.Prior(np.zeros((2, 1)))
         )
-        assert np.abs(one.positions - usual.positions).max() < 1e-9
+        assert np.abs(one.estimate.positions - usual.estimate.positions).max() < 1e-9
         assert np.allclose(one.stars["x_err"], usual.stars["x_err"], rtol=1e-9)
 
     def test_stars_that_move(self, night, table, gsaoi):
@@ -344,7 +347,7 @@ class TestSolution:
         good = np.all(errors < 0.02, axis=1)
         assert good.sum() > 200
         left = gsaoi_images.without_common_map(
-            found[good] - motion[solution.star_names][good], night.sky[solution.star_names][good], 3
+            found[good] - motion[solution.estimate.star_names][good], night.sky[solution.estimate.star_names][good], 3
         )
         assert np.sqrt(np.mean((left / errors[good]) ** 2)) == pytest.approx(1, abs=0.12)
 
@@ -377,7 +380,9 @@ class TestFittedCamera:
         for seed in range(3):
             table = night.table(sigma=SIGMA, seed=seed)
             solution = legdistort.solve(legdistort.Matches.from_table(table, camera=camera), layout="fit")
-            left.append(gsaoi_images.without_common_map(solution.positions, night.sky[solution.star_names], 3))
+            left.append(
+                gsaoi_images.without_common_map(solution.estimate.positions, night.sky[solution.estimate.star_names], 3)
+            )
             errors = np.stack([solution.stars[name].value for name in ("x_err", "y_err")], axis=1)
             pulls.append(left[-1] / errors)
             layouts.append(apart(solution.camera, gsaoi))
@@ -441,8 +446,8 @@ class TestFittedCamera:
             assert lost(solution.stars[name]).mean() > 0.9
         assert np.isfinite(solution.stars["x_err"]).all()
         xy = np.array([[300.0, 1700.0]])
-        assert np.isnan(solution.correct("frame00", xy, errors=[[0.01, 0.01]], detector="1").absolute).all()
-        assert "so that their places relative to each other are not determined" in solution.camera_sentence
+        assert np.isnan(solution["frame00", "1"].correct(xy, errors=[[0.01, 0.01]]).absolute).all()
+        assert "so that their places relative to each other are not determined" in in_tables.camera_sentence(solution)
         assert "inf" in str(solution).splitlines()[-4]
         again = legdistort.Camera.read(solution.camera.write("camera.asdf"))
         assert np.array_equal(again["1"].layout_sigma, solution.camera["1"].layout_sigma)
@@ -496,7 +501,7 @@ class TestFittedCamera:
         matches = legdistort.Matches.from_table(night.table(sigma=SIGMA), camera=legdistort.Camera("bare", bare))
         solution = legdistort.solve(matches, degree=5, layout="fit", static="fit")
         assert solution.chi2 == pytest.approx(solution.dof, rel=0.06)
-        left = gsaoi_images.without_common_map(solution.positions, night.sky[solution.star_names], 5)
+        left = gsaoi_images.without_common_map(solution.estimate.positions, night.sky[solution.estimate.star_names], 5)
         errors = np.stack([solution.stars[name].value for name in ("x_err", "y_err")], axis=1)
         assert np.mean((left / errors) ** 2) == pytest.approx(1, abs=0.15)
 
@@ -539,7 +544,7 @@ class TestBadInput:
             legdistort.Matches.from_table(rows, shape=(2048, 2048)), prior=legdistort.Prior(np.zeros((2, 1)))
         )
         with pytest.raises(InputError, match="has no camera with several detectors"):
-            solution.wcs("frame00", "1")
+            solution["frame00", "1"].wcs
         with pytest.raises(InputError, match="is for exposures with several detectors"):
             legdistort.solve(legdistort.Matches.from_table(rows, shape=(2048, 2048)), layout="fit")
 
@@ -562,10 +567,10 @@ class TestFiles:
         solution = legdistort.Solution.read("results/solution.asdf")
         names = [f"{name}-{key}" for name in solution.names for key in gsaoi.detectors]
         assert sorted(path.stem for path in (tmp_path / "results" / "wcs").iterdir()) == sorted(names)
-        assert len(solution.star_names) > 0.9 * len(np.unique(table["star"]))
+        assert len(solution.estimate.star_names) > 0.9 * len(np.unique(table["star"]))
         xy = 0.99 * pixels(6) + 10
         for key in gsaoi.detectors:
-            here = solution.wcs("frame02", key)
+            here = solution["frame02", key].wcs
             path = f"results/wcs/frame02-{key}.asdf"
             with asdf.open(path) as file:
                 stock = file["meta"]["wcs"]
@@ -586,7 +591,7 @@ class TestFiles:
             for key in "1234":
                 storage.write_wcs(fresh, name, tmp_path / f"{name}-{key}.asdf", detector=key)
         assert len(made) == 4 * (4 + 3)  # x and y, there and back, of four detectors and three exposures
-        first, second = (fresh.wcs("frame00", key).get_transform("focal_plane", "reference") for key in "12")
+        first, second = (fresh["frame00", key].wcs.get_transform("focal_plane", "reference") for key in "12")
         shared = {id(leaf) for leaf in models.leaves(first)} & {id(leaf) for leaf in models.leaves(second)}
         assert not shared
 
@@ -677,7 +682,12 @@ class TestPrediction:
         table = night.table(sigma=SIGMA)
         solution = legdistort.solve(legdistort.Matches.from_table(table, camera=gsaoi), degree=3)
         planned = legdistort.predict(
-            n_exposures=6, stars=solution.positions, sigma=SIGMA, poses=solution.poses, camera=gsaoi, min_exposures=3
+            n_exposures=6,
+            stars=solution.estimate.positions,
+            sigma=SIGMA,
+            poses=solution.poses,
+            camera=gsaoi,
+            min_exposures=3,
         )
         assert np.sum(planned.solution.stars["n"]) == np.sum(solution.stars["n"])
         found, expected = (s.stars["x_err"].value for s in (solution, planned.solution))
@@ -768,7 +778,7 @@ class TestFrames:
         solution = legdistort.Solution.read(out / "solution.asdf")
         assert solution.names == tuple(f"exp{i}" for i in range(6))
         assert 0.8 < solution.chi2 / solution.dof < 1.25
-        left = to_nearest(solution.positions, sky)
+        left = to_nearest(solution.estimate.positions, sky)
         assert len(left) > 50
         assert np.sqrt(np.mean(left**2)) < 0.03
         again = ["match", str(out / "detections.ecsv"), "--min-exposures", "3", "--out", str(tmp_path / "again.ecsv")]
@@ -786,9 +796,9 @@ class TestFrames:
                         key = str(hdu.header["CCDCHIP"])
                         name = path.rpartition("/")[2].removesuffix(".fits")
                         found = WCS(hdu.header, hdulist).all_pix2world(xy, 0)
-                        true = np.stack(solution.wcs(name, key)(*xy.T), axis=1)
+                        true = np.stack(solution[name, key].wcs(*xy.T), axis=1)
                         assert np.abs((found - true) * 3600 / 0.05).max() < 2e-3
-                        assert np.abs(np.stack(view.wcs(f"{name}-{key}")(*xy.T), axis=1) - true).max() * 72000 < 1e-5
+                        assert np.abs(np.stack(view[f"{name}-{key}"].wcs(*xy.T), axis=1) - true).max() * 72000 < 1e-5
 
     def test_step_by_step_no_detector_is_missed(self, frames, tmp_path):
         """Tables name exposures and detectors, their meta data both in one; only what is dark is left out."""

@@ -241,7 +241,7 @@ class TestWeights:
 class TestSupport:
     def one_corner(self, solution):
         """Stars of frame0 in the left half only."""
-        table = solution.observations
+        table = solution.residuals
         xy = [(10, 10), (200, 10), (200, 290), (10, 290)]
         table["x"][:4], table["y"][:4] = np.transpose(xy) * u.pix
         return measured(solution, table)
@@ -280,7 +280,7 @@ class TestSupport:
 
     def test_an_exposure_without_support(self):
         solution = scene(2, rolls=(0, 0), spread=0)[0]
-        table = solution.observations
+        table = solution.residuals
         table["used"][:4] = False
         assert not supported(support("frame0", measured(solution, table)), np.full((2, 3), 100.0)).any()
 
@@ -346,7 +346,7 @@ class TestBackground:
         y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
         exposures = []
         for i, e in enumerate(expose(solution, stars, flux)):
-            reference = solution.correct(e.name, np.column_stack([x.ravel(), y.ravel()]).astype(float))
+            reference = solution[e.name].correct(np.column_stack([x.ravel(), y.ravel()]).astype(float))
             glow = (0.02 * reference[:, 0] + 0.01 * reference[:, 1]).reshape(SHAPE)
             exposures.append(Exposure(e.name, e.data + rng.normal(0, 2, SHAPE) + 100 + 30 * i + glow))
         mosaic = coadd(exposures, solution, **{**FLAT, "match_background": True})
@@ -377,7 +377,7 @@ class TestFlux:
             wcs.array_shape = mosaic.shape
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # numpy's, from the corners outside the distortion
-                other, _ = reproject_interp((frame.data, solution.wcs(frame.name)), wcs, order="bicubic")
+                other, _ = reproject_interp((frame.data, solution[frame.name].wcs), wcs, order="bicubic")
             for key, image in (("ours", mosaic.data.astype(float)), ("plain", np.nan_to_num(other))):
                 fits = [fit_star(image, xy[i], flux[i]) for i in chosen]
                 ratios[key] += [f / flux[i] for i, (_, f) in zip(chosen, fits, strict=True)]

@@ -68,7 +68,7 @@ class TestReferencePlane:
         reference = np.stack([gx.ravel(), gy.ravel()], 1) + mosaic.offset
         expected = np.zeros(nx * ny, dtype=int)
         for e in exposures:
-            p = solution.distort(e.name, reference)
+            p = solution[e.name].distort(reference)
             expected += np.all((p >= 0) & (p <= np.array(SHAPE[::-1]) - 1), axis=1)
         np.testing.assert_array_equal(mosaic.footprint.ravel(), expected)
         np.testing.assert_array_equal(np.isnan(mosaic.data), mosaic.footprint == 0)
@@ -147,7 +147,7 @@ class TestSky:
         gx, gy = (a.ravel() for a in np.meshgrid(np.arange(0, 660, 9), np.arange(0, 660, 9)))
         expected = np.zeros(len(gx), dtype=int)
         for e in exposures:
-            p = np.stack(solution.wcs(e.name).world_to_pixel(grid.pixel_to_world(gx, gy).icrs), 1)
+            p = np.stack(solution[e.name].wcs.world_to_pixel(grid.pixel_to_world(gx, gy).icrs), 1)
             expected += np.all((p >= 0) & (p <= np.array(SHAPE[::-1]) - 1), axis=1)
         np.testing.assert_array_equal(mosaic.footprint[gy, gx], expected)
 
@@ -176,8 +176,8 @@ class TestSky:
             np.testing.assert_allclose(planes[:, y, x].T, exact, atol=1e-9)
             # The area is the derivative of the chain.
             h, hx, xy = 1e-4, np.array([1e-4, 0]), np.stack([x, y], 1) + np.array(grid.offset, dtype=float)
-            dx = (solution.distort(name, xy + hx) - solution.distort(name, xy - hx)) / (2 * h)
-            dy = (solution.distort(name, xy + hx[::-1]) - solution.distort(name, xy - hx[::-1])) / (2 * h)
+            dx = (solution[name].distort(xy + hx) - solution[name].distort(xy - hx)) / (2 * h)
+            dy = (solution[name].distort(xy + hx[::-1]) - solution[name].distort(xy - hx[::-1])) / (2 * h)
             ok = np.isfinite(dx + dy).all(axis=1)
             area = np.abs(dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0])
             np.testing.assert_allclose(exact[ok, 4], area[ok], rtol=1e-6)
@@ -672,7 +672,7 @@ class TestBadInput:
 def test_sky_of_the_stand_in_is_consistent():
     """The oracle itself: gwcs and tangent plane agree."""
     solution, stars, *_ = plain()
-    seen = solution.distort("frame0", stars)
+    seen = solution["frame0"].distort(stars)
     ok = np.isfinite(seen).all(axis=1)
-    sky = SkyCoord(*solution.wcs("frame0")(*seen[ok].T) * u.deg)
+    sky = SkyCoord(*solution["frame0"].wcs(*seen[ok].T) * u.deg)
     assert solution.sky.to_sky(stars[ok]).separation(sky).max() < 1e-9 * u.deg

@@ -51,7 +51,7 @@ def test_hot_pixels_are_gone(night):
     left = {}
     for method, mosaic in mosaics.items():
         for shift in (0, 7):
-            places = [solution.correct(e.name, np.stack([x + shift, y + shift], 1) * 1.0) for e in exposures]
+            places = [solution[e.name].correct(np.stack([x + shift, y + shift], 1) * 1.0) for e in exposures]
             left[method, shift] = np.nanmedian(excess(mosaic.data, *(np.concatenate(places) - mosaic.offset).T))
     assert left["mean", 0] > 3 * left["mean", 7]  # they were there
     assert left["clipped", 0] < 1.3 * left["clipped", 7]  # no more than anywhere
@@ -75,7 +75,7 @@ def test_cores_of_stars_are_intact_and_sharp(night):
     exposures, solution, mosaics = night
     mean, clipped = mosaics["mean"], mosaics["clipped"]
     flux = np.asarray(solution.stars["flux"])
-    xy = solution.positions - mean.offset
+    xy = solution.estimate.positions - mean.offset
     chosen = np.argsort(-flux)[20:120]  # below saturation
     chosen = chosen[np.all((xy[chosen] > 12) & (xy[chosen] < np.array(mean.shape[::-1]) - 12), axis=1)]
     y, x = np.mgrid[: mean.shape[0], : mean.shape[1]]
@@ -100,7 +100,7 @@ def test_nothing_dark_beside_saturated_stars(night):
     seen = 0
     for e in exposures:
         y, x = np.nonzero(e.data >= e.saturation)
-        for column, row in np.rint(solution.correct(e.name, np.stack([x, y], 1) * 1.0) - mosaic.offset).astype(int):
+        for column, row in np.rint(solution[e.name].correct(np.stack([x, y], 1) * 1.0) - mosaic.offset).astype(int):
             box = slice(max(row - 6, 0), row + 7), slice(max(column - 6, 0), column + 7)
             if count[box].size and count[box].min() >= 6:
                 seen += 1

@@ -335,7 +335,7 @@ def test_errors_by_brightness(start, tmp_path):
     """Truth: a law that the fit does not start from. Faint, middle and bright stars get their errors within 10 %."""
     simulated, matches, sigma = night(2, start=start)
     solution = ld.solve(matches, prior=ld.Prior(simulated.truth.static), clip=None, errors="by-brightness")
-    ratio = solution.observations["x_err"].value / sigma
+    ratio = solution.residuals["x_err"].value / sigma
     faint_first = np.argsort(matches.table["flux"])
     for part in np.array_split(ratio[faint_first], 3):
         assert np.median(part) == pytest.approx(1, abs=0.1)
@@ -361,7 +361,7 @@ def test_a_brightness_that_tells_nothing_gives_the_same_errors_to_all():
     shuffled = Matches.from_table(table, shape=matches.shapes, poses=matches.poses)
     solution = ld.solve(shuffled, prior=ld.Prior(simulated.truth.static), clip=None, errors="by-brightness")
     assert solution.chi2 == pytest.approx(solution.dof, rel=1e-3)
-    error = solution.observations["x_err"].value
+    error = solution.residuals["x_err"].value
     assert np.sqrt(np.mean(error**2)) == pytest.approx(np.sqrt(np.mean(sigma**2)), rel=0.25)
     assert np.std(np.log(error)) < 0.5 * np.std(np.log(sigma))
 
@@ -395,7 +395,7 @@ def test_stray_rows_are_left_out_by_name():
     ):
         stray = Matches.from_table(table, shape=matches.shapes, poses=matches.poses)
     assert len(stray.table) == len(matches.table)
-    assert_allclose(ld.solve(stray, degree=2).positions, clean.positions)
+    assert_allclose(ld.solve(stray, degree=2).estimate.positions, clean.estimate.positions)
 
 
 def test_many_stray_rows_are_a_wrong_shape():

@@ -413,7 +413,7 @@ def test_from_lists_to_stars_in_the_shell(tmp_path, capsys):
     )
     stars = ["stars", str(tmp_path / "r" / "solution.asdf"), "--out", str(tmp_path / "s.fits")]
     assert parser.main(stars) == 0
-    assert len(QTable.read(tmp_path / "s.fits")) == len(solution.star_names)
+    assert len(QTable.read(tmp_path / "s.fits")) == len(solution.estimate.star_names)
     capsys.readouterr()
     assert parser.main(stars) == 1
     assert "s.fits exists already" in capsys.readouterr().err
@@ -453,5 +453,5 @@ def test_warnings_are_those_of_astropy():
 
 def test_celestial_axes_have_names():
     sim = simulate_gsaoi_matches(small=True, seed=3)
-    wcs = solve(sim.matches, degree=1, clip=None).wcs(sim.matches.names[0])
+    wcs = solve(sim.matches, degree=1, clip=None)[sim.matches.names[0]].wcs
     assert tuple(wcs.world_axis_names) == ("ra", "dec")

@@ -309,8 +309,8 @@ def test_scatter_of_real_stars_follows_the_curve(microobservatory):
     solution = ld.solve(matches, degree=2, clip=5.0)
     corrected = accuracy.corrected_positions(solution)
     n = np.isfinite(corrected[:, :, 0]).sum(axis=0)
-    used = solution.observations[solution.observations["used"]]
-    star = np.searchsorted(solution.star_names, used["star"])
+    used = solution.residuals[solution.residuals["used"]]
+    star = np.searchsorted(solution.estimate.star_names, used["star"])
     names = np.asarray(used["exposure"])
     variance = np.zeros(len(used))
     for name in solution.names:

@@ -112,7 +112,7 @@ def test_solutions_priors_and_wcs(solution, place, alone, stem):
     assert Prior.from_file(place / f"{stem}.asdf").shape == SHAPE
     write_wcs(solution, NAMES[0], place / f"{stem}.wcs.asdf")
     np.testing.assert_allclose(
-        read_wcs(str(place / f"{stem}.wcs.asdf"))(3.0, 4.0), solution.wcs(NAMES[0])(3.0, 4.0), rtol=0, atol=1e-12
+        read_wcs(str(place / f"{stem}.wcs.asdf"))(3.0, 4.0), solution[NAMES[0]].wcs(3.0, 4.0), rtol=0, atol=1e-12
     )
     assert Prior.from_file(place / f"{stem}.wcs.asdf").shape == SHAPE
     alone(f"{stem}.asdf", f"{stem}.prior.asdf", f"{stem}.wcs.asdf")
@@ -251,7 +251,7 @@ def test_exposures_that_no_file_can_be_named_after_are_refused_at_the_door(tmp_p
 
 @pytest.mark.parametrize("name", [*UNFIT, "a/b", "", "a\0b"])
 def test_so_are_those_of_tables(solution, name):
-    table = solution.observations.copy()
+    table = solution.residuals.copy()
     table["exposure"] = [name if other == NAMES[0] else other for other in table["exposure"]]
     with pytest.raises(InputError, match="cannot be the name of a file; rename it"):
         ld.Matches.from_table(table, shape=SHAPE)

@@ -48,13 +48,13 @@ def image(solution):
     """Three Gaussian stars on exposure exp01, and their sky positions by the exact road."""
     y, x = np.mgrid[:NY, :NX]
     data = sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * 2.0**2)) for a, b in STARS)
-    return data, solution.sky.to_sky(solution.correct("exp01", STARS))
+    return data, solution.sky.to_sky(solution["exp01"].correct(STARS))
 
 
 @pytest.fixture(scope="module")
 def target(solution, image):
     """A TAN WCS and a shape for it that hold the exposure."""
-    return find_optimal_celestial_wcs([(image[0], solution.wcs("exp01"))])
+    return find_optimal_celestial_wcs([(image[0], solution["exp01"].wcs)])
 
 
 def centroids(data, wcs, sky):
@@ -70,7 +70,7 @@ def centroids(data, wcs, sky):
 
 
 def test_it_is_a_wcs_of_the_shared_interface(solution):
-    wcs = solution.wcs("exp01")
+    wcs = solution["exp01"].wcs
     assert isinstance(wcs, BaseLowLevelWCS)
     assert isinstance(wcs, BaseHighLevelWCS)
     assert (wcs.pixel_n_dim, wcs.world_n_dim) == (2, 2)
@@ -84,8 +84,8 @@ def test_it_is_a_wcs_of_the_shared_interface(solution):
 
 
 def test_positions_in_all_ways(solution):
-    wcs = solution.wcs("exp01")
-    exact = solution.sky.to_sky(solution.correct("exp01", STARS))
+    wcs = solution["exp01"].wcs
+    exact = solution.sky.to_sky(solution["exp01"].correct(STARS))
     for sky in (wcs.pixel_to_world(*STARS.T), wcs.pixel_to_world(*(STARS * u.pix).T)):
         assert sky.separation(exact).max() < 1e-9 * u.deg
     assert_allclose(np.array(wcs.pixel_to_world_values(*STARS.T)), [exact.ra.deg, exact.dec.deg], rtol=0, atol=1e-9)
@@ -99,29 +99,29 @@ def test_positions_in_all_ways(solution):
 
 def test_footprint_is_the_outline_of_the_detector(solution):
     corners = np.array([[-0.5, -0.5], [-0.5, NY - 0.5], [NX - 0.5, NY - 0.5], [NX - 0.5, -0.5]])
-    exact = solution.sky.to_sky(solution.correct("exp01", corners))
-    assert_allclose(solution.wcs("exp01").footprint(), np.column_stack([exact.ra.deg, exact.dec.deg]), atol=1e-9)
+    exact = solution.sky.to_sky(solution["exp01"].correct(corners))
+    assert_allclose(solution["exp01"].wcs.footprint(), np.column_stack([exact.ra.deg, exact.dec.deg]), atol=1e-9)
 
 
 @pytest.mark.parametrize("method", ["interp", "adaptive", "exact"])
 def test_reproject(solution, image, target, method):
     (data, sky), (wcs, shape) = image, target
     function = getattr(reproject, f"reproject_{method}")
-    out, footprint = function((data, solution.wcs("exp01")), wcs, shape_out=shape)
+    out, footprint = function((data, solution["exp01"].wcs), wcs, shape_out=shape)
     assert centroids(out, wcs, sky).max() < 0.05
     assert 0.5 < np.mean(footprint > 0) < 1
-    back, _ = function((np.nan_to_num(out), wcs), solution.wcs("exp01"), shape_out=data.shape)
-    assert centroids(back, solution.wcs("exp01"), sky).max() < 0.1
+    back, _ = function((np.nan_to_num(out), wcs), solution["exp01"].wcs, shape_out=data.shape)
+    assert centroids(back, solution["exp01"].wcs, sky).max() < 0.1
 
 
 def test_reproject_finds_the_frame(solution, image, target):
     """The whole exposure is on the grid that reproject proposes, and the grid is not larger than it needs to be."""
     wcs, shape = target
     edge = np.concatenate([[[x, y] for x in np.linspace(-0.5, NX - 0.5, 50) for y in (-0.5, NY - 0.5)]])
-    x, y = wcs.world_to_pixel(solution.wcs("exp01").pixel_to_world(*edge.T))
+    x, y = wcs.world_to_pixel(solution["exp01"].wcs.pixel_to_world(*edge.T))
     assert -1.5 < x.min() < 1.5
     assert -1.5 < y.min() < 1.5
-    both = [(image[0], solution.wcs(name)) for name in ("exp00", "exp01")]
+    both = [(image[0], solution[name].wcs) for name in ("exp00", "exp01")]
     mosaic, footprint = reproject_and_coadd(both, wcs, shape_out=shape, reproject_function=reproject.reproject_interp)
     assert mosaic.shape == shape
     assert footprint.max() == 2
@@ -141,7 +141,7 @@ def bent(request):
 
 
 def test_no_position_on_the_detector_is_lost(bent):
-    wcs = bent.wcs("a")
+    wcs = bent["a"].wcs
     p, ra, dec = (a[404:] for a in detector(bent, "a"))  # the first ones are on the edge, to all digits
     for sky in ((ra, dec), (ra - 360, dec), (ra * u.deg, dec * u.deg)):
         back = np.column_stack([u.Quantity(a, u.pix).value for a in wcs.invert(*sky)])
@@ -156,8 +156,8 @@ def test_no_position_on_the_detector_is_lost(bent):
 
 def test_positions_beyond_the_detector_are_nan(bent):
     """The opposite half of the sky as well, which a gnomonic projection could send to the same pixels."""
-    wcs = bent.wcs("a")
-    ny, nx = bent.shapes["a"]
+    wcs = bent["a"].wcs
+    ny, nx = bent.estimate.shapes["a"]
     middle = np.array([nx - 1, ny - 1]) / 2
     ring = [[np.cos(t), np.sin(t)] for t in np.linspace(0, 2 * np.pi, 40)]
     far = np.concatenate([middle + np.hypot(nx, ny) * s * np.array(ring) for s in (0.6, 1, 3, 30)])
@@ -174,14 +174,14 @@ def test_positions_beyond_the_detector_are_nan(bent):
 @pytest.mark.parametrize("method", ["interp", "adaptive", "exact"])
 def test_reproject_fills_the_whole_image(bent, method):
     """An image that rises by one a column and three a row, on a plain grid: every pixel holds where it comes from."""
-    ny, nx = bent.shapes["a"]
+    ny, nx = bent.estimate.shapes["a"]
     y, x = np.mgrid[:ny, :nx].astype(float)
     shape = ny // 2 + 60, nx // 2 + 60
     grid = WCS(naxis=2)
     grid.wcs.ctype, grid.wcs.crval = ["RA---TAN", "DEC--TAN"], [bent.sky.lon, bent.sky.lat]
     grid.wcs.crpix = (shape[1] + 1) / 2, (shape[0] + 1) / 2
     grid.wcs.cdelt = np.array([-2.0, 2.0]) * bent.sky.pixel_scale / 3600
-    out, _ = getattr(reproject, f"reproject_{method}")((x + 3 * y, bent.wcs("a")), grid, shape_out=shape)
+    out, _ = getattr(reproject, f"reproject_{method}")((x + 3 * y, bent["a"].wcs), grid, shape_out=shape)
     to = np.indices(shape)[::-1].reshape(2, -1).T
     p = pixels_of(bent, "a", *grid.all_pix2world(to, 0).T).reshape(*shape, 2)
     inside = np.minimum(np.minimum(p[..., 0], nx - 1 - p[..., 0]), np.minimum(p[..., 1], ny - 1 - p[..., 1]))
@@ -194,7 +194,7 @@ def test_reproject_fills_the_whole_image(bent, method):
 
 def test_photutils(solution, image):
     data, sky = image
-    wcs = solution.wcs("exp01")
+    wcs = solution["exp01"].wcs
     circle = CircularAperture(STARS, r=5.0)
     on_sky = circle.to_sky(wcs)
     assert on_sky.positions.separation(sky).max() < 1e-9 * u.deg
@@ -210,7 +210,7 @@ def test_photutils(solution, image):
 
 def test_regions(solution):
     regions = pytest.importorskip("regions", reason="regions is an extra of the tests (dev)")
-    wcs = solution.wcs("exp01")
+    wcs = solution["exp01"].wcs
     circle = regions.CirclePixelRegion(regions.PixCoord(70.0, 40.0), 5.0)
     again = circle.to_sky(wcs).to_pixel(wcs)
     assert_allclose(again.center.xy, (70.0, 40.0), atol=2e-6)
@@ -219,7 +219,7 @@ def test_regions(solution):
 
 def test_wcsaxes(solution, image, tmp_path):
     """The grid of the axes follows the distortion: labels stand where the exact chain puts them."""
-    wcs = solution.wcs("exp01")
+    wcs = solution["exp01"].wcs
     figure = plt.figure(figsize=(6, 5))
     axes = figure.add_subplot(projection=wcs)
     assert isinstance(axes, WCSAxes)
@@ -234,7 +234,7 @@ def test_wcsaxes(solution, image, tmp_path):
 
 
 def test_nddata_takes_the_exact_wcs(solution, image):
-    ndd = NDData(image[0], wcs=solution.wcs("exp01"))
+    ndd = NDData(image[0], wcs=solution["exp01"].wcs)
     assert_allclose(np.column_stack(ndd.wcs.world_to_pixel(image[1])), STARS, atol=2e-6)
 
 
@@ -242,8 +242,8 @@ def test_ccddata_takes_the_fits_wcs(solution, image):
     """`CCDData` accepts `astropy.wcs.WCS` and nothing else (astropy#11727), however well another WCS behaves."""
     ccd = CCDData(image[0], unit="adu")
     with pytest.raises(TypeError, match="must be a WCS instance"):
-        ccd.wcs = solution.wcs("exp01")
-    ccd.wcs = solution.fits_wcs("exp01")
+        ccd.wcs = solution["exp01"].wcs
+    ccd.wcs = solution["exp01"].fits_wcs()
     assert ccd.wcs.array_shape == (NY, NX)
     assert np.hypot(*(np.column_stack(ccd.wcs.world_to_pixel(image[1])) - STARS).T).max() < 1e-3
     part = ccd[10:90, 20:]
@@ -257,25 +257,27 @@ def test_ccddata_takes_the_fits_wcs(solution, image):
 def test_fits_wcs_is_as_good_as_asked(solution):
     p = np.random.default_rng(0).uniform([-0.5, -0.5], [NX - 0.5, NY - 0.5], (200, 2))
     for name in solution.names:
-        exact = solution.sky.to_sky(solution.correct(name, p))
+        exact = solution.sky.to_sky(solution[name].correct(p))
         for max_error in (0.1, 1e-3):
-            wcs = solution.fits_wcs(name, max_error=max_error)
+            wcs = solution[name].fits_wcs(max_error=max_error)
             assert np.hypot(*(np.column_stack(wcs.world_to_pixel(exact)) - p).T).max() <= max_error
             assert wcs.pixel_to_world(*p.T).separation(exact).max() <= max_error * 1.1 * SCALE * u.arcsec
     with pytest.raises(ExportError, match="exp01: no SIP header meets max_error"):
-        solution.fits_wcs("exp01", max_error=1e-14)
+        solution["exp01"].fits_wcs(max_error=1e-14)
     blind = solve(simulate_matches(n_stars=40, n_exposures=3, degree=1, static=1, seed=1).matches, degree=1)
     with pytest.raises(InputError, match="sky"):
-        blind.fits_wcs("exp00")
+        blind["exp00"].fits_wcs()
 
 
 def test_ccdproc(solution, image, target):
     """`wcs_project` of a `CCDData` is what reproject makes of the exact WCS, to the error of the header."""
     ccdproc = pytest.importorskip("ccdproc", reason="ccdproc is an extra of the tests (dev): it needs scikit-image")
     (data, sky), (wcs, shape) = image, target
-    projected = ccdproc.wcs_project(CCDData(data, unit="adu", wcs=solution.fits_wcs("exp01")), wcs, target_shape=shape)
+    projected = ccdproc.wcs_project(
+        CCDData(data, unit="adu", wcs=solution["exp01"].fits_wcs()), wcs, target_shape=shape
+    )
     assert centroids(projected.data, wcs, sky).max() < 0.05
-    exact, _ = reproject.reproject_interp((data, solution.wcs("exp01")), wcs, shape_out=shape)
+    exact, _ = reproject.reproject_interp((data, solution["exp01"].wcs), wcs, shape_out=shape)
     seen = np.isfinite(exact) & np.isfinite(projected.data)
     area = np.median(projected.data[seen & (exact > 0.1)] / exact[seen & (exact > 0.1)])  # counts scale with the area
     assert np.abs(projected.data / area - exact)[seen].max() < 1e-3
@@ -284,7 +286,7 @@ def test_ccdproc(solution, image, target):
 
 def test_cutout(solution, image):
     """`Cutout2D` looks for the distortion of a FITS WCS, so it takes that one only."""
-    wcs = solution.fits_wcs("exp01")
+    wcs = solution["exp01"].fits_wcs()
     cutout = Cutout2D(image[0], image[1][0], (20, 30), wcs=wcs)
     assert cutout.shape == (20, 30)
     assert_allclose(cutout.wcs.world_to_pixel(image[1][0]), cutout.input_position_cutout, atol=2e-3)

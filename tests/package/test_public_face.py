@@ -94,13 +94,13 @@ def test_nouns_explain_themselves(simulation, solution):
     )
     assert repr(solution.gauge) == "<Gauge 'minimal': 20 constraints, 6 exposures>"
     name = solution.names[0]
-    assert repr(solution.distortion(name)) == f"<Distortion of {name}: degree 3, {shape[1]} x {shape[0]} px>"
-    assert repr(solution.distortion(name).inverse).startswith("<Inverse: degree ")
+    assert repr(solution[name].distortion) == f"<Distortion of {name}: degree 3, {shape[1]} x {shape[0]} px>"
+    assert repr(solution[name].distortion.inverse).startswith("<Inverse: degree ")
     assert repr(Prior(np.zeros((2, 6)), sigma=1)) == "<Prior: degree 2, 6 modes an axis, sigma given>"
     assert repr(TangentPlane(10, -5, np.eye(2, 3) / 3600)) == "<TangentPlane: 10.00000 -5.00000 deg, 1.0000 arcsec/px>"
     image = Exposure(name="e1", data=np.zeros((20, 30)))
     assert repr(image).startswith("<Exposure 'e1': 30 x 20 px, ")
-    for thing in (simulation, simulation.truth, solution.distortion(name).inverse, image):
+    for thing in (simulation, simulation.truth, solution[name].distortion.inverse, image):
         assert len(repr(thing)) < 150
         assert "array" not in repr(thing)
 
@@ -152,18 +152,18 @@ def test_results_cannot_be_assigned_to(solution):
 
 def test_unknown_exposures_are_named(solution):
     for call in (
-        lambda: solution.correct("nobody", [[1, 1]]),
-        lambda: solution.distort("nobody", [[1, 1]]),
-        lambda: solution.wcs("nobody"),
-        lambda: solution.model("nobody"),
-        lambda: solution.sigma_map("nobody"),
+        lambda: solution["nobody"].correct([[1, 1]]),
+        lambda: solution["nobody"].distort([[1, 1]]),
+        lambda: solution["nobody"].wcs,
+        lambda: solution["nobody"].model,
+        lambda: solution["nobody"].sigma_map(),
     ):
         with pytest.raises(LegdistortError, match=r"no exposure 'nobody' in the solution; it has .*, "):
             call()
     sim = simulate_matches(n_exposures=3, n_stars=20, degree=1)
     matches = Matches(sim.matches.table, sim.matches.shapes, sim.matches.poses, None, {"dark": "no stars were found"})
     with pytest.raises(LegdistortError, match=r"no exposure 'dark' in the solution: it was left out \(no stars"):
-        solve(matches, degree=1).wcs("dark")
+        solve(matches, degree=1)["dark"].wcs
 
 
 # --- the plan ----------------------------------------------------------------------------------------------------
@@ -257,7 +257,7 @@ def test_files_open_with_gwcs_alone(solution, tmp_path, stack):
     assert got.returncode == 0, got.stderr
     (tmp_path / "wcs").mkdir()
     paths = [write_wcs(solution, name, tmp_path / "wcs" / f"{name}.asdf") for name in solution.names]
-    ny, nx = solution.shapes[solution.names[0]]
+    ny, nx = solution.estimate.shapes[solution.names[0]]
     x, y = np.random.default_rng(0).uniform([[0], [0]], [[nx - 1], [ny - 1]], (2, 200))
     (tmp_path / "points.json").write_text(json.dumps([x.tolist(), y.tolist()]))
     command = [python, "-I", "-c", READER, tmp_path / "points.json", *paths]
@@ -266,12 +266,12 @@ def test_files_open_with_gwcs_alone(solution, tmp_path, stack):
     seen = json.loads(read.stdout)
     assert set(seen) == set(solution.names)
     for name, (ra, dec, back, coefficients) in seen.items():
-        ours = solution.wcs(name).pixel_to_world(x, y)
-        exact = solution.sky.to_sky(solution.correct(name, np.column_stack([x, y])))
+        ours = solution[name].wcs.pixel_to_world(x, y)
+        exact = solution.sky.to_sky(solution[name].correct(np.column_stack([x, y])))
         assert_allclose([ra, dec], [ours.ra.deg, ours.dec.deg], rtol=0, atol=1e-9)
         assert_allclose([ra, dec], [exact.ra.to_value(u.deg), exact.dec.to_value(u.deg)], rtol=0, atol=1e-9)
         assert_allclose(back, [x, y], rtol=0, atol=1e-6)
-        tensors = to_tensor(solution.coefficients[solution.index(name)])
+        tensors = to_tensor(solution.coefficients[solution.names.index(name)])
         assert coefficients == [tensor.T.ravel().tolist() for tensor in tensors]  # to the bit
 
 
@@ -308,16 +308,16 @@ def test_objects_draw_themselves_where_they_are_told(solution):
     for draw in (
         solution.plot,
         solution.plot_residuals,
-        lambda ax: solution.plot_residuals(name, ax=ax),
-        lambda ax: solution.plot_error_map(name, ax=ax),
-        lambda ax: solution.plot_error_map(name, absolute=True, ax=ax),
+        lambda ax: solution[name].plot_residuals(ax=ax),
+        lambda ax: solution[name].plot_error_map(ax=ax),
+        lambda ax: solution[name].plot_error_map(absolute=True, ax=ax),
         mosaic.plot,
     ):
         ax = Figure().subplots()
         assert draw(ax=ax) is ax
         assert ax.get_title(loc="left")
     with pytest.raises(LegdistortError, match="no exposure 'x' in the solution"):
-        solution.plot_error_map("x")
+        solution["x"].plot_error_map()
 
 
 def test_calls_the_wrong_way_round_are_told_the_right_one(simulation, solution):

@@ -234,8 +234,8 @@ def test_a_solution_in_another_process(solution, method):
     with ProcessPoolExecutor(1, multiprocessing.get_context(method)) as pool:
         corrected = pool.submit(solution.correct, name, PIXELS).result()
         again = pool.submit(pickle.loads, pickle.dumps(solution)).result()
-    np.testing.assert_array_equal(corrected, solution.correct(name, PIXELS))
-    np.testing.assert_array_equal(again.wcs(name)(*PIXELS.T), solution.wcs(name)(*PIXELS.T))
+    np.testing.assert_array_equal(corrected, solution[name].correct(PIXELS))
+    np.testing.assert_array_equal(again[name].wcs(*PIXELS.T), solution[name].wcs(*PIXELS.T))
     assert str(again) == str(solution)
 
 
@@ -247,4 +247,4 @@ def test_a_solution_on_a_cluster(solution):
     )
     with cluster, distributed.Client(cluster) as client:
         corrected = client.submit(solution.correct, solution.names[0], PIXELS).result(timeout=60)
-    np.testing.assert_array_equal(corrected, solution.correct(solution.names[0], PIXELS))
+    np.testing.assert_array_equal(corrected, solution[solution.names[0]].correct(PIXELS))

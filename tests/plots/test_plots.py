@@ -103,11 +103,11 @@ def test_grid_is_the_distortion_magnified(solution):
     lines = grids(ax)
     straight, bent = lines[color(elements.GREY)], lines[color(elements.BLUE)]
     q = straight.reshape(-1, 2)
-    expected = q + 50 * (solution.distortion(name)(q) - q)
+    expected = q + 50 * (solution[name].distortion(q) - q)
     np.testing.assert_allclose(bent.reshape(-1, 2), expected, atol=1e-8)
     assert np.ptp(q[:, 0]) == 2048  # edge to edge
     prior = lines[color(elements.ORANGE)].reshape(-1, 2)
-    shift = solution.prior_mean[3] @ basis.values(3, *basis.normalize(q, (2048, 2048)))
+    shift = solution.estimate.prior_mean[3] @ basis.values(3, *basis.normalize(q, (2048, 2048)))
     np.testing.assert_allclose(prior, q + 50 * shift.T, atol=1e-8)
 
 
@@ -116,7 +116,9 @@ def test_dynamic_grid_leaves_the_prior_out(solution):
     lines = grids(ax)
     assert color(elements.ORANGE) not in lines
     q = lines[color(elements.GREY)].reshape(-1, 2)
-    shift = (solution.coefficients[0] - solution.prior_mean[0]) @ basis.values(3, *basis.normalize(q, (2048, 2048)))
+    shift = (solution.coefficients[0] - solution.estimate.prior_mean[0]) @ basis.values(
+        3, *basis.normalize(q, (2048, 2048))
+    )
     np.testing.assert_allclose(lines[color(elements.BLUE)].reshape(-1, 2), q + 10 * shift.T, atol=1e-8)
 
 
@@ -124,7 +126,7 @@ def test_automatic_magnification_makes_a_tenth_of_the_detector(solution):
     scale = solution_plots.distortion_scale(solution, solution.names)
     t = np.linspace(-0.5, 2047.5, 40)
     q = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
-    peak = max(np.abs(solution.distortion(name)(q) - q).max() for name in solution.names)
+    peak = max(np.abs(solution[name].distortion(q) - q).max() for name in solution.names)
     assert 0.03 * 2048 < scale * peak <= 0.1 * 2048 * 1.02
 
 
@@ -158,7 +160,7 @@ def test_bars_are_the_coefficients_beside_the_prior(degree):
         heights = {c.get_label(): [bar.get_height() for bar in c] for c in ax.containers if isinstance(c, BarContainer)}
         np.testing.assert_allclose(heights[solution.names[1]], solution.coefficients[1, axis])
         if degree >= 2:
-            np.testing.assert_allclose(heights["prior"], solution.prior_mean[1, axis])
+            np.testing.assert_allclose(heights["prior"], solution.estimate.prior_mean[1, axis])
         assert ax.get_ylabel() == f"along {'xy'[axis]} [px]"
     labels = [t.get_text() for t in panels[1].get_xticklabels()]
     assert len(labels) == n
@@ -238,8 +240,8 @@ def test_pulls_are_one_with_right_errors_and_their_sum_is_chi2():
         sums.append(pulls.by_star())
     inside = [stats.chi2.cdf(s.rms**2 * s.freedom, s.freedom) for s in sums]
     assert 0.9 < np.mean(np.abs(np.concatenate(inside) - 0.5) < 0.475) < 0.985  # 95 % are expected
-    solution.observations["x_err"] *= factor
-    solution.observations["y_err"] *= factor
+    solution.residuals["x_err"] *= factor
+    solution.residuals["y_err"] *= factor
     np.testing.assert_allclose(pulls_of(solution).by_exposure().rms, pulls.by_exposure().rms / factor)
 
 

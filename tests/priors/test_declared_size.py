@@ -71,7 +71,7 @@ def test_what_exposures_determine_they_determine_as_well_with_a_size(declared, s
 def test_larger_size_larger_error_same_relative_positions(declared, sim):
     larger = ld.solve(sim.matches, prior=ld.Prior(None, static_sigma=6.0))
     assert np.median(larger.stars["x_err_abs"] / declared.stars["x_err_abs"]) > 1.5
-    assert accuracy.bias(larger.positions, declared.positions, removed=5) < 1e-3
+    assert accuracy.bias(larger.estimate.positions, declared.estimate.positions, removed=5) < 1e-3
 
 
 @pytest.mark.slow
@@ -81,8 +81,10 @@ def test_errors_are_calibrated_for_distortions_of_that_size():
     for seed in range(100):
         sim = ld.simulate_matches(seed=seed, static=2.0, dynamic=0.3, **SETTING)
         solution = ld.solve(sim.matches, prior=ld.Prior(None, static_sigma=_size(sim.truth.static)))
-        good = np.isfinite(solution.positions[:, 0])
-        true.append(accuracy.bias(solution.positions[good], sim.truth.positions[good], removed="similarity") ** 2)
+        good = np.isfinite(solution.estimate.positions[:, 0])
+        true.append(
+            accuracy.bias(solution.estimate.positions[good], sim.truth.positions[good], removed="similarity") ** 2
+        )
         reported.append(accuracy.expected_bias(solution, removed="similarity", absolute=True) ** 2)
     assert np.mean(true) / np.mean(reported) == pytest.approx(1, abs=0.2)  # standard error 0.06
 
@@ -128,7 +130,7 @@ def test_files_keep_it(tmp_path, declared):
     for column in ("x_err", "x_err_abs"):
         assert_array_equal(again.stars[column], declared.stars[column])
     name = declared.names[0]
-    assert_array_equal(again.sigma_map(name, n=4)[2], declared.sigma_map(name, n=4)[2])
+    assert_array_equal(again[name].sigma_map(n=4)[2], declared[name].sigma_map(n=4)[2])
 
 
 def test_it_is_no_static_map_to_correct_with(sim, declared):
@@ -143,7 +145,7 @@ def test_with_other_options(sim, options):
     solution = ld.solve(sim.matches, prior=ld.Prior(None, static_sigma=2.0), **options)
     assert solution.gauge.unknown == ()
     assert np.isfinite(solution.stars["x_err_abs"]).all()
-    assert np.isfinite(solution.coefficient_errors(solution.names[0])).all()
+    assert np.isfinite(solution[solution.names[0]].errors).all()
 
 
 def test_by_detector(sim):

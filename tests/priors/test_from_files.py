@@ -530,7 +530,7 @@ def test_prior_of_another_field(tmp_path, capsys):
     solution.write(tmp_path / "solution.asdf")
     prior = Prior.from_file(tmp_path / "solution.asdf", sigma=0.5)
     assert_allclose(prior.mean, solution.coefficients.mean(axis=0))
-    assert prior.shape == solution.shapes[solution.names[0]]
+    assert prior.shape == solution.estimate.shapes[solution.names[0]]
     assert list(prior.source["files"]) == ["solution.asdf"]
     prior.write(tmp_path / "prior.asdf")
     table = sim.matches.table.copy()
@@ -539,7 +539,7 @@ def test_prior_of_another_field(tmp_path, capsys):
     command = ["solve", str(tmp_path / "matched.ecsv"), "--degree", "2", "--quiet", "--prior"]
     assert main([*command, str(tmp_path / "prior.asdf"), "--out", str(tmp_path / "out")]) == 0
     again = Solution.read(tmp_path / "out" / "solution.asdf")
-    assert_allclose(again.prior_mean, [prior.mean] * 4)
+    assert_allclose(again.estimate.prior_mean, [prior.mean] * 4)
     assert main([*command, "gsaoi-9", "--out", str(tmp_path / "no")]) == 1
     assert "gsaoi-9: no such file; give a file, gsaoi-1 ..." in capsys.readouterr().err
 

@@ -266,8 +266,8 @@ def test_the_sky_is_that_of_the_headers():
     matches = ld.match(table, exposures=exposures)
     solution = ld.solve(matches, degree=3, prior=ld.Prior.from_headers(exposures))
     fluxes = dict(zip(matches.table["star"], matches.table["flux"], strict=True))
-    truth = sky[[int(fluxes[star] - 1000) for star in solution.star_names]]
-    found = solution.sky.to_sky(solution.positions)
+    truth = sky[[int(fluxes[star] - 1000) for star in solution.estimate.star_names]]
+    found = solution.sky.to_sky(solution.estimate.positions)
     off = np.column_stack([(found.ra.deg - truth[:, 0]) * np.cos(np.radians(2)), found.dec.deg - truth[:, 1]]) / SCALE
     assert np.abs(off).max() < 0.02
 

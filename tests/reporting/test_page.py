@@ -27,6 +27,7 @@ from legdistort.reporting import page as report
 from legdistort.reporting.pictures import Picture
 from legdistort.reporting.svg import STYLE, detached_figure, svg_of
 from legdistort.reporting.tables import detectors_table
+from legdistort.results import in_tables
 from legdistort.simulation import observations
 from legdistort.solving.estimation import solve
 
@@ -131,11 +132,11 @@ def test_every_picture_has_its_sentence_and_follows_the_colours_of_the_page(page
 
 def test_marks_belong_to_their_stars_and_exposures(text, solution):
     names = json.loads(re.search(r'id="names">(.*?)</script>', text)[1])
-    assert names == {"s": [str(name) for name in solution.star_names], "e": list(solution.names)}
+    assert names == {"s": [str(name) for name in solution.estimate.star_names], "e": list(solution.names)}
     pulls = pulls_of(solution)
     (dots,) = [each for each in re.findall(r"<svg.*?</svg>", text, re.DOTALL) if "stars by brightness" in each]
     found = {int(s): (float(x), float(y)) for s, x, y in re.findall(r'data-s="(\d+)"[^>]* x="(\S+)" y="(\S+)"', dots)}
-    assert sorted(found) == list(range(len(solution.star_names)))
+    assert sorted(found) == list(range(len(solution.estimate.star_names)))
     place, rms = np.array([found[i] for i in sorted(found)]), pulls.by_star().rms
     assert np.corrcoef(place[:, 0], np.log(pulls.brightness))[0, 1] == pytest.approx(1, abs=1e-6)
     assert np.corrcoef(place[:, 1], rms)[0, 1] == pytest.approx(-1, abs=1e-6)
@@ -219,18 +220,21 @@ def test_numbers_are_those_of_the_solution(page, solution):
     t = (t[1:] + t[:-1]) / 2
     q = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
     sizes = []
-    for c in (solution.coefficients[1], solution.coefficients[1] - solution.prior_mean[1]):
+    for c in (solution.coefficients[1], solution.coefficients[1] - solution.estimate.prior_mean[1]):
         displacement = c @ basis.values(3, *basis.normalize(q, (2048, 2048)))
         sizes.append(np.sqrt(np.sum(np.var(displacement, axis=1))))
     expected = [f"{shift[0]:.2f}", f"{shift[1]:.2f}", "0.0000", "1.000000", str(len(rows))]
     expected += [f"{r:.4f}" for r in rms]
     assert page.row(name)[1:8] == expected
     np.testing.assert_allclose([float(c) for c in page.row(name)[8:]], sizes, atol=2e-3)
-    assert page.row("Residuals, rms")[1] == f"{solution.rms[0]:.4f} px in x, {solution.rms[1]:.4f} px in y"
+    assert (
+        page.row("Residuals, rms")[1]
+        == f"{in_tables.rms(solution)[0]:.4f} px in x, {in_tables.rms(solution)[1]:.4f} px in y"
+    )
     assert page.row("Stars")[1] == "40"
     assert page.row("χ² / degrees of freedom")[1].startswith("1432.1 / 1380 = 1.038")
     assert float(page.row("Largest error of an inverse")[1].split()[0]) == pytest.approx(
-        solution.max_inverse_error, rel=0.1
+        in_tables.largest_inverse_error(solution), rel=0.1
     )
 
 
@@ -247,7 +251,7 @@ def test_summary_replaces_what_follows_from_the_solution(solution, tables_only):
 
 def test_stars_without_a_position_do_not_count(tables_only):
     solution = make_solution(5, 40)
-    solution.positions[7] = np.nan
+    solution.estimate.positions[7] = np.nan
     assert Page(report.render(solution)).row("Stars")[1] == "39 (1 more without a position)"
 
 
@@ -278,7 +282,7 @@ def test_strong_distortion_is_magnified_less():
 @pytest.mark.usefixtures("undrawn")
 def test_many_exposures_are_listed_and_the_dozen_that_departs_most_is_drawn():
     solution = make_solution(14, 10)
-    solution.coefficients[5] = solution.prior_mean[5]
+    solution.coefficients[5] = solution.estimate.prior_mean[5]
     page = Page(text := report.render(solution))
     assert set(solution.names) <= set(page.cells)
     assert "the 12 exposures that depart most" in text

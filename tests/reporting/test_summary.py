@@ -14,7 +14,7 @@ from legdistort.reporting.summary import summarise
 def test_figures_are_those_of_the_tables():
     solution = solve(simulate_matches(n_stars=30, n_exposures=6, seed=3).matches, degree=1)
     found = summarise(solution, timings={"solve": 0.12345})
-    used = solution.observations[solution.observations["used"]]
+    used = solution.residuals[solution.residuals["used"]]
     assert json.loads(json.dumps(found)) == found
     assert (found["n_exposures"], found["n_stars"], found["n_observations"]) == (6, 30, len(used))
     left = np.concatenate([used["dx"].value, used["dy"].value])

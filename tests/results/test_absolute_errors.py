@@ -22,7 +22,7 @@ def offsets(name, seed=0, **changed):
     simulating, solving = table.settings()[name]
     matches, sky, common = table.simulated(seed, **simulating | changed)
     solution = ld.solve(matches, **solving(matches, sky, common, np.random.default_rng(seed)))
-    return solution, sky[solution.star_names]
+    return solution, sky[solution.estimate.star_names]
 
 
 def ratio(solution, true):
@@ -34,7 +34,7 @@ def ratio(solution, true):
 def linear(solution, true):
     """Rms of the offsets once a similarity and the unknown directions at the solution are taken off."""
     columns = [table.similarity_fields(true), *(each.stars.T.reshape(-1, 1) for each in solution.gauge.unknown)]
-    return np.sqrt(np.mean(table.without((true - solution.positions).T.ravel(), np.hstack(columns)) ** 2))
+    return np.sqrt(np.mean(table.without((true - solution.estimate.positions).T.ravel(), np.hstack(columns)) ** 2))
 
 
 @pytest.mark.parametrize("name", ["no prior, no dithers", "static='fit', no rolls"])
@@ -53,7 +53,7 @@ def test_unknown_directions_are_taken_off_to_second_order(name):
 def test_known_offsets_are_those_after_a_similarity_where_all_is_known():
     solution, true = offsets("prior, exact", n_exposures=4)
     assert solution.gauge.unknown == ()
-    expected = accuracy.bias(solution.positions, true, removed="similarity")
+    expected = accuracy.bias(solution.estimate.positions, true, removed="similarity")
     assert np.sqrt(np.mean(accuracy.known_offsets(solution, true) ** 2)) == pytest.approx(expected)
 
 
@@ -66,9 +66,9 @@ def test_relative_errors_are_calibrated_after_any_common_map(prior, least):
         matches, sky, common = table.simulated(seed, n_stars=150, sigma=0.003, n_exposures=6)
         given = table.as_prior(common, None) if prior == "exact" else None
         solution = ld.solve(matches, prior=given)
-        wrong = (solution.positions - sky[solution.star_names]).T.ravel()
+        wrong = (solution.estimate.positions - sky[solution.estimate.star_names]).T.ravel()
         directions = solution.gauge.directions.transpose(1, 0, 2).reshape(len(wrong), -1)
-        linear.append(relative_errors_table.squared_pull(wrong, solution.uncertainty.star_matrix, directions))
+        linear.append(relative_errors_table.squared_pull(wrong, solution.estimate.uncertainty.star_matrix, directions))
     assert np.mean(after) == pytest.approx(1, abs=0.15)
     assert least < np.mean(linear) < least + 2
 
@@ -123,4 +123,4 @@ def test_wrong_models_are_outside_of_the_errors():
     wrong = matches.table.copy()
     wrong["x_err"], wrong["y_err"] = wrong["x_err"] / 3, wrong["y_err"] / 3
     solution = ld.solve(ld.Matches.from_table(wrong, shape=(table.SIZE, table.SIZE), poses=matches.poses))
-    assert 5 < ratio(solution, sky[solution.star_names]) < 13
+    assert 5 < ratio(solution, sky[solution.estimate.star_names]) < 13

@@ -68,8 +68,8 @@ def test_relative_bias_is_the_one_expected(runs, make, removed):
     """Undithered exposures of zero mean are in the gauge as they come; elsewhere the common map is taken out."""
     pairs = []
     for sim, solution in runs(make):
-        true = sim.truth.positions[solution.star_names]
-        b = accuracy.bias(solution.positions, true, removed=removed)
+        true = sim.truth.positions[solution.estimate.star_names]
+        b = accuracy.bias(solution.estimate.positions, true, removed=removed)
         pairs.append((b**2, accuracy.expected_bias(solution, removed=removed) ** 2))
     assert_agrees(pairs, slack=0.03)
 
@@ -85,8 +85,8 @@ def test_scatter_of_new_positions_is_the_one_expected(runs, make):
         seen = ((p >= -0.5) & (p <= np.array([nx, ny]) - 0.5)).all(axis=2)
         corrected = np.full(p.shape, np.nan)
         for i, name in enumerate(solution.names):
-            corrected[i, seen[i]] = solution.correct(name, p[i, seen[i]])
-        inside = solution.supported(solution.names[1], p[1])  # beyond the stars it is extrapolation
+            corrected[i, seen[i]] = solution[name].correct(p[i, seen[i]])
+        inside = solution[solution.names[1]].supported(p[1])  # beyond the stars it is extrapolation
         use = inside & (seen.sum(axis=0) > 1)
         measured = accuracy.scatter(corrected)
         expected = accuracy.expected_scatter(solution, xy, sigma, seen=seen)
@@ -111,8 +111,8 @@ def test_absolute_bias_is_the_one_expected(make, slack):
     for seed in SEEDS:
         sim = make(seed)
         solution = solved(sim)
-        true = sim.truth.positions[solution.star_names]
-        b = accuracy.bias(solution.positions, true, removed="similarity")
+        true = sim.truth.positions[solution.estimate.star_names]
+        b = accuracy.bias(solution.estimate.positions, true, removed="similarity")
         pairs.append((b**2, accuracy.expected_bias(solution, removed="similarity", absolute=True) ** 2))
         relative.append(accuracy.expected_bias(solution, removed="similarity"))
     assert_agrees(pairs, slack=slack)
@@ -146,11 +146,11 @@ def test_covariance_between_stars_is_the_oracles(corr):
     sim = simulate_matches(n_stars=12, n_exposures=3, degree=1, shape=(700, 1200), sigma=0.1, corr=corr, dither=40)
     solution = solved(sim)
     oracle = DenseOracle(sim.matches, solution, sim.truth.static)
-    n = 2 * len(solution.positions)
-    x = np.concatenate([solution.positions.ravel(), solution.coefficients.ravel()])
+    n = 2 * len(solution.estimate.positions)
+    x = np.concatenate([solution.estimate.positions.ravel(), solution.coefficients.ravel()])
     expected = oracle.covariance(x)[:n, :n]
     by_axis = np.concatenate([np.arange(0, n, 2), np.arange(1, n, 2)])  # ours has all x first
-    matrix = solution.uncertainty.star_matrix
+    matrix = solution.estimate.uncertainty.star_matrix
     assert_allclose(matrix, expected[np.ix_(by_axis, by_axis)], rtol=1e-3, atol=1e-7)
     errors = np.concatenate([solution.stars[c].value for c in ("x_err", "y_err")])
     assert_allclose(np.sqrt(np.diag(matrix)), errors, rtol=1e-6)
@@ -206,14 +206,14 @@ def test_scatter_is_the_papers():
 def test_corrected_positions_stand_where_they_belong(runs):
     _, solution = runs(gsaoi)[0]
     corrected = accuracy.corrected_positions(solution)
-    assert corrected.shape == (len(solution.names), len(solution.star_names), 2)
+    assert corrected.shape == (len(solution.names), len(solution.estimate.star_names), 2)
     rows = solution.residuals
     seen = np.zeros(corrected.shape[:2], dtype=bool)
     for row in rows:
-        i, j = solution.names.index(row["exposure"]), np.searchsorted(solution.star_names, row["star"])
+        i, j = solution.names.index(row["exposure"]), np.searchsorted(solution.estimate.star_names, row["star"])
         seen[i, j] = row["used"]
     assert np.array_equal(np.isfinite(corrected).all(axis=2), seen)
-    errors = corrected - solution.positions
+    errors = corrected - solution.estimate.positions
     assert np.nanmax(np.abs(errors)) < 6 * rows["x_err"].max().value
 
 
@@ -221,7 +221,7 @@ def test_scatter_of_positions_seen_once_or_without_noise(runs):
     _, solution = runs(gsaoi)[0]
     far = np.array([[1e5, 1e5]])
     assert np.isnan(accuracy.expected_scatter(solution, far, 0.1)).all()
-    middle = solution.positions[:5]
+    middle = solution.estimate.positions[:5]
     once = np.zeros((len(solution.names), 5), dtype=bool)
     once[2] = True
     assert np.isnan(accuracy.expected_scatter(solution, middle, 0.1, seen=once)).all()
@@ -236,5 +236,5 @@ def test_a_solution_from_a_file_says_what_it_lacks(runs, tmp_path):
     back = Solution.read(solution.write(tmp_path / "s.asdf"))
     with pytest.raises(InputError, match="read from a file keeps no covariances between stars; call solve again"):
         accuracy.expected_bias(back)
-    xy = solution.positions[:4]
+    xy = solution.estimate.positions[:4]
     assert_allclose(accuracy.expected_scatter(back, xy, 0.1), accuracy.expected_scatter(solution, xy, 0.1))

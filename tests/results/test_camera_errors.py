@@ -26,17 +26,17 @@ class Dense:
     """Normal equations of stars, coefficients and layouts together, and covariances on given constraints."""
 
     def __init__(self, solution):
-        self.solution, camera, table = solution, solution.camera, solution.observations
-        keys, names, self.n_stars = list(camera.detectors), list(solution.names), len(solution.star_names)
+        self.solution, camera, table = solution, solution.camera, solution.residuals
+        keys, names, self.n_stars = list(camera.detectors), list(solution.names), len(solution.estimate.star_names)
         self.size = 2 * basis.n_modes(solution.degree)
         self.n_first = 2 * self.n_stars + len(names) * self.size
         n = self.n_first + 6 * len(keys)
         self.normal = np.zeros((n, n))
         for row in table:
             i, c = names.index(row["exposure"]), keys.index(row["detector"])
-            j = int(np.searchsorted(solution.star_names, row["star"]))
+            j = int(np.searchsorted(solution.estimate.star_names, row["star"]))
             design = np.zeros((2, n))
-            q = similarity.apply(solution.poses[row["exposure"]], solution.positions[[j]])
+            q = similarity.apply(solution.poses[row["exposure"]], solution.estimate.positions[[j]])
             by_star, by_exposure, by_layout, f = self.slopes(row["exposure"], camera[row["detector"]], q)
             design[:, 2 * j : 2 * j + 2] = by_star
             design[:, 2 * self.n_stars + i * self.size :][:, : self.size] = by_exposure
@@ -46,7 +46,7 @@ class Dense:
 
     def slopes(self, name, chip, q):
         """Derivatives of residuals at an undistorted position by star, coefficients and layout; where it falls."""
-        distortion, pose = self.solution.distortion(name), self.solution.poses[name]
+        distortion, pose = self.solution[name].distortion, self.solution.poses[name]
         values = basis.values(self.solution.degree, *basis.normalize(q, distortion.shape))[:, 0]
         f = distortion(q)
         low = basis.values(1, *basis.normalize(similarity.apply(chip.layout, f), chip.shape))[:, 0]
@@ -86,7 +86,7 @@ def dense(solution):
 def relative(dense, solution):
     """Covariance by the layouts of stars, coefficients and layouts, a common map of the stars taken off."""
     gauge, n = solution.gauge, 2 * dense.n_stars
-    modes = gauge.modes_at(solution.positions)
+    modes = gauge.modes_at(solution.estimate.positions)
     fit = np.zeros((gauge.n_modes * 2, len(dense.normal)))
     for k in range(2):
         fit[k * gauge.n_modes : (k + 1) * gauge.n_modes, k:n:2] = np.linalg.pinv(modes.T)
@@ -102,8 +102,8 @@ def test_coefficients(solution, dense, relative):
     """The covariance of every exposure is that of a known camera, and what the layouts add."""
     for i, name in enumerate(solution.names):
         mine = slice(2 * dense.n_stars + i * dense.size, 2 * dense.n_stars + (i + 1) * dense.size)
-        known = own_coefficients(solution.gauge, solution.uncertainty, i)
-        added = solution.coefficient_covariance(name) - known
+        known = own_coefficients(solution.gauge, solution.estimate.uncertainty, i)
+        added = solution[name].covariance - known
         expected = relative[mine, mine]
         assert np.abs(added - expected).max() < 0.02 * np.abs(expected).max()
         assert np.trace(expected) > np.trace(known)  # it is not little
@@ -111,14 +111,14 @@ def test_coefficients(solution, dense, relative):
 
 def test_stars(solution, dense, relative):
     n = 2 * dense.n_stars
-    matrix = solution.uncertainty.star_matrix.reshape(2, dense.n_stars, 2, dense.n_stars)
-    own = solution.uncertainty.star_unknowns
+    matrix = solution.estimate.uncertainty.star_matrix.reshape(2, dense.n_stars, 2, dense.n_stars)
+    own = solution.estimate.uncertainty.star_unknowns
     expected = relative[:n, :n].reshape(dense.n_stars, 2, dense.n_stars, 2)
     for k in range(2):
         added = np.diag(matrix[k, :, k]) - own[k]
         assert np.abs(added - np.einsum("jj->j", expected[:, k, :, k])).max() < 0.02 * np.abs(added).max()
     between = np.delete(expected[0, 0, :, 0], 0)
-    camera = solution.uncertainty.camera.stars
+    camera = solution.estimate.uncertainty.camera.stars
     assert np.allclose(np.delete(camera[0, 0] @ camera[:, 0].T, 0), between, atol=0.02 * np.abs(between).max())
 
 
@@ -128,9 +128,9 @@ def test_new_positions(solution, dense, relative, night, key):
     chip, name = solution.camera[key], solution.names[1]
     xy = night.pixels[1][key]
     xy = xy[np.isfinite(xy[:, 0])][::5]
-    found = solution.correct(name, xy, errors=np.zeros((len(xy), 2)), detector=key).relative
-    q = solution.distortion(name).invert(chip.to_focal_plane(xy))
-    c, block = int(key) - 1, relative_coefficients(solution.gauge, solution.uncertainty, 1)
+    found = solution[name, key].correct(xy, errors=np.zeros((len(xy), 2))).relative
+    q = solution[name].distortion.invert(chip.to_focal_plane(xy))
+    c, block = int(key) - 1, relative_coefficients(solution.gauge, solution.estimate.uncertainty, 1)
     for at, covariance in zip(q, found, strict=True):
         by_star, by_exposure, by_layout, _ = dense.slopes(name, chip, at[None])
         through = np.zeros((2, len(relative)))
@@ -145,8 +145,8 @@ def test_new_positions(solution, dense, relative, night, key):
 def test_kept_in_files(solution, night, tmp_path):
     again = legdistort.Solution.read(solution.write(tmp_path / "solution.asdf"))
     name = solution.names[2]
-    assert np.array_equal(again.coefficient_covariance(name), solution.coefficient_covariance(name))
-    assert np.array_equal(again.sigma_map(name, n=8)[2], solution.sigma_map(name, n=8)[2], equal_nan=True)
+    assert np.array_equal(again[name].covariance, solution[name].covariance)
+    assert np.array_equal(again[name].sigma_map(n=8)[2], solution[name].sigma_map(n=8)[2], equal_nan=True)
 
 
 def test_errors_that_are_scaled(night, solution):
@@ -158,8 +158,8 @@ def test_errors_that_are_scaled(night, solution):
     scaled = legdistort.solve(matches, layout="fit", clip=None, errors="scale")
     factor = scaled.diagnostics.error_scale / 2
     assert np.allclose(scaled.stars["x_err"], factor * solution.stars["x_err"], rtol=1e-3)
-    assert np.allclose(scaled.coefficient_errors("frame01", relative=True),
-                       factor * solution.coefficient_errors("frame01", relative=True), rtol=1e-3)  # fmt: skip
+    assert np.allclose(scaled["frame01"].relative_errors,
+                       factor * solution["frame01"].relative_errors, rtol=1e-3)  # fmt: skip
     for key, detector in solution.camera.detectors.items():
         again = scaled.camera[key]
         assert np.allclose(again.layout_sigma, factor * detector.layout_sigma, rtol=1e-3)

@@ -37,7 +37,7 @@ def carried(sim, solution, prior):
         exact[:, part] = sim.truth.distort(name, sim.truth.positions[sim.matches.stars[problem.star[part]]]).T
     problem = type(problem)(**{**vars(problem), "xy": exact, "prior_sigma": None})
     fixed = np.stack([solution.poses[name] for name in solution.names])
-    state = minimisers.State(solution.positions.T.copy(), solution.coefficients.copy(), fixed)
+    state = minimisers.State(solution.estimate.positions.T.copy(), solution.coefficients.copy(), fixed)
     for _ in range(6):
         blocks = criterion.linearise(problem, state)
         departure = (state.coefficients - problem.prior_mean)[:, :, : problem.n_modes].reshape(problem.n_exposures, -1)
@@ -79,27 +79,27 @@ def test_covariances_are_calibrated(setting):
         prior = None if widths is None else Prior(sim.truth.static, **widths)
         solution = solve(sim.matches, prior=prior)
         positions, a = carried(sim, solution, prior)
-        a += solution.prior_mean[:, :, : a.shape[1] // 2].reshape(len(a), -1)
+        a += solution.estimate.prior_mean[:, :, : a.shape[1] // 2].reshape(len(a), -1)
         n = len(positions)
-        covariance = solution.uncertainty.star_matrix
-        chi2, rank = normalised((solution.positions - positions).T.ravel(), covariance)
+        covariance = solution.estimate.uncertainty.star_matrix
+        chi2, rank = normalised((solution.estimate.positions - positions).T.ravel(), covariance)
         stars.append(chi2 / rank)
         assert rank <= 2 * n
         departure = solution.coefficients.reshape(len(a), -1) - a
-        chi2, rank = normalised(departure.ravel(), solution.uncertainty.coefficients)
+        chi2, rank = normalised(departure.ravel(), solution.estimate.uncertainty.coefficients)
         coefficients.append(chi2 / rank)
         for name, mine in zip(solution.names, a, strict=True):
-            ny, nx = solution.shapes[name]
+            ny, nx = solution.estimate.shapes[name]
             grid = np.stack(np.meshgrid(*[np.linspace(-0.5, n - 0.5, 6) for n in (nx, ny)]), axis=-1).reshape(-1, 2)
-            grid = grid[solution.supported(name, grid)]
+            grid = grid[solution[name].supported(grid)]
             true = similarity.apply(
                 similarity.invert(solution.poses[name]),
-                Distortion(mine.reshape(2, -1), solution.shapes[name]).invert(grid),
+                Distortion(mine.reshape(2, -1), solution.estimate.shapes[name]).invert(grid),
             )
-            by_modes = new_positions.response(solution, name, solution.distortion(name).invert(grid))[0]
+            by_modes = new_positions.response(solution, name, solution[name].distortion.invert(grid))[0]
             # under the constraints of the gauge, like the truth
-            covariance = new_positions.carried(by_modes, solution.coefficient_covariance(name))
-            maps.append((solution.correct(name, grid) - true) ** 2 / np.einsum("naa->na", covariance))
+            covariance = new_positions.carried(by_modes, solution[name].covariance)
+            maps.append((solution[name].correct(grid) - true) ** 2 / np.einsum("naa->na", covariance))
     means = {"stars": np.mean(stars), "coefficients": np.mean(coefficients), "map": np.mean(np.concatenate(maps))}
     assert means == pytest.approx(dict.fromkeys(means, 1), abs=0.05)
 
@@ -119,9 +119,9 @@ def test_what_residuals_determine_is_left_to_them(monkeypatch, method):
     assert solution.gauge.released.shape == (20, 2)
     assert [each.name for each in solution.gauge.unknown] == ["shear", "shear"]
     assert abs(solution.chi2 - solution.dof) < 5 * np.sqrt(2 * solution.dof)
-    true = sim.truth.positions[solution.star_names]
+    true = sim.truth.positions[solution.estimate.star_names]
     # maps of the gauge are cubics of cubics here, so a common map of higher degree is taken out
-    b, bound = accuracy.bias(solution.positions, true, removed=6), accuracy.expected_bias(solution, removed=6)
+    b, bound = accuracy.bias(solution.estimate.positions, true, removed=6), accuracy.expected_bias(solution, removed=6)
     assert b == pytest.approx(bound, rel=0.25)
     assert "2 combinations that are not known otherwise are determined by residuals" in str(solution.gauge)
 
@@ -202,8 +202,8 @@ def test_absolute_errors_are_right():
     for seed in range(200):
         sim = simulate_matches(seed=seed, zero_mean=False, dither=100.0, sigma=0.05, n_stars=60)
         solution = solve(sim.matches, prior=Prior(sim.truth.static))
-        true = sim.truth.positions[solution.star_names]
-        measured.append(accuracy.bias(solution.positions, true, removed="similarity"))
+        true = sim.truth.positions[solution.estimate.star_names]
+        measured.append(accuracy.bias(solution.estimate.positions, true, removed="similarity"))
         reported.append(accuracy.expected_bias(solution, removed="similarity", absolute=True))
     ratio = np.sqrt(np.mean(np.square(measured)) / np.mean(np.square(reported)))
     assert ratio == pytest.approx(1, abs=0.10)
@@ -216,10 +216,10 @@ def test_simulation_1_is_at_the_bound():
     for seed in range(20):
         sim = simulate_matches(seed=seed)
         solution = solve(sim.matches, prior=Prior(sim.truth.static))
-        b.append(accuracy.bias(solution.positions, sim.truth.positions[solution.star_names]))
+        b.append(accuracy.bias(solution.estimate.positions, sim.truth.positions[solution.estimate.star_names]))
         rng = RNG(1000 + seed)
         corrected = np.stack([
-            solution.correct(name, sim.truth.distort(name, grid) + 0.14 * rng.normal(size=grid.shape))
+            solution[name].correct(sim.truth.distort(name, grid) + 0.14 * rng.normal(size=grid.shape))
             for name in solution.names
         ])  # fmt: skip
         sigma.append(np.sqrt(np.mean(accuracy.scatter(corrected) ** 2)))
@@ -249,7 +249,7 @@ def test_gross_mismatches_cost_nothing():
         clean = solve(Matches.from_table(table[~wrong], shape=(2048, 2048), poses=nominal), prior=prior)
         assert not np.any(clipped.residuals["used"] & wrong)
         for solution, out in ((clipped, with_them), (clean, without)):
-            out.append(accuracy.bias(solution.positions, sim.truth.positions[solution.star_names]))
+            out.append(accuracy.bias(solution.estimate.positions, sim.truth.positions[solution.estimate.star_names]))
     ratio = np.sqrt(np.mean(np.square(with_them)) / np.mean(np.square(without)))
     assert ratio == pytest.approx(1, abs=0.05)
 
@@ -272,7 +272,7 @@ def test_mismatched_exposure_is_named_and_moves_nobody(known_poses):
         Matches.from_table(table[table["exposure"] != "exp03"], shape=(2048, 2048), poses=sim.matches.poses),
         prior=prior,
     )
-    error = np.sqrt(np.diag(clean.uncertainty.coefficients)).reshape(len(clean.names), 2, -1)
+    error = np.sqrt(np.diag(clean.estimate.uncertainty.coefficients)).reshape(len(clean.names), 2, -1)
     assert np.all(np.abs(solution.coefficients - clean.coefficients) < error)
 
 
@@ -286,12 +286,12 @@ def test_one_noisy_exposure_does_not_blur_the_others():
         sim = _quiet_exposure(seed, sigma, dynamic, 4)
         table = sim[0].table
         solution = solve(sim[0], prior=Prior(np.zeros((2, 10))))
-        b.append(accuracy.bias(solution.positions, sim[1][solution.star_names]))
+        b.append(accuracy.bias(solution.estimate.positions, sim[1][solution.estimate.star_names]))
         others = table[table["exposure"] != "e4"]
         without = solve(
             Matches.from_table(others, shape=(2048, 2048), poses=sim[0].poses), prior=Prior(np.zeros((2, 10)))
         )
-        b_without.append(accuracy.bias(without.positions, sim[1][without.star_names]))
+        b_without.append(accuracy.bias(without.estimate.positions, sim[1][without.estimate.star_names]))
     assert np.sqrt(np.mean(np.square(b)) / np.mean(np.square(b_without))) < 1.1
 
 
@@ -325,7 +325,9 @@ def test_errors_found_on_request():
     stated, scaled, floored = (solve(matches, prior=prior, errors=kind) for kind in ("stated", "scale", "floor"))
     assert stated.diagnostics.error_scale == 1
     assert scaled.diagnostics.error_scale == pytest.approx(np.sqrt(stated.chi2 / stated.dof))
-    assert_allclose(scaled.uncertainty.stars, stated.uncertainty.stars * scaled.diagnostics.error_scale**2)
+    assert_allclose(
+        scaled.estimate.uncertainty.stars, stated.estimate.uncertainty.stars * scaled.diagnostics.error_scale**2
+    )
     assert floored.diagnostics.error_floor == pytest.approx(0.1, abs=0.01)
     assert floored.chi2 / floored.dof == pytest.approx(1, abs=0.01)
     quiet = solve(sim.matches, prior=prior, errors="floor")
@@ -347,7 +349,9 @@ def test_static_uncertainty_does_not_average_down():
     sim = simulate_matches(seed=1)
     tight = solve(sim.matches, prior=Prior(sim.truth.static))
     loose = solve(sim.matches, prior=Prior(sim.truth.static, static_sigma=[0, 0, 0] + [0.3] * 7))
-    assert_allclose(loose.uncertainty.stars, tight.uncertainty.stars, rtol=1e-3, atol=1e-7)  # in nearly the same gauge
+    assert_allclose(
+        loose.estimate.uncertainty.stars, tight.estimate.uncertainty.stars, rtol=1e-3, atol=1e-7
+    )  # in nearly the same gauge
     added = np.einsum("nkk->nk", loose.absolute_covariance() - tight.absolute_covariance())
     # 7 modes of 0.3 px, each of mean square 1/4 over the field
     assert np.mean(added) == pytest.approx(7 * 0.3**2 / 4, rel=0.35)

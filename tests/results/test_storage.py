@@ -31,6 +31,7 @@ import legdistort
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
 from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
+from legdistort.results import in_tables
 from legdistort.results.solution import Solution
 from legdistort.runtime import provenance
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
@@ -80,22 +81,22 @@ def test_round_trip_is_exact(which, tmp_path, request):
     path = given.write(tmp_path / "s.asdf")
     back = Solution.read(path)
     assert path == tmp_path / "s.asdf"
-    assert (back.names, back.degree, back.shapes) == (given.names, given.degree, given.shapes)
+    assert (back.names, back.degree, back.estimate.shapes) == (given.names, given.degree, given.estimate.shapes)
     assert (back.chi2, back.dof, back.status) == (given.chi2, given.dof, given.status)
     assert (back.settings, back.left_out, back.provenance) == (given.settings, given.left_out, given.provenance)
     assert back.diagnostics == given.diagnostics
     for name in given.names:
         assert back.poses[name].tobytes() == given.poses[name].tobytes()
-        assert_array_equal(back.coefficient_errors(name), given.coefficient_errors(name))
-        assert_array_equal(back.sigma_map(name, n=5)[2], given.sigma_map(name, n=5)[2])
+        assert_array_equal(back[name].errors, given[name].errors)
+        assert_array_equal(back[name].sigma_map(n=5)[2], given[name].sigma_map(n=5)[2])
     for key in ("coefficients", "prior_mean", "positions", "star_names"):
         assert_array_equal(getattr(back, key), getattr(given, key))
         assert getattr(back, key).dtype == getattr(given, key).dtype
     for key in ("kind", "constraint", "motion", "dynamic", "box", "covariance", "static", "directions"):
         assert_array_equal(getattr(back.gauge, key), getattr(given.gauge, key))
     assert str(back.gauge) == str(given.gauge)
-    assert_array_equal(back.uncertainty.coefficients, given.uncertainty.coefficients)
-    assert_array_equal(back.uncertainty.stars, given.uncertainty.stars)
+    assert_array_equal(back.estimate.uncertainty.coefficients, given.estimate.uncertainty.coefficients)
+    assert_array_equal(back.estimate.uncertainty.stars, given.estimate.uncertainty.stars)
     assert_same_table(back.stars, given.stars)
     assert_array_equal(back.stars["x_err_abs"], given.stars["x_err_abs"])
     assert_same_table(back.residuals, given.residuals)
@@ -115,9 +116,9 @@ def test_geometry_survives(with_sky, tmp_path):
     back = Solution.read(with_sky.write(tmp_path / "s.asdf"))
     p = np.random.default_rng(0).uniform(0, 511, (50, 2))
     name = with_sky.names[3]
-    assert_array_equal(back.correct(name, p), with_sky.correct(name, p))
-    assert_array_equal(back.wcs(name)(*p.T), with_sky.wcs(name)(*p.T))
-    assert back.max_inverse_error == with_sky.max_inverse_error
+    assert_array_equal(back[name].correct(p), with_sky[name].correct(p))
+    assert_array_equal(back[name].wcs(*p.T), with_sky[name].wcs(*p.T))
+    assert in_tables.largest_inverse_error(back) == in_tables.largest_inverse_error(with_sky)
 
 
 def test_covariances_as_blocks_survive(tmp_path, monkeypatch):
@@ -126,11 +127,11 @@ def test_covariances_as_blocks_survive(tmp_path, monkeypatch):
         monkeypatch.setattr(f"legdistort.solving.equations.{place}", 100)
     sim = simulate_matches(n_exposures=8, n_stars=25, seed=3)
     solution = solve(sim.matches, prior=Prior(sim.truth.static))
-    assert solution.uncertainty.coefficients.shape == (8, 20, 20)
+    assert solution.estimate.uncertainty.coefficients.shape == (8, 20, 20)
     for name in ("solution.asdf", "solution.fits"):
         solution.write(tmp_path / name)
         again = Solution.read(tmp_path / name)
-        assert_array_equal(again.uncertainty.coefficients, solution.uncertainty.coefficients)
+        assert_array_equal(again.estimate.uncertainty.coefficients, solution.estimate.uncertainty.coefficients)
         assert_array_equal(again.stars["x_err"], solution.stars["x_err"])
 
 
@@ -178,11 +179,11 @@ def test_columns_of_objects_are_left_out_loudly(tmp_path):
 
 
 def test_a_star_whose_observations_are_all_clipped_survives(with_sky, tmp_path):
-    table = with_sky.observations.copy()
+    table = with_sky.residuals.copy()
     star = table["star"][0]
     table["used"][table["star"] == star] = False
-    positions = with_sky.positions.copy()
-    positions[np.searchsorted(with_sky.star_names, star)] = np.nan
+    positions = with_sky.estimate.positions.copy()
+    positions[np.searchsorted(with_sky.estimate.star_names, star)] = np.nan
     holed = replace(with_sky, observations=table, positions=positions)
     row = np.flatnonzero(holed.stars["star"] == star)[0]
     assert holed.stars["n"][row] == 0
@@ -361,7 +362,7 @@ def test_reading_does_not_hold_the_file(solution, tmp_path):
     path = solution.write(tmp_path / "s.asdf")
     back = Solution.read(path)
     path.unlink()
-    assert_allclose(back.positions, solution.positions)
+    assert_allclose(back.estimate.positions, solution.estimate.positions)
     assert isinstance(back.residuals, QTable)
 
 
@@ -402,8 +403,8 @@ def test_a_folded_solution_can_be_written(solution, tmp_path):
     folded = replace(solution, coefficients=coefficients)
     back = Solution.read(folded.write(tmp_path / "s.asdf"))
     with pytest.raises(LegdistortError, match="folds"):
-        back.wcs(back.names[0])
-    assert back.wcs(back.names[1]) is not None
+        back[back.names[0]].wcs
+    assert back[back.names[1]].wcs is not None
 
 
 # --- the certificate -----------------------------------------------------------------------------------------------
@@ -439,7 +440,7 @@ def test_changed_coefficients_are_noticed(solution, tmp_path, change, message):
 def test_the_inverse_that_was_certified_is_the_one_used(solution, tmp_path):
     back = Solution.read(solution.write(tmp_path / "s.asdf"))
     for name in solution.names:
-        kept, made = back.distortion(name).inverse, solution.distortion(name).inverse
+        kept, made = back[name].distortion.inverse, solution[name].distortion.inverse
         assert_array_equal(kept.tensors, made.tensors)
         assert (kept.error, kept.valid) == (made.error, made.valid)
 
@@ -449,8 +450,8 @@ def test_other_coefficients_have_another_inverse(solution, tmp_path):
     name = solution.names[0]
     half = replace(back, coefficients=0.5 * back.coefficients)
     p = np.array([[100.0, 200.0]])
-    correction = half.distortion(name).model().inverse
-    assert_allclose(np.column_stack(correction(*p.T)), half.distortion(name).invert(p), rtol=0, atol=1e-6)
+    correction = half[name].distortion.model().inverse
+    assert_allclose(np.column_stack(correction(*p.T)), half[name].distortion.invert(p), rtol=0, atol=1e-6)
 
 
 # --- single WCS files ----------------------------------------------------------------------------------------------
@@ -459,7 +460,7 @@ def test_other_coefficients_have_another_inverse(solution, tmp_path):
 def test_a_wcs_comes_back_as_it_was(with_sky, tmp_path):
     name = with_sky.names[2]
     back = legdistort.read_wcs(write_wcs(with_sky, name, tmp_path / "w.asdf"))
-    made = with_sky.wcs(name)
+    made = with_sky[name].wcs
     p = np.random.default_rng(0).uniform(-100, 611, (500, 2))
     ra, dec = made(*p.T)
     assert np.isnan(ra).sum() > 50
@@ -478,7 +479,7 @@ def test_a_wcs_without_sky_and_with_another_shape(solution, tmp_path):
     name = solution.names[0]
     back = legdistort.read_wcs(write_wcs(solution, name, tmp_path / "w.asdf"))
     # not to the last digit: the sums of one point may be taken in another order
-    assert_allclose(back(100.0, 200.0), solution.wcs(name)(100.0, 200.0), rtol=1e-13)
+    assert_allclose(back(100.0, 200.0), solution[name].wcs(100.0, 200.0), rtol=1e-13)
     assert back.available_frames == ["detector", "undistorted", "reference"]
 
 

@@ -44,7 +44,7 @@ def outcomes(n_im, n_star, sigma, n, *, seed=0, n_grid=12):
             table[axis] += sigma * rng.normal(size=len(table)) * u.pix
         solution = solve(Matches.from_table(table, shape=SHAPE, poses=sim.matches.poses), prior=prior)
         new = accuracy.new_scatter(solution, sim.truth.distort, grid, sigma, rng=rng)
-        squares.append((accuracy.bias(solution.positions, sim.truth.positions) ** 2, np.mean(new**2)))
+        squares.append((accuracy.bias(solution.estimate.positions, sim.truth.positions) ** 2, np.mean(new**2)))
     mean, spread = np.mean(squares, axis=0), np.std(squares, axis=0)
     return prediction, np.sqrt(mean), spread / (2 * mean * np.sqrt(n))
 
@@ -129,7 +129,7 @@ def test_aliasing_agrees_with_monte_carlo():
             return xy + displacement(drawn[int(name[3:])], xy, SHAPE)
 
         new = accuracy.new_scatter(solution, distort, grid, 0.0)
-        squares.append((accuracy.bias(solution.positions, sim.truth.positions) ** 2, np.mean(new**2)))
+        squares.append((accuracy.bias(solution.estimate.positions, sim.truth.positions) ** 2, np.mean(new**2)))
     measured = np.sqrt(np.mean(squares, axis=0))
     assert_allclose([prediction.b_alias, prediction.sigma_alias], measured, rtol=0.05)
 
@@ -146,7 +146,7 @@ def test_aliasing_of_undithered_exposures_in_closed_form():
     def columns(xy):
         return np.stack([displacement(np.tile(row, (2, 1)), xy, SHAPE)[:, 0] for row in np.eye(28)], axis=1)
 
-    at_stars = columns(p.solution.positions)
+    at_stars = columns(p.solution.estimate.positions)
     assert p.b_alias**2 == pytest.approx(np.mean((at_stars * widths) ** 2 @ np.ones(28)) / n, rel=1e-4)
     grid = np.stack(np.meshgrid(p.x, p.y), axis=-1).reshape(-1, 2)
     fit = np.linalg.lstsq(at_stars[:, :10], at_stars[:, 10:], rcond=None)[0]
@@ -160,7 +160,7 @@ def test_aliasing_of_undithered_exposures_in_closed_form():
 
 def test_a_static_distortion_nobody_knows_goes_into_the_stars():
     p = predict(n_exposures=7, n_stars=50, sigma=0.05, static_spectrum={4: 0.2})
-    xy = p.solution.positions
+    xy = p.solution.estimate.positions
     square = sum(displacement(np.eye(15)[[m, m]], xy, SHAPE) ** 2 for m in range(10, 15))
     assert p.b_alias == pytest.approx(0.2 * np.sqrt(np.mean(square)), rel=1e-4)
     assert p.sigma_alias < 1e-6
@@ -193,8 +193,8 @@ def test_aliasing_is_that_of_a_dense_fit():
     )
     given = {"n_exposures": n, "stars": sim.truth.positions, "poses": sim.truth.poses, "shape": (900, 1300)}
     p = predict(**given, sigma=sigma, degree=1, spectrum={2: 0.3}, static_spectrum={2: 0.2}, n_grid=6)
-    rows, obs = p.solution.gauge.orthonormal, p.solution.observations
-    stars = p.solution.positions
+    rows, obs = p.solution.gauge.orthonormal, p.solution.residuals
+    stars = p.solution.estimate.positions
 
     def both(i, j):  # Jacobian of one observation by stars and all modes
         pose = p.solution.poses[p.solution.names[i]]
@@ -204,7 +204,10 @@ def test_aliasing_is_that_of_a_dense_fit():
     fitted = np.tile(np.arange(6) < 3, 2)
     design, target = [], []
     for row in obs:
-        i, j = p.solution.names.index(row["exposure"]), int(np.searchsorted(p.solution.star_names, row["star"]))
+        i, j = (
+            p.solution.names.index(row["exposure"]),
+            int(np.searchsorted(p.solution.estimate.star_names, row["star"])),
+        )
         by_star, by_mode = both(i, j)
         line, left_out = np.zeros((2, 50 + 6 * n)), np.zeros((2, 6 * n))
         line[:, 2 * j : 2 * j + 2] = by_star
@@ -227,7 +230,7 @@ def test_the_sky_takes_the_mean_distortion_whatever_is_fitted(degree):
     spectrum = {1: 0.0, 2: 0.4, 3: 0.3, 4: 0.2}
     exact = Prior(np.zeros((2, 1)))
     p = predict(n_exposures=8, n_stars=60, sigma=0.001, degree=degree, spectrum=spectrum, prior=exact)
-    xy = p.solution.positions
+    xy = p.solution.estimate.positions
     squares = [displacement(np.eye(15)[[m, m]], xy, SHAPE) ** 2 * spectrum.get(i + j, 0) ** 2
                for m, (i, j) in enumerate(modes(4))]  # fmt: skip
     expected = np.sqrt(np.mean(np.sum(squares, axis=0)) / 8)
@@ -262,7 +265,7 @@ def test_errors_are_proportional_to_the_noise():
 def test_stars_are_those_of_the_simulation():
     sim = simulate_matches(n_exposures=6, n_stars=40, dither=300.0, seed=9)
     p = predict(n_exposures=6, n_stars=40, sigma=0.1, dithers=300.0, seed=9)
-    assert_allclose(p.solution.positions, sim.truth.positions)
+    assert_allclose(p.solution.estimate.positions, sim.truth.positions)
     assert list(p.stars_per_exposure) == [
         np.count_nonzero(sim.matches.table["exposure"] == n) for n in p.solution.names
     ]

@@ -62,7 +62,7 @@ def test_layouts_to_begin_with_do_not_matter():
         matches = legdistort.Matches.from_table(field.table(sigma=0.01), camera=camera)
         solution = legdistort.solve(matches, layout="fit", static="fit")
         parts = gsaoi_bounds.camera_error(solution.camera, 3, 1.0)
-        stars = gsaoi_images.without_common_map(solution.positions, field.sky[solution.star_names], 3)
+        stars = gsaoi_images.without_common_map(solution.estimate.positions, field.sky[solution.estimate.star_names], 3)
         found.append(np.concatenate([stars.ravel(), *(part.ravel() for part in parts)]))
     assert np.sqrt(np.mean((found[0] - found[1]) ** 2)) < 1e-4
 

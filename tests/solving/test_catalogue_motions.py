@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 
 from legdistort.exceptions import InputError
 from legdistort.geometry.parallax import on_plane
+from legdistort.results import in_tables
 from legdistort.results.errors.absolute_errors import absolute_blocks, relative_blocks
 from legdistort.solving.estimation import solve
 
@@ -44,8 +45,8 @@ def test_the_dense_oracle_agrees(kind, epochs):
     table, values, covariance = gaia(sim, np.random.default_rng(5), n=14, parallax=kind == "parallax")
     solution = solve(sim.matches, degree=1, motion=kind, reference=table, clip=None)
     k = 5 if kind == "parallax" else 4
-    values, covariance = at(values[:, :k], covariance[:, :k, :k], solution.epoch - 2016.0)
-    phi = (epochs - solution.epoch)[:, None, None] * np.eye(2)
+    values, covariance = at(values[:, :k], covariance[:, :k, :k], in_tables.epoch(solution) - 2016.0)
+    phi = (epochs - in_tables.epoch(solution))[:, None, None] * np.eye(2)
     if k == 5:
         phi = np.concatenate([phi, on_plane(SKY, epochs)[:, :, None]], axis=2)
     oracle = TiedOracle(sim.matches, solution, phi, values, covariance)
@@ -57,9 +58,9 @@ def test_the_dense_oracle_agrees(kind, epochs):
     expected = np.linalg.inv(jacobian @ jacobian.T)[: 14 * k, : 14 * k].reshape(14, k, 14, k)
     expected = np.stack([expected[j, :, j] for j in range(14)])
     errors = np.sqrt(np.einsum("jaa->ja", expected))
-    stars = np.hstack([solution.positions, solution.motions.values])
+    stars = np.hstack([solution.estimate.positions, solution.estimate.motions.values])
     assert np.abs((stars - oracle.unpack(found)[0]) / errors).max() < 0.05
-    absolute = absolute_blocks(solution.gauge, solution.uncertainty, solution.positions)
+    absolute = absolute_blocks(solution.gauge, solution.estimate.uncertainty, solution.estimate.positions)
     both = errors[:, :, None] * errors[:, None, :]
     assert np.abs((absolute - expected) / both).max() < 0.02
     assert_allclose(solution.stars["x_err_abs"].value, errors[:, 0], rtol=0.01)
@@ -83,12 +84,12 @@ def test_absolute_errors_are_calibrated(n, kind, sigma, accuracy):
         sim = field(100, epochs, seed=seed, **({"parallax": 0.1} if kind == "parallax" else {}))
         table, *_ = gaia(sim, np.random.default_rng(seed + 100), parallax=kind == "parallax")
         solution = solve(sim.matches, motion=kind, motion_sigma=sigma, reference=table, clip=None)
-        truth, years = sim.truth, solution.epoch - sim.truth.epoch
-        off = [solution.positions - truth.positions - years * truth.motions]
-        off.append(solution.motions.values[:, :2] - truth.motions)
+        truth, years = sim.truth, in_tables.epoch(solution) - sim.truth.epoch
+        off = [solution.estimate.positions - truth.positions - years * truth.motions]
+        off.append(solution.estimate.motions.values[:, :2] - truth.motions)
         names = ["x_err_abs", "y_err_abs", "vx_err_abs", "vy_err_abs"]
         if kind == "parallax":
-            off.append(10 * (solution.motions.values[:, 2:] - truth.parallaxes[:, None]))
+            off.append(10 * (solution.estimate.motions.values[:, 2:] - truth.parallaxes[:, None]))
             names.append("parallax_error_abs")
         errors = np.stack([solution.stars[name].value for name in names], axis=1)
         parts = slice(30), slice(30, None)
@@ -107,11 +108,11 @@ def test_stars_of_the_catalogue_have_what_it_knows_of_them():
     matches = type(sim.matches).from_table(rows[kept], shape=sim.matches.shapes, poses=sim.matches.poses, sky=SKY)
     table, values, covariance = gaia(sim, np.random.default_rng(3), parallax=False, errors=np.full(5, 0.02))
     solution = solve(matches, motion="proper", reference=table, clip=None)
-    expected, cov = at(values, covariance, solution.epoch - 2016.0)
+    expected, cov = at(values, covariance, in_tables.epoch(solution) - 2016.0)
     errors = np.sqrt(np.einsum("jaa->ja", cov))
-    assert np.abs((solution.motions.values[:30] - expected[:, 2:4]) / errors[:, 2:4]).max() < 1
+    assert np.abs((solution.estimate.motions.values[:30] - expected[:, 2:4]) / errors[:, 2:4]).max() < 1
     assert_allclose(solution.stars["vx_err_abs"].value[:30], errors[:, 2], rtol=0.05)
-    assert np.isfinite(solution.motions.values[3]).all()
+    assert np.isfinite(solution.estimate.motions.values[3]).all()
     poor = solve(matches, motion="proper", reference=gaia(sim, np.random.default_rng(3), errors=np.full(5, 20.0))[0])
     alone = solve(matches, motion="proper")
     others = np.arange(60) != 3
@@ -140,7 +141,7 @@ def test_a_table_of_stars_is_a_prior_of_its_motions():
     stars["vx"][5] += 100 * stars["vx"].unit  # one that deviates is left out
     kept = solve(sim.matches, motion="proper", reference=stars, clip=None)
     assert not kept.gauge.tie.used[5]
-    assert np.abs(kept.motions.values - again.motions.values).max() < 0.02
+    assert np.abs(kept.estimate.motions.values - again.estimate.motions.values).max() < 0.02
     del stars["vx_err"], stars["vx_err_abs"]
     with pytest.raises(InputError, match="lacks vx_err, errors of its motions"):
         solve(sim.matches, motion="proper", reference=stars)
@@ -181,7 +182,9 @@ def test_correlations_of_the_stars():
     sim = field(60, FIVE, parallax=0.1)
     solution = solve(sim.matches, motion="parallax", motion_epoch=2000.0)
     stars = solution.stars
-    relative = relative_blocks(solution.gauge, solution.uncertainty, solution.positions).transpose(1, 2, 0)
+    relative = relative_blocks(solution.gauge, solution.estimate.uncertainty, solution.estimate.positions).transpose(
+        1, 2, 0
+    )
     for (a, b), name in CORRELATIONS.items():
         expected = relative[a, b] / np.sqrt(relative[a, a] * relative[b, b]) * np.sign(AXES[a] * AXES[b])
         assert_allclose(stars[name], expected, atol=0.03, err_msg=name)

@@ -52,9 +52,11 @@ def test_compiled_solution_is_the_plain_one(monkeypatch, direct):
     monkeypatch.setattr("legdistort.solving.equations.problem.COMPILED_FROM", 0)
     monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: direct)
     fast = solve(sim.matches, prior=prior)
-    assert_allclose(fast.positions, plain.positions, atol=1e-5)  # both stop within 5e-5 standard errors
+    assert_allclose(
+        fast.estimate.positions, plain.estimate.positions, atol=1e-5
+    )  # both stop within 5e-5 standard errors
     assert_allclose(fast.coefficients, plain.coefficients, atol=1e-5)
-    assert_allclose(fast.uncertainty.stars, plain.uncertainty.stars, rtol=1e-5, atol=1e-9)
+    assert_allclose(fast.estimate.uncertainty.stars, plain.estimate.uncertainty.stars, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("robust", [True, False])
@@ -66,7 +68,7 @@ def test_compiled_start_is_the_plain_one(monkeypatch, robust):
     plain, astray = start_values.start(problem, nominal, robust=robust)
     monkeypatch.setattr("legdistort.solving.equations.problem.COMPILED_FROM", 0)
     fast, also_astray = start_values.start(problem, nominal, robust=robust)
-    assert_allclose(fast.positions, plain.positions, atol=1e-8)
+    assert_allclose(fast.estimate.positions, plain.estimate.positions, atol=1e-8)
     assert_allclose(fast.poses, plain.poses, atol=1e-8)
     assert_allclose(also_astray, astray, atol=1e-8)
     assert astray.max() < 5

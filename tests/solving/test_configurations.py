@@ -53,7 +53,7 @@ def test_little_overlap_converges_to_the_minimum(monkeypatch, mosaic, direct):
     assert int(solution.status.split()[2]) <= 10
     assert solution.chi2 / solution.dof == pytest.approx(1, abs=5 * np.sqrt(2 / solution.dof))
     oracle = DenseOracle(matches, solution, np.zeros((2, 6)))
-    x = np.concatenate([solution.positions.ravel(), solution.coefficients.ravel()])
+    x = np.concatenate([solution.estimate.positions.ravel(), solution.coefficients.ravel()])
     base = np.sum(oracle.residuals(x) ** 2)
     assert base == pytest.approx(solution.chi2, rel=1e-9)
     rows = solution.gauge.orthonormal
@@ -79,8 +79,8 @@ def test_every_degree_reaches_its_bound(degree):
         sim = simulate_matches(n_stars=160, n_exposures=6, degree=degree, static=0.5, dynamic=spread, sigma=0.05,
                                dither=80.0, seed=seed)  # fmt: skip
         solution = solve(sim.matches, degree=degree, prior=Prior(sim.truth.static))
-        true = sim.truth.positions[solution.star_names]
-        b.append(accuracy.bias(solution.positions, true, removed=degree))
+        true = sim.truth.positions[solution.estimate.star_names]
+        b.append(accuracy.bias(solution.estimate.positions, true, removed=degree))
         bound.append(accuracy.expected_bias(solution, removed=degree))
         pulls.append((solution.chi2 - solution.dof) / np.sqrt(2 * solution.dof))
     assert np.mean(b) / np.mean(bound) == pytest.approx(1, abs=0.06)
@@ -109,10 +109,10 @@ def test_rolled_and_flipped_exposures_of_two_detectors():
     prior = {name: Prior(mean) for name, mean in static.items()}
     solution = solve(matches, degree=2, prior=prior)
     assert solution.chi2 / solution.dof == pytest.approx(1, abs=4 * np.sqrt(2 / solution.dof))
-    b = accuracy.bias(solution.positions, true[solution.star_names], removed=2)
+    b = accuracy.bias(solution.estimate.positions, true[solution.estimate.star_names], removed=2)
     assert b == pytest.approx(accuracy.expected_bias(solution, removed=2), rel=0.25)
     # each detector's own static distortion served its exposures
-    departure = np.abs(solution.coefficients - solution.prior_mean)[:, :, 3:]
+    departure = np.abs(solution.coefficients - solution.estimate.prior_mean)[:, :, 3:]
     assert departure.mean() < 0.3
     with pytest.raises(SolveError, match="fewer than the 120 modes of degree 14"):
         solve(matches, degree=14, prior=prior)

@@ -41,8 +41,8 @@ def solved(matches, errors="correlated", **options):
 
 def true_over_reported(solution, truth):
     """Rms of true errors after a common linear map, over those reported."""
-    positions = truth.positions[solution.star_names]
-    offset = solution.positions - positions
+    positions = truth.positions[solution.estimate.star_names]
+    offset = solution.estimate.positions - positions
     maps = np.column_stack([np.ones(len(offset)), positions / 1000])
     left = offset - maps @ np.linalg.lstsq(maps, offset, rcond=None)[0]
     reported = np.stack([solution.stars[f"{axis}_err"].value for axis in "xy"])
@@ -86,7 +86,7 @@ def test_files_keep_what_was_found(wandering, tmp_path):
 
 
 def test_covariance_of_all_stars_has_that_of_each_on_its_diagonal(wandering):
-    uncertainty = wandering[0]["correlated"].uncertainty
+    uncertainty = wandering[0]["correlated"].estimate.uncertainty
     n = uncertainty.stars.shape[1]
     assert np.diag(uncertainty.star_matrix) == pytest.approx(uncertainty.stars[:2].ravel())
     assert np.diag(uncertainty.star_matrix[:n, n:]) == pytest.approx(uncertainty.stars[2], abs=1e-12)

@@ -64,7 +64,7 @@ def test_what_is_kept_out_has_no_say():
     elsewhere = solve(moved, degree=2, prior=Prior(sim.truth.static), validate=0.2)
     for other in (plain, elsewhere):
         assert other.chi2 == solution.chi2
-        assert np.array_equal(other.positions, solution.positions)
+        assert np.array_equal(other.estimate.positions, solution.estimate.positions)
         assert np.array_equal(other.coefficients, solution.coefficients)
     assert not np.isin(solution.residuals["star"], table["star"]).any()
     assert plain.diagnostics.validation is None
@@ -102,7 +102,7 @@ def test_reported_scatter_is_that_of_the_corrected_positions():
     by_star = []
     for star in np.unique(table["star"]):
         rows = table[table["star"] == star]
-        xy = [solution.correct(r["exposure"], [[r["x"].value, r["y"].value]])[0] for r in rows]
+        xy = [solution[r["exposure"]].correct([[r["x"].value, r["y"].value]])[0] for r in rows]
         by_star.append(np.var(xy, axis=0).sum() / 2)
     got = solution.diagnostics.validation
     assert got.scatter == pytest.approx(np.sqrt(np.mean(by_star)), rel=1e-9)
@@ -341,7 +341,7 @@ def test_x4_folds_as_foretold(margin):
     assert told.energy == pytest.approx(put_in, rel=0.05)
     assert told.noise < 0.1 * told.energy
     low = solved(sim, degree=3, clip=None)
-    wrong = (low.coefficients - low.prior_mean)[:, :, :10]
+    wrong = (low.coefficients - low.estimate.prior_mean)[:, :, :10]
     for degree in (2, 3):  # those below are, in part, in the poses
         part = slice(degree * (degree + 1) // 2, (degree + 1) * (degree + 2) // 2)
         done = np.sqrt((wrong[:, :, part] ** 2).mean(axis=(0, 1)).sum()) / 2
@@ -362,7 +362,7 @@ def test_few_stars_fold_more():
         sim = simulate_matches(n_stars=25, dynamic=width, sigma=0.01, noise=0, seed=seed)
         told.append(folding(sim, 2, 3, Prior(sim.truth.static)).folds_into[2])
         low = solved(sim, degree=2, clip=None)
-        wrong = (low.coefficients - low.prior_mean)[:, :, 3:6]
+        wrong = (low.coefficients - low.estimate.prior_mean)[:, :, 3:6]
         done.append(np.sqrt((wrong**2).mean(axis=(0, 1)).sum()) / 2)
     assert np.sqrt(np.mean(np.square(told))) == pytest.approx(np.sqrt(np.mean(np.square(done))), rel=0.15)
 
@@ -474,7 +474,7 @@ def test_what_auto_does_not_go_with():
     with pytest.raises(InputError, match="static='fit' needs a degree in numbers, not 'auto'"):
         solve(sim.matches, degree="auto", static="fit")
     with pytest.raises(InputError, match="leave degree='auto' and static out"):
-        solve(sim.matches, degree="auto", model=solved(sim, degree=1).distortion("exp00").model())
+        solve(sim.matches, degree="auto", model=solved(sim, degree=1)["exp00"].distortion.model())
 
 
 def test_run_refuses_before_it_reads(tmp_path):

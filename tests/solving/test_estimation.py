@@ -56,12 +56,12 @@ def test_joint_is_the_dense_oracle(settings):
     dense = oracle.solve()
     positions, coefficients = oracle.unpack(dense.x)
     assert_allclose(solution.chi2, np.sum(oracle.residuals(dense.x) ** 2), rtol=1e-7)
-    assert_allclose(solution.positions, positions, atol=2e-5)
+    assert_allclose(solution.estimate.positions, positions, atol=2e-5)
     assert_allclose(solution.coefficients, coefficients, atol=5e-5)
     covariance = oracle.covariance(dense.x)
     n = 2 * len(positions)
-    assert_allclose(solution.uncertainty.coefficients, covariance[n:, n:], rtol=2e-4, atol=1e-7)
-    xx, yy, xy = solution.uncertainty.stars
+    assert_allclose(solution.estimate.uncertainty.coefficients, covariance[n:, n:], rtol=2e-4, atol=1e-7)
+    xx, yy, xy = solution.estimate.uncertainty.stars
     assert_allclose(xx, np.diag(covariance)[0:n:2], rtol=2e-4)
     assert_allclose(yy, np.diag(covariance)[1:n:2], rtol=2e-4)
     assert_allclose(xy, np.diag(covariance, 1)[0:n:2], rtol=2e-4, atol=1e-9)
@@ -71,16 +71,18 @@ def test_model_is_the_published_formula():
     sim = small()
     solution = solve(sim.matches, degree=2, prior=Prior(sim.truth.static))
     for i, name in enumerate(solution.names):
-        expected = predict(solution.positions, solution.coefficients[i], solution.poses[name], solution.shapes[name])
-        on = np.isfinite(solution.distort(name, solution.positions)).all(axis=1)
-        assert_allclose(solution.distort(name, solution.positions)[on], expected[on], atol=1e-9)
+        expected = predict(
+            solution.estimate.positions, solution.coefficients[i], solution.poses[name], solution.estimate.shapes[name]
+        )
+        on = np.isfinite(solution[name].distort(solution.estimate.positions)).all(axis=1)
+        assert_allclose(solution[name].distort(solution.estimate.positions)[on], expected[on], atol=1e-9)
     rows = solution.residuals
     for name in solution.names:
         mine = rows[rows["exposure"] == name]
-        place = solution.positions[np.searchsorted(solution.star_names, mine["star"])]
-        i = solution.index(name)
+        place = solution.estimate.positions[np.searchsorted(solution.estimate.star_names, mine["star"])]
+        i = solution.names.index(name)
         left = np.column_stack([mine["x"].value, mine["y"].value]) - predict(
-            place, solution.coefficients[i], solution.poses[name], solution.shapes[name]
+            place, solution.coefficients[i], solution.poses[name], solution.estimate.shapes[name]
         )
         assert_allclose(np.column_stack([mine["dx"].value, mine["dy"].value]), left, atol=1e-9)
 
@@ -117,7 +119,7 @@ def test_alternating_reaches_the_same_minimum():
     with warns_here(ConvergenceWarning, match="drift along directions that the data do not determine"):
         published = solve(sim.matches, prior=prior, method="alternating", max_iterations=60)
     assert_allclose(published.chi2, joint.chi2, rtol=2e-4)
-    assert accuracy.bias(published.positions, joint.positions, removed=3) < 5e-4
+    assert accuracy.bias(published.estimate.positions, joint.estimate.positions, removed=3) < 5e-4
 
 
 def test_conjugate_gradients_give_the_direct_answer(monkeypatch):
@@ -126,7 +128,7 @@ def test_conjugate_gradients_give_the_direct_answer(monkeypatch):
     monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: False)
     iterative = solve(sim.matches, degree=2, prior=Prior(sim.truth.static))
     # the scatter of exposures, which weighs in the gauge, is found by iterations of its own
-    assert_allclose(iterative.positions, direct.positions, atol=1e-5)
+    assert_allclose(iterative.estimate.positions, direct.estimate.positions, atol=1e-5)
     assert_allclose(iterative.coefficients, direct.coefficients, atol=1e-5)
 
 
@@ -134,7 +136,7 @@ def test_poses_carry_the_similarities():
     sim = small(pose_error=15.0)
     solution = solve(sim.matches, degree=2, prior=Prior(sim.truth.static))
     for i, name in enumerate(solution.names):
-        part = similarity_part(solution.coefficients[i] - sim.truth.static, solution.shapes[name])
+        part = similarity_part(solution.coefficients[i] - sim.truth.static, solution.estimate.shapes[name])
         corner = np.array([[0.0, 0.0], [1199.0, 699.0]])
         assert np.abs(similarity.apply(part, corner) - corner).max() < 1e-3
 
@@ -151,7 +153,7 @@ def test_poses_are_a_convention():
     blind = solve(Matches.from_table(table_of(sim), shape=(2048, 2048)), prior=prior)
     for other in (off, blind):
         assert_allclose(other.chi2, right.chi2, rtol=1e-6)
-        assert accuracy.bias(other.positions, right.positions, removed="similarity") < 2e-3
+        assert accuracy.bias(other.estimate.positions, right.estimate.positions, removed="similarity") < 2e-3
 
 
 def test_minimal_gauge_of_equal_exposures_is_the_mean():
@@ -174,7 +176,7 @@ def test_mean_of_corrected_positions_is_the_reference_position():
     sim = simulate_matches(seed=4)
     solution = solve(sim.matches, prior=Prior(sim.truth.static))
     mean = np.nanmean(accuracy.corrected_positions(solution), axis=0)
-    assert np.abs(mean - solution.positions).max() < 3e-3
+    assert np.abs(mean - solution.estimate.positions).max() < 3e-3
 
 
 def test_permutation_changes_nothing():
@@ -185,7 +187,7 @@ def test_permutation_changes_nothing():
     prior = Prior(sim.truth.static)
     first = solve(sim.matches, degree=2, prior=prior)
     second = solve(Matches.from_table(shuffled, shape=(700, 1200), poses=sim.matches.poses), degree=2, prior=prior)
-    assert_allclose(second.positions[::-1], first.positions, atol=1e-7)
+    assert_allclose(second.estimate.positions[::-1], first.estimate.positions, atol=1e-7)
     order = [second.names.index(name) for name in first.names]
     assert_allclose(second.coefficients[order], first.coefficients, atol=1e-7)
 
@@ -212,7 +214,7 @@ def test_an_exposure_of_infinite_error_changes_nothing():
     prior = Prior(sim.truth.static)
     with_it = solve(Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses), prior=prior)
     without = solve(Matches.from_table(table[~last], shape=(2048, 2048), poses=sim.matches.poses), prior=prior)
-    assert_allclose(with_it.positions, without.positions, atol=1e-3)
+    assert_allclose(with_it.estimate.positions, without.estimate.positions, atol=1e-3)
 
 
 def test_prior_of_higher_degree_keeps_its_upper_modes():
@@ -228,7 +230,7 @@ def test_prior_width_makes_sparse_fields_solvable():
     with pytest.raises(SolveError, match=r"exp00 has 8 stars, fewer than the 10 modes of degree 3: .*at most 2 here"):
         solve(sim.matches, prior=Prior(sim.truth.static))
     solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma=0.9))
-    assert accuracy.bias(solution.positions, sim.truth.positions[solution.star_names]) < 0.3
+    assert accuracy.bias(solution.estimate.positions, sim.truth.positions[solution.estimate.star_names]) < 0.3
 
 
 def test_clipping_finds_gross_outliers():
@@ -243,7 +245,7 @@ def test_clipping_finds_gross_outliers():
                            poses=sim.matches.poses), prior=Prior(sim.truth.static))  # fmt: skip
     assert set(wrong) <= set(np.flatnonzero(~clipped.residuals["used"]))
     assert np.count_nonzero(~clipped.residuals["used"]) <= len(wrong) + 3
-    assert accuracy.bias(clipped.positions, clean.positions) < 0.02
+    assert accuracy.bias(clipped.estimate.positions, clean.estimate.positions) < 0.02
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
@@ -255,8 +257,8 @@ def test_robust_losses_resist_outliers(loss):
     matches = Matches.from_table(table, shape=(2048, 2048), poses=sim.matches.poses)
     true = sim.truth.positions
     prior = Prior(sim.truth.static)
-    assert accuracy.bias(solve(matches, prior=prior, loss=loss, clip=None).positions, true) < 0.12
-    assert accuracy.bias(solve(matches, prior=prior, clip=None).positions, true) > 0.3
+    assert accuracy.bias(solve(matches, prior=prior, loss=loss, clip=None).estimate.positions, true) < 0.12
+    assert accuracy.bias(solve(matches, prior=prior, clip=None).estimate.positions, true) > 0.3
 
 
 @pytest.mark.parametrize(

@@ -197,7 +197,7 @@ def test_the_origin_of_the_plane_is_of_no_matter():
     far = Matches.from_table(sim.matches.table, shape=(2048, 2048), poses=moved)
     one, other = (solve(matches, degree=2, clip=None) for matches in (sim.matches, far))
     assert one.gauge.unknown_names == other.gauge.unknown_names
-    assert_allclose(other.positions, one.positions + shift, atol=1e-4)
+    assert_allclose(other.estimate.positions, one.estimate.positions + shift, atol=1e-4)
     for a, b in ((one, other), (other, one)):
         covariance = a.absolute_covariance(without_unknown=True)
         assert_allclose(b.absolute_covariance(without_unknown=True), covariance, rtol=1e-3, atol=1e-6)

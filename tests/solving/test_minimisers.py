@@ -58,7 +58,7 @@ def test_what_the_last_steps_keep_moves_no_star(known, direct, loss, monkeypatch
     new, old = found[minimisers._NEAR], found[0.0]
     n_steps = sum(int(re.search(r"after (\d+)", each.status).group(1)) for each in (new, old))
     assert n_steps <= len(stepped) <= n_steps + direct  # conjugate gradients never step twice
-    off = (new.positions - old.positions) / np.stack([old.stars["x_err"], old.stars["y_err"]], axis=1)
+    off = (new.estimate.positions - old.estimate.positions) / np.stack([old.stars["x_err"], old.stars["y_err"]], axis=1)
     assert np.abs(np.asarray(off)).max() < 1e-3
     assert new.chi2 == pytest.approx(old.chi2, rel=1e-6)
     assert np.allclose(new.stars["x_err"], old.stars["x_err"], rtol=1e-4)
@@ -73,9 +73,9 @@ def test_coefficients_fitted_to_the_start_values_of_the_stars_save_steps_and_mov
         found[up_to] = solve(sim.matches, prior=prior, clip=None)
     old, new = found.values()
     # the plane is that of the nominal poses to 1e-3 px, wherever the steps lead
-    assert np.abs(new.positions - old.positions).max() < 1e-3
-    pose = similarity.fit_similarity(new.positions, old.positions)
-    off = similarity.apply(pose, new.positions) - old.positions
+    assert np.abs(new.estimate.positions - old.estimate.positions).max() < 1e-3
+    pose = similarity.fit_similarity(new.estimate.positions, old.estimate.positions)
+    off = similarity.apply(pose, new.estimate.positions) - old.estimate.positions
     errors = np.column_stack([old.stars["x_err"].value, old.stars["y_err"].value])
     assert (np.abs(off) / errors).max() < 2e-3
     steps = [int(re.search(r"after (\d+)", each.status).group(1)) for each in (old, new)]

@@ -83,7 +83,7 @@ def obedient(simulation):
 
 def values(solution, name):
     """Both directions of the model of an exposure, where its detector is."""
-    model = solution.model(name)
+    model = solution[name].model
     reference = model.inverse([100.0, 600.0, 1100.0], [50.0, 300.0, 650.0])
     return np.array([*model(*reference), *reference])
 
@@ -94,7 +94,7 @@ def test_a_whole_form_is_the_usual_solution(simulation, plain):
     assert (solution.degree, solution.dof) == (3, plain.dof)
     assert solution.chi2 == pytest.approx(plain.chi2)
     for name in solution.names:
-        pose, start, mapping, x, y = leaves(solution.model(name))
+        pose, start, mapping, x, y = leaves(solution[name].model)
         assert pose.name == "pose"
         assert (type(start), type(mapping)) == (Identity, Mapping)
         assert isinstance(x, FastLegendre2D)
@@ -115,7 +115,7 @@ def test_a_whole_form_is_the_usual_solution(simulation, plain):
 def test_any_domain_is_converted_exactly(simulation, plain, domain):
     solution = solve(simulation.matches, model=form(domain=domain))
     assert_allclose(solution.chi2, plain.chi2, rtol=1e-9)
-    *_, x, _ = leaves(solution.model("exp01"))
+    *_, x, _ = leaves(solution["exp01"].model)
     assert tuple(x.x_domain) == domain.get("x_domain", DETECTOR["x_domain"])
     assert tuple(x.x_window) == domain.get("x_window", (-1, 1))
     for name in solution.names:
@@ -124,14 +124,16 @@ def test_any_domain_is_converted_exactly(simulation, plain, domain):
 
 def test_models_that_are_no_stranger_than_our_own(simulation, plain):
     """What `Solution.model` gives goes in again: its pose gives way to those of the exposures."""
-    given = plain.model("exp02")
+    given = plain["exp02"].model
     before = given.parameters.copy()
     solution = solve(simulation.matches, model=given)
     assert_array_equal(given.parameters, before)
     assert given.has_user_inverse
     assert solution.degree == 3
     expected = plain.coefficients[2].copy()
-    assert_allclose(solution.prior_mean, np.broadcast_to(expected, solution.prior_mean.shape), rtol=0, atol=1e-9)
+    assert_allclose(
+        solution.estimate.prior_mean, np.broadcast_to(expected, solution.estimate.prior_mean.shape), rtol=0, atol=1e-9
+    )
     assert solution.chi2 == pytest.approx(plain.chi2, rel=0.02)  # another start, another convention
 
 
@@ -148,15 +150,15 @@ def test_a_static_part_of_its_own(simulation):
     assert solution.coefficients.shape == (5, 2, 15)
     assert_allclose(solution.coefficients[:, 0, 10], fourth, rtol=1e-9)
     t = np.linspace(0, 600, 5)
-    mean = solution.prior_mean[0] @ basis.values(4, *basis.normalize(np.stack([t, t], axis=1), (NY, NX)))
+    mean = solution.estimate.prior_mean[0] @ basis.values(4, *basis.normalize(np.stack([t, t], axis=1), (NY, NX)))
     u = 2 * (t + 0.5) / NX - 1
     assert_allclose(mean[0], 0.4 * np.polynomial.legendre.legval(u, [0, 0, 0, 0, 1]), atol=1e-9)
     assert_allclose(mean[1], 1e-6 * t * t, atol=1e-9)
-    model = solution.model("exp03")
+    model = solution["exp03"].model
     assert model.c4_0_6 == 0.4
     assert model.c1_1_7 == 1e-6
     x = values(solution, "exp03")[2:]
-    assert_allclose(np.array(model(*x)).T, solution.distort("exp03", x.T), rtol=0, atol=1e-9)
+    assert_allclose(np.array(model(*x)).T, solution["exp03"].distort(x.T), rtol=0, atol=1e-9)
 
 
 def test_fixed_coefficients_keep_their_values(obedient):
@@ -164,13 +166,13 @@ def test_fixed_coefficients_keep_their_values(obedient):
     solution = solve(matches, model=PARTLY)
     assert "converged after" in solution.status
     for name in solution.names:
-        model = solution.model(name)
+        model = solution[name].model
         for parameter, value in (("c3_0_3", 0.3), ("c1_1_3", 0.0), ("c2_1_4", 0.0), ("c3_3_3", 0.0)):
             assert getattr(model, parameter) == value
             assert getattr(model, parameter).fixed
         assert model.c1_1_4 != 0
         x = values(solution, name)[2:]
-        assert_allclose(np.array(model(*x)).T, solution.distort(name, x.T), rtol=0, atol=1e-9)
+        assert_allclose(np.array(model(*x)).T, solution[name].distort(x.T), rtol=0, atol=1e-9)
     assert_allclose(solution.coefficients[:, 0, 6], 0.3 / basis.norm(3) / basis.norm(0), rtol=1e-15)
     assert_array_equal(solution.coefficients[:, 0, 4], 0)
     assert np.abs(solution.chi2 - solution.dof) < 4 * np.sqrt(2 * solution.dof)
@@ -182,7 +184,7 @@ def test_fixed_coefficients_against_a_dense_solution(obedient):
     matches, _ = obedient
     solution = solve(matches, model=PARTLY)
     obs, n_stars, names = matches.observations, len(matches.stars), matches.names
-    mean, gauge = solution.prior_mean, solution.gauge
+    mean, gauge = solution.estimate.prior_mean, solution.gauge
 
     def unpack(v):
         coefficients = mean.copy()
@@ -198,11 +200,11 @@ def test_fixed_coefficients_against_a_dense_solution(obedient):
         constraint = 1e3 * gauge.orthonormal @ (coefficients - mean).reshape(len(names), -1).ravel()
         return np.concatenate([(r / SIGMA).ravel(), constraint])
 
-    start = np.concatenate([solution.positions.ravel(), mean[:, ~HELD].ravel()])
+    start = np.concatenate([solution.estimate.positions.ravel(), mean[:, ~HELD].ravel()])
     dense = least_squares(residuals, start, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=20)
     assert solution.chi2 == pytest.approx(2 * dense.cost, rel=1e-5)
     positions, coefficients = unpack(dense.x)
-    assert_allclose(solution.positions, positions, rtol=0, atol=0.02 * SIGMA)
+    assert_allclose(solution.estimate.positions, positions, rtol=0, atol=0.02 * SIGMA)
     assert_allclose(solution.coefficients, coefficients, rtol=0, atol=0.1 * SIGMA)
 
 
@@ -214,7 +216,7 @@ def test_truth_is_found_better_with_what_is_known_fixed(obedient, simulation):
         solution = solve(matches, **options)
         for i, name in enumerate(matches.names):
             exact = predict(truth.positions[stars], coefficients[i], truth.poses[name], (NY, NX))
-            off.append(np.nanmean((solution.distort(name, solution.positions) - exact) ** 2))
+            off.append(np.nanmean((solution[name].distort(solution.estimate.positions) - exact) ** 2))
     fixed, free = np.sqrt(np.reshape(off, (2, -1)).mean(axis=1))
     assert fixed < free < SIGMA
 
@@ -258,13 +260,13 @@ def test_nothing_free_leaves_poses(simulation):
     assert np.abs(solution.chi2 - solution.dof) < 4 * np.sqrt(2 * solution.dof)
     assert solution.degree == 0
     assert_allclose(solution.coefficients[:, 0, 3], 0.5 / basis.norm(2) / basis.norm(0))
-    assert solution.model("exp00").c2_0_3 == 0.5
+    assert solution["exp00"].model.c2_0_3 == 0.5
 
 
 def test_a_file_keeps_the_solution_and_says_what_the_form_was(obedient, tmp_path):
     solution = solve(obedient[0], model=PARTLY)
     again = Solution.read(solution.write(tmp_path / "s.asdf"))
-    assert again.form is None
+    assert again.estimate.form is None
     assert again.settings.model["fixed"]["c3_0_2"] == 0.3
     assert again.settings.model["n_free"] == 17
     assert_array_equal(again.coefficients, solution.coefficients)

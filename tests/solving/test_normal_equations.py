@@ -284,14 +284,14 @@ def test_many_exposures_of_few_stars_are_solved_on_the_stars(monkeypatch):
     few = Matches.from_table(few, shape=sim.matches.shapes, poses=sim.matches.poses)
     for matches, made in ((sim.matches, OnStars), (few, Direct)):
         found = solve(matches, prior=Prior(sim.truth.static), clip=None)
-        assert isinstance(found.uncertainty.system, made)
+        assert isinstance(found.estimate.uncertainty.system, made)
         with monkeypatch.context() as patch:
             patch.setattr(reduced_system, "STARS_FROM", np.inf)
             other = solve(matches, prior=Prior(sim.truth.static), clip=None)
-            assert isinstance(other.uncertainty.system, Direct)
-            errors = np.sqrt(other.uncertainty.stars[:2].T)
-        assert np.abs((found.positions - other.positions) / errors).max() < 1e-3
-        assert_allclose(np.sqrt(found.uncertainty.stars[:2].T), errors, rtol=1e-5)
+            assert isinstance(other.estimate.uncertainty.system, Direct)
+            errors = np.sqrt(other.estimate.uncertainty.stars[:2].T)
+        assert np.abs((found.estimate.positions - other.estimate.positions) / errors).max() < 1e-3
+        assert_allclose(np.sqrt(found.estimate.uncertainty.stars[:2].T), errors, rtol=1e-5)
 
 
 def test_exposures_to_blame_are_named_where_steps_are_iterated(case, monkeypatch):

@@ -148,9 +148,9 @@ def test_where_the_fit_stood_does_not_matter(likelihoods):
     sim = simulate(8, n_exposures=5, seed=3)
     for sigma in (0.05, 5.0):
         solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma=sigma))
-        problem, gauge = solution.uncertainty._problem, solution.gauge
+        problem, gauge = solution.estimate.uncertainty._problem, solution.gauge
         poses = np.stack([solution.poses[name] for name in solution.names])
-        state = State(solution.positions.T, solution.coefficients, poses)
+        state = State(solution.estimate.positions.T, solution.coefficients, poses)
         labels = np.tile(np.arange(3), (5, 1))
         other = prior_widths.evidence(problem, state, labels, gauge.motion)
         for widths in ([0.9, 0.3, 0.1], [0.1, 1.0, 0.5]):
@@ -194,7 +194,7 @@ def test_what_is_not_there_gets_no_width():
     solution = found(sim)
     assert solution.diagnostics.widths == (0, 0, 0)
     lowest = solve(sim.matches, degree=0, prior=Prior(sim.truth.static))
-    assert_allclose(solution.positions, lowest.positions, atol=1e-3)
+    assert_allclose(solution.estimate.positions, lowest.estimate.positions, atol=1e-3)
     assert solution.dof == lowest.dof
 
 
@@ -304,7 +304,7 @@ def test_widths_up_to_a_degree_below_that_of_the_fit():
     prior = Prior(sim.truth.static, sigma=0.5)
     solution, lower = (solve(sim.matches, degree=degree, prior=prior) for degree in (3, 2))
     assert solution.chi2 / solution.dof == pytest.approx(1, abs=4 * np.sqrt(2 / solution.dof))
-    assert_allclose(solution.positions, lower.positions, atol=0.02)
+    assert_allclose(solution.estimate.positions, lower.estimate.positions, atol=0.02)
     assert_allclose(solution.stars["x_err"].value, lower.stars["x_err"].value, rtol=0.2)
 
 
@@ -316,14 +316,14 @@ def test_all_of_them_without_widths(degree):
     sim = simulate(30)
     solution = solve(sim.matches, degree=degree, prior=Prior(sim.truth.static))
     n = max(4, (degree + 1) * (degree + 2))
-    assert_allclose(list(solution.effective_modes.values()), n * 0.9, rtol=1e-2)
+    assert_allclose(list(solution.diagnostics.effective_modes.values()), n * 0.9, rtol=1e-2)
 
 
 @pytest.mark.parametrize("sigma", [10.0, 0.5, 0.1, 1e-3, 0.0, "evidence"])
 def test_they_and_the_stars_are_the_free_parameters(sigma):
     sim = simulate(20, "zero")
     solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma=sigma))
-    number = np.array(list(solution.effective_modes.values()))
+    number = np.array(list(solution.diagnostics.effective_modes.values()))
     assert 2 * len(solution.residuals) - 2 * 20 - number.sum() == pytest.approx(solution.dof, abs=0.6)
     assert np.all((number > 3.5) & (number < 18.1))
     if sigma == 10.0:
@@ -338,7 +338,7 @@ def test_they_grow_with_the_width_and_the_stars():
         sim = simulate(n_stars, "zero")
         for sigma in (0.05, 0.2, 1.0):
             solution = solve(sim.matches, prior=Prior(sim.truth.static, sigma=sigma))
-            number[n_stars, sigma] = np.mean(list(solution.effective_modes.values()))
+            number[n_stars, sigma] = np.mean(list(solution.diagnostics.effective_modes.values()))
     for n_stars in (8, 30):
         assert number[n_stars, 0.05] < number[n_stars, 0.2] < number[n_stars, 1.0]
     assert number[8, 0.2] < number[30, 0.2]
@@ -357,7 +357,7 @@ def test_solution_says_what_was_found(tmp_path):
     again = Solution.read(tmp_path / "solution.asdf")
     assert again.settings == solution.settings
     assert again.diagnostics == solution.diagnostics
-    assert again.effective_modes == solution.effective_modes
+    assert again.diagnostics.effective_modes == solution.diagnostics.effective_modes
 
 
 def test_plain_solution_says_nothing_of_widths():
@@ -438,7 +438,7 @@ def test_command_line_refuses_other_words(capsys):
 def errors(solution, truth, places):
     """Errors of one solution: stars (similarity removed), and new positions among the stars and all over the field."""
     scatter = [np.sqrt(np.nanmean(accuracy.new_scatter(solution, truth.distort, xy, 0) ** 2)) for xy in places]
-    return [accuracy.bias(solution.positions, truth.positions, removed="similarity"), *scatter]
+    return [accuracy.bias(solution.estimate.positions, truth.positions, removed="similarity"), *scatter]
 
 
 @pytest.mark.slow
@@ -473,7 +473,7 @@ def test_wrong_priors_are_told():
         row = []
         for mean, factor in ((0, 1), (0, 2), (0, 0.5), (off, 1)):
             solution = solve(sim.matches, prior=Prior(sim.truth.static + mean, sigma=factor * widths))
-            b = accuracy.bias(solution.positions, sim.truth.positions, removed="similarity")
+            b = accuracy.bias(solution.estimate.positions, sim.truth.positions, removed="similarity")
             row.append([b, solution.chi2 / solution.dof, solution.diagnostics.departure_ratio])
         rows.append(row)
     (b, chi2, ratio) = np.mean(rows, axis=0).T

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from astropy.table import Table, vstack
+from moving_stars import positions_at
 
 from legdistort.exceptions import AssumptionWarning
 from legdistort.inputs.table_files import read_table
@@ -47,10 +48,10 @@ def moving(epochs):
 
 def names(solution):
     """The name that the lists most often give a star."""
-    table, found = solution.observations, {}
+    table, found = solution.residuals, {}
     for star, name in zip(table["star"], table["name"], strict=True):
         found.setdefault(star, []).append(str(name))
-    return np.array([max(set(found[star]), key=found[star].count) for star in solution.star_names])
+    return np.array([max(set(found[star]), key=found[star].count) for star in solution.estimate.star_names])
 
 
 def test_motions_explain_what_positions_do_not(epochs, moving):
@@ -69,7 +70,7 @@ def test_motions_are_those_published(shared_data, moving):
     labels = labels[labels["vxerr"] > 0]
     _, mine, theirs = np.intersect1d(names(moving), labels["name"].astype(str), return_indices=True)
     published = np.column_stack([labels["vx"], labels["vy"]])[theirs]
-    ours, xy = moving.motions.values[mine] * MAS, moving.positions[mine]
+    ours, xy = moving.estimate.motions.values[mine] * MAS, moving.estimate.positions[mine]
     good = np.isfinite(ours[:, 0])
     ours, published, xy = ours[good], published[good], xy[good]
     design = np.column_stack([np.ones(len(xy)), (xy - xy.mean(axis=0)) / 500])
@@ -91,10 +92,10 @@ def test_an_epoch_kept_out_is_predicted(epochs):
     solution = solve(others, degree=2, motion="proper")
     year = epochs.epochs[epochs.names.index("18aug21")]
     star, xy = epochs.table["star"][rows], np.column_stack([epochs.table[k][rows].value for k in "xy"])
-    _, here, there = np.intersect1d(star, solution.star_names, return_indices=True)
-    seen = (solution.motions.n_epochs[there] > 2) & np.isfinite(solution.positions[there, 0])
+    _, here, there = np.intersect1d(star, solution.estimate.star_names, return_indices=True)
+    seen = (solution.estimate.motions.n_epochs[there] > 2) & np.isfinite(solution.estimate.positions[there, 0])
     measured, offsets = xy[here[seen]], {}
-    for what, predicted in (("moved", solution.positions_at(year)), ("still", solution.positions)):
+    for what, predicted in (("moved", positions_at(solution, year)), ("still", solution.estimate.positions)):
         source = predicted[there[seen]]
         x, y = (source / 500 - 1).T
         design = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])

@@ -57,7 +57,7 @@ def moved(sim, exposures, size, *, seed=0, share=1.0, common=False):
 
 def error(solution, sim):
     """Gauge-free error b."""
-    return accuracy.bias(solution.positions, sim.truth.positions[solution.star_names], removed=3)
+    return accuracy.bias(solution.estimate.positions, sim.truth.positions[solution.estimate.star_names], removed=3)
 
 
 # --- exposures that contradict the others ------------------------------------------------------------------------
@@ -159,8 +159,8 @@ def test_a_star_seen_twice_that_contradicts_itself_has_no_position():
     assert len(told) == 1
     assert not solution.residuals["used"][solution.residuals["star"] == 7].any()
     assert solution.residuals["used"][solution.residuals["star"] != 7].all()
-    assert np.isnan(solution.positions[7]).all()
-    assert np.isfinite(np.delete(solution.positions, 7, axis=0)).all()
+    assert np.isnan(solution.estimate.positions[7]).all()
+    assert np.isfinite(np.delete(solution.estimate.positions, 7, axis=0)).all()
     assert f"{len(matches.stars)} stars (1 without a position)" in repr(solution)
 
 
@@ -177,7 +177,7 @@ def test_a_majority_of_the_observations_is_believed(n_wrong, has_position):
         warnings.simplefilter("always")
         solution = solve(matches)
     assert len(told) == (not has_position)
-    assert np.isfinite(solution.positions[3]).all() == has_position
+    assert np.isfinite(solution.estimate.positions[3]).all() == has_position
     assert solution.residuals["used"][mine].tolist() == [has_position and k >= n_wrong for k in range(4)]
 
 
@@ -224,7 +224,7 @@ def test_clean_data_are_solved_as_without_clipping(n_exposures, noise):
     assert solution.settings.clip == 5
     assert plain.settings.clip is None
     assert solution.residuals["used"].all()
-    np.testing.assert_array_equal(solution.positions, plain.positions)
+    np.testing.assert_array_equal(solution.estimate.positions, plain.estimate.positions)
 
 
 def test_no_more_is_left_out_than_leaves_something_to_judge_by():
@@ -234,7 +234,7 @@ def test_no_more_is_left_out_than_leaves_something_to_judge_by():
     table["x"][[3, 20]] += 1 * u.pix
     matches = Matches.from_table(table, shape=sim.matches.shapes, poses=sim.matches.poses)
     solution = solve(matches, degree=2, prior=Prior(sim.truth.static))
-    assert solution.observations["used"].all()
+    assert solution.residuals["used"].all()
     assert solution.dof == 4
     assert {check.name: check.state for check in solution.checks}["chi2"] == "fail"
 
@@ -551,12 +551,12 @@ def test_a_plain_fit_leads_to_the_same_observations_as_robust_start_values(
     assert not used.all()
     clean = Matches.from_table(matches.table[used], shape=SHAPE, poses=sim.matches.poses)
     clean = solve(clean, prior=Prior(sim.truth.static), clip=None)
-    seen = np.isin(new.star_names, clean.star_names)
+    seen = np.isin(new.estimate.star_names, clean.estimate.star_names)
     if serves:  # the plane of the nominal poses; errors are 0.02 px
-        assert np.abs(new.positions[seen] - clean.positions).max() < 0.004
+        assert np.abs(new.estimate.positions[seen] - clean.estimate.positions).max() < 0.004
     for each in (new, old):
-        pose = similarity.fit_similarity(each.positions[seen], clean.positions)
-        assert np.abs(similarity.apply(pose, each.positions[seen]) - clean.positions).max() < 1e-4
+        pose = similarity.fit_similarity(each.estimate.positions[seen], clean.estimate.positions)
+        assert np.abs(similarity.apply(pose, each.estimate.positions[seen]) - clean.estimate.positions).max() < 1e-4
 
 
 @pytest.mark.parametrize("unequal", [False, True])

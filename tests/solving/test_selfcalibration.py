@@ -60,7 +60,7 @@ def undistorted(coefficients):
 def expected_map_error(solution):
     """Rms error of the static map on the grid, affine removed, from the reported covariance."""
     n = solution.coefficients.shape[2]
-    covariance = solution.uncertainty.coefficients[: 2 * n, : 2 * n].reshape(2, n, 2, n)
+    covariance = solution.estimate.uncertainty.coefficients[: 2 * n, : 2 * n].reshape(2, n, 2, n)
     b = basis.values(solution.degree, *basis.normalize(GRID, SHAPE)).T
     b = without_affine(b)
     variance = [np.einsum("pm,mk,pk->p", b, covariance[k, :, k], b).mean() for k in (0, 1)]
@@ -100,7 +100,7 @@ def test_against_a_general_least_squares_code(own):
         return (out / sigma).ravel()
 
     start = np.concatenate([
-        solution.positions.ravel() + np.random.default_rng(0).normal(scale=0.3, size=2 * n_stars),
+        solution.estimate.positions.ravel() + np.random.default_rng(0).normal(scale=0.3, size=2 * n_stars),
         np.zeros(6 * len(names)),
         np.zeros(2 * (10 - n_own)),
     ])  # fmt: skip
@@ -114,10 +114,10 @@ def test_is_a_minimum_in_every_pose(own):
     """A pose carries the points that the common distortion is evaluated at: its slope there counts."""
     sim = camera(2, n_stars=60, n_exposures=5, rolls=60.0)
     solution = solve(sim.matches, static="fit", exposure_degree=own)
-    table = solution.observations
+    table = solution.residuals
     for i, name in enumerate(solution.names):
         mine = table[table["exposure"] == name]
-        stars = solution.positions[np.searchsorted(solution.star_names, mine["star"])]
+        stars = solution.estimate.positions[np.searchsorted(solution.estimate.star_names, mine["star"])]
         q0 = stars @ solution.poses[name][:, :2].T + solution.poses[name][:, 2]
         measured = np.column_stack([mine["x"].value, mine["y"].value])
 
@@ -228,10 +228,10 @@ def test_writes_and_reads(tmp_path):
     assert_allclose(again.coefficients, solution.coefficients, atol=0)
     assert_allclose(again.stars["x_err_abs"], solution.stars["x_err_abs"])
     name = solution.names[0]
-    assert again.coefficient_errors(name).shape == (2, 10)
-    assert np.isfinite(again.sigma_map(name, n=8, support=False)[2]).all()
+    assert again[name].errors.shape == (2, 10)
+    assert np.isfinite(again[name].sigma_map(n=8, support=False)[2]).all()
     xy = np.array([[700.0, 300.0]])
-    assert_allclose(again.distort(name, again.correct(name, xy)), xy, atol=1e-8)
+    assert_allclose(again[name].distort(again[name].correct(xy)), xy, atol=1e-8)
     assert "static  fitted: one distortion for all exposures of a detector, modes up to degree 1" in str(again)
 
 

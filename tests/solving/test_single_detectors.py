@@ -55,15 +55,15 @@ def test_errors(gsaoi):
     ratios, absolute = [], []
     for seed in range(6):
         night, _, solution = draw(gsaoi, seed)
-        true, n = night.sky[solution.star_names], len(solution.star_names)
-        left = gsaoi_images.without_common_map(solution.positions, true, 3)
+        true, n = night.sky[solution.estimate.star_names], len(solution.estimate.star_names)
+        left = gsaoi_images.without_common_map(solution.estimate.positions, true, 3)
         centred = gsaoi_images.without_common_map(np.eye(n), true, 3)
-        matrix = solution.uncertainty.star_matrix.reshape(2, n, 2, n)
+        matrix = solution.estimate.uncertainty.star_matrix.reshape(2, n, 2, n)
         expected = sum(np.trace(centred @ matrix[k, :, k] @ centred.T) for k in (0, 1))
         ratios.append(np.sum(left**2) / expected)
         assert solution.chi2 == pytest.approx(solution.dof, rel=0.1)
         reported = np.stack([solution.stars[name].value for name in ("x_err_abs", "y_err_abs")], axis=1)
-        absolute.append(np.mean(without_similarity(solution.positions, true) ** 2) / np.mean(reported**2))
+        absolute.append(np.mean(without_similarity(solution.estimate.positions, true) ** 2) / np.mean(reported**2))
     print(ratios, absolute)
     assert np.mean(ratios) == pytest.approx(1, abs=0.35)
     assert 0.35 < np.mean(absolute) < 1.5
@@ -75,14 +75,14 @@ def test_it_is_what_it_says(drawn, gsaoi, tmp_path):
     assert solution.camera is None
     assert solution.settings.dynamic == "detector"
     assert solution.names[:4] == ("frame00-1", "frame00-2", "frame00-3", "frame00-4")
-    assert set(solution.shapes.values()) == {(2048, 2048)}
+    assert set(solution.estimate.shapes.values()) == {(2048, 2048)}
     rows = (table["exposure"] == "frame03") & (table["detector"] == "2")
     xy = np.stack([table["x"][rows], table["y"][rows]], axis=1)
-    there = solution.positions[np.searchsorted(solution.star_names, table["star"][rows])]
-    assert np.sqrt(np.mean((solution.correct("frame03-2", xy) - there) ** 2)) < 1.2 * SIGMA
+    there = solution.estimate.positions[np.searchsorted(solution.estimate.star_names, table["star"][rows])]
+    assert np.sqrt(np.mean((solution["frame03-2"].correct(xy) - there) ** 2)) < 1.2 * SIGMA
     again = legdistort.Solution.read(solution.write(tmp_path / "solution.asdf"))
     assert again.settings.dynamic == "detector"
-    assert np.array_equal(again.correct("frame03-2", xy), solution.correct("frame03-2", xy))
+    assert np.array_equal(again["frame03-2"].correct(xy), solution["frame03-2"].correct(xy))
 
 
 def test_one_detector_is_as_without_camera(gsaoi):
@@ -94,7 +94,7 @@ def test_one_detector_is_as_without_camera(gsaoi):
     found = legdistort.solve(legdistort.Matches.from_table(table, camera=camera), dynamic="detector")
     prior = legdistort.Prior(gsaoi["2"].static, sigma="evidence")
     usual = legdistort.solve(legdistort.Matches.from_table(table, shape=(2048, 2048)), prior=prior)
-    both = [gsaoi_images.without_common_map(s.positions, usual.positions, 3) for s in (found, usual)]
+    both = [gsaoi_images.without_common_map(s.estimate.positions, usual.estimate.positions, 3) for s in (found, usual)]
     assert np.sqrt(np.mean((both[0] - both[1]) ** 2)) < 0.1 * np.nanmedian(usual.stars["x_err"].value)
 
 
@@ -109,7 +109,7 @@ def test_the_whole_focal_plane_by_name(gsaoi):
     table = gsaoi_images.Night(n_exposures=5, n_stars=200).table(sigma=SIGMA)
     matches = legdistort.Matches.from_table(table, camera=gsaoi)
     named, usual = (legdistort.solve(matches, dynamic=word) for word in ("focal_plane", None))
-    assert np.array_equal(named.positions, usual.positions)
+    assert np.array_equal(named.estimate.positions, usual.estimate.positions)
 
 
 def test_bad_words(gsaoi):

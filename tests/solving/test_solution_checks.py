@@ -37,7 +37,7 @@ def changed(matches, table):
 
 
 def residuals(solution):
-    parts = solution.checked.keywords
+    parts = solution.estimate.checked.keywords
     return Residuals(parts["problem"], parts["state"], parts["blocks"], parts["uncertainty"].system, solution.dof)
 
 
@@ -161,7 +161,7 @@ def test_the_last_system_of_the_minimisation_serves_checks_and_errors(clip):
     table = (matches := simulated(1).matches).table.copy()
     table["x"][[3, 77]] += (0 if clip is None else 40) * SIGMA * u.pix
     solution = solved(changed(matches, table), clip=clip)
-    parts = solution.checked.keywords
+    parts = solution.estimate.checked.keywords
     made = parts["uncertainty"].system
     again = Direct(parts["problem"], parts["blocks"], solution.gauge)
     assert parts["problem"].weight[0].all() == (clip is None)

@@ -8,7 +8,7 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
 from erfa import ErfaWarning
-from moving_stars import FIVE, RNG, SKY, THREE, MovingOracle, field, without_a_map, without_a_similarity
+from moving_stars import FIVE, RNG, SKY, THREE, MovingOracle, field, positions_at, without_a_map, without_a_similarity
 from numpy.testing import assert_allclose
 
 from legdistort.cli.parser import main
@@ -17,7 +17,7 @@ from legdistort.geometry.parallax import on_plane, parallax_factors
 from legdistort.plots import motion_plots
 from legdistort.priors.prior import Prior
 from legdistort.reporting.page import write_report
-from legdistort.results import accuracy
+from legdistort.results import accuracy, in_tables
 from legdistort.results.solution import Solution
 from legdistort.simulation.prediction import predict as plan
 from legdistort.solving import motion_choice, star_motions, start_values
@@ -36,17 +36,17 @@ def test_the_dense_oracle_agrees(kind, epochs):
     exposures = {"n_exposures": len(epochs), "rotations": np.linspace(0, 40, len(epochs)), "epochs": epochs}
     sim = field(14, degree=1, static=0.5, sigma=0.03, corr=0.3, parallax=0.1, **exposures)
     solution = solve(sim.matches, degree=1, motion=kind, clip=None)
-    time = (epochs - solution.epoch)[:, None, None] * np.eye(2)
+    time = (epochs - in_tables.epoch(solution))[:, None, None] * np.eye(2)
     phi = time if kind == "proper" else np.concatenate([time, on_plane(SKY, epochs)[:, :, None]], axis=2)
     oracle = MovingOracle(sim.matches, solution, phi)
     found = oracle.solve()
     stars, coefficients = oracle.unpack(found.x)
     assert 2 * found.cost == pytest.approx(solution.chi2, rel=1e-6)
-    assert_allclose(solution.positions, stars[:, :2], atol=1e-5)
-    assert_allclose(solution.motions.values, stars[:, 2:], atol=1e-5)
+    assert_allclose(solution.estimate.positions, stars[:, :2], atol=1e-5)
+    assert_allclose(solution.estimate.motions.values, stars[:, 2:], atol=1e-5)
     assert_allclose(solution.coefficients, coefficients, atol=1e-5)
     expected = oracle.covariance_of_stars(found.x)
-    assert_allclose(unpacked(solution.uncertainty.star_unknowns), expected, atol=2e-5 * np.abs(expected).max())
+    assert_allclose(unpacked(solution.estimate.uncertainty.star_unknowns), expected, atol=2e-5 * np.abs(expected).max())
     n_free = expected.shape[1] * 14 + coefficients.size - len(oracle.rows)
     assert solution.dof == 2 * len(sim.matches.table) - n_free
 
@@ -56,7 +56,7 @@ def test_rows_of_zero_motion_change_nothing():
     sim = field(60, motion=0.0)
     plain = solve(sim.matches, clip=None)
     held = solve(sim.matches, clip=None, motion="proper", motion_sigma=1e-7)
-    assert np.abs(held.motions.values).max() < 1e-7
+    assert np.abs(held.estimate.motions.values).max() < 1e-7
     assert held.chi2 == pytest.approx(plain.chi2, rel=1e-4)
 
 
@@ -96,8 +96,8 @@ def test_conjugate_gradients_find_the_same(monkeypatch):
     direct = solve(sim.matches, motion="parallax", clip=None)
     monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: False)
     iterative = solve(sim.matches, motion="parallax", clip=None)
-    assert_allclose(iterative.positions, direct.positions, atol=1e-4)
-    assert_allclose(iterative.motions.values, direct.motions.values, atol=1e-4)
+    assert_allclose(iterative.estimate.positions, direct.estimate.positions, atol=1e-4)
+    assert_allclose(iterative.estimate.motions.values, direct.estimate.motions.values, atol=1e-4)
 
 
 def test_the_exposures_may_come_in_any_order():
@@ -105,7 +105,9 @@ def test_the_exposures_may_come_in_any_order():
     solution = solve(sim.matches, motion="proper", clip=None)
     shuffled = RNG.permutation(len(sim.matches.table))
     again = type(sim.matches).from_table(sim.matches.table[shuffled], shape=sim.matches.shapes, poses=sim.matches.poses)
-    assert_allclose(solve(again, motion="proper", clip=None).motions.values, solution.motions.values, atol=1e-5)
+    assert_allclose(
+        solve(again, motion="proper", clip=None).estimate.motions.values, solution.estimate.motions.values, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(("n", "accuracy"), [(8, 0.1), pytest.param(60, 0.05, marks=pytest.mark.slow)])
@@ -116,8 +118,8 @@ def test_relative_errors_are_calibrated(n, accuracy):
         sim = field(seed=seed)
         solution = solve(sim.matches, motion="proper", clip=None)
         stars, truth = solution.stars, sim.truth
-        true = {"x": truth.positions + (solution.epoch - truth.epoch) * truth.motions, "vx": truth.motions}
-        for name, found in (("x", solution.positions), ("vx", solution.motions.values)):
+        true = {"x": truth.positions + (in_tables.epoch(solution) - truth.epoch) * truth.motions, "vx": truth.motions}
+        for name, found in (("x", solution.estimate.positions), ("vx", solution.estimate.motions.values)):
             left, m = without_a_map(found - true[name], truth.positions)
             errors = np.column_stack([stars[f"{k}_err"].value for k in (name, name.replace("x", "y"))])
             pulls[name].append(np.mean((left / errors) ** 2) * len(left) / (len(left) - m))
@@ -140,7 +142,7 @@ def test_absolute_errors_of_motions_are_calibrated(n, kind, accuracy):
         epochs, more = (THREE, {}) if kind == "proper" else (FIVE, {"parallax": 0.1})
         sim = field(100, epochs, seed=seed, min_exposures=len(epochs), **more)
         solution = solve(sim.matches, motion=kind, clip=None)
-        found = solution.motions.values
+        found = solution.estimate.motions.values
         left = without_a_similarity(found[:, :2] - sim.truth.motions, sim.truth.positions)
         true.append([np.mean(left**2)])
         stated.append([np.mean([np.mean(solution.stars[name].value ** 2) for name in ("vx_err_abs", "vy_err_abs")])])
@@ -201,18 +203,20 @@ def test_a_star_seen_at_one_epoch_has_no_motion():
     assert np.isnan([row["vx"].value, row["vx_err"].value, row["vx_err_abs"].value]).all()
     assert np.isfinite([row["x"].value, row["x_err"].value]).all()
     assert "1 seen at a single epoch stays where it was then" in " ".join(str(solution).split())
-    assert np.isfinite(np.delete(solution.motions.values, 7, axis=0)).all()
+    assert np.isfinite(np.delete(solution.estimate.motions.values, 7, axis=0)).all()
     known = solve(matches, motion="proper", clip=None, motion_sigma=0.3)  # where the scatter is known, it has its error
     assert 0.3 < known.stars[7]["vx_err"].value < 0.34  # and that of the map common to the others
 
 
 def test_positions_at_another_time():
     solution = solve(field(60, FIVE, parallax=0.1).matches, motion="parallax")
-    moved = solution.positions_at(solution.epoch + 2.0) - solution.positions
-    expected = 2 * solution.motions.values[:, :2] + solution.motions.values[:, 2:] * on_plane(SKY, [solution.epoch + 2])
+    moved = positions_at(solution, in_tables.epoch(solution) + 2.0) - solution.estimate.positions
+    expected = 2 * solution.estimate.motions.values[:, :2] + solution.estimate.motions.values[:, 2:] * on_plane(
+        SKY, [in_tables.epoch(solution) + 2]
+    )
     assert_allclose(moved, expected, atol=1e-9)
     with pytest.raises(InputError, match="motion='proper'"):
-        solve(field(60).matches).positions_at(2015.0)
+        positions_at(solve(field(60).matches), 2015.0)
 
 
 def test_the_epoch_of_the_positions_may_be_given():
@@ -222,7 +226,7 @@ def test_the_epoch_of_the_positions_may_be_given():
     assert early.stars.meta["epoch"] == 2012.0
     assert early.chi2 == pytest.approx(mean.chi2, rel=1e-6)
     assert np.median(early.stars["x_err"]) > 3 * np.median(mean.stars["x_err"])
-    left, _ = without_a_map(mean.positions_at(2012.0) - early.positions, sim.truth.positions)
+    left, _ = without_a_map(positions_at(mean, 2012.0) - early.estimate.positions, sim.truth.positions)
     assert np.abs(left).max() < 0.01
 
 
@@ -235,11 +239,11 @@ def test_motions_on_the_sky():
     assert_allclose(stars["pmra"].value, -10 * stars["vx"].value, rtol=1e-3, atol=1e-3)
     assert_allclose(stars["pmdec"].value, 10 * stars["vy"].value, rtol=1e-3, atol=1e-3)
     assert_allclose(stars["pmra_error"].value, 10 * stars["vx_err"].value, rtol=1e-3)
-    assert_allclose(stars["parallax"].value, 10 * solution.motions.values[:, 2], rtol=1e-3)
+    assert_allclose(stars["parallax"].value, 10 * solution.estimate.motions.values[:, 2], rtol=1e-3)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=ErfaWarning)  # astropy moves stars without a distance so
         moved = stars["sky"].apply_space_motion(new_obstime=stars["sky"].obstime + 3 * u.yr)
-    expected = SKY.to_sky(solution.positions + 3 * solution.motions.values[:, :2])
+    expected = SKY.to_sky(solution.estimate.positions + 3 * solution.estimate.motions.values[:, :2])
     assert moved.separation(expected).mas.max() < 0.01
 
 
@@ -265,7 +269,9 @@ def test_parallax_factors_are_those_of_the_almanac():
 def test_parallaxes_are_found():
     sim = field(150, FIVE, parallax=0.2, sigma=0.02)
     solution = solve(sim.matches, motion="parallax", clip=None)
-    left, n = without_a_map(solution.motions.values[:, 2:] - sim.truth.parallaxes[:, None], sim.truth.positions)
+    left, n = without_a_map(
+        solution.estimate.motions.values[:, 2:] - sim.truth.parallaxes[:, None], sim.truth.positions
+    )
     errors = solution.stars["parallax_error"].value / 10
     assert np.mean((left[:, 0] / errors) ** 2) * 150 / (150 - n) == pytest.approx(1, abs=0.35)
     assert "the mean parallax" in str(solution.gauge)
@@ -333,7 +339,7 @@ def test_files_keep_motions(tmp_path, settings, tied):
     assert again.settings == solution.settings
     assert again.diagnostics.motion_scatter == solution.diagnostics.motion_scatter
     assert_allclose(again.stars["vx_err_abs"], solution.stars["vx_err_abs"], rtol=1e-12)
-    assert_allclose(again.positions_at(2030.0), solution.positions_at(2030.0))
+    assert_allclose(positions_at(again, 2030.0), positions_at(solution, 2030.0))
 
 
 @pytest.mark.parametrize("place", [None, SkyCoord(SKY.lon, SKY.lat, unit="deg")])
@@ -393,7 +399,7 @@ def test_a_catalogue_ties_positions_at_the_epoch_of_the_motions():
     solution = solve(sim.matches, motion="proper", reference=gaia, motion_epoch=2012.0)
     true = truth.positions + (2012.0 - truth.epoch) * truth.motions
     errors = np.hypot(solution.stars["x_err_abs"].value, solution.stars["y_err_abs"].value)
-    off = np.hypot(*(solution.positions - true).T)
+    off = np.hypot(*(solution.estimate.positions - true).T)
     assert np.median(off / errors) == pytest.approx(1, abs=0.5)
 
 
@@ -408,7 +414,7 @@ def test_absolute_motions_tied_to_a_catalogue_are_calibrated(n, accuracy, sigma)
         sim, rng = field(100, seed=seed), np.random.default_rng(seed + 1000)
         gaia = catalogue(sim, rng, rate=np.array([0.2, -0.1]))
         solution = solve(sim.matches, motion="proper", motion_sigma=sigma, reference=gaia, clip=None)
-        off = solution.motions.values - sim.truth.motions - [0.2, -0.1]
+        off = solution.estimate.motions.values - sim.truth.motions - [0.2, -0.1]
         true.append(np.mean(off**2))
         size.append(np.mean((off - off.mean(axis=0)) ** 2))
         stated.append(np.mean([np.mean(solution.stars[name].value ** 2) for name in ("vx_err_abs", "vy_err_abs")]))
@@ -423,7 +429,7 @@ def test_motions_are_tied_to_a_catalogue_with_parallaxes_too():
     gaia = catalogue(sim, np.random.default_rng(3), rate=np.array([0.2, -0.1]))
     solution = solve(sim.matches, motion="parallax", reference=gaia, clip=None)
     assert solution.gauge.drift.n_tied == 30
-    off = (solution.motions.values[:, :2] - sim.truth.motions).mean(axis=0)
+    off = (solution.estimate.motions.values[:, :2] - sim.truth.motions).mean(axis=0)
     assert_allclose(off, [0.2, -0.1], atol=0.05)
 
 
@@ -431,7 +437,7 @@ def test_motions_of_a_catalogue_that_disagree():
     sim = field(60)
     gaia = catalogue(sim, RNG)
     gaia["pmra"] += 5 * RNG.normal(size=30)
-    gaia["ref_epoch"] = solve(sim.matches, motion="proper").epoch  # positions agree
+    gaia["ref_epoch"] = in_tables.epoch(solve(sim.matches, motion="proper"))  # positions agree
     with pytest.warns(AssumptionWarning, match=r"the proper motions of the reference differ .* by \d+"):
         solve(sim.matches, motion="proper", reference=gaia)
     places = gaia["star", "ra", "dec", "ra_error", "dec_error"]
@@ -487,7 +493,7 @@ def bound(sim, solution):
         slope = np.stack([moved[1] - moved[2], moved[3] - moved[4]], axis=1)
         u_, v = (2 * (pose[:, :2] @ place + pose[:, 2]) + 1) / np.array(truth.shape[::-1]) - 1
         modes = np.array([u_**a * v**b for a in range(4) for b in range(4 - a)])
-        time = truth.years[i] - solution.epoch
+        time = truth.years[i] - in_tables.epoch(solution)
         for k in (0, 1):
             at = 2 * row + k
             mine = np.concatenate([slope[k], time * slope[k], [slope[k] @ factors[i]]])[:m]
@@ -514,10 +520,10 @@ def test_positions_motions_and_parallaxes_are_at_the_bound(kind, epochs, realisa
         sim = field(300, epochs, seed=seed, min_exposures=6, **({"parallax": 0.1} if kind == "parallax" else {}))
         solution = solve(sim.matches, motion=kind, clip=None)
         truth = sim.truth
-        true = truth.positions + (solution.epoch - truth.epoch) * truth.motions
-        offsets = [solution.positions - true, solution.motions.values[:, :2] - truth.motions]
+        true = truth.positions + (in_tables.epoch(solution) - truth.epoch) * truth.motions
+        offsets = [solution.estimate.positions - true, solution.estimate.motions.values[:, :2] - truth.motions]
         if kind == "parallax":
-            offsets.append(solution.motions.values[:, 2:] - truth.parallaxes[:, None])
+            offsets.append(solution.estimate.motions.values[:, 2:] - truth.parallaxes[:, None])
         squares.append([np.mean(without_a_map(each, truth.positions)[0] ** 2) for each in offsets])
         limit.append(np.array(bound(sim, solution)) ** 2)
     ratio = np.sqrt(np.mean(squares, axis=0) / np.mean(limit, axis=0))

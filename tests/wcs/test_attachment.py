@@ -134,7 +134,7 @@ def test_every_form_gives_the_same_sky(geometry, tmp_path, degree, peak, place):
     fits.writeto(path, np.zeros(shape, "uint8"))
     (done,) = attach(solution, path, in_place=True, max_error=1.0 if peak == 100 else 1e-3)
     p, ra, dec = detector(solution, "frame")
-    for found in (wcs_in(path)(*p.T), solution.wcs("frame")(*p.T), read_by_stdatamodels(path, p)):
+    for found in (wcs_in(path)(*p.T), solution["frame"].wcs(*p.T), read_by_stdatamodels(path, p)):
         turned = np.mod(found[0] - ra + 180, 360) - 180
         assert np.abs(turned * np.cos(np.radians(dec))).max() < 1e-9
         assert np.abs(found[1] - dec).max() < 1e-9
@@ -158,14 +158,14 @@ def test_read_by_stdatamodels(one, frame):
     pytest.importorskip("stdatamodels", reason="stdatamodels is not installed")
     attach(one, frame, in_place=True)
     p = detector(one, "frame")[0]
-    assert_allclose(read_by_stdatamodels(frame, p), one.wcs("frame")(*p.T), rtol=0, atol=1e-12)
+    assert_allclose(read_by_stdatamodels(frame, p), one["frame"].wcs(*p.T), rtol=0, atol=1e-12)
 
 
 def test_no_ghosts_over_a_wide_mosaic(geometry):
     """Three detectors wide: what lies beyond one of them is never put on it."""
     for seed_name in ("a", "b"):
         solution = geometry(5, 20, names=("a", "b"), shape=(500, 500))
-        wcs = solution.wcs(seed_name)
+        wcs = solution[seed_name].wcs
         t = np.linspace(-750, 1250, 161)
         q = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2)
         q = q[(np.abs(q - 249.5) > 270).any(axis=1)]  # not on the detector: 20 px is the largest displacement
@@ -279,7 +279,7 @@ def test_attaching_again_replaces(one, frame):
     assert header["CRVAL1"] == turned.sky.lon
     assert sum(key.startswith("PV") for key in header) == 1  # PVX
     assert len(header["HISTORY"]) == 2  # the frame's own, and ours once
-    assert_allclose(wcs_in(frame)(3.0, 4.0), turned.wcs("frame")(3.0, 4.0), rtol=0, atol=1e-12)
+    assert_allclose(wcs_in(frame)(3.0, 4.0), turned["frame"].wcs(3.0, 4.0), rtol=0, atol=1e-12)
     check_sums(frame)
 
 
@@ -309,7 +309,7 @@ def test_its_own_extension_is_known_wherever_it_stands(one, tmp_path, start, the
     turned = dataclasses.replace(one, sky=TangentPlane(one.sky.lon + 1e-4, one.sky.lat, one.sky.matrix))
     attach(turned, frame, in_place=True)
     assert [name for name in names_in(frame) if name in ("ASDF", "LOG")] == ["LOG", "ASDF"]
-    assert_allclose(wcs_in(frame)(3.0, 4.0), turned.wcs("frame")(3.0, 4.0), rtol=0, atol=1e-12)
+    assert_allclose(wcs_in(frame)(3.0, 4.0), turned["frame"].wcs(3.0, 4.0), rtol=0, atol=1e-12)
     (exposure,) = legdistort.read_exposures(frame)
     assert exposure.has_gwcs
 
@@ -323,11 +323,11 @@ def test_fpack_and_back(one, tmp_path):
     turned = dataclasses.replace(one, sky=TangentPlane(one.sky.lon + 1e-4, one.sky.lat, one.sky.matrix))
     (done,) = attach(turned, f"{frame}.fz", in_place=True)
     assert names_in(done.path).count("ASDF") == 1
-    assert_allclose(wcs_in(done.path)(3.0, 4.0), turned.wcs("frame")(3.0, 4.0), rtol=0, atol=1e-12)
+    assert_allclose(wcs_in(done.path)(3.0, 4.0), turned["frame"].wcs(3.0, 4.0), rtol=0, atol=1e-12)
     subprocess.run(["funpack", "-D", f"{frame}.fz"], check=True)
     attach(one, frame, in_place=True)
     assert names_in(frame) == ["PRIMARY", "ASDF"]
-    assert_allclose(wcs_in(frame)(3.0, 4.0), one.wcs("frame")(3.0, 4.0), rtol=0, atol=1e-12)
+    assert_allclose(wcs_in(frame)(3.0, 4.0), one["frame"].wcs(3.0, 4.0), rtol=0, atol=1e-12)
     check_sums(frame)
 
 
@@ -337,7 +337,7 @@ def test_a_frame_under_another_name(one, frame, tmp_path):
     os.rename(frame, tmp_path / "other.fits")
     attach(one, tmp_path / "other.fits", in_place=True)
     assert names_in(tmp_path / "other.fits").count("ASDF") == 1
-    assert_allclose(wcs_in(tmp_path / "other.fits")(3.0, 4.0), one.wcs("other")(3.0, 4.0), rtol=0, atol=1e-12)
+    assert_allclose(wcs_in(tmp_path / "other.fits")(3.0, 4.0), one["other"].wcs(3.0, 4.0), rtol=0, atol=1e-12)
 
 
 def test_names_beyond_ascii(geometry, tmp_path):
@@ -385,7 +385,7 @@ def test_all_detectors_of_a_file_at_once(geometry, mosaic):
     for number, item in enumerate(done, start=1):
         header = fits.getheader(mosaic, ("SCI", number))
         assert holds(header, item.header)
-        assert_allclose(wcs_in(mosaic, number)(3.0, 4.0), solution.wcs(item.exposure)(3.0, 4.0), rtol=0, atol=1e-12)
+        assert_allclose(wcs_in(mosaic, number)(3.0, 4.0), solution[item.exposure].wcs(3.0, 4.0), rtol=0, atol=1e-12)
         assert fits.getheader(mosaic, ("ASDF", number))["EXPNAME"] == f"night_SCI{number}"
 
 
@@ -395,7 +395,7 @@ def test_detectors_one_by_one(geometry, mosaic):
     attach(solution, mosaic, in_place=True, kind=None, ext=("SCI", 1))
     assert fits.getheader(mosaic, ("ASDF", 1))["EXPNAME"] == "night_2"
     assert fits.getheader(mosaic, ("ASDF", 2))["EXPNAME"] == "night_SCI1"
-    assert_allclose(wcs_in(mosaic, 1)(3.0, 4.0), solution.wcs("night_2")(3.0, 4.0), rtol=0, atol=1e-12)
+    assert_allclose(wcs_in(mosaic, 1)(3.0, 4.0), solution["night_2"].wcs(3.0, 4.0), rtol=0, atol=1e-12)
     attach(solution, mosaic, in_place=True, kind=None)
     assert names_in(mosaic) == ["PRIMARY", "SCI", "SCI", "ASDF", "ASDF"]
 
@@ -457,7 +457,7 @@ def test_nothing_is_written_unless_all_can_be(geometry, tmp_path):
     assert [path.read_bytes() for path in paths] == before
     assert sorted(item.name for item in tmp_path.iterdir()) == ["frame.fits", "other.fits"]
     attach(solution, paths, kind=None, in_place=True)
-    assert_allclose(wcs_in(paths[1])(9.0, 8.0), solution.wcs("other")(9.0, 8.0), rtol=0, atol=1e-12)
+    assert_allclose(wcs_in(paths[1])(9.0, 8.0), solution["other"].wcs(9.0, 8.0), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("where", ["in place", "out"])
@@ -593,7 +593,7 @@ def test_foreign_asdf_is_replaced_when_asked(one, frame):
     _foreign(frame)
     attach(one, frame, in_place=True, overwrite=True, kind=None)
     assert names_in(frame).count("ASDF") == 1
-    assert_allclose(wcs_in(frame)(3.0, 4.0), one.wcs("frame")(3.0, 4.0), rtol=0, atol=1e-12)
+    assert_allclose(wcs_in(frame)(3.0, 4.0), one["frame"].wcs(3.0, 4.0), rtol=0, atol=1e-12)
 
 
 def test_no_sky(one, frame):
@@ -611,7 +611,7 @@ def test_a_frame_of_another_field_is_named(one, tmp_path, recwarn):
     """Names of exposures are those of files, and exp00 there is every night."""
     nx = SHAPE[1]
     for off, told in ((0.0, 0), (0.4, 0), (3.0, 1)):  # frames in which the headers lead elsewhere
-        header = one.header("frame")
+        header = one["frame"].header()
         header["CRPIX1"] += off * nx
         path = tmp_path / "frame.fits"
         fits.PrimaryHDU(pixels().astype("int16"), header).writeto(path, overwrite=True)

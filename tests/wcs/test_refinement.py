@@ -144,7 +144,7 @@ def test_real_pipelines(shared_data, name, shape):
         (lambda w, s: (_of(w, pixel_shape=(10, 20)), s), r"wcs is of \(10, 20\) pixels \(nx, ny\), exposure"),
         (lambda w, s: (_one_way(w), s), "the transform of wcs from v2v3 to world has no inverse"),
         (lambda w, s: (_with_units(), s), "take quantities; give a WCS whose models are without units"),
-        (lambda w, s: (s.wcs("a").__class__(w.pipeline[:1] + [(plane("v2v3", u.arcsec), None)]), s), "to the sky, got"),
+        (lambda w, s: (s["a"].wcs.__class__(w.pipeline[:1] + [(plane("v2v3", u.arcsec), None)]), s), "to the sky, got"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_refined(change, words):
@@ -196,7 +196,7 @@ def test_tweakwcs():
     corrector.set_correction(shift=(1.0, 0.0))
     assert corrector.wcs.available_frames == ["detector", "v2v3", "v2v3vacorr", "v2v3corr", "world"]
     moved = corrector.wcs.pixel_to_world(*p.T)
-    apart = moved.separation(solution.wcs("a").pixel_to_world(*p.T)).arcsec
+    apart = moved.separation(solution["a"].wcs.pixel_to_world(*p.T)).arcsec
     assert_allclose(apart, 1.0, rtol=1e-4)
 
 
@@ -207,7 +207,7 @@ def test_stcal():
     solution = solution_at(wcs, SHAPE)
     made = legdistort.refine(wcs, solution, "a")
     ny, nx = SHAPE
-    grid = solution.fits_wcs("a")  # as a target of another kind
+    grid = solution["a"].fits_wcs()  # as a target of another kind
     pixmap = utils.calc_pixmap(made, made, shape=SHAPE)
     y, x = np.mgrid[:ny, :nx]
     inside = x > 3.5
