@@ -8,6 +8,7 @@ from astropy.table import QTable
 
 from legdistort.geometry import basis
 from legdistort.results.diagnostics import Diagnostics
+from legdistort.results.estimate import Estimate
 from legdistort.results.settings import Settings
 from legdistort.results.solution import Solution
 
@@ -38,20 +39,22 @@ def make_solution(
     solution = Solution(
         names=names,
         degree=degree,
-        shapes=dict.fromkeys(names, shape),
         poses={name: np.column_stack([np.eye(2), rng.normal(0, 99, 2)]) for name in names},
         coefficients=coefficients,
-        prior_mean=mean if prior else np.zeros(size),
-        star_names=np.arange(n_stars),
-        positions=positions,
-        observations=rows,
+        residuals=rows,
         chi2=1432.1,
         dof=1380,
         status="converged after 4 iterations",
         gauge=SimpleNamespace(sentence="minimal: by convention", warning="", motion=coefficients),
-        uncertainty=SimpleNamespace(coefficients=1e-4 * np.eye(coefficients.size), bends=None, camera=None),
         settings=Settings(degree),
         diagnostics=Diagnostics(),
+        estimate=Estimate(
+            star_names=np.arange(n_stars),
+            positions=positions,
+            shapes=dict.fromkeys(names, shape),
+            prior_mean=mean if prior else np.zeros(size),
+            uncertainty=SimpleNamespace(coefficients=1e-4 * np.eye(coefficients.size), bends=None, camera=None),
+        ),
         left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},
     )
     stars = {"star": solution.estimate.star_names, "x": positions[:, 0] * u.pix, "y": positions[:, 1] * u.pix}

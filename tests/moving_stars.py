@@ -63,6 +63,12 @@ class MovingOracle(DenseOracle):
         return np.stack([full[j * n : (j + 1) * n, j * n : (j + 1) * n] for j in range(self.n_stars)])
 
 
+def positions_at(solution, epoch):
+    """Positions (n_stars, 2) of the stars at another time."""
+    stars = solution.stars_at(epoch)
+    return np.column_stack([stars["x"].to_value("pix"), stars["y"].to_value("pix")])
+
+
 def without_a_map(values, xy, degree=3):
     """Values (n, k) of stars without a polynomial map, in plain powers."""
     x, y = ((xy - xy.mean(axis=0)) / np.ptp(xy, axis=0)).T

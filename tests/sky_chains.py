@@ -43,10 +43,11 @@ def geometries():
             base,
             names=tuple(names),
             degree=degree,
-            shapes=dict.fromkeys(names, shape),
             poses={name: np.column_stack([rotation, middle - rotation @ middle + shift]) for name in names},
             coefficients=coefficients,
-            prior_mean=np.zeros_like(coefficients),
+            estimate=dataclasses.replace(
+                base.estimate, shapes=dict.fromkeys(names, shape), prior_mean=np.zeros_like(coefficients)
+            ),
             sky=TangentPlane(lon, lat, np.column_stack([m, -m @ middle])),
         )
 

@@ -1,7 +1,6 @@
 """Frames of Gaussian stars with a distortion of 20 px, made without the package, and what a stack must keep of them."""
 
 import itertools
-from dataclasses import dataclass, field
 from functools import cache
 
 import gwcs.coordinate_frames as cf
@@ -16,67 +15,96 @@ from gwcs import WCS as GWCS
 from scipy.optimize import least_squares
 
 from legdistort.coaddition.mosaicking import coadd
-from legdistort.geometry import similarity
+from legdistort.geometry import basis, similarity
 from legdistort.geometry.distortion import Distortion
 from legdistort.geometry.models import outside
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.exposures import Exposure
+from legdistort.results.estimate import Estimate
+from legdistort.results.solution import Solution
+from legdistort.results.view import View
 
 SHAPE = (300, 400)
 SIGMA = 1.4  # of the Gaussian stars, px
 SKY = TangentPlane(83.2, -31.7, np.array([[-5e-5, 1e-5, 0.004], [1e-5, 5e-5, -0.003]]))
 
 
-@dataclass
-class StandIn:
-    """The part of a solution that co-adding needs, with truth inside."""
-
-    poses: dict
-    distortions: dict
-    sky: object = None
-    left_out: dict = field(default_factory=dict)
+class StandInView(View):
+    """An exposure with a distortion that is known."""
 
     @property
-    def by_detector(self):
-        """There is one detector."""
-        return self
+    def distortion(self):
+        return self.solution.distortions[self.name]
 
-    @property
-    def observations(self):
-        """Stars at the corners of all detectors, and their width."""
-        rows = [
-            (name, star, x, y, True, SIGMA * 2.3548)
-            for name, d in self.distortions.items()
-            for star, (x, y) in enumerate(itertools.product((-5, d.shape[1] + 5), (-5, d.shape[0] + 5)))
-        ]
-        units = {"x": u.pix, "y": u.pix, "fwhm": u.pix}
-        return QTable(rows=rows, names=["exposure", "star", "x", "y", "used", "fwhm"], units=units)
-
-    @property
-    def shapes(self):
-        return {name: d.shape for name, d in self.distortions.items()}
-
-    def distortion(self, name):
-        return self.distortions[name]
-
-    def distort(self, name, xy):
-        q = similarity.apply(self.poses[name], xy)
-        p = self.distortions[name](q)
-        p[outside(self.distortions[name].inverse.valid, *q.T)] = np.nan
+    def distort(self, xy):
+        q = similarity.apply(self.pose, xy)
+        p = self.distortion(q)
+        p[outside(self.distortion.inverse.valid, *q.T)] = np.nan
         return p
 
-    def correct(self, name, xy):
-        return similarity.apply(similarity.invert(self.poses[name]), self.distortions[name].invert(xy))
+    def correct(self, xy):
+        return similarity.apply(similarity.invert(self.pose), self.distortion.invert(xy))
 
-    def wcs(self, name):
-        m = similarity.invert(self.poses[name])
+    def sigma_map(self, *, support=True):
+        x, y = np.linspace(-0.5, SHAPE[1] - 0.5, 20), np.linspace(-0.5, SHAPE[0] - 0.5, 16)
+        return (
+            x,
+            y,
+            np.broadcast_to(self.solution.maps[self.name](x[None, :], y[:, None]), (16, 20))[..., None] * [1, 1],
+        )
+
+    @property
+    def wcs(self):
+        m = similarity.invert(self.pose)
         to_reference = models.AffineTransformation2D(m[:, :2], m[:, 2])
         pixels = cf.Frame2D(name="detector", unit=(u.pix, u.pix))
-        forward = self.distortions[name].model()
+        forward = self.distortion.model()
         correction = forward.inverse
         correction.inverse = forward
-        chain = correction | to_reference | self.sky.model()
+        chain = correction | to_reference | self.solution.sky.model()
         return GWCS([(pixels, chain), (cf.CelestialFrame(reference_frame=ICRS(), unit=(u.deg, u.deg)), None)])
+
+
+class StandIn(Solution):
+    """The part of a solution that co-adding needs, with truth inside, error maps too where they are given.
+
+    Without a table of residuals every exposure has stars at the corners of its detector.
+    """
+
+    def __init__(self, poses, distortions, sky=None, *, table=None, maps=None):
+        names, degree = tuple(poses), max((d.degree for d in distortions.values()), default=0)
+        series = [basis.change_degree(distortions[name].coefficients, degree) for name in names]
+        shapes = {name: distortions[name].shape for name in names}
+        super().__init__(
+            names=names,
+            degree=degree,
+            poses=poses,
+            coefficients=np.reshape(series, (len(names), 2, basis.n_modes(degree))),
+            residuals=_at_corners(shapes) if table is None else table,
+            chi2=1.0,
+            dof=1,
+            status="",
+            gauge=None,
+            settings=None,
+            diagnostics=None,
+            estimate=Estimate(np.zeros(0), np.zeros((0, 2)), shapes, np.zeros(0), None),
+            sky=sky,
+        )
+        vars(self).update(distortions=distortions, maps=maps)
+
+    def __getitem__(self, key):
+        return StandInView(self, super().__getitem__(key).name)
+
+
+def _at_corners(shapes):
+    """Stars at the corners of all detectors, and their width."""
+    rows = [
+        (name, star, x, y, True, SIGMA * 2.3548)
+        for name, (ny, nx) in shapes.items()
+        for star, (x, y) in enumerate(itertools.product((-5, nx + 5), (-5, ny + 5)))
+    ]
+    units = {"x": u.pix, "y": u.pix, "fwhm": u.pix}
+    return QTable(rows=rows, names=["exposure", "star", "x", "y", "used", "fwhm"], units=units)
 
 
 def star_image(xy, flux, shape=SHAPE):
@@ -90,23 +118,23 @@ def scene(n=4, *, peak=20.0, sky=SKY, rolls=(0, 2, -3, 40), spread=15.0, seed=1)
     """Exposures of one star field with different degree-3 distortions, dithers and rolls; stars, fluxes."""
     rng = np.random.default_rng(seed)
     names = [f"frame{i}" for i in range(n)]
-    solution = StandIn({}, {}, sky)
+    poses, distortions = {}, {}
     centre = np.array(SHAPE[::-1]) / 2
     for name, roll in zip(names, rolls, strict=False):
         angle = np.radians(roll)
         m = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        solution.poses[name] = np.column_stack([m, centre - m @ centre + rng.uniform(-spread, spread, 2)])
+        poses[name] = np.column_stack([m, centre - m @ centre + rng.uniform(-spread, spread, 2)])
         coefficients = rng.normal(size=(2, 10))
         coefficients[:, 0] = 0
         coefficients[:, 6:] /= 2
         raw = Distortion(coefficients, SHAPE)
         grid = np.stack(np.meshgrid(np.linspace(0, SHAPE[1], 20), np.linspace(0, SHAPE[0], 20)), -1).reshape(-1, 2)
         coefficients *= peak / np.abs(raw(grid) - grid).max()
-        solution.distortions[name] = Distortion(coefficients, SHAPE, name)
+        distortions[name] = Distortion(coefficients, SHAPE, name)
     gx, gy = np.meshgrid(np.arange(-20, 440, 33.0), np.arange(-20, 340, 33.0))
     stars = np.stack([gx.ravel(), gy.ravel()], 1) + rng.uniform(-4, 4, (gx.size, 2))
     flux = rng.uniform(3e3, 3e4, len(stars))
-    return solution, stars, flux
+    return StandIn(poses, distortions, sky), stars, flux
 
 
 def expose(solution, stars, flux, **changes):

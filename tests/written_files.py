@@ -48,7 +48,7 @@ def main():
     folder.mkdir(parents=True, exist_ok=True)
     solution.write(folder / "solution.asdf", overwrite=True)
     prior.write(folder / "prior.asdf", overwrite=True)
-    write_wcs(solution, solution.names[1], folder / "wcs.asdf", overwrite=True)
+    write_wcs(solution[solution.names[1]], folder / "wcs.asdf", overwrite=True)
     found = seen(solution, prior, solution[solution.names[1]].wcs)
     (folder / "expected.json").write_text(json.dumps(found, indent=1) + "\n")
 

@@ -103,7 +103,7 @@ def steps(folder, out, ext, camera):
     lap("solve")
     for name in solution.names:
         for key in camera.detectors if camera else [None]:
-            write_wcs(solution, name, out / f"{name}-{key}.asdf", detector=key)
+            write_wcs(solution[name, key], out / f"{name}-{key}.asdf")
     lap("WCS files")
     ld.coadd(exposures, solution, method="clipped")
     lap("co-add")

@@ -161,9 +161,9 @@ def single_reproject(folder, out, *, stock):
 
     solution, _, _ = inputs(folder)
     path = frames(folder)[0]
-    grid, wcs = reference_grid([path.stem], solution), unbounded(solution, path)
+    grid, wcs = reference_grid([solution[path.stem]], solution.sky), unbounded(solution, path)
     if stock:
-        write_wcs(solution, path.stem, folder / "wcs.asdf", overwrite=True)
+        write_wcs(solution[path.stem], folder / "wcs.asdf", overwrite=True)
         with asdf.open(folder / "wcs.asdf") as file:
             wcs = file["meta"]["wcs"]
         wcs.bounding_box = None

@@ -432,7 +432,7 @@ def wcs_in_pipelines():
     """`refine` of NIRCam's WCS, in tweakwcs, stcal and a file as Roman has them."""
     with asdf.open(data("gwcs_interop", "nircamwcs.asdf"), memmap=False, lazy_load=False) as file:
         solution = sky_chains.solution_at(file["wcs"], (2048, 2048), 5.0)
-        made = refine(file["wcs"], solution, "a")
+        made = refine(file["wcs"], solution["a"])
     p, ra, dec = sky_chains.detector(solution, "a")
     p, sky = p[404:], SkyCoord(ra[404:], dec[404:], unit="deg")
     with contextlib.suppress(Skip):
@@ -649,7 +649,7 @@ def refined_in_roman():
     with asdf.open(data("gwcs_interop", "roman_wcs.asdf"), memmap=False, lazy_load=False) as file:
         wcs = file["roman"]["wcs"] if "roman" in file.tree else file["wcs"]
         solution = sky_chains.solution_at(wcs, (5000, 5000), 5.0)
-        made = refine(wcs, solution, "a")
+        made = refine(wcs, solution["a"])
     p, ra, dec = sky_chains.detector(solution, "a")
     model = datamodels.ImageModel.create_fake_data(shape=(8, 8))
     model.meta.wcs = made.stock()

@@ -589,7 +589,7 @@ class TestFiles:
             detector.distortion.__dict__.pop("shared_correction", None)
         for name in fresh.names[:3]:
             for key in "1234":
-                storage.write_wcs(fresh, name, tmp_path / f"{name}-{key}.asdf", detector=key)
+                storage.write_wcs(fresh[name, key], tmp_path / f"{name}-{key}.asdf")
         assert len(made) == 4 * (4 + 3)  # x and y, there and back, of four detectors and three exposures
         first, second = (fresh["frame00", key].wcs.get_transform("focal_plane", "reference") for key in "12")
         shared = {id(leaf) for leaf in models.leaves(first)} & {id(leaf) for leaf in models.leaves(second)}
@@ -597,7 +597,7 @@ class TestFiles:
 
     def test_a_changed_wcs_is_refused(self, solution, tmp_path):
         """The certificates of both distortions, of the detector and of the focal plane, are checked."""
-        tree = storage.wcs_tree(solution, "frame00", "1")
+        tree = storage.wcs_tree(solution["frame00", "1"])
         for part in (tree["meta"], tree["meta"]["focal_plane"]):
             kept, part["inverse_error_px"] = part["inverse_error_px"], 9e-7
             path = tmp_path / "frame00_1.asdf"

@@ -1,7 +1,8 @@
 """Flux scales, weights, support and saturation in co-adding, against what was put in."""
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,24 +29,14 @@ from legdistort.inputs.exposures import Exposure
 FLAT = {"conserve": "surface_brightness", "match_background": False}
 
 
-@dataclass
-class Measured(StandIn):
-    """With a table of observations of one's own."""
-
-    table: object = None
-    maps: object = None
-
-    @property
-    def observations(self):
-        return self.table
-
-    def sigma_map(self, name, *, support=True):
-        x, y = np.linspace(-0.5, SHAPE[1] - 0.5, 20), np.linspace(-0.5, SHAPE[0] - 0.5, 16)
-        return x, y, np.broadcast_to(self.maps[name](x[None, :], y[:, None]), (16, 20))[..., None] * np.ones(2)
-
-
 def measured(solution, table, maps=None):
-    return Measured(solution.poses, solution.distortions, solution.sky, {}, table, maps)
+    """With a table of observations of one's own."""
+    return StandIn(solution.poses, solution.distortions, solution.sky, table=table, maps=maps)
+
+
+def views(table):
+    """What was seen on each exposure or detector that a table names."""
+    return {n: SimpleNamespace(residuals=table[table["exposure"] == n]) for n in dict.fromkeys(table["exposure"])}
 
 
 def observed(depth, *, n=60, noise=0.03, seed=0, outliers=0.1, fwhm=None, seen=0.8):
@@ -77,14 +68,14 @@ class TestFluxScale:
                 key = "ab"[(star + 17 * i) % 60 >= 30]
                 flux = (1000 + 50 * star) * d * sensitivity[key] * (areas or {}).get(key, 1)
                 rows.append((f"frame{i}-{key}", star, flux * np.exp(rng.normal(0, 0.01)), True))
-        solution = measured(plain()[0], QTable(rows=rows, names=["exposure", "star", "flux", "used"]))
+        seen = views(QTable(rows=rows, names=["exposure", "star", "flux", "used"]))
         frames = [
             Exposure(f"frame{i}-{key}", np.ones(SHAPE), exposure_time=60.0, frame=f"frame{i}", detector=key)
             for i in range(3)
             for key in "ab"
         ]
         by_part = areas and {f.name: areas[f.detector] for f in frames}
-        factors, origin = flux_scales(frames, "auto", solution, by_part)
+        factors, origin = flux_scales(frames, "auto", seen, by_part)
         product = np.array([factors[f"frame{i}-{key}"] * depth[i] * sensitivity[key] for i in range(3) for key in "ab"])
         assert origin == "stars"
         np.testing.assert_allclose(product / product.mean(), 1, atol=0.005)
@@ -96,16 +87,15 @@ class TestFluxScale:
         rows = [
             (f"frame{i}-{k}", f"{k}{star}", 100.0 * star * (1 + i), True) for i, k in parts for star in range(1, 20)
         ]
-        solution = measured(plain()[0], QTable(rows=rows, names=["exposure", "star", "flux", "used"]))
+        seen = views(QTable(rows=rows, names=["exposure", "star", "flux", "used"]))
         frames = [Exposure(f"frame{i}-{k}", np.ones(SHAPE), frame=f"frame{i}", detector=k) for i, k in parts]
-        factors, _ = flux_scales(frames, "auto", solution)
+        factors, _ = flux_scales(frames, "auto", seen)
         assert [factors[f.name] / factors["frame0-a"] for f in frames] == pytest.approx([1, 1, 0.5, 0.5])
 
     @pytest.mark.parametrize("scale", ["auto", "stars"])
     def test_stars_through_clouds(self, scale):
         depth = np.array([1.0, 0.7, 0.9, 0.4, 1.1])
-        solution = measured(plain()[0], observed(depth))
-        factors, origin = flux_scales(blank(5, exposure_time=[60.0] * 5), scale, solution)
+        factors, origin = flux_scales(blank(5, exposure_time=[60.0] * 5), scale, views(observed(depth)))
         assert origin == "stars"
         product = np.array([factors[f"frame{i}"] for i in range(5)]) * depth
         np.testing.assert_allclose(product / product.mean(), 1, atol=0.02)
@@ -113,37 +103,36 @@ class TestFluxScale:
 
     def test_time_is_preferred_where_stars_agree(self):
         times = [10.0, 20.0, 30.0]
-        solution = measured(plain()[0], observed(np.array(times)))
-        factors, origin = flux_scales(blank(3, exposure_time=times), "auto", solution)
+        factors, origin = flux_scales(blank(3, exposure_time=times), "auto", views(observed(np.array(times))))
         assert origin == "exptime"
         assert factors == {"frame0": 2.0, "frame1": 1.0, "frame2": 2 / 3}
 
     def test_stars_take_the_place_of_unknown_times(self):
-        solution = measured(plain()[0], observed([1.0, 3.0]))
+        seen = views(observed([1.0, 3.0]))
         frames = blank(2, exposure_time=[10.0, None])
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            factors, origin = flux_scales(frames, "auto", solution)
+            factors, origin = flux_scales(frames, "auto", seen)
         assert origin == "stars"
         assert factors["frame0"] / factors["frame1"] == pytest.approx(3, rel=0.03)
         with warns_here(AssumptionWarning, match="no exposure time known for frame1"):
-            assert flux_scales(frames, "exptime", solution)[0]["frame0"] == 1
+            assert flux_scales(frames, "exptime", seen)[0]["frame0"] == 1
 
     def test_exposures_are_joined_through_others(self):
         table = observed([1.0, 2.0, 4.0], seen=1.0, outliers=0)
         first, last = (table["exposure"] == f"frame{i}" for i in (0, 2))
         table = table[~(first & (table["star"] > 40)) & ~(last & (table["star"] < 20))]
-        factors, _ = flux_scales(blank(3), "stars", measured(plain()[0], table))
+        factors, _ = flux_scales(blank(3), "stars", views(table))
         assert factors["frame0"] / factors["frame2"] == pytest.approx(4, rel=0.03)
 
     def test_bad_input(self):
-        solution = plain()[0]
+        known = {name: plain()[0][name] for name in ("frame0", "frame1")}
         with pytest.raises(InputError, match="scale='stars': the solution has no fluxes of 5 common stars"):
-            flux_scales(blank(2), "stars", solution)
+            flux_scales(blank(2), "stars", known)
         apart = observed([1.0, 1.0], seen=1.0)
         apart = apart[(apart["exposure"] == "frame0") == (apart["star"] < 30)]
         with pytest.raises(InputError, match="that join all exposures"):
-            flux_scales(blank(2), "stars", measured(solution, apart))
+            flux_scales(blank(2), "stars", views(apart))
         with pytest.raises(
             InputError, match=r"scale must be one of 'auto', 'exptime', 'stars', None or a dict .* 'sky'"
         ):
@@ -174,11 +163,11 @@ class TestFluxScale:
 
 class TestWeights:
     def test_by_seeing(self):
-        solution = measured(plain()[0], observed([1.0] * 3, fwhm=[2.0, 3.0, 4.0]))
+        seen = views(observed([1.0] * 3, fwhm=[2.0, 3.0, 4.0]))
         noise = {f"frame{i}": 1.0 for i in range(3)}
-        values = [w.value for w in make_weights("seeing", noise, solution).values()]
+        values = [w.value for w in make_weights("seeing", noise, seen).values()]
         np.testing.assert_allclose(values, [1, 4 / 9, 1 / 4], rtol=0.05)
-        assert stellar_widths(solution, ["frame0"])["frame0"] == pytest.approx(2, rel=0.03)
+        assert stellar_widths({"frame0": seen["frame0"]})["frame0"] == pytest.approx(2, rel=0.03)
 
     def test_by_exposure_time(self):
         noise = {"a": 1.0, "b": 5.0}
@@ -226,14 +215,13 @@ class TestWeights:
         assert ratio == pytest.approx(1, abs=0.005)
 
     def test_bad_input(self):
-        solution = plain()[0]
         noise = {"frame0": 1.0, "frame1": 1.0}
         with pytest.raises(InputError, match="no exposure time known for frame1; give a dict"):
-            make_weights("exptime", noise, solution, times={"frame0": 3.0, "frame1": None})
+            make_weights("exptime", noise, None, times={"frame0": 3.0, "frame1": None})
         table = observed([1.0, 1.0])
         table.remove_column("fwhm")
         with pytest.raises(InputError, match="weights='seeing': the solution has no FWHM"):
-            make_weights("seeing", noise, measured(solution, table))
+            make_weights("seeing", noise, views(table))
         with pytest.raises(InputError, match=r"weights must be one of 'noise', 'variance', .*, got 'ivar'"):
             CoaddOptions(weights="ivar")
 
@@ -248,17 +236,15 @@ class TestSupport:
 
     def test_supported_is_that_of_the_solution(self):
         table = observed([1.0])
-        planes = support("frame0", measured(plain()[0], table))
-        from legdistort.results.solution import Solution
+        planes, view = support(table), measured(plain()[0], table)["frame0"]
 
         rng = np.random.default_rng(0)
         xy = rng.uniform(0, 300, (2000, 2))
-        stand_in = type("S", (), {"observations": table})()
-        np.testing.assert_array_equal(supported(planes, xy.T), Solution.supported(stand_in, "frame0", xy))
+        np.testing.assert_array_equal(supported(planes, xy.T), view.supported(xy))
         hull = Delaunay(np.column_stack([table["x"].to_value("pix"), table["y"].to_value("pix")]))
         np.testing.assert_array_equal(supported(planes, xy.T), hull.find_simplex(xy) >= 0)
         inside = xy[supported(planes, xy.T)]
-        assert not Solution.supported(stand_in, "frame0", np.append(inside[:5], [[np.nan, 1.0]], axis=0))[-1]
+        assert not view.supported(np.append(inside[:5], [[np.nan, 1.0]], axis=0))[-1]
         assert supported(planes, inside[:5].T).all()  # a box that lies inside altogether
 
     def test_options(self):
@@ -282,7 +268,7 @@ class TestSupport:
         solution = scene(2, rolls=(0, 0), spread=0)[0]
         table = solution.residuals
         table["used"][:4] = False
-        assert not supported(support("frame0", measured(solution, table)), np.full((2, 3), 100.0)).any()
+        assert not supported(support(table), np.full((2, 3), 100.0)).any()
 
 
 class TestSaturation:

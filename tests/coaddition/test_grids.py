@@ -87,7 +87,7 @@ def test_headers_without_sense(tmp_path, header, changes, words):
     solution, *_ = scene(1)
     words = words.replace("no grid can be read from it", "no WCS can be read from the header")
     with pytest.raises(InputError, match=f"grid: .*{words}"):
-        given_grid(header, solution)
+        given_grid(header, solution.sky)
 
 
 def test_a_reference_pixel_that_is_no_number(header):

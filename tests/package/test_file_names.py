@@ -110,7 +110,7 @@ def test_solutions_priors_and_wcs(solution, place, alone, stem):
     prior.write(str(place / f"{stem}.prior.asdf"))
     np.testing.assert_array_equal(Prior.from_file(str(place / f"{stem}.prior.asdf")).mean, prior.mean)
     assert Prior.from_file(place / f"{stem}.asdf").shape == SHAPE
-    write_wcs(solution, NAMES[0], place / f"{stem}.wcs.asdf")
+    write_wcs(solution[NAMES[0]], place / f"{stem}.wcs.asdf")
     np.testing.assert_allclose(
         read_wcs(str(place / f"{stem}.wcs.asdf"))(3.0, 4.0), solution[NAMES[0]].wcs(3.0, 4.0), rtol=0, atol=1e-12
     )

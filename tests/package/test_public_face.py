@@ -256,7 +256,7 @@ def test_files_open_with_gwcs_alone(solution, tmp_path, stack):
         pytest.skip(f"the package index cannot be reached: {got.stderr.strip().splitlines()[-1]}")
     assert got.returncode == 0, got.stderr
     (tmp_path / "wcs").mkdir()
-    paths = [write_wcs(solution, name, tmp_path / "wcs" / f"{name}.asdf") for name in solution.names]
+    paths = [write_wcs(solution[name], tmp_path / "wcs" / f"{name}.asdf") for name in solution.names]
     ny, nx = solution.estimate.shapes[solution.names[0]]
     x, y = np.random.default_rng(0).uniform([[0], [0]], [[nx - 1], [ny - 1]], (2, 200))
     (tmp_path / "points.json").write_text(json.dumps([x.tolist(), y.tolist()]))

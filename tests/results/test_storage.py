@@ -229,7 +229,7 @@ def test_nothing_is_overwritten_unasked(solution, tmp_path):
     with pytest.raises(InputError, match=r"s\.asdf exists already; give overwrite=True \(--overwrite\)"):
         solution.write(path)
     with pytest.raises(InputError, match="exists already"):
-        write_wcs(solution, solution.names[0], path)
+        write_wcs(solution[solution.names[0]], path)
     assert path.read_text() == "precious"
     solution.write(path, overwrite=True)
     assert len(Solution.read(path).names) == 4
@@ -250,7 +250,7 @@ def test_a_failed_write_leaves_nothing(solution, tmp_path, monkeypatch, existing
     with pytest.raises(OSError, match="No space left"):
         solution.write(path, overwrite=True)
     with pytest.raises(OSError, match="No space left"):
-        write_wcs(solution, solution.names[0], tmp_path / "w.asdf")
+        write_wcs(solution[solution.names[0]], tmp_path / "w.asdf")
     assert [p.name for p in tmp_path.iterdir()] == (["s.asdf"] if existing else [])
     assert not existing or path.read_text() == "precious"
 
@@ -271,7 +271,7 @@ def test_absent_and_foreign_files(solution, tmp_path):
         Solution.read(tmp_path / "empty.asdf")
     with pytest.raises(InputError, match=r"solution\.asdf: no such file"):  # of a folder, that of its results
         Solution.read(tmp_path)
-    write_wcs(solution, solution.names[0], tmp_path / "w.asdf")
+    write_wcs(solution[solution.names[0]], tmp_path / "w.asdf")
     with pytest.raises(
         InputError, match=r"w\.asdf is not .*: tag '.*gwcs/wcs.*' has no business in such a file; is it"
     ):
@@ -459,7 +459,7 @@ def test_other_coefficients_have_another_inverse(solution, tmp_path):
 
 def test_a_wcs_comes_back_as_it_was(with_sky, tmp_path):
     name = with_sky.names[2]
-    back = legdistort.read_wcs(write_wcs(with_sky, name, tmp_path / "w.asdf"))
+    back = legdistort.read_wcs(write_wcs(with_sky[name], tmp_path / "w.asdf"))
     made = with_sky[name].wcs
     p = np.random.default_rng(0).uniform(-100, 611, (500, 2))
     ra, dec = made(*p.T)
@@ -477,7 +477,7 @@ def test_a_wcs_comes_back_as_it_was(with_sky, tmp_path):
 
 def test_a_wcs_without_sky_and_with_another_shape(solution, tmp_path):
     name = solution.names[0]
-    back = legdistort.read_wcs(write_wcs(solution, name, tmp_path / "w.asdf"))
+    back = legdistort.read_wcs(write_wcs(solution[name], tmp_path / "w.asdf"))
     # not to the last digit: the sums of one point may be taken in another order
     assert_allclose(back(100.0, 200.0), solution[name].wcs(100.0, 200.0), rtol=1e-13)
     assert back.available_frames == ["detector", "undistorted", "reference"]
@@ -517,7 +517,7 @@ def shifted(tree):
     ],
 )
 def test_changed_wcs_files_are_noticed(with_sky, tmp_path, change, message):
-    path = write_wcs(with_sky, with_sky.names[0], tmp_path / "w.asdf")
+    path = write_wcs(with_sky[with_sky.names[0]], tmp_path / "w.asdf")
     with asdf.open(path, lazy_load=False, memmap=False) as file:
         meta = dict(file.tree["meta"])
     change(meta)
@@ -714,7 +714,7 @@ def test_no_tree_breaks_the_reader(whole_tree, tmp_path, data):
 def test_no_damage_breaks_the_reader(solution, with_sky, tmp_path, which, data):
     path = tmp_path / f"{which}.asdf"
     if not path.exists():
-        solution.write(path) if which == "solution" else write_wcs(with_sky, with_sky.names[0], path)
+        solution.write(path) if which == "solution" else write_wcs(with_sky[with_sky.names[0]], path)
     content = bytearray(path.read_bytes())
     text = content.index(b"\n...\n")
     for _ in range(data.draw(st.integers(1, 8))):

@@ -416,7 +416,7 @@ def legendres(model):
 
 def test_file_holds_stock_models_only(solution, tmp_path):
     name = solution.names[2]
-    path = write_wcs(solution, name, tmp_path / "w.asdf")
+    path = write_wcs(solution[name], tmp_path / "w.asdf")
     head = path.read_bytes()[:60]
     assert head.startswith(b"#ASDF 1.0.0\n#ASDF_STANDARD 1.5.0\n")
     text = path.read_bytes().split(b"\n...")[0].decode()

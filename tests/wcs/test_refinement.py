@@ -65,7 +65,7 @@ def test_frames_stay_and_the_sky_is_that_of_the_solution(lon, lat):
     wcs = pipeline(lon, lat)
     before = np.array(wcs(100.0, 200.0))
     solution = solution_at(wcs, SHAPE)
-    made = legdistort.refine(wcs, solution, "a")
+    made = legdistort.refine(wcs, solution["a"])
     assert isinstance(made, gwcs.WCS)
     assert made.available_frames == ["detector", "v2v3", "v2v3vacorr", "world"]
     assert [step.frame for step in made.pipeline] == [step.frame for step in wcs.pipeline]
@@ -84,7 +84,7 @@ def test_frames_stay_and_the_sky_is_that_of_the_solution(lon, lat):
 
 def test_read_without_legdistort(tmp_path):
     wcs = pipeline()
-    made = legdistort.refine(wcs, solution_at(wcs, SHAPE), "a")
+    made = legdistort.refine(wcs, solution_at(wcs, SHAPE)["a"])
     content = io.BytesIO()
     asdf.AsdfFile({"meta": {"wcs": made}}).write_to(content)
     assert b"legdistort" not in content.getvalue()
@@ -104,7 +104,7 @@ def test_longitudes_stay_in_their_turn():
     wrapped.inverse = to_sky.inverse | models.Shift(1296000.0) & models.Identity(1)
     wcs = gwcs.WCS([*((s.frame, s.transform) for s in wcs.pipeline[:2]), (wcs.pipeline[2].frame, wrapped),
                     (wcs.output_frame, None)])  # fmt: skip
-    made = legdistort.refine(wcs, solution_at(wcs, SHAPE), "a")
+    made = legdistort.refine(wcs, solution_at(wcs, SHAPE)["a"])
     assert -100 < made.get_transform("detector", "v2v3")(280.0, 200.0)[0] < -60
     assert_allclose(made.get_transform("detector", "world")(280.0, 200.0), made(280.0, 200.0), rtol=1e-12)
 
@@ -115,7 +115,7 @@ def test_without_a_frame_between():
     short.bounding_box = None  # that of the whole detector then
     short.pixel_shape = SHAPE[::-1]
     solution = solution_at(wcs, SHAPE)
-    made = legdistort.refine(short, solution, "a")
+    made = legdistort.refine(short, solution["a"])
     assert made.available_frames == ["detector", "world"]
     assert made.pixel_shape == SHAPE[::-1]
     check_sky(made, solution, ((-0.5, SHAPE[1] - 0.5), (-0.5, SHAPE[0] - 0.5)))
@@ -128,7 +128,7 @@ def test_real_pipelines(shared_data, name, shape):
     with asdf.open(shared_data / "gwcs_interop" / f"{name}.asdf", lazy_load=False, memmap=False) as file:
         wcs = file["roman"]["wcs"] if "roman" in file.tree else file["wcs"]
     solution = solution_at(wcs, shape, peak=5.0)
-    made = legdistort.refine(wcs, solution, "a")
+    made = legdistort.refine(wcs, solution["a"])
     assert made.available_frames == wcs.available_frames
     check_sky(made, solution, wcs.bounding_box.bounding_box(order="F"))
 
@@ -151,13 +151,13 @@ def test_what_cannot_be_refined(change, words):
     wcs = pipeline()
     wcs, solution = change(wcs, solution_at(wcs, SHAPE))
     with pytest.raises(InputError, match=words):
-        legdistort.refine(wcs, solution, "a")
+        legdistort.refine(wcs, solution["a"])
 
 
 def test_an_exposure_that_is_not_there():
     wcs = pipeline()
     with pytest.raises(InputError, match="no exposure 'b' in the solution"):
-        legdistort.refine(wcs, solution_at(wcs, SHAPE), "b")
+        legdistort.refine(wcs, solution_at(wcs, SHAPE)["b"])
 
 
 def _of(wcs, **attributes):
@@ -189,7 +189,7 @@ def test_tweakwcs():
     wcs = pipeline()
     solution = solution_at(wcs, SHAPE)
     info = {"v2_ref": 80.0, "v3_ref": -490.0, "roll_ref": 0.0}
-    corrector = correctors.JWSTWCSCorrector(legdistort.refine(wcs, solution, "a"), info)
+    corrector = correctors.JWSTWCSCorrector(legdistort.refine(wcs, solution["a"]), info)
     p, ra, _ = (a[404:] for a in detector(solution, "a"))
     p, ra = p[p[:, 0] > 3.5], ra[p[:, 0] > 3.5]
     assert_allclose(np.mod(corrector.det_to_world(*p.T)[0], 360), ra, rtol=0, atol=1e-9)
@@ -205,7 +205,7 @@ def test_stcal():
     utils = pytest.importorskip("stcal.resample.utils", reason="stcal is no extra of the tests")
     wcs = pipeline()
     solution = solution_at(wcs, SHAPE)
-    made = legdistort.refine(wcs, solution, "a")
+    made = legdistort.refine(wcs, solution["a"])
     ny, nx = SHAPE
     grid = solution["a"].fits_wcs()  # as a target of another kind
     pixmap = utils.calc_pixmap(made, made, shape=SHAPE)
