@@ -58,7 +58,7 @@ def unknown_fields(solution, table):
     for i, name in enumerate(solution.names):
         mine = np.asarray(table["exposure"]) == name
         pixels = np.column_stack([table["x"].value, table["y"].value])[mine]
-        by_modes = new_positions.response(solution, name, solution[name].distortion.invert(pixels))[0]
+        by_modes = new_positions.response(solution[name], solution[name].distortion.invert(pixels))[0]
         for k, each in enumerate(solution.gauge.unknown):
             moved[k, mine] = by_modes @ each.coefficients[i].ravel()
     return [each.T.reshape(-1, 1) for each in moved]

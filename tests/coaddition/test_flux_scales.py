@@ -36,7 +36,7 @@ def measured(solution, table, maps=None):
 
 def views(table):
     """What was seen on each exposure or detector that a table names."""
-    return {n: SimpleNamespace(residuals=table[table["exposure"] == n]) for n in dict.fromkeys(table["exposure"])}
+    return {n: SimpleNamespace(residuals=table[table["exposure"] == n]) for n in sorted(set(table["exposure"]))}
 
 
 def observed(depth, *, n=60, noise=0.03, seed=0, outliers=0.1, fwhm=None, seen=0.8):
@@ -268,7 +268,7 @@ class TestSupport:
         solution = scene(2, rolls=(0, 0), spread=0)[0]
         table = solution.residuals
         table["used"][:4] = False
-        assert not supported(support(table), np.full((2, 3), 100.0)).any()
+        assert not supported(support(table[table["exposure"] == "frame0"]), np.full((2, 3), 100.0)).any()
 
 
 class TestSaturation:

@@ -232,7 +232,7 @@ def test_a_solution_in_another_process(solution, method):
         pytest.skip(f"no {method} here")
     name = solution.names[1]
     with ProcessPoolExecutor(1, multiprocessing.get_context(method)) as pool:
-        corrected = pool.submit(solution.correct, name, PIXELS).result()
+        corrected = pool.submit(solution[name].correct, PIXELS).result()
         again = pool.submit(pickle.loads, pickle.dumps(solution)).result()
     np.testing.assert_array_equal(corrected, solution[name].correct(PIXELS))
     np.testing.assert_array_equal(again[name].wcs(*PIXELS.T), solution[name].wcs(*PIXELS.T))
@@ -246,5 +246,5 @@ def test_a_solution_on_a_cluster(solution):
         n_workers=1, threads_per_worker=1, processes=True, dashboard_address=":0", protocol="tcp"
     )
     with cluster, distributed.Client(cluster) as client:
-        corrected = client.submit(solution.correct, solution.names[0], PIXELS).result(timeout=60)
+        corrected = client.submit(solution[solution.names[0]].correct, PIXELS).result(timeout=60)
     np.testing.assert_array_equal(corrected, solution[solution.names[0]].correct(PIXELS))

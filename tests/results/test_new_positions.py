@@ -75,7 +75,7 @@ def test_measurement_goes_through_the_inverse_by_finite_differences(solution):
 def test_coefficients_move_positions_as_finite_differences_say(solution):
     name, step = solution.names[4], 1e-4
     q = solution[name].distortion.invert(PIXELS)
-    response = new_positions.response(solution, name, q)[0].reshape(4, 2, 2, -1)
+    response = new_positions.response(solution[name], q)[0].reshape(4, 2, 2, -1)
     for axis, mode in ((0, 0), (1, 4), (0, 9)):
         moved = []
         for sign in (1, -1):
@@ -92,7 +92,7 @@ def test_a_common_map_moves_new_positions_with_the_stars():
     gauge, worst = solution.gauge, 0.0
     for i, name in enumerate(solution.names):
         q = similarity.apply(solution.poses[name], solution.estimate.positions)
-        by_modes = new_positions.response(solution, name, q)[0]
+        by_modes = new_positions.response(solution[name], q)[0]
         moved = by_modes @ new_positions.widened(gauge.motion[i], solution.degree)
         plain = absolute_errors.plain_directions(gauge, solution.estimate.positions, gauge.n_modes)
         inside = (np.abs(q - 1023.5) < 1000).all(axis=1)
@@ -195,12 +195,12 @@ def test_limit_of_what_is_unknown_is_the_rest_of_the_error(free):
     one = free.gauge.unknown[0]
     alone = replace(free, gauge=replace(free.gauge, unknown_maps=free.gauge.unknown_maps[:1]))
     q = free[name].distortion.invert(PIXELS)
-    by_modes = new_positions.response(free, name, q)[0]
+    by_modes = new_positions.response(free[name], q)[0]
     moved = np.linalg.norm(by_modes @ one.coefficients[0].ravel(), axis=1)
     known = replace(free, gauge=replace(free.gauge, unknown_maps=()))
     for factor, hidden in ((0.99, True), (1.01, False)):
         rest = np.trace(known[name].correct(PIXELS, errors=0.0).absolute, axis1=1, axis2=2)
-        scale = np.abs(np.linalg.det(new_positions.response(free, name, q)[1]))
+        scale = np.abs(np.linalg.det(new_positions.response(free[name], q)[1]))
         error = np.sqrt(np.maximum((factor * moved) ** 2 - rest, 0) / (2 * scale))
         absolute = alone[name].correct(PIXELS, errors=np.column_stack([error, error])).absolute
         clear = (factor * moved) ** 2 > 1.05 * rest

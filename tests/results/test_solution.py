@@ -15,6 +15,7 @@ from legdistort.assessment import baselines
 from legdistort.exceptions import LegdistortWarning
 from legdistort.results import in_tables
 from legdistort.results.diagnostics import DegreeChoice, Diagnostics, UsedReference, Validation
+from legdistort.results.estimate import Estimate
 from legdistort.results.motions import StarMotions
 from legdistort.results.settings import Settings
 from legdistort.runtime.provenance import with_inputs
@@ -143,8 +144,12 @@ class TestEveryProducer:
     def test_file_and_words(self, produced, tmp_path):
         back = Solution.read(produced.write(tmp_path / "s.asdf"))
         for field in dataclasses.fields(Solution):
-            if field.name not in ("uncertainty", "form", "checked"):
+            if field.name not in ("estimate", "checksum"):
                 assert_same(getattr(produced, field.name), getattr(back, field.name), field.name)
+        for field in dataclasses.fields(Estimate):
+            if field.name not in ("uncertainty", "form", "checked", "certified"):
+                one, other = (getattr(each.estimate, field.name) for each in (produced, back))
+                assert_same(one, other, f"estimate.{field.name}")
         assert back.checks == produced.checks
         for name in ("coefficients", "stars"):
             assert_same(getattr(produced.estimate.uncertainty, name), getattr(back.estimate.uncertainty, name), name)

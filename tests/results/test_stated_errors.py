@@ -96,7 +96,7 @@ def test_covariances_are_calibrated(setting):
                 similarity.invert(solution.poses[name]),
                 Distortion(mine.reshape(2, -1), solution.estimate.shapes[name]).invert(grid),
             )
-            by_modes = new_positions.response(solution, name, solution[name].distortion.invert(grid))[0]
+            by_modes = new_positions.response(solution[name], solution[name].distortion.invert(grid))[0]
             # under the constraints of the gauge, like the truth
             covariance = new_positions.carried(by_modes, solution[name].covariance)
             maps.append((solution[name].correct(grid) - true) ** 2 / np.einsum("naa->na", covariance))

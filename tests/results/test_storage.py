@@ -89,9 +89,10 @@ def test_round_trip_is_exact(which, tmp_path, request):
         assert back.poses[name].tobytes() == given.poses[name].tobytes()
         assert_array_equal(back[name].errors, given[name].errors)
         assert_array_equal(back[name].sigma_map(n=5)[2], given[name].sigma_map(n=5)[2])
-    for key in ("coefficients", "prior_mean", "positions", "star_names"):
-        assert_array_equal(getattr(back, key), getattr(given, key))
-        assert getattr(back, key).dtype == getattr(given, key).dtype
+    assert_array_equal(back.coefficients, given.coefficients)
+    for key in ("prior_mean", "positions", "star_names"):
+        assert_array_equal(getattr(back.estimate, key), getattr(given.estimate, key))
+        assert getattr(back.estimate, key).dtype == getattr(given.estimate, key).dtype
     for key in ("kind", "constraint", "motion", "dynamic", "box", "covariance", "static", "directions"):
         assert_array_equal(getattr(back.gauge, key), getattr(given.gauge, key))
     assert str(back.gauge) == str(given.gauge)
@@ -184,7 +185,7 @@ def test_a_star_whose_observations_are_all_clipped_survives(with_sky, tmp_path):
     table["used"][table["star"] == star] = False
     positions = with_sky.estimate.positions.copy()
     positions[np.searchsorted(with_sky.estimate.star_names, star)] = np.nan
-    holed = replace(with_sky, observations=table, positions=positions)
+    holed = replace(with_sky, residuals=table, estimate=replace(with_sky.estimate, positions=positions))
     row = np.flatnonzero(holed.stars["star"] == star)[0]
     assert holed.stars["n"][row] == 0
     for column in ("x", "x_err_abs", "ra", "dec", "flux"):
@@ -403,7 +404,7 @@ def test_a_folded_solution_can_be_written(solution, tmp_path):
     folded = replace(solution, coefficients=coefficients)
     back = Solution.read(folded.write(tmp_path / "s.asdf"))
     with pytest.raises(LegdistortError, match="folds"):
-        back[back.names[0]].wcs
+        _ = back[back.names[0]].wcs
     assert back[back.names[1]].wcs is not None
 
 

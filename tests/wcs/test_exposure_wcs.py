@@ -229,13 +229,13 @@ def test_quantities_in_quantities_out(solution):
         assert_array_equal(u.Quantity(unit).to_value(u.pix), plain)
         with pytest.raises(InputError, match="positions must be in pixels, got deg"):
             function(*(at * u.deg).T)
-    for function, at in ((solution.correct, p), (solution.distort, x)):
-        unit = function(name, at * u.pix)
+    for function, at in ((solution[name].correct, p), (solution[name].distort, x)):
+        unit = function(at * u.pix)
         assert unit.unit == u.pix
-        assert_array_equal(unit.value, function(name, at))
-        assert not isinstance(function(name, at), u.Quantity)
+        assert_array_equal(unit.value, function(at))
+        assert not isinstance(function(at), u.Quantity)
         with pytest.raises(InputError, match="positions must be in pixels, got arcsec"):
-            function(name, at * u.arcsec)
+            function(at * u.arcsec)
 
 
 def test_matches_take_any_unit_that_is_pixels(solution):
