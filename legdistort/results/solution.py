@@ -153,7 +153,7 @@ class Solution(ShownAsPrinted):
 
     def __contains__(self, key: object) -> bool:
         name, detector = key if isinstance(key, tuple) and len(key) == 2 else (key, None)
-        return name in self.names and (detector is None or detector in self[name].detectors)
+        return name in self.names and (detector is None or str(detector) in self[name].detectors)
 
     @cached_property
     def checks(self) -> tuple[Check, ...]:

@@ -508,7 +508,8 @@ def check_key(solution, key):
     """
     name, detector = key if isinstance(key, tuple) and len(key) == 2 else (key, None)
     if name not in solution.names:
-        why = f": it was left out ({solution.left_out[name]})" if name in solution.left_out else ""
+        left_out = isinstance(name, str) and name in solution.left_out
+        why = f": it was left out ({solution.left_out[name]})" if left_out else ""
         near = [] if why else get_close_matches(str(name), solution.names, n=3)
         meant = f" (do you mean {' or '.join(near)}?)" if near else ""
         known = some_of(list(solution.names), _MOST_NAMED)
