@@ -11,6 +11,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from astropy.wcs import WCS
 from scipy import special
+from two_chips import two_chips_small
 
 import legdistort
 from legdistort.cameras import camera as cameras
@@ -636,20 +637,6 @@ def frames(tmp_path_factory):
             hdus += [fits.ImageHDU(plane, fits.Header(header), name=name) for name, plane in planes.items()]
         fits.HDUList(hdus).writeto(folder / f"exp{i}.fits")
     return folder, camera, sky
-
-
-def two_chips_small():
-    """Detectors 1 and 2 with a gap of 15 px between them, the second turned, both with a static distortion."""
-    angle, static = np.radians(0.4), np.zeros((2, 10))
-    static[0, 3], static[1, 5], static[0, 8] = 1.2, -0.7, 0.4
-    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    return legdistort.Camera(
-        "TWO",
-        {
-            1: legdistort.Detector((300, 200), layout=np.eye(2, 3), static=static),
-            2: legdistort.Detector((300, 200), layout=np.column_stack([turn, turn @ [-215.0, 1.0]]), static=-static),
-        },
-    )
 
 
 def gaussian(shape, x, y, fwhm=2.6):
