@@ -302,10 +302,8 @@ def test_pictures(view, several):
     for drawn in (view, several[0]["frame1"], several[0]["frame1", "2"]):
         ax = Figure().subplots()
         assert drawn.plot_residuals(scale=300, ax=ax) is ax
-        arrows, rows = (
-            next(c for c in ax.collections if isinstance(c, Quiver)),
-            drawn.residuals[drawn.residuals["used"]],
-        )
+        arrows = next(c for c in ax.collections if isinstance(c, Quiver))
+        rows = drawn.residuals[drawn.residuals["used"]]
         assert_allclose(arrows.XY, np.column_stack([rows["x"].value, rows["y"].value]))
         assert_allclose(np.stack([arrows.U, arrows.V]), np.stack([rows["dx"].value, rows["dy"].value]))
         assert arrows.scale == 1 / 300
@@ -365,9 +363,7 @@ def test_an_exposure_of_several_detectors_asks_for_one(several):
         lambda: view.sigma_map(),
         lambda: view.plot_error_map(),
     ):
-        with pytest.raises(
-            InputError, match=r"exposure frame1 has several detectors, 1, 2, .* solution\['frame1', '1'\]"
-        ):
+        with pytest.raises(InputError, match=words):
             call()
 
 
