@@ -83,10 +83,9 @@ def sweeps(n_sweeps=300, n_seeds=10):
 def stacked(run):
     """The same stars in stacks made with other corrections."""
     solution = run.solution
-    matches = ld.Matches.from_table(
-        solution.observations, shape=solution.shapes, poses=solution.poses, sky=solution.sky
-    )
-    comparison = baselines.compare(matches, solution, prior=ld.Prior(solution.prior_mean[0]))
+    shapes = {view.name: view.shape for view in solution}
+    matches = ld.Matches.from_table(solution.residuals, shape=shapes, poses=solution.poses, sky=solution.sky)
+    comparison = baselines.compare(matches, solution, prior=ld.Prior(solution[solution.names[0]].prior_mean))
     frames = ld.open_exposures(str(run.out / "frames" / "*.fits"))
     stacks = stack_quality.compare_stacks(frames, comparison, mosaic=run.mosaic, method="clipped")
     return stack_plots.plot_zooms(stacks.zooms)[0, 0].figure
@@ -96,7 +95,7 @@ def draw_first_mosaic(run):
     """Pictures of the page "First mosaic"."""
     solution, first = run.solution, run.solution.names[0]
     fig, panels = plt.subplots(1, 2, figsize=(10, 5), layout="constrained")
-    solution_plots.plot_residuals(solution, ax=panels[0])
+    solution[first].plot_residuals(ax=panels[0])
     solution_plots.plot_scatter(solution, ax=panels[1])
     save(fig, "residuals.png")
 
@@ -106,7 +105,7 @@ def draw_first_mosaic(run):
     save(fig, "distortion.png")
 
     fig, panels = plt.subplots(1, 2, figsize=(10, 4.6), layout="constrained")
-    solution_plots.plot_sigma_map(*solution.sigma_map(first), ax=panels[0])
+    solution_plots.plot_sigma_map(*solution[first].sigma_map(), ax=panels[0])
     offset = run.mosaic.offset
     xy = np.column_stack([solution.stars["x"].value, solution.stars["y"].value]) - offset
     stack_plots.plot_mosaic(run.mosaic, stars=xy, ax=panels[1])

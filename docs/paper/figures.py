@@ -95,8 +95,8 @@ def one_star(sim, solution, star=0):
     raw = np.stack([truth.distort(name, truth.positions[[star]])[0] for name in truth.names])
     table = sim.matches.table[sim.matches.table["star"] == star]
     raw = np.column_stack([table["x"].value, table["y"].value])
-    corrected = np.stack([solution.correct(name, p)[0] for name, p in zip(truth.names, raw, strict=True)])
-    true, estimated = truth.positions[star], solution.positions[star]
+    corrected = np.stack([solution[name].correct(p)[0] for name, p in zip(truth.names, raw, strict=True)])
+    true, estimated = truth.positions[star], solution.estimate.positions[star]
     fig, panels = new(3, size=(11.5, 4.2))
     for ax, points, title in zip(
         panels, (raw, corrected, corrected), ("measured", "corrected", "corrected, enlarged"), strict=True
@@ -288,14 +288,14 @@ def corrections(solutions, noise):
 
 def coefficients(solution, name):
     """Figure "coeff": coefficients of one exposure beside the static ones."""
-    i = solution.index(name)
+    view = solution[name]
     n = solution.gauge.n_constraints // 2
     orders = list(zip(*basis.orders(solution.degree), strict=True))
     fig, panels = new(1, 2, size=(8, 5), sharex=True)
     for axis, ax in enumerate(panels):
         at = np.arange(n)
-        ax.bar(at - 0.2, solution.prior_mean[i, axis, :n], 0.4, color=ORANGE, label="static, A⁰")
-        ax.bar(at + 0.2, solution.coefficients[i, axis, :n], 0.4, color=BLUE, label=f"estimated, {name}")
+        ax.bar(at - 0.2, view.prior_mean[axis, :n], 0.4, color=ORANGE, label="static, A⁰")
+        ax.bar(at + 0.2, view.coefficients[axis, :n], 0.4, color=BLUE, label=f"estimated, {name}")
         ax.axhline(0, color="black", linewidth=0.6)
         ax.set_ylabel(f"along {'xy'[axis]} [px]")
         ax.grid(axis="y", linewidth=0.3)

@@ -70,8 +70,8 @@ def correct(twin, *, errors="stated"):
 
 def absolute_error(twin, solution, *, removed):
     """Error b of the reference positions after a common similarity or polynomial, pixels per axis."""
-    true = nearest(solution.positions, twin.truth.positions)
-    return accuracy.bias(solution.positions, true, removed=removed)
+    true = nearest(solution.estimate.positions, twin.truth.positions)
+    return accuracy.bias(solution.estimate.positions, true, removed=removed)
 
 
 def psf_of_width(fwhm):

@@ -99,13 +99,13 @@ def held_out(matches, solution, prior=None, *, n=5, seed=0):
     for k in range(n):
         kept = ld.Matches.from_table(table[part != k], shape=matches.shapes, poses=matches.poses)
         other = ld.solve(kept, degree=solution.degree, prior=prior, error_floor=floor, clip=5.0)
-        place = dict(zip(other.star_names.tolist(), other.positions, strict=True))
+        place = dict(zip(other.estimate.star_names.tolist(), other.estimate.positions, strict=True))
         rows = table[part == k]
         rows = rows[[star in place for star in rows["star"]]]
         for name in other.names:
             own = rows[rows["exposure"] == name]
             measured = np.column_stack([own["x"].value, own["y"].value])
-            predicted = other.distort(name, np.array([place[star] for star in own["star"]]).reshape(-1, 2))
+            predicted = other[name].distort(np.array([place[star] for star in own["star"]]).reshape(-1, 2))
             squares.append((predicted - measured) ** 2)
     return float(np.sqrt(np.nanmedian(np.concatenate(squares)) / 0.4549))  # median of chi2 with one degree of freedom
 

@@ -74,7 +74,7 @@ def model(plan):
     solution = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static), gauge=simulations.GAUGE)
     plan.save(figures.one_star(sim, solution), "schema")
     corrected = accuracy.corrected_positions(solution)
-    apart = np.abs(np.nanmean(corrected, axis=0) - solution.positions).max()
+    apart = np.abs(np.nanmean(corrected, axis=0) - solution.estimate.positions).max()
     yield Row("3.3", "mean of corrected positions − X_ref, px", "a few 0.001", f"{apart:.4f}", "largest of 30 stars")
 
 
@@ -83,7 +83,7 @@ def simulation_1(plan):
     sim, solution, grid, sigma, square = simulations.simulation_1(n_grid=50 if plan.quick else simulations.N_GRID)
     plan.save(figures.error_map(sim, grid, sigma, square), "ergrid")
     inside = accuracy.in_contour(grid, square)
-    b = accuracy.bias(solution.positions, sim.truth.positions)
+    b = accuracy.bias(solution.estimate.positions, sim.truth.positions)
     yield Row("Sim. 1", "b, px", "0.05", f"{b:.3f}", "one outcome")
     yield Row("Sim. 1", "σ_contour, px", "0.16", f"{simulations.rms(sigma[inside]):.3f}", "one outcome")
     yield Row("Sim. 1", "σ_grid, px", "0.2", f"{simulations.rms(sigma):.3f}", "one outcome")
@@ -251,8 +251,8 @@ def _zooms(method, static, n=2, apart=400, least=8):
     bright = np.asarray(method.stars["flux"]) > np.nanmedian(method.stars["flux"])
     chosen = []
     for k in np.argsort(-np.where(bright & (seen >= min(least, len(static.names))), sigma, 0)):
-        if all(np.hypot(*(method.positions[k] - other)) > apart for other in chosen):
-            chosen.append(method.positions[k])
+        if all(np.hypot(*(method.estimate.positions[k] - other)) > apart for other in chosen):
+            chosen.append(method.estimate.positions[k])
     return chosen[:n]
 
 

@@ -57,7 +57,7 @@ class Outcome:
         solution = ld.solve(
             sim.matches, prior=ld.Prior(truth.static) if self.static_known else None, gauge=GAUGE, clip=None
         )
-        b = [accuracy.bias(solution.positions, truth.positions, removed=removed) for removed in (None, 3)]
+        b = [accuracy.bias(solution.estimate.positions, truth.positions, removed=removed) for removed in (None, 3)]
         if not self.n_grid:
             return (*b, np.nan, np.nan)
         grid = truth.grid(truth.names[0], self.n_grid)
@@ -140,7 +140,7 @@ def simulation_5(kind, *, amplitude=1.0, n_stars=1000, n_exposures=10, seed=0):
     matches = matches_from(truth, observed, errors, np.random.default_rng(0), noise=0)
     solution = ld.solve(matches, prior=ld.Prior(sim.truth.static), gauge=GAUGE, clip=None)
     found = np.stack([whole_coefficients(solution, name) for name in solution.names])
-    return found - sim.truth.coefficients, accuracy.bias(solution.positions, truth.positions)
+    return found - sim.truth.coefficients, accuracy.bias(solution.estimate.positions, truth.positions)
 
 
 def x4_coefficients():
@@ -151,7 +151,7 @@ def x4_coefficients():
 
 def whole_coefficients(solution, name):
     """Coefficients (2, n_modes) of D_i(T_i(X)) - X: the pose, too, as a distortion, where it is nearly none."""
-    shape, distortion = solution.shapes[name], solution.distortion(name)
+    shape, distortion = solution[name].shape, solution[name].distortion
 
     def displacement(u, v):
         xy = basis.denormalize(u, v, shape)

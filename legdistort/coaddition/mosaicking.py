@@ -89,7 +89,7 @@ def coadd(
     weights : {'noise', 'variance', 'exptime', 'seeing', 'sigma_map', None} or dict
         Of the exposures in a mean: 1/sigma^2 of their background noise; the same by pixel, from the uncertainty planes
         without the photons of stars; exposure time; 'noise' / FWHM^2; 'noise' times s^2 / (s^2 + e^2), e being
-        the error of the distortion correction (`Solution.sigma_map`) and s = 0.02 FWHM that of a star of
+        the error of the distortion correction (`View.sigma_map`) and s = 0.02 FWHM that of a star of
         signal-to-noise ratio 20; equal; or by name.
     scale : {'auto', 'exptime', 'stars', None} or dict
         Factors by which data are multiplied: 'exptime' brings all to the mean exposure time if times differ (data
@@ -97,7 +97,7 @@ def coadd(
         time unless stars differ from that by more than 2 % and 3 sigma, as through clouds, or times are not known;
         none; or by name.
     extrapolated : {'flag', 'mask', 'keep'}
-        Pixels outside the stars used of an exposure, where its distortion is extrapolated (`Solution.supported`): used
+        Pixels outside the stars used of an exposure, where its distortion is extrapolated (`View.supported`): used
         and flagged in the mosaic; left out; or used.
     pixfrac, kernel
         For 'drizzle': side of the drops as a fraction of a pixel, and their shape, 'square', 'turbo' or 'point'.

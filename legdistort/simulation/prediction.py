@@ -47,7 +47,7 @@ class Prediction(ShownAsPrinted):
     ----------
     solution : Solution
         As the solution would be without noise: star positions with their expected errors (``solution.stars``),
-        covariances, gauge, ``solution.sigma_map(name)``.
+        covariances, gauge, ``solution[name].sigma_map()``.
     sigma_meas : float
         Error of one measured position: rms over all, and that of new positions.
     b : float

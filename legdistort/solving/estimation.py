@@ -89,7 +89,7 @@ def solve(
         Form of the distortion of every exposure, undistorted -> detector pixels, instead of `degree` and `prior`:
         ``Identity(2) + (Mapping((0, 1, 0, 1)) | Legendre2D & Legendre2D)``, with a static part added if there is one.
         Its Legendre coefficients are fitted, those marked as ``fixed`` keep their values; the values of all are the
-        static distortion from which exposures depart. `Solution.model` then gives it back fitted. A similarity in
+        static distortion from which exposures depart. `View.model` then gives it back fitted. A similarity in
         front is replaced by the pose of each exposure. Poses also carry shift, rotation and scale: their part of the
         coefficients c0_0, c1_0 and c0_1 stays as given.
     static : {None, "fit"}, with a camera also {"hold", "prior"}
