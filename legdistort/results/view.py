@@ -134,7 +134,15 @@ class View(ShownAsPrinted):
 
     @property
     def residuals(self) -> QTable:
-        """The rows of ``solution.residuals`` that are of it; of a detector in its own pixels, residuals too."""
+        """The rows of ``solution.residuals`` that are of it; of a detector in its own pixels, residuals too.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.residuals["star", "x", "dx", "used"].colnames
+        ['star', 'x', 'dx', 'used']
+        """
         table = self.solution.residuals
         rows = table[np.asarray(table["exposure"] == self.name)]
         return rows if self.chip is None else detector_view.own_rows(self, rows)
@@ -148,7 +156,15 @@ class View(ShownAsPrinted):
 
     @property
     def pose(self) -> np.ndarray:
-        """Similarity (2, 3) from the reference plane to undistorted pixels."""
+        """Similarity (2, 3) from the reference plane to undistorted pixels.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.pose.shape
+        (2, 3)
+        """
         return self.solution.poses[self.name] if self.chip is None else self._whole.pose
 
     @property
@@ -156,6 +172,13 @@ class View(ShownAsPrinted):
         """Total distortion (2, n_modes), undistorted -> detector pixels: normalised Legendre modes in pixels, x first.
 
         Of a detector in a focal plane the degree is as high as it takes to hold a millionth of a pixel.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.coefficients.shape
+        (2, 10)
         """
         return self.solution.coefficients[self.index] if self.chip is None else self._whole.coefficients
 
@@ -166,7 +189,15 @@ class View(ShownAsPrinted):
 
     @cached_property
     def distortion(self) -> Distortion:
-        """The total `Distortion`: undistorted -> detector pixels, without the pose."""
+        """The total `Distortion`: undistorted -> detector pixels, without the pose.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.distortion
+        <Distortion of exp00: degree 3, 2048 x 2048 px>
+        """
         known = self.solution.estimate.certified.get(self.name) if self.chip is None else None
         if known is not None and known.shape == self.shape and np.array_equal(known.coefficients, self.coefficients):
             return known
@@ -174,7 +205,17 @@ class View(ShownAsPrinted):
 
     @cached_property
     def model(self) -> Model:
-        """Reference plane -> pixels as an astropy compound model with inverse."""
+        """Reference plane -> pixels as an astropy compound model with inverse.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> x, y = view.model(1000.0, 500.0)
+        >>> back = view.model.inverse(x, y)
+        >>> bool(abs(back[0] - 1000) < 1e-6 and abs(back[1] - 500) < 1e-6)
+        True
+        """
         form = None if self.chip is not None else self.solution.estimate.form
         return exposure_model(self.pose, self.distortion, form)
 
@@ -196,6 +237,14 @@ class View(ShownAsPrinted):
         ------
         InputError
             Where several detectors have pixels of their own.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.distort([[1000.0, 1000.0], [-500.0, 0.0]]).round(1)
+        array([[1000.4, 1000.4],
+               [   nan,    nan]])
         """
         view = self._pixels
         if y is not None:
@@ -264,6 +313,15 @@ class View(ShownAsPrinted):
         -----
         AssumptionWarning
             Of positions with errors and without a flux, where a law of brightness was found.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> x, y = view.correct(1000.0, 500.0)
+        >>> xy, relative, absolute = view.correct([[1000.0, 500.0]], errors=[[0.05, 0.05]])
+        >>> bool(abs(xy[0, 0] - x) < 1e-9), relative.shape
+        (True, (1, 2, 2))
         """
         view = self._pixels
         if flux is not None and errors is None:
@@ -286,11 +344,30 @@ class View(ShownAsPrinted):
         ------
         FoldError
             If the distortion folds.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> import numpy as np
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> rows = view.residuals[:3]
+        >>> view.to_reference(np.column_stack([rows["x"].value, rows["y"].value])).shape
+        (3, 2)
         """
         return new_positions.correct(self, np.asarray(xy, dtype=float))[0]
 
     def supported(self, xy: ArrayLike) -> np.ndarray:
-        """Whether pixels (n, 2) lie inside the convex hull of the stars used."""
+        """Whether pixels (n, 2) lie inside the convex hull of the stars used.
+
+        Those of the detector, or of the focal plane of several. Outside the correction is extrapolated.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.supported([[1000.0, 1000.0], [-30.0, 1000.0]])
+        array([ True, False])
+        """
         return star_hull.supported(star_hull.support(self.residuals), np.asarray(xy, dtype=float).T)
 
     # -- WCS
@@ -300,6 +377,16 @@ class View(ShownAsPrinted):
         """The gwcs: detector -> undistorted -> reference -> icrs (the last if the sky is known).
 
         That of a detector in a focal plane: detector -> undistorted -> focal_plane -> reference -> icrs.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> import numpy as np
+        >>> from legdistort.geometry.tangent_plane import TangentPlane
+        >>> sky = TangentPlane(85.0, -70.0, np.array([[-2e-5, 0, 0.02], [0, 2e-5, -0.02]]))
+        >>> view = ld.solve(ld.simulate_matches(sky=sky, seed=1).matches)["exp00"]
+        >>> view.wcs.available_frames
+        ['detector', 'undistorted', 'reference', 'icrs']
         """
         from ..wcs.exposure_wcs import exposure_wcs
 
@@ -322,6 +409,16 @@ class View(ShownAsPrinted):
             If no polynomial is that close, naming the best.
         InputError
             If the sky is not known, or several detectors have pixels of their own.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> import numpy as np
+        >>> from legdistort.geometry.tangent_plane import TangentPlane
+        >>> sky = TangentPlane(85.0, -70.0, np.array([[-2e-5, 0, 0.02], [0, 2e-5, -0.02]]))
+        >>> view = ld.solve(ld.simulate_matches(sky=sky, seed=1).matches)["exp00"]
+        >>> view.header(kind="tpv", max_error=0.01)["CTYPE1"]
+        'RA---TPV'
         """
         from ..wcs.fits_headers import make_header
 
@@ -332,6 +429,16 @@ class View(ShownAsPrinted):
         """The nearest `astropy.wcs.WCS`, TAN-SIP, for what takes no other (`CCDData`, `Cutout2D`).
 
         Parameters and errors are those of `header`.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> import numpy as np
+        >>> from legdistort.geometry.tangent_plane import TangentPlane
+        >>> sky = TangentPlane(85.0, -70.0, np.array([[-2e-5, 0, 0.02], [0, 2e-5, -0.02]]))
+        >>> view = ld.solve(ld.simulate_matches(sky=sky, seed=1).matches)["exp00"]
+        >>> view.fits_wcs().array_shape
+        (2048, 2048)
         """
         wcs = WCS(self.header(max_error=max_error))
         wcs.array_shape = self._pixels.shape
@@ -347,6 +454,17 @@ class View(ShownAsPrinted):
         ------
         InputError
             If the sky is not known.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> import numpy as np
+        >>> from legdistort.geometry.tangent_plane import TangentPlane
+        >>> sky = TangentPlane(85.0, -70.0, np.array([[-2e-5, 0, 0.02], [0, 2e-5, -0.02]]))
+        >>> view = ld.solve(ld.simulate_matches(sky=sky, seed=1).matches)["exp00"]
+        >>> angle, scale = view.orientation
+        >>> round(scale, 3)
+        0.072
         """
         if self.solution.sky is None:
             raise InputError("no position angle: where the exposures lie on the sky is not known")
@@ -359,6 +477,14 @@ class View(ShownAsPrinted):
         """Standard deviations (2, n_modes) of the fitted coefficients, pixels.
 
         With the error of the common map, and NaN for what changes with an unknown direction (`Gauge.unknown`).
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> sim = ld.simulate_matches(seed=1)
+        >>> view = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static))["exp00"]
+        >>> view.errors.shape, bool((view.errors > view.relative_errors).all())
+        ((2, 10), True)
         """
         if self.chip is not None:
             return np.sqrt(detector_view.coefficient_variance(self))
@@ -368,7 +494,17 @@ class View(ShownAsPrinted):
 
     @property
     def relative_errors(self) -> np.ndarray:
-        """The same without the error of the common map, under the convention of the gauge."""
+        """Standard deviations (2, n_modes) of the coefficients without the error of the common map, pixels.
+
+        Under the convention of the gauge (`Gauge.convention`).
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.relative_errors.shape
+        (2, 10)
+        """
         return _deviations(self.relative_covariance)
 
     @property
@@ -376,12 +512,29 @@ class View(ShownAsPrinted):
         """Covariance (2 n_modes, 2 n_modes) of the fitted coefficients, px^2, x first, in the gauge.
 
         Under all its constraints, with the errors of a camera that was fitted.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.covariance.shape
+        (20, 20)
         """
         return self._covariance(absolute_errors.own_coefficients)
 
     @property
     def relative_covariance(self) -> np.ndarray:
-        """The same under the convention of the gauge alone (`Gauge.convention`)."""
+        """Covariance (2 n_modes, 2 n_modes) of the coefficients under the convention of the gauge alone, px^2.
+
+        See `Gauge.convention`.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.relative_covariance.shape
+        (20, 20)
+        """
         return self._covariance(absolute_errors.relative_coefficients)
 
     def _covariance(self, of_exposure):
@@ -416,6 +569,14 @@ class View(ShownAsPrinted):
         ------
         InputError
             Where several detectors have pixels of their own.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> x, y, sigma = view.sigma_map(n=16, support=False)
+        >>> x.shape, y.shape, sigma.shape
+        ((16,), (16,), (16, 16, 2))
         """
         return error_map(self._pixels, n=n, support=support, absolute=absolute)
 
@@ -441,6 +602,13 @@ class View(ShownAsPrinted):
         ------
         InputError
             If none of the positions was used.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.plot_residuals(scale=500).get_title(loc="left")
+        'exp00: residuals × 500'
         """
         return solution_plots.plot_residuals(self, scale=scale, ax=ax)
 
@@ -464,6 +632,13 @@ class View(ShownAsPrinted):
             Where several detectors have pixels of their own.
         FoldError
             If the distortion folds.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> view = ld.solve(ld.simulate_matches(seed=1).matches)["exp00"]
+        >>> view.plot_error_map().get_xlabel()
+        'x [px]'
         """
         return solution_plots.plot_sigma_map(*self.sigma_map(absolute=absolute), ax=ax)
 

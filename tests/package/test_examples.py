@@ -3,9 +3,14 @@
 import doctest
 import warnings
 
+import matplotlib.pyplot as plt
 import pytest
 
 import legdistort
+from legdistort.results.view import View
+
+#: Members of views that say what they are of; the others are what views are for.
+WITHOUT_EXAMPLE = {"chip", "detectors", "index", "label", "n_stars", "parts", "prior_mean", "shape"}
 
 
 @pytest.mark.parametrize("name", legdistort.__all__)
@@ -15,7 +20,21 @@ def test_examples_do_what_they_show(name, tmp_path, monkeypatch):
     (examples,) = doctest.DocTestFinder(recurse=False).find(public, name, globs={})
     assert examples.examples, "no example"
     assert "\nSee Also\n" in public.__doc__.replace("    ", "")
-    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    assert not failures(examples)
+
+
+def test_examples_of_views_do_what_they_show():
+    parser = doctest.DocTestParser()  # the finder passes over cached properties
+    names = {key for key in vars(View) if not key.startswith("_")} - set(View.__dataclass_fields__)
+    examples = {key: parser.get_doctest(getattr(View, key).__doc__, {}, key, None, 0) for key in names}
+    assert {key for key in names if not examples[key].examples} == WITHOUT_EXAMPLE
+    try:
+        assert [key for key in sorted(names) if failures(examples[key])] == []
+    finally:
+        plt.close("all")
+
+
+def failures(examples):
+    """Number of the examples of a docstring that do something else."""
     with warnings.catch_warnings():
-        failed, _ = runner.run(examples)
-    assert not failed
+        return doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(examples).failed
