@@ -143,6 +143,34 @@ def test_new_positions(solution, dense, relative, night, key):
         assert np.allclose(covariance - own, through @ relative @ through.T, atol=0.03 * np.trace(covariance))
 
 
+@pytest.mark.parametrize(("name", "key"), [("frame00", "4"), ("frame03", "2")])
+def test_coefficients_of_a_detector(solution, dense, relative, name, key):
+    """Those of its series follow coefficients and layout together, by quadrature over the detector."""
+    view, common, chip = solution[name, key], solution[name], solution.camera[key]
+    i, c, size = common.index, list(solution.camera.detectors).index(key), dense.size
+    degree = view.distortion.degree
+    t, w = np.polynomial.legendre.leggauss(2 * degree)
+    (x, y), weights = (each.ravel() for each in np.meshgrid(t, t)), np.outer(w, w).ravel()
+    q = np.stack([(x + 1) * chip.shape[1] / 2 - 0.5, (y + 1) * chip.shape[0] / 2 - 0.5], axis=1)
+    modes = weights * basis.values(degree, x, y)
+    through = np.zeros((len(q), 2, len(relative)))
+    there = similarity.apply(common.pose, similarity.apply(similarity.invert(view.pose), q))
+    for k, at in enumerate(there):
+        _, by_exposure, by_layout, f = dense.slopes(name, chip, at[None])
+        to_pixels = chip.slope(f)[0]
+        through[k, :, 2 * dense.n_stars + i * size :][:, :size] = to_pixels @ by_exposure
+        through[k, :, dense.n_first + 6 * c :][:, :6] = to_pixels @ by_layout
+    through = np.einsum("mn,nak->amk", modes, through).reshape(-1, len(relative))
+    coefficients = through[:, 2 * dense.n_stars + i * size :][:, :size]
+    for found, block in (
+        (view.covariance, own_coefficients(solution.gauge, solution.estimate.uncertainty, i)),
+        (view.relative_covariance, relative_coefficients(solution.gauge, solution.estimate.uncertainty, i)),
+    ):
+        expected = coefficients @ block @ coefficients.T + through @ relative @ through.T
+        assert np.abs(found - expected).max() < 0.02 * np.abs(expected).max()
+    assert np.allclose(view.relative_errors.ravel() ** 2, np.diag(view.relative_covariance))
+
+
 def test_kept_in_files(solution, night, tmp_path):
     again = legdistort.Solution.read(solution.write(tmp_path / "solution.asdf"))
     name = solution.names[2]

@@ -1,6 +1,8 @@
 """What every `Solution` keeps, whoever made it: it comes back from its file equal, and says the same."""
 
+import copy
 import dataclasses
+import pickle
 import warnings
 from dataclasses import FrozenInstanceError, replace
 
@@ -13,9 +15,11 @@ from astropy.table import QTable, Table
 from legdistort import Matches, Prior, Solution, solve
 from legdistort.assessment import baselines
 from legdistort.exceptions import LegdistortWarning
+from legdistort.geometry import basis
+from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.results import in_tables
 from legdistort.results.diagnostics import DegreeChoice, Diagnostics, UsedReference, Validation
-from legdistort.results.estimate import Estimate
+from legdistort.results.estimate import Estimate, StoredUncertainty, plain_covariances
 from legdistort.results.motions import StarMotions
 from legdistort.results.settings import Settings
 from legdistort.runtime.provenance import with_inputs
@@ -182,6 +186,74 @@ class TestEveryProducer:
         ):
             assert words == words.strip()
             assert words[-1] not in ",;:"
+
+    @pytest.mark.parametrize("remake", [lambda s: pickle.loads(pickle.dumps(s)), copy.copy, copy.deepcopy])
+    def test_copies(self, produced, remake):
+        """Every field of a solution and of its estimate survives; covariances as numbers, checks as they were made."""
+        filled = dataclasses.replace(
+            produced,
+            sky=produced.sky or TangentPlane(1.0, 2.0, np.eye(2, 3)),
+            left_out={"dark": "no stars"},
+            provenance=produced.provenance | {"inputs": {"a.fits": "0" * 64}},
+            checksum="1" * 64,
+            estimate=dataclasses.replace(
+                produced.estimate, certified={view.name: view.distortion for view in produced}
+            ),
+        )
+        again = remake(filled)
+        assert again is not filled
+        for field in dataclasses.fields(Solution):
+            if field.name != "estimate":
+                assert_same(getattr(filled, field.name), getattr(again, field.name), field.name)
+        for field in dataclasses.fields(Estimate):
+            one, other = (getattr(each.estimate, field.name) for each in (filled, again))
+            if field.name == "uncertainty":
+                for part in dataclasses.fields(StoredUncertainty):
+                    if part.name not in ("star_unknowns", "drift_directions") or filled.estimate.motions is not None:
+                        assert_same(getattr(one, part.name), getattr(other, part.name), part.name)
+            elif field.name == "certified":
+                assert list(one) == list(other) == list(filled.names)
+                for name in one:
+                    assert_same(one[name].coefficients, other[name].coefficients, name)
+                    assert one[name].inverse.error == other[name].inverse.error
+            elif field.name == "form":
+                assert (one is None) == (other is None)
+            elif field.name != "checked":
+                assert_same(one, other, f"estimate.{field.name}")
+        assert again.checks == filled.checks
+        assert_same(filled.stars, again.stars, "stars")
+        name = filled.names[1]
+        assert_same(filled[name].errors, again[name].errors, "errors")
+        assert_same(filled[name].sigma_map(n=3)[2], again[name].sigma_map(n=3)[2], "error map")
+        assert str(again) == str(filled)
+
+
+def test_size_of_a_pickle():
+    """Of 24,000 positions in 60 exposures; equations stay behind, and what was made from the solution."""
+    matches = simulate_matches(n_exposures=60, n_stars=400, degree=3, seed=1).matches
+    solution = solve(matches, degree=1, clip=None)
+    assert len(solution.residuals) > 23000
+    size = 2 * basis.n_modes(3)
+    covariances = replace(plain_covariances(solution.estimate), coefficients=np.zeros((60 * size, 60 * size)))
+    large = replace(solution, estimate=replace(solution.estimate, uncertainty=covariances))  # as degree 3 has them
+    assert len(pickle.dumps(large)) <= 16e6
+    before = len(pickle.dumps(solution))
+    _ = solution.stars, solution.checks, solution["exp00"].wcs, solution["exp01"].residuals
+    assert len(pickle.dumps(solution)) == pytest.approx(before, rel=0.01)
+    assert type(pickle.loads(pickle.dumps(solution)).estimate.uncertainty) is StoredUncertainty
+
+
+@pytest.mark.slow
+def test_size_of_a_pickle_of_degree_3():
+    solution = solve(simulate_matches(n_exposures=60, n_stars=400, degree=3, seed=1).matches, degree=3)
+    assert len(pickle.dumps(solution)) <= 16e6
+
+
+def test_members_are_few():
+    public = {name for name in dir(Solution) if not name.startswith("_")}
+    public |= {field.name for field in dataclasses.fields(Solution)}
+    assert len(public) <= 25, sorted(public)
+    assert len([field.name for field in dataclasses.fields(Solution)]) <= 17
 
 
 def test_absolute_errors_of_a_simpler_correction_stay_unknown(tmp_path):
