@@ -1,5 +1,7 @@
 """What a camera that was fitted adds to the errors of coefficients and new positions, against a dense solution."""
 
+import pickle
+
 import gsaoi_images
 import numpy as np
 import pytest
@@ -169,6 +171,16 @@ def test_coefficients_of_a_detector(solution, dense, relative, name, key):
         expected = coefficients @ block @ coefficients.T + through @ relative @ through.T
         assert np.abs(found - expected).max() < 0.02 * np.abs(expected).max()
     assert np.allclose(view.relative_errors.ravel() ** 2, np.diag(view.relative_covariance))
+
+
+def test_kept_in_pickles(solution):
+    again = pickle.loads(pickle.dumps(solution))
+    for part in solution[solution.names[2]].parts[:2]:
+        other = again[part.name, part.detector]
+        for key in ("covariance", "relative_errors", "errors", "coefficients", "pose"):
+            assert np.array_equal(getattr(other, key), getattr(part, key), equal_nan=True), key
+    assert np.array_equal(again.stars["x_err"], solution.stars["x_err"])
+    assert list(again.camera.detectors) == list(solution.camera.detectors)
 
 
 def test_kept_in_files(solution, night, tmp_path):
