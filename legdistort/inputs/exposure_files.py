@@ -329,7 +329,7 @@ def expand_paths(paths):
     """The argument of `read_exposures` as a flat list of sources, patterns expanded."""
     if isinstance(paths, (str, Path, fits.HDUList)) or is_nddata(paths):
         paths = [paths]
-    if not np.iterable(paths):
+    if not np.iterable(paths) or hasattr(paths, "estimate"):  # a solution goes over its views
         raise InputError(
             f"frames must be a path, an HDUList, an NDData or a sequence of them, got {type(paths).__name__}"
         )

@@ -114,7 +114,7 @@ def _ready(where, kind):
 def _of_solution(path, kind):
     """The mean distortion of the exposures of another field."""
     earlier = Solution.read(path)
-    shapes = {tuple(earlier.shapes[name]) for name in earlier.names}
+    shapes = set(earlier.estimate.shapes.values())
     if len(shapes) > 1:
         raise InputError(f"{path} has detectors of several shapes, {sorted(shapes)}; it gives no single prior")
     record = {"kind": "solution", "name": str(path), "files": {Path(path).name: earlier.checksum}}

@@ -44,7 +44,7 @@ def on_detector(view):
     InputError
         If the map is not smooth enough for a series of degree 16.
     """
-    chip, common = view.chip, view.solution[view.name]
+    chip, common = view.chip, view.common
     t = np.linspace(-1, 1, 33)
     pixels = basis.denormalize(*(a.ravel() for a in np.meshgrid(t, t)), chip.shape)
     there = similarity.apply(similarity.invert(common.pose), common.distortion.invert(chip.to_focal_plane(pixels)))
@@ -63,6 +63,19 @@ def on_detector(view):
         f"exposure {view.name}, detector {view.detector}: layout and distortions together are no smooth map of the "
         "detector; lower the degree, or look at the camera"
     )
+
+
+def without_departure(view, mean):
+    """Series (2, n_modes) of a detector, by its own pose and degree, of a static distortion of the focal plane."""
+    chip, common = view.chip, view.common
+    focal_plane = Distortion(mean, common.shape)
+    back = similarity.compose(common.pose, similarity.invert(view.pose))
+
+    def shift(u, v):
+        q = basis.denormalize(u, v, chip.shape)
+        return (chip.to_pixels(focal_plane(similarity.apply(back, q))) - q).T
+
+    return basis.project(shift, view.distortion.degree, HIGHEST + 6)
 
 
 def own_rows(view, rows):
@@ -108,7 +121,7 @@ def _responses(view):
 
     Arrays (2 n_modes of the detector, 2 n_modes of the exposure) and (the same, r).
     """
-    solution, chip, common = view.solution, view.chip, view.solution[view.name]
+    solution, chip, common = view.solution, view.chip, view.common
     degree, errors = view.distortion.degree, solution.estimate.uncertainty.camera
     back = similarity.compose(common.pose, similarity.invert(view.pose))
     x, y, weights = basis.quadrature(max(degree, HIGHEST) + 2)

@@ -39,7 +39,8 @@ class Estimate:
     checked : callable or tuple of Check
         The checks, or a function that makes them from the solution.
     certified : dict
-        ``{exposure: Distortion}`` with inverses that were certified, as long as the coefficients are the same.
+        ``{exposure: Distortion}`` that views have made, or a file has, with their certified inverses; they count as
+        long as the coefficients are the same.
     """
 
     star_names: np.ndarray

@@ -124,7 +124,7 @@ def correct_with_errors(view, xy, errors, moved=None, flux=None):
 
 def _with_errors(view, pixels, measured, moved):
     """`Corrected` of pixels of an exposure, of its focal plane if it has one, with their covariances (n, 2, 2)."""
-    corrected, q = correct(view.solution[view.name], pixels, moved)
+    corrected, q = correct(view.common, pixels, moved)
     return Corrected(corrected, *covariances(view, q, measured, moved))
 
 
@@ -190,7 +190,7 @@ def response(view, q):
 
     `q` (n, 2) are undistorted pixels of an exposure, of its focal plane if it has one.
     """
-    common, degree = view.solution[view.name], view.solution.degree
+    common, degree = view.common, view.solution.degree
     back = np.linalg.inv(common.distortion.jacobian(q) @ common.pose[:, :2])
     b = basis.values(degree, *basis.normalize(q, common.shape))
     return np.einsum("nac,mn->nacm", back, b).reshape(len(q), 2, -1), back
@@ -227,7 +227,7 @@ def covariances(view, q, measured, moved=None):
         directions = directions + moved.columns @ uncertainty.drift_directions[terms[:2]]
     absolute = own + carried(directions, hidden)
     if uncertainty.camera:
-        f = solution[view.name].distortion(q)
+        f = view.common.distortion(q)
         absolute[uncertainty.camera.lost(solution.camera, f, view.detector)] = np.nan
     for each in gauge.unknown:
         moved = by_modes @ widened(each.coefficients[i].reshape(-1, 1), solution.degree)
@@ -250,7 +250,7 @@ def by_camera(view, q, by_modes, back):
     errors = solution.estimate.uncertainty.camera
     if errors is None:
         return np.zeros((len(q), 2, 2))
-    seen = errors.in_focal_plane(solution.camera, solution[view.name].distortion(q), view.detector)
+    seen = errors.in_focal_plane(solution.camera, view.common.distortion(q), view.detector)
     through = back @ seen - by_modes @ errors.coefficients[view.index]
     return through @ through.mT
 

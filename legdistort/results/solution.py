@@ -21,7 +21,7 @@ from .errors import absolute_errors
 from .estimate import Estimate, plain_covariances
 from .gauge import Gauge
 from .settings import Settings
-from .view import View, check_key
+from .view import View, check_key, has_key
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -126,15 +126,8 @@ class Solution(ShownAsPrinted):
     # -- exposures
 
     def __getitem__(self, key: str | tuple[str, str]) -> View:
-        """View of an exposure, by its name, or of a detector, by both."""
-        name, detector = check_key(self, key)
-        if (name, detector) not in self._views:
-            self._views[name, detector] = View(self, name, detector)
-        return self._views[name, detector]
-
-    @cached_property
-    def _views(self):
-        return {}
+        """View of an exposure, by its name, or of a detector, by both; a new one, which keeps what it has made."""
+        return View(self, *check_key(self, key))
 
     def __iter__(self) -> Iterator[View]:
         return (self[name] for name in self.names)
@@ -152,8 +145,7 @@ class Solution(ShownAsPrinted):
         return replace(self)
 
     def __contains__(self, key: object) -> bool:
-        name, detector = key if isinstance(key, tuple) and len(key) == 2 else (key, None)
-        return name in self.names and (detector is None or str(detector) in self[name].detectors)
+        return has_key(self, key)
 
     @cached_property
     def checks(self) -> tuple[Check, ...]:

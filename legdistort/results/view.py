@@ -18,6 +18,7 @@ from ..geometry.distortion import Distortion
 from ..geometry.models import exposure_model, like, outside, to_pixels
 from ..inputs.exposure_names import detector_name
 from ..plots import solution_plots
+from ..runtime.checks import check_counts
 from ..runtime.notebook import ShownAsPrinted
 from . import detector_view, new_positions
 from .errors import absolute_errors
@@ -109,7 +110,7 @@ class View(ShownAsPrinted):
         """Views whose pixels are those of images: this one, or those of all detectors of a focal plane."""
         if self.chip is not None or not self.solution.camera.has_focal_plane:
             return (self,)
-        return tuple(self.solution[self.name, key] for key in self.detectors)
+        return tuple(View(self.solution, self.name, key) for key in self.detectors)
 
     @property
     def chip(self) -> Detector | None:
@@ -117,15 +118,13 @@ class View(ShownAsPrinted):
         camera = self.solution.camera
         return camera[self.detector] if camera.has_focal_plane and self.detector is not None else None
 
-    @property
-    def _pixels(self) -> View:
-        """The view whose pixels are meant; `InputError` where several detectors have some."""
-        if len(parts := self.parts) == 1:
-            return parts[0]
-        raise InputError(
-            f"exposure {self.name} has several detectors, {some_of(self.detectors, _MOST_NAMED)}, with pixels of their "
-            f"own: say which, solution[{self.name!r}, {self.detectors[0]!r}]"
-        )
+    def check_pixels(self) -> None:
+        """Raise `InputError` if its pixels are those of a focal plane, and of no image."""
+        if self.chip is None and self.solution.camera.has_focal_plane:
+            raise InputError(
+                f"exposure {self.name} has detectors, {some_of(self.detectors, _MOST_NAMED)}, with their own pixels; "
+                f"say which: solution[{self.name!r}, {self.detectors[0]!r}]"
+            )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -146,6 +145,11 @@ class View(ShownAsPrinted):
         table = self.solution.residuals
         rows = table[np.asarray(table["exposure"] == self.name)]
         return rows if self.chip is None else detector_view.own_rows(self, rows)
+
+    @cached_property
+    def common(self) -> View:
+        """What the detectors of the exposure have in common: this view itself, but for a detector in a focal plane."""
+        return self if self.chip is None else View(self.solution, self.name)
 
     # -- the map
 
@@ -182,10 +186,11 @@ class View(ShownAsPrinted):
         """
         return self.solution.coefficients[self.index] if self.chip is None else self._whole.coefficients
 
-    @property
+    @cached_property
     def prior_mean(self) -> np.ndarray:
         """Static distortion around which it lies, modes as those fitted; zero without a prior."""
-        return self.solution.estimate.prior_mean[self.index]
+        mean = self.solution.estimate.prior_mean[self.index]
+        return mean if self.chip is None else detector_view.without_departure(self, mean)
 
     @cached_property
     def distortion(self) -> Distortion:
@@ -198,10 +203,13 @@ class View(ShownAsPrinted):
         >>> view.distortion
         <Distortion of exp00: degree 3, 2048 x 2048 px>
         """
-        known = self.solution.estimate.certified.get(self.name) if self.chip is None else None
+        if self.chip is not None:
+            return Distortion(self.coefficients, self.shape, self.label)
+        known = self.solution.estimate.certified.get(self.name)
         if known is not None and known.shape == self.shape and np.array_equal(known.coefficients, self.coefficients):
             return known
-        return Distortion(self.coefficients, self.shape, self.label)
+        self.solution.estimate.certified[self.name] = made = Distortion(self.coefficients, self.shape, self.name)
+        return made
 
     @cached_property
     def model(self) -> Model:
@@ -246,17 +254,16 @@ class View(ShownAsPrinted):
         array([[1000.4, 1000.4],
                [   nan,    nan]])
         """
-        view = self._pixels
+        self.check_pixels()
         if y is not None:
-            return _one_by_one(view.distort, x, y)
-        places = np.atleast_2d(to_pixels(x))
-        q = similarity.apply(view.pose, places)
-        if view.chip is None:
-            p = view.distortion(q)
+            return _one_by_one(self.distort, x, y)
+        places = _points(x)
+        q = similarity.apply(self.pose, places)
+        if self.chip is None:
+            p = self.distortion(q)
         else:
-            common = view.solution[view.name]
-            p = view.chip.to_pixels(common.distortion(similarity.apply(common.pose, places)))
-        p[outside(view.distortion.inverse.valid, q[:, 0], q[:, 1])] = np.nan
+            p = self.chip.to_pixels(self.common.distortion(similarity.apply(self.common.pose, places)))
+        p[outside(self.distortion.inverse.valid, q[:, 0], q[:, 1])] = np.nan
         return like(x, p)
 
     def correct(
@@ -323,19 +330,19 @@ class View(ShownAsPrinted):
         >>> bool(abs(xy[0, 0] - x) < 1e-9), relative.shape
         (True, (1, 2, 2))
         """
-        view = self._pixels
+        self.check_pixels()
         if flux is not None and errors is None:
             raise InputError("flux tells the errors of measured positions by a law of brightness: give errors too")
         if y is not None:
             if errors is not None:
                 raise InputError("errors go with points: give positions (n, 2) in the place of x and y")
-            return _one_by_one(view.correct, x, y, epoch=epoch, stars=stars)
-        pixels = np.atleast_2d(to_pixels(x))
-        moved = new_positions.movement(view.solution, view.name, stars, epoch, len(pixels))
+            return _one_by_one(self.correct, x, y, epoch=epoch, stars=stars)
+        pixels = _points(x)
+        moved = new_positions.movement(self.solution, self.name, stars, epoch, len(pixels))
         if errors is not None:
-            return new_positions.correct_with_errors(view, x, errors, moved, flux)
-        pixels = pixels if view.chip is None else view.chip.to_focal_plane(pixels)
-        return like(x, new_positions.correct(view.solution[view.name], pixels, moved)[0])
+            return new_positions.correct_with_errors(self, x, errors, moved, flux)
+        pixels = pixels if self.chip is None else self.chip.to_focal_plane(pixels)
+        return like(x, new_positions.correct(self.common, pixels, moved)[0])
 
     def to_reference(self, xy: ArrayLike) -> np.ndarray:
         """Pixels (n, 2) as `residuals` has them, of several detectors those of the focal plane -> reference positions.
@@ -354,7 +361,7 @@ class View(ShownAsPrinted):
         >>> view.to_reference(np.column_stack([rows["x"].value, rows["y"].value])).shape
         (3, 2)
         """
-        return new_positions.correct(self, np.asarray(xy, dtype=float))[0]
+        return new_positions.correct(self, _points(xy))[0]
 
     def supported(self, xy: ArrayLike) -> np.ndarray:
         """Whether pixels (n, 2) lie inside the convex hull of the stars used.
@@ -368,7 +375,7 @@ class View(ShownAsPrinted):
         >>> view.supported([[1000.0, 1000.0], [-30.0, 1000.0]])
         array([ True, False])
         """
-        return star_hull.supported(star_hull.support(self.residuals), np.asarray(xy, dtype=float).T)
+        return star_hull.supported(star_hull.support(self.residuals), _points(xy).T)
 
     # -- WCS
 
@@ -390,9 +397,8 @@ class View(ShownAsPrinted):
         """
         from ..wcs.exposure_wcs import exposure_wcs
 
-        view = self._pixels
-        common = view.solution[view.name]
-        return exposure_wcs(view.name, common.pose, common.distortion, view.solution.sky, view.chip)
+        self.check_pixels()
+        return exposure_wcs(self.name, self.common.pose, self.common.distortion, self.solution.sky, self.chip)
 
     def header(self, *, kind: str = "sip", max_error: float = 1e-3) -> Header:
         """FITS header, TAN-SIP or TPV, with its error in it.
@@ -422,8 +428,8 @@ class View(ShownAsPrinted):
         """
         from ..wcs.fits_headers import make_header
 
-        view = self._pixels
-        return make_header(view.pose, view.distortion, view.solution.sky, kind=kind, max_error=max_error)
+        self.check_pixels()
+        return make_header(self.pose, self.distortion, self.solution.sky, kind=kind, max_error=max_error)
 
     def fits_wcs(self, *, max_error: float = 1e-3) -> WCS:
         """The nearest `astropy.wcs.WCS`, TAN-SIP, for what takes no other (`CCDData`, `Cutout2D`).
@@ -441,7 +447,7 @@ class View(ShownAsPrinted):
         (2048, 2048)
         """
         wcs = WCS(self.header(max_error=max_error))
-        wcs.array_shape = self._pixels.shape
+        wcs.array_shape = self.shape
         return wcs
 
     @property
@@ -578,7 +584,9 @@ class View(ShownAsPrinted):
         >>> x.shape, y.shape, sigma.shape
         ((16,), (16,), (16, 16, 2))
         """
-        return error_map(self._pixels, n=n, support=support, absolute=absolute)
+        self.check_pixels()
+        check_counts(n=n)
+        return error_map(self, n=n, support=support, absolute=absolute)
 
     # -- pictures
 
@@ -673,6 +681,24 @@ class View(ShownAsPrinted):
         return "\n".join(lines)
 
 
+def _pair(solution, key):
+    """Name of an exposure and id of a detector, or None, of a key; single detectors are exposures of their own."""
+    name, detector = key if isinstance(key, tuple) and len(key) == 2 else (key, None)
+    detector = None if detector is None else str(detector)
+    if isinstance(name, str) and detector is not None and name not in solution.names:
+        alone = detector_name(name, detector)
+        name = alone if alone in solution.names else name
+    return name, detector
+
+
+def has_key(solution, key):
+    """Whether a solution has the exposure, or the detector of an exposure, that a key means."""
+    name, detector = _pair(solution, key)
+    if not isinstance(name, str) or name not in solution.names:
+        return False
+    return detector is None or detector in View(solution, name).detectors
+
+
 def check_key(solution, key):
     """Exposure and detector (None for all of it) that a key of a solution means.
 
@@ -681,20 +707,20 @@ def check_key(solution, key):
     InputError
         For an exposure or a detector that is not there, naming what is.
     """
-    name, detector = key if isinstance(key, tuple) and len(key) == 2 else (key, None)
-    if name not in solution.names:
+    name, detector = _pair(solution, key)
+    if not isinstance(name, str) or name not in solution.names:
         left_out = isinstance(name, str) and name in solution.left_out
         why = f": it was left out ({solution.left_out[name]})" if left_out else ""
         near = [] if why else get_close_matches(str(name), solution.names, n=3)
         meant = f" (do you mean {' or '.join(near)}?)" if near else ""
         known = some_of(list(solution.names), _MOST_NAMED)
         raise InputError(f"no exposure {name!r} in the solution{why}{meant}; it has {known}")
-    detectors = solution[name].detectors if detector is not None else ()
-    if detector is not None and str(detector) not in detectors:
+    detectors = View(solution, name).detectors
+    if detector is not None and detector not in detectors:
         raise InputError(
-            f"exposure {name} has no detector {str(detector)!r}; it has {some_of(list(detectors), _MOST_NAMED)}"
+            f"exposure {name} has no detector {detector!r}; it has {some_of(list(detectors), _MOST_NAMED)}"
         )
-    return name, None if detector is None else str(detector)
+    return name, detector
 
 
 def image_view(solution, image):
@@ -712,8 +738,7 @@ def error_map(view, *, n=64, support=True, absolute=False):
     x = np.linspace(-0.5, nx - 0.5, max(2, round(nx / step)))
     y = np.linspace(-0.5, ny - 0.5, max(2, round(ny / step)))
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    common = view.solution[view.name]
-    q = common.distortion.invert(grid if view.chip is None else view.chip.to_focal_plane(grid))
+    q = view.common.distortion.invert(grid if view.chip is None else view.chip.to_focal_plane(grid))
     if absolute:
         covariance = new_positions.covariances(view, q, np.zeros((len(q), 2, 2)))[1]
     else:
@@ -729,9 +754,17 @@ def _deviations(covariance):
     return np.sqrt(np.diag(covariance)).reshape(2, -1)
 
 
+def _points(xy):
+    """Positions (n, 2) as floats, pixels taken off quantities."""
+    return np.atleast_2d(similarity.as_positions(to_pixels(xy)))
+
+
 def _one_by_one(function, x, y, **keywords):
     """A function of points for x and y apart: two arrays, or numbers, of their common shape."""
     quantity = isinstance(x, u.Quantity) or isinstance(y, u.Quantity)
-    x, y = np.broadcast_arrays(to_pixels(x), to_pixels(y))
+    try:
+        x, y = np.broadcast_arrays(to_pixels(x), to_pixels(y))
+    except ValueError:
+        raise InputError(f"x and y must have one shape, got {np.shape(x)} and {np.shape(y)}") from None
     out = function(np.stack([x.ravel(), y.ravel()], axis=1), **keywords).T.reshape(2, *x.shape)
     return tuple(each * u.pix if quantity else each[()] for each in out)

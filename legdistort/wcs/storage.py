@@ -37,7 +37,8 @@ NOTE = (
 
 def wcs_tree(view):
     """The ASDF tree of a view of one image: its gwcs at ``meta.wcs``, with the errors of inverses."""
-    common, chip = view.solution[view.name], view.chip
+    view.check_pixels()
+    common, chip = view.common, view.chip
     origin = view.solution.provenance or provenance.stamp()
     wcs = exposure_wcs(view.name, common.pose, common.distortion, view.solution.sky, chip, shared=True)
     meta = {"wcs": wcs, "exposure": view.name}

@@ -12,9 +12,9 @@ import legdistort as ld
 from legdistort.cli import parser
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs import column_contract
-from legdistort.matching.matches import Matches
 from legdistort.inputs.reference_catalogue import read_reference
 from legdistort.inputs.table_files import read_table
+from legdistort.matching.matches import Matches
 from legdistort.measurement.flags import Flag
 from legdistort.simulation.observations import simulate_matches
 

@@ -19,10 +19,10 @@ import legdistort
 from legdistort.cli import parser
 from legdistort.exceptions import AssumptionWarning, InputError, LegdistortError
 from legdistort.inputs import column_contract
-from legdistort.matching.matches import Matches
 from legdistort.inputs.star_lists import sextractor
 from legdistort.inputs.star_lists.formats import stack
 from legdistort.inputs.table_files import read_table, write_stars
+from legdistort.matching.matches import Matches
 from legdistort.measurement.positions import Flag
 from legdistort.priors.prior import Prior
 from legdistort.results.solution import Solution

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from legdistort.exceptions import InputError, MatchError
 from legdistort.geometry import similarity
-from legdistort.matching.matches import Matches
 from legdistort.inputs.table_files import read_table
+from legdistort.matching.matches import Matches
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
 
 SHAPE = (2048, 2048)

@@ -24,8 +24,8 @@ from legdistort.exceptions import AssumptionWarning, InputError, MatchError
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.exposure_files import open_exposures, read_exposures
 from legdistort.inputs.exposures import Exposure
-from legdistort.matching.matches import Matches
 from legdistort.inputs.table_files import read_table
+from legdistort.matching.matches import Matches
 from legdistort.measurement.injection import MoffatStars, inject
 from legdistort.measurement.options import MeasureOptions
 from legdistort.priors.prior import Prior

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 from legdistort.exceptions import AssumptionWarning
 from legdistort.geometry import similarity
 from legdistort.geometry.distortion import Distortion
-from legdistort.matching.matches import Matches
 from legdistort.matching.matcher import match
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy, new_positions
 from legdistort.simulation.observations import simulate_matches

@@ -19,8 +19,8 @@ from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry.epochs import mean_epoch, year
 from legdistort.geometry.tangent_plane import TangentPlane
-from legdistort.matching.matches import Matches
 from legdistort.inputs.reference_catalogue import read_reference
+from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy, in_tables
 from legdistort.results.solution import Solution
