@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 _MOST_NAMED = 6
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, repr=False)
 class View(ShownAsPrinted):
     """One exposure of a solution, or one detector of it.
 
@@ -122,8 +122,8 @@ class View(ShownAsPrinted):
         """Raise `InputError` if its pixels are those of a focal plane, and of no image."""
         if self.chip is None and self.solution.camera.has_focal_plane:
             raise InputError(
-                f"exposure {self.name} has detectors, {some_of(self.detectors, _MOST_NAMED)}, with their own pixels; "
-                f"say which: solution[{self.name!r}, {self.detectors[0]!r}]"
+                f"exposure {self.name} has detectors, {some_of(self.detectors, _MOST_NAMED)}, with their own pixels: "
+                f"say which, solution[{self.name!r}, {self.detectors[0]!r}]"
             )
 
     @property
@@ -762,8 +762,9 @@ def _points(xy):
 def _one_by_one(function, x, y, **keywords):
     """A function of points for x and y apart: two arrays, or numbers, of their common shape."""
     quantity = isinstance(x, u.Quantity) or isinstance(y, u.Quantity)
+    x, y = to_pixels(x), to_pixels(y)
     try:
-        x, y = np.broadcast_arrays(to_pixels(x), to_pixels(y))
+        x, y = np.broadcast_arrays(x, y)
     except ValueError:
         raise InputError(f"x and y must have one shape, got {np.shape(x)} and {np.shape(y)}") from None
     out = function(np.stack([x.ravel(), y.ravel()], axis=1), **keywords).T.reshape(2, *x.shape)

@@ -743,7 +743,7 @@ class TestFrames:
         folder, _, _ = frames
         exposures = legdistort.read_exposures(f"{folder}/*.fits", ext="SCI")
         assert [e.name for e in exposures[:4]] == ["exp0-1", "exp1-1", "exp1-2", "exp2-1"]
-        assert {(e.frame, e.detector) for e in exposures[:3]} == {("exp0", "1"), ("exp1", "1"), ("exp1", "2")}
+        assert {(e.exposure, e.detector) for e in exposures[:3]} == {("exp0", "1"), ("exp1", "1"), ("exp1", "2")}
         for exposure in exposures[1:3]:  # the planes of its own detector
             assert np.argwhere(exposure.mask).tolist() == [[50 + 10 * int(exposure.detector), 60]]
             assert np.allclose(exposure.uncertainty**2, np.maximum(exposure.data, 1), rtol=1e-3, atol=6e4)
@@ -878,7 +878,7 @@ class TestFrames:
             fits.HDUList([*(hdu.copy() for hdu in hdulist), extra]).writeto(tmp_path / "exp2.fits")
         paths = [*sorted(folder.glob("exp[0134].fits")), tmp_path / "exp2.fits"]
         exposures = legdistort.read_exposures(paths, ext="SCI")
-        assert [e.name for e in exposures if e.frame == "exp2"] == ["exp2-1", "exp2-2", "exp2-3"]
+        assert [e.name for e in exposures if e.exposure == "exp2"] == ["exp2-1", "exp2-2", "exp2-3"]
         if known:
             with pytest.raises(
                 InputError, match=r"exp2-3 is of detector 3, and camera TWO has 1, 2: .* leave these ext"

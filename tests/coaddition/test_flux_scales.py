@@ -70,7 +70,7 @@ class TestFluxScale:
                 rows.append((f"frame{i}-{key}", star, flux * np.exp(rng.normal(0, 0.01)), True))
         seen = views(QTable(rows=rows, names=["exposure", "star", "flux", "used"]))
         frames = [
-            Exposure(f"frame{i}-{key}", np.ones(SHAPE), exposure_time=60.0, frame=f"frame{i}", detector=key)
+            Exposure(f"frame{i}-{key}", np.ones(SHAPE), exposure_time=60.0, exposure=f"frame{i}", detector=key)
             for i in range(3)
             for key in "ab"
         ]
@@ -88,7 +88,7 @@ class TestFluxScale:
             (f"frame{i}-{k}", f"{k}{star}", 100.0 * star * (1 + i), True) for i, k in parts for star in range(1, 20)
         ]
         seen = views(QTable(rows=rows, names=["exposure", "star", "flux", "used"]))
-        frames = [Exposure(f"frame{i}-{k}", np.ones(SHAPE), frame=f"frame{i}", detector=k) for i, k in parts]
+        frames = [Exposure(f"frame{i}-{k}", np.ones(SHAPE), exposure=f"frame{i}", detector=k) for i, k in parts]
         factors, _ = flux_scales(frames, "auto", seen)
         assert [factors[f.name] / factors["frame0-a"] for f in frames] == pytest.approx([1, 1, 0.5, 0.5])
 

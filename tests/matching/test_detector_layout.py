@@ -86,7 +86,7 @@ def test_images_without_wcs(night, matches):
     exposures = [
         Exposure(
             f"{name}-{key}", np.broadcast_to(np.float32(0), (2048, 2048)), header=fits.Header({"MJD-OBS": date}),
-            frame=name, detector=key,
+            exposure=name, detector=key,
         )
         for name, date in dates.items()
         for key in "1234"

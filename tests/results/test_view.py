@@ -74,7 +74,7 @@ def test_a_solution_holds_its_exposures(solution):
     assert len(solution) == 5
     assert [view.name for view in solution] == list(solution.names) == [f"exp{i:02d}" for i in range(5)]
     assert all(isinstance(view, View) and view.solution is solution for view in solution)
-    assert solution["exp03"] is solution["exp03"]
+    assert solution["exp03"] == solution["exp03"]
     for key, there in (("exp01", True), (("exp01", "1"), True), ("exp09", False), (("exp01", "2"), False),
                        (("exp09", "1"), False), (3, False), (None, False)):  # fmt: skip
         assert (key in solution) is there, key
@@ -98,7 +98,7 @@ def test_unknown_names(solution, several):
 
 def test_ids_may_be_numbers(several):
     solution, _ = several
-    assert solution["frame1", 2] is solution["frame1", "2"]
+    assert solution["frame1", 2] == solution["frame1", "2"]
     assert ("frame1", 2) in solution
 
 
@@ -128,9 +128,9 @@ def test_what_it_is_of(solution, several):
 
 def test_the_view_of_an_image(solution, several):
     data = np.zeros((30, 20))
-    assert image_view(solution, Exposure("exp02", data)) is solution["exp02"]
+    assert image_view(solution, Exposure("exp02", data)) == solution["exp02"]
     assert image_view(solution, Exposure("other", data)) is None
-    part = Exposure("frame2-1", data, frame="frame2", detector="1")
+    part = Exposure("frame2-1", data, exposure="frame2", detector="1")
     assert image_view(several[0], part) is several[0]["frame2", "1"]
     assert image_view(several[0], replace(part, detector="3")) is None
 
@@ -350,7 +350,7 @@ def test_a_view_goes_into_a_pickle(view, several):
 
 def test_an_exposure_of_several_detectors_asks_for_one(several):
     view = several[0]["frame1"]
-    words = r"exposure frame1 has several detectors, 1, 2, .* solution\['frame1', '1'\]"
+    words = r"exposure frame1 has detectors, 1, 2, .* solution\['frame1', '1'\]"
     for call in (
         lambda: view.correct([[1.0, 2.0]]),
         lambda: view.correct(1.0, 2.0),
@@ -365,6 +365,12 @@ def test_an_exposure_of_several_detectors_asks_for_one(several):
     ):
         with pytest.raises(InputError, match=words):
             call()
+    with pytest.raises(InputError, match=words):
+        view.check_pixels()
+    assert view.common is view
+    detector = several[0]["frame1", "2"]
+    detector.check_pixels()
+    assert detector.common == view
 
 
 def test_the_focal_plane(several):
@@ -510,7 +516,7 @@ def test_a_mosaic_weighted_by_the_error_maps_of_detectors(several):
     """Values of flat images come out as the errors of the correction at their pixels have them."""
     solution, _ = several
     images = [
-        Exposure(part.label, np.full(part.shape, 10.0 * part.index + k + 1), frame=part.name, detector=part.detector)
+        Exposure(part.label, np.full(part.shape, 10.0 * part.index + k + 1), exposure=part.name, detector=part.detector)
         for view in solution
         for k, part in enumerate(view.parts)
     ]
