@@ -163,6 +163,10 @@ def use_prior(path):
     repr(ld.Prior.from_file(path, **given))
 
 
+def use_camera(path):
+    repr(ld.Camera.read(path))
+
+
 def use_psf(path):
     repr(read_psf(path))
 
@@ -191,6 +195,7 @@ READERS = {
     "solution": (use_solution, ["solution.asdf"]),
     "wcs": (use_wcs, ["wcs.asdf"]),
     "prior": (use_prior, ["prior.asdf", "frame_sip.fits", "sip.head", "solution.asdf"]),
+    "camera": (use_camera, ["camera.asdf"]),
     "psf": (use_psf, ["psf.fits"]),
     "grid": (use_grid, ["frame_sip.fits", "sip.head"]),
     "reference": (use_reference, ["gaia.csv", "gaia.vot"]),

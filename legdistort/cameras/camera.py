@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from dataclasses import field as stored
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,8 @@ from ..geometry.gsaoi import GSAOI_SIZE, GsaoiMap
 from ..inputs import column_contract
 from ..inputs.file_images import of_files
 from ..runtime.notebook import ShownAsPrinted
+from ..runtime.trees import codec
+from ..runtime.trees.facts import SIZE, array, keyed
 from . import storage
 from .detector import Detector
 from .from_wcs import camera_of
@@ -93,9 +96,11 @@ class Camera(ShownAsPrinted):
     """
 
     name: str
-    detectors: dict[str, Detector]
-    field: tuple[int, int] | None = None
-    common_sigma: np.ndarray | None = None
+    detectors: dict[str, Detector] = stored(metadata=keyed("id"))
+    field: tuple[int, int] | None = stored(default=None, metadata=SIZE)
+    common_sigma: np.ndarray | None = stored(
+        default=None, metadata=array(2, "modes", unit="pix", minimum=0, infinite=True)
+    )
 
     def __post_init__(self) -> None:
         if not isinstance(self.detectors, dict) or not self.detectors:
@@ -395,7 +400,7 @@ class Camera(ShownAsPrinted):
 
     def to_meta(self) -> dict[str, Any]:
         """The camera as plain numbers, lists and strings, for the header of a table file; see `from_meta`."""
-        return storage.to_tree(self, plain=True)
+        return codec.to_tree(self, plain=True)
 
     @classmethod
     def from_meta(cls, meta: Mapping[str, Any]) -> Camera:

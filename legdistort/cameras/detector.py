@@ -12,6 +12,7 @@ from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
 from ..runtime.notebook import ShownAsPrinted
+from ..runtime.trees.facts import SIZE, array
 from .source import check_shape
 
 if TYPE_CHECKING:
@@ -97,13 +98,17 @@ class Detector(ShownAsPrinted):
     array([[-140.,   20.]])
     """
 
-    shape: tuple[int, int]
+    shape: tuple[int, int] = field(metadata=SIZE)
     _: KW_ONLY
-    layout: np.ndarray = field(default_factory=lambda: np.eye(2, 3))
-    static: np.ndarray | None = None
-    layout_sigma: np.ndarray | None = None
-    static_sigma: np.ndarray | None = None
-    layout_covariance: np.ndarray | None = None
+    layout: np.ndarray = field(default_factory=lambda: np.eye(2, 3), metadata=array(2, 3, unit="pix", invertible=True))
+    static: np.ndarray | None = field(default=None, metadata=array(2, "modes", unit="pix"))
+    layout_sigma: np.ndarray | None = field(default=None, metadata=array(2, 3, unit="pix", minimum=0, infinite=True))
+    static_sigma: np.ndarray | None = field(
+        default=None, metadata=array(2, "modes", unit="pix", minimum=0, infinite=True)
+    )
+    layout_covariance: np.ndarray | None = field(
+        default=None, metadata=array(6, 6, unit="pix2", covariance=True, infinite=True)
+    )
 
     def __post_init__(self) -> None:
         shape = check_shape(self.shape)

@@ -3,49 +3,29 @@
 from functools import partial
 
 import asdf
-import numpy as np
 
 from ..exceptions import InputError
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, check_layout, check_tree, read_tree, understood
 from ..runtime.outputs import replacing
-from .detector import Detector
+from ..runtime.trees import codec
 
 #: Version of the layout under ``legdistort_camera``.
 LAYOUT = 1
-_ARRAYS = "layout", "static", "layout_sigma", "static_sigma", "layout_covariance"
+#: Entry of a file under which a camera stands.
+ROOT = "legdistort_camera"
 
 
-def to_tree(camera, *, plain=False):
-    """A `Camera` as a tree; `plain` makes lists of its arrays."""
-    detectors = []
-    for key, each in camera.detectors.items():
-        arrays = {name: getattr(each, name) for name in _ARRAYS}
-        if plain:
-            arrays = {name: None if array is None else array.tolist() for name, array in arrays.items()}
-        detectors.append({"id": key, "shape": list(each.shape)} | arrays)
-    common = camera.common_sigma
-    common = common.tolist() if plain and common is not None else common
-    return {"name": camera.name, "field": list(camera.field), "detectors": detectors, "common_sigma": common}
-
-
-def from_tree(tree, kind):
-    """The `Camera`, the `kind`, of a tree; arrays may be lists."""
-    detectors = {}
-    for each in tree["detectors"]:
-        given = {name: each.get(name) for name in _ARRAYS}
-        arrays = {name: None if array is None else np.array(array, dtype=float) for name, array in given.items()}
-        detectors[each["id"]] = Detector(tuple(each["shape"]), **arrays)
-    if len(detectors) < len(tree["detectors"]):
-        raise InputError("two detectors have the same id")
-    return kind(tree["name"], detectors, tuple(tree["field"]), tree.get("common_sigma"))
+def from_tree(tree, kind, where=ROOT):
+    """The `Camera`, the `kind`, of a tree; `where` is how messages call it."""
+    return codec.from_tree(kind, tree, where, strict=False)
 
 
 def write_camera(camera, path, *, overwrite=False):
     """Write a `Camera` to an ASDF file; returns the path."""
-    tree = {"layout": LAYOUT, "provenance": provenance.stamp()} | to_tree(camera)
+    tree = {"layout": LAYOUT, "provenance": provenance.stamp()} | codec.to_tree(camera)
     with replacing(path, overwrite=overwrite) as file:
-        asdf.AsdfFile({"legdistort_camera": tree}, version=ASDF_STANDARD).write_to(file)
+        asdf.AsdfFile({ROOT: tree}, version=ASDF_STANDARD).write_to(file)
     return path
 
 
@@ -57,9 +37,9 @@ def read_camera(path, kind):
     InputError
         If the file is not one that `write_camera` wrote, was damaged since, or has a newer layout.
     """
-    tree = read_tree(path).get("legdistort_camera")
+    tree = read_tree(path).get(ROOT)
     if not isinstance(tree, dict) or "layout" not in tree:
-        raise InputError(f"{path} holds no legdistort camera (no entry 'legdistort_camera'); write one: Camera.write")
+        raise InputError(f"{path} holds no legdistort camera (no entry '{ROOT}'); write one: Camera.write")
     check_layout(tree["layout"], LAYOUT, path)
-    check_tree({"legdistort_camera": tree}, "camera-1.0.0", path)
+    check_tree({ROOT: tree}, "camera-1.0.0", path)
     return understood(path, partial(from_tree, kind=kind), tree)

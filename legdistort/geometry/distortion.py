@@ -7,7 +7,7 @@ Legendre tensor whose degree is raised until the round trip holds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from ..exceptions import FoldError, InputError
 from ..runtime.notebook import ShownAsPrinted
+from ..runtime.trees.facts import array, number
 from . import basis, similarity
 from .models import CHUNK, correction_model
 
@@ -43,9 +44,9 @@ class Inverse:
         ``(x_min, x_max, y_min, y_max)``: box of undistorted pixels around the image of the detector.
     """
 
-    tensors: np.ndarray
-    error: float
-    valid: tuple[tuple[float, float], tuple[float, float]]
+    tensors: np.ndarray = field(metadata=array(2, "n", "n", unit="pix"))
+    error: float = field(metadata=number(entry="error_px", minimum=0, maximum=TOLERANCE, unit="pix"))
+    valid: tuple[float, float, float, float] = field(metadata=number(entry="valid_undistorted_px", unit="pix"))
 
     def __repr__(self) -> str:
         return f"<Inverse: degree {self.tensors.shape[1] - 1}, error {self.error:.1e} px>"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from astropy.modeling.core import FittableModel
 from astropy.modeling.parameters import Parameter
 
 from ..runtime.notebook import ShownAsPrinted
+from ..runtime.trees.facts import array, number
 from .models import CHUNK, leaves
 from .similarity import apply, invert
 
@@ -86,9 +87,9 @@ class TangentPlane(ShownAsPrinted):
         Reference-plane pixels -> (xi, eta) on the tangent plane, degrees, xi to the east.
     """
 
-    lon: float
-    lat: float
-    matrix: np.ndarray
+    lon: float = field(metadata=number(minimum=-360, maximum=360, unit="deg"))
+    lat: float = field(metadata=number(minimum=-90, maximum=90, unit="deg"))
+    matrix: np.ndarray = field(metadata=array(2, 3, unit="deg", invertible=True))
 
     def __repr__(self) -> str:
         return f"<TangentPlane: {self.lon:.5f} {self.lat:+.5f} deg, {self.pixel_scale:.4f} arcsec/px>"

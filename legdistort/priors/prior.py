@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from ..cameras.source import check_shape
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis
 from ..runtime.notebook import ShownAsPrinted
+from ..runtime.trees.facts import SIZE, array, number
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -27,6 +28,7 @@ EVIDENCE = "evidence"
 HEADER = "header"
 #: Source of a mean whose source is not stated.
 UNSTATED = "unstated"
+_WIDTHS = array(2, "n_modes", unit="pix", minimum=0, infinite=True, choices=(EVIDENCE,))
 
 
 def _per_mode(value, n, name):
@@ -119,13 +121,13 @@ class Prior(ShownAsPrinted):
     <Prior: degree 3, 10 modes an axis, static_sigma given>
     """
 
-    mean: np.ndarray | None
+    mean: np.ndarray | None = field(metadata=array(2, "n_modes", unit="pix", entry="coefficients"))
     _: KW_ONLY
-    sigma: np.ndarray | str | None = None
-    static_sigma: np.ndarray | float | None = None
-    shape: tuple[int, int] | None = None
-    truncation: float = 0.0
-    plane: np.ndarray | None = None
+    sigma: np.ndarray | str | None = field(default=None, metadata=_WIDTHS)
+    static_sigma: np.ndarray | float | None = field(default=None, metadata=_WIDTHS)
+    shape: tuple[int, int] | None = field(default=None, metadata=SIZE)
+    truncation: float = field(default=0.0, metadata=number(entry="truncation_px", minimum=0, unit="pix"))
+    plane: np.ndarray | None = field(default=None, metadata=array(2, 3, unit="pix", invertible=True))
     source: str | dict[str, Any] | None = None
 
     def __post_init__(self) -> None:

@@ -2,10 +2,10 @@
 
 import dataclasses
 import re
+from functools import partial
 from pathlib import Path
 
 import asdf
-import numpy as np
 
 from ..cameras.source import check_shape
 from ..exceptions import InputError
@@ -13,8 +13,9 @@ from ..geometry import similarity
 from ..geometry.basis import check_degree
 from ..results.solution import Solution
 from ..runtime import provenance
-from ..runtime.asdf_files import ASDF_STANDARD, check_layout, check_tree, read_tree
+from ..runtime.asdf_files import ASDF_STANDARD, check_layout, check_tree, read_tree, understood
 from ..runtime.outputs import replacing, settle_for
+from ..runtime.trees.codec import from_tree, to_tree
 from .from_files import read_source
 
 #: Version of the layout under ``legdistort_prior``.
@@ -23,17 +24,7 @@ LAYOUT = 1
 
 def write_prior(prior, path, *, overwrite=False):
     """Write a `Prior` to an ASDF file of plain arrays, numbers and strings."""
-    tree = {
-        "layout": LAYOUT,
-        "provenance": provenance.stamp(),
-        "coefficients": prior.mean,
-        "sigma": prior.sigma,
-        "static_sigma": prior.static_sigma,
-        "shape": None if prior.shape is None else [int(n) for n in prior.shape],
-        "truncation_px": float(prior.truncation),
-        "plane": prior.plane,
-        "source": prior.source,
-    }
+    tree = {"layout": LAYOUT, "provenance": provenance.stamp()} | to_tree(prior)
     with replacing(path, overwrite=overwrite) as file:
         asdf.AsdfFile({"legdistort_prior": tree}, version=ASDF_STANDARD).write_to(file)
     return Path(path)
@@ -52,21 +43,14 @@ def read_prior(path, kind):
         raise InputError(f"{path} holds no legdistort prior (no entry 'legdistort_prior'); make one: legdistort prior")
     check_layout(tree["layout"], LAYOUT, path)
     check_tree({"legdistort_prior": tree}, "prior-1.0.0", path)
-    try:
-        given = ((key, tree[key]) for key in ("coefficients", "sigma", "static_sigma", "plane"))
-        arrays = {key: np.array(value) if hasattr(value, "shape") else value for key, value in given}
-        if arrays["plane"] is not None:
-            similarity.check(arrays["plane"], "plane")
-        prior = kind(
-            arrays.pop("coefficients"),
-            shape=None if tree["shape"] is None else tuple(tree["shape"]),
-            truncation=float(tree["truncation_px"]),
-            source=tree["source"],
-            **arrays,
-        )
-        check_degree(prior.degree)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path} is damaged: {error}") from None
+    return understood(path, partial(_from_tree, kind), tree)
+
+
+def _from_tree(kind, tree):
+    prior = from_tree(kind, tree, "legdistort_prior", strict=False)
+    if prior.plane is not None:
+        similarity.check(prior.plane, "plane")
+    check_degree(prior.degree)
     return prior
 
 

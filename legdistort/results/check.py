@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 
 from ..runtime.notebook import ShownAsPrinted
+from ..runtime.trees.facts import text
 
 #: Probability with which a check warns of a set in which nothing is wrong; all of them together make 2 %.
 FALSE_ALARM = 1e-3
@@ -32,7 +33,7 @@ class Check(ShownAsPrinted):
     """
 
     name: str
-    state: str
+    state: str = field(metadata=text(*STATES))
     value: float | None
     limit: float | None
     sentence: str

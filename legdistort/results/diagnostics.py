@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..inputs import column_contract
+from ..runtime.trees.facts import YEARS, number, text
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 #: distribution of half a chi2 with one degree of freedom: 0.5 % of motionless sets exceed it
 #: (measured: none of 100, tests/benchmarks/motions_table.py).
 MOVING = 6.6
+
+_COUNT, _SCALE, _PIXELS = number(minimum=0), number(minimum=0), number(minimum=0, unit="pix")
 
 
 @dataclass(frozen=True)
@@ -39,14 +42,14 @@ class AliasedDegree:
         The mode with most energy and the mode in which most of it appears, orders in x and y.
     """
 
-    degree: int
-    found: float
-    noise: float
+    degree: int = field(metadata=_COUNT)
+    found: float = field(metadata=_PIXELS)
+    noise: float = field(metadata=_PIXELS)
     excess: float
-    energy: float
-    folds_into: tuple[float, ...]
-    mode: tuple[int, int]
-    into: tuple[int, int]
+    energy: float = field(metadata=_PIXELS)
+    folds_into: tuple[float, ...] = field(metadata=_PIXELS)
+    mode: tuple[int, int] = field(metadata=_COUNT)
+    into: tuple[int, int] = field(metadata=_COUNT)
 
 
 @dataclass(frozen=True)
@@ -68,10 +71,10 @@ class DegreeChoice:
     sentence : str
     """
 
-    degree: int
-    degrees: tuple[int, ...]
-    scores: tuple[float, ...]
-    n_folds: int
+    degree: int = field(metadata=_COUNT)
+    degrees: tuple[int, ...] = field(metadata=number(minimum=0, length="tried"))
+    scores: tuple[float, ...] = field(metadata=number(minimum=0, length="tried"))
+    n_folds: int = field(metadata=_COUNT)
     aliasing: tuple[AliasedDegree, ...]
     alarm: bool
     sentence: str
@@ -92,13 +95,13 @@ class Validation:
         Of the two.
     """
 
-    fraction: float
-    n_stars: int
-    n_observations: int
-    n_clipped: int
-    scatter: float
-    expected: float
-    ratio: float
+    fraction: float = field(metadata=number(minimum=0, maximum=1))
+    n_stars: int = field(metadata=_COUNT)
+    n_observations: int = field(metadata=_COUNT)
+    n_clipped: int = field(metadata=_COUNT)
+    scatter: float = field(metadata=_PIXELS)
+    expected: float = field(metadata=_PIXELS)
+    ratio: float = field(metadata=_SCALE)
 
     def __str__(self) -> str:
         return (
@@ -123,9 +126,9 @@ class UsedReference:
     """
 
     name: str
-    epoch: float | None
-    n_stars: int
-    rms_px: float
+    epoch: float | None = field(metadata=YEARS)
+    n_stars: int = field(metadata=_COUNT)
+    rms_px: float = field(metadata=_PIXELS)
 
 
 @dataclass(frozen=True)
@@ -140,10 +143,10 @@ class ErrorLaw:
         ``{exposure: factor}``.
     """
 
-    a: float
-    b: float
-    floor: float
-    factors: dict[str, float]
+    a: float = field(metadata=_PIXELS)
+    b: float = field(metadata=_PIXELS)
+    floor: float = field(metadata=_PIXELS)
+    factors: dict[str, float] = field(metadata=_SCALE)
 
     def sigma(self, flux: ArrayLike, exposure: ArrayLike | None = None) -> np.ndarray:
         """Error [pix] of positions with a flux (n,), in the exposures named (n,); by default of the average one."""
@@ -189,9 +192,9 @@ class MotionScatter:
         Whose motions are determined.
     """
 
-    sigma: float
+    sigma: float = field(metadata=number(minimum=0, unit="pix/yr"))
     gain: float
-    n_stars: int
+    n_stars: int = field(metadata=_COUNT)
 
     @property
     def is_there(self) -> bool:
@@ -231,15 +234,15 @@ class CorrelatedErrors:
         (Matern 1/2, 3/2, 5/2).
     """
 
-    floor: float
-    x: float = 0.0
-    y: float = 0.0
-    along: str | None = None
-    length: float = 0.0
-    longest: float = 0.0
+    floor: float = field(metadata=_PIXELS)
+    x: float = field(default=0.0, metadata=_PIXELS)
+    y: float = field(default=0.0, metadata=_PIXELS)
+    along: str | None = field(default=None, metadata=text("time", "x", "y"))
+    length: float = field(default=0.0, metadata=_SCALE)
+    longest: float = field(default=0.0, metadata=_SCALE)
     unit: str = ""
     reason: str = ""
-    derivatives: int = 0
+    derivatives: int = field(default=0, metadata=number(minimum=0, maximum=len(FOLDING) - 1))
 
     @property
     def scale(self) -> float:
@@ -310,18 +313,18 @@ class Diagnostics:
         Whether stars move, where the set was asked.
     """
 
-    error_floor: float = 0.0
-    error_scale: float = 1.0
-    sky: str | None = None
+    error_floor: float = field(default=0.0, metadata=_PIXELS)
+    error_scale: float = field(default=1.0, metadata=_SCALE)
+    sky: str | None = field(default=None, metadata=text("exposures", "reference"))
     reference: UsedReference | None = None
-    widths: tuple[Any, ...] | dict[str, Any] | None = None
+    widths: tuple[float, ...] | dict[str, tuple[float, ...] | None] | None = field(default=None, metadata=_PIXELS)
     prior_has_widths: bool = False
     effective_modes: dict[str, float] | None = None
-    departure_ratio: float | None = None
+    departure_ratio: float | None = field(default=None, metadata=_SCALE)
     selection: DegreeChoice | None = None
     validation: Validation | None = None
     error_law: ErrorLaw | None = None
-    epoch: float | None = None
+    epoch: float | None = field(default=None, metadata=YEARS)
     correlated: CorrelatedErrors | None = None
     motion_scatter: MotionScatter | None = None
 

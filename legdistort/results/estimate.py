@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..geometry.distortion import Distortion
+from ..runtime.trees.facts import array
 from .errors.camera_errors import CameraErrors
+from .gauge import UnknownDirection
 from .motions import StarMotions
 
 if TYPE_CHECKING:
@@ -58,13 +60,27 @@ class Estimate:
 class StoredUncertainty:
     """Covariances as files and pickles have them; see `legdistort.solving.equations.covariances.Uncertainty`."""
 
-    coefficients: np.ndarray
-    stars: np.ndarray
-    directions: np.ndarray
-    weak: tuple
-    bends: np.ndarray | None = None
-    star_unknowns: np.ndarray | None = None
-    drift_directions: np.ndarray | None = None
+    coefficients: np.ndarray = field(
+        metadata=array(
+            "n_exposures 2 n_modes",
+            "n_exposures 2 n_modes",
+            blocks=("n_exposures", "2 n_modes", "2 n_modes"),
+            unit="pix2",
+            covariance=True,
+        )
+    )
+    stars: np.ndarray = field(metadata=array(3, "n_stars", unit="pix2", packed=True, nan=True))
+    directions: np.ndarray = field(metadata=array("n_stars", 2, "2 n_map_modes", nan=True))
+    weak: tuple[UnknownDirection, ...]
+    bends: np.ndarray | None = field(
+        default=None, metadata=array("n_stars", "2 + n_terms", "2 n_map_modes", unit="pix2", nan=True)
+    )
+    star_unknowns: np.ndarray | None = field(
+        default=None, metadata=array("n_star_pairs", "n_stars", packed=True, nan=True)
+    )
+    drift_directions: np.ndarray | None = field(
+        default=None, metadata=array("n_stars", "2 + n_terms", "2 n_map_modes + n_drift", nan=True)
+    )
     camera: CameraErrors | None = None
 
 

@@ -22,11 +22,11 @@ from scipy.linalg import block_diag
 from ..geometry import basis
 from ..geometry.detector_modes import similarity_basis
 from ..runtime.notebook import ShownAsPrinted
+from ..runtime.trees.facts import NOT_STORED, array, number, text
+from .errors.catalogue_tie import Tie
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
-
-    from .errors.catalogue_tie import Tie
 
 _CONVENTIONS = {
     "minimal": "smallest dynamic part, weighted by its scatter and errors",
@@ -40,6 +40,7 @@ _STATIC = {
     "exact": ("", "the scatter of single exposures; the static distortion given is taken as exact"),
     "uncertain": ("", "the scatter of single exposures and the uncertainty of the static distortion"),
 }
+_ROWS = array("n_constraints", "n_exposures", "2 n_map_modes")
 CURE = "give a prior (--prior) or its size (--static-sigma), turn the camera between exposures, or tie to a reference"
 
 
@@ -57,8 +58,8 @@ class UnknownMap:
     """
 
     name: str
-    degree: int
-    map: np.ndarray
+    degree: int = field(metadata=number(minimum=0, maximum=30))
+    map: np.ndarray = field(metadata=array("2 n_map_modes", unit="pix"))
 
     def __repr__(self) -> str:
         return f"<UnknownMap: {self.name}>"
@@ -78,8 +79,8 @@ class UnknownDirection:
     """
 
     name: str
-    stars: np.ndarray
-    coefficients: np.ndarray
+    stars: np.ndarray = field(metadata=array("n_stars", 2, unit="pix", nan=True))
+    coefficients: np.ndarray = field(metadata=array("n_exposures", 2, "modes", unit="pix"))
 
     def __repr__(self) -> str:
         return f"<UnknownDirection: {self.name}>"
@@ -112,15 +113,17 @@ class Drift:
         Covariance of the common map and these, where a reference determined them together.
     """
 
-    names: tuple[str, ...]
-    motion: np.ndarray
-    covariance: np.ndarray
-    maps: np.ndarray
-    rates: np.ndarray
+    names: tuple[str, ...] = field(metadata=text("vx", "vy", "parallax", length="n_terms"))
+    motion: np.ndarray = field(metadata=array("n_exposures", "2 n_map_modes", "n_drift"))
+    covariance: np.ndarray = field(metadata=array("n_drift", "n_drift", unit="(pix/yr)2", covariance=True))
+    maps: np.ndarray = field(metadata=array("maps", "n_drift"))
+    rates: np.ndarray = field(metadata=array("rates", "n_drift"))
     held: bool = False
-    n_tied: int = 0
+    n_tied: int = field(default=0, metadata=number(minimum=0))
     parallax_tied: bool = False
-    joint: np.ndarray | None = None
+    joint: np.ndarray | None = field(
+        default=None, metadata=array("2 n_map_modes + n_drift", "2 n_map_modes + n_drift", covariance=True)
+    )
 
     @property
     def n_constraints(self) -> int:
@@ -228,20 +231,22 @@ class Gauge(ShownAsPrinted):
         Common maps that change with time, where the motions of stars are fitted.
     """
 
-    kind: str
-    constraint: np.ndarray
-    motion: np.ndarray
-    dynamic: np.ndarray
-    box: np.ndarray
-    covariance: np.ndarray
+    kind: str = field(metadata=text(*_CONVENTIONS, "shift", "static + shift", "relative polynomial"))
+    constraint: np.ndarray = field(metadata=_ROWS)
+    motion: np.ndarray = field(metadata=array("n_exposures", "2 n_map_modes", "2 n_map_modes"))
+    dynamic: np.ndarray = field(
+        metadata=array("n_exposures", "2 n_map_modes", "2 n_map_modes", unit="pix2", covariance=True)
+    )
+    box: np.ndarray = field(metadata=array(2, 2, unit="pix"))
+    covariance: np.ndarray = field(metadata=array("2 n_map_modes", "2 n_map_modes", unit="pix2", covariance=True))
     unknown_maps: tuple[UnknownMap, ...] = ()
-    static: str = "exact"
+    static: str = field(default="exact", metadata=text(*_STATIC))
     prior: bool = False
-    values: np.ndarray | None = None
-    released: np.ndarray | None = None
+    values: np.ndarray | None = field(default=None, metadata=array("n_constraints", unit="pix"))
+    released: np.ndarray | None = field(default=None, metadata=array("2 n_map_modes", "released"))
     tie: Tie | None = None
-    convention: np.ndarray | None = None
-    responses: Any = field(default=None, repr=False, compare=False)
+    convention: np.ndarray | None = field(default=None, metadata=_ROWS)
+    responses: Any = field(default=None, repr=False, compare=False, metadata=NOT_STORED)
     plane: str | None = None
     drift: Drift | None = None
 
@@ -443,14 +448,14 @@ class Gauge(ShownAsPrinted):
             f"{'modes':24s} {'number':>6s} {'absolute error':>15s}  determined by",
         ]
         measured = {} if self.tie is None else self.tie.words(convention)
-        for name, number, error in self.absolute_errors():
-            text = "not known" if np.isnan(error) else f"{error:.2g} px"
+        for name, n, error in self.absolute_errors():
+            size = "not known" if np.isnan(error) else f"{error:.2g} px"
             cause = measured.get(name) or ("the nominal poses, mean over exposures" if np.isnan(error) else convention)
             here = [w for w in self.unknown_maps if (f"degree {w.degree}" if w.degree > 1 else "shear") == name]
             if here:
                 cause += f"; {len(here)} of them ({_listed(w.name for w in here)}) not known"
-                text = "not known" if len(here) == number else text
-            lines.append(f"{name:24s} {number:6d} {text:>15s}  {cause}")
+                size = "not known" if len(here) == n else size
+            lines.append(f"{name:24s} {n:6d} {size:>15s}  {cause}")
         if self.released is not None:
             lines.append(
                 f"{self.released.shape[1]} combinations that are not known otherwise are determined by residuals of "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from ..exceptions import InputError
 from ..geometry import parallax
 from ..inputs.column_contract import correlation
 from ..runtime.notebook import ShownAsPrinted
+from ..runtime.trees.facts import YEARS, array, text
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -45,13 +46,13 @@ class StarMotions(ShownAsPrinted):
         Between the first and the last of them, years.
     """
 
-    names: tuple[str, ...]
-    values: np.ndarray
-    epoch: float
-    years: np.ndarray
-    chi2: np.ndarray
-    n_epochs: np.ndarray
-    span: np.ndarray
+    names: tuple[str, ...] = field(metadata=text(*UNITS, length="n_terms"))
+    values: np.ndarray = field(metadata=array("n_stars", "n_terms", unit="pix/yr, pix", nan=True))
+    epoch: float = field(metadata=YEARS)
+    years: np.ndarray = field(metadata=array("n_exposures", unit="yr", minimum=1800, maximum=2200))
+    chi2: np.ndarray = field(metadata=array("n_stars", minimum=0))
+    n_epochs: np.ndarray = field(metadata=array("n_stars", holds="integers", minimum=0))
+    span: np.ndarray = field(metadata=array("n_stars", unit="yr", minimum=0))
 
     @property
     def kind(self) -> str:

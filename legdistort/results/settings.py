@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
+
+from ..runtime.trees.facts import YEARS, number, text
+
+_PIXELS = number(minimum=0, unit="pix")
 
 
 @dataclass(frozen=True)
@@ -35,21 +39,21 @@ class Settings:
     max_iterations : int or None
     """
 
-    degree: int | str = 3
-    prior: Any = None
-    model: Any = None
+    degree: int | str = field(default=3, metadata=number(minimum=0, maximum=30))
+    prior: dict[str, Any] | None = None
+    model: dict[str, Any] | None = None
     static: str | None = None
     layout: str | None = None
     dynamic: str | None = None
-    exposure_degree: int | None = None
+    exposure_degree: int | None = field(default=None, metadata=number(minimum=0, maximum=30))
     gauge: str = "minimal"
     method: str = "joint"
     loss: str = "linear"
-    clip: float | None = None
-    error_floor: float = 0.0
+    clip: float | None = field(default=None, metadata=number(minimum=0))
+    error_floor: float = field(default=0.0, metadata=_PIXELS)
     errors: str = "stated"
-    motion: str | None = None
-    motion_sigma: float | str | None = None
-    motion_epoch: float | None = None
-    max_iterations: int | None = None
-    validate: float | None = None
+    motion: str | None = field(default=None, metadata=text("proper", "parallax"))
+    motion_sigma: float | str | None = field(default=None, metadata=number(minimum=0, unit="pix/yr"))
+    motion_epoch: float | None = field(default=None, metadata=YEARS)
+    max_iterations: int | None = field(default=None, metadata=number(minimum=0))
+    validate: float | None = field(default=None, metadata=number(minimum=0, maximum=1))

@@ -8,6 +8,7 @@ again when they are read.
 import dataclasses
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import asdf
 import numpy as np
@@ -23,58 +24,81 @@ from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from ..inputs.plain_columns import plain, plain_columns, restored
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_layout, check_tree, read_tree, understood
+from ..runtime.checks import LARGEST
 from ..runtime.outputs import replacing, settle_for
 from ..runtime.provenance import checksums, unchanged
+from ..runtime.trees.codec import from_tree, to_tree
+from ..runtime.trees.facts import SIZE, array, number
 from .check import Check
-from .diagnostics import (
-    AliasedDegree,
-    CorrelatedErrors,
-    DegreeChoice,
-    Diagnostics,
-    ErrorLaw,
-    MotionScatter,
-    UsedReference,
-    Validation,
-)
-from .errors.camera_errors import CameraErrors
-from .errors.catalogue_tie import Tie
-from .estimate import Estimate, StoredUncertainty
-from .gauge import Drift, Gauge, UnknownDirection, UnknownMap
+from .diagnostics import Diagnostics
+from .errors.absolute_errors import absolute_variance, own_blocks
+from .estimate import Estimate, StoredUncertainty, plain_covariances
+from .gauge import Gauge
 from .motions import StarMotions
 from .settings import Settings
 
 #: Version of the layout under ``legdistort``.
 LAYOUT = 1
+#: Entry of a file under which a solution stands.
+ROOT = "legdistort"
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredFit:
+    """Numbers and words of a solution as a whole."""
+
+    degree: int = dataclasses.field(metadata=number(minimum=0, maximum=30))
+    chi2: float = dataclasses.field(metadata=number(minimum=0))
+    dof: int
+    status: str
+    columns: tuple[str, ...]
+    left_out: dict[str, str]
+    provenance: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StoredExposure:
+    """One exposure; the inverse of its distortion is None where it folds."""
+
+    name: str
+    shape: tuple[int, int] = dataclasses.field(metadata=SIZE)
+    pose: np.ndarray = dataclasses.field(metadata=array(2, 3, unit="pix", invertible=True))
+    coefficients: np.ndarray = dataclasses.field(metadata=array(2, "n_series", unit="pix"))
+    prior_mean: np.ndarray = dataclasses.field(metadata=array(2, "n_series", unit="pix"))
+    inverse: Inverse | None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StoredStars:
+    """Names and positions of the stars."""
+
+    star: np.ndarray = dataclasses.field(metadata=array("n_stars", holds="names"))
+    position: np.ndarray = dataclasses.field(metadata=array("n_stars", 2, unit="pix", nan=True))
 
 
 def write_solution(solution, path, *, overwrite=False):
     """Write a `Solution`, its covariances included, to an ASDF file."""
     estimate, table = solution.estimate, plain_columns(solution.residuals)
-    camera = estimate.uncertainty.camera
-    covariances = ["coefficients", "stars", "directions", "bends"]
-    covariances += ["star_unknowns", "drift_directions"] if estimate.motions is not None else []
     tree = {
         "layout": LAYOUT,
         "provenance": solution.provenance,
-        "settings": dataclasses.asdict(solution.settings),
-        "diagnostics": dataclasses.asdict(solution.diagnostics),
+        "settings": to_tree(solution.settings),
+        "diagnostics": to_tree(solution.diagnostics),
         "status": solution.status,
         "degree": solution.degree,
         "chi2": float(solution.chi2),
         "dof": int(solution.dof),
-        "exposures": [_exposure_tree(view) for view in solution],
-        "stars": {"star": np.asarray(estimate.star_names), "position": estimate.positions},
+        "exposures": [to_tree(_stored_exposure(view)) for view in solution],
+        "stars": to_tree(StoredStars(np.asarray(estimate.star_names), estimate.positions)),
         "columns": table.colnames,  # their order: that of a mapping is lost in files
         "observations": {name: plain(table[name]) for name in table.colnames},
-        "motions": estimate.motions and dataclasses.asdict(estimate.motions),
-        "covariance": {key: getattr(estimate.uncertainty, key) for key in covariances}
-        | {"weak": [dataclasses.asdict(each) for each in estimate.uncertainty.weak]}
-        | {"camera": camera and dataclasses.asdict(camera)},
-        "gauge": _gauge_tree(solution.gauge),
-        "sky": solution.sky and dataclasses.asdict(solution.sky),
+        "motions": estimate.motions and to_tree(estimate.motions),
+        "covariance": to_tree(plain_covariances(estimate)),
+        "gauge": to_tree(solution.gauge),
+        "sky": solution.sky and to_tree(solution.sky),
         "left_out": solution.left_out,
-        "camera": cameras.to_tree(solution.camera) if solution.camera.is_known else None,
-        "checks": [dataclasses.asdict(each) for each in solution.checks],
+        "camera": to_tree(solution.camera) if solution.camera.is_known else None,
+        "checks": [to_tree(each) for each in solution.checks],
     }
     content = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
     for column in tree["observations"].values():  # names repeat; covariances and coefficients would not get smaller
@@ -84,34 +108,13 @@ def write_solution(solution, path, *, overwrite=False):
     return Path(path)
 
 
-def _gauge_tree(gauge):
-    fields = dataclasses.fields(gauge)  # the responses stand with the covariances
-    tree = {field.name: getattr(gauge, field.name) for field in fields if field.name != "responses"}
-    return tree | {
-        "tie": gauge.tie and dataclasses.asdict(gauge.tie),
-        "drift": gauge.drift and dataclasses.asdict(gauge.drift),
-        "unknown_maps": [dataclasses.asdict(each) for each in gauge.unknown_maps],
-    }
-
-
-def _exposure_tree(view):
+def _stored_exposure(view):
     try:
         inverse = view.distortion.inverse
-        certified = {
-            "tensors": inverse.tensors,
-            "error_px": inverse.error,
-            "valid_undistorted_px": list(inverse.valid),
-        }
     except FoldError:  # such a solution is worth a look, but has no WCS
-        certified = None
-    return {
-        "name": view.name,
-        "shape": [int(n) for n in view.shape],
-        "pose": view.pose,
-        "coefficients": view.coefficients,
-        "prior_mean": view.prior_mean,
-        "inverse": certified,
-    }
+        inverse = None
+    shape = tuple(int(n) for n in view.shape)
+    return StoredExposure(view.name, shape, view.pose, view.coefficients, view.prior_mean, inverse)
 
 
 def read_solution(path, kind, *, max_bytes=None):
@@ -129,151 +132,104 @@ def read_solution(path, kind, *, max_bytes=None):
     return understood(path, partial(_from_tree, kind, checksum), tree)
 
 
-def _made(kind, tree, **inner):
-    """A dataclass from its fields by name, with dataclasses in some of them, ``field=kind``; None for None.
-
-    Fields that files of earlier versions lack have their defaults.
-    """
-    if tree is None:
-        return None
-    made = {name: _made(each, tree[name]) for name, each in inner.items() if name in tree}
-    return kind(**{name: _own(value) for name, value in tree.items()} | made)
-
-
-def _own(value):
-    """Arrays of our own for those of a file, tuples for lists, as frozen objects have them."""
-    if isinstance(value, dict):
-        return {key: _own(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return tuple(_own(each) for each in value)
-    return np.array(value) if hasattr(value, "shape") else value
-
-
-def _diagnostics(tree, names):
-    """`Diagnostics`; with exposures in their order, which mappings in files do not keep."""
-    parts = {"selection": DegreeChoice, "validation": Validation, "error_law": ErrorLaw, "correlated": CorrelatedErrors}
-    parts["motion_scatter"] = MotionScatter
-    found = _made(Diagnostics, tree, reference=UsedReference, **parts)
-    if (chosen := found.selection) is not None:
-        degrees = tuple(AliasedDegree(**each) for each in chosen.aliasing)
-        found = dataclasses.replace(found, selection=dataclasses.replace(chosen, aliasing=degrees))
-    effective = found.effective_modes
-    return dataclasses.replace(found, effective_modes=effective and {name: effective[name] for name in names})
-
-
 def _from_tree(kind, checksum, tree):
-    exposures = tree["exposures"]
-    uncertainty = _made(StoredUncertainty, tree["covariance"], camera=CameraErrors)
-    weak = tuple(UnknownDirection(**each) for each in uncertainty.weak)
-    uncertainty = dataclasses.replace(uncertainty, weak=weak)
-    gauge = _made(Gauge, tree["gauge"], tie=Tie, drift=Drift)
-    maps = tuple(UnknownMap(**each) for each in gauge.unknown_maps)
-    gauge = dataclasses.replace(gauge, unknown_maps=maps, responses=uncertainty)
-    table = QTable({name: restored(tree["observations"][name]) for name in tree["columns"]})
+    """The solution of a tree that has the outline of one."""
+    sizes = {"n_modes": basis.n_modes(tree["degree"]), "n_exposures": len(tree["exposures"])}
+    fit = from_tree(StoredFit, tree, ROOT, sizes=sizes, strict=False)
+    exposures = _part(tuple[StoredExposure, ...], tree, "exposures", sizes, strict=False)
+    names = tuple(e.name for e in exposures)
+    stars = _part(StoredStars, tree, "stars", sizes, strict=False)
+    motions = _part(StarMotions | None, tree, "motions", sizes)
+    k = sizes.setdefault("n_terms", 0)
+    sizes["n_star_pairs"] = (2 + k) * (3 + k) // 2
+    gauge = _part(Gauge, tree, "gauge", sizes)
+    camera = tree.get("camera") and cameras.from_tree(tree["camera"], Camera, f"{ROOT}.camera")
+    sizes["n_detectors"] = len(camera.detectors) if camera else 0
+    uncertainty = _part(StoredUncertainty, tree, "covariance", sizes)
+    diagnostics = _part(Diagnostics, tree, "diagnostics", sizes)
+    if effective := diagnostics.effective_modes:  # in the order of exposures, which mappings in files do not keep
+        diagnostics = dataclasses.replace(diagnostics, effective_modes={name: effective[name] for name in names})
     solution = kind(
-        names=tuple(e["name"] for e in exposures),
-        degree=tree["degree"],
-        poses={e["name"]: np.array(e["pose"]) for e in exposures},
-        coefficients=np.stack([np.array(e["coefficients"]) for e in exposures]),
-        residuals=table,
-        chi2=tree["chi2"],
-        dof=tree["dof"],
-        status=tree["status"],
-        gauge=gauge,
-        settings=Settings(**tree["settings"]),
-        diagnostics=_diagnostics(tree["diagnostics"], [e["name"] for e in exposures]),
-        sky=_made(TangentPlane, tree["sky"]),
-        left_out=dict(tree["left_out"]),
-        provenance=dict(tree["provenance"]),
-        camera=tree.get("camera") and cameras.from_tree(tree["camera"], Camera),
+        names=names,
+        degree=fit.degree,
+        poses={e.name: e.pose for e in exposures},
+        coefficients=np.stack([e.coefficients for e in exposures]),
+        residuals=QTable({name: restored(tree["observations"][name]) for name in fit.columns}),
+        chi2=fit.chi2,
+        dof=fit.dof,
+        status=fit.status,
+        gauge=dataclasses.replace(gauge, responses=uncertainty),
+        settings=_part(Settings, tree, "settings", sizes),
+        diagnostics=diagnostics,
+        sky=_part(TangentPlane | None, tree, "sky", sizes),
+        left_out=fit.left_out,
+        provenance=fit.provenance,
+        camera=camera,
         estimate=Estimate(
-            star_names=np.array(tree["stars"]["star"]),
-            positions=np.array(tree["stars"]["position"]),
-            shapes={e["name"]: tuple(e["shape"]) for e in exposures},
-            prior_mean=np.stack([np.array(e["prior_mean"]) for e in exposures]),
+            star_names=stars.star,
+            positions=stars.position,
+            shapes={e.name: e.shape for e in exposures},
+            prior_mean=np.stack([e.prior_mean for e in exposures]),
             uncertainty=uncertainty,
-            motions=_made(StarMotions, tree.get("motions")),
-            checked=tuple(Check(**each) for each in tree.get("checks", ())),
+            motions=motions,
+            checked=_part(tuple[Check, ...], tree, "checks", sizes),
+            certified={
+                e.name: Distortion(e.coefficients, e.shape, e.name, e.inverse)  # checks the certificate
+                for e in exposures
+                if e.inverse is not None
+            },
         ),
         checksum=checksum,
     )
     _check_consistent(solution)
-    return dataclasses.replace(
-        solution, estimate=dataclasses.replace(solution.estimate, certified=_certified(solution, exposures))
-    )
+    return solution
 
 
-def _certified(solution, exposures):
-    """``{exposure: Distortion}`` with the inverses of a file, whose certificates are checked."""
-    views = {e["name"]: (solution[e["name"]], e["inverse"]) for e in exposures if e["inverse"] is not None}
-    return {
-        name: Distortion(view.coefficients, view.shape, name, _inverse(inverse))
-        for name, (view, inverse) in views.items()
-    }
-
-
-def _inverse(tree):
-    return Inverse(np.array(tree["tensors"]), tree["error_px"], tuple(tree["valid_undistorted_px"]))
+def _part(kind, tree, entry, sizes, *, strict=True):
+    """An entry of the tree; none of it for one that files of earlier versions lack."""
+    given = tree.get(entry, [] if entry == "checks" else None)
+    return from_tree(kind, given, f"{ROOT}.{entry}", sizes=sizes, strict=strict)
 
 
 def _check_consistent(solution):
-    """Raise if parts of a solution do not fit together."""
-    estimate = solution.estimate
-    n, n_modes, n_stars = len(solution.names), basis.n_modes(solution.degree), len(estimate.star_names)
-    if len(set(solution.names)) < n:
+    """Raise if parts of a solution do not fit together, beyond their shapes."""
+    if len(set(solution.names)) < len(solution.names):
         raise ValueError("two exposures have the same name")
-    for name, pose in solution.poses.items():
-        if pose.shape != (2, 3) or not np.isfinite(pose).all() or np.linalg.det(pose[:, :2]) == 0:
-            raise ValueError(f"the pose of {name} should be a finite, invertible array (2, 3)")
-    own, gauge, moving = 2 * n_modes, solution.gauge, estimate.motions
-    if (gauge.drift is None) != (moving is None):
+    estimate = solution.estimate
+    gauge, camera = solution.gauge, estimate.uncertainty.camera
+    if (gauge.drift is None) != (estimate.motions is None):
         raise ValueError("motions of stars and the maps common to them come together")
-    k, q = (0, 0) if moving is None else (len(moving.names), gauge.drift.motion.shape[2])
-    held, modes = gauge.n_constraints, gauge.motion.shape[1]  # those that exposures have for themselves
-    if modes != 2 * basis.n_modes(basis.degree_of(modes // 2)) or gauge.n_maps > modes:
-        raise ValueError(f"the gauge cannot have {held} constraints on {modes} modes")
-    for what, array, shape in (
-        ("positions", estimate.positions, (n_stars, 2)),
-        ("prior means", estimate.prior_mean, solution.coefficients.shape),
-        (
-            "covariance of the coefficients",
-            estimate.uncertainty.coefficients,
-            (n, own, own) if np.ndim(estimate.uncertainty.coefficients) == 3 else (n * own, n * own),
-        ),
-        ("covariance of the stars", estimate.uncertainty.stars, (3, n_stars)),
-        ("directions", estimate.uncertainty.directions, (n_stars, 2, modes)),
-        (
-            "covariance of the stars with the bend to the convention",
-            estimate.uncertainty.bends,
-            (n_stars, 2 + k, modes),
-        ),
-        ("gauge.constraint", gauge.constraint, (held, n, modes)),
-        ("gauge.convention", gauge.convention, (held, n, modes)),
-        ("gauge.motion", gauge.motion, (n, modes, modes)),
-        ("gauge.dynamic", gauge.dynamic, (n, modes, modes)),
-        ("gauge.box", gauge.box, (2, 2)),
-        ("gauge.covariance", gauge.covariance, (modes, modes)),
-        *(("map of gauge.unknown_maps", each.map, (modes,)) for each in gauge.unknown_maps),
-        ("gauge.values", gauge.values, (held,)),
-        ("motions", None if moving is None else moving.values, (n_stars, k)),
-        (
-            "covariance of the motions",
-            estimate.uncertainty.star_unknowns if k else None,
-            ((2 + k) * (3 + k) // 2, n_stars),
-        ),
-        ("drift directions", estimate.uncertainty.drift_directions if k else None, (n_stars, 2 + k, modes + q)),
-        ("gauge.drift.motion", None if gauge.drift is None else gauge.drift.motion, (n, modes, q)),
-        ("gauge.drift.covariance", None if gauge.drift is None else gauge.drift.covariance, (q, q)),
-        ("gauge.drift.joint", None if gauge.drift is None else gauge.drift.joint, (modes + q, modes + q)),
-        ("gauge.tie.shared", None if gauge.tie is None else gauge.tie.shared, (3, n_stars)),
-    ):
-        if array is not None and array.shape != shape:
-            raise ValueError(f"the {what} should have shape {shape}, not {array.shape}")
+    basis.degree_of(gauge.n_modes)  # refuses a number that is none of modes
+    if gauge.n_maps > 2 * gauge.n_modes:
+        raise ValueError(f"the gauge cannot have {gauge.n_constraints} constraints on {2 * gauge.n_modes} modes")
+    if camera and np.count_nonzero(camera.free) != len(camera.changes):
+        raise ValueError(f"{np.count_nonzero(camera.free)} modes of the camera are free, {len(camera.changes)} change")
+    if estimate.uncertainty.bends is not None:
+        _check_bends(gauge, estimate.uncertainty)
+    if gauge.tie is not None:
+        x, y, xy = absolute_variance(gauge, estimate.uncertainty, estimate.positions, without_unknown=True)
+        if np.any(np.minimum(x, y) < -1e-12) or np.any(xy**2 > (1 + 1e-6) * x * y + 1e-24):
+            raise ValueError(f"entry {ROOT}.gauge.tie.shared: takes more from a variance than there is of it")
     table = column_contract.check(solution.residuals, column_contract.MATCHED, "the table of residuals")
-    for name in ("dx", "dy"):
-        column_contract.values(table, name, u.pix)
-    if np.asarray(table["used"]).dtype != bool:
+    used = np.asarray(table["used"])
+    if used.dtype != bool:
         raise ValueError("the column 'used' should be of booleans")
+    for name in ("dx", "dy"):
+        size = np.abs(column_contract.values(table, name, u.pix))
+        if not np.all((size < LARGEST) | (np.isnan(size) & ~used)):
+            raise ValueError(f"the column {name!r} should hold finite numbers of pixels, none beyond 1e30")
+    lost = estimate.star_names[~np.isfinite(estimate.positions).all(axis=1)]
+    if np.isin(np.asarray(table["star"])[used], lost).any():
+        raise ValueError("a star without a position has observations that were used")
     for column, known in (("exposure", solution.names), ("star", estimate.star_names)):
         if not np.isin(np.asarray(table[column]), known).all():
             raise ValueError(f"the table of residuals names {column}s that are not in the list of them")
+
+
+def _check_bends(gauge, uncertainty):
+    """Raise if covariances of the stars with the bend to the convention are larger than the variances of both allow."""
+    stars = np.einsum("jaa->ja", own_blocks(gauge, uncertainty))[:, :, None]
+    bend = np.maximum(np.diag(gauge.bend_errors(uncertainty.coefficients)[1]), 0)
+    rounding = 1e-9 * stars * np.max(bend) + 1e-24
+    if np.any(uncertainty.bends**2 > stars * bend + rounding):
+        raise ValueError(f"entry {ROOT}.covariance.bends: covariances that are larger than the variances allow")

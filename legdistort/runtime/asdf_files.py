@@ -297,7 +297,7 @@ def understood(path, function, tree):
     try:
         with np.errstate(all="ignore"):
             return function(tree)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    except ValueError as error:  # of our checks, in words
+        raise InputError(f"{path} is damaged: {error}") from None
     except Exception as error:  # there is no end to what can be wrong in a file
         raise InputError(f"{path} is damaged: {type(error).__name__} {error}") from None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,12 +14,15 @@ from astropy.modeling import models
 
 from ..exceptions import InputError
 from ..geometry import basis
-from ..geometry.distortion import Distortion, Inverse
+from ..geometry.distortion import TOLERANCE, Distortion, Inverse
 from ..geometry.models import correction_model, displacement_model, leaves, pose_model
 from ..geometry.tangent_plane import PlaneToSky
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, WITH_WCS, check_tree, read_tree, understood
+from ..runtime.checks import LARGEST
 from ..runtime.outputs import replacing
+from ..runtime.trees.codec import from_tree, to_tree
+from ..runtime.trees.facts import number
 from .exposure_wcs import ExposureWCS, exposure_wcs, from_focal_plane, rebuilt
 
 if TYPE_CHECKING:
@@ -35,6 +40,14 @@ NOTE = (
 )
 
 
+@dataclass(frozen=True)
+class Certificate:
+    """Round-trip error of an inverse and the box of undistorted pixels in which it holds."""
+
+    error: float = field(metadata=number(entry="inverse_error_px", minimum=0, maximum=TOLERANCE, unit="pix"))
+    valid: tuple[float, float, float, float] = field(metadata=number(entry="valid_undistorted_px", unit="pix"))
+
+
 def wcs_tree(view):
     """The ASDF tree of a view of one image: its gwcs at ``meta.wcs``, with the errors of inverses."""
     view.check_pixels()
@@ -43,16 +56,12 @@ def wcs_tree(view):
     wcs = exposure_wcs(view.name, common.pose, common.distortion, view.solution.sky, chip, shared=True)
     meta = {"wcs": wcs, "exposure": view.name}
     if chip is None:
-        meta |= _certificate(common.distortion.inverse)
+        meta |= to_tree(common.distortion.inverse, Certificate)
     else:
-        meta |= {"detector": view.detector} | _certificate(chip.distortion.inverse)
-        meta["focal_plane"] = _certificate(common.distortion.inverse)
+        meta |= {"detector": view.detector} | to_tree(chip.distortion.inverse, Certificate)
+        meta["focal_plane"] = to_tree(common.distortion.inverse, Certificate)
     meta |= {"provenance": {key: origin[key] for key in ("created", "versions")}, "note": NOTE}
     return {"meta": meta}
-
-
-def _certificate(inverse):
-    return {"inverse_error_px": inverse.error, "valid_undistorted_px": list(inverse.valid)}
 
 
 def write_wcs(view, path, *, overwrite=False):
@@ -113,13 +122,15 @@ def _checked_wcs(meta):
     frames = ["detector", "undistorted", *["focal_plane"] * ("focal_plane" in meta), "reference"]
     if not isinstance(wcs, gwcs.WCS) or wcs.available_frames[: len(frames)] != frames:
         raise ValueError(f"meta.wcs should be a gwcs {' -> '.join(frames)}")
+    for first, second in pairwise(wcs.available_frames):
+        _check_parameters(wcs.get_transform(first, second), f"meta.wcs, {first} -> {second}")
     box = wcs.bounding_box
-    correction = _checked_correction(wcs.get_transform("detector", "undistorted"), meta, meta["exposure"])
+    correction = _checked_correction(wcs.get_transform("detector", "undistorted"), meta, "meta", meta["exposure"])
     wcs.set_transform("detector", "undistorted", correction)
     if "focal_plane" in meta:
         whole = wcs.get_transform("focal_plane", "reference")
         whole.left.inverse = whole.inverse.right
-        correction = _checked_correction(whole.left, meta["focal_plane"], meta["exposure"])
+        correction = _checked_correction(whole.left, meta["focal_plane"], "meta.focal_plane", meta["exposure"])
         back = pose_model(np.column_stack([whole.right.matrix.value, whole.right.translation.value]), whole.right.name)
         wcs.set_transform("focal_plane", "reference", from_focal_plane(correction, back))
     if wcs.available_frames[-1] == "icrs":
@@ -128,8 +139,18 @@ def _checked_wcs(meta):
     return rebuilt(ExposureWCS, wcs)
 
 
-def _checked_correction(correction, certificate, name):
+def _check_parameters(transform, where):
+    """Raise if a part of a transform has parameters that mean nothing, or is affine and has no inverse."""
+    for model in leaves(transform):
+        if not np.all(np.abs(model.parameters) < LARGEST):
+            raise ValueError(f"entry {where}: {type(model).__name__} has parameters that are not finite")
+        if isinstance(model, models.AffineTransformation2D) and not np.linalg.det(model.matrix.value):
+            raise ValueError(f"entry {where}: a map that has no inverse; it should be one that has")
+
+
+def _checked_correction(correction, tree, where, name):
     """A correction with its inverse checked against its certificate, and its region of validity."""
+    certificate = from_tree(Certificate, tree, where, strict=False)
     parts = _series(correction.inverse)
     (x0, x1), (y0, y1) = parts[0].x_domain, parts[0].y_domain
     shape = round(y1 - y0), round(x1 - x0)
@@ -137,7 +158,7 @@ def _checked_correction(correction, certificate, name):
                for m in (correction.inverse, correction)]  # fmt: skip
     for model, tensor in zip((correction.inverse, correction), tensors, strict=True):
         _check_same(model, displacement_model(tensor, shape), shape)
-    inverse = Inverse(tensors[1], certificate["inverse_error_px"], tuple(certificate["valid_undistorted_px"]))
+    inverse = Inverse(tensors[1], certificate.error, certificate.valid)
     Distortion(basis.from_tensor(tensors[0]), shape, name, inverse)  # checks the certificate
     return correction_model(tensors[0], inverse, shape)
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...geometry import basis, similarity
+from ...runtime.trees.facts import array
 
 if TYPE_CHECKING:
     from ...cameras.camera import Camera
@@ -36,11 +37,13 @@ class CameraErrors:
         How stars move with directions of the camera that nothing determines, of unit rms.
     """
 
-    free: np.ndarray
-    changes: np.ndarray
-    stars: np.ndarray
-    coefficients: np.ndarray
-    unknown: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    free: np.ndarray = field(metadata=array("n_detectors", 2, "modes", holds="booleans"))
+    changes: np.ndarray = field(metadata=array("k", "r", unit="pix"))
+    stars: np.ndarray = field(metadata=array("n_stars", 2, "r", unit="pix"))
+    coefficients: np.ndarray = field(metadata=array("n_exposures", "2 n_modes", "r", unit="pix"))
+    unknown: np.ndarray = field(
+        default_factory=lambda: np.zeros((0, 2, 0)), metadata=array("n_stars", 2, "m", blocks=(0, 2, 0))
+    )
 
     def scaled(self, factor: float) -> CameraErrors:
         """The same with all errors times a factor."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...geometry import basis
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees, similarity_basis
+from ...runtime.trees.facts import array, number
 
 if TYPE_CHECKING:
     from ...runtime.annotations import Shape
@@ -38,13 +39,13 @@ class Tie:
         chi2 of the offsets over its degrees of freedom; NaN if there are hardly any.
     """
 
-    covariance: np.ndarray
-    shared: np.ndarray
-    measured: np.ndarray
-    stars: np.ndarray
-    offsets: np.ndarray
-    used: np.ndarray
-    ratio: float
+    covariance: np.ndarray = field(metadata=array("2 k", "2 k", unit="pix2", covariance=True))
+    shared: np.ndarray = field(metadata=array(3, "n_stars", unit="pix2"))
+    measured: np.ndarray = field(metadata=array("n", minimum=0, maximum=1))
+    stars: np.ndarray = field(metadata=array("n_reference", holds="names"))
+    offsets: np.ndarray = field(metadata=array("n_reference", 2, unit="pix"))
+    used: np.ndarray = field(metadata=array("n_reference", holds="booleans"))
+    ratio: float = field(metadata=number(minimum=0, nan=True))
 
     @property
     def rms(self) -> float:
