@@ -57,7 +57,7 @@ def seen_camera(camera):
 def seen_matches(path):
     """What is compared of matches, as `legdistort solve` reads them."""
     table = read_table(path)
-    matches = Matches.from_table(table, shape=table.meta["shapes"], **Matches.read_meta(table.meta))
+    matches = Matches.from_table(table, **Matches.read_meta(table.meta))
     return {
         "matched": [str(matches), list(matches.names), dict(matches.left_out)],
         "matched_x": matches.table["x"].value.tolist(),

@@ -75,7 +75,8 @@ class Detector(ShownAsPrinted):
         Standard deviation of the layout, as that of modes of orders 0 and 1 over the detector (constant, x, y), pixels:
         a number, (3,) or (2, 3); infinite where nothing is known. None takes it as exact.
     static_sigma : array_like, optional
-        That of `static`, the same forms; that of the Prior if one is given. None takes it as exact.
+        That of `static`, the same forms; that of the Prior if one is given. None takes it as exact; of plain images
+        (`Camera.has_focal_plane`) it is not known at all without `static`.
     layout_covariance : array_like, shape (6, 6), optional
         Covariance of the modes of `layout_sigma`, those of x first, instead of it, px^2. It is for the errors of
         `place`: as a prior they count as independent.

@@ -319,18 +319,36 @@ class TestSolution:
         assert np.array_equal(fewer.table["x"][rows], matches.table["x"][first])
         assert np.array_equal(matches.table["x_detector"].value, table["x"])
 
-    def test_one_detector_without_static_is_no_camera(self, table):
-        """Identity layout and no static distortion: the usual solution."""
+    @pytest.mark.parametrize("known", [{}, {"static_sigma": 0.05}, {"static_sigma": None}, {"static": None}])
+    def test_one_detector_with_the_identity_is_a_plain_image(self, table, known, tmp_path):
+        """To the last bit: its static distortion is the prior, and without one nothing is known."""
         rows = table[table["detector"] == "1"]
         rows = rows[np.bincount(rows["star"])[rows["star"]] >= 3]
         size = (gsaoi_images.SIZE, gsaoi_images.SIZE)
-        camera = legdistort.Camera("one", {"1": legdistort.Detector(size, layout=np.eye(2, 3))})
+        static = np.zeros((2, 10))
+        static[:, 1:6] = [[0.2, 0.1, 0.3, -0.2, 0.1], [0.1, -0.2, 0.1, 0.3, -0.3]]  # shear and tilt are part of a prior
+        known = {"static": static} | known
+        detector = legdistort.Detector(size, layout=np.eye(2, 3), **known)
+        camera = legdistort.Camera("one", {"1": detector})
+        assert not camera.has_focal_plane
+        prior = None
+        if known["static"] is not None:
+            prior = legdistort.Prior(static, static_sigma=known.get("static_sigma"))
         one = legdistort.solve(legdistort.Matches.from_table(rows, camera=camera))
-        usual = legdistort.solve(
-            legdistort.Matches.from_table(rows, shape=size), prior=legdistort.Prior(np.zeros((2, 1)))
-        )
-        assert np.abs(one.estimate.positions - usual.estimate.positions).max() < 1e-9
-        assert np.allclose(one.stars["x_err"], usual.stars["x_err"], rtol=1e-9)
+        usual = legdistort.solve(legdistort.Matches.from_table(rows, shape=size), prior=prior)
+        assert one.chi2 == usual.chi2
+        for name in ("coefficients", "poses"):
+            np.testing.assert_equal(getattr(one, name), getattr(usual, name))
+        for name in usual.stars.colnames:
+            np.testing.assert_array_equal(one.stars[name], usual.stars[name])
+        name = usual.names[0]
+        assert one[name].wcs.available_frames == usual[name].wcs.available_frames
+        xy = np.array([[10.0, 20.0], [400.0, 300.0]])
+        np.testing.assert_array_equal(one[name].wcs(*xy.T), usual[name].wcs(*xy.T))
+        np.testing.assert_array_equal(one[name, "1"].correct(xy), usual[name, "1"].correct(xy))
+        again = legdistort.Solution.read(one.write(tmp_path / "one.asdf"))
+        assert again.camera.name == "one"
+        np.testing.assert_array_equal(again[name].correct(xy), usual[name].correct(xy))
 
     def test_stars_that_move(self, night, table, gsaoi):
         """Proper motions over all detectors, after a common map, with true errors."""

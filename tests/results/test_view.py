@@ -131,7 +131,7 @@ def test_the_view_of_an_image(solution, several):
     assert image_view(solution, Exposure("exp02", data)) == solution["exp02"]
     assert image_view(solution, Exposure("other", data)) is None
     part = Exposure("frame2-1", data, exposure="frame2", detector="1")
-    assert image_view(several[0], part) is several[0]["frame2", "1"]
+    assert image_view(several[0], part) == several[0]["frame2", "1"]
     assert image_view(several[0], replace(part, detector="3")) is None
 
 
