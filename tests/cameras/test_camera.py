@@ -300,7 +300,7 @@ class TestSolution:
         assert np.allclose(corrected["x_err"].value ** 2, relative[:, 0, 0])
         assert np.all(corrected["x_err"].value > 0.97 * SIGMA)
         floored = replace(solution, diagnostics=replace(solution.diagnostics, error_floor=0.05))
-        more = floored.correct("frame00", xy, errors=np.full((20, 2), SIGMA), detector="3").relative
+        more = floored["frame00", "3"].correct(xy, errors=np.full((20, 2), SIGMA)).relative
         assert np.allclose(floored.correct_table(new)["x_err"].value ** 2, more[:, 0, 0])
         assert np.allclose(more[:, 0, 0] - relative[:, 0, 0], 0.05**2, rtol=0.02)
 
