@@ -39,7 +39,7 @@ from .runtime.notebook import ShownAsPrinted
 from .runtime.progress import Bar
 from .simulation.truth import Truth
 from .solving.estimation import solve
-from .solving.options import CLIP, SolveOptions, check_detectors, check_reference
+from .solving.options import CLIP, DEGREE, SolveOptions, check_detectors, check_reference
 from .wcs.storage import write_wcs
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def run(
     earlier: StrPath | None = None,
     ext: Extension | None = None,
     dq_good: int | str | Sequence[int] | None = None,
-    degree: int = 3,
+    degree: int = DEGREE,
     prior: Prior | Mapping[str, Prior] | str | HeaderPrior | None = None,
     camera: Camera | None = None,
     min_exposures: int = 4,

@@ -228,7 +228,7 @@ class Camera(ShownAsPrinted):
             return np.full(len(table), *self.detectors)
         if "detector" not in table.colnames:
             raise InputError(
-                f"the table has no column detector, which of {', '.join(self.detectors)} of camera {self.name}"
+                f"the table has no column detector, which of {', '.join(self.detectors)} of camera {self.name}: add it"
             )
         detector = np.asarray(table["detector"]).astype(str)
         for key in np.unique(detector):

@@ -9,6 +9,7 @@ import numpy as np
 from ..exceptions import InputError
 from ..geometry import basis
 from ..inputs import column_contract
+from ..runtime.checks import check_positive
 from . import elements
 from .camera_plots import outline_detectors
 
@@ -38,8 +39,10 @@ def plot_residuals(view, *, scale=None, ax=None):
     Raises
     ------
     InputError
-        If none of the positions was used.
+        If none of the positions was used, or the scale is not positive.
     """
+    if scale is not None:
+        check_positive(scale, "scale")
     ax = elements.new_axes(ax, (6.4, 6.4))
     table = view.residuals
     x, y, dx, dy = (column_contract.values(table, column, "pix") for column in ("x", "y", "dx", "dy"))

@@ -100,7 +100,7 @@ class Gallery:
 
     def coefficients(self, solution):
         """Coefficients beyond the linear ones; none where there are none."""
-        if solution.coefficients.shape[2] <= 3:
+        if solution.degree < 2 and not np.any(solution.coefficients[:, :, 3:]):
             return None
         panels = solution_plots.plot_coefficients(solution, lowest=2, fig=_quick_figure())
         return self.add(

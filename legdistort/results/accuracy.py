@@ -11,6 +11,8 @@ import numpy as np
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from .errors.coefficient_covariance import exposure_blocks, times
+from .errors.star_covariance import star_matrix
+from .estimate import StoredUncertainty
 
 #: Numbers held at once while expected scatters are computed.
 _BLOCK = 2**24
@@ -116,7 +118,9 @@ def _compared(solution, xy):
         raise InputError(
             f"xy must have one row for each of the {len(solution.estimate.positions)} stars, got shape {xy.shape}"
         )
-    return np.isfinite(xy - solution.estimate.positions).all(axis=1)
+    if not (good := np.isfinite(xy - solution.estimate.positions).all(axis=1)).any():
+        raise InputError("xy has a position of none of the stars that have one in the solution: give more of them")
+    return good
 
 
 def _without_directions(solution, xy, similar, stars, moves, there):
@@ -156,25 +160,34 @@ def expected_bias(solution, *, removed=None, absolute=False):
     Parameters
     ----------
     solution : Solution
-        As returned by `legdistort.solve`.
+        As returned by `legdistort.solve`, or read.
     removed : None, "similarity" or int
         As for `bias`. With the fitted degree this is the Cramer-Rao bound of the gauge-free error.
     absolute : bool
         Add what the gauge hides (mean dynamic distortion, static uncertainty).
+
+    Returns
+    -------
+    float
+        Pixels, rms per axis.
+
+    Raises
+    ------
+    InputError
+        With `removed`, for a solution that was read if covariances between its stars do not follow from its residuals
+        (robust losses, motions, references, correlated errors).
     """
     good = np.isfinite(solution.estimate.positions).all(axis=1)
     xy = solution.estimate.positions[good]
-    if not hasattr(
-        type(solution.estimate.uncertainty), "star_matrix"
-    ):  # of the class: to ask the object would compute it
-        raise InputError("a solution read from a file keeps no covariances between stars; call solve again")
     if removed is None:  # each star by itself: the covariances between stars, a large matrix, are not needed
         blocks = solution.absolute_covariance(without_unknown=True) if absolute else None
         variance = (
             solution.estimate.uncertainty.stars[:2, good] if blocks is None else np.einsum("nkk->kn", blocks)[:, good]
         )
         return float(np.sqrt(np.mean(variance)))
-    covariance = solution.estimate.uncertainty.star_matrix[np.ix_(np.tile(good, 2), np.tile(good, 2))]
+    stored = isinstance(solution.estimate.uncertainty, StoredUncertainty)
+    between = star_matrix(solution) if stored else solution.estimate.uncertainty.star_matrix
+    covariance = between[np.ix_(np.tile(good, 2), np.tile(good, 2))]
     if absolute:
         hidden = solution.gauge.absolute_covariance
         modes = np.kron(np.eye(2), solution.gauge.modes_at(xy, len(hidden) // 2)).T

@@ -135,7 +135,10 @@ def _covariance(errors, n):
         if not errors.unit.is_equivalent(unit):
             raise InputError(f"errors must be in {unit}, got {errors.unit}")
         errors = errors.to_value(unit)
-    given = np.asarray(errors, dtype=float)
+    try:
+        given = np.asarray(errors, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"errors must be numbers, in pixels: {error}") from None
     try:
         given = np.broadcast_to(given, (n, 2, 2) if given.ndim == 3 else (n, 2))
     except ValueError:
@@ -143,7 +146,7 @@ def _covariance(errors, n):
             f"errors must be standard deviations of shape ({n}, 2) or covariances of shape ({n}, 2, 2), one for each "
             f"position, got shape {given.shape}"
         ) from None
-    finite = np.isfinite(given).reshape(n, -1).all(axis=1)
+    finite = np.isfinite(given).all(axis=tuple(range(1, given.ndim)))
     known = np.where(finite.reshape(-1, *[1] * (given.ndim - 1)), given, -1.0)
     if given.ndim == 2:
         bad, out = (known < 0).any(axis=1), known[:, :, None] ** 2 * np.eye(2)
@@ -193,7 +196,7 @@ def response(view, q):
     common, degree = view.common, view.solution.degree
     back = np.linalg.inv(common.distortion.jacobian(q) @ common.pose[:, :2])
     b = basis.values(degree, *basis.normalize(q, common.shape))
-    return np.einsum("nac,mn->nacm", back, b).reshape(len(q), 2, -1), back
+    return np.einsum("nac,mn->nacm", back, b).reshape(len(q), 2, 2 * len(b)), back
 
 
 def covariances(view, q, measured, moved=None):

@@ -574,7 +574,7 @@ class View(ShownAsPrinted):
         Raises
         ------
         InputError
-            Where several detectors have pixels of their own.
+            Where several detectors have pixels of their own, or if n is no positive integer.
 
         Examples
         --------
@@ -609,7 +609,7 @@ class View(ShownAsPrinted):
         Raises
         ------
         InputError
-            If none of the positions was used.
+            If none of the positions was used, or the scale is not positive.
 
         Examples
         --------
@@ -733,6 +733,7 @@ def image_view(solution, image):
 
 def error_map(view, *, n=64, support=True, absolute=False):
     """`View.sigma_map`, of the focal plane of several detectors too."""
+    check_counts(n=n)
     ny, nx = view.shape
     step = max(nx, ny) / n
     x = np.linspace(-0.5, nx - 0.5, max(2, round(nx / step)))
@@ -766,6 +767,6 @@ def _one_by_one(function, x, y, **keywords):
     try:
         x, y = np.broadcast_arrays(x, y)
     except ValueError:
-        raise InputError(f"x and y must have one shape, got {np.shape(x)} and {np.shape(y)}") from None
+        raise InputError(f"x and y must have one shape, got {x.shape} and {y.shape}: give as many of each") from None
     out = function(np.stack([x.ravel(), y.ravel()], axis=1), **keywords).T.reshape(2, *x.shape)
     return tuple(each * u.pix if quantity else each[()] for each in out)

@@ -1,6 +1,7 @@
 """Checks of arguments that more than one function has."""
 
 from dataclasses import fields
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,12 @@ def check_counts(**counts):
     for name, value in counts.items():
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
             raise InputError(f"{name} must be a positive integer, got {value!r}")
+
+
+def check_positive(value, name, what="number"):
+    """Raise `InputError` naming the argument, and what it is a number of, unless `value` is positive and finite."""
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < value < LARGEST:
+        raise InputError(f"{name} must be a positive {what}, got {value!r}")
 
 
 def check_is_file(path, instead="", *, of_folder="name a file in it"):

@@ -25,7 +25,7 @@ from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
 from .equations import effective_modes
 from .motion_choice import resolve as resolve_motion
-from .options import CLIP, SolveOptions, check_detectors, check_reference
+from .options import CLIP, DEGREE, SolveOptions, Unasked, check_detectors, check_reference
 from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
 from .single_detectors import by_detector
@@ -48,7 +48,7 @@ _MOST_NAMED = 6
 def solve(
     matches: Matches,
     *,
-    degree: int | str = 3,
+    degree: int | str = DEGREE,
     prior: Prior | Mapping[str, Prior] | None = None,
     model: Model | None = None,
     static: str | None = None,
@@ -81,7 +81,7 @@ def solve(
     matches : Matches
     degree : int or "auto"
         Total degree of the Legendre series, 0 to 30; or the one up to 6 whose distortions serve stars best that are
-        left out of the fit (`legdistort.solving.choices.degree_choice`).
+        left out of the fit (`legdistort.solving.choices.degree_choice`). 3 if neither it nor a `model` is given.
     prior : Prior or dict, optional
         Static distortion; one, or by ``detector`` or exposure name. None: nothing is known of it. The null space of the
         problem may then leave absolute positions undetermined (``gauge.unknown``), which is logged as a warning.
@@ -202,7 +202,7 @@ def solve(
         _warn_of_header(matches, prior)
     options, form = replace(asked, static=None, layout=None) if matches.camera.has_focal_plane else asked, None
     if model is not None:
-        form = model_forms.read(model, matches, degree=degree, gauge=gauge)
+        form = model_forms.read(model, matches, degree=None if isinstance(degree, Unasked) else degree, gauge=gauge)
         options = replace(options, degree=form.degree, model=None, prior=form.prior())
     given, kept_out = (matches, None) if validate is None else hold_out(matches, validate)
     with single_fit.threads(given), minimisers.iterations_shown(progress):

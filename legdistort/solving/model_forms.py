@@ -139,7 +139,7 @@ def read(model, matches, *, degree, gauge):
         For a model that cannot be the form of a distortion, or arguments that contradict it.
     """
     form = Form(model, matches.shapes)
-    if degree not in (3, form.degree):  # 3 where the caller gave none
+    if degree not in (None, form.degree):  # None where the caller gave none
         raise InputError(
             f"the model has free coefficients up to total degree {form.degree}: leave degree={degree!r} out"
         )

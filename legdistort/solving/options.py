@@ -16,12 +16,22 @@ from .choices.degree_choice import AUTO
 from .equations.problem import check_error_floor, check_prior
 
 
-class Unasked(float):
+class Unasked:
     """The value of an option that was not given: it yields to others that exclude it."""
 
 
+class _UnaskedInteger(Unasked, int):
+    pass
+
+
+class _UnaskedNumber(Unasked, float):
+    pass
+
+
+#: Total degree, unless the caller gives another, or a model that has one.
+DEGREE = _UnaskedInteger(3)
 #: Standard errors beyond which an observation is left out, unless the caller gives another limit.
-CLIP = Unasked(5.0)
+CLIP = _UnaskedNumber(5.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +44,7 @@ class SolveOptions(Settings):
         For options that are out of range or contradict one another.
     """
 
+    degree: int | str = DEGREE
     clip: float | None = CLIP
 
     def __post_init__(self):

@@ -19,7 +19,7 @@ from numpy.polynomial.polynomial import polyval2d
 from ..exceptions import ExportError, InputError
 from ..geometry import basis, models, similarity
 from ..geometry.tangent_plane import TangentPlane
-from ..runtime.checks import check_choice
+from ..runtime.checks import check_choice, check_positive
 
 #: Highest degree of each convention: SIP has one digit, TPV has no keywords beyond.
 MAX_DEGREE = {"sip": 9, "tpv": 7}
@@ -64,8 +64,7 @@ def make_header(pose, distortion, sky, *, kind="sip", max_error=1e-3):
         If the sky is not known.
     """
     check_choice(kind, tuple(MAX_DEGREE), "kind")
-    if not max_error > 0:
-        raise InputError(f"max_error must be a positive number of pixels, got {max_error!r}")
+    check_positive(max_error, "max_error", "number of pixels")
     origin, tangent = _reference_point(pose, distortion, sky)
     nodes = _detector_points(distortion.shape, np.cos(np.pi * np.arange(_NODES) / (_NODES - 1)))
     offset = nodes - origin

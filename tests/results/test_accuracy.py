@@ -231,10 +231,8 @@ def test_scatter_of_positions_seen_once_or_without_noise(runs):
     assert np.all(without < accuracy.expected_scatter(solution, middle, 0.1))
 
 
-def test_a_solution_from_a_file_says_what_it_lacks(runs, tmp_path):
+def test_scatter_is_that_of_a_solution_from_a_file(runs, tmp_path):
     _, solution = runs(gsaoi)[0]
     back = Solution.read(solution.write(tmp_path / "s.asdf"))
-    with pytest.raises(InputError, match="read from a file keeps no covariances between stars; call solve again"):
-        accuracy.expected_bias(back)
     xy = solution.estimate.positions[:4]
     assert_allclose(accuracy.expected_scatter(back, xy, 0.1), accuracy.expected_scatter(solution, xy, 0.1))

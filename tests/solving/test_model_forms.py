@@ -302,6 +302,7 @@ def test_the_form_itself_explains_itself():
             r"has coefficients but no x_domain: .* x_domain=\(-0.5, 1199.5\)",
         ),
         (form(), {"degree": 5}, "free coefficients up to total degree 3: leave degree=5 out"),
+        (form(2), {"degree": 3}, "free coefficients up to total degree 2: leave degree=3 out"),
         (PARTLY, {"gauge": "mean"}, "gauge='mean' balances all modes"),
         (form(), {"prior": {}}, "leave prior out"),
         (np.sin, {}, "must be one astropy model"),

@@ -14,7 +14,8 @@ from .coefficient_covariance import exposure_block
 
 def plain_directions(gauge, xy, n):
     """Displacements (n_stars, 2, 2 n) by the modes of the reference plane themselves."""
-    return np.kron(np.eye(2), gauge.modes_at(xy, n).T).reshape(2, len(xy), -1).transpose(1, 0, 2)
+    modes = gauge.modes_at(xy, n)
+    return np.kron(np.eye(2), modes.T).reshape(2, len(xy), 2 * len(modes)).transpose(1, 0, 2)
 
 
 def _directions(gauge, xy):
