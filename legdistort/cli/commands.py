@@ -15,6 +15,7 @@ from ..coaddition.grids import given_grid, read_grid
 from ..coaddition.mosaic import check_ending
 from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
+from ..inputs import column_contract
 from ..inputs.exposure_names import detector_name
 from ..inputs.star_lists.formats import stack
 from ..inputs.table_files import read_table, write_stars
@@ -133,15 +134,18 @@ def do_match(a):
     from ..measurement.earlier import measured_frames
     from ..pipeline import timed, write_matched
 
-    read = {Path(path): _read_table(path, a) for path in a.tables}
+    contract = column_contract.DETECTED | {"epoch": column_contract.MATCHED["epoch"]}
+    read = {Path(path): _read_table(path, a, contract) for path in a.tables}
     tables = list(read.values())
+    if not any(map(len, tables)):
+        column_contract.check(tables[0], contract, str(a.tables[0]))
     names = [name for table in tables for name in dict.fromkeys(table["exposure"])]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
     camera = _camera(a.camera) or _measured_with(tables)
-    if camera is not None:
+    if camera:
         _refuse({"shape": a.shape}, "comes from the camera of the run")
     known = {"shape": tuple(a.shape) if a.shape else shapes or None, "camera": camera}
     if (exposures := measured_frames(read)) is not None:
@@ -179,7 +183,7 @@ def do_solve(a):
     check_results(a.out, a.overwrite)
     _refuse_ignored(a)
     with outputs.replacing_folder(a.out, former=RESULTS) as target:  # a mosaic there does not belong to this solution
-        table = _read_table(a.table, a)
+        table = _read_table(a.table, a, column_contract.MATCHED)
         known = legdistort.Matches.read_meta(table.meta)
         known |= {"shape": tuple(a.shape)} if a.shape else {}
         known |= {"camera": _camera(a.camera)} if a.camera else {}
@@ -416,8 +420,12 @@ def _prior(text, shape, static_sigma):
     return legdistort.Prior.from_file(text, shape=shape, static_sigma=static_sigma)
 
 
-def _read_table(path, a):
-    return read_table(path, columns=dict(a.columns), origin=a.origin, error=a.error)
+def _read_table(path, a, contract=None):
+    """The table in a file; where it does not keep a contract, the message names the file."""
+    table = read_table(path, columns=dict(a.columns), origin=a.origin, error=a.error)
+    if contract is not None and len(table):
+        column_contract.check(table, contract, str(path))
+    return table
 
 
 def _camera(given):

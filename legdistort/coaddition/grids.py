@@ -11,6 +11,8 @@ from astropy.wcs import WCS
 
 from ..exceptions import InputError, without_astropy_warnings
 from ..geometry.tangent_plane import TangentPlane
+from ..inputs.file_images import plane_shape
+from ..inputs.sky_wcs import image_wcs
 from ..runtime.checks import check_is_file
 from ..runtime.fits_bytes import open_fits
 
@@ -110,7 +112,7 @@ def checked_wcs(grid):
     """The WCS, a copy, of a grid given as a celestial WCS or FITS header with a shape; `InputError` if it is none."""
     if isinstance(grid, fits.Header):
         try:
-            wcs = WCS(grid)
+            wcs = image_wcs(grid)
             wcs.wcs.set()
         except Exception as error:  # whatever a broken header provokes, in wcslib too
             raise InputError(f"grid: no WCS can be read from the header ({' '.join(str(error).split())})") from None
@@ -195,8 +197,8 @@ def _of_image(path):
     with path.open("rb") as file, open_fits(file, "the file") as hdulist:
         for hdu in hdulist:
             if hdu.is_image:
-                wcs = WCS(hdu.header, hdulist)
-                if hdu.header["NAXIS"] == 2 and wcs.has_celestial:
+                wcs = image_wcs(hdu.header, hdulist)
+                if wcs.naxis == 2 == len(plane_shape(hdu)) and wcs.has_celestial:
                     return wcs
                 first = first or wcs
     return first

@@ -4,11 +4,12 @@ from itertools import combinations
 
 import numpy as np
 from astropy import units as u
-from astropy.table import QTable, Table
+from astropy.table import Column, QTable, Table
 
 from ..exceptions import InputError
 from ..geometry.epochs import years
 from ..runtime import checks
+from .plain_columns import is_text, numbers, text
 
 #: Columns of a table of matched positions: name -> (unit, required)
 MATCHED = {
@@ -131,6 +132,8 @@ def values(table, column, unit=None):
     data = table[column]
     if data.ndim != 1:
         raise InputError(f"column {column!r} must hold one number a row, it has shape {data.shape}")
+    if is_text(data):
+        data = _stated(data, column, unit)
     try:
         if np.ma.isMaskedArray(data) and np.ma.is_masked(data):
             data = data.astype(float).filled(np.nan)
@@ -139,6 +142,19 @@ def values(table, column, unit=None):
         return np.array(data, dtype=float)
     except (u.UnitConversionError, TypeError, ValueError) as error:
         raise InputError(f"column {column!r} cannot be read as numbers in {unit or 'no unit'}: {error}") from None
+
+
+def _stated(data, column, unit):
+    """The numbers that a column of text states, with its unit."""
+    found, bad = numbers(data)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise InputError(
+            f"column {column!r} cannot be read as numbers in {unit or 'no unit'}: row {row} has "
+            f"{str(text(data)[row])!r}, the first of {np.count_nonzero(bad)} of {len(bad)} that are none; correct "
+            "them or leave these rows out"
+        )
+    return found if getattr(data, "unit", None) is None else u.Quantity(found, data.unit)
 
 
 def covariance(table):
@@ -156,21 +172,21 @@ def set_covariance(table, blocks):
 
 def labels(table, column):
     """A column of names (str) or serials (int) as a plain array."""
-    missing = np.ma.getmaskarray(table[column]) if np.ma.isMaskedArray(table[column]) else np.zeros(len(table), bool)
+    data = table[column]
+    if data.ndim != 1:
+        raise InputError(f"column {column!r} must hold one name a row, it has shape {data.shape}")
+    missing = np.ma.getmaskarray(data) if np.ma.isMaskedArray(data) else np.zeros(len(table), bool)
+    if data.dtype.kind in "SUO":
+        data = text(data)
+        missing = missing | (data == "")
     if missing.any():
         raise InputError(
             f"column {column!r} has no value in {np.count_nonzero(missing)} of {len(missing)} rows, the first is row "
             f"{int(np.argmax(missing))}; fill them or leave these rows out"
         )
-    data = np.asarray(table[column])
-    if data.ndim != 1:
-        raise InputError(f"column {column!r} must hold one name a row, it has shape {data.shape}")
-    if data.dtype.kind == "S":
-        data = np.char.decode(data, "utf-8", "replace")
-    if data.dtype.kind == "O":
-        data = data.astype(str)
+    data = np.asarray(data)
     if data.dtype.kind not in "iuU":
-        raise InputError(f"column {column!r} must hold names or integers, got {data.dtype}")
+        raise InputError(f"column {column!r} must hold names or integers, got {data.dtype}; write them as text")
     return data
 
 
@@ -204,7 +220,7 @@ def rename(table, columns):
 
 #: What values must be, and the words if they are not, by column.
 _RULES = (
-    (("x", "y"), np.isfinite, "not finite", ""),
+    (("x", "y"), np.isfinite, "not finite", "; correct these rows or leave them out"),
     (
         ("x_err", "y_err"),
         lambda values: np.isfinite(values) & (values > 0),
@@ -218,7 +234,7 @@ _RULES = (
         "not between 1e-30 and 1e30",
         "; errors are standard deviations in pixels",
     ),
-    (("xy_corr",), lambda values: np.abs(values) < 1, "not inside (-1, 1)", ""),
+    (("xy_corr",), lambda values: np.abs(values) < 1, "not inside (-1, 1)", "; correct it or leave the column out"),
 )
 
 
@@ -294,21 +310,28 @@ def check(table, contract, what):
         raise InputError(f"{what} is empty: give one with{needed} a row for each position")
     out = QTable()
     for name in table.colnames:
-        unit = contract[name][0] if name in contract else None
-        if name in ("exposure", "star", "detector"):
-            out.add_column(labels(table, name).copy(), name=name, copy=False)
-        elif name == "epoch" and name in contract:
-            out[name] = years(table[name])
-        elif name in contract:
-            column = values(table, name, unit)
-            column = column if unit is None else u.Quantity(column, unit, copy=False)
-            out.add_column(column, name=name, copy=False)  # `values` made a copy already
-        else:
-            out[name] = table[name]
+        try:
+            out.add_column(_kept(table, name, contract), name=name, copy=False)
+        except InputError as error:
+            raise InputError(f"{what}: {error}") from None
     if "mag" in contract and "mag" in out.colnames and "flux" not in out.colnames:
         out["flux"] = flux_of(out["mag"])
     _check_values(out, what)
     return out
+
+
+def _kept(table, name, contract):
+    """A column as a table that keeps the contract has it."""
+    if name in ("exposure", "star", "detector"):
+        return labels(table, name).copy()
+    if name not in contract:
+        column = table[name]
+        return Column(text(column)) if is_text(column) and getattr(column, "unit", None) is not None else column.copy()
+    if name == "epoch":
+        column = table[name]
+        return years(column if not is_text(column) else Column(values(table, name), unit=column.unit))
+    column, unit = values(table, name, contract[name][0]), contract[name][0]  # `values` makes a copy
+    return column if unit is None else u.Quantity(column, unit, copy=False)
 
 
 def flux_of(magnitudes):

@@ -28,7 +28,7 @@ from ..runtime.provenance import checksum, unchanged
 from . import repetitions
 from .exposure_names import detector_name, exposure_name
 from .exposures import LEAVE_OUT, Exposure, known_from_header
-from .file_images import find_image, images_of_detectors, is_image, named_images, of_detector
+from .file_images import as_plane, find_image, images_of_detectors, is_image, named_images, of_detector, plane_shape
 from .foreign_images import from_nddata, is_nddata, read_roman
 from .pixel_flags import bad_pixels, good_bits
 from .sky_wcs import believable_wcs, header_wcs
@@ -486,7 +486,7 @@ def _from_hdulist(hdulist, ext, label, path, good=None):
         integer = hdu.header.get("BITPIX", -32) > 0  # before the data are touched: scaling changes it
         planes = _planes(hdulist, hdu, good)
     name = exposure_name(label, ext)
-    wcs = header_wcs(header, hdulist, hdu.shape, name)
+    wcs = header_wcs(header, hdulist, plane_shape(hdu), name)
     known = known_from_header(header, planes["data"], integer=integer)
     tables = [other for other in hdulist if other.name == "ASDF"]
     if len(tables) == 1:
@@ -494,7 +494,7 @@ def _from_hdulist(hdulist, ext, label, path, good=None):
         if path is not None:
             known["has_gwcs"] = owner is None or named_images(hdulist, path).get(owner) is hdu
         if owner is None and header.get("TELESCOP") == "JWST":
-            wcs = _gwcs_of(tables[0], name, hdu.shape) or wcs
+            wcs = _gwcs_of(tables[0], name, plane_shape(hdu)) or wcs
     return Exposure(name, **planes, header=header, wcs=wcs, path=path, **known)
 
 
@@ -520,15 +520,15 @@ def _planes(hdulist, hdu, good=None):
     if data is None or data.shape != hdu.shape:
         raise OSError("data incomplete")
     telescope = hdu.header.get("TELESCOP", hdulist[0].header.get("TELESCOP", ""))
-    planes = {"data": data}
+    planes, shape = {"data": as_plane(data)}, plane_shape(hdu)
     for other in hdulist:
-        alike = other is not hdu and is_image(other) and other.shape == hdu.shape and other.ver == hdu.ver
+        alike = other is not hdu and is_image(other) and plane_shape(other) == shape and other.ver == hdu.ver
         if alike and other.name in MASK_NAMES:
-            planes["mask"] = bad_pixels(other.data, good, do_not_use=telescope in ("JWST", "ROMAN"))
+            planes["mask"] = bad_pixels(as_plane(other.data), good, do_not_use=telescope in ("JWST", "ROMAN"))
         elif alike and other.name in UNCERTAINTY_NAMES:
             kind = str(other.header.get("UTYPE", UNCERTAINTY_NAMES[other.name]))  # CCDData writes its class as UTYPE
             with np.errstate(invalid="ignore", divide="ignore"):
-                values = np.asarray(other.data, dtype=float)
+                values = np.asarray(as_plane(other.data), dtype=float)
                 if kind.startswith("Variance"):
                     values = np.sqrt(values)
                 elif kind.startswith("InverseVariance"):

@@ -149,7 +149,9 @@ def named_images(hdulist, path):
 
 def planes_beside(hdulist, image):
     """HDUs of errors, flags, weights beside an image: of its shape and ``EXTVER``, and of no other image."""
-    alike = [hdu for hdu in hdulist if is_image(hdu) and hdu.shape == image.shape and hdu.ver == image.ver]
+    alike = [
+        hdu for hdu in hdulist if is_image(hdu) and plane_shape(hdu) == plane_shape(image) and hdu.ver == image.ver
+    ]
     planes = [hdu for hdu in alike if hdu is not image and _stands_beside(hdu.name)]
     return planes if len(planes) == len(alike) - 1 else []
 
@@ -157,6 +159,17 @@ def planes_beside(hdulist, image):
 def is_image(hdu):
     """Whether an HDU is an image that has pixels."""
     return isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) and len(hdu.shape) > 0
+
+
+def plane_shape(image):
+    """Shape ``(ny, nx)`` of an HDU or array whose further axes have one pixel each (``NAXIS3 = 1``), else its own."""
+    shape = tuple(image.shape)
+    return shape[-2:] if all(n == 1 for n in shape[:-2]) else shape
+
+
+def as_plane(data):
+    """An array without the axes of one pixel before the last two."""
+    return data.reshape(plane_shape(data))
 
 
 def find_image(hdulist, ext, label, *, of_several=False):
@@ -177,10 +190,10 @@ def find_image(hdulist, ext, label, *, of_several=False):
         raise DamagedError(f"{label}: no image{where}")
     images = [hdu for hdu in candidates if len(hdu.shape) > 1]
     if len(images) > 1 and of_several:
-        images.sort(key=lambda hdu: len(hdu.shape))  # stable: 2-D before cubes, else the order of the file
+        images.sort(key=lambda hdu: len(plane_shape(hdu)))  # stable: 2-D before cubes, else the order of the file
     elif len(images) > 1:
         raise InputError(f"{label} holds {_listed_images(hdulist, images)}")
-    if not images or len(images[0].shape) > 2:
+    if not images or len(plane_shape(images[0])) > 2:
         shape = (images or candidates)[0].shape
         words = "choose one plane, and give it as a file of its own"
         raise InputError(f"{label}: no 2-D image{where}, the data have shape {shape}; {words}")

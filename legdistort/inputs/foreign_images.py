@@ -13,6 +13,7 @@ from ..exceptions import DamagedError, InputError
 from ..runtime.checks import first_line
 from .exposure_names import exposure_name
 from .exposures import Exposure, known_from_header
+from .file_images import as_plane
 from .pixel_flags import bad_pixels
 from .sky_wcs import believable_wcs
 
@@ -50,8 +51,9 @@ def from_nddata(image, default, good=0):
             ) from None
     if image.unit is not None:
         header["BUNIT"] = image.unit.to_string()
-    data = np.asarray(image.data)
-    mask = None if image.mask is None else bad_pixels(image.mask, good)
+    data = as_plane(np.asarray(image.data))
+    uncertainty = None if uncertainty is None else as_plane(np.asarray(uncertainty))
+    mask = None if image.mask is None else bad_pixels(as_plane(np.asarray(image.mask)), good)
     known = known_from_header(header, data, integer=data.dtype.kind in "iu")
     return Exposure(name, data, mask, uncertainty, believable_wcs(image.wcs, data.shape, name), header, **known)
 
@@ -102,7 +104,7 @@ def read_roman(file, label, path, good=None):
         with quiet, asdf.open(file, memmap=False, lazy_load=True) as opened:
             roman = opened.tree.get("roman")
             image = roman if hasattr(roman, "get") else {}
-            planes = {key: np.array(image[key]) for key in ("data", "err", "dq") if key in image}
+            planes = {key: as_plane(np.array(image[key])) for key in ("data", "err", "dq") if key in image}
             meta = _plain(image.get("meta") or {})
     except Exception as error:  # there is no end to what a broken file provokes
         if "lz4 library" in str(error):

@@ -4,20 +4,23 @@ Columns are those of Gaia (also as VizieR writes them), or ``x``, ``y`` in the r
 of stars of solutions. Where a table has both, the sky is taken.
 """
 
+import warnings
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 from astropy import units as u
-from astropy.coordinates import SkyCoord
+from astropy.coordinates import Angle, SkyCoord
 from astropy.table import Table
 from astropy.time import Time
 
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry.epochs import year
 from ..geometry.tangent_plane import angles, compass, directions
+from ..runtime import checks
 from . import column_contract
+from .plain_columns import is_text, numbers, text
 from .table_files import read_table
 
 #: How VizieR calls the columns of Gaia, in small letters.
@@ -29,6 +32,8 @@ VIZIER = {
     "raplxcor": "ra_parallax_corr", "deplxcor": "dec_parallax_corr", "plxpmracor": "parallax_pmra_corr",
     "plxpmdecor": "parallax_pmdec_corr",
 }  # fmt: skip
+#: How the tables of the CDS call the parts of sexagesimal positions, in small letters.
+_PARTS = ("rah", "ram", "ras", "ded", "dem", "des", "de-")
 #: Columns of errors that are not called NAME_error.
 _ERRORS = {"x": "x_err", "y": "y_err", "vx": "vx_err", "vy": "vy_err"}
 _UNITS = dict.fromkeys(("ra", "dec"), u.deg) | dict.fromkeys(("pmra", "pmdec"), u.mas / u.yr)
@@ -260,6 +265,11 @@ def _named(table):
         wanted = VIZIER.get(small, small)
         if wanted != name and wanted not in table.colnames:
             table.rename_column(name, wanted)
+    if set(_PARTS) <= set(table.colnames) and not {"ra", "dec"} & set(table.colnames):
+        h, m, s, deg, arcmin, arcsec = (column_contract.values(table, name) for name in _PARTS[:-1])
+        south = [word.strip().startswith(("-", "\u2212")) for word in text(np.asarray(table["de-"]).astype(str))]
+        table["ra"] = 15 * (h + m / 60 + s / 3600)
+        table["dec"] = np.where(south, -1, 1) * (deg + arcmin / 60 + arcsec / 3600)
     for name in [name for name in table.colnames if name.endswith("_abs")]:  # a table of stars of a solution
         table[name.removesuffix("_abs")] = table[name]
     return table
@@ -288,11 +298,40 @@ def _moving(table, places, motions, unit, label):
 
 
 def _celestial(table, label):
-    sky = np.column_stack([column_contract.values(table, name, u.deg) for name in ("ra", "dec")])
+    sky = np.column_stack([_degrees_of(table, name, unit) for name, unit in (("ra", u.hourangle), ("dec", u.deg))])
     if np.any(np.abs(sky[:, 1]) > 90):
-        raise InputError(f"dec must lie in -90 ... 90 degrees, got {sky[np.argmax(np.abs(sky[:, 1])), 1]:g}")
+        row = int(np.nanargmax(np.abs(sky[:, 1])))
+        raise InputError(f"dec must lie in -90 ... 90 degrees, got {sky[row, 1]:g} in row {row}")
     motion, epoch, covariance = _moving(table, ("ra", "dec"), ("pmra", "pmdec"), u.mas, label)
     return Reference(label, _star(table), _flux(table), sky, None, covariance, motion, epoch)
+
+
+def _degrees_of(table, name, usual):
+    """A column of right ascensions or declinations in degrees; sexagesimal ones are in the unit that is `usual`.
+
+    The unit of a column, or letters (5h35m12s, -5d24m), go before.
+    """
+    column = table[name]
+    found, is_none = numbers(column) if is_text(column) else (np.zeros(len(table)), np.zeros(len(table), dtype=bool))
+    is_number = np.isfinite(found)
+    if np.count_nonzero(is_none) <= np.count_nonzero(is_number):  # a column of numbers, but for some
+        return column_contract.values(table, name, u.deg)
+    stated = str(getattr(column, "unit", None) or "").strip("\"' ").lower()
+    unit = {"h": u.hourangle, "d": u.deg}.get(stated[:1], usual)
+    words, out = text(column), np.full(len(table), np.nan)
+    for row in np.flatnonzero(is_none | is_number):
+        try:
+            if is_number[row]:
+                raise ValueError("a number among sexagesimal values")
+            with warnings.catch_warnings(action="ignore"):  # 60 s, of rounding
+                out[row] = Angle(str(words[row]).strip().replace("\u2212", "-"), unit).deg
+        except (ValueError, u.UnitsError) as error:
+            raise InputError(
+                f"column {name!r} has {str(words[row])!r} in row {row}, which is not sexagesimal in "
+                f"{'hours' if unit is u.hourangle else 'degrees'} ({checks.first_line(error)}): correct it or leave "
+                "the row out; or give all in degrees as numbers, or the column its unit, deg or hourangle"
+            ) from None
+    return out
 
 
 def _errors(table, values, unit, label):
@@ -322,7 +361,8 @@ def _covariance(table, errors, names):
         if (name := column_contract.correlation(first, second)) in table.colnames:
             corr = np.nan_to_num(column_contract.values(table, name))
             if np.any(np.abs(corr) > 1):
-                raise InputError(f"{name} must lie in -1 ... 1, got {corr[np.argmax(np.abs(corr))]:g}")
+                row = int(np.argmax(np.abs(corr)))
+                raise InputError(f"{name} must lie in -1 ... 1, got {corr[row]:g} in row {row}")
             i, k = names.index(first), names.index(second)
             out[:, i, k] = out[:, k, i] = corr * errors[:, i] * errors[:, k]
     return out
@@ -340,8 +380,11 @@ def _epochs(table, label):
         return np.full(len(table), year(table.meta["ref_epoch"]))
     column = table["ref_epoch"]
     out = column.jyear if isinstance(column, Time) else column_contract.values(table, "ref_epoch", u.yr)
-    for value in (np.nanmin(out), np.nanmax(out)):
-        year(float(value))
+    for row in {int(np.nanargmin(out)), int(np.nanargmax(out))} if np.isfinite(out).any() else ():
+        try:
+            year(float(out[row]))
+        except InputError as error:
+            raise InputError(f"ref_epoch in row {row}: {error}") from None
     return out
 
 

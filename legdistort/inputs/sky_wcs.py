@@ -69,10 +69,22 @@ def believable_wcs(wcs, shape, name="", *, level=logging.INFO):
 def header_wcs(header, hdulist, shape, name, *, level=logging.INFO):
     """The believable WCS of a header of a file, or None with a log entry."""
     try:
-        return believable_wcs(WCS(header, fobj=hdulist), shape, name, level=level)
+        return believable_wcs(image_wcs(header, hdulist), shape, name, level=level)
     except Exception as error:  # wcslib raises many kinds; a header WCS is a hint, never a must
         log.log(level, "%s: WCS of the header not used: %s", name, error)
         return None
+
+
+def image_wcs(header, hdulist=None):
+    """The `~astropy.wcs.WCS` of a header; of its first two axes, if further ones have one pixel (``NAXIS3 = 1``)."""
+    n_axes = max(header.get("NAXIS", 2), header.get("WCSAXES", 2))
+    further = [header.get(f"NAXIS{axis}", 1) for axis in range(3, n_axes + 1)]
+    if not further or any(n != 1 for n in further):
+        return WCS(header, fobj=hdulist)
+    wcs = WCS(header, fobj=hdulist, naxis=2)
+    if wcs.pixel_shape is not None:
+        wcs.pixel_shape = wcs.pixel_shape[:2]
+    return wcs
 
 
 def to_icrs(wcs, xy, *, distortion=True):

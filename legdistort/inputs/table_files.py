@@ -10,10 +10,11 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.table import Column, QTable
 
-from ..exceptions import InputError
+from ..exceptions import InputError, without_astropy_warnings
 from ..runtime import outputs, provenance
 from ..runtime.checks import check_is_file
 from . import column_contract, exposure_names
+from .plain_columns import for_fits, with_text
 from .star_lists import dialects, formats
 
 log = logging.getLogger(__name__)
@@ -25,7 +26,7 @@ WRITTEN = {".ecsv": "ascii.ecsv", ".fits": "fits", ".csv": "ascii.csv", ".vot": 
 def read_table(path, *, columns=None, origin=None, error=None):
     """Read a table of positions from a file.
 
-    ECSV, FITS (FITS_LDAC too), VOTable, CSV, all also packed with gzip or bzip2; lists of SExtractor, FlyStar,
+    ECSV, FITS (FITS_LDAC too), VOTable, IPAC, CSV, all also packed with gzip or bzip2; lists of SExtractor, FlyStar,
     hst1pass, DAOPHOT and photutils, whose columns are understood (`legdistort.inputs.star_lists.dialects`); and any
     other text whose columns are named in its first line or in a comment. A table without a column ``exposure`` is taken
     for one exposure, named after the file; an LDAC file of several extensions, or a list of several chips, for as many,
@@ -51,7 +52,7 @@ def read_table(path, *, columns=None, origin=None, error=None):
     Raises
     ------
     InputError
-        Naming the file.
+        Naming the file, and the row and column that cannot be read.
     """
     path = Path(path)
     if origin not in (None, 0, 1):
@@ -166,5 +167,8 @@ def write_table(table, path, *, kind="ascii.ecsv", overwrite=False):
             text = io.TextIOWrapper(file, encoding="utf-8", newline="")
             table.write(text, format=kind)
             text.detach()
+        elif kind == "fits":
+            with without_astropy_warnings():  # of names of columns that are no words of ASCII
+                for_fits(table).write(file, format=kind)
         else:
-            table.write(file, format=kind)
+            with_text(table).write(file, format=kind)

@@ -21,7 +21,7 @@ from ..inputs.exposure_names import whole_name
 from ..inputs.exposures import Exposure
 from ..inputs.start_poses import estimate_poses
 from ..measurement.crowding import LIMIT, is_isolated
-from ..measurement.flags import UNUSABLE
+from ..measurement.flags import UNUSABLE, Flag
 from ..priors.from_headers import describe, header_distortions
 from ..runtime import parallel
 from . import detector_layout
@@ -44,6 +44,8 @@ log = logging.getLogger(__name__)
 FEWEST = 5
 #: With a smaller part of hot pixels among the detections of every exposure these are not linked anew without them.
 FEW_HOT = 0.05
+#: Larger numbers are no flags: the bits of 32.
+LARGEST_FLAGS = 2.0**32 - 1
 
 
 def match(
@@ -151,9 +153,7 @@ def match(
     names = list(dict.fromkeys(table["exposure"].tolist()) if named is None else named)
     _check_names(table, names, min_exposures)
     shapes = _shapes(table, names, named, shape)
-    if "flags" in table.colnames:
-        table = table[(np.asarray(table["flags"]).astype(int) & int(reject_flags)) == 0]
-    table = _without_repetitions(table)
+    table = _without_repetitions(_without_flagged(table, int(reject_flags)))
     copies = _copies(table)
     table, names = table[~np.isin(table["exposure"], list(copies))], [name for name in names if name not in copies]
     headers = HeaderPoses.from_wcs({n: e.wcs for n, e in (named or {}).items() if e.wcs is not None}, shapes)
@@ -201,6 +201,22 @@ def _add_epochs(table, named):
     if any(epoch is not None for epoch in epochs.values()) and "epoch" not in table.colnames:
         years = {name: np.nan if epoch is None else epoch for name, epoch in epochs.items()}
         table["epoch"] = [years.get(name, np.nan) for name in table["exposure"]] * u.yr
+
+
+def _without_flagged(table, reject_flags):
+    """The table without rows of which a flag is to be rejected; a missing flag is none."""
+    if "flags" not in table.colnames:
+        return table
+    flags = np.nan_to_num(np.clip(table["flags"], 0, LARGEST_FLAGS)).astype(int)
+    good = (flags & reject_flags) == 0
+    if not good.any():
+        counts = {flag.name: np.count_nonzero(flags & flag) for flag in Flag if flag & reject_flags}
+        named = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+        raise MatchError(
+            f"none of the {len(table)} detections can be used, all have flags for which they are rejected ({named}): "
+            "correct the column flags or leave it out, or give the bits to reject, match(reject_flags=...), 0 for none"
+        )
+    return table[good]
 
 
 def _without_repetitions(table):

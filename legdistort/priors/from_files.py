@@ -12,13 +12,13 @@ import gwcs
 import numpy as np
 from astropy.io import fits
 from astropy.modeling import Model
-from astropy.wcs import WCS
 
 from ..cameras.source import of_maps, of_powers
 from ..exceptions import AssumptionWarning, InputError, warn, without_astropy_warnings
 from ..geometry import basis
 from ..geometry.gsaoi import GSAOI_SIZE, gsaoi_static
 from ..inputs.exposure_files import read_exposures
+from ..inputs.sky_wcs import image_wcs
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.checks import check_is_file
 from ..runtime.fits_bytes import open_fits
@@ -182,7 +182,7 @@ def _from_header(header, name, hdulist=None):
         header = header.copy()
         if hdulist is None:
             _leave_out_tables(header, name)
-        source = as_source(WCS(header, fobj=hdulist), name=name)
+        source = as_source(image_wcs(header, hdulist), name=name)
     except InputError:
         raise
     except Exception as error:  # wcslib raises many kinds

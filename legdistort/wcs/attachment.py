@@ -236,7 +236,7 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
 def _is_elsewhere(view, hdulist, hdu):
     """Whether the header of an image leads far from where the solution has it."""
     with without_astropy_warnings():
-        wcs = header_wcs(hdu.header, hdulist, hdu.shape, view.label, level=logging.DEBUG)
+        wcs = header_wcs(hdu.header, hdulist, file_images.plane_shape(hdu), view.label, level=logging.DEBUG)
     return leads_elsewhere(wcs, view)
 
 
@@ -268,9 +268,9 @@ def _images(known, hdulist, path, ext):
     for name, form in found.items():
         # of several images the first, if the solution knows the file by its name alone
         hdu = file_images.find_image(hdulist, form, str(path), of_several=True)
-        if hdu.shape != tuple(known.views[name].shape):
+        if (shape := file_images.plane_shape(hdu)) != tuple(known.views[name].shape):
             raise InputError(
-                f"{path}: the image has shape {hdu.shape}, exposure {name} of the solution "
+                f"{path}: the image has shape {shape}, exposure {name} of the solution "
                 f"{tuple(known.views[name].shape)}; give the frames that the solution was made from"
             )
         images[name] = _number(hdulist, hdu)

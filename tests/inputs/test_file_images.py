@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData
+from numpy.testing import assert_allclose, assert_array_equal
 
 import legdistort as ld
 from legdistort.cli.parser import main
+from legdistort.coaddition.grids import read_grid
 from legdistort.exceptions import InputError
 
 SHAPE = (256, 256)
@@ -60,6 +62,34 @@ def test_a_cube_beside_an_image(tmp_path):
         fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(tmp_path / "cube.fits", overwrite=True)
         with pytest.raises(InputError, match=words):
             ld.read_exposures(tmp_path / "cube.fits")
+
+
+@pytest.mark.parametrize("further", [(1,), (1, 1)])
+@pytest.mark.parametrize("read", [ld.read_exposures, ld.open_exposures])
+def test_axes_of_one_pixel_are_none(tmp_path, read, further):
+    """The same frame, with its planes and the WCS of its header, as with two axes."""
+    header = fits.Header({"CTYPE1": "RA---TAN-SIP", "CTYPE2": "DEC--TAN-SIP", "CRVAL1": 83.8, "CRVAL2": -5.4,
+                          "CRPIX1": 100.0, "CRPIX2": 120.0, "CD1_1": -1e-5, "CD2_2": 1e-5, "A_ORDER": 2, "B_ORDER": 2,
+                          "A_2_0": 1e-5, "B_0_2": -1e-5})  # fmt: skip
+    data, error, flags = pixels(), np.full(SHAPE, 5, "float32"), np.zeros(SHAPE, "int16")
+    flags[3, 4] = 1
+    for name, axes in (("flat", ()), ("deep", further)):
+        planes = {"SCI": data, "ERR": error, "DQ": flags}
+        hdus = [fits.ImageHDU(a.reshape(axes + SHAPE), header if n == "SCI" else None, n) for n, a in planes.items()]
+        hdus[2] = fits.ImageHDU(flags, name="DQ")  # of two axes beside an image of more
+        fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(tmp_path / f"{name}.fits")
+    (flat,), (deep,) = (read(tmp_path / f"{name}.fits") for name in ("flat", "deep"))
+    assert deep.shape == SHAPE
+    assert_array_equal(deep.read().data, flat.read().data)
+    assert_array_equal(deep.read().mask, flags > 0)
+    assert_array_equal(deep.read().uncertainty, 5)
+    places = [e.wcs.all_pix2world([[10.0, 20.0], [200.0, 50.0]], 0) for e in (flat, deep)]
+    assert_allclose(*places, rtol=0, atol=1e-12)
+    array = CCDData(data.reshape(further + SHAPE), unit="adu", mask=(flags > 0).reshape(further + SHAPE))
+    assert_array_equal(ld.read_exposures(array)[0].mask, flags > 0)
+    priors = [ld.Prior.from_file(tmp_path / f"{name}.fits") for name in ("flat", "deep")]
+    assert_allclose(*(prior.mean for prior in priors), rtol=0, atol=1e-9)
+    assert read_grid(tmp_path / "deep.fits").array_shape == SHAPE
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ from legdistort.matching.registration import Registration, register
 from legdistort.matching.similarity_candidates import offset_candidates, triangle_candidates
 from legdistort.matching.star_labels import label_stars
 from legdistort.matching.star_lists import StarList, Warp
+from legdistort.measurement.flags import Flag
 from legdistort.simulation.observations import simulate_matches
 
 
@@ -324,6 +325,21 @@ def test_flags():
     table["flags"] = np.where(np.arange(len(table)) % 10 == 0, 2, 0)
     assert np.all(match(table, shape=SHAPE, reject_flags=2).table["flags"] == 0)
     assert np.any(match(table, shape=SHAPE, reject_flags=1).table["flags"] == 2)
+
+
+def test_where_all_are_flagged_the_flags_are_named():
+    table = simulate_matches(n_stars=20, n_exposures=4, seed=1).matches.table
+    table = table["exposure", "x", "y", "x_err", "y_err"]
+    table["flags"] = np.where(np.arange(len(table)) % 2, Flag.SATURATED, Flag.EDGE | Flag.BLENDED)
+    with pytest.raises(
+        MatchError,
+        match=r"none of the 80 detections .*\(SATURATED 40, EDGE 40\): correct the column.*reject_flags",
+    ):
+        match(table, shape=(2048, 2048))
+    assert len(match(table, shape=(2048, 2048), reject_flags=0).stars) == 20
+    table["flags"] = np.where(table["exposure"] == table["exposure"][0], 1.0, np.nan)  # no flag is none
+    matches = match(table, shape=(2048, 2048), min_exposures=3)
+    assert matches.left_out == {table["exposure"][0]: "only 0 usable detections of at least 5"}
 
 
 def test_an_empty_table_is_told_from_one_without_columns():
