@@ -123,7 +123,7 @@ def measured_frames(tables):
         earlier = EarlierRun(path.parent, table)
         try:
             opened = open_exposures(earlier.frames, **earlier.reading)
-            exposures += opened if earlier.camera is None else earlier.camera.of_detectors(opened)
+            exposures += earlier.camera.of_detectors(opened) if earlier.camera else opened
             earlier.of(opened)
         except LegdistortError as error:
             warn(f"{path}: matched without the headers of its frames, so without their sky: {error}", AssumptionWarning)
