@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import InitVar, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,7 +76,7 @@ class Solution(ShownAsPrinted):
         Of a camera with a focal plane (`Camera.has_focal_plane`) positions, shapes and distortions are those of that.
         That of plain images has one detector, "1"; it need not be given.
     checksum : str or None
-        SHA-256 of the file that it was read from, in hexadecimal digits.
+        SHA-256 of the file that it was read from, in hexadecimal digits; what `dataclasses.replace` makes has none.
 
     See Also
     --------
@@ -117,9 +117,11 @@ class Solution(ShownAsPrinted):
     left_out: dict[str, str] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     camera: Camera = None
-    checksum: str | None = None
+    checksum: str | None = field(default=None, init=False)  # what `replace` makes is another solution
+    _checksum: InitVar[str | None] = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, _checksum: str | None) -> None:
+        object.__setattr__(self, "checksum", _checksum)
         if self.camera is None:
             object.__setattr__(self, "camera", Camera.of_images(self.estimate.shapes.values()))
 
@@ -142,7 +144,7 @@ class Solution(ShownAsPrinted):
         return state | {"estimate": estimate, "gauge": replace(self.gauge, responses=estimate.uncertainty)}
 
     def __copy__(self) -> Solution:
-        return replace(self)
+        return replace(self, _checksum=self.checksum)
 
     def __contains__(self, key: object) -> bool:
         return has_key(self, key)

@@ -179,7 +179,7 @@ def _from_tree(kind, checksum, tree):
                 if e.inverse is not None
             },
         ),
-        checksum=checksum,
+        _checksum=checksum,
     )
     _check_consistent(solution)
     return solution
