@@ -68,7 +68,7 @@ def test_compiled_start_is_the_plain_one(monkeypatch, robust):
     plain, astray = start_values.start(problem, nominal, robust=robust)
     monkeypatch.setattr("legdistort.solving.equations.problem.COMPILED_FROM", 0)
     fast, also_astray = start_values.start(problem, nominal, robust=robust)
-    assert_allclose(fast.estimate.positions, plain.estimate.positions, atol=1e-8)
+    assert_allclose(fast.positions, plain.positions, atol=1e-8)
     assert_allclose(fast.poses, plain.poses, atol=1e-8)
     assert_allclose(also_astray, astray, atol=1e-8)
     assert astray.max() < 5
