@@ -199,7 +199,7 @@ def assert_survives(solution, remake):
         sky=solution.sky or TangentPlane(1.0, 2.0, np.eye(2, 3)),
         left_out={"dark": "no stars"},
         provenance=solution.provenance | {"inputs": {"a.fits": "0" * 64}},
-        checksum="1" * 64,
+        _checksum="1" * 64,
         estimate=replace(solution.estimate, certified={view.name: view.distortion for view in solution}),
     )
     again = remake(filled)
