@@ -232,7 +232,7 @@ SOLVE = [
     row(progress=True),
 ]
 
-ALONE = "exposure exp00 has several detectors, a, b, with pixels of their own: say which"
+ALONE = "exposure exp00 has detectors, a, b, with their own pixels: say which"
 IN_PIXELS = dict.fromkeys(("pair", "layout held", "read pair", "pickled"), ALONE)
 UNMOVED = "motions of the stars were not fitted: call solve with motion='proper'"
 SKYLESS = {"no sky": "does not know the sky"}
