@@ -24,6 +24,7 @@ from .exceptions import InputError, MatchError
 from .inputs import exposure_files, table_files
 from .inputs.exposure_names import whole_name
 from .inputs.exposures import observed
+from .inputs.frames.statement import stated_rows
 from .matching.matcher import match
 from .matching.options import MatchOptions, check_enough
 from .measurement.earlier import EarlierRun, write_detections
@@ -341,7 +342,7 @@ def _assessed(solution, exposures, quality, comparison, stacks, truth):
     """The entries of the summary on images, mosaic and other corrections, as far as known, with all checks."""
     checked = solution.checks + run_checks.check_run(solution, quality)
     figures = {"checks": [asdict(check) for check in checked], "fwhm_ratio": quality and quality.fwhm_ratio}
-    figures["observed"] = observed(exposures)
+    figures |= {"observed": observed(exposures), "stated": stated_rows(exposures)}
     if quality:
         figures["quality"] = asdict(quality)
     if comparison:

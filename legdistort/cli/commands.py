@@ -292,8 +292,17 @@ def do_simulate(a):
 
 def do_show(a):
     """``legdistort show``."""
+    from ..inputs.exposure_files import read_exposures
     from ..reporting.summary import summarise
+    from ..runtime.fits_bytes import looks_like_fits
 
+    if looks_like_fits(a.solution):
+        _refuse({"max_bytes": a.max_bytes, "strict": a.strict}, "is for a solution")
+        exposures = read_exposures(str(a.solution), **given(a, {"ext": options.FRAMES["ext"]}, options.FLAGGED))
+        stated = {exposure.name: exposure.stated for exposure in exposures}
+        _say(a, "\n\n".join(map(str, stated.values())), {name: each.to_dict() for name, each in stated.items()})
+        return 0
+    _refuse({"ext": a.ext, "dq_good": a.dq_good}, "is for a frame")
     solution = _solution(a)
     summary = summarise(solution)
     _report(a, solution, summary)

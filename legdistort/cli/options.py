@@ -40,6 +40,11 @@ SOLUTION = {
     "solution": Option("solution.asdf, or the folder of the results with it", "solution", path="read"),
     "max_bytes": Option("accept arrays of so many bytes, unpacked (default 2147483648)", type=int),
 }
+SHOWN = {
+    "solution": Option("solution.asdf, the folder of the results with it, or a FITS frame", "solution", path="read"),
+    "max_bytes": SOLUTION["max_bytes"],
+    "ext": FRAMES["ext"],
+}
 COLUMNS = {
     "columns": Option("names of columns", type=columns, default=[], metavar="OURS=THEIRS,..."),
     "origin": Option("of pixels in the table (default: the program's, else 0)", type=int, choices=(0, 1)),

@@ -128,7 +128,13 @@ COMMANDS = {
         options.MOVING,
         options.OPTICS,
     ),
-    "show": _command("print a solution", "results/solution.asdf", options.SOLUTION, options.STRICT),
+    "show": _command(
+        "print a solution, or what a frame states and where",
+        "results/solution.asdf",
+        options.SHOWN,
+        options.FLAGGED,
+        options.STRICT,
+    ),
     "stars": _command(
         "the stars of a solution as a table",
         "results/solution.asdf --out stars.fits",

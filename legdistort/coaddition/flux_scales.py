@@ -11,6 +11,8 @@ from scipy.sparse.csgraph import connected_components
 
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..inputs.exposure_names import whole_name
+from ..inputs.frames.integrations import value_time
+from ..inputs.frames.value_units import value_unit
 from .options import by_name
 from .pairs import median_differences, values_from_differences
 
@@ -59,7 +61,7 @@ def _factors(frames, scale, views, areas):
     if scale is None:
         return np.ones(len(frames)), "none"
     if scale == "exptime":
-        return _time_scales(frames, [f.exposure_time or None for f in frames]), "exptime"
+        return _time_scales(frames, _times(frames)), "exptime"
     exposures = list(dict.fromkeys(whole_name(f) for f in frames))
     detectors = list(dict.fromkeys(f.detector for f in frames))
     place = np.array([(exposures.index(whole_name(f)), detectors.index(f.detector)) for f in frames])
@@ -70,7 +72,7 @@ def _factors(frames, scale, views, areas):
             f"scale='stars': the solution has no fluxes of {_FEW} common stars or more that join all exposures; "
             "give scale='exptime' or a dict by exposure"
         )
-    times = [f.exposure_time or None for f in first]
+    times = _times(first)
     if stars is None:
         return _time_scales(first, times)[place[:, 0]], "exptime"
     (logs, errors), (of_detectors, their_errors) = stars
@@ -90,10 +92,18 @@ def _factors(frames, scale, views, areas):
     return factors[place[:, 0]] * of_detectors[place[:, 1]], "stars"
 
 
+def _times(frames):
+    """Seconds of light that values stand for, None if not known; of rates among others that are none, one second."""
+    times = [value_time(f) for f in frames]
+    grows = [value_unit(f.header).has_time for f in frames]
+    if None in times or not any(grows):
+        return times
+    return [time if own else 1.0 for time, own in zip(times, grows, strict=True)]
+
+
 def _time_scales(frames, times):
     same = np.ones(len(frames))
-    unit = str(frames[0].header.get("BUNIT", "")).replace(" ", "").lower()
-    if len(set(times)) == 1 or unit.endswith(("/s", "/sec", "s-1", "s**-1", "s^-1")):
+    if len(set(times)) == 1 or not any(value_unit(f.header).has_time for f in frames):
         return same
     if None in times:
         missing = ", ".join(f.name for f in frames if not f.exposure_time)

@@ -17,6 +17,7 @@ from astropy.nddata import CCDData, VarianceUncertainty
 from astropy.wcs import WCS
 
 from ..exceptions import InputError
+from ..inputs.frames.value_units import value_unit
 from ..plots.stack_plots import plot_mosaic
 from ..runtime.fits_bytes import BLOCK, sum32, with_checksum
 from ..runtime.notebook import ShownAsPrinted
@@ -124,13 +125,10 @@ class Mosaic(ShownAsPrinted):
     def to_ccddata(self) -> CCDData:
         """The mosaic as a `~astropy.nddata.CCDData`: unit, variance, `mask`, WCS, header.
 
-        Its arrays are those of the mosaic, not copies. Without a unit (``BUNIT``) that astropy understands it is
+        Its arrays are those of the mosaic, not copies. Without a unit (``BUNIT``) that is understood it is
         dimensionless.
         """
-        try:
-            unit = u.Unit(self.header.get("BUNIT", ""))
-        except ValueError:
-            unit = u.dimensionless_unscaled
+        unit = value_unit(self.header).unit or u.dimensionless_unscaled
         uncertainty = VarianceUncertainty(self.variance, copy=False)
         return CCDData(
             self.data, unit=unit, uncertainty=uncertainty, mask=self.mask, wcs=self.wcs, meta=self.header.copy()

@@ -1,15 +1,18 @@
 """The cards of a mosaic: what its exposures have in common, their times, and how it was made."""
 
 from importlib.metadata import version
-from numbers import Real
 
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
 from astropy.time import Time
 
+from ..geometry.epochs import read_date
+from ..inputs.frames.integrations import value_time
+from ..inputs.frames.value_units import value_unit
+
 #: What is taken from the exposures where all agree.
-_COPIED = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "BUNIT")
+_COPIED = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER")
 #: Where headers have the start of an exposure: as a date, as a day (with a time of day beside it), as a modified Julian
 #: date; ESO and Astropy, HST and JWST.
 _DATES = ("DATE-BEG", "DATE-OBS")
@@ -35,9 +38,12 @@ def mosaic_header(frames, left_out, factors, settings):
         values = {str(f.header.get(key, "")) for f in frames}
         if len(values) == 1 and values != {""}:
             header[key] = values.pop()
+    first, *others = (value_unit(f.header) for f in frames)
+    if first.text and all(first.same_as(other) for other in others):
+        header["BUNIT"] = first.text
     times = [f.exposure_time or None for f in frames]
     if None not in times:
-        mean = float(np.mean([time * factors[f.name] for f, time in zip(frames, times, strict=True)]))
+        mean = float(np.mean([value_time(f) * factors[f.name] for f in frames]))
         header["EXPTIME"] = (round(mean, 9), "[s] exposure time that the values stand for")
         header["TEXPTIME"] = (sum(times), "[s] sum of the exposure times")
     header.extend(_dates(frames, times))
@@ -64,16 +70,13 @@ def exposure_start(header):
         if isinstance(text, str) and text.strip():
             clock = next((header[c] for c in _CLOCKS if isinstance(header.get(c), str)), None)
             text = text.strip() if "T" in text or clock is None else f"{text.strip()}T{clock.strip()}"
-            if "T" not in text:
+            if ":" not in text:
                 continue  # a day alone is no time
-            try:
-                return Time(text, scale="utc", format="isot")
-            except ValueError:  # what cannot be read counts as absent
-                continue
+            if (start := read_date(text)) is not None:
+                return start
     for key in _DAYS:
-        day = header.get(key)
-        if isinstance(day, Real) and not isinstance(day, bool) and day > 1:
-            return Time(float(day), format="mjd", scale="utc")
+        if (start := read_date(header.get(key))) is not None:
+            return start
     return None
 
 

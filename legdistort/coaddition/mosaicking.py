@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,8 @@ import numpy as np
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry.star_hull import support
 from ..inputs.exposure_names import whole_name
+from ..inputs.frames.value_units import value_unit
+from ..inputs.frames.working_units import header_in_working_unit, working_unit
 from ..inputs.sky_wcs import leads_elsewhere, warn_of_another_field
 from ..results.solution import Solution
 from ..results.view import image_view
@@ -82,7 +85,8 @@ def coadd(
         exposures need.
     conserve : {'flux', 'surface_brightness'}
         'flux' multiplies by the determinant of the distortion, so that a star has the flux of the exposures.
-        'surface_brightness' leaves pixel values as they are interpolated.
+        'surface_brightness' leaves pixel values as they are interpolated; so does 'flux' where their unit (``BUNIT``)
+        is that of an area, as MJy/sr: light is then values times the area of pixels.
     match_background : bool
         Bring the backgrounds to one level, by robust differences where exposures overlap. The level is then
         left out of the multiplication for 'flux', so that a flat sky stays flat.
@@ -92,8 +96,8 @@ def coadd(
         the error of the distortion correction (`View.sigma_map`) and s = 0.02 FWHM that of a star of
         signal-to-noise ratio 20; equal; or by name.
     scale : {'auto', 'exptime', 'stars', None} or dict
-        Factors by which data are multiplied: 'exptime' brings all to the mean exposure time if times differ (data
-        in units per second are left alone); 'stars' makes the measured fluxes of common stars agree; 'auto' goes by
+        Factors by which data are multiplied: 'exptime' brings all to the mean exposure time if times differ (rates
+        and calibrated units are left alone); 'stars' makes the measured fluxes of common stars agree; 'auto' goes by
         time unless stars differ from that by more than 2 % and 3 sigma, as through clouds, or times are not known;
         none; or by name.
     extrapolated : {'flag', 'mask', 'keep'}
@@ -172,6 +176,8 @@ def _check_order(exposures, solution):
 def _coadd(exposures, solution, options, share):
     """The mosaic; `share` is `map_items`, which shares the work among threads or processes."""
     frames, views, left_out = _select(exposures, solution)
+    if all(value_unit(f.header).per_area for f in frames):  # light is values times the area of pixels
+        options = replace(options, conserve="surface_brightness")
     options.check_names([*(f.name for f in frames), *left_out])
     if options.grid is None:
         output = reference_grid(list(views.values()), solution.sky)
@@ -185,12 +191,13 @@ def _coadd(exposures, solution, options, share):
     ny, nx = output.shape
     what = f"a mosaic of {nx} x {ny} px and the pixels of {len(frames)} exposures"
     with scratch_folder(options.scratch, need, what) as folder:
-        found = list(share(partial(prepare, folder=folder), frames, description="reading"))
+        unit = _working_unit(solution)
+        found = list(share(partial(prepare, folder=folder, unit=unit), frames, description="reading"))
         unfit = {f.name: reason for f, reason in zip(frames, found, strict=True) if isinstance(reason, str)}
         _warn(unfit)
         left_out |= unfit
         prepared = {f.name: one for f, one in zip(frames, found, strict=True) if f.name not in unfit}
-        frames = [f for f in frames if f.name in prepared]
+        frames = [_in_unit(f, unit) for f in frames if f.name in prepared]
         if not frames:
             raise InputError(f"no exposure meets the output grid: {_reasons(left_out)}")
         areas = None if options.conserve == "flux" else {f.name: _area(maps[f.name]) for f in frames}
@@ -207,6 +214,20 @@ def _coadd(exposures, solution, options, share):
     made = {"exposures": names, "left_out": left_out, "offset": output.offset, "header": header}
     made["planes"] = tuple(PLANES) if options.planes is None else options.planes
     return Mosaic(*planes, wcs=output.wcs, **made, extrapolated=extrapolated, rejected=rejected)
+
+
+def _working_unit(solution):
+    """The factor on data whose squares single precision would not hold, by the fluxes of the stars."""
+    rows = solution.residuals
+    return working_unit(np.asarray(rows["flux"], dtype=float)) if "flux" in rows.colnames else 1.0
+
+
+def _in_unit(frame, unit):
+    """What is known of a frame, for data that were multiplied by a factor."""
+    if unit == 1.0:
+        return frame
+    header = header_in_working_unit(frame.header, unit)
+    return replace(frame, header=header, gain=frame.gain and frame.gain / unit)
 
 
 def _layers(frames, prepared, maps, factors, views, output, options):
@@ -313,12 +334,10 @@ def _warn_of_misuse(frames, maps, algorithm, views):
             "out; take algorithm='adaptive' or 'drizzle'",
             AssumptionWarning,
         )
-    units = {str(f.header.get("BUNIT", "")).strip() for f in frames} - {""}
-    if len(units) > 1:
-        warn(
-            f"the units (BUNIT) of the exposures differ: {', '.join(sorted(units))}; values are combined as they are",
-            AssumptionWarning,
-        )
+    units = [unit for unit in (value_unit(f.header) for f in frames) if unit.text]
+    if not all(unit.same_as(units[0]) for unit in units):
+        listed = ", ".join(sorted({unit.text for unit in units}))
+        warn(f"the units (BUNIT) of the exposures differ: {listed}; values are combined as they are", AssumptionWarning)
 
 
 def _settings(options, recipe, origin, correlation):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from ..inputs.frames.working_units import in_working_unit
 from ..runtime.scratch import Stored, store
 from .background import Background, measure_background
 
@@ -25,7 +26,7 @@ class Prepared:
     background: Background
 
 
-def prepare(frame, folder):
+def prepare(frame, folder, unit=1.0):
     """Prepare an exposure.
 
     Parameters
@@ -33,13 +34,15 @@ def prepare(frame, folder):
     frame : Exposure or ExposureFile
     folder : path
         For its planes.
+    unit : float
+        Factor on its data, as on its gain before (`legdistort.inputs.frames.working_units`).
 
     Returns
     -------
     Prepared or str
         The reason why it cannot be used.
     """
-    exposure = frame.read()
+    exposure = in_working_unit(frame.read(), unit)
     bad, full = ~np.isfinite(exposure.data), np.zeros(exposure.shape, dtype=bool)
     if exposure.mask is not None:
         bad |= exposure.mask

@@ -1,5 +1,6 @@
 """When exposures were taken, in Julian years: from columns of tables and from headers."""
 
+import re
 from numbers import Real
 
 import numpy as np
@@ -9,7 +10,19 @@ from astropy.time import Time
 from ..exceptions import InputError, some_of
 
 #: Keywords of headers that state it, the middle of the exposure before its beginning; those of HST are MJD too.
-KEYWORDS = ("MJD-AVG", "MJD-MID", "MJD-OBS", "MJD-BEG", "EXPSTART", "DATE-AVG", "DATE-OBS")
+KEYWORDS = (
+    "MJD-AVG", "MJD-MID", "MJD-OBS", "MJD-BEG", "EXPSTART", "DATE-AVG", "DATE-OBS", "DATE-BEG", "MJD_OBS", "DATE_OBS",
+    "MJD", "JD", "JD-OBS", "JD_OBS",
+)  # fmt: skip
+#: Julian dates are between these (the years 1858 to 2132).
+_JD = 2400000.5, 2500000.5
+#: Dates as FITS had them before 2000, always of the years 1900 to 1999, and as others write them.
+_OLD = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{2})(\D.*)?")
+_SLASHES = re.compile(r"(\d{4})/(\d{1,2})/(\d{1,2})(\D.*)?")
+_ZONE = re.compile(r"(?<=\d)\s*([-+])(\d\d):?(\d\d)$")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?")
+#: Texts that state no date, and claim none.
+_NOTHING = re.compile(r"[\s?*-]*|n/?a|none|null|nan|unknown|undef(ined)?|[0/:.T -]*", re.IGNORECASE)
 #: Numbers between these are modified Julian dates (the years 1949 to 2132), as years they would be absurd.
 _MJD = 33000.0, 100000.0
 _FIRST, _LAST = 1800, 2200
@@ -102,13 +115,62 @@ def mean_epoch(headers):
 
 def header_epoch(header):
     """Epoch of an exposure by its header (`KEYWORDS`), a Julian year, or None; that of the day if it has no time."""
+    return stated_epoch(header)[0]
+
+
+def stated_epoch(header):
+    """Epoch of an exposure by its header, and the keyword that states it; None, None if there is none."""
+    for key in KEYWORDS:
+        found = read_date(header.get(key))
+        if found is not None and _FIRST <= found.jyear <= _LAST:
+            return float(found.jyear), key
+    return None, None
+
+
+def unreadable_dates(header):
+    """What the header has in the place of dates and is none, in words."""
     for key in KEYWORDS:
         value = header.get(key)
-        try:
-            if isinstance(value, Real) and value > 1:
-                return year(Time(value, format="mjd"))
-            if isinstance(value, str):
-                return year(Time(value.strip(), scale="utc"))
-        except ValueError:  # what cannot be read counts as absent
-            continue
-    return None
+        absent = not isinstance(value, (str, Real)) or value == 0 or _NOTHING.fullmatch(str(value).strip())
+        if not absent and read_date(value) is None:
+            yield f"{key} = {value!r} is no date"
+
+
+def read_date(value):
+    """The `~astropy.time.Time` (UTC) that a value of a header means, or None.
+
+    Parameters
+    ----------
+    value : str or float
+        ``'2014-12-09T10:11:12.3'``, with ``Z``, a zone (``-0700``) or neither; ``'09/12/95'``, the 9th of December 1995
+        as FITS had it before 2000; ``'2014/12/09'``; or a number, as text too: a Julian date between 2400000.5 and
+        2500000.5, else a modified one.
+    """
+    if isinstance(value, str):
+        value = value.strip()
+        if not _NUMBER.fullmatch(value):
+            return _of_text(value)
+        value = float(re.sub("[dD]", "e", value))
+        if not (_MJD[0] < value < _MJD[1] or _JD[0] < value < _JD[1]):
+            return None
+    if not isinstance(value, Real) or isinstance(value, bool) or not value > 1:
+        return None
+    try:
+        return Time(float(value), format="jd" if _JD[0] < value < _JD[1] else "mjd", scale="utc")
+    except ValueError:
+        return None
+
+
+def _of_text(text):
+    if old := _OLD.fullmatch(text):
+        text = f"19{old[3]}-{int(old[2]):02d}-{int(old[1]):02d}{old[4] or ''}"
+    elif slashes := _SLASHES.fullmatch(text):
+        text = f"{slashes[1]}-{int(slashes[2]):02d}-{int(slashes[3]):02d}{slashes[4] or ''}"
+    zone = _ZONE.search(text) if ":" in text else None
+    text = re.sub(r"\s*(Z|UTC?)$", "", text[: zone.start()] if zone else text)
+    try:
+        if zone:
+            return Time(text, scale="utc") - int(f"{zone[1]}1") * (int(zone[2]) * u.hour + int(zone[3]) * u.min)
+        return Time(text, scale="utc")
+    except ValueError:
+        return None

@@ -6,8 +6,8 @@ import contextlib
 import glob
 import hashlib
 import logging
+import re
 import threading
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from astropy.io import fits
 
-from ..exceptions import AssumptionWarning, DamagedError, InputError, warn, without_astropy_warnings
-from ..runtime.asdf_files import ARCHIVES, read_tree
+from ..exceptions import AssumptionWarning, DamagedError, InputError, some_of, warn, without_astropy_warnings
 from ..runtime.checks import check_is_file
 from ..runtime.fits_bytes import open_fits, readable
 from ..runtime.notebook import ShownAsPrinted
@@ -27,26 +26,22 @@ from ..runtime.progress import Bar
 from ..runtime.provenance import checksum, unchanged
 from . import repetitions
 from .exposure_names import detector_name, exposure_name
-from .exposures import LEAVE_OUT, Exposure, known_from_header
-from .file_images import as_plane, find_image, images_of_detectors, is_image, named_images, of_detector, plane_shape
+from .exposures import LEAVE_OUT, Exposure
+from .file_images import find_image, images_of_detectors, is_image, of_detector
+from .fits_images import from_hdulist, planes_of, told_as_damaged
 from .foreign_images import from_nddata, is_nddata, read_roman
-from .pixel_flags import bad_pixels, good_bits
-from .sky_wcs import believable_wcs, header_wcs
+from .frames.pixel_flags import good_bits
 
 if TYPE_CHECKING:
     from astropy.wcs.wcsapi import BaseHighLevelWCS
 
     from ..runtime.annotations import Extension, Images
+    from .frames.statement import FrameStatement
 
 log = logging.getLogger(__name__)
 
-#: Names of extensions that belong to an image, and how their values become standard deviations.
-UNCERTAINTY_NAMES = {"ERR": "StdDev", "UNCERT": "StdDev", "VAR": "Variance", "VARIANCE": "Variance"}
-MASK_NAMES = ("DQ", "MASK")
 _FILTERS = threading.Lock()  # warning filters belong to the process, not to the thread that changes them
 _NO_FRAME = "tables of positions go to match(table) (legdistort match)"
-_DAMAGED = "truncated or damaged, its image cannot be read"
-_UNREADABLE = (OSError, EOFError, TypeError, ValueError, KeyError, IndexError, zlib.error, fits.VerifyError)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,7 +51,7 @@ class ExposureFile(ShownAsPrinted):
     Attributes
     ----------
     name, wcs, header, saturation, gain, read_noise, exposure_time, path
-        As those of the `Exposure`; so are `has_gwcs`, `exposure` and `detector`.
+        As those of the `Exposure`; so are `has_gwcs`, `exposure`, `detector` and `stated`.
     shape : tuple
         ``(ny, nx)``.
     checksum, pixels : str
@@ -86,6 +81,7 @@ class ExposureFile(ShownAsPrinted):
     dq_good: int | None = None
     exposure: str | None = None
     detector: str | None = None
+    stated: FrameStatement | None = None
 
     def read(self) -> Exposure:
         """The `Exposure` with its pixels; what else is known is not worked out again.
@@ -103,8 +99,8 @@ class ExposureFile(ShownAsPrinted):
                     image = read_roman(file, str(self.path), self.path, self.dq_good)
                 planes = {name: getattr(image, name) for name in ("data", "mask", "uncertainty")}
             else:
-                with _quiet(), _opened(self.path) as hdulist, _told(f"{self.path}: {_DAMAGED}"):
-                    planes = _planes(hdulist, find_image(hdulist, self.ext, self.path), self.dq_good)
+                with _quiet(), _opened(self.path) as hdulist, told_as_damaged(self.path):
+                    planes = planes_of(hdulist, find_image(hdulist, self.ext, self.path), self.dq_good)
         return Exposure(**{name: getattr(self, name) for name in _SHARED}, **planes)
 
     def _check_content(self):
@@ -297,7 +293,19 @@ def _read_each(paths, read, ext, progress, bad=None, copies=None):
                 )
             origins[exposure.name] = origin
             exposures.append(exposure)
+    _warn_of_doubts(exposures)
     return exposures
+
+
+def _warn_of_doubts(exposures):
+    """Warn of what headers state that contradicts itself or cannot be, of all frames together."""
+    named = {}
+    for exposure in exposures:
+        for doubt in exposure.stated.doubts:  # of many values that are of one kind the first is shown
+            named.setdefault(re.sub(r" = .*?(?= is )", "", doubt), (doubt, []))[1].append(exposure.name)
+    if named:
+        sentences = "; ".join(f"{some_of(names, 3)}: {doubt}" for doubt, names in named.values())
+        warn(f"{sentences} (legdistort show FRAME prints what a frame states)", AssumptionWarning)
 
 
 def _one_after_another(sources, parts):
@@ -398,7 +406,7 @@ def _read(source, default, ext, good=None):
     if isinstance(source, fits.HDUList):
         filename = source.filename()
         label = filename or str(source[0].header.get("FILENAME", default)) if len(source) else default
-        return _from_hdulist(source, ext, label, Path(filename) if filename else None, good)
+        return from_hdulist(source, ext, label, Path(filename) if filename else None, good)
     if not isinstance(source, _OpenFile):
         raise InputError(f"an exposure must be a path, an HDUList or an NDData, got {type(source).__name__}")
     if _is_asdf(source.path):
@@ -406,7 +414,7 @@ def _read(source, default, ext, good=None):
             _check_no_extension(source.path, ext)
             return read_roman(file, str(source.path), source.path, good)
     with readable(source.path):
-        exposure = _from_hdulist(source.hdulist, ext, str(source.path), source.path, good)
+        exposure = from_hdulist(source.hdulist, ext, str(source.path), source.path, good)
         for hdu in filter(is_image, source.hdulist):
             del hdu.data  # the memory need hold but one detector of a camera
     return exposure
@@ -461,77 +469,7 @@ def _quiet():
 
 
 @contextlib.contextmanager
-def _told(sentence):
-    """Whatever a damaged file provokes, as a `DamagedError` that begins with the sentence."""
-    try:
-        yield
-    except InputError:
-        raise
-    except _UNREADABLE as error:
-        raise DamagedError(f"{sentence} ({error})") from None
-
-
-@contextlib.contextmanager
 def _opened(path):
     """A FITS file as an HDUList."""
     with _file(path) as file, open_fits(file, path, _NO_FRAME) as hdulist:
         yield hdulist
-
-
-def _from_hdulist(hdulist, ext, label, path, good=None):
-    with _told(f"{label}: {_DAMAGED}"):
-        hdu = find_image(hdulist, ext, label)
-        header = hdulist[0].header.copy()
-        header.update(hdu.header)
-        integer = hdu.header.get("BITPIX", -32) > 0  # before the data are touched: scaling changes it
-        planes = _planes(hdulist, hdu, good)
-    name = exposure_name(label, ext)
-    wcs = header_wcs(header, hdulist, plane_shape(hdu), name)
-    known = known_from_header(header, planes["data"], integer=integer)
-    tables = [other for other in hdulist if other.name == "ASDF"]
-    if len(tables) == 1:
-        owner = tables[0].header.get("EXPNAME")
-        if path is not None:
-            known["has_gwcs"] = owner is None or named_images(hdulist, path).get(owner) is hdu
-        if owner is None and header.get("TELESCOP") == "JWST":
-            wcs = _gwcs_of(tables[0], name, plane_shape(hdu)) or wcs
-    return Exposure(name, **planes, header=header, wcs=wcs, path=path, **known)
-
-
-def _gwcs_of(table, name, shape):
-    """The gwcs at ``meta.wcs`` of the table in which JWST keeps the data model of a file, if that can be read."""
-    try:
-        content = np.asarray(table.data["ASDF_METADATA"]).tobytes()
-        tree = read_tree(f"{name}[ASDF]", content=content, tags=ARCHIVES)
-    except (InputError, *_UNREADABLE) as error:
-        log.warning("the gwcs of %s cannot be read, the WCS of its header is taken: %s", name, error)
-        return None
-    wcs = (tree.get("meta") or {}).get("wcs")
-    if not hasattr(wcs, "pixel_to_world"):  # none in _rate files; a mapping where a package is missing
-        if wcs is not None:
-            log.warning("the gwcs of %s needs a package that is not there (stdatamodels); its header is taken", name)
-        return None
-    return believable_wcs(wcs, shape, name)
-
-
-def _planes(hdulist, hdu, good=None):
-    """Data of an image, and the mask and uncertainty that stand beside it in the same file."""
-    data = hdu.data
-    if data is None or data.shape != hdu.shape:
-        raise OSError("data incomplete")
-    telescope = hdu.header.get("TELESCOP", hdulist[0].header.get("TELESCOP", ""))
-    planes, shape = {"data": as_plane(data)}, plane_shape(hdu)
-    for other in hdulist:
-        alike = other is not hdu and is_image(other) and plane_shape(other) == shape and other.ver == hdu.ver
-        if alike and other.name in MASK_NAMES:
-            planes["mask"] = bad_pixels(as_plane(other.data), good, do_not_use=telescope in ("JWST", "ROMAN"))
-        elif alike and other.name in UNCERTAINTY_NAMES:
-            kind = str(other.header.get("UTYPE", UNCERTAINTY_NAMES[other.name]))  # CCDData writes its class as UTYPE
-            with np.errstate(invalid="ignore", divide="ignore"):
-                values = np.asarray(as_plane(other.data), dtype=float)
-                if kind.startswith("Variance"):
-                    values = np.sqrt(values)
-                elif kind.startswith("InverseVariance"):
-                    values = 1 / np.sqrt(values)
-                planes["uncertainty"] = values
-    return planes

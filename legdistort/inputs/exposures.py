@@ -18,15 +18,12 @@ from .exposure_names import check_exposure_name, whole_name
 if TYPE_CHECKING:
     from astropy.wcs.wcsapi import BaseHighLevelWCS
 
+    from .frames.statement import FrameStatement
+
 log = logging.getLogger(__name__)
 
-#: Header keywords in order of preference. EGAIN comes first: cameras that write it use GAIN for a setting without unit.
-KEYWORDS = {
-    "saturation": ("SATURATE", "SATLEVEL"),
-    "gain": ("EGAIN", "GAIN", "CCDGAIN", "HIERARCH ESO DET OUT1 CONAD"),
-    "read_noise": ("RDNOISE", "READNOIS", "READNSE", "RON", "HIERARCH ESO DET OUT1 RON"),
-    "exposure_time": ("EXPTIME", "EXPOSURE", "XPOSURE", "ITIME", "EFFEXPTM"),
-}
+#: What is known of the detector and the time, as far as it is.
+_KNOWN = ("saturation", "gain", "read_noise", "exposure_time")
 
 #: Header keywords of what was observed, in order of preference; of filters all that are there count.
 OBSERVED = {
@@ -70,6 +67,8 @@ class Exposure(ShownAsPrinted):
         Whether its file has an extension ``ASDF`` beside it, which may hold a gwcs.
     exposure, detector : str or None
         Of a camera with several detectors: name of the exposure that they share, and id of the one that took this part.
+    stated : `~legdistort.inputs.frames.statement.FrameStatement` or None
+        What its header states, each value with its source; None for an exposure that was not read.
 
     Raises
     ------
@@ -103,6 +102,7 @@ class Exposure(ShownAsPrinted):
     has_gwcs: bool = False
     exposure: str | None = None
     detector: str | None = None
+    stated: FrameStatement | None = None
 
     def __post_init__(self) -> None:
         check_exposure_name(self.name, self.path)
@@ -141,9 +141,7 @@ class Exposure(ShownAsPrinted):
     def __repr__(self) -> str:
         ny, nx = self.shape
         words = [f"{nx} x {ny} px", f"{np.count_nonzero(self.mask)} masked"]
-        words += [
-            f"{key.replace('_', ' ')} {getattr(self, key):g}" for key in KEYWORDS if getattr(self, key) is not None
-        ]
+        words += [f"{key.replace('_', ' ')} {getattr(self, key):g}" for key in _KNOWN if getattr(self, key) is not None]
         words += ["with uncertainty"] * (self.uncertainty is not None) + ["WCS" if self.wcs is not None else "no WCS"]
         return f"<Exposure {self.name!r}: {', '.join(words)}>"
 
@@ -186,40 +184,6 @@ def _listed(values, most=4):
     """Different texts in a line, not more than some."""
     values = list(dict.fromkeys(filter(None, values)))
     return ", ".join(values[:most]) + (f" and {len(values) - most} more" if len(values) > most else "")
-
-
-def known_from_header(header, data, *, integer):
-    """Saturation, gain, read noise and exposure time, as arguments of `Exposure`; `integer` data may show the first."""
-    known = {key: _number(header, keywords) for key, keywords in KEYWORDS.items()}
-    # Detector readings are counts; calibrated data state in BUNIT that they are electrons, or electrons per second.
-    unit = str(header.get("BUNIT", "")).lower().replace(" ", "")
-    if re.fullmatch(r"(e-?|electrons?)", unit):
-        known["gain"] = 1.0
-    elif re.fullmatch(r"(e-?|electrons?)(/s(ec)?|s-1|s\*\*-1)", unit):
-        known["gain"] = known["exposure_time"]
-    if known["saturation"] is None and integer:
-        known["saturation"] = piled_up(data)
-    return known
-
-
-def _number(header, keywords):
-    """First positive number under one of the keywords, or None."""
-    for key in keywords:
-        value = header.get(key)
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and np.isfinite(value) and value > 0:
-            return float(value)
-    return None
-
-
-def piled_up(data):
-    """Saturation level: a maximum more frequent than all of the 5 % below it together, in pixels side by side."""
-    top = np.nanmax(data) if np.isfinite(data).any() else np.nan
-    if not top > 0:
-        return None
-    flat = data == top
-    at_top, below = np.count_nonzero(flat), np.count_nonzero((data > 0.95 * top) & (data < top))
-    beside = max(np.count_nonzero(flat[1:] & flat[:-1]), np.count_nonzero(flat[:, 1:] & flat[:, :-1]))
-    return float(top) if max(5, below + 1) <= at_top < min(0.1 * data.size, 8 * beside + 1) else None
 
 
 def _as_float(data, name):

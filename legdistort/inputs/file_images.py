@@ -188,7 +188,7 @@ def find_image(hdulist, ext, label, *, of_several=False):
         candidates = science or [hdu for hdu in every if not _stands_beside(hdu.name)] or every
     if not candidates:
         raise DamagedError(f"{label}: no image{where}")
-    images = [hdu for hdu in candidates if len(hdu.shape) > 1]
+    images = [hdu for hdu in candidates if len(plane_shape(hdu)) > 1]
     if len(images) > 1 and of_several:
         images.sort(key=lambda hdu: len(plane_shape(hdu)))  # stable: 2-D before cubes, else the order of the file
     elif len(images) > 1:

@@ -12,9 +12,11 @@ from astropy.time import Time
 from ..exceptions import DamagedError, InputError
 from ..runtime.checks import first_line
 from .exposure_names import exposure_name
-from .exposures import Exposure, known_from_header
+from .exposures import Exposure
 from .file_images import as_plane
-from .pixel_flags import bad_pixels
+from .frames.cards import Stated
+from .frames.pixel_flags import bad_pixels
+from .frames.statement import read_statement
 from .sky_wcs import believable_wcs
 
 log = logging.getLogger(__name__)
@@ -54,8 +56,14 @@ def from_nddata(image, default, good=0):
     data = as_plane(np.asarray(image.data))
     uncertainty = None if uncertainty is None else as_plane(np.asarray(uncertainty))
     mask = None if image.mask is None else bad_pixels(as_plane(np.asarray(image.mask)), good)
-    known = known_from_header(header, data, integer=data.dtype.kind in "iu")
-    return Exposure(name, data, mask, uncertainty, believable_wcs(image.wcs, data.shape, name), header, **known)
+    wcs = believable_wcs(image.wcs, data.shape, name)
+    return Exposure(name, data, mask, uncertainty, wcs, header, **_known(header, data, wcs))
+
+
+def _known(header, data, wcs):
+    """What header and WCS state, as arguments of `Exposure`."""
+    seen = None if wcs is None else Stated(type(wcs).__name__, "the WCS that came with it")
+    return read_statement(header, data, integer=data.dtype.kind in "iu", wcs=wcs, seen=seen).known
 
 
 def _header(meta):
@@ -121,9 +129,8 @@ def read_roman(file, label, path, good=None):
     if wcs is not None and not hasattr(wcs, "pixel_to_world"):
         log.warning("%s: its WCS cannot be read: %s", name, "install gwcs and asdf-astropy")
         wcs = None
-    known = known_from_header(header, data, integer=data.dtype.kind in "iu")
     wcs = believable_wcs(wcs, data.shape, name)
-    return Exposure(name, data, mask, planes.get("err"), wcs, header, path=path, **known)
+    return Exposure(name, data, mask, planes.get("err"), wcs, header, path=path, **_known(header, data, wcs))
 
 
 def _plain(node):

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
+from scipy import special
 
-from ..exceptions import AssumptionWarning, warn
+from ..exceptions import AssumptionWarning, some_of, warn
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs.sky_wcs import to_icrs
@@ -14,6 +15,9 @@ from ..priors.from_headers import undistorted_plane
 
 #: Headers that disagree with the others by more than this part of the field do not determine where the field lies.
 TOLERANCE = 0.1
+#: The dithers by headers and by stars are compared in so many exposures or more; they contradict each other if a turn
+#: and a scale explain what they differ by, by no more than this chance, and that is more than this part of the dithers.
+_FEWEST, _BY_CHANCE, _DEPARTURE = 4, 1e-4, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +103,51 @@ class HeaderPoses:
                 AssumptionWarning,
             )
             return found, None
+        off = [name for name, agrees in zip(names, good, strict=True) if not agrees]
+        if off:
+            warn(
+                f"the header WCS of {some_of(off, 3)} contradicts the stars by up to {apart.max():.0f} px; the sky is "
+                "that of the other headers",
+                AssumptionWarning,
+            )
         mean = steps[good].mean(axis=0)
+        self._compare_dithers({name: found[name] for name, agrees in zip(names, good, strict=True) if agrees}, mean)
         return {name: similarity.compose(pose, mean) for name, pose in found.items()}, self.sky
+
+    def _compare_dithers(self, found, mean):
+        """Warn where the stars move between exposures as no WCS of that scale and orientation lets them move.
+
+        Parameters
+        ----------
+        found : dict
+            ``{exposure: (2, 3)}`` by the stars.
+        mean : ndarray, shape (2, 3)
+                From the plane of the headers to theirs.
+        """
+        if len(found) < _FEWEST:
+            return
+        centres = {name: _grid(self.shapes[name], 1) for name in found}
+        seen = np.concatenate([similarity.apply(similarity.invert(found[n]), centres[n]) for n in found])
+        stated = np.concatenate([similarity.apply(similarity.invert(self.poses[n]), centres[n]) for n in found])
+        seen = similarity.apply(similarity.invert(mean), seen)
+        z, w = (plane[:, 0] + 1j * plane[:, 1] for plane in (seen, stated))
+        z, w = z - z.mean(), w - w.mean()
+        off, spread = np.sum(np.abs(w - z) ** 2), np.sum(np.abs(z) ** 2)
+        if not spread > 0:
+            return
+        factors = {mirrored: np.sum(w * np.conj(a)) / spread for mirrored, a in ((False, z), (True, z.conj()))}
+        mirrored = abs(factors[True]) > abs(factors[False])
+        factor = factors[mirrored]
+        left = max(off * 1e-12, np.sum(np.abs(w - factor * (z.conj() if mirrored else z)) ** 2))
+        dof = 2 * len(z) - 4
+        if special.fdtrc(2, dof, (off - left) / 2 / (left / dof)) < _BY_CHANCE and off > _DEPARTURE**2 * spread:
+            turned = "mirrored" if mirrored else f"turned by {np.degrees(np.angle(factor)):.1f} deg"
+            warn(
+                "the header WCSs contradict the stars: from exposure to exposure these move as if the WCS were "
+                f"{turned}, and its pixels {abs(factor):.3f} times as large; give reference= (--reference), or mend "
+                "the headers",
+                AssumptionWarning,
+            )
 
 
 def _grid(shape, n):

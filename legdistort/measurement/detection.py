@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from ..inputs.exposures import piled_up
+from ..inputs.frames.statement import piled_up
 from .background import is_steep, mean_light, sky_and_noise, sky_variance, smooth_light
 from .filters import gaussian_sums
 from .sidelobes import side_light

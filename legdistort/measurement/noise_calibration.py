@@ -116,9 +116,10 @@ def _calibrate(exposure, *, options, widths, **stars):
     options = replace(options, errors="fit", max_stars=None)
     psf = None
     if widths is None and options.psf != "moffat":
-        _, _, psf, verdict = measure_exposure(exposure, options)
+        measured = measure_exposure(exposure, options)
+        psf = measured.psf
         if options.psf == "effective":
-            warn_of_psf({exposure.name: verdict})
+            warn_of_psf({exposure.name: measured.verdict})
     options = replace(options, psf=psf or "moffat")
 
     def remeasure(image, *, fwhm=options.fwhm):

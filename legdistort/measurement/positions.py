@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs.exposure_files import listed
+from ..inputs.frames.working_units import in_working_unit, working_unit
 from ..runtime import outputs
 from ..runtime.parallel import map_items
 from . import camera_gain
@@ -278,6 +279,8 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
             found[i] = one
     names = [exposure.name for exposure in exposures]
     _warn_of_gain({name: one.photon for name, one in zip(names, found, strict=True)})
+    doubtful = {name: one.noise_ratio for name, one in zip(names, found, strict=True) if one.noise_ratio is not None}
+    camera_gain.warn_of_contradictions(doubtful, {e.name: options.gain or e.gain for e in exposures})
     verdicts = {name: one.verdict for name, one in zip(names, found, strict=True)}
     if options.psf == "effective" or any(v.psf == "effective" for v in verdicts.values()):
         warn_of_psf(verdicts)
@@ -319,8 +322,9 @@ def _camera_gains(exposures, options, share):
 def _photon_noise(exposure, options):
     """Variance per unit of star light that an exposure determines, None if it is known or there are no stars."""
     exposure = options.with_detector(exposure.read())
-    stamps, shape = _stamps(exposure, options)
-    return None if stamps is None or stamps.frame.photon is not None else frame_fit.photon_noise(stamps, shape)
+    unit = working_unit(exposure.data[~exposure.mask])
+    stamps, shape = _stamps(in_working_unit(exposure, unit), options)
+    return None if stamps is None or stamps.frame.photon is not None else frame_fit.photon_noise(stamps, shape) / unit
 
 
 def _measure_with_gain(pair, options):
@@ -328,7 +332,7 @@ def _measure_with_gain(pair, options):
     exposure, gain = pair
     if gain is None:
         return measure_exposure(exposure, options)
-    return measure_exposure(exposure, replace(options, gain=gain))._replace(photon=1 / gain)
+    return measure_exposure(exposure, replace(options, gain=gain))._replace(photon=1 / gain, noise_ratio=None)
 
 
 def _warn_of_gain(photons):
@@ -358,6 +362,9 @@ def measure_exposure(exposure, options):
     MeasuredExposure
     """
     exposure = options.with_detector(exposure.read())
+    unit = working_unit(exposure.data[~exposure.mask])
+    exposure = in_working_unit(exposure, unit)
+    options = options if unit == 1.0 else replace(options, gain=None, saturation=None)  # the exposure has them
     measured = _measure_frame(exposure, options)
     if options.errors != "fit" and np.any((measured.table["flags"] & UNUSABLE) == 0):
         held = replace(options, max_stars=None, psf=measured.psf or "moffat")
@@ -367,7 +374,7 @@ def measure_exposure(exposure, options):
 
         curves = calibrate_frame(exposure, remeasure, psf=measured.psf, threshold=options.threshold)
         measured = measured._replace(table=curves.apply(measured.table, options.errors))
-    return measured
+    return measured if unit == 1.0 else measured.in_unit(unit)
 
 
 class MeasuredExposure(NamedTuple):
@@ -382,12 +389,22 @@ class MeasuredExposure(NamedTuple):
     psf : `~legdistort.measurement.effective.model.EffectivePSF` or None
         None if Moffat profiles were fitted.
     verdict : `~legdistort.measurement.effective.frame_psf.Verdict`
+    noise_ratio : float or None
+        Of the noise seen to that which the gain implies, where that is doubtful (`camera_gain.contradiction`).
     """
 
     table: QTable
     photon: float | None
     psf: EffectivePSF | None
     verdict: frame_psf.Verdict
+    noise_ratio: float | None = None
+
+    def in_unit(self, unit):
+        """The same in a unit of light that is so many times larger."""
+        table = self.table.copy()
+        for name in ("flux", "flux_err"):
+            table[name] = table[name] / unit
+        return self._replace(table=table, photon=self.photon and self.photon / unit)
 
 
 def _measure_frame(exposure, options):
@@ -416,7 +433,11 @@ def _measure_frame(exposure, options):
     log.info("%s: %d detections, FWHM %.2f px, %s", name, len(table), fwhm, verdict.psf)
     known = exposure.gain or exposure.uncertainty is not None or not len(table)
     own = None if measured is None else measured.psf.named(exposure=name)
-    return MeasuredExposure(table, None if known else fitted.photon, own, verdict)
+    clean = (stars.flags & UNUSABLE) == 0
+    ratio = camera_gain.contradiction(
+        exposure, stamps.frame, stars.flux[clean], stars.chi2[clean] / np.maximum(stars.dof[clean], 1)
+    )
+    return MeasuredExposure(table, None if known else fitted.photon, own, verdict, ratio)
 
 
 def _stamps(exposure, options):

@@ -13,7 +13,7 @@ from .cutouts import cut_out
 from .facts import BIBTEX, facts_of, methods, observed_rows, solution_rows, truth_rows
 from .pictures import Gallery
 from .svg import STYLE
-from .tables import count, detectors_table, exposures_table, stars_table
+from .tables import count, detectors_table, exposures_table, stars_table, stated_table
 
 
 def write_report(
@@ -47,7 +47,8 @@ def write_report(
         (``{name: reason}``), ``checks`` (dicts of
         `~legdistort.results.check.Check`), ``timings`` (``{step: seconds}``), ``quality`` (of the mosaic, a
         `~legdistort.assessment.stack_quality.Quality` as a dict), ``observed`` (``{"target" | "instrument" | ...:
-        text}``, see `legdistort.inputs.exposures.observed`), ``command``, and the figures of
+        text}``, see `legdistort.inputs.exposures.observed`), ``stated`` (what the frames state, see
+        `legdistort.inputs.frames.statement.stated_rows`), ``command``, and the figures of
         `legdistort.assessment.truth.compare_with_truth`.
     comparison : dict, optional
         ``{name: Solution}`` of `legdistort.assessment.baselines.compare`: a table and a picture are added.
@@ -144,6 +145,7 @@ def _details(gallery, solution, pulls, psfs, facts, comparison, stacks):
             *([compared_stacks(stacks, gallery)] if stacks else []),
         ],
         "exposures": exposures_table(solution),
+        "stated": stated_table(facts["stated"]) if facts.get("stated") else None,
         "detectors": (camera.name, detectors_table(camera)) if camera.has_focal_plane else None,
         "stars": stars_table(solution, pulls),
         "more": pictures,

@@ -5,10 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..assessment.pulls import exposure_rms
+from ..exceptions import some_of
 from ..geometry import similarity
 
 #: An exposure whose residuals exceed the median by this factor is marked.
 _MARK = 2.0
+#: Different values of what frames state that are listed.
+_MOST_VALUES = 4
 #: Stars that are listed, the brightest; all of them are in the file.
 MOST_STARS = 500
 
@@ -92,6 +95,24 @@ def exposures_table(solution):
         "displacement over the detector, less its mean; dynamic part: the same of the departure from the "
         f"{reference}. Residuals above {_MARK:g} times the median are marked.",
     )
+
+
+def stated_table(stated):
+    """What frames state (`legdistort.inputs.frames.statement.stated_rows`): one row a quantity, value and source."""
+    rows = []
+    for (quantity, source), group in _grouped(stated).items():
+        values = list(dict.fromkeys(row["value"] for row in group))
+        listed = ", ".join(values) if len(values) <= _MOST_VALUES else f"{min(values)} to {max(values)}"
+        names = [name for row in group for name in row["exposures"]]
+        rows.append(Row([quantity, listed, source, some_of(names, 3)]))
+    return Table({"quantity": "", "value": "", "source": "", "frames": ""}, rows)
+
+
+def _grouped(stated):
+    groups = {}
+    for row in stated:
+        groups.setdefault((row["quantity"], row["source"]), []).append(row)
+    return groups
 
 
 def stars_table(solution, pulls):

@@ -103,6 +103,16 @@ def unpacked(file, name, max_bytes=None):
     return io.BytesIO(content)
 
 
+def looks_like_fits(path):
+    """Whether a path is a file that begins as FITS does, packed or not."""
+    path = Path(path)
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        start = file.read(9)
+    return start.startswith((b"SIMPLE  =", *_UNPACKERS))
+
+
 @contextmanager
 def readable(name):
     """A block that reads FITS: whatever a damaged file provokes becomes a `DamagedError` that begins with its name."""

@@ -1,5 +1,6 @@
 """A solution goes into the frames it was made from: distortion in their headers, and the exact gwcs as a table."""
 
+import contextlib
 import io
 import logging
 import re
@@ -13,15 +14,19 @@ from pathlib import Path
 import asdf
 import numpy as np
 from astropy.io import fits
+from astropy.wcs import WCS
 
 from ..exceptions import ExportError, InputError, some_of, without_astropy_warnings
 from ..inputs import exposure_files, exposure_names, file_images
+from ..inputs.frames import wcs_cards
 from ..inputs.sky_wcs import header_wcs, leads_elsewhere, warn_of_another_field
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD
+from ..runtime.checks import first_line
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, readable, splice
 from ..runtime.outputs import replacing, replacing_folders
 from ..runtime.progress import Bar
+from .fits_headers import header_error
 from .storage import wcs_tree
 
 log = logging.getLogger(__name__)
@@ -30,12 +35,9 @@ log = logging.getLogger(__name__)
 _MOST_NAMED = 6
 #: What the header of an image records of a WCS that was written into it; `attach` takes it for its own later.
 _HISTORY = "legdistort {} wrote the WCS of this image"
-#: Keywords of the primary WCS and its distortion, all of which give way; those of alternative WCSs end in a letter.
+#: Cards of the primary WCS and its distortion, all of which give way; those of alternative WCSs end in a letter.
 WCS_KEYWORDS = re.compile(
-    rf"HISTORY {_HISTORY.format('.*')}.*|SOLSHA"
-    r"|WCSAXES|WCSNAME|LONPOLE|LATPOLE|RADESYS|RADECSYS|EQUINOX|D2IMARR|AXISCORR|(SIP|TPV)(MX|IV)ERR|ZHECKSUM"
-    r"|(CTYPE|CUNIT|CRVAL|CRPIX|CDELT|CROTA|CNAME|CRDER|CSYER|CPDIS|CQDIS|CPERR|CQERR|D2IMDIS|D2IMERR)\d+"
-    r"|(PC|CD|PV|PS)\d+_\d+|(PC|CD)\d{6}|WAT\d+_\d+|(DP|DQ|D2IM)\d+|(A|B|AP|BP)_(ORDER|DMAX|\d+_\d+)"
+    rf"HISTORY {_HISTORY.format('.*')}.*|SOLSHA|(SIP|TPV)(MX|IV)ERR|ZHECKSUM|{wcs_cards.KEYWORDS}"
 )
 
 
@@ -83,8 +85,10 @@ def attach(
     Two things go in: in the header of the image the keywords of `legdistort.wcs.fits_headers.make_header`, instead of
     those of the former WCS, and an extension ``ASDF`` with the exact gwcs at ``meta.wcs``, which
     ``stdatamodels.asdf_in_fits.open`` reads. Errors, flags and weights beside the image (``ERR``, ``DQ`` and the like,
-    of its shape and ``EXTVER``) get the keywords as well. Every other HDU, card and byte stays as it is. Nothing is
-    written unless everything can be.
+    of its shape and ``EXTVER``) get the keywords as well. Every other HDU, card and byte stays as it is, but for what
+    would be taken for the WCS of the image before that: plates of scans (DSS: ``PLTRAH``, ``AMDX1``, ``XPIXELSZ`` ...),
+    polynomials of IRAF and wcstools. The errors hold for the header as it stands in the file. Nothing is written unless
+    everything can be.
 
     Frames are identified by their names, as `read_exposures` gives them. A frame that was left out of the solution is
     skipped, which is logged.
@@ -118,7 +122,7 @@ def attach(
     Raises
     ------
     ExportError
-        If no header of an exposure meets `max_error`.
+        If no header of an exposure meets `max_error`, or other cards of the file contradict it, naming them.
     InputError
         Naming the file: not FITS, not in the solution, of another shape, without the extension, or in the way; or if
         the solution does not know the sky and a header is wanted.
@@ -227,6 +231,7 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
                 for number in (image, *(_number(hdulist, plane) for plane in planes)):
                     start, data, stop, _ = spans[number]
                     new = exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)
+                    _check_written(new, headers[name], known.views[name], path)
                     edits.append((start, data, new))
         if images:
             edits += _asdf_edits(known, images, spans, *_tables(hdulist, spans, path, overwrite))
@@ -236,7 +241,12 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
 def _is_elsewhere(view, hdulist, hdu):
     """Whether the header of an image leads far from where the solution has it."""
     with without_astropy_warnings():
-        wcs = header_wcs(hdu.header, hdulist, file_images.plane_shape(hdu), view.label, level=logging.DEBUG)
+        header = wcs_cards.header_of_image(hdulist[0].header, hdu.header)
+        try:
+            wcs_cards.make_numbers(header, view.label)
+        except InputError:  # it gives way
+            return False
+        wcs = header_wcs(header, hdulist, file_images.plane_shape(hdu), view.label, level=logging.DEBUG)
     return leads_elsewhere(wcs, view)
 
 
@@ -249,6 +259,73 @@ def _header(known, name, kind, max_error):
         header["SOLSHA"] = known.checksum  # no room for a comment
     header["HISTORY"] = f"{_HISTORY.format(version('legdistort'))}, {provenance.now()[:10]}"
     return header
+
+
+def _check_written(written, stated, view, path):
+    """Refuse a header of a file in which other cards make another WCS of what is stated.
+
+    Parameters
+    ----------
+    written : bytes
+        The header as it will stand in the file.
+    stated : `~astropy.io.fits.Header`
+        The cards that went into it, with the largest errors.
+    """
+    with without_astropy_warnings():
+        header = _readable_cards(written)
+        if any(key.startswith("BEGAST") for key in header):
+            raise ExportError(
+                f"{path}: the header has a WCS of Starlink's AST as well (cards BEGAST_A to ENDAST_A), which its "
+                "programs prefer; remove these cards, or attach the exact WCS alone, kind=None (--asdf-only)"
+            )
+        if header["NAXIS"] > 2:
+            raise ExportError(
+                f"{path}: the image has NAXIS = {header['NAXIS']}, and headers with SIP or TPV are read with two axes "
+                "alone; write it with NAXIS = 2, or attach the exact WCS alone, kind=None (--asdf-only)"
+            )
+        try:
+            errors = header_error(header, view.pose, view.distortion, view.solution.sky)
+        except Exception as error:  # wcslib raises many kinds
+            found = first_line(error)
+        else:
+            promised = [value for key, value in stated.items() if key.endswith(("MXERR", "IVERR"))]
+            if all(error <= value for error, value in zip(errors, promised, strict=True)):
+                return
+            found = f"{max(errors):.2g} px off"
+        cards = ", ".join(_misleading(header, stated)) or "other cards"
+    raise ExportError(
+        f"{path}: with {cards} in the header the WCS written is read as another one ({found}): remove these cards, or "
+        "attach the exact WCS alone, kind=None (--asdf-only)"
+    )
+
+
+def _readable_cards(written):
+    """A header without the cards of no sense, which are none of the WCS."""
+    cards = []
+    for card in fits.Header.fromstring(written).cards:
+        with contextlib.suppress(fits.VerifyError):
+            card.verify("silentfix")
+            cards.append((card.keyword, card.value, card.comment))
+    return fits.Header(cards)
+
+
+def _misleading(header, stated):
+    """The keywords without one of which a header has the WCS that is stated."""
+    points = np.stack(np.meshgrid(*([0.0, 100.0, 300.0],) * 2), axis=-1).reshape(-1, 2)
+
+    def on_sky(cards):
+        try:
+            return WCS(cards).celestial.all_pix2world(points, 0)
+        except Exception:  # wcslib raises many kinds
+            return np.full_like(points, np.nan)
+
+    right, found = on_sky(stated), []
+    for key in dict.fromkeys(header):
+        less = header.copy()
+        less.remove(key, ignore_missing=True, remove_all=True)
+        if key not in stated and key and np.allclose(on_sky(less), right, rtol=0, atol=1e-9):
+            found.append(key)
+    return found
 
 
 def _number(hdulist, hdu):

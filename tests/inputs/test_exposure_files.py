@@ -49,14 +49,14 @@ def test_a_file_is_opened_once_for_all_its_detectors(tmp_path, monkeypatch, pack
 
 def test_a_file_exchanged_between_two_detectors_is_noticed(tmp_path, monkeypatch):
     path = mosaic_file(tmp_path / "a.fits", ("SCI", 1), ("SCI", 2))
-    read = exposure_files._from_hdulist
+    read = exposure_files.from_hdulist
 
     def exchanged(hdulist, ext, *others):
         if ext == ("SCI", 2):
             path.write_bytes(path.read_bytes())
         return read(hdulist, ext, *others)
 
-    monkeypatch.setattr(exposure_files, "_from_hdulist", exchanged)
+    monkeypatch.setattr(exposure_files, "from_hdulist", exchanged)
     with pytest.raises(InputError, match=r"a\.fits changed while it was read"):
         ld.open_exposures(path, ext="SCI")
 

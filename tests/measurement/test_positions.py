@@ -417,7 +417,10 @@ def test_frames_as_they_come(field, kind):
     rng = np.random.default_rng(33)
     frame = observe(change(clean), rng) if before else change(observe(clean, rng))
     gain = GAIN * 1e18 if kind == "units of 1e-18" else GAIN
-    table = usable(measure(Exposure(kind, frame, gain=gain, saturation=30000 if kind == "bleeding" else None)))
+    with warnings.catch_warnings():
+        if kind == "steep sky":  # ten thousand counts that have no noise
+            warnings.filterwarnings("ignore", "steep sky: the noise is .* too small", AssumptionWarning)
+        table = usable(measure(Exposure(kind, frame, gain=gain, saturation=30000 if kind == "bleeding" else None)))
     star = identify(table, xy)
     assert np.count_nonzero(star < 0) <= 1
     assert len(table) >= least

@@ -324,8 +324,8 @@ class TestExposureFiles:
     def test_what_is_small_is_worked_out_once(self, frames, monkeypatch):
         handles = ld.open_exposures([*frames[:2], CCDData(np.ones((5, 5)), unit="adu")])
         assert file_checksums(handles) == checksums(*frames[:2])
-        for name in ("believable_wcs", "known_from_header"):
-            monkeypatch.setattr(f"legdistort.inputs.exposure_files.{name}", lambda *_, **__: pytest.fail("once more"))
+        for name in ("header_wcs", "read_statement"):
+            monkeypatch.setattr(f"legdistort.inputs.fits_images.{name}", lambda *_, **__: pytest.fail("once more"))
         for handle in handles[:2]:
             read = handle.read()
             assert read.header is handle.header

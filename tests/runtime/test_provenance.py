@@ -11,7 +11,7 @@ from astropy.io import fits
 
 import legdistort as ld
 from legdistort.exceptions import InputError
-from legdistort.inputs import exposure_files
+from legdistort.inputs import exposure_files, fits_images
 from legdistort.inputs.star_lists import formats
 from legdistort.inputs.table_files import read_table
 from legdistort.priors import storage as prior_storage
@@ -79,14 +79,15 @@ def test_a_frame_that_goes_is_named(pair):
 @pytest.mark.parametrize("reading", ["first", "later"])
 def test_a_frame_that_changes_while_it_is_read(pair, monkeypatch, swap, reading):
     (handle,) = ld.open_exposures(pair[0])
-    usual = exposure_files._planes
+    usual = exposure_files.planes_of
 
     def planes(*args):
         found = usual(*args)
         swap(*pair)
         return found
 
-    monkeypatch.setattr(exposure_files, "_planes", planes)
+    for module in (exposure_files, fits_images):
+        monkeypatch.setattr(module, "planes_of", planes)
     with pytest.raises(InputError, match=r"a\.fits changed while it was read: wait until it is complete"):
         ld.open_exposures(pair[0]) if reading == "first" else handle.read()
 

@@ -231,6 +231,58 @@ def test_odd_cards_survive(one, tmp_path):
     assert b"CHECKSUM" not in path.read_bytes().split(b"XTENSION")[0]
 
 
+#: Cards of which some reader would make another WCS than that which is written.
+MISLEADING = {
+    "plate": {"PLTRAH": 5, "PLTRAM": 35, "PLTRAS": 12.0, "PLTDECSN": "-", "PLTDECD": 5, "PLTDECM": 24, "PLTDECS": 0.0,
+              "AMDX1": 67.2, "AMDY1": 67.2, "PPO3": 1.0, "PPO6": 1.0, "CNPIX1": 1, "CNPIX2": 1},
+    "pixels of a plate": {"XPIXELSZ": 15.0, "YPIXELSZ": 15.0},
+    "PC": {"PC1_1": 0.5, "PC2_2": 0.5, "CDELT1": 1e-3, "CDELT2": 1e-3},
+    "old matrix": {"CD001001": 1e-3, "CD002002": 1e-3},
+    "PV": {"PV1_0": 0.1, "PV1_1": 2.0, "PV1_3": 90.0, "PV2_1": 3.0},
+    "SIP": {"A_ORDER": 3, "A_3_0": 1e-4, "B_ORDER": 3, "B_0_3": 1e-4},
+    "IRAF": {"WAT1_001": "wtype=tnx axtype=ra", "WAT2_001": "wtype=tnx axtype=dec"},
+    "axis": {"CTYPE3": "FREQ", "CRVAL3": 1.0},
+    "text": {"CRVAL1": "05:35:12", "CRPIX1": "9"},
+    "tables": {"CPDIS1": "LOOKUP", "DP1": "EXTVER: 1.0"},
+    "polynomials": {"TR1_0": 5.0, "CO1_1": 0.3, "PROJP1": 45.0, "EPOCH": 1950.0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["sip", "tpv"])
+@pytest.mark.parametrize("left", MISLEADING)
+def test_what_is_promised_is_what_others_find(one, tmp_path, left, kind):
+    """By astropy, and by Starlink's AST, which shares no code with it."""
+    fits.writeto(tmp_path / "frame.fits", np.zeros(SHAPE, "f4"), header_of(MISLEADING[left]))
+    (done,) = attach(one, tmp_path / "frame.fits", out=tmp_path / "out", kind=kind)
+    header, (p, ra, dec) = fits.getheader(done.path), detector(one, "frame")
+    found = {"astropy": WCS(header).all_pix2world(p, 0).T}
+    try:
+        from starlink import Ast
+    except ImportError:
+        pass
+    else:
+        found["AST"] = np.degrees(Ast.FitsChan(header.tostring(sep="\n").split("\n")).read().tran(p.T + 1))
+    for program, sky in found.items():
+        turned = (np.mod(sky[0] - ra + 180, 360) - 180) * np.cos(np.radians(dec))
+        off = np.hypot(turned, sky[1] - dec).max() / (one.sky.pixel_scale / 3600)
+        assert off < 2 * max(done.errors.values()) + 1e-6, program
+
+
+def test_what_would_be_read_otherwise_is_refused(one, tmp_path, monkeypatch):
+    path = tmp_path / "frame.fits"
+    fits.writeto(path, np.zeros((1, *SHAPE), "f4"))
+    with pytest.raises(ExportError, match=r"NAXIS = 3, and headers with SIP or TPV are read with two axes"):
+        attach(one, path, in_place=True)
+    attach(one, path, in_place=True, kind=None)
+    fits.writeto(path, np.zeros(SHAPE, "f4"), header_of({"BEGAST_A": "FrameSet"}), overwrite=True)
+    with pytest.raises(ExportError, match=r"has a WCS of Starlink's AST as well"):
+        attach(one, path, in_place=True)
+    fits.writeto(path, np.zeros(SHAPE, "f4"), header_of({"AMDX1": 67.2, "OBJECT": "field"}), overwrite=True)
+    monkeypatch.setattr(attachment, "WCS_KEYWORDS", re.compile("SOLSHA"))  # as for a card that nobody thought of
+    with pytest.raises(ExportError, match=r"frame.fits: with AMDX1 in the header the WCS written is read as another"):
+        attach(one, path, in_place=True)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_checksum_of_any_content(one, tmp_path, seed):
     path = tmp_path / "frame.fits"

@@ -1,12 +1,20 @@
 """Flags of pixels (data quality, DQ): which make a pixel bad."""
 
+import re
+
 import numpy as np
 from astropy.nddata.bitmask import interpret_bit_flags
 
-from ..exceptions import InputError
+from ...exceptions import InputError
 
 #: The bit by which JWST and Roman mark a pixel that is not to be used; their others only describe.
 DO_NOT_USE = 1
+#: Names of flags that describe what is on a pixel, and are no reason against its value (LSST, Pan-STARRS).
+_DESCRIPTIVE = re.compile(
+    r"DETECTED(_.*)?|(NOT_)?DEBLENDED|DEBLENDED_.*|INEXACT_PSF|CROSSTALK|FAKE|INJECTED.*|BRIGHT_OBJECT|OBJECTS?|STARS?"
+    r"|SOURCES?|PRIMARY|CONV\.POOR",
+    re.IGNORECASE,
+)
 
 
 def good_bits(bits):
@@ -61,3 +69,20 @@ def bad_pixels(flags, good=None, *, do_not_use=False):
     if good is None:
         return (flags & flags.dtype.type(DO_NOT_USE) if do_not_use else flags) != 0
     return (flags.astype(np.int64) & ~np.int64(good)) != 0
+
+
+def descriptive_flags(header):
+    """``{name: flag}`` of those that only describe, by the names in the header of a plane of flags.
+
+    ``MP_NAME = bit`` (LSST), or ``MSKNAMnn = name`` with ``MSKVALnn = flag`` (Pan-STARRS).
+    """
+    named = {key[3:]: 1 << header[key] for key in header if key.startswith("MP_") and _is_bit(header[key])}
+    for key in header:
+        value = header.get(key.replace("NAM", "VAL")) if re.fullmatch(r"MSKNAM\d+", key) else None
+        if isinstance(value, int):
+            named[str(header[key]).strip()] = value
+    return {name: flag for name, flag in named.items() if _DESCRIPTIVE.fullmatch(name)}
+
+
+def _is_bit(value):
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 63

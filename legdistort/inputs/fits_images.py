@@ -1,0 +1,141 @@
+"""An `Exposure` from an open FITS file: its image, the planes beside it, and what its headers state."""
+
+import contextlib
+import logging
+import zlib
+
+import numpy as np
+from astropy.io import fits
+
+from ..exceptions import DamagedError, InputError
+from ..runtime.asdf_files import ARCHIVES, read_tree
+from .exposure_names import exposure_name
+from .exposures import Exposure
+from .file_images import find_image, is_image, named_images, plane_shape
+from .frames.cards import Stated
+from .frames.pixel_flags import bad_pixels, descriptive_flags
+from .frames.statement import read_statement
+from .frames.wcs_cards import header_of_image, is_left_out, make_numbers
+from .sky_wcs import believable_wcs, header_wcs
+
+log = logging.getLogger(__name__)
+
+#: Names of extensions that belong to an image, and how their values become standard deviations.
+UNCERTAINTY_NAMES = {"ERR": "StdDev", "UNCERT": "StdDev", "VAR": "Variance", "VARIANCE": "Variance"}
+MASK_NAMES = ("DQ", "MASK")
+_UNREADABLE = (OSError, EOFError, TypeError, ValueError, KeyError, IndexError, zlib.error, fits.VerifyError)
+
+
+@contextlib.contextmanager
+def told_as_damaged(label):
+    """Whatever a damaged file provokes, as a `DamagedError` that begins with its name."""
+    try:
+        yield
+    except InputError:
+        raise
+    except _UNREADABLE as error:
+        raise DamagedError(f"{label}: truncated or damaged, its image cannot be read ({error})") from None
+
+
+def from_hdulist(hdulist, ext, label, path, good=None):
+    """The `Exposure` of an image of a file, see `legdistort.read_exposures`; `label` names the file in errors."""
+    with told_as_damaged(label):
+        hdu = find_image(hdulist, ext, label)
+        primary, own = hdulist[0].header, hdu.header
+        header = header_of_image(primary, own)
+        lacking = make_numbers(header, label)
+        integer = own.get("BITPIX", -32) > 0  # before the data are touched: scaling changes it
+        planes = planes_of(hdulist, hdu, good)
+    name, shape = exposure_name(label, ext), plane_shape(hdu)
+    wcs = None if lacking else header_wcs(header, hdulist, shape, name)
+    known, origin = {}, None
+    tables = [other for other in hdulist if other.name == "ASDF"]
+    if len(tables) == 1:
+        owner = tables[0].header.get("EXPNAME")
+        if path is not None:
+            known["has_gwcs"] = owner is None or named_images(hdulist, path).get(owner) is hdu
+        if owner is None and header.get("TELESCOP") == "JWST":
+            gwcs = _gwcs_of(tables[0], name, shape)
+            wcs, origin = (wcs, None) if gwcs is None else (gwcs, Stated("gwcs", "extension ASDF"))
+    stated = read_statement(
+        header, planes["data"], integer=integer, own=None if hdu is hdulist[0] else own, wcs=wcs,
+        seen=origin or _wcs_in_words(wcs, header, own), mask=_masks_in_words(hdulist, hdu, good),
+    )  # fmt: skip
+    if lacking:
+        stated = stated.with_doubt(f"the WCS of the header has no card {lacking} and is not used")
+    if is_left_out(primary, own):
+        stated = stated.with_doubt(
+            "the primary header has a WCS, the image none, and not INHERIT = T: it is not that of the image and is not "
+            "used; if it is, write INHERIT = T into the header of the image"
+        )
+    return Exposure(name, **planes, header=header, wcs=wcs, path=path, **known, **stated.known)
+
+
+def _wcs_in_words(wcs, header, own):
+    """The WCS of a header and where it stands, as `Stated`."""
+    if wcs is None:
+        return Stated(None, "no celestial WCS that is plausible")
+    projection = ", ".join(str(header.get(f"CTYPE{k}", "")) for k in (1, 2))
+    return Stated(projection, "CTYPE1" if "CTYPE1" in own else "CTYPE1 of the primary header, by INHERIT = T")
+
+
+def _masks_in_words(hdulist, hdu, good):
+    """The planes of flags beside an image, as `Stated`."""
+    beside = [other for other in _alike(hdulist, hdu) if other.name in MASK_NAMES]
+    if not beside:
+        return Stated(None, "no plane of flags")
+    names = descriptive_flags(beside[-1].header)
+    words = f"without {', '.join(f'{name} ({bit})' for name, bit in names.items())}" if names else "of all flags"
+    words = f"without flags {good}" if good is not None and not names else words
+    return Stated(words, f"plane {beside[-1].name}")
+
+
+def _gwcs_of(table, name, shape):
+    """The gwcs at ``meta.wcs`` of the table in which JWST keeps the data model of a file, if that can be read."""
+    try:
+        content = np.asarray(table.data["ASDF_METADATA"]).tobytes()
+        tree = read_tree(f"{name}[ASDF]", content=content, tags=ARCHIVES)
+    except (InputError, *_UNREADABLE) as error:
+        log.warning("the gwcs of %s cannot be read, the WCS of its header is taken: %s", name, error)
+        return None
+    wcs = (tree.get("meta") or {}).get("wcs")
+    if not hasattr(wcs, "pixel_to_world"):  # none in _rate files; a mapping where a package is missing
+        if wcs is not None:
+            log.warning("the gwcs of %s needs a package that is not there (stdatamodels); its header is taken", name)
+        return None
+    return believable_wcs(wcs, shape, name)
+
+
+def planes_of(hdulist, hdu, good=None):
+    """Data of an image, and the mask and uncertainty that stand beside it in the same file."""
+    data = hdu.data
+    if data is None or data.shape != hdu.shape:
+        raise OSError("data incomplete")
+    data = data.reshape(plane_shape(hdu))
+    telescope = hdu.header.get("TELESCOP", hdulist[0].header.get("TELESCOP", ""))
+    planes = {"data": data}
+    for other in _alike(hdulist, hdu):
+        if other.name in MASK_NAMES:
+            flags, described = other.data.reshape(data.shape), sum(descriptive_flags(other.header).values())
+            kept = (good or 0) | described if described or good is not None else None
+            planes["mask"] = bad_pixels(flags, kept, do_not_use=telescope in ("JWST", "ROMAN"))
+        elif other.name in UNCERTAINTY_NAMES:
+            kind = str(other.header.get("UTYPE", UNCERTAINTY_NAMES[other.name]))  # CCDData writes its class as UTYPE
+            with np.errstate(invalid="ignore", divide="ignore"):
+                values = np.asarray(other.data, dtype=float).reshape(data.shape)
+                if kind.startswith("Variance"):
+                    values = np.sqrt(values)
+                elif kind.startswith("InverseVariance"):
+                    values = 1 / np.sqrt(values)
+                planes["uncertainty"] = values
+    return planes
+
+
+def _alike(hdulist, hdu):
+    """The other images of the shape and version of one."""
+    shape = plane_shape(hdu)
+    return [
+        other
+        for other in hdulist
+        if other is not hdu and is_image(other) and plane_shape(other) == shape and other.ver == hdu.ver
+    ]
