@@ -825,6 +825,7 @@ class TestFrames:
         _, camera, _ = frames
         for k, each in enumerate((camera, replace(camera, name="other"))):
             table = QTable({"exposure": [f"exp{k}"], "detector": ["1"], "x": [1.0], "y": [1.0]})
+            table["x_err"] = table["y_err"] = 0.1
             table.meta["camera"] = each.to_meta()
             table.write(tmp_path / f"t{k}.ecsv")
         paths, out = [str(tmp_path / f"t{k}.ecsv") for k in (0, 1)], ["--out", str(tmp_path / "m.ecsv"), "--quiet"]

@@ -10,7 +10,9 @@ import legdistort
 from legdistort.results.view import View
 
 #: Members of views that say what they are of; the others are what views are for.
-WITHOUT_EXAMPLE = {"chip", "detectors", "index", "label", "n_stars", "parts", "prior_mean", "shape"}
+WITHOUT_EXAMPLE = {
+    "check_pixels", "chip", "common", "detectors", "index", "label", "n_stars", "parts", "prior_mean", "shape",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", legdistort.__all__)

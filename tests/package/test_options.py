@@ -279,6 +279,7 @@ VIEW = {
         row(n=5, support=False, absolute=True),
         row(n=0, refused=dict.fromkeys(VIEWS, "n must be a positive integer, got 0")),
     ],
+    "check_pixels": [row()],
     "supported": [row(xy=XY)],
     "to_reference": [row(xy=XY)],
     "plot_residuals": [
