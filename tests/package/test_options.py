@@ -5,6 +5,7 @@ sample; all else must run.
 """
 
 import inspect
+import itertools
 import pickle
 import warnings
 from dataclasses import dataclass, field
@@ -469,6 +470,14 @@ def assert_complete(function, rows, *subjects):
     assert {name for each in rows for name in each.options} >= options_of(function, subjects), function.__name__
 
 
+def crossed(pairs, every):
+    """Pairs of options and settings; all but some of each option, each time others, are slow."""
+    return [
+        pytest.param(*pair, marks=[] if k % every == 0 else pytest.mark.slow, id="-".join(map(str, pair)))
+        for k, pair in enumerate(pairs)
+    ]
+
+
 #: A camera of one detector is a plain image but for its static distortion.
 OF_ONE = {"degree", "static", "gauge", "errors", "reference"}
 SOLVED_ROWS = [
@@ -479,7 +488,7 @@ SOLVED_ROWS = [
 ]
 
 
-@pytest.mark.parametrize(("given", "setting"), SOLVED_ROWS, ids=str)
+@pytest.mark.parametrize(("given", "setting"), crossed(SOLVED_ROWS, 2))
 def test_solve(given, setting, tmp_path):
     options = {"degree": 1} | resolved(given.options, setting)
     if options["degree"] is None:
@@ -490,8 +499,10 @@ def test_solve(given, setting, tmp_path):
         quiet(assert_of_use, made, tmp_path / "solution.asdf" if in_file else None)
 
 
-@pytest.mark.parametrize("setting", VIEWS)
-@pytest.mark.parametrize(("method", "given"), [(name, given) for name, rows in VIEW.items() for given in rows], ids=str)
+@pytest.mark.parametrize(
+    ("method", "given", "setting"),
+    crossed([(name, given, setting) for name, rows in VIEW.items() for given in rows for setting in VIEWS], 7),
+)
 def test_views(solution, method, given, setting):
     solved = solution(setting)
     views, options = [solved[solved.names[0]]], resolved(given.options, solved)
@@ -507,9 +518,9 @@ def test_views(solution, method, given, setting):
     plt.close("all")
 
 
-@pytest.mark.parametrize("setting", VIEWS)
 @pytest.mark.parametrize(
-    ("method", "given"), [(name, given) for name, rows in SOLUTION.items() for given in rows], ids=str
+    ("method", "given", "setting"),
+    crossed([(name, given, setting) for name, rows in SOLUTION.items() for given in rows for setting in VIEWS], 7),
 )
 def test_solutions(solution, method, given, setting, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -526,8 +537,7 @@ def images(solution):
     return cache(lambda setting: frames(solution(setting)))
 
 
-@pytest.mark.parametrize("setting", MOSAICS)
-@pytest.mark.parametrize("given", COADD, ids=str)
+@pytest.mark.parametrize(("given", "setting"), crossed(itertools.product(COADD, MOSAICS), 4))
 def test_coadd(solution, images, given, setting, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     solved = solution(setting)
@@ -539,8 +549,7 @@ def test_coadd(solution, images, given, setting, tmp_path, monkeypatch):
         assert made.write("mosaic.fits").exists()
 
 
-@pytest.mark.parametrize("setting", MOSAICS)
-@pytest.mark.parametrize("given", ATTACH, ids=str)
+@pytest.mark.parametrize(("given", "setting"), crossed(itertools.product(ATTACH, MOSAICS), 4))
 def test_attach(solution, images, given, setting, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for each in images(setting):
@@ -558,8 +567,9 @@ def test_refine(solution, setting):
     assert made is None or np.isfinite(made(30.0, 40.0)).all()
 
 
-@pytest.mark.parametrize("setting", ["plain", "pair", "motions", "read pair", "no sky"])
-@pytest.mark.parametrize("given", REPORT, ids=str)
+@pytest.mark.parametrize(
+    ("given", "setting"), crossed(itertools.product(REPORT, ["plain", "pair", "motions", "read pair", "no sky"]), 4)
+)
 def test_report(solution, given, setting, tmp_path, undrawn):
     solved = solution(setting)
     options = resolved(given.options, solved)
@@ -577,8 +587,7 @@ def test_predict(given):
         assert np.isfinite(made.b)
 
 
-@pytest.mark.parametrize("setting", ["plain", "pair"])
-@pytest.mark.parametrize("given", MATCH, ids=str)
+@pytest.mark.parametrize(("given", "setting"), crossed(itertools.product(MATCH, ["plain", "pair"]), 3))
 def test_match(solution, images, given, setting):
     solved = solution(setting)
     positions = solved.camera.on_detectors(solved.residuals) if setting == "pair" else solved.residuals
