@@ -24,6 +24,7 @@ from legdistort.exceptions import AssumptionWarning, InputError, MatchError
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.exposure_files import open_exposures, read_exposures
 from legdistort.inputs.exposures import Exposure
+from legdistort.inputs.frames.statement import read_statement
 from legdistort.inputs.table_files import read_table
 from legdistort.matching.matches import Matches
 from legdistort.measurement.injection import MoffatStars, inject
@@ -96,7 +97,7 @@ def exposure():
     return Exposure(
         "night1-2", data, mask=mask, uncertainty=np.full(data.shape, 5.0), wcs=WCS(header()), header=header(),
         saturation=5e4, gain=2.0, read_noise=4.0, exposure_time=30.0, path=pipeline.Path("night1.fits"), has_gwcs=True,
-        exposure="night1", detector="2",
+        exposure="night1", detector="2", stated=read_statement(header(), data, integer=False),
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -67,7 +67,7 @@ class FrameStatement:
     doubts: tuple[str, ...]
 
     @property
-    def known(self) -> dict:
+    def known(self) -> dict[str, Any]:
         """The arguments of `Exposure` that it determines, itself included."""
         names = ("saturation", "gain", "read_noise", "exposure_time")
         return {name: getattr(self, name).value for name in names} | {"stated": self}
@@ -82,7 +82,7 @@ class FrameStatement:
         lines = [f"{row[0]:{widths[0]}s}  {row[1]:{widths[1]}s}  {row[2]}".rstrip() for row in rows]
         return "\n".join([*lines, *(f"doubtful: {doubt}" for doubt in self.doubts)])
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> dict[str, Any]:
         """Rows and doubts as JSON holds them."""
         rows = [dict(zip(("quantity", "value", "source"), row, strict=True)) for row in self.rows()]
         return {"stated": rows, "doubts": list(self.doubts)}
