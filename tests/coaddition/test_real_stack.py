@@ -71,6 +71,7 @@ def test_background_is_flat(night):
     assert np.std(blocks) < np.sqrt(np.nanmedian(mosaic.variance[count >= 9]))
 
 
+@pytest.mark.filterwarnings("ignore:.*the noise is .* too small for a gain of 1 ")  # it has none; widths alone count
 def test_cores_of_stars_are_intact_and_sharp(night):
     exposures, solution, mosaics = night
     mean, clipped = mosaics["mean"], mosaics["clipped"]

@@ -648,8 +648,7 @@ stacks.SHAPE = (2048, 2048)
 import legdistort as ld
 
 if __name__ == "__main__":
-    solution, *_ = stacks.scene(100, rolls=[0.01 * i for i in range(100)])
-    solution.sky = None
+    solution, *_ = stacks.scene(100, rolls=[0.01 * i for i in range(100)], sky=None)
     exposures = ld.open_exposures({folder!r} + "/*.fits")
     mosaic = ld.coadd(exposures, solution, method="clipped", workers=2, scratch={folder!r})
     mosaic.write({folder!r} + "/mosaic.fits")
