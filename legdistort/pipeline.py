@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from .assessment import baselines, run_checks, stack_quality
 from .assessment.truth import compare_with_truth
-from .cameras.camera import Camera
+from .cameras.camera import Camera, check_camera
 from .coaddition.mosaic_header import is_mosaic
 from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
@@ -287,8 +287,7 @@ def _known_of(exposures, solving, prior, camera):
 def _where_to_begin(paths, earlier, measuring, **reading):
     """Frames, how they are read, and the earlier run that has measured them, or None."""
     camera = reading["camera"]
-    if not isinstance(camera, Camera | None):
-        raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
+    check_camera(camera)
     if earlier is None and paths is None:
         raise InputError("give frames, or the folder of an earlier run to go on from (earlier=, --from)")
     if earlier is None:

@@ -456,3 +456,9 @@ def _overlap(first, second):
         q = similarity.apply(other.layout, f)  # its distortion is no matter of percents, and means nothing far off
         shares.append(np.mean(np.all((q > -0.5) & (q < np.array(other.shape[::-1]) - 0.5), axis=1)))
     return float(max(shares))
+
+
+def check_camera(camera):
+    """Raise `InputError` unless an argument is a camera, or None."""
+    if not isinstance(camera, Camera | None):
+        raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from astropy import units as u
 
-from ..cameras.camera import Camera
+from ..cameras.camera import Camera, check_camera
 from ..cameras.exchanged import check_places
 from ..cameras.focal_planes import focal_planes
 from ..exceptions import AssumptionWarning, InputError, MatchError, warn
@@ -130,6 +130,7 @@ def match(
         isolation=isolation, progress=progress,
     )  # fmt: skip
     _check_measured(detections)
+    check_camera(camera)
     if columns:
         detections = column_contract.rename(detections, columns)
     table = column_contract.check(detections, column_contract.DETECTED, "the table of detections")
@@ -145,7 +146,7 @@ def match(
         if any(exposure.detector is not None for exposure in exposures or ()):
             camera = Camera.of_frames(exposures)
             log.info("layout of the detectors by the headers: %s", camera)
-    if camera:
+    if camera is not None:
         table = in_focal_plane(table, camera)
         shape = camera.field
         exposures = None if exposures is None else focal_planes(camera, exposures)
@@ -171,7 +172,7 @@ def match(
     if not isolated.all():
         log.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
         star[~isolated] = -1
-    if camera:
+    if camera is not None:
         _check_detectors(camera, table, star, shapes)
     table, star = _keep_common(table, star, min_exposures, left_out)
     epoch = mean_epoch(e.header for e in named.values()) if named else None

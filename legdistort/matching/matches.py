@@ -12,7 +12,7 @@ from astropy import units as u
 from astropy.table import QTable
 from scipy.sparse.csgraph import connected_components
 
-from ..cameras.camera import Camera
+from ..cameras.camera import Camera, check_camera
 from ..exceptions import AssumptionWarning, InputError, MatchError, some_of, warn
 from ..geometry import similarity
 from ..geometry.epochs import exposure_years
@@ -528,8 +528,7 @@ def _inside(seen, shapes):
 
 def in_focal_plane(table, camera):
     """The table with positions in the focal plane of a camera, without those outside of their detector (`_inside`)."""
-    if not isinstance(camera, Camera):
-        raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
+    check_camera(camera)
     if not camera.has_focal_plane:
         return table
     if "x_detector" not in table.colnames:

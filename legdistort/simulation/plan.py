@@ -11,7 +11,7 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
 
-from ..cameras.camera import Camera
+from ..cameras.camera import Camera, check_camera
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.tangent_plane import TangentPlane
@@ -82,8 +82,7 @@ class Plan:
         camera, shape = self.camera, self.shape
         if camera is None:
             return (2048, 2048) if shape is None else shape, self.prior
-        if not isinstance(camera, Camera):
-            raise InputError(f"camera must be a legdistort.Camera, got {type(camera).__name__}")
+        check_camera(camera)
         if shape is not None and tuple(shape) != camera.field:
             raise InputError("shape and camera both state the size of the field: leave shape out")
         if self.prior is not None or not camera.has_focal_plane:
