@@ -11,6 +11,8 @@ from ..runtime.trees.facts import text
 
 #: Probability with which a check warns of a set in which nothing is wrong; all of them together make 2 %.
 FALSE_ALARM = 1e-3
+#: What is less probable than this is beyond doubt: "fail", where it is also large enough to matter.
+CERTAIN = 1e-6
 #: From best to worst; "unknown" is a question that the data cannot answer.
 STATES = ("pass", "unknown", "warn", "fail")
 
@@ -47,6 +49,11 @@ class Check(ShownAsPrinted):
 
     def __str__(self) -> str:
         return f"{self.state:7s} {self.name}: {self.sentence}{'; ' * bool(self.cure)}{self.cure}"
+
+
+def state_of(p, matters=True):
+    """State of a check whose finding has the probability p by chance, and may be large enough to matter."""
+    return "pass" if p > FALSE_ALARM else "fail" if p < CERTAIN and matters else "warn"
 
 
 def worst(checks):

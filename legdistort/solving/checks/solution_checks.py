@@ -13,11 +13,10 @@ from scipy import special
 
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...geometry.star_hull import enclosed_area
-from ...results.check import FALSE_ALARM, Check
+from ...results.check import CERTAIN, FALSE_ALARM, Check, state_of
+from .prior_check import prior_check
 from .residual_tests import Residuals
 
-#: What is less probable than this is beyond doubt: "fail", where it is also large enough to matter.
-CERTAIN = 1e-6
 #: Errors right to this fraction pass, however many observations prove the rest.
 NEGLIGIBLE = 0.05
 #: Usual share of gross errors (Hampel et al. 1986: 1 to 10 % in routine data).
@@ -59,6 +58,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
         time_check(residuals, times),
         degree_check(solution, residuals, uncertainty),
         dynamic_check(solution, blocks),
+        prior_check(solution, problem, state, error=_star_error(residuals)),
         absolute_check(solution),
         extrapolation_check(residuals),
         rejection_check(solution),
@@ -90,10 +90,6 @@ def _causes_first(checks):
     return tuple(map(with_cause, checks))
 
 
-def _state(p, matters=True):
-    return "pass" if p > FALSE_ALARM else "fail" if p < CERTAIN and matters else "warn"
-
-
 def _star_error(residuals, part=0.5):
     """Error that a part of the star positions has at most, pixels; the typical one."""
     v = residuals.blocks.v[:2]
@@ -106,7 +102,7 @@ def _pattern_state(score, residuals):
     It does not matter if the errors of the best sixth of the positions are right to `NEGLIGIBLE` in spite of it.
     """
     least = np.sqrt((1 + NEGLIGIBLE) ** 2 - 1) * _star_error(residuals, 1 / 6)
-    state = _state(score.p, score.rms > _star_error(residuals))
+    state = state_of(score.p, score.rms > _star_error(residuals))
     if state != "pass" and score.rms < least:
         return "pass", f" beyond {score.rms:.2g} px rms, too little to matter"
     return state, ""
@@ -161,7 +157,7 @@ def exposures_check(solution, residuals):
     s, name = scores[worst], names[worst]
     typical = np.median([t.t / max(t.nu, 1e-9) for t in scores])
     ratio = np.sqrt(s.t / max(s.nu, 1e-9) / typical) if typical > 0 else 1.0
-    state = _state(s.p, ratio > 2)
+    state = state_of(s.p, ratio > 2)
     if state == "pass":
         return Check("exposures", "pass", ratio, None, f"residuals of all {len(names)} exposures are alike")
     return Check("exposures", state, ratio, None, f"residuals of {name} are {ratio:.3g} times those of the others",
@@ -188,7 +184,7 @@ def brightness_check(solution, residuals):
     usual = np.sqrt(residuals.chi2 / residuals.dof)
     # residuals do not show what neighbouring exposures share, least of all those of bright stars
     limit = (1 + NEGLIGIBLE) * (max(usual, 1.0) if solution.diagnostics.correlated else usual)
-    state = _state(s.p, s.rms > _star_error(residuals)) if ratios[worst] > limit else "pass"
+    state = state_of(s.p, s.rms > _star_error(residuals)) if ratios[worst] > limit else "pass"
     which = f"{('the ' + what, 'the middle', 'the other')[worst]} third of the observations"
     if state == "pass":
         return Check("brightness", "pass", ratios[worst], None, "errors of bright and faint stars are right alike")

@@ -18,8 +18,8 @@ from scipy.optimize import minimize
 from ...exceptions import ConvergenceWarning, warn
 from ...geometry import basis, detector_modes
 from ...priors.prior import Prior
-from ..equations import criterion, elimination
-from ..equations.problem import State, by_exposure
+from ..equations.problem import by_exposure
+from ..knowledge.reduced_data import drawn, part_of, reduced_data
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,6 @@ RANGE = 1e-3, 1e6
 MOST = 800
 #: A width is taken for nothing if that costs less than this in the logarithm of the likelihood: two standard errors.
 PARSIMONY = 2.0
-_RIDGE = 1e-10  # on what is eliminated, relative: a similarity common to all exposures is not determined
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,31 +142,8 @@ def _labels(widths, priors):
 
 def _sample(problem, state, labels, motion):
     """The same with a random choice of the exposures, should they be more than are needed."""
-    n = max(5, MOST // problem.unknowns.n_own)
-    if problem.n_exposures <= n:
-        return problem, state, labels, motion
-    rng = np.random.default_rng(0)
-    groups = [np.flatnonzero(labels[:, 0] == first) for first in np.unique(labels[:, 0])]
-    keep = np.sort(np.concatenate([rng.permutation(g)[: max(5, n // len(groups))] for g in groups]))
-    rows = np.concatenate([np.arange(*problem.start[i : i + 2]) for i in keep])
-    stars, star = np.unique(problem.star[rows], return_inverse=True)
-    group = problem.group if problem.group is None else np.unique(problem.group[keep], return_inverse=True)[1]
-    part = replace(
-        problem,
-        names=tuple(problem.names[i] for i in keep),
-        shapes=[problem.shapes[i] for i in keep],
-        n_stars=len(stars),
-        start=np.concatenate([[0], np.cumsum(np.diff(problem.start)[keep])]),
-        star=star,
-        xy=problem.xy[:, rows],
-        weight=problem.weight[:, rows],
-        prior_mean=problem.prior_mean[keep],
-        prior_sigma=problem.prior_sigma[keep],
-        group=group,
-        moving=None if problem.moving is None else problem.moving.subset(keep),
-    )
-    state = State(state.stars[:, stars], state.coefficients[keep], state.poses[keep])
-    return part, state, labels[keep], motion[keep]
+    keep = drawn(labels[:, 0], MOST // problem.unknowns.n_own)
+    return *part_of(problem, state, keep), labels[keep], motion[keep]
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,8 +248,6 @@ def evidence(problem, state, labels, motion):
     wanted = labels[:, 0] >= 0
     sigma = np.where(wanted[:, None, None], np.inf, problem.prior_sigma)
     problem = replace(problem, prior_sigma=None if np.isinf(sigma).all() else sigma)
-    blocks, unknowns = criterion.linearise(problem, state), problem.unknowns
-    tangents = blocks.unknowns
     n = problem.n_modes
     degree, departure = detector_modes.dynamic_degrees(n), state.coefficients - problem.prior_mean
     sought = degree <= labels.shape[1]
@@ -282,31 +256,8 @@ def evidence(problem, state, labels, motion):
         mine = detector_modes.dynamic_basis(problem.shapes[i], n)[sought]
         place = np.zeros((problem.n_exposures, 2 * n, len(mine)))
         place[i] = mine.T
-        rows.append(unknowns.gather(place).T)
+        rows.append(problem.unknowns.gather(place).T)
         label.append(labels[i, degree[sought] - 1])
         origin.append(mine @ departure[i, :, :n].ravel())
-    rows, origin = np.concatenate(rows), np.concatenate(origin)
-    moved = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
-    pull = tangents.gather(blocks.g_exposure - elimination.to_exposures(problem, blocks, moved))
-    matrix = elimination.reduced_matrix(problem, blocks)
-    common = motion.reshape(problem.n_exposures, 2, -1, motion.shape[2])
-    common = np.pad(common, ((0, 0), (0, 0), (0, n - common.shape[2]), (0, 0)))
-    common = np.linalg.qr(unknowns.gather(common.reshape(problem.n_exposures, 2 * n, -1)))[0]
-    pull -= common @ (common.T @ pull)
-    matrix -= common @ (common.T @ matrix)
-    matrix -= (matrix @ common) @ common.T
-    others = criterion.complement(rows)
-    across, inner = rows @ matrix @ others.T, others @ matrix @ others.T
-    inner += _RIDGE * np.trace(inner) / max(len(inner), 1) * np.eye(len(inner))
-    solved = np.linalg.solve(inner, np.column_stack([across.T, others @ pull]))
-    curvature = rows @ matrix @ rows.T - across @ solved[:, :-1]
-    slope = rows @ pull - across @ solved[:, -1]
-    chi2 = blocks.cost - (moved * blocks.g_star).sum() - others @ pull @ solved[:, -1]
-    n_free = elimination.star_freedom(problem, blocks) + len(others) - 4
-    return Evidence(
-        curvature=(curvature + curvature.T) / 2,
-        pull=slope + curvature @ origin,
-        label=np.concatenate(label),
-        chi2=float(chi2 + 2 * slope @ origin + origin @ curvature @ origin),
-        n_data=2 * np.count_nonzero(problem.weight[0]) - n_free,
-    )
+    data = reduced_data(problem, state, np.concatenate(rows), motion).at(-np.concatenate(origin))
+    return Evidence(data.curvature, data.pull, np.concatenate(label), data.chi2, data.n_data)

@@ -1,0 +1,102 @@
+"""The check of what was believed of the static distortion: do the exposures agree with it, and could they tell?"""
+
+import numpy as np
+
+from ...exceptions import some_of
+from ...geometry.detector_modes import dynamic_basis
+from ...results.check import FALSE_ALARM, Check, state_of
+from ..knowledge.exposures import ExposureModel
+from ..knowledge.reduced_data import drawn, part_of
+from ..knowledge.static_test import static_tests
+
+#: So many coefficients, those of exposures drawn at random, are enough for a test.
+MOST = 500
+#: A test that would not have found a wrong prior with this probability is none.
+POWER = 0.95
+_MOST_NAMED = 3
+_CURE = "dithers by a good part of the field, or a turned camera, test it"
+_DOUBT = (
+    "look whether it is that of this detector, in its orientation, with its sign; or leave --prior out, or state how "
+    "uncertain it is (--static-sigma)"
+)
+
+
+def prior_check(solution, problem, state, *, error):
+    """Do exposures agree with the static distortion that was given?
+
+    Parameters
+    ----------
+    solution : Solution
+    problem : Problem
+        With the weights that were in force.
+    state : State
+    error : float
+        Typical error of a star, pixels: less matters little.
+
+    Returns
+    -------
+    Check or None
+        None where nothing was stated of a single detector, where the exposures share its distortion, or where a
+        catalogue tells what the absolute positions are.
+    """
+    if problem.unknowns.shared or solution.camera.has_focal_plane or problem.degree < 1:
+        return None
+    if solution.gauge.plane is not None:  # a catalogue has placed the stars
+        return None
+    keep = drawn(np.broadcast_to(problem.group, problem.n_exposures), MOST // (2 * problem.n_modes))
+    problem, state = part_of(problem, state, keep)
+    given, variance, group, first = _stated(problem)
+    believed = np.isfinite(variance).any(axis=1) & (given.any(axis=1) | (variance > 0).any(axis=1))
+    if not believed.any():
+        return None
+    noise = np.sqrt(max(1.0, solution.chi2 / max(solution.dof, 1)))
+    model = ExposureModel.of(problem, state, solution.gauge.all_motion[keep], group, noise=noise)
+    tests = static_tests(model, given, variance, [problem.shapes[i] for i in first])
+    tests = [(problem.names[i], test) for i, test, known in zip(first, tests, believed, strict=True) if known]
+    return _in_words(_given(solution), tests, error)
+
+
+def _stated(problem):
+    """Mean and variance (n_priors, K) of every prior, that of each exposure, and the first exposure of each.
+
+    Exposures of one detector with one prior depart from one distortion.
+    """
+    others = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])
+    mean = problem.prior_mean[:, :, : problem.n_modes].reshape(problem.n_exposures, -1, 1)
+    sigma = np.zeros(mean.shape) if problem.mean_sigma is None else problem.mean_sigma.reshape(mean.shape)
+    infinite = (others != 0) @ np.isinf(sigma)
+    variance = np.where(infinite, np.inf, others**2 @ np.where(np.isinf(sigma), 0, sigma) ** 2)[:, :, 0]
+    given = (others @ mean)[:, :, 0]
+    detector = np.broadcast_to(problem.group, problem.n_exposures)
+    keys = np.column_stack([detector, given, variance])
+    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return given[first], variance[first], group.ravel(), first
+
+
+def _given(solution):
+    """What was given, in words."""
+    prior = solution.settings.prior
+    source = prior.get("source") if isinstance(prior, dict) else None
+    return f"the static distortion given ({source})" if source else "the static distortion given"
+
+
+def _in_words(given, tests, error):
+    """The check of some priors, each tested and with the name of an exposure that it was given for."""
+    p = np.array([test.p for _, test in tests])
+    name, worst = tests[int(np.argmin(p))]
+    alarm = FALSE_ALARM / len(tests)
+    where = f" for {name}" * (len(tests) > 1)
+    if p.min() > alarm:
+        untested = [name for name, test in tests if test.power(alarm) < POWER]
+        if untested:
+            where = f" for {some_of(untested, _MOST_NAMED)}" * (len(tests) > 1)
+            found = f"{given}{where} is believed, not tested: these exposures could not tell it from a wrong one"
+            return Check("prior", "unknown", p.min(), alarm, found, _CURE)
+        return Check("prior", "pass", p.min(), alarm, f"{given} agrees with what dithers and rolls show of it")
+    found = f"{given}{where} is not what dithers and rolls show, by {worst.rms:.2g} px rms"
+    others = worst.better()
+    words = min(others, key=others.get)
+    if worst.chance(others[words]) > FALSE_ALARM:
+        found += f"; {words} it would agree"
+    state = state_of(p.min() * len(tests), worst.rms > error)
+    return Check("prior", state, p.min(), alarm, found, _DOUBT)

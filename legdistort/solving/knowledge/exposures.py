@@ -1,0 +1,106 @@
+"""Departures of exposures from the static distortion of their detector, and what is known of that, as factors.
+
+``A_i = S_g + d_i`` with ``d_i ~ N(0, Lambda)``, Lambda by degree, and ``S_g ~ N(m_g, V_g)`` for the detector g of
+exposure i. Similarities of single exposures are free.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
+from .factors import GIVEN, Factor
+from .posterior import most_likely
+from .reduced_data import ReducedData, reduced_data
+
+#: Sizes are sought within these factors of the typical error of a coefficient.
+RANGE = 1e-2, 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureModel:
+    """Data on the coefficients of exposures, and the static distortions that these scatter about.
+
+    The unknowns are the coefficients of every exposure but its similarity, from where they are, by exposure and in the
+    order of `dynamic_basis`; then those of the statics, from the prior mean.
+
+    Attributes
+    ----------
+    data : ReducedData
+    departure : ndarray, shape (n_exposures, K)
+        A_i - m_g where the data are linear.
+    group : ndarray of int, shape (n_exposures,)
+        Number of the static distortion that every exposure departs from.
+    degrees : ndarray of int, shape (K,)
+        Of every coefficient.
+    """
+
+    data: ReducedData
+    departure: np.ndarray
+    group: np.ndarray
+    degrees: np.ndarray
+
+    @classmethod
+    def of(cls, problem, state, motion, group, *, noise=1.0):
+        """That of a fit.
+
+        Parameters
+        ----------
+        problem : Problem
+            With the weights in force.
+        state : State
+        motion : ndarray
+            Of its gauge, see `reduced_data`.
+        group : ndarray of int, shape (n_exposures,)
+            Number of the static distortion that every exposure departs from.
+        noise : float
+            Errors are so many times those stated.
+        """
+        problem = replace(problem, prior_sigma=None, static_sigma=None)
+        n, others = problem.n_modes, [dynamic_basis(shape, problem.n_modes) for shape in problem.shapes]
+        rows = np.zeros((problem.n_exposures, len(others[0]), problem.n_exposures, 2 * n))
+        for i, mine in enumerate(others):
+            rows[i, :, i] = mine
+        data = reduced_data(problem, state, rows.reshape(-1, problem.n_exposures * 2 * n), motion)
+        departure = (state.coefficients - problem.prior_mean)[:, :, :n].reshape(problem.n_exposures, -1)
+        departure = np.stack([mine @ a for mine, a in zip(others, departure, strict=True)])
+        return cls(data.scaled(noise**-2), departure, group, dynamic_degrees(n))
+
+    @property
+    def n_groups(self):
+        """Number of static distortions."""
+        return int(self.group.max()) + 1
+
+    @cached_property
+    def departures(self):
+        """The factor on A_i - S_g, whose sizes are numbered by degree."""
+        n, k = self.departure.shape
+        own = sparse.eye_array(n * k)
+        static = sparse.kron(sparse.csr_array((-np.ones(n), (range(n), self.group)), (n, self.n_groups)), np.eye(k))
+        size = np.tile(self.degrees - 1, n)
+        rows = sparse.hstack([own, static], format="csr")
+        return Factor("departures of the exposures", rows, self.departure.ravel(), np.ones(n * k), size)
+
+    def statics(self, *, size=GIVEN, width=np.nan):
+        """The factor on S_g - m_g: of one size that is found, or of given widths (n_groups, K)."""
+        n, k = self.departure.shape
+        m = self.n_groups * k
+        rows = sparse.hstack([sparse.csr_array((m, n * k)), sparse.eye_array(m)], format="csr")
+        widths = np.broadcast_to(width, (self.n_groups, k)).ravel()
+        return Factor("static distortion", rows, np.zeros(m), widths, np.full(m, size))
+
+    @cached_property
+    def posterior(self):
+        """That with all sizes found, those of the departures by degree, then that of the statics."""
+        factor = Factor.joined([self.departures, self.free_statics])
+        unit = 1 / np.sqrt(np.median(np.diag(self.data.curvature)))
+        n = int(self.degrees.max(initial=0)) + 1
+        scatter = max(float(np.sqrt(np.mean(self.departure**2))), unit)
+        return most_likely(self.data, factor, np.full(n, scatter), unit * np.array(RANGE))
+
+    @cached_property
+    def free_statics(self):
+        """The factor on S_g - m_g of a size that is found."""
+        return self.statics(size=int(self.degrees.max(initial=0)))

@@ -1,0 +1,155 @@
+"""The posterior of data and factors that are linear in the unknowns, and the sizes that make the data most likely."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
+from scipy.optimize import minimize
+
+from ...exceptions import SolveError
+from ..equations.elimination import mirrored
+from .factors import GIVEN, Factor
+from .reduced_data import ReducedData
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Data and a factor (several are `Factor.joined`) at some sizes.
+
+    ``J = data(z) + |(value + rows z) / width|^2``; its minimum and the inverse of half its curvature are mean and
+    covariance of z.
+
+    Attributes
+    ----------
+    data : ReducedData
+        Its unknowns come first among those of the factor.
+    factor : Factor
+    sizes : ndarray, shape (n_sizes,)
+    """
+
+    data: ReducedData
+    factor: Factor
+    sizes: np.ndarray
+
+    @cached_property
+    def widths(self):
+        """Width of every row of the factor."""
+        return self.factor.widths(self.sizes)
+
+    @cached_property
+    def precision(self):
+        """Of the factor, (n, n)."""
+        weighted = self.factor.rows.multiply(1 / self.widths[:, None] ** 2).tocsr()
+        return (self.factor.rows.T @ weighted).toarray()
+
+    @cached_property
+    def slope(self):
+        """Minus half the slope of J at z = 0, (n,)."""
+        return self._padded(self.data.pull) - self.factor.rows.T @ (self.factor.value / self.widths**2)
+
+    def _padded(self, values):
+        return np.pad(values, (0, self.factor.rows.shape[1] - len(values)))
+
+    @cached_property
+    def information(self):
+        """Half the curvature of J, (n, n)."""
+        out, k = self.precision.copy(), len(self.data.pull)
+        out[:k, :k] += self.data.curvature
+        return out
+
+    @cached_property
+    def _root(self):
+        """Cholesky factor of the information at unit diagonal, and the unit."""
+        unit = 1 / np.sqrt(np.diag(self.information))
+        try:
+            return cho_factor(unit[:, None] * self.information * unit, lower=True), unit
+        except (LinAlgError, ValueError):
+            raise SolveError(f"{self.factor.name}: data and what is known do not determine all unknowns") from None
+
+    @cached_property
+    def mean(self):
+        """Of z, (n,)."""
+        root, unit = self._root
+        return unit * cho_solve(root, unit * self.slope)
+
+    @cached_property
+    def covariance(self):
+        """Of z, (n, n)."""
+        (root, _), unit = self._root
+        inverse, _ = dpotri(root, lower=1)
+        return unit[:, None] * mirrored(inverse) * unit
+
+    @cached_property
+    def left(self):
+        """Values of the rows of the factor at the mean, and their variances: (k,) each."""
+        rows = self.factor.rows
+        variance = rows.multiply(rows @ self.covariance).sum(axis=1)
+        return self.factor.value + rows @ self.mean, np.asarray(variance).ravel()
+
+    @property
+    def cost(self):
+        """Minus twice the logarithm of the likelihood, up to a constant, and its slopes by those of the sizes.
+
+        The slope vanishes where the square of a size is the sum of squares of its rows over the number of them that the
+        data determine (MacKay 1992); in mixed models this is restricted maximum likelihood.
+        """
+        (root, _), unit = self._root
+        value, variance = self.left
+        least = self.data.chi2 + ((self.factor.value / self.widths) ** 2).sum() - self.slope @ self.mean
+        total = least + 2 * np.log(np.diag(root) / unit).sum() + 2 * np.log(self.widths).sum()
+        slope, found = 2 - 2 * (value**2 + variance) / self.widths**2, self.factor.size != GIVEN
+        return total, np.bincount(self.factor.size[found], slope[found], len(self.sizes))
+
+    @property
+    def determined(self):
+        """How many values the data determine of those that have each size, (n_sizes,): its degrees of freedom."""
+        found = self.factor.size != GIVEN
+        share = 1 - self.left[1] / self.widths**2
+        return np.bincount(self.factor.size[found], share[found], len(self.sizes))
+
+    def without(self, factor):
+        """Information (m, m) and slope (m,) of the last m unknowns if nothing but they are in a factor, and not in J.
+
+        That is what everything else says of them: their posterior without what that factor states. It may be singular.
+
+        Parameters
+        ----------
+        factor : Factor
+            One of those that were joined, with rows on the last unknowns alone.
+        """
+        m = len(np.unique(factor.rows.indices))
+        first = self.factor.rows.shape[1] - m
+        weight = factor.rows.multiply(1 / factor.widths(self.sizes)[:, None] ** 2)
+        own, pulled = (factor.rows.T @ weight).toarray()[first:, first:], weight.T @ factor.value
+        inner, across = self.information[:first, :first], self.information[:first, first:]
+        solved = np.linalg.solve(inner, np.column_stack([across, self.slope[:first]]))
+        information = self.information[first:, first:] - own - across.T @ solved[:, :-1]
+        slope = self.slope[first:] + pulled[first:] - across.T @ solved[:, -1]
+        return (information + information.T) / 2, slope
+
+
+def most_likely(data, factor, start, bounds):
+    """The posterior at the sizes of the largest likelihood.
+
+    Parameters
+    ----------
+    data : ReducedData
+    factor : Factor
+    start : array-like, shape (n_sizes,)
+    bounds : (float, float)
+        Within which all sizes are sought.
+
+    Returns
+    -------
+    Posterior
+    """
+    low, high = np.log(bounds)
+
+    def cost(logs):
+        return Posterior(data, factor, np.exp(logs)).cost
+
+    start = np.clip(np.log(start), low, high)
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(low, high)] * len(start))
+    return Posterior(data, factor, np.exp(found.x))
