@@ -1,12 +1,14 @@
 """How often checks warn of sets in which nothing is wrong, and how surely they see what is.
 
 ``python tests/benchmarks/checks_table.py alarms --sets 2000``, ``... power --sets 200``, and ``... images --sets 100``
-for runs on simulated frames; ``... cost`` for what the checks cost. Distortions of all but the frames are Chebyshev
-polynomials (`calibration_table.simulated`), none of them made by the package.
+for runs on simulated frames; ``... priors --sets 40`` for priors that are wrong; ``... cost`` for what the checks cost.
+Distortions of all but the frames are Chebyshev polynomials (`calibration_table.simulated`) or those of
+`dense_model.drawn_set`, none of them made by the package.
 """
 
 import argparse
 import logging
+import sys
 import tempfile
 import time
 import warnings
@@ -24,6 +26,10 @@ import legdistort as ld
 from legdistort.exceptions import LegdistortWarning
 from legdistort.inputs.exposures import Exposure
 from legdistort.simulation.pupil import PupilPSF
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import dense_model
+import drawn_sets
 
 SIGMA = 0.02
 #: Pixels: the largest of the distortion in the headers that is not used.
@@ -216,6 +222,58 @@ def images(n_sets):
             print("".join(f"  seed {seed}, {frames} frames: {check}\n" for check in bad), end="", flush=True)
 
 
+#: How exposures of `priors` are taken, and what is given as their static distortion, by that which is true (2, m).
+TAKEN = {
+    "dithers of 150 px": {},
+    "dithers of 400 px": {"dither": 400.0},
+    "rolls of 30 degrees": {"rolls": 30.0},
+    "rolls of 90 degrees": {"rolls": 90.0},
+    "six exposures, rolls": {"rolls": 30.0, "n": 6},
+    "no dithers": {"dither": 1.0},
+}
+#: Number of every cubic mode with x and y exchanged.
+_EXCHANGED = [dense_model.orders(3).index((j, i)) for i, j in dense_model.orders(3)]
+GIVEN = {
+    "right": lambda static, rng: static,
+    "wrong sign": lambda static, rng: -static,
+    "x and y exchanged": lambda static, rng: static[::-1, _EXCHANGED],
+    "turned by 90 degrees": lambda static, rng: (-1.0) ** np.array(dense_model.orders(3))[:, 0]
+    * np.array([[-1], [1]]) * static[::-1, _EXCHANGED],
+    "of another detector": lambda static, rng: rng.normal(size=static.shape) * np.sqrt(np.mean(static**2)),
+    "times 0.8": lambda static, rng: 0.8 * static,
+}  # fmt: skip
+
+
+def priors(n_sets):
+    """Print what the check "prior" says of right and wrong priors, and how large absolute errors are then."""
+    print(f"{'':22s} {'prior':22s}  pass unknown warn fail  true over stated absolute error where passed")
+    for taken, changes in TAKEN.items():
+        for given, made in GIVEN.items():
+            states, ratios = Counter(), []
+            for seed in range(n_sets):
+                data, truth = dense_model.drawn_set(seed, **changes)
+                static = made(truth["static"], np.random.default_rng(10_000 + seed))
+                solution = solved(drawn_sets.as_matches(data), ld.Prior(static))
+                state = next(check.state for check in solution.checks if check.name == "prior")
+                states[state] += 1
+                if state == "pass":
+                    ratios.append(_ratio(solution, truth["stars"]))
+            ratio = f"{np.sqrt(np.mean(np.square(ratios))):.2f}" if ratios else ""
+            counts = " ".join(f"{states[each]:5d}" for each in ("pass", "unknown", "warn", "fail"))
+            print(f"{taken:22s} {given:22s} {counts}  {ratio}", flush=True)
+
+
+def _ratio(solution, stars):
+    """Absolute errors of the stars over those stated, rms, after a similarity."""
+    found = np.stack([solution.stars[k].value for k in "xy"], axis=1)
+    stated = np.stack([solution.stars[f"{k}_err_abs"].value for k in "xy"], axis=1)
+    z, other = (stars[solution.stars["star"]] @ [1, 1j]), found @ [1, 1j]
+    design = np.stack([np.ones_like(z), z], axis=1)
+    off = other - design @ np.linalg.lstsq(design, other, rcond=None)[0]
+    known = np.isfinite(stated).all(axis=1)
+    return np.sqrt(np.mean(np.abs(off[known]) ** 2) / np.mean((stated[known] ** 2).sum(axis=1)))
+
+
 #: Exposures, stars on a frame, part of the observations that are gross errors.
 SIZES = ((11, 120, 0.0), (65, 700, 0.0), (40, 1000, 0.0), (100, 300, 0.0), (65, 700, 0.01))
 
@@ -244,7 +302,7 @@ def cost(n_rounds):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("alarms", "power", "images", "cost"))
+    parser.add_argument("what", choices=("alarms", "power", "images", "priors", "cost"))
     parser.add_argument("--sets", type=int, default=100, help="how many; rounds of `cost`")
     parser.add_argument("--fault", nargs="+", choices=FAULTS, default=list(FAULTS), help="of `power` (default: all)")
     arguments = parser.parse_args()
@@ -252,4 +310,4 @@ if __name__ == "__main__":
     if arguments.what == "power":
         power(arguments.sets, arguments.fault)
     else:
-        {"alarms": alarms, "images": images, "cost": cost}[arguments.what](arguments.sets)
+        {"alarms": alarms, "images": images, "priors": priors, "cost": cost}[arguments.what](arguments.sets)

@@ -49,8 +49,7 @@ def prior_check(solution, problem, state, *, error):
     believed = np.isfinite(variance).any(axis=1) & (given.any(axis=1) | (variance > 0).any(axis=1))
     if not believed.any():
         return None
-    noise = np.sqrt(max(1.0, solution.chi2 / max(solution.dof, 1)))
-    model = ExposureModel.of(problem, state, solution.gauge.all_motion[keep], group, noise=noise)
+    model = ExposureModel.of(problem, state, solution.gauge.all_motion[keep], group)
     tests = static_tests(model, given, variance, [problem.shapes[i] for i in first])
     tests = [(problem.names[i], test) for i, test, known in zip(first, tests, believed, strict=True) if known]
     return _in_words(_given(solution), tests, error)

@@ -22,7 +22,8 @@ NEGLIGIBLE = 0.05
 #: Usual share of gross errors (Hampel et al. 1986: 1 to 10 % in routine data).
 GROSS_ERRORS = 0.05
 #: What else may be behind a check that does not pass.
-_CAUSES = {"time": ("degree",)} | dict.fromkeys(("exposures", "brightness", "place", "duplicates"), ("degree", "time"))
+_CAUSES = dict.fromkeys(("time", "prior"), ("degree",))
+_CAUSES |= dict.fromkeys(("exposures", "brightness", "place", "duplicates"), ("degree", "time"))
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
 _TOO_MUCH = 0.5  # of a frame without stars around

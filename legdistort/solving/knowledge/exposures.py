@@ -43,7 +43,7 @@ class ExposureModel:
     degrees: np.ndarray
 
     @classmethod
-    def of(cls, problem, state, motion, group, *, noise=1.0):
+    def of(cls, problem, state, motion, group):
         """That of a fit.
 
         Parameters
@@ -55,8 +55,6 @@ class ExposureModel:
             Of its gauge, see `reduced_data`.
         group : ndarray of int, shape (n_exposures,)
             Number of the static distortion that every exposure departs from.
-        noise : float
-            Errors are so many times those stated.
         """
         problem = replace(problem, prior_sigma=None, static_sigma=None)
         n, others = problem.n_modes, [dynamic_basis(shape, problem.n_modes) for shape in problem.shapes]
@@ -66,7 +64,7 @@ class ExposureModel:
         data = reduced_data(problem, state, rows.reshape(-1, problem.n_exposures * 2 * n), motion)
         departure = (state.coefficients - problem.prior_mean)[:, :, :n].reshape(problem.n_exposures, -1)
         departure = np.stack([mine @ a for mine, a in zip(others, departure, strict=True)])
-        return cls(data.scaled(noise**-2), departure, group, dynamic_degrees(n))
+        return cls(data, departure, group, dynamic_degrees(n))
 
     @property
     def n_groups(self):

@@ -62,7 +62,8 @@ class Posterior:
     @cached_property
     def _root(self):
         """Cholesky factor of the information at unit diagonal, and the unit."""
-        unit = 1 / np.sqrt(np.diag(self.information))
+        diagonal = np.diag(self.information)
+        unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
         try:
             return cho_factor(unit[:, None] * self.information * unit, lower=True), unit
         except (LinAlgError, ValueError):

@@ -37,10 +37,6 @@ class ReducedData:
         chi2 = self.chi2 - 2 * self.pull @ step + step @ change
         return ReducedData(self.curvature, self.pull - change, float(chi2), self.n_data)
 
-    def scaled(self, factor):
-        """The same with all weights multiplied by a number."""
-        return ReducedData(factor * self.curvature, factor * self.pull, factor * self.chi2, self.n_data)
-
 
 def reduced_data(problem, state, rows, motion):
     """The data of a fit as some coefficients see them.
