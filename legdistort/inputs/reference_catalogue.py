@@ -92,16 +92,28 @@ class Reference:
         arrays = {key: value[rows] for key, value in vars(self).items() if isinstance(value, np.ndarray)}
         return replace(self, **arrays)
 
-    def at(self, epoch):
+    def at(self, epoch, *, moving=False):
         """The reference with its stars where they were at an epoch, in years (straight motion, no parallax).
+
+        Without proper motions they are taken to stay; where stars are known to be `moving`, those of another epoch are
+        left out.
 
         Raises
         ------
         InputError
-            If there are proper motions and `epoch` is None, or no star has one.
+            If there are proper motions and `epoch` is None, or no star has one; if no star is left.
         """
         if self.motion is None:
-            return self
+            near = moving and self.epoch is not None and np.abs(epoch - self.epoch) < _SAME_TIME
+            if near is False:
+                return self
+            if not near.any():
+                raise InputError(
+                    f"{self.label} has no proper motions, and its positions are those of {np.median(self.epoch):.2f}, "
+                    f"where stars that move are sought at {epoch:.2f}: give motion_epoch={np.median(self.epoch):.2f} "
+                    "(--motion-epoch), or the proper motions"
+                )
+            return self.subset(near)
         if epoch is None:
             raise InputError(
                 f"{self.label} has proper motions, but the epoch of the exposures is not known (no MJD-OBS or DATE-OBS "
@@ -285,7 +297,9 @@ def _moving(table, places, motions, unit, label):
     """Motions (n, k) and epochs (n,) of a table, None if it has none, and covariances with those of its places."""
     moving = [name in table.colnames for name in motions]
     if not any(moving):
-        return None, None, _covariance(table, _errors(table, places, unit, label), places)
+        dated = "ref_epoch" in table.colnames or not {"ref_epoch", "epoch"}.isdisjoint(table.meta)
+        epoch = _epochs(table, label) if dated else None
+        return None, epoch, _covariance(table, _errors(table, places, unit, label), places)
     if not all(moving):
         raise InputError(f"one of {motions[0]}, {motions[1]} is missing")
     if places[0] == "ra" and {"parallax", "parallax_error"} <= set(table.colnames):

@@ -41,6 +41,8 @@ _SETTLED = 0.01
 _HARMLESS = 0.3
 #: Offsets larger than expected by this factor in chi2 raise a warning.
 _LARGE = 2.0
+#: ... and this one means that stars that move were elsewhere when the reference was made.
+_ELSEWHERE = 25.0
 #: A map moves the solution to first order; what is left comes from another round.
 _MAP_ROUNDS = 2
 
@@ -87,7 +89,7 @@ class ReferenceTie:
         Raises
         ------
         InputError
-            If most of the reference stars lie elsewhere.
+            If most of the reference stars lie elsewhere, or, where stars move, those of a reference without motions.
         """
         status, first = result.status, self._rough(result.state)
         if first is not None:
@@ -129,6 +131,12 @@ class ReferenceTie:
             )
             rest = ", not settled"
         unknown = hierarchy.named(equations.determined(made.used)[2], result.gauge, result.state.positions.T)
+        if problem.terms.n and self.identified.motion is None and made.ratio > _ELSEWHERE:
+            raise InputError(
+                f"the stars of {self.label}, which has no proper motions, are off by {np.sqrt(made.ratio):.0f} times "
+                f"the errors of both at {problem.terms.epoch:.2f}, the epoch of the positions: give the year that they "
+                "belong to as column ref_epoch, or their proper motions"
+            )
         self._warn(made)
         log.info("%s", made.sentence)
         if result.converged:
@@ -383,7 +391,7 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         epoch = fit.problem.terms.epoch
     epoch = matches.epoch if epoch is None else epoch
     identified = identify(
-        reference.at(epoch),
+        reference.at(epoch, moving=fit.problem.terms.n > 0),
         matches.stars,
         np.where(fit.blocks.v[0] > 0, result.state.positions, np.nan).T,
         flux=_flux(matches),

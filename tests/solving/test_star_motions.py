@@ -8,7 +8,18 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
 from erfa import ErfaWarning
-from moving_stars import FIVE, RNG, SKY, THREE, MovingOracle, field, positions_at, without_a_map, without_a_similarity
+from moving_stars import (
+    FIVE,
+    RNG,
+    SKY,
+    THREE,
+    MovingOracle,
+    field,
+    gaia,
+    positions_at,
+    without_a_map,
+    without_a_similarity,
+)
 from numpy.testing import assert_allclose
 
 from legdistort.cli.parser import main
@@ -431,6 +442,26 @@ def test_motions_are_tied_to_a_catalogue_with_parallaxes_too():
     assert solution.gauge.drift.n_tied == 30
     off = (solution.estimate.motions.values[:, :2] - sim.truth.motions).mean(axis=0)
     assert_allclose(off, [0.2, -0.1], atol=0.05)
+
+
+def test_a_catalogue_without_motions_serves_stars_that_move_at_its_own_epoch_alone():
+    """It was held at the epoch of the positions, years away, and chi2 rose from 1300 to 5 million."""
+    sim = field(60)
+    places = gaia(sim, np.random.default_rng(5), parallax=False)[0]
+    places = places["star", "ra", "dec", "ra_error", "dec_error", "ref_epoch"]
+    words = r"positions are those of 2016\.00, where .* sought at 20\d\d\.\d\d: .*--motion-epoch"
+    with pytest.raises(InputError, match=words):
+        solve(sim.matches, motion="proper", reference=places)
+    near = solve(sim.matches, motion="proper", reference=places, motion_epoch=2016.0)
+    assert near.chi2 == pytest.approx(near.dof, abs=5 * np.sqrt(2 * near.dof))
+    off = near.estimate.positions - sim.truth.positions - (2016.0 - sim.truth.epoch) * sim.truth.motions
+    stated = near.stars["x_err_abs"].value ** 2 + near.stars["y_err_abs"].value ** 2
+    assert np.sqrt(np.mean((off**2).sum(axis=1)) / np.mean(stated)) == pytest.approx(1, abs=0.4)
+    with pytest.raises(InputError, match=r"no proper motions, are off by \d+ times .* column ref_epoch"):
+        solve(sim.matches, motion="proper", reference=places["star", "ra", "dec", "ra_error", "dec_error"])
+    places["ref_epoch"][:5] = 2010.0
+    some = solve(sim.matches, motion="proper", reference=places, motion_epoch=2016.0)
+    assert some.diagnostics.reference.n_stars == 25
 
 
 def test_motions_of_a_catalogue_that_disagree():
