@@ -2,8 +2,11 @@
 
 import json
 import re
+import warnings
 from dataclasses import replace
 
+import dense_model
+import drawn_sets
 import numpy as np
 import pytest
 from astropy import units as u
@@ -15,6 +18,7 @@ import legdistort as ld
 from legdistort.assessment.run_checks import check_run, image_check
 from legdistort.assessment.stack_quality import Quality
 from legdistort.cli import main
+from legdistort.exceptions import LegdistortWarning
 from legdistort.reporting.page import render
 from legdistort.results.check import Check, in_lines, worst
 from legdistort.simulation.pupil import PupilPSF
@@ -235,7 +239,7 @@ def spoiled(kind):
         ("degree", "--degree 3"),
         ("duplicates", "residuals of exp03 and exp99 are the same"),
         ("rejection", "observations .* were left out"),
-        ("exposures", "residuals of exp05 are"),
+        ("exposures", r"larger than those of the others in exp05 \(\d\.\d+ times\); look at the frame"),
         ("completeness", "exp05 has 20 of the"),
         ("brightness", "the brightest third"),
     ],
@@ -464,6 +468,83 @@ def test_a_trailed_frame_is_seen_in_a_run(tmp_path):
     assert "exp02 are unlike" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_all_exposures_that_are_worse_are_named():
+    matches = simulated(3, n_exposures=12).matches
+    table, rng = matches.table.copy(), np.random.default_rng(1)
+    for name, factor in (("exp02", 5), ("exp07", 6)):
+        rows = np.flatnonzero(table["exposure"] == name)
+        table["x"][rows] += factor * rng.normal(0, SIGMA, len(rows)) * u.pix
+    check = next(c for c in solved(changed(matches, table), clip=None).checks if c.name == "exposures")
+    assert re.search(r"in exp07 \(\S+ times\), exp02 \(\S+ times\); look at the frames .* leave them out", str(check))
+
+
+class TestDuplicates:
+    """Noise that two exposures share, told from what they share beside it; sets of `dense_model`, numpy alone."""
+
+    def of(self, data, **options):
+        with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+            solution = ld.solve(drawn_sets.as_matches(data), **options)
+        return next(c for c in solution.checks if c.name == "duplicates")
+
+    def refracted(self, seed, size=0.3):
+        """Stars are displaced by their colours, along a direction that turns through the night."""
+        data, rng = dense_model.drawn_set(seed)[0], np.random.default_rng(seed)
+        colour = rng.normal(size=data["star"].max() + 1)[data["star"]]
+        angle = np.deg2rad(np.linspace(-60, 60, 11))[data["exposure"]]
+        return data | {"xy": data["xy"] + size * (colour * np.stack([np.sin(angle), np.cos(angle)])).T}
+
+    def again(self, data, noise=0.3):
+        """With exposure 3 measured once more."""
+        rows = data["exposure"] == 3
+        xy = data["xy"][rows] + noise * np.random.default_rng(1).normal(size=(rows.sum(), 2)) * data["err"][rows]
+        new = {"xy": xy, "err": data["err"][rows], "star": data["star"][rows], "exposure": np.full(rows.sum(), 11)}
+        new["poses"] = data["poses"][3:4]
+        return data | {key: np.concatenate([data[key], value]) for key, value in new.items()}
+
+    @pytest.mark.parametrize("per_epoch", [2, 4])
+    def test_three_epochs_of_motions_are_no_alarm(self, per_epoch):
+        """Residuals of one epoch follow from those of the others; they are not the noise of copies."""
+        epochs = np.repeat([2010.0, 2013.0, 2016.0], per_epoch)
+        sim = simulated(4, n_exposures=len(epochs), epochs=epochs, motion=0.3)
+        check = next(c for c in solved(sim.matches, motion="proper").checks if c.name == "duplicates")
+        assert check.state == "pass"
+        assert abs(check.value) < 0.6
+
+    def test_stars_with_too_few_exposures_tell_nothing(self):
+        sim = simulated(4, n_exposures=3, epochs=[2010.0, 2013.0, 2016.0], motion=0.3)
+        check = next(c for c in solved(sim.matches, motion="proper").checks if c.name == "duplicates")
+        assert check.state == "unknown"
+
+    def test_correlations_are_those_of_the_noise(self):
+        """Of drawn noise that exposures 3 and 11 share by 0.8, with an exposure that is three times as noisy."""
+        data = self.again(dense_model.drawn_set(5, n_stars=400, errors=(0.02, 0.02))[0], noise=0.75)
+        with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+            solution = ld.solve(drawn_sets.as_matches(data), clip=None)
+        value = residuals(solution).correlations()[0]
+        assert value[3, 11] == pytest.approx(1 / np.hypot(1, 0.75), abs=0.08)
+        others = value[np.triu_indices(12, 1)]
+        assert abs(np.mean(others[others < 0.5])) < 0.02
+        assert np.abs(others[others < 0.5]).max() < 0.3
+
+    def test_what_exposures_share_beside_their_noise_makes_no_copies_of_them(self):
+        check = self.of(self.refracted(6))
+        assert check.state == "warn"
+        assert "have a pattern in common, beyond their noise" in check.sentence
+        assert "leave one of them out" not in check.cure
+        assert check.cure.startswith("see ")
+
+    def test_a_copy_is_found_among_exposures_that_share_a_pattern(self):
+        check = self.of(self.again(self.refracted(6)))
+        assert check.state == "fail"
+        assert "residuals of e03 and e11 are the same" in check.sentence
+
+    def test_errors_that_are_too_large_hide_no_copy_and_make_none(self):
+        data = dense_model.drawn_set(7)[0]
+        assert self.of(data | {"err": 3 * data["err"]}).state == "pass"
+        copied = self.again(data)
+        assert self.of(copied | {"err": 3 * copied["err"]}).state == "fail"
+
+
 def test_without_degrees_of_freedom_residuals_tell_nothing():
     """As many observations as unknowns: every solution fits them."""
     sim = ld.simulate_matches(n_exposures=6, n_stars=7, degree=2, sigma=0.003, static=3.0, seen=0.93, seed=52)
@@ -471,6 +552,6 @@ def test_without_degrees_of_freedom_residuals_tell_nothing():
     assert solution.dof == 0
     states = {check.name: check.state for check in solution.checks}
     assert {name for name, state in states.items() if state == "unknown"} == {
-        "chi2", "exposures", "place", "time", "degree", "absolute"
+        "chi2", "exposures", "place", "time", "degree", "absolute", "duplicates"
     }  # fmt: skip
     assert "no degrees of freedom are left to judge it by" in str(solution.checks[1])

@@ -19,6 +19,8 @@ from ..equations.leverage import leverages
 
 _DETERMINED = 1e-4  # information [1/px^2]: what is held wrong by some pixels shows where 100 px would be beyond doubt
 _PROBES = 64  # patterns up to which a trace is exact, and random combinations beyond: right to 2 %
+_TELLING = 4  # degrees of freedom, both axes, of a star whose residuals tell noise that two exposures share
+_ROUNDS = 4
 _RANK = 1e-3  # part of its variance without a fit that a combination must keep to count
 
 
@@ -325,24 +327,66 @@ class Residuals:
         return stars, moved, rest
 
     def correlations(self):
-        """Correlation of the residuals of every two exposures over their common stars, and how many they are.
+        """Correlation of the noise of every two exposures, and of how many values it is.
+
+        Of residuals e = (1 - H) n a correlation c of the noise n of two exposures makes
+        ``sum e_i e_k = sum (c ((1 - h_ii) (1 - h_kk) + h_ik^2) - h_ik)`` over their common stars, h the leverage of the
+        star alone: without any, residuals of stars that few exposures determine are not independent either.
 
         Returns
         -------
         correlation, number : ndarray, shape (n_exposures, n_exposures)
         """
         problem, n = self.problem, self.problem.n_exposures
-        product, mine, number = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+        counts = 2 * np.bincount(problem.star[self.used], minlength=problem.n_stars) - problem.n_star
+        tells = self.used & (counts >= _TELLING)[problem.star]
+        held = np.einsum("kl...n,kan->lan", elimination.star_roots(self.blocks.v)[..., problem.star], self._columns)
+        product, common, gain = np.zeros((3, n, n))
+        mine, free, less = np.zeros((3, n, n))
         for first in range(0, problem.n_stars, 4096):
-            rows = self.used & (problem.star >= first) & (problem.star < first + 4096)
-            where = self.exposure[rows], problem.star[rows] - first
-            seen = np.zeros((n, min(4096, problem.n_stars - first)))
-            seen[where] = 1
-            number += seen @ seen.T
-            for e in self.whitened:
-                values = np.zeros_like(seen)
-                values[where] = e[rows]
+            rows = tells & (problem.star >= first) & (problem.star < first + 4096)
+            where, size = (self.exposure[rows], problem.star[rows] - first), min(4096, problem.n_stars - first)
+
+            def placed(values, where=where, rows=rows, size=size):
+                out = np.zeros((n, size))
+                out[where] = values if np.ndim(values) == 0 else values[rows]
+                return out
+
+            seen = placed(1.0)
+            for e, columns in zip(self.whitened, held.swapaxes(0, 1), strict=True):
+                values, left = placed(e), placed(1 - np.sum(columns**2, axis=0))
                 product += values @ values.T
                 mine += values**2 @ seen.T
+                free += left @ seen.T
+                gain += left @ left.T
+                for column in columns:
+                    common += placed(column) @ placed(column).T
+                    less += (left * placed(column)) @ placed(column).T
+                    for other in columns:
+                        both = placed(column * other)
+                        gain += both @ both.T
+        value = np.zeros((n, n))
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.nan_to_num(product / np.sqrt(mine * mine.T)), number
+            for _ in range(_ROUNDS):  # shared noise pulls at the star twice, which leaves less of it in both residuals
+                own = free - 2 * value * less
+                scale = np.sqrt(mine * mine.T / (own * own.T))
+                value = np.clip(np.nan_to_num((product / scale + common) / gain), -1, 1)
+        share = self.freedom.sum() / max(float(np.sum(2 * (1 - self.star_share) * self.used)), 1e-300)
+        return value, gain * min(share, 1.0)
+
+    def difference(self, i, k):
+        """Squares of the differences of two exposures' residuals over those to be expected, and of how many values."""
+        problem, (a, b) = self.problem, (self.problem.part(i), self.problem.part(k))
+        at_i, at_k = (np.arange(part.start, part.stop)[self.used[part]] for part in (a, b))
+        _, first, second = np.intersect1d(problem.star[at_i], problem.star[at_k], return_indices=True)
+        at_i, at_k = at_i[first], at_k[second]
+        roots = elimination.star_roots(self.blocks.v)[..., problem.star[at_i]]
+        total = 0.0
+        for axis in (0, 1):
+            g, h = (np.einsum("kln,kn->ln", roots, self._columns[:, axis, rows]) for rows in (at_i, at_k))
+            s, t = (1 / np.sqrt(problem.weight[axis, rows]) for rows in (at_i, at_k))
+            expected = s**2 * (1 - np.sum(g**2, axis=0)) + t**2 * (1 - np.sum(h**2, axis=0))
+            expected += 2 * s * t * np.sum(g * h, axis=0)
+            off = self.blocks.residual[axis, at_i] - self.blocks.residual[axis, at_k]
+            total += float(np.sum(off**2 / np.maximum(expected, 1e-3 * (s**2 + t**2))))
+        return total, 2 * len(at_i)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
+from ...exceptions import some_of
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, Check, state_of
@@ -23,10 +24,12 @@ NEGLIGIBLE = 0.05
 GROSS_ERRORS = 0.05
 #: What else may be behind a check that does not pass.
 _CAUSES = dict.fromkeys(("time", "prior"), ("degree",))
-_CAUSES |= dict.fromkeys(("exposures", "brightness", "place", "duplicates"), ("degree", "time"))
+_CAUSES |= dict.fromkeys(("exposures", "brightness", "place"), ("degree", "time"))
+_CAUSES["duplicates"] = "degree", "time", "place"
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
 _TOO_MUCH = 0.5  # of a frame without stars around
+_LOOKED_AT = 6  # pairs of exposures of which the residuals are compared; names in a sentence
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
 
 
@@ -154,15 +157,20 @@ def exposures_check(solution, residuals):
     """Does an exposure scatter more than the others?"""
     names = residuals.problem.names
     scores = residuals.of_groups(residuals.exposure)
-    worst = int(np.argmin([s.p for s in scores]))
-    s, name = scores[worst], names[worst]
-    typical = np.median([t.t / max(t.nu, 1e-9) for t in scores])
-    ratio = np.sqrt(s.t / max(s.nu, 1e-9) / typical) if typical > 0 else 1.0
-    state = state_of(s.p, ratio > 2)
+    p = np.array([s.p for s in scores])
+    squares = np.array([s.t / max(s.nu, 1e-9) for s in scores])
+    typical = np.median(squares)
+    ratios = np.sqrt(squares / typical) if typical > 0 else np.ones(len(p))
+    worst = int(np.argmin(p))
+    state = state_of(p[worst], ratios[worst] > 2)
     if state == "pass":
-        return Check("exposures", "pass", ratio, None, f"residuals of all {len(names)} exposures are alike")
-    return Check("exposures", state, ratio, None, f"residuals of {name} are {ratio:.3g} times those of the others",
-                 "look at the frame (seeing, guiding, clouds), or leave it out")  # fmt: skip
+        return Check("exposures", "pass", ratios[worst], None, f"residuals of all {len(names)} exposures are alike")
+    order = np.argsort(p, kind="stable")
+    found = [f"{names[i]} ({ratios[i]:.3g} times)" for i in order if p[i] <= FALSE_ALARM]
+    which, them = ("frames", "them") if len(found) > 1 else ("frame", "it")
+    return Check("exposures", state, ratios[worst], None,
+                 f"residuals are larger than those of the others in {some_of(found, _LOOKED_AT)}",
+                 f"look at the {which} (seeing, guiding, clouds), or leave {them} out")  # fmt: skip
 
 
 def brightness_check(solution, residuals):
@@ -386,18 +394,30 @@ def duplicates_check(solution, residuals):
     """Do two exposures have the same noise?"""
     if len(solution.names) < 2 or len(solution.names) > 2000:
         return None
-    correlation, number = residuals.correlations()
-    free = np.maximum(2 * number * residuals.freedom.sum() / (2 * np.count_nonzero(residuals.used)) - 3, 0)
-    z = (np.arctanh(np.clip(correlation, -0.999999, 0.999999)) - np.arctanh(_SAME)) * np.sqrt(free)
-    i, j = np.triu_indices(len(solution.names), 1)
-    worst = int(np.argmax(z[i, j]))
-    i, j, pairs = i[worst], j[worst], len(i)
-    value = correlation[i, j]
-    if pairs * special.ndtr(-z[i, j]) < FALSE_ALARM:
-        return Check("duplicates", "fail", value, _SAME,
-                     f"residuals of {solution.names[i]} and {solution.names[j]} are the same (correlation {value:.2f})",
-                     "leave one of them out")  # fmt: skip
-    return Check("duplicates", "pass", value, _SAME, "no two exposures have the same noise")
+    names, (correlation, number) = solution.names, residuals.correlations()
+    i, j = np.triu_indices(len(names), 1)
+    value, free = correlation[i, j], np.maximum(number[i, j] - 3, 0)
+    if not np.any(free):
+        return Check(
+            "duplicates", "unknown", None, None, "no star is in enough exposures to tell their noise", "add exposures"
+        )
+    z = (np.arctanh(np.clip(value, -0.999999, 0.999999)) - np.arctanh(_SAME)) * np.sqrt(free)
+    same = np.flatnonzero(len(z) * special.ndtr(-z) < FALSE_ALARM)
+    if not len(same):
+        return Check("duplicates", "pass", np.max(value[free > 0]), _SAME, "no two exposures have the same noise")
+    same = same[np.argsort(-z[same], kind="stable")]
+    noise = min(1.0, residuals.chi2 / residuals.dof) if residuals.dof > 0 else 1.0
+    for worst in same[:_LOOKED_AT]:
+        square, n = residuals.difference(i[worst], j[worst])
+        if square < _SAME * noise * n and special.chdtr(n, square / noise) < FALSE_ALARM:
+            return Check("duplicates", "fail", value[worst], _SAME,
+                         f"residuals of {names[i[worst]]} and {names[j[worst]]} are the same "
+                         f"(correlation {value[worst]:.2f})", "leave one of them out")  # fmt: skip
+    shared = some_of([names[k] for k in np.unique([i[same], j[same]])], _LOOKED_AT)
+    return Check("duplicates", "warn", value[same[0]], _SAME,
+                 f"residuals of {shared} have a pattern in common, beyond their noise (correlation "
+                 f"{value[same[0]]:.2f})", "exposures that are close in time or place share a distortion or errors of "
+                 "the measurement: --errors correlated counts that")  # fmt: skip
 
 
 def header_check(header_distortion):
