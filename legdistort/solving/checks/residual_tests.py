@@ -284,7 +284,14 @@ class Residuals:
         return float(np.vdot(rest, self.system.respond(rest))) / probes.shape[1]
 
     def of_cells(self, cells):
-        """`Score` of a displacement common to all observations of a cell, for cells (n,) from 0."""
+        """`Score` of a displacement common to all observations of a cell, for cells (n,) from 0, and what shows of it.
+
+        Returns
+        -------
+        Score
+        float
+            By how much T would grow for displacements of one pixel rms, 1/pix^2; the rest of them is in the stars.
+        """
         n = cells.max() + 1
         seen = np.concatenate([self.whitened[:, :, None], self.released], axis=2)
         inside = csr_array((np.ones(len(cells)), (cells, np.arange(len(cells)))), shape=(n, len(cells)))
@@ -299,7 +306,8 @@ class Residuals:
         values, vectors = np.linalg.eigh((covariance + covariance.T) / 2 * unit[:, None] * unit)
         kept = values > _RANK
         t = np.sum((vectors[:, kept].T @ (unit * g)) ** 2 / values[kept])
-        return self.score(t, float(np.count_nonzero(kept)))
+        shown = float(np.sum((vectors[:, kept] / unit[:, None]) ** 2 * values[kept]))
+        return self.score(t, float(np.count_nonzero(kept))), shown
 
     def _followed(self, cells, n):
         """Gradients of the unknowns by displacements (2 n) of cells, the stars eliminated.

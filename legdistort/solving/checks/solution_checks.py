@@ -28,6 +28,8 @@ _CAUSES |= dict.fromkeys(("exposures", "brightness", "place"), ("degree", "time"
 _CAUSES["duplicates"] = "degree", "time", "place"
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
+_SEEN = 3.0  # errors of a star: a pattern of so much must show, else the question is open
+_TELL_STATIC = "dithers by a good part of the field, or a turned camera, show it"
 _TOO_MUCH = 0.5  # of a frame without stars around
 _LOOKED_AT = 6  # pairs of exposures of which the residuals are compared; names in a sentence
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
@@ -54,13 +56,14 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     tuple of Check
     """
     residuals = Residuals(problem, state, blocks, uncertainty.system, solution.dof)
+    place = place_check(residuals)
     made = [
         errors_check(solution, residuals),
         exposures_check(solution, residuals),
         brightness_check(solution, residuals),
-        place_check(residuals),
+        place,
         time_check(residuals, times),
-        degree_check(solution, residuals, uncertainty),
+        degree_check(solution, residuals, shows_static=place.state != "unknown"),
         dynamic_check(solution, blocks),
         prior_check(solution, problem, state, error=_star_error(residuals)),
         absolute_check(solution),
@@ -210,15 +213,24 @@ def place_check(residuals):
     groups = np.broadcast_to(problem.group, problem.n_exposures)[residuals.exposure]
     size = np.array(problem.shapes)[residuals.exposure][:, ::-1].T
     x, y = np.clip(((problem.xy + 0.5) / size * n).astype(int), 0, n - 1)
-    score = residuals.of_cells((groups * n + y) * n + x)
+    score, shown = residuals.of_cells((groups * n + y) * n + x)
     error = _star_error(residuals)
     state, little = _pattern_state(score, residuals)
+    if state == "pass" and not _would_show(score, shown * (_SEEN * error) ** 2):
+        found = "a pattern on the detector would go into the stars, these exposures would not show it"
+        return Check("place", "unknown", score.rms, error, found, _TELL_STATIC)
     if state == "pass":
         return Check("place", "pass", score.rms, None, f"no pattern in {n} x {n} cells of the detector{little}")
     return Check("place", state, score.rms, error,
                  f"residuals have a pattern of {score.rms:.2g} px rms in {n} x {n} cells of the detector "
                  f"(typical error of a star {error:.2g} px)",
                  "raise --degree, or give a prior of the static distortion")  # fmt: skip
+
+
+def _would_show(score, more):
+    """Whether a pattern that adds so much to T of a score would not be taken for chance, 19 times of 20."""
+    limit = special.chdtri(score.nu, FALSE_ALARM) if score.nu >= 1 else np.inf
+    return special.ndtr((score.nu + more - limit) / np.sqrt(2 * (score.nu + 2 * more) + 1e-300)) > 0.95
 
 
 def time_check(residuals, times):
@@ -241,8 +253,8 @@ def time_check(residuals, times):
                  f"{error:.2g} px)", cure)  # fmt: skip
 
 
-def degree_check(solution, residuals, uncertainty):
-    """Is the degree too low or too high?"""
+def degree_check(solution, residuals, *, shows_static):
+    """Is the degree too low or too high? Of what all exposures have in common that may not show."""
     score, more = residuals.next_degree
     error = _star_error(residuals)
     state, little = _pattern_state(score, residuals)
@@ -256,7 +268,11 @@ def degree_check(solution, residuals, uncertainty):
         return Check("degree", "warn", score.rms, error,
                      f"no exposure has modes of degree {solution.degree} beyond noise",
                      f"--degree {solution.degree - 1} fits as well, with smaller errors")  # fmt: skip
-    return Check("degree", "pass", score.rms, error, f"degree {more} would explain nothing more{little}")
+    found = f"degree {more} would explain nothing more{little}"
+    if not shows_static:
+        found += " of what changes between exposures; what they have in common would go into the stars"
+        return Check("degree", "unknown", score.rms, error, found, _TELL_STATIC)
+    return Check("degree", "pass", score.rms, error, found)
 
 
 def _significance(solution, blocks, *, top_only=False):
