@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
+from .exceptions import InputError
 from .pipeline import check_results, run
+from .runtime.outputs import replacing_folder
 from .runtime.parallel import check_workers
 from .simulation.example_files import published_prior
 from .simulation.observations import simulate_exposures
@@ -36,9 +38,12 @@ def run_demo(*, out, small=False, camera=None, seed=0, workers=None, overwrite=F
     out = Path(out)
     check_results(out, overwrite)
     check_workers(workers)
+    if (frames := out / "frames").is_symlink():
+        raise InputError(f"{frames} is a link, which would lead elsewhere: remove it, or give another folder")
     night = simulate_exposures(small=small, camera=camera, seed=seed, progress=progress)
     truth = night.truth
-    out.mkdir(parents=True, exist_ok=True)
-    paths = night.write(out / "frames")
+    with replacing_folder(frames, overwrite=overwrite) as target:
+        paths = [frames / path.name for path in night.write(target)]
     known = {"camera": truth.camera, "ext": "SCI"} if camera else {"prior": published_prior(truth.shape)}
-    return run(paths, out=out, **known, truth=truth, workers=workers, overwrite=overwrite, progress=progress)
+    share = {"workers": workers, "progress": progress}
+    return run(paths, out=out, **known, truth=truth, overwrite=overwrite, keep=True, **share)  # the frames stay

@@ -63,7 +63,7 @@ class FoldError(LegdistortError, ValueError):
 
 
 class DiskFullError(LegdistortError, OSError):
-    """No space is left for a file; nothing is there half-written: free some space or write elsewhere."""
+    """No space is left for a file, which was left as it was: free some space or write elsewhere."""
 
 
 class ExportError(LegdistortError, ValueError):

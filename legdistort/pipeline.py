@@ -117,6 +117,7 @@ def run(
     truth: Truth | None = None,
     stop_at_bad: bool = False,
     overwrite: bool = False,
+    keep: bool = False,
     workers: int | None = None,
     progress: bool = False,
 ) -> Run:
@@ -164,7 +165,9 @@ def run(
         Raise `InputError` for blank, truncated or damaged frames, naming all of them; else they are left out with a
         warning.
     overwrite : bool
-        Replace the results of an earlier run.
+        Replace the results of an earlier run, with their folder. See the page on files.
+    keep : bool
+        Keep other files that are in the folder; they are refused otherwise.
     workers : int, optional
         Cores to use. None = the current ``dask.distributed.Client`` if there is one, else one. Results do not depend
         on it.
@@ -203,7 +206,7 @@ def run(
     _check_others(workers, truth)
     paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
     share, timings = {"workers": workers, "progress": progress}, _of_start()
-    with outputs.replacing_folder(out, former=RESULTS) as target:
+    with outputs.replacing_folder(out, results=RESULTS, keep=keep) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
             exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, **reading)
@@ -414,10 +417,10 @@ def check_results(out, overwrite):
     """Raise `InputError` if `out` cannot be a folder, or holds results and `overwrite` is false."""
     outputs.check_folder(out)
     out = Path(out)
-    outputs.settle(out)
     there = [name for name in dict.fromkeys(Path(each).parts[0] for each in RESULTS) if (out / name).exists()]
+    folders = {"wcs", "psf"}
     for name in there:
-        if (out / name).is_dir() is not (name in ("wcs", "psf")):
+        if (out / name).is_dir() is not (name in folders) or (name in folders and (out / name).is_symlink()):
             raise InputError(f"{out / name} is in the place of a result: move it away, or give another folder")
     if there and not overwrite:
         raise InputError(

@@ -1,14 +1,21 @@
-"""SIGKILL at every operation on files: afterwards a folder of results is the old one or the new one, never a mixture.
+"""SIGKILL, or an error, at every operation on files: afterwards results are the old ones or the new, never a mixture.
 
     python tests/kills.py --kills 200
+    python tests/kills.py --kills 200 --two-renames
+    python tests/kills.py --kills 400 --errors
 
 runs `solve`, `run`, `coadd`, `attach`, `simulate` and `measure --write-psf`, each into a new folder and over the
 results of an earlier call. Every rename, removal, making of a folder or file, every ``fsync`` and every write is one
 place to be killed at, a write in its middle. The process that works forks one child for every kill, as late as it can,
 so that the work itself is done once.
 
-After each kill the next reader (``legdistort show DIR`` where there is a solution) must succeed and leave a folder that
-is, byte for byte, the old one or the new one. `measure` has two results, a folder of PSFs and then a table: between
+After each kill the next reader (``legdistort show DIR`` where there is a solution) must succeed and find a folder that
+is, byte for byte, the old one or the new one, hidden folders of dead processes apart. Where the process was killed
+between two renames of folders (``--two-renames``: as on systems that cannot exchange them), or between the frames of
+``attach --in-place``, the message must have the line that brings the old ones back, which is carried out. With
+``--errors`` the operation fails instead, with error numbers of all kinds; the command may tell of no hidden file.
+
+`measure` has two results, a folder of PSFs and then a table: between
 them the PSFs are new and the table is not, which the checksums in the table tell. Linux only.
 """
 
@@ -21,9 +28,11 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
+from errno import EACCES, EBUSY, EDQUOT, EIO, ENOMEM, ENOSPC, EPERM, EROFS, EXDEV
 from pathlib import Path
 
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
@@ -41,6 +50,8 @@ VARYING = {"summary.json", "report.html"}
 #: Of `measure`, beside the PSFs.
 TABLE = "stars.ecsv"
 _LAST = 25
+_HIDDEN = ".partial-"
+_NUMBERS = (EIO, ENOSPC, EDQUOT, EACCES, EROFS, EXDEV, EBUSY, ENOMEM, EPERM)
 _CHANGING = ("replace", "rename", "mkdir", "unlink", "remove", "rmdir", "fsync", "link", "symlink")
 
 
@@ -50,9 +61,10 @@ class Operations:
     def __init__(self, folder):
         self.folder, self.count, self.killed_at = str(folder), 0, None
         self.serve = self.tell = self.first_write = None
-        self.armed = False
+        self.armed, self.errors = False, False
 
     def install(self):
+        outputs.exchange = self._exchanging(outputs.exchange)
         for name in _CHANGING:
             setattr(os, name, self._counted(getattr(os, name)))
         self.real_open = io.open
@@ -71,14 +83,24 @@ class Operations:
 
         return counted
 
+    def _exchanging(self, function):
+        def exchanging(*folders):
+            if self.armed:
+                self.step()
+            return function(*folders)
+
+        return exchanging
+
     def step(self, half=None):
-        """One operation; `half` does a part of it before the process dies."""
+        """One operation; `half` does a part of it before the process dies, or it fails."""
         self.count += 1
         if self.count == self.first_write and self.serve:
             self.serve()
         if self.count == self.killed_at:
             if half is not None:
                 half()
+            if self.errors:
+                raise OSError(_NUMBERS[self.count % len(_NUMBERS)], "an error of the disk")
             os.kill(os.getpid(), signal.SIGKILL)
 
     def _open(self, file, mode="r", *args, **options):
@@ -106,14 +128,14 @@ class _Raw(io.FileIO):
 
 
 def state(folder):
-    """``{name: SHA-256}`` of all in a folder but the file of a lock; None without it."""
+    """``{name: SHA-256}`` of all in a folder but hidden folders of dead processes; None without it."""
     if not folder.exists():
         return None
     found = {}
     for path in sorted(folder.rglob("*")):
-        if path.name == locks.LOCK:
-            continue
         name = path.relative_to(folder).as_posix()
+        if any(part.startswith(_HIDDEN) for part in name.split("/")):
+            continue
         found[name] = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"
     return found
 
@@ -161,16 +183,22 @@ class Case:
         Whether `out` holds the results of an earlier call.
     between : callable
         Whether what is found, as `state` gives it, is between two results of a command, and tells so.
+    errors : bool
+        Operations fail, and nothing is killed.
     """
+
+    errors = False
 
     def __init__(self, name, arguments, out, read, old, between=None):
         self.name, self.arguments, self.out, self.read, self.old = name, arguments, out, read, old
         self.between = between
         self.root = out.parent
-        self.faults, self.kills, self.results = [], 0, {"old": 0, "new": 0, "between": 0}
+        self.faults, self.kills, self.results = [], 0, {"old": 0, "new": 0, "between": 0, "brought back": 0}
 
-    def call(self):
-        return quietly([*self.arguments, *(["--overwrite"] if self.old else [])])
+    def call(self, *, failing=False):
+        """Exit status of the command, 97 if it tells of what is hidden."""
+        status, told = quietly([*self.arguments, *(["--overwrite"] if self.old else [])], failing=failing)
+        return 97 if status and _HIDDEN in told else status
 
     def run(self, n_kills):
         """Kill it `n_kills` times; returns the number of operations."""
@@ -191,14 +219,14 @@ class Case:
         for k in early:
             self._restore(self.saved)
             fresh = Operations(self.root)
-            fresh.killed_at = k
+            fresh.killed_at, fresh.errors = k, self.errors
             self._judge(k, in_child(lambda fresh=fresh: self._working(fresh)))
         return total
 
     def _working(self, operations):
         operations.install()
         operations.armed = True
-        status = self.call()
+        status = self.call(failing=self.errors)
         operations.armed = False
         if operations.tell:
             operations.tell()
@@ -241,7 +269,7 @@ class Case:
                     os.dup2(again, descriptor)
                     if again != descriptor:
                         os.close(again)
-                operations.armed, operations.killed_at = True, k
+                operations.armed, operations.killed_at, operations.errors = True, k, self.errors
                 operations.serve = None
                 if k is None:
                     operations.tell = lambda: os.write(counted, json.dumps(operations.count).encode())
@@ -269,11 +297,17 @@ class Case:
             self.results[verdict] += 1
 
     def _verdict(self, status):
-        if status != -signal.SIGKILL:
+        ended = status
+        if status not in ((0, 1) if self.errors else (-signal.SIGKILL,)):
             return None, f"it ended with {status}"
+        back = self._bring_back()
         status = in_child(lambda: self.read(self.out))
         found = state(self.out)
-        if self._like(found, self.after) and status == 0:
+        if back:
+            verdict = "brought back"
+            if found != self.before or status:
+                return None, f"brought back, but not as it was (status of the reader {status})"
+        elif self._like(found, self.after) and status == 0:
             verdict = "new"
         elif found == self.before and (status == 0 or not self.old):
             verdict = "old"
@@ -285,9 +319,26 @@ class Case:
                 k: ("old" if old.get(k) == v else "new" if new.get(k) == v else v[:8]) for k, v in (found or {}).items()
             }
             return None, f"neither old nor new (status of the reader {status}): {odd}"
-        outputs.settle(self.root)  # as the next writer beside it does
+        if ended == 0 and verdict != "new":
+            return None, f"it ended well, and left the results that are {verdict}"
+        locks.remove_dead(self.root, _HIDDEN)  # as the next writer beside it does
         strays = [path.name for path in self.root.iterdir() if path != self.out]
         return verdict, f"left behind: {strays}" if strays else None
+
+    def _bring_back(self):
+        """Carry out the line of a message, where former files were set aside; whether that was done."""
+        aside, kept = locks.set_aside(self.out), sorted(self.out.glob(".replaced-*"))
+        if not self.out.exists() and len(aside) == 1:
+            told = locks.way_back(self.out / "some file").partition("this brings it back: ")[2]
+        elif any(not copy.samefile(self.out / copy.name) for folder in kept for copy in folder.iterdir()):
+            told = quietly(self.arguments, failing=True)[1].partition("this brings them back: ")[2].partition("; or")[0]
+        else:  # names of the same files, which the next call takes away
+            for folder in kept:
+                shutil.rmtree(folder)
+            for folder in aside:
+                shutil.rmtree(folder)
+            return False
+        return subprocess.run(told, shell=True, check=False).returncode == 0 if told else False
 
     def _like(self, found, wanted):
         """Whether a folder is the new one; what changes from call to call must fit the list of the files."""
@@ -302,25 +353,24 @@ class Case:
 
 
 def quietly(arguments, *, failing=False):
-    """Exit status of a command, without a word of it unless it fails."""
+    """Exit status of a command and what it says, without a word of it unless it fails."""
     told = io.StringIO()
     with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
         status = main([*arguments, "--quiet"])
     if status and not failing:
         print(told.getvalue(), file=sys.stderr)
-    return status
+    return status, told.getvalue()
 
 
 def show(out):
     """The next reader of a folder with a solution."""
-    return quietly(["show", str(out)], failing=True)
+    return quietly(["show", str(out)], failing=True)[0]
 
 
 def open_mosaic(out):
     """The next reader of a folder with a mosaic."""
     from astropy.io import fits
 
-    outputs.settle(out)
     for path in out.glob("*.fits"):
         with fits.open(path, checksum=True) as hdus:
             assert [hdu.data for hdu in hdus]
@@ -341,7 +391,6 @@ def open_measured(out):
     from legdistort.inputs.table_files import read_table
     from legdistort.measurement.effective.model import EffectivePSF
 
-    outputs.settle(out, out / "psf")
     for path in sorted((out / "psf").glob("*.fits")):
         EffectivePSF.read(path)
     if (out / TABLE).exists():
@@ -387,7 +436,7 @@ def cases(folder, only=None):
             out = folder / f"{name}-{'old' if old else 'new'}" / "room" / "out"
             out.parent.mkdir(parents=True)
             arguments_of = [each.replace("{out}", str(out)) for each in [*arguments, "--out", str(out / file)]]
-            if old or name in ("coadd", "measure"):  # a file needs a folder
+            if name in ("coadd", "measure"):  # a file needs a folder
                 out.mkdir()
                 (out / "notes.txt").write_text("not ours")
             if old:
@@ -404,7 +453,9 @@ def cases(folder, only=None):
                     earlier = [*arguments_of[:-3], "2", *arguments_of[-2:]]
                 elif name == "measure":
                     earlier = [*arguments_of, "--gain", "3"]
-                assert quietly([*earlier]) == 0
+                assert quietly([*earlier])[0] == 0
+                (out / "notes.txt").write_text("not ours")
+                arguments_of += ["--keep"] if name in ("solve", "run") else []
             what = f"{name} {'over an earlier one' if old else 'into a new folder'}"
             yield Case(what, arguments_of, out, read, old, psfs_before_the_table if name == "measure" else None)
     if only in (None, "attach"):
@@ -414,8 +465,11 @@ def cases(folder, only=None):
         yield Case("attach in place", ["attach", solution, *copies, "--in-place"], out, open_frames, True)
 
 
-def kill(n_kills, folder, only=None):
+def kill(n_kills, folder, only=None, *, errors=False, two_renames=False):
     """Rows of the table, and the faults."""
+    Case.errors = errors
+    if two_renames:
+        outputs.exchange = lambda *_: False
     provenance.now = lambda: "2026-01-01T00:00:00"
     rows, faults = [], []
     everything = list(cases(Path(folder), only))
@@ -433,14 +487,16 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--only", help="solve, run, coadd, attach, simulate or measure")
+    parser.add_argument("--errors", action="store_true", help="operations fail, and nothing is killed")
+    parser.add_argument("--two-renames", action="store_true", help="as where folders cannot be exchanged")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
-        table, wrong = kill(given.kills, place, given.only)
-    print(f"{'command':28s} operations  kills   old   new  between  faults  seconds")
-    for name, total, kills, old, new, between, bad, seconds in table:
-        print(f"{name:28s} {total:10d} {kills:6d} {old:5d} {new:5d} {between:8d} {bad:7d} {seconds:8.1f}")
-    total, kills, old, new, between = (sum(row[k] for row in table) for k in range(1, 6))
-    print(f"{'all':28s} {total:10d} {kills:6d} {old:5d} {new:5d} {between:8d} {len(wrong):7d}")
+        table, wrong = kill(given.kills, place, given.only, errors=given.errors, two_renames=given.two_renames)
+    print(f"{'command':28s} operations  kills   old   new  between  brought back  faults  seconds")
+    for name, total, kills, old, new, between, back, bad, seconds in table:
+        print(f"{name:28s} {total:10d} {kills:6d} {old:5d} {new:5d} {between:8d} {back:13d} {bad:7d} {seconds:8.1f}")
+    total, kills, old, new, between, back = (sum(row[k] for row in table) for k in range(1, 7))
+    print(f"{'all':28s} {total:10d} {kills:6d} {old:5d} {new:5d} {between:8d} {back:13d} {len(wrong):7d}")
     if wrong:
         print("\n".join(wrong))
     sys.exit(bool(wrong))

@@ -80,6 +80,7 @@ def do_run(a):
             coadding=given(a, options.COADDING),
             compare=a.compare,
             overwrite=a.overwrite,
+            keep=a.keep,
             **_share(a),
         )
     _report(a, result.solution, result.summary)
@@ -182,7 +183,9 @@ def do_solve(a):
 
     check_results(a.out, a.overwrite)
     _refuse_ignored(a)
-    with outputs.replacing_folder(a.out, former=RESULTS) as target:  # a mosaic there does not belong to this solution
+    # a mosaic there does not belong to this solution
+    with outputs.replacing_folder(a.out, results=RESULTS, keep=a.keep) as target:
+        check_results(a.out, a.overwrite)  # again: nobody else writes there any more
         table = _read_table(a.table, a, column_contract.MATCHED)
         known = legdistort.Matches.read_meta(table.meta)
         known |= {"shape": tuple(a.shape)} if a.shape else {}

@@ -70,10 +70,12 @@ TABLE_ENDINGS, PICTURE_ENDINGS = (".ecsv",), (".png", ".pdf", ".svg")
 
 def out(what, *, path="file", endings=None):
     """The output of a command."""
-    return {
+    named = {
         "out": Option(what, required=True, type=Path, path=path, endings=endings),
         "overwrite": Option("replace what an earlier call left", action="store_true"),
     }
+    keep = Option("keep other files that are in the folder, which are refused else", action="store_true")
+    return named | ({"keep": keep} if path == "results" else {})
 
 
 def picture(what):

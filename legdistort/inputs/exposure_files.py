@@ -20,8 +20,8 @@ from astropy.io import fits
 from ..exceptions import AssumptionWarning, DamagedError, InputError, some_of, warn, without_astropy_warnings
 from ..runtime.checks import check_is_file
 from ..runtime.fits_bytes import open_fits, readable
+from ..runtime.locks import way_back
 from ..runtime.notebook import ShownAsPrinted
-from ..runtime.outputs import settle_for
 from ..runtime.progress import Bar
 from ..runtime.provenance import checksum, unchanged
 from . import repetitions
@@ -342,13 +342,12 @@ def expand_paths(paths):
             f"frames must be a path, an HDUList, an NDData or a sequence of them, got {type(paths).__name__}"
         )
     paths = list(paths)
-    settle_for(*(path for path in paths if isinstance(path, (str, Path))))
     sources = []
     for source in paths:
         if isinstance(source, str) and any(c in source for c in "*?") and not Path(source).exists():
             found = sorted(glob.glob(source)) or sorted(glob.glob(source.replace("[", "[[]")))
             if not found:
-                raise InputError(f"no file matches {source!r}")
+                raise InputError(f"no file matches {source!r}{way_back(source)}")
             sources += found
         else:
             sources.append(source)

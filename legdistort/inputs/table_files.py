@@ -59,7 +59,6 @@ def read_table(path, *, columns=None, origin=None, error=None):
         raise InputError(f"origin must be 0 or 1 (coordinate of the first pixel's centre), got {origin!r}")
     if error is not None and not (isinstance(error, Real) and 0 < error < np.inf):
         raise InputError(f"error must be a positive number of pixels, got {error!r}")
-    outputs.settle_for(path)
     check_is_file(path)
     try:
         with provenance.unchanged(path):

@@ -1,7 +1,8 @@
 """Positions that an earlier run measured, so that another one goes on from there."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from ..exceptions import AssumptionWarning, InputError, LegdistortError, some_of
 from ..inputs.exposure_files import ExposureFile, file_checksums, open_exposures
 from ..inputs.exposure_names import whole_name
 from ..inputs.table_files import read_table, write_table
+from ..runtime import provenance
+from ..runtime.locks import way_back
 from .effective.model import EffectivePSF
 
 #: Files of a run that have what it measured.
@@ -27,27 +30,39 @@ class EarlierRun:
     folder : Path
     table : Table
         Detections of all its exposures, as `legdistort.measure` gives them.
+    psfs : dict of str to EffectivePSF
+        Of the exposures that have one.
     """
 
     folder: Path
     table: Table
+    psfs: dict = field(default_factory=dict)
 
     @classmethod
     def read(cls, folder):
         """What the run that left this folder measured.
 
+        All of it is read here: the folder may be replaced by the results of the next run.
+
         Raises
         ------
         InputError
-            Where there is no such folder, or no run has left its positions there.
+            Where there is no such folder, no run has left its positions there, or it has files of several runs.
         """
-        folder = Path(folder)
+        return provenance.of_one_run(folder, partial(cls._read, Path(folder)))
+
+    @classmethod
+    def _read(cls, folder):
+        """The object, and the names of the files that it was read from."""
         if not (folder / DETECTIONS).is_file():
-            raise InputError(f"{folder} has no {DETECTIONS}: give the folder of the results of a run")
+            lost = way_back(folder / DETECTIONS) or ": give the folder of the results of a run"
+            raise InputError(f"{folder} has no {DETECTIONS}{lost}")
         table = read_table(folder / DETECTIONS)
         if not {"exposure", "x", "y", "x_err", "y_err"} <= set(table.colnames) or "frames" not in table.meta:
             raise InputError(f"{folder / DETECTIONS} is not what a run has left: measure the frames again")
-        return cls(folder, table)
+        paths = sorted((folder / PSFS).glob("*.fits"))
+        psfs = {path.stem: EffectivePSF.read(path) for path in paths}
+        return cls(folder, table, psfs), [DETECTIONS, *(f"{PSFS}/{path.name}" for path in paths)]
 
     @property
     def frames(self):
@@ -98,8 +113,7 @@ class EarlierRun:
         names = [whole_name(exposure) for exposure in exposures]
         table = self.table[np.isin(self.table["exposure"], names)]
         table.meta = {}
-        files = {exposure.name: self.folder / PSFS / f"{exposure.name}.fits" for exposure in exposures}
-        return table, {name: EffectivePSF.read(file) for name, file in files.items() if file.is_file()}
+        return table, {exposure.name: self.psfs[exposure.name] for exposure in exposures if exposure.name in self.psfs}
 
 
 def measured_frames(tables):

@@ -14,7 +14,7 @@ from ..geometry.basis import check_degree
 from ..results.solution import Solution
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, check_layout, check_tree, read_tree, understood
-from ..runtime.outputs import replacing, settle_for
+from ..runtime.outputs import replacing
 from ..runtime.trees.codec import from_tree, to_tree
 from .from_files import read_source
 
@@ -71,7 +71,6 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
         return dataclasses.replace(ready, **widths)
     files = where if isinstance(where, (list, tuple)) else [where]
     files = [path for path in files if isinstance(path, (str, Path))]
-    settle_for(*files)
     with provenance.unchanged(*files):
         source = read_source(where, ext=ext, frame=frame)
         try:

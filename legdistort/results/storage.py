@@ -25,7 +25,7 @@ from ..inputs import column_contract
 from ..inputs.plain_columns import plain, plain_columns, restored
 from ..runtime.asdf_files import ASDF_STANDARD, MAX_BYTES, check_layout, check_tree, read_tree, understood
 from ..runtime.checks import LARGEST
-from ..runtime.outputs import replacing, settle_for
+from ..runtime.outputs import replacing
 from ..runtime.provenance import checksums, unchanged
 from ..runtime.trees.codec import from_tree, to_tree
 from ..runtime.trees.facts import SIZE, array, number
@@ -121,7 +121,6 @@ def read_solution(path, kind, *, max_bytes=None):
     """Read a solution of class `kind` from an ASDF file or a folder of results; see `Solution.read`."""
     path = Path(path)
     path = path / "solution.asdf" if path.is_dir() else path
-    settle_for(path)
     with unchanged(path):
         tree = read_tree(path, max_bytes=MAX_BYTES if max_bytes is None else max_bytes).get("legdistort")
         (checksum,) = checksums(path).values()

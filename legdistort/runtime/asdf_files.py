@@ -29,7 +29,6 @@ from asdf.tags.core.ndarray import asdf_datatype_to_numpy_dtype
 
 from ..exceptions import InputError
 from .checks import check_is_file, first_line
-from .outputs import settle_for
 
 #: Version of the ASDF standard that is written.
 ASDF_STANDARD = "1.5.0"
@@ -85,7 +84,6 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
     if inside and b"fits:" in content:
         content = _without_fits_arrays(path, content)
     if not inside:
-        settle_for(path)
         check_is_file(path)
     try:
         # absolute, since asdf takes ~x for somebody's home

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..exceptions import InputError
+from .locks import way_back
 
 #: No number of pixels or standard errors is as large; squares of larger ones overflow.
 LARGEST = 1e30
@@ -34,10 +35,11 @@ def check_positive(value, name, what="number"):
 def check_is_file(path, instead="", *, of_folder="name a file in it"):
     """Raise `InputError`, which says what to give `instead`, or `of_folder`, if a path is none of a file."""
     path = Path(path)
+    lost = "" if path.exists() else way_back(path)
     if path.is_file():
         return
     if not path.exists():
-        fault = "no such file"
+        fault, instead = "no such file" + lost, "" if lost else instead
     elif path.is_dir():
         fault, instead = "is not a file but a folder", instead or of_folder
     else:

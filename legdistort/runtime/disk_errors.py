@@ -57,6 +57,25 @@ def told_when_full(path, folder):
         if not is_full(error, folder):
             raise
         raise DiskFullError(
-            f"No space left on the disk for {path}: nothing was replaced or left half-written; free some space (or "
-            "allow larger files: ulimit -f), or write elsewhere"
+            f"No space left on the disk for {path}, which was left as it was: free some space (or allow larger files: "
+            "ulimit -f), or write elsewhere"
         ) from None
+
+
+@contextmanager
+def named_as_given(hidden, path):
+    """Errors that name a hidden file or folder, or what is in it, name `path` instead, which it is to become."""
+    try:
+        yield
+    except Exception as error:
+        error.args = tuple(_named(each, hidden, path) for each in error.args)
+        for name in ("filename", "filename2"):
+            if getattr(error, name, None) is not None:
+                setattr(error, name, _named(getattr(error, name), hidden, path))
+        raise
+
+
+def _named(text, hidden, path):
+    """A text with another name; whatever else an error has stays."""
+    text = os.fspath(text) if isinstance(text, os.PathLike) else text
+    return text.replace(str(hidden), str(path)) if isinstance(text, str) else text

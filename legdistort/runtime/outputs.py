@@ -1,32 +1,37 @@
 """Outputs appear under their name only when they are complete, and replace nothing unless asked.
 
-A file is written in a hidden folder beside its place, and renamed. So is a folder that is new. The files of a folder
-that is there already are completed in a hidden folder inside it, ``.partial-RUN``, which becomes ``.commit-RUN``; from
-then on they are its content, and are moved to their places one by one. If that is interrupted, whatever of this package
-opens the folder next goes on with it (`settle`).
+A file is written in a hidden folder beside its place, ``.partial-...``, and renamed. A folder is completed beside its
+place too, and exchanged for the one that is there, in one step where the system can. Files among those of others take
+their places one by one (`replacing_files`); those that were there are kept in ``.replaced-...`` until the last has.
 
-An empty folder is not replaced by a new one: it may be the top of a disk, where somebody works just now, or have
-permissions of its own.
+Nothing that lies in a folder says what is to be done: readers change nothing on the disk, and writers remove only
+hidden folders of dead processes (`locks.remove_dead`). What a process leaves that is killed is told by the next.
 
 Libraries that write are handed open files, never paths: some take parts of a path for those of a URL, or for a home
 folder, and would write elsewhere.
 """
 
+import ctypes
 import hashlib
-import json
+import logging
 import os
+import shlex
+import shutil
+import stat
+import uuid
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from ..exceptions import InputError, LegdistortError
+from ..exceptions import InputError, LegdistortError, some_of
 from . import locks
-from .disk_errors import told_when_full
-from .provenance import checksum
+from .disk_errors import named_as_given, told_when_full
+from .provenance import SUMMARY, checksum, files_of_run
 
-_PARTIAL, _COMMIT = ".partial-", ".commit-"
-#: What a commit removes, beside its files.
-_PLAN = ".legdistort.json"
-_OURS = (locks.LOCK, _PLAN)
+log = logging.getLogger(__name__)
+
+_PARTIAL, _KEPT = ".partial-", ".replaced-"
+_NAMED = 3  # files in a message
+_EXCHANGE, _CWD = 2, -100  # RENAME_EXCHANGE and AT_FDCWD of Linux
 
 
 def check_file(path, *, overwrite=False):
@@ -67,7 +72,7 @@ def try_to_write(path):
     folder = next(place for place in Path(path).absolute().parents if place.is_dir())
     folder = Path(path) if Path(path).is_dir() else folder
     try:
-        with locks.temporary_folder(folder, _PARTIAL) as (trial, _):
+        with locks.temporary_folder(folder, _PARTIAL) as trial:
             (trial / "file").write_bytes(b"0")
             os.replace(trial / "file", trial / "renamed")
     except OSError as error:
@@ -139,105 +144,104 @@ def replacing(path, *, overwrite=False):
     path = Path(path)
     check_file(path, overwrite=overwrite)
     place = path.absolute()  # since asdf takes ~x for somebody's home
-    settle(place.parent)
-    with told_when_full(path, place.parent), locks.temporary_folder(place.parent, _PARTIAL) as (folder, _):
+    with locks.temporary_folder(place.parent, _PARTIAL) as folder:
         temporary = folder / "file"  # since a long name would become too long
-        with temporary.open("wb") as file:
+        with _written(temporary, path) as file:
             yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, place)
+        with named_as_given(temporary, path):
+            os.replace(temporary, place)
         _sync(place.parent)
 
 
 @contextmanager
-def replacing_folder(out, *, former=(), overwrite=True):
-    """A temporary folder whose content moves into the folder `out`, all or nothing, when the block ends well.
+def _written(temporary, path):
+    """An open file that is on the disk when the block ends; errors name the path that it will have."""
+    with named_as_given(temporary, path), told_when_full(path, temporary.parent), temporary.open("wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
 
-    What stands in `out` under other names stays. As long as the block runs, `out` is locked against other writers.
+
+# -- folders
+
+
+@contextmanager
+def replacing_folder(out, *, results=(), overwrite=True, keep=True):
+    """A temporary folder that takes the place of the folder `out`, all or nothing, when the block ends well.
+
+    As long as the block runs, `out` is locked against other writers. What stands in it under other names is moved
+    along.
 
     Parameters
     ----------
     out : str or path
-        Made, with its parents, if it does not exist.
-    former : sequence of str
-        Patterns of names in `out`; files of earlier results that have no successor are removed. Of those in a
-        ``summary.json`` with a list of its files, only these.
+        Made, with its parents, if it does not exist. A link is followed.
+    results : sequence of str
+        Patterns of names in `out`: files of earlier results, which go. Of those in a ``summary.json`` with a list of
+        its files, only these.
     overwrite : bool
-        Replace files that exist.
+        Replace files of the same names.
+    keep : bool
+        Other files in `out` are moved along; False: they are refused, those apart whose names begin with a dot.
 
     Yields
     ------
     Path
-        The name of the folder ends in a word of its own.
 
     Raises
     ------
     InputError
-        As `check_folder` does; if another process writes there; if a folder stands in the place of a file, or the
-        reverse; if a file exists that is not to be replaced.
+        As `check_folder` does; if another process writes there; if there are other files; if results lie in a folder
+        that cannot be exchanged for another; if a folder stands in the place of a file, or the reverse; if a file
+        exists that is not to be replaced.
     DiskFullError
         If the disk is full.
     """
     out = Path(out)
     check_folder(out)
-    place = out.absolute()
-    with told_when_full(out, place):
-        if place.exists():
-            with _locked(place, out):
-                _settle(place)
-                with locks.temporary_folder(place, _PARTIAL) as (folder, held):
-                    yield folder
-                    locks.before_renaming(held)
-                    _commit(folder, place, former, overwrite)
-        else:
-            with _new_parents(place), _new_folder(place, out) as folder:
-                yield folder
+    place = Path(os.path.realpath(out))
+    fixed = _why_not_exchanged(place)
+    with told_when_full(out, place), _new_parents(place), ExitStack() as stack:
+        work = None if fixed else stack.enter_context(_work_folder(place.parent, place.name, out))
+        _bring_back(place)
+        existed, held = place.is_dir(), stack.enter_context(ExitStack())
+        if existed:
+            inside = held.enter_context(_work_folder(place, "", out))
+            _check_content(place, out, results, keep, fixed)
+        new = (work or inside) / "new"
+        new.mkdir()
+        with named_as_given(new, out):
+            yield new
+            _check_places(new, place, out, overwrite)
+            for path in (*new.rglob("*"), new):  # on the disk, and not in the memory of the system only
+                _sync(path)
+            if fixed:
+                names = sorted(_items(new), key=lambda name: (name == SUMMARY, name))
+                _move_all({place / name: new / name for name in names})
+            elif existed and place.is_dir():
+                if os.name == "nt":  # Windows renames no folder in which a file is open
+                    held.close()
+                _take_the_place(new, place, _results(place, results))
+            else:
+                _rename_new(new, place, out)
 
 
 @contextmanager
-def replacing_folders(outs):
-    """`replacing_folder` of several folders at once; none changes unless the block ends well.
+def _work_folder(parent, name, out):
+    """A locked folder for a place of some name in another folder: who wants the same place wants the same one.
 
-    Parameters
-    ----------
-    outs : sequence of path
-
-    Yields
-    ------
-    dict
-        The temporary folder of each.
-
-    Raises
-    ------
-    LegdistortError
-        As `replacing_folder` does. If a disk fails between one and the next, the error names those that have changed.
+    Without a name it is for the folder that it is in, which is locked so against other writers.
     """
-    done = []
-    try:
-        with ExitStack() as stack:
-            folders = {}
-            for out in outs:
-                stack.push(lambda kind, *_, out=out: done.append(str(out)) if kind is None else None)
-                folders[out] = stack.enter_context(replacing_folder(out))
-            yield folders
-    except (LegdistortError, OSError) as error:
-        if not done:
-            raise
-        raise LegdistortError(
-            f"all of the files in {', '.join(done)} were replaced, and none of the others: {error}"
-        ) from error
-
-
-@contextmanager
-def _locked(place, out):
-    held = locks.lock(place)
-    if held is None:
-        raise InputError(f"another process is writing in {out}: wait until it has ended, or give another folder")
-    try:
-        yield
-    finally:
-        locks.release(held, place)
+    word = hashlib.sha256(os.fsencode(name)).hexdigest()[:32]
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(locks.temporary_folder(parent, _PARTIAL, word))
+        except FileExistsError as error:
+            raise InputError(
+                f"another process is writing in {out}: wait until it has ended, or give another folder (if there is "
+                f"none, remove {error.filename})"
+            ) from None
+        yield folder
 
 
 @contextmanager
@@ -254,180 +258,305 @@ def _new_parents(place):
         raise
 
 
-@contextmanager
-def _new_folder(place, out):
-    """A folder beside a place that is renamed to it; two processes that want the same place want the same one."""
-    locks.remove_dead(place.parent, _PARTIAL)
-    folder = place.with_name(_PARTIAL + hashlib.sha256(os.fsencode(place.name)).hexdigest()[:32])
-    held = locks.make_locked(folder)
-    if held is None:
+def _why_not_exchanged(place):
+    """Why a folder cannot give way to another one of its name; None if it can, or does not exist."""
+    if not place.is_dir():
+        return None
+    with suppress(FileNotFoundError):  # the folder that is worked in may be gone
+        here = Path(os.path.realpath("."))
+        if place in (here, *here.parents):
+            return "this command works in it (call it from elsewhere)"
+    if os.path.ismount(place):
+        return "it is the top of a disk"
+    above, own = place.parent, place.stat().st_uid
+    if not os.access(above, os.W_OK | os.X_OK):
+        return f"{above} cannot be written"
+    if above.stat().st_mode & stat.S_ISVTX and os.geteuid() not in (0, own, above.stat().st_uid):
+        return "it belongs to another user"
+    return None
+
+
+def _bring_back(place):
+    """Rename the results of a place back that were set aside when a process was killed; name what else is there."""
+    aside = locks.set_aside(place)
+    ours = [folder for folder in aside if locks.is_own_folder(folder) and files_of_run(folder) is not None]
+    if not place.exists() and len(ours) == 1:
+        os.rename(ours[0], place)
+        log.warning("%s was brought back: its writer had been stopped as it replaced it", place)
+    elif aside:
+        log.warning("%s may be what %s was earlier; look into it, and remove it", aside[-1], place)
+
+
+def _items(folder):
+    """Names in a folder and those below it of all but folders with something in them; links are not followed."""
+    found = []
+    for root, folders, files in os.walk(folder, onerror=_refuse_unreadable):
+        links = [name for name in folders if os.path.islink(os.path.join(root, name))]
+        empty = [""] if root != str(folder) and not files and not folders else []
+        found += [Path(root, name).relative_to(folder).as_posix() for name in files + links + empty]
+    own = _PARTIAL + hashlib.sha256(b"").hexdigest()[:32]
+    return {name for name in found if not name.startswith(own)}
+
+
+def _refuse_unreadable(error):
+    raise InputError(f"{error.filename} cannot be read ({error.strerror}): move it away, or write elsewhere") from None
+
+
+def _results(place, patterns):
+    """Names in a folder that are those of earlier results: of its summary, if there is one that lists them."""
+    known, listed = {Path(pattern).parts[0] for pattern in patterns if "/" in pattern}, files_of_run(place)
+    for pattern in patterns:
+        known |= {path.relative_to(place).as_posix() for path in place.glob(pattern)}
+    return known if listed is None else known & {SUMMARY, *listed, *(name.partition("/")[0] for name in listed)}
+
+
+def _check_content(place, out, patterns, keep, fixed):
+    """Refuse a folder whose content cannot give way, or is not to be moved along."""
+    names, results = _items(place), _results(place, patterns)
+    if fixed:
+        _check_unfinished(place)
+    if fixed and (there := sorted(names & results)):
         raise InputError(
-            f"another process is writing {out}: wait until it has ended, or give another folder (if there is none, "
-            f"remove {folder})"
+            f"{out} already holds {some_of(there, _NAMED)}, and cannot be replaced as a whole, since {fixed}: give a "
+            f"folder in it, such as {out / 'results'}, or remove these first"
         )
-    where = folder
-    try:
-        yield folder
-        _sync_tree(folder)
-        locks.before_renaming(held)
+    others = sorted(names - results)
+    visible = [name for name in others if not any(part.startswith(".") for part in PurePosixPath(name).parts)]
+    if visible and not keep:
+        raise InputError(
+            f"{out} holds what is not of an earlier run, {some_of(visible, _NAMED)}: move it away, give another "
+            "folder, or keep=True (--keep) to keep it there"
+        )
+    for folder in {above for name in others for above in (place / name).parents if place in above.parents}:
+        if os.path.ismount(folder) and not fixed:
+            raise InputError(f"{folder} is the top of a disk, which cannot be moved along: give another folder")
+
+
+def _check_places(new, place, out, overwrite):
+    """Refuse what cannot be put in its place."""
+    for item in sorted(new.rglob("*")):
+        name = item.relative_to(new)
+        target = place / name
+        if os.path.lexists(target):
+            was_folder = target.is_dir() and not target.is_symlink()
+            if item.is_dir() and not was_folder:
+                raise InputError(
+                    f"{out / name} is a file or a link, in the place of a folder: move it away, or write elsewhere"
+                )
+            if was_folder and not item.is_dir():
+                raise InputError(f"{out / name} is a folder, in the place of a file: move it away, or write elsewhere")
+            if not item.is_dir() and not overwrite:
+                raise InputError(f"{out / name} exists already; give --overwrite to replace it, or another folder")
+
+
+def _take_the_place(new, place, results):
+    """Put a folder in the place of another one, of which all but the earlier results stays; that is `new` then."""
+    with suppress(OSError, AttributeError):  # Windows has no groups
+        os.chown(new, -1, place.stat().st_gid)
+    shutil.copymode(place, new)
+    names = _items(place)
+    for name in sorted(names - results):
+        _keep(place, new, name)
+    for folder, *_ in os.walk(new):
+        _sync(Path(folder))
+    aside = place.with_name(f"{place.name}{locks.OLD}{uuid.uuid4().hex}")
+    if not exchange(new, place):
+        os.rename(place, aside)  # from here to the next line it is there alone
         try:
-            os.rename(folder, place)
-        except OSError as error:
-            if not os.path.lexists(place):
-                raise
-            raise InputError(f"{out} was made by another process meanwhile ({error.strerror}): give another") from None
-        where = place
-        _sync(place.parent)
-    finally:
-        if where is folder:
-            locks.remove(folder)
-        locks.release(held, where)
+            os.rename(new, place)
+        except BaseException:
+            os.rename(aside, place)
+            raise
+        os.rename(aside, new)
+    _sync(place.parent)
+    if late := sorted(_items(new) - names):
+        os.rename(new, aside)
+        log.warning("%s was put into %s as it was replaced: it lies in %s", late[0], place, aside)
+
+
+def _keep(place, new, name):
+    """Have something of a folder in another one too, unless it has another of this name."""
+    for folder in reversed(PurePosixPath(name).parents):
+        if not (new / folder).is_dir():
+            (new / folder).mkdir()
+            shutil.copymode(place / folder, new / folder)
+    if (place / name).is_dir() and not (place / name).is_symlink():
+        (new / name).mkdir(exist_ok=True)
+    elif not os.path.lexists(new / name):
+        _link(place / name, new / name)
+
+
+def _link(path, other):
+    """Give a file another name; a copy where the disk has no such links."""
+    try:
+        os.link(path, other, follow_symlinks=False)
+    except OSError:
+        shutil.copy2(path, other, follow_symlinks=False)
+        _sync(other)
+
+
+def exchange(one, other):
+    """Exchange two folders in one step; whether that was done, which not all systems can."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except (AttributeError, OSError, TypeError):  # not on Linux
+        return False
+    return rename(_CWD, os.fsencode(one), _CWD, os.fsencode(other), _EXCHANGE) == 0
+
+
+def _rename_new(new, place, out):
+    try:
+        os.rename(new, place)
+    except OSError as error:
+        if not os.path.lexists(place):
+            raise
+        raise InputError(f"{out} was made by another process meanwhile ({error.strerror}): give another") from None
+    _sync(place.parent)
+
+
+# -- files among those of others
+
+
+@contextmanager
+def replacing_files(targets):
+    """Files to be written that replace others, all or none, when the block ends well.
+
+    If an error comes between one and the next, the former files come back. If the process is killed there, they lie in
+    ``.replaced-...`` in their folder, which the next call says and leaves alone.
+
+    Parameters
+    ----------
+    targets : sequence of path
+        In whatever folders.
+
+    Yields
+    ------
+    callable
+        Of one of the targets, gives an open binary file as a context.
+
+    Raises
+    ------
+    InputError
+        If a folder cannot be written, another process writes there, or one was killed on the way.
+    DiskFullError
+        If the disk is full.
+    LegdistortError
+        If a disk fails, and then fails again as former files are put back; names where they are.
+    """
+    with ExitStack() as stack:
+        temporary = {}
+        for folder in dict.fromkeys(target.parent for target in targets):
+            check_folder(folder)
+            stack.enter_context(told_when_full(folder, folder))
+            work = stack.enter_context(_work_folder(folder, "", folder))
+            _check_unfinished(folder)
+            own = [target for target in targets if target.parent == folder]
+            temporary |= {target: work / str(number) for number, target in enumerate(own)}
+        yield lambda target: _written(temporary[target], target)
+        _move_all(temporary)
+
+
+def _check_unfinished(folder):
+    """Refuse a folder in which files were replaced one by one until a process was killed."""
+    if kept := [each for each in sorted(folder.glob(f"{_KEPT}*")) if _holds_others(each)]:
+        raise InputError(
+            f"{kept[0]} holds files as they were before a command replaced them that was stopped on the way; this "
+            f"brings them back: {_line_back(kept)}; or remove it, if the new ones are all there, or no command of "
+            "yours was stopped"
+        )
+
+
+def _holds_others(kept):
+    """Whether former files are kept that are not in their places; if none is, an own folder for them goes."""
+    if locks.is_own_folder(kept):
+        for copy in kept.iterdir():
+            with suppress(OSError):
+                if copy.samefile(kept.parent / copy.name):
+                    copy.unlink()  # another name of the same file
+        with suppress(OSError):
+            kept.rmdir()
+    return kept.is_dir() and not kept.is_symlink()
+
+
+def _line_back(kept):
+    """Words of the shell that bring former files back."""
+    names = [(shlex.quote(str(folder)), shlex.quote(str(folder.parent))) for folder in kept]
+    return " && ".join(f"mv -f {folder}/* {place}/ && rmdir {folder}" for folder, place in names)
+
+
+def _move_all(sources):
+    """Rename files, ``{target: file}``, all or none; former ones are kept beside until the last is in its place."""
+    word = f"{_KEPT}{uuid.uuid4().hex}"
+    made = [folder for folder in {target.parent for target in sources} if not folder.exists()]
+    for folder in made:
+        folder.mkdir(parents=True)
+    former = [target for target in sources if os.path.lexists(target)]
+    places = {target.parent / word: sources[target].parent / word for target in former}
+    try:
+        for hidden in places.values():
+            hidden.mkdir(0o700)
+        for target in former:
+            _link(target, sources[target].parent / word / target.name)
+        for kept, hidden in places.items():
+            _sync(hidden)
+            os.rename(hidden, kept)
+            _sync(kept.parent)
+        for target, source in sources.items():
+            os.replace(source, target)
+        for folder in {target.parent for target in sources}:
+            _sync(folder)
+    except BaseException as error:
+        _put_back(sources, former, word, error)
+        _finish(places)
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
+    _finish(places)
+
+
+def _finish(places):
+    """Take away what was kept, for every folder in one step."""
+    for kept, hidden in places.items():
+        try:
+            os.rename(kept, hidden)
+        except OSError:
+            shutil.rmtree(kept, ignore_errors=True)
+            if kept.exists():
+                log.warning("the files before those written could not be removed: remove %s", kept)
+
+
+def _put_back(sources, former, word, error):
+    """Have former files in their places again, where others were moved to."""
+    moved = [target for target, source in sources.items() if not os.path.lexists(source)]
+    try:
+        for target in moved:
+            if target in former:
+                os.replace(target.parent / word / target.name, target)
+            else:
+                target.unlink(missing_ok=True)
+    except OSError as fault:
+        raise LegdistortError(
+            f"files in {target.parent} were replaced in part ({error}), and the former ones could not be put back "
+            f"({fault}): once the disk works the same command names the line that brings them back"
+        ) from error
+
+
+# -- what is there
 
 
 def contents(folder):
     """``{name: SHA-256}`` of the files in a folder and those below it."""
     found = {}
     for path in sorted(Path(folder).rglob("*")):
-        if path.is_file() and path.name not in _OURS:
+        if path.is_file():
             with path.open("rb") as file:
                 found[path.relative_to(folder).as_posix()] = checksum(file)
     return found
 
 
-def settle(*folders):
-    """Put in order what was interrupted in folders: finish a commit, remove what is incomplete.
-
-    Raises
-    ------
-    InputError
-        If a commit cannot be finished.
-    """
-    for folder in map(Path, folders):
-        if folder.is_dir() and os.access(folder, os.R_OK):
-            names = {name[: len(start)] for name in os.listdir(folder) for start in (_PARTIAL, _COMMIT)}
-            if _PARTIAL in names and os.access(folder, os.W_OK):
-                locks.remove_dead(folder, _PARTIAL)
-            if _COMMIT in names:
-                _settle_locked(folder)
-
-
-def settle_for(*paths):
-    """The same for the folders in which files lie that are about to be read, and those above them."""
-    parents = [Path(path).absolute().parent for path in paths]
-    settle(*dict.fromkeys(folder for parent in parents for folder in (parent, parent.parent)))
-
-
-def _settle_locked(folder):
-    """Finish commits, unless the one who made them is about to do it."""
-    try:
-        held = locks.lock(folder)
-        if held is not None:
-            try:
-                _settle(folder)
-            finally:
-                locks.release(held, folder)
-    except OSError as error:
-        raise InputError(
-            f"{folder} holds a complete result whose files are not all in their places, since its writer was stopped; "
-            f"they cannot be moved now ({error.strerror or error}): read it as a user who may write there"
-        ) from None
-
-
-def _settle(folder):
-    locks.remove_dead(folder, _PARTIAL)
-    for commit in sorted(folder.glob(f"{_COMMIT}*")):
-        if (commit / _PLAN).is_file():
-            _finish(commit, folder)
-    locks.remove_dead(folder, _COMMIT)  # those that are finished but for their removal
-
-
-def _commit(folder, place, former, overwrite):
-    """Make the content of a folder that of the place around it."""
-    items = [item.relative_to(folder) for item in sorted(folder.rglob("*")) if item.name not in _OURS]
-    _check_places(folder, place, items, overwrite)
-    files = {item.as_posix() for item in items}
-    plan = {"remove": [name for name in former_files(place, former) if name not in files]}
-    (folder / _PLAN).write_text(json.dumps(plan), encoding="utf-8")
-    _sync_tree(folder)
-    commit = folder.with_name(_COMMIT + folder.name.removeprefix(_PARTIAL))
-    os.rename(folder, commit)
-    _sync(place)
-    try:
-        _finish(commit, place)
-    except OSError as error:
-        raise LegdistortError(
-            f"the results for {place} are complete, but lie in {commit} in part, since moving them to their places "
-            f"failed ({error.strerror or error}): the next command that reads or writes there goes on with it"
-        ) from error
-
-
-def _check_places(folder, place, items, overwrite):
-    """Refuse what could not be moved once it is decided: then there is no way back."""
-    for item in items:
-        target = place / item
-        if not overwrite and target.is_file():
-            raise InputError(f"{target} exists already; give --overwrite to replace it, or another folder")
-        if target.is_dir() and not (folder / item).is_dir():
-            raise InputError(f"{target} is a folder, in the place of a file: move it away, or write elsewhere")
-        if (folder / item).is_dir() and os.path.lexists(target):
-            if not target.is_dir():
-                raise InputError(f"{target} is a file, in the place of a folder: move it away, or write elsewhere")
-            if target.stat().st_dev != place.stat().st_dev or not os.access(target, os.W_OK):
-                raise InputError(f"{target} is on another disk or cannot be written: move it away, or write elsewhere")
-
-
-def former_files(place, patterns):
-    """Names of the files of earlier results in a folder: of those with their names the ones that its summary lists.
-
-    Parameters
-    ----------
-    place : path
-    patterns : sequence of str
-
-    Returns
-    -------
-    list of str
-        All that have such names where there is no summary, or one of a version that does not list its files.
-    """
-    found = [path for pattern in patterns for path in place.glob(pattern) if not path.is_dir()]
-    names = [path.relative_to(place).as_posix() for path in found]
-    try:
-        listed = {"summary.json", *json.loads((place / "summary.json").read_text(encoding="utf-8"))["files"]}
-    except (OSError, ValueError, KeyError, TypeError):
-        return names
-    return [name for name in names if name in listed]
-
-
-def _finish(commit, place):
-    """Move the files of a commit to their places; what was moved before, by whomever, is not there any more."""
-    remove = json.loads((commit / _PLAN).read_text(encoding="utf-8"))["remove"]
-    folders = {place}
-    for item in sorted(commit.rglob("*")):
-        target = place / item.relative_to(commit)
-        if item.is_dir():
-            target.mkdir(exist_ok=True)
-        elif item.name not in _OURS:
-            os.replace(item, target)
-        folders.add(target.parent)
-    for name in remove:
-        (place / name).unlink(missing_ok=True)
-        if "/" in name:
-            with suppress(OSError):  # others stand in it
-                (place / name).parent.rmdir()
-    for folder in folders:
-        _sync(folder)
-    (commit / _PLAN).unlink()
-    locks.remove(commit)
-
-
-def _sync_tree(folder):
-    """Have a folder with all that is in it on the disk, and not in the memory of the system only."""
-    for path in folder.rglob("*"):
-        _sync(path)
-    _sync(folder)
-
-
 def _sync(path):
+    """Have a file, or the names in a folder, on the disk."""
     if os.name != "nt" or path.is_file():  # folders cannot be opened on Windows
         with suppress(FileNotFoundError, PermissionError):
             descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)

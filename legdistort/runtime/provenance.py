@@ -2,9 +2,11 @@
 
 import datetime
 import hashlib
+import json
 import os
 import shlex
 import sys
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -13,6 +15,9 @@ from pathlib import Path
 
 from ..exceptions import InputError
 
+#: File of a run that lists the others.
+SUMMARY = "summary.json"
+_WAITS = 0.0, 0.01, 0.05, 0.2, 0.5  # s, before what is read is that of several runs for sure
 PACKAGES = ("legdistort", "astropy", "gwcs", "asdf", "numpy", "scipy")
 
 
@@ -41,11 +46,13 @@ def command_line():
 
 def checksums(*paths):
     """``{base name: SHA-256}`` of files."""
-    out = {}
-    for path in paths:
-        with open(path, "rb") as file:
-            out[Path(path).name] = checksum(file)
-    return out
+    return {Path(path).name: checksum_of(path) for path in paths}
+
+
+def checksum_of(path):
+    """SHA-256 of a file, in hexadecimal digits."""
+    with open(path, "rb") as file:
+        return checksum(file)
 
 
 def checksum(file):
@@ -81,6 +88,58 @@ def unchanged(*paths):
     for path, known in zip(paths, before, strict=True):
         if identity(path) != known:
             raise InputError(f"{path} changed while it was read: wait until it is complete, and read it again")
+
+
+def files_of_run(folder):
+    """``{name: SHA-256}`` of the files of the run that left a folder, by its summary; None if none lists them."""
+    path = Path(folder) / SUMMARY
+    try:
+        files = json.loads(path.read_text(encoding="utf-8"))["files"] if path.is_file() else None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return files if isinstance(files, dict) else None
+
+
+def of_one_run(folder, read):
+    """What is read of several files in a folder of results, which another process may replace just now.
+
+    Parameters
+    ----------
+    folder : path
+        Where there is no summary of a run that lists its files, they are not compared with it.
+    read : callable
+        Returns what it has read, and the names of the files, as the summary has them.
+
+    Raises
+    ------
+    InputError
+        If files are not those of the run, after several attempts; else what `read` raises.
+    """
+    folder, fault = Path(folder), ""
+    for wait in _WAITS:
+        time.sleep(wait)
+        before, listed = _state(folder), files_of_run(folder)
+        try:
+            found, names = read()
+            own = {name: checksum_of(folder / name) for name in names}
+        except (InputError, OSError):
+            if _state(folder) == before:
+                raise
+            own = {}
+        if _state(folder) != before or not own:
+            fault = "it is replaced again and again"
+        elif other := [name for name in own if listed is not None and listed.get(name) != own[name]]:
+            fault = f"{folder / other[0]} is not the file that {SUMMARY} lists"
+        else:
+            return found
+    raise InputError(
+        f"{folder} does not hold the files of one run, {fault}: take it as a run has left it, or run again"
+    )
+
+
+def _state(folder):
+    """What changes when a folder of results is replaced."""
+    return identity(folder / SUMMARY) or identity(folder)
 
 
 def with_inputs(solution, files):

@@ -59,7 +59,7 @@ def scratch_folder(parent, need, what="the pixels"):
     advice = "give another folder as scratch=... (--scratch), or in the environment as TMPDIR"
     with ExitStack() as stack:
         try:
-            folder, _ = stack.enter_context(locks.temporary_folder(place, "legdistort-", mode=0o700))
+            folder = stack.enter_context(locks.temporary_folder(place, "legdistort-"))
         except OSError as error:
             raise InputError(f"no scratch folder can be made in {place} ({error.strerror}): {advice}") from None
         free = free_bytes(place)

@@ -24,7 +24,7 @@ from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.checks import first_line
 from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read_bytes, readable, splice
-from ..runtime.outputs import replacing, replacing_folders
+from ..runtime.outputs import replacing, replacing_files, replacing_folder
 from ..runtime.progress import Bar
 from .fits_headers import header_error
 from .storage import wcs_tree
@@ -101,8 +101,8 @@ def attach(
     out : str or path, optional
         Folder for the copies, made if it does not exist.
     in_place : bool
-        Change the files themselves, all or none of a folder (see the page on files). Exactly one of `out` and
-        `in_place` must be given.
+        Change the files themselves, all or none (see the page on files). Exactly one of `out` and `in_place` must be
+        given.
     kind : {"sip", "tpv", None}
         Form of the header; None leaves it alone and adds the ASDF extension only.
     max_error : float
@@ -138,9 +138,9 @@ def attach(
     warn_of_another_field([name for plan in plans for name in plan.elsewhere])
     if not plans:
         raise InputError("none of the frames is part of the solution; give those it was made from")
-    with replacing_folders(dict.fromkeys(plan.target.parent for plan in plans)) as folders:
+    with replacing_files([plan.target for plan in plans]) if in_place else _copies(Path(out), overwrite) as writing:
         for plan in plans:
-            with replacing(folders[plan.target.parent] / plan.target.name) as file:
+            with writing(plan.target) as file:
                 plan.write(file)
     return [Attachment(plan.target, *item) for plan in plans for item in plan.headers.items()]
 
@@ -196,6 +196,13 @@ def _files(paths):
     if twice is not None:
         raise InputError(f"{twice} is given twice")
     return files
+
+
+@contextlib.contextmanager
+def _copies(out, overwrite):
+    """What gives an open file for a copy in a folder, which has all of them when the block ends well."""
+    with replacing_folder(out, overwrite=overwrite) as folder:
+        yield lambda target: replacing(folder / target.name)
 
 
 def _targets(paths, out, overwrite):

@@ -13,6 +13,8 @@ from legdistort import Solution
 from legdistort.cli.parser import main
 from legdistort.exceptions import InputError
 from legdistort.measurement import positions
+from legdistort.measurement.earlier import EarlierRun
+from legdistort.measurement.effective.sources import psf_from
 
 pytestmark = [pytest.mark.filterwarnings("ignore::legdistort.LegdistortWarning"), pytest.mark.usefixtures("undrawn")]
 
@@ -63,6 +65,27 @@ def test_other_options_and_fewer_frames(night, tmp_path, monkeypatch):
     solved = Solution.read("solved")
     np.testing.assert_allclose(three.estimate.positions, solved.estimate.positions, atol=1e-9)
     assert None not in (three.sky, solved.sky)
+
+
+@pytest.mark.parametrize("name", ["detections.ecsv", "psf/exp01.fits"])
+def test_files_of_two_runs_are_refused(night, tmp_path, name):
+    """Those of one are known by its summary; without one they are taken as they are."""
+    results = tmp_path / "results"
+    shutil.copytree(night / "first", results)
+    read = EarlierRun.read(results)
+    assert list(read.psfs) == ["exp00", "exp01", "exp02", "exp03"]
+    assert list(psf_from(results / "psf")) == list(read.psfs)
+    if name == "detections.ecsv":
+        (results / name).write_text((results / name).read_text() + "\n")
+    else:
+        shutil.copy(results / "psf" / "exp00.fits", results / name)
+        with pytest.raises(InputError, match=r"results does not hold the files of one run, \S*psf/exp01.fits is not"):
+            psf_from(results / "psf")
+    with pytest.raises(InputError, match=rf"results does not hold the files of one run, \S*{name} is not"):
+        EarlierRun.read(results)
+    (results / "summary.json").unlink()
+    assert len(EarlierRun.read(results).table) == len(read.table)
+    assert len(psf_from(results / "psf")) == 4
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import legdistort as ld
+from legdistort.cli import main
 from legdistort.runtime.outputs import replacing_folder
 from legdistort.runtime.provenance import checksum
 from legdistort.simulation.observations import simulate_matches
@@ -199,16 +200,40 @@ def test_readers_need_no_permission_to_write(place, solution):
     assert [path.name for path in place.iterdir()] == ["solution.asdf"]
 
 
-def test_a_reader_that_cannot_finish_a_commit_says_so(place, solution):
-    commit = place / ".commit-1"
-    commit.mkdir()
-    solution.write(commit / "solution.asdf")
-    (commit / ".legdistort.json").write_text('{"remove": []}')
-    told = as_nobody(lambda: ld.Solution.read(place))
-    assert told.startswith("InputError"), told
-    assert "complete result whose files are not all in their places" in told
-    assert ld.Solution.read(place).chi2 == solution.chi2
-    assert [path.name for path in place.iterdir()] == ["solution.asdf"]
+@pytest.mark.usefixtures("undrawn")
+def test_results_that_were_set_aside_are_brought_back_by_the_next_run(table, tmp_path, capsys):
+    """Where a process was killed between two renames; they are replaced only if that is asked for."""
+    out, words = tmp_path / "out", command(table, tmp_path / "out")[3:]
+    assert main(words) == 0
+    before = (out / "summary.json").read_text()
+    out.rename(tmp_path / f"out.old-{'0' * 32}")
+    capsys.readouterr()
+    assert main(["show", str(out)]) == 1
+    assert f"this brings it back: mv {tmp_path}/out.old-{'0' * 32} {out}" in capsys.readouterr().err
+    assert main(words) == 1
+    assert "out already holds solution.asdf" in capsys.readouterr().err
+    assert (out / "summary.json").read_text() == before
+    assert whole(out)
+    assert main([*words, "--overwrite"]) == 0
+    assert (out / "summary.json").read_text() != before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["matched.ecsv", "out"]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_files_of_the_user_in_a_folder_of_results(table, tmp_path, capsys):
+    out, words = tmp_path / "out", [*command(table, tmp_path / "out")[3:], "--overwrite"]
+    assert main(words) == 0
+    (out / "notes.txt").write_text("mine")
+    (out / "wcs" / "mine.txt").write_text("mine")
+    capsys.readouterr()
+    assert main(words) == 1
+    assert capsys.readouterr().err.strip() == (
+        f"legdistort: {out} holds what is not of an earlier run, notes.txt, wcs/mine.txt: move it away, give another "
+        "folder, or --keep to keep it there"
+    )
+    assert main([*words, "--keep"]) == 0
+    assert (out / "notes.txt").read_text() == (out / "wcs" / "mine.txt").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["matched.ecsv", "out"]
 
 
 def test_two_commands_at_once(table, tmp_path):

@@ -76,7 +76,7 @@ def test_a_folder_is_filled_and_keeps_the_rest(tmp_path):
     (out / "wcs").mkdir(parents=True)
     for name in ("mine.txt", "report.html", "wcs/stale.asdf"):
         (out / name).write_text("old")
-    with replacing_folder(out, former=("report.html", "wcs/*.asdf")) as temporary:
+    with replacing_folder(out, results=("report.html", "wcs/*.asdf")) as temporary:
         (temporary / "report.html").write_text("new")
         (temporary / "wcs").mkdir()
         (temporary / "wcs" / "a.asdf").write_text("new")
@@ -114,7 +114,7 @@ def test_a_file_in_the_place_of_a_folder_and_the_reverse_are_refused(tmp_path):
     ):
         (temporary / "was_folder").write_text("new")
     with (
-        pytest.raises(InputError, match=r"was_file is a file, in the place of a folder: move it away"),
+        pytest.raises(InputError, match=r"was_file is a file or a link, in the place of a folder: move it"),
         replacing_folder(tmp_path / "out") as temporary,
     ):
         (temporary / "was_file").mkdir()

@@ -1,8 +1,12 @@
 """The checksum of an input is that of what was read: whatever changes or goes meanwhile is noticed and named."""
 
 import hashlib
+import json
 import os
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +20,7 @@ from legdistort.inputs.star_lists import formats
 from legdistort.inputs.table_files import read_table
 from legdistort.priors import storage as prior_storage
 from legdistort.results import storage as solution_storage
-from legdistort.runtime import provenance
+from legdistort.runtime import outputs, provenance
 from legdistort.simulation.observations import simulate_exposures, simulate_matches
 from legdistort.solving.estimation import solve
 
@@ -144,3 +148,121 @@ def test_what_is_no_file_has_no_identity(tmp_path):
         assert provenance.identity(name) is None
     with provenance.unchanged(Path(tmp_path / "none")):
         pass
+
+
+# --- several files of one run -------------------------------------------------------------------------------------
+
+NAMES = ("a", "b", "wcs/c")
+
+
+def write_run(out, text):
+    """A run that leaves some files, all of the same text, and a summary that lists them."""
+    with outputs.replacing_folder(out) as target:
+        (target / "wcs").mkdir()
+        for name in NAMES:
+            (target / name).write_text(text)
+        summary = {"run": text, "files": outputs.contents(target)}
+        (target / provenance.SUMMARY).write_text(json.dumps(summary))
+
+
+def read_run(out):
+    return provenance.of_one_run(out, lambda: ([(out / name).read_text() for name in NAMES], NAMES))
+
+
+def test_files_of_one_run(tmp_path):
+    write_run(tmp_path / "out", "1")
+    assert read_run(tmp_path / "out") == ["1"] * 3
+    (tmp_path / "out" / "summary.json").unlink()  # there is nothing to compare with
+    (tmp_path / "out" / "b").write_text("2")
+    assert read_run(tmp_path / "out") == ["1", "2", "1"]
+    with pytest.raises(FileNotFoundError):
+        read_run(tmp_path / "none")
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    waited = []
+    monkeypatch.setattr(time, "sleep", waited.append)
+    return waited
+
+
+def test_a_mixture_is_read_again_and_then_refused(tmp_path, quick):
+    out = tmp_path / "out"
+    write_run(out, "1")
+    (out / "b").write_text("2")
+    with pytest.raises(InputError, match=r"out does not hold the files of one run, \S*out/b is not the file that summ"):
+        read_run(out)
+    assert len(quick) == 5
+    assert 0.5 < sum(quick) < 2  # seconds
+    assert provenance.of_one_run(out, lambda: ("those that fit", ["a", "wcs/c"])) == "those that fit"
+    (out / "d").write_text("")
+    with pytest.raises(InputError, match="out/d is not the file"):
+        provenance.of_one_run(out, lambda: (None, ["d"]))
+
+
+@pytest.mark.parametrize("failing", [False, True])
+def test_what_is_replaced_while_it_is_read_is_read_again(tmp_path, quick, failing):
+    """Be it that all that was read is of one run, or that a file was missing just then."""
+    out, reads = tmp_path / "out", []
+    write_run(out, "0")
+
+    def read():
+        reads.append([(out / name).read_text() for name in NAMES])
+        if len(reads) < 3:
+            write_run(out, str(len(reads)))
+            if failing:
+                raise InputError("no such file")
+        return reads[-1], NAMES
+
+    assert provenance.of_one_run(out, read) == ["2"] * 3
+    assert len(reads) == len(quick) == 3
+
+
+def test_what_is_replaced_again_and_again_is_refused(tmp_path, quick):
+    out = tmp_path / "out"
+    write_run(out, "0")
+
+    def read():
+        write_run(out, f"{len(quick)}")
+        return None, NAMES
+
+    with pytest.raises(InputError, match="out does not hold the files of one run, it is replaced again and again"):
+        provenance.of_one_run(out, read)
+
+
+WRITER = """
+import sys, time
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_provenance import write_run
+k, next_one = 0, time.monotonic()
+while True:
+    write_run(Path(sys.argv[1]), str(k))
+    k, next_one = k + 1, next_one + 1 / 24
+    print(k, flush=True)
+    time.sleep(max(0, next_one - time.monotonic()))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="folders are exchanged in one step there alone")
+@pytest.mark.parametrize("n_reads", [300, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_readers_beside_a_writer(tmp_path, n_reads):
+    """At 24 commits a second: never files of two runs, and never a folder that is missing."""
+    out, seen, mixed, refused = tmp_path / "out", set(), 0, 0
+    arguments = [sys.executable, "-c", WRITER, str(out), str(Path(__file__).parent)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE) as process:
+        try:
+            assert process.stdout.readline() == b"1\n"
+            for _ in range(n_reads):
+                try:
+                    found = set(read_run(out))
+                except InputError as error:
+                    refused += "again and again" in str(error)
+                    continue
+                mixed += len(found) > 1
+                seen |= found
+        finally:
+            process.kill()
+    assert mixed == 0
+    assert refused < 0.01 * n_reads
+    assert len(seen) > 2

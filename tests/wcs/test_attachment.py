@@ -25,10 +25,9 @@ from sky_chains import detector
 
 import legdistort
 from legdistort.cli.parser import main
-from legdistort.exceptions import DiskFullError, ExportError, InputError, LegdistortError
+from legdistort.exceptions import DiskFullError, ExportError, InputError
 from legdistort.geometry import similarity
 from legdistort.geometry.tangent_plane import TangentPlane
-from legdistort.inputs.exposure_files import read_exposures
 from legdistort.results.solution import Solution
 from legdistort.runtime.fits_bytes import locate
 from legdistort.simulation.observations import simulate_matches
@@ -767,7 +766,7 @@ def test_frames_are_changed_all_or_none(three, tmp_path, monkeypatch, good):
 
     with monkeypatch.context() as patch:
         patch.setattr(attachment._Plan, "write", write)
-        with pytest.raises(DiskFullError, match=r"No space left on the disk for .*: nothing was replaced"):
+        with pytest.raises(DiskFullError, match=r"No space left on the disk for .*fits, which was left as it was"):
             attach(solution, paths, in_place=True)
     assert everything(tmp_path) == before
     attach(solution, paths, in_place=True)
@@ -775,38 +774,46 @@ def test_frames_are_changed_all_or_none(three, tmp_path, monkeypatch, good):
     assert everything(tmp_path).keys() == before.keys()
 
 
-def test_what_has_changed_is_told_exactly(three, tmp_path, monkeypatch):
-    """A disk that fails between two folders, of which the last is the first to be done."""
+def test_a_disk_that_fails_between_two_files(three, tmp_path, monkeypatch):
+    """Those that were replaced come back, in whatever folder."""
     solution, paths = three
-    before, usual = everything(tmp_path), os.rename
-
-    def rename(path, target):
-        if path.parent == paths[0].parent:
-            raise OSError(5, "Input/output error")
-        usual(path, target)
-
-    monkeypatch.setattr(os, "rename", rename)
-    with pytest.raises(LegdistortError, match=r"all of the files in \S*second were replaced, and none of the others"):
-        attach(solution, paths, in_place=True)
-    now = everything(tmp_path)
-    assert {path for path in now if now[path] != before.get(path)} == {paths[2]}
-
-
-def test_a_set_that_could_not_be_moved_is_moved_next_time(three, tmp_path, monkeypatch):
-    solution, paths = three
-    usual = os.replace
+    before, usual = everything(tmp_path), os.replace
 
     def replace(path, target):
-        if Path(target) == paths[1]:
-            raise OSError(5, "Input/output error")
+        if Path(target) == paths[2] and ".replaced-" not in str(path):
+            raise OSError(5, "Input/output error", str(path), None, str(target))
         usual(path, target)
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", replace)
-        with pytest.raises(
-            LegdistortError, match=r"are complete, but lie in .*\.commit-.* in part.*Input/output error"
-        ):
-            attach(solution, paths[:2], in_place=True)
-    assert len(read_exposures(paths[:2], ext=0)) == 2
-    assert all(map(has_wcs, paths[:2]))
-    assert not [path for path in everything(tmp_path) if path not in paths]
+        with pytest.raises(OSError, match="Input/output error"):
+            attach(solution, paths, in_place=True)
+    assert everything(tmp_path) == before
+    attach(solution, paths, in_place=True)
+    assert all(map(has_wcs, paths))
+    assert everything(tmp_path).keys() == before.keys()
+
+
+def test_copies_come_together_beside_other_files(three, tmp_path, monkeypatch):
+    """Of a folder of the user's own everything else stays, and a failure changes nothing."""
+    solution, paths = three
+    out = tmp_path / "out"
+    attach(solution, paths, out=out)
+    (out / "notes.txt").write_text("mine")
+    before, usual, written = everything(tmp_path), attachment._Plan.write, []
+
+    def write(plan, file):
+        written.append(plan)
+        usual(plan, file)
+        if len(written) == 2:
+            raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(attachment._Plan, "write", write)
+        with pytest.raises(OSError, match="Input/output error"):
+            attach(solution, paths, out=out, overwrite=True)
+    assert everything(tmp_path) == before
+    attach(solution, paths, out=out, overwrite=True, kind=None)
+    assert everything(tmp_path).keys() == before.keys()
+    assert everything(tmp_path)[out / "notes.txt"] == b"mine"
+    assert all(map(has_wcs, out.glob("*.fits")))

@@ -356,7 +356,6 @@ class EffectivePSF(ShownAsPrinted):
         InputError
             If the file is none.
         """
-        outputs.settle_for(path)
         try:
             with open(path, "rb") as file, open_fits(file, path) as hdus:
                 return cls.from_hdus(hdus, path)

@@ -7,6 +7,8 @@ import numpy as np
 
 from ...exceptions import InputError
 from ...runtime.fits_bytes import open_fits
+from ...runtime.locks import way_back
+from ...runtime.provenance import files_of_run, of_one_run
 from . import splines
 from .model import EXTENSION, EffectivePSF, Polynomial
 
@@ -36,7 +38,8 @@ def psf_from(given):
         if path.is_dir():
             return _from_folder(path)
         if not path.exists():
-            raise InputError(f"psf must be one of {', '.join(map(repr, PSFS))} or a file, and there is no file {path}")
+            lost = f"there is no file {path}{way_back(path)}"
+            raise InputError(f"psf must be one of {', '.join(map(repr, PSFS))} or a file, and {lost}")
         return read_psf(path)
     if isinstance(given, np.ndarray):
         raise InputError(
@@ -53,10 +56,16 @@ def psf_from(given):
 
 def _from_folder(folder):
     """The PSFs of a folder by the names of their files."""
-    paths = sorted(p for p in folder.iterdir() if p.suffix in (".fits", ".psf"))
-    if not paths:
-        raise InputError(f"psf: there are neither .fits nor .psf files in the folder {folder}")
-    return {path.stem: read_psf(path) for path in paths}
+
+    def read():
+        paths = sorted(p for p in folder.iterdir() if p.suffix in (".fits", ".psf"))
+        if not paths:
+            raise InputError(f"psf: there are neither .fits nor .psf files in the folder {folder}")
+        return {path.stem: read_psf(path) for path in paths}, [path.relative_to(root).as_posix() for path in paths]
+
+    listed = files_of_run(folder.parent) or {}
+    root = folder.parent if any(name.startswith(f"{folder.name}/") for name in listed) else folder
+    return of_one_run(root, read)
 
 
 def from_photutils(model):
