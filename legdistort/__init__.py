@@ -6,7 +6,6 @@ gwcs objects, ASDF files and a co-added image.
 """
 
 from importlib import import_module
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` states the same for Python
@@ -35,7 +34,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` states the s
     from .wcs.refinement import refine as refine
     from .wcs.storage import read_wcs as read_wcs
 
-__version__ = version("legdistort")
+__version__: str  # of the package as it is installed, see `__getattr__`
 
 # Loaded when first asked for: astropy.modeling looks into this package for a fitter while it is itself half imported,
 # and a program that only fits models should not wait for the rest.
@@ -70,6 +69,11 @@ __all__ = sorted(_PLACES)
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value = globals()[name] = version("legdistort")
+        return value
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(f".{_PLACES[name]}", __name__), name)

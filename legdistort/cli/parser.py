@@ -10,6 +10,7 @@ import time
 from importlib.metadata import version
 
 from .arguments import add_options
+from .process import with_streams
 from .usage import COMMANDS
 
 
@@ -19,16 +20,25 @@ def main(argv=None):
     0; 1 for a failed run, 2 for wrong usage, 3 where `--strict` is given and a check fails, 130 after Ctrl-C.
     """
     begun = time.perf_counter()
+    with with_streams():
+        arguments = _parsed(argv)
+        from ..runtime.guards.offline import offline
+
+        with offline():  # while modules are imported, too: astropy would fetch leap seconds where the clock is ahead
+            from .running import run_command
+
+            arguments.begun = begun
+            return run_command(arguments)
+
+
+def _parsed(argv):
     arguments, unknown = _parser().parse_known_args(argv)
     if unknown:
         hint = ""
         if arguments.command == "solve" and not unknown[0].startswith("-"):
             hint = ": solve takes one table of matched positions, and lists of exposures go to legdistort match first"
         arguments.parser.error(f"no option or place for {' '.join(unknown)}{hint}")
-    from .running import run_command
-
-    arguments.begun = begun
-    return run_command(arguments)
+    return arguments
 
 
 class _Parser(argparse.ArgumentParser):

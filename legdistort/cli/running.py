@@ -1,10 +1,8 @@
-"""A command while it runs: its log, its signals, what becomes of its errors."""
+"""A command while it runs: its log, and what becomes of its errors."""
 
 import logging
 import re
-import signal
 import sys
-import threading
 import warnings
 from contextlib import contextmanager, nullcontext
 
@@ -14,6 +12,7 @@ from ..exceptions import LegdistortError, LegdistortWarning
 from ..runtime.progress import Bar
 from . import commands
 from .arguments import check_paths, wants_progress
+from .process import INTERRUPTED, stoppable, tell
 
 log = logging.getLogger("legdistort")
 
@@ -24,35 +23,31 @@ _VALUE = r"(?:\{[^{}]*\}|\([^()]*\)|'[^']*'|[^\s(){}',]*)"
 def run_command(arguments):
     """Run a command of a parsed command line; returns the exit status."""
     try:
-        with _stopping(), _logging(arguments), warnings.catch_warnings():
+        with stoppable(), _logging(arguments), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of other packages
             warnings.simplefilter("default", LegdistortWarning)
             warnings.showwarning = lambda message, *_, **__: log.warning("%s", in_shell_words(str(message)))
             with logging_redirect_tqdm([log], Bar) if wants_progress(arguments) else nullcontext():  # bars stay whole
                 check_paths(arguments, arguments.groups)
                 status = getattr(commands, f"do_{arguments.command}")(arguments)
-    except LegdistortError as error:
-        if arguments.debug:
-            raise
-        print(f"legdistort: {in_shell_words(str(error))}", file=sys.stderr)
-        return 1
     except BrokenPipeError:  # the reader of our output has left, as in ``legdistort show FILE | head``
         sys.stdout = None
         return 0
-    except OSError as error:
+    except (LegdistortError, OSError, MemoryError) as error:
         if arguments.debug:
             raise
-        print(f"legdistort: {error} (nothing was left half-written)", file=sys.stderr)
-        return 1
-    except MemoryError as error:
-        if arguments.debug:
-            raise
-        print(f"legdistort: not enough memory ({error}); nothing was left half-written", file=sys.stderr)
+        tell(_in_words(error))
         return 1
     except KeyboardInterrupt:
-        print("legdistort: interrupted; nothing was left half-written", file=sys.stderr)
-        return 130
+        tell("interrupted")
+        return INTERRUPTED
     return status or 0
+
+
+def _in_words(error):
+    if isinstance(error, LegdistortError):
+        return in_shell_words(str(error))
+    return f"not enough memory ({error})" if isinstance(error, MemoryError) else str(error)
 
 
 def in_shell_words(text):
@@ -73,22 +68,6 @@ def _named_option(found):
 
 def _as_option(found):
     return f"--{found[1].replace('_', '-')} {found[2] or found[3]}"
-
-
-@contextmanager
-def _stopping():
-    """While a command runs, SIGTERM and SIGHUP (batch systems, lost terminals) are as Ctrl-C: temporary files go."""
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    numbers = [n for n in numbers if signal.getsignal(n) is signal.SIG_DFL]  # as nohup ignores it, so do we
-    if threading.current_thread() is not threading.main_thread():  # where signals do not arrive
-        numbers = []
-    for n in numbers:
-        signal.signal(n, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        for n in numbers:
-            signal.signal(n, signal.SIG_DFL)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from astropy import units as u
 from astropy.time import Time
 
 from ..exceptions import InputError, some_of
+from ..runtime.guards.offline import offline
 
 #: Keywords of headers that state it, the middle of the exposure before its beginning; those of HST are MJD too.
 KEYWORDS = (
@@ -34,6 +35,7 @@ ONE_EPOCH = 1 / 365.25
 _MOST_NAMED = 6
 
 
+@offline()
 def year(epoch):
     """An epoch as a decimal Julian year, None as None.
 
@@ -50,6 +52,7 @@ def year(epoch):
     return float(value)
 
 
+@offline()
 def years(column):
     """A column of epochs as a quantity in Julian years: of `~astropy.time.Time`, decimal years, or MJD.
 

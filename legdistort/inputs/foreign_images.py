@@ -1,16 +1,17 @@
 """Images that are no plain FITS: arrays in memory with what belongs to them (NDData), and the ASDF files of Roman."""
 
+import io
 import logging
-import warnings
 
-import asdf
 import numpy as np
 from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.time import Time
 
 from ..exceptions import DamagedError, InputError
+from ..runtime.asdf_files import ARCHIVES, MAX_BYTES, open_checked
 from ..runtime.checks import first_line
+from ..runtime.guards.offline import offline
 from .exposure_names import exposure_name
 from .exposures import Exposure
 from .file_images import as_plane
@@ -84,6 +85,7 @@ def is_nddata(image):
     return isinstance(image, CCDData) or (hasattr(image, "data") and hasattr(image, "uncertainty"))
 
 
+@offline()
 def read_roman(file, label, path, good=None):
     """`Exposure` of a Roman image (level 1 or 2) in an ASDF file, with its flags, errors and gwcs.
 
@@ -106,10 +108,10 @@ def read_roman(file, label, path, good=None):
         Where a package is missing that unpacks it.
     """
     try:
-        quiet = warnings.catch_warnings(
-            action="ignore", category=asdf.exceptions.AsdfWarning
-        )  # of tags it does not know
-        with quiet, asdf.open(file, memmap=False, lazy_load=True) as opened:
+        allowed = max(MAX_BYTES, 2 * file.seek(0, io.SEEK_END))  # cubes of many reads are large
+        file.seek(0)
+        settings = {"tags": ARCHIVES, "max_bytes": allowed, "packings": ("zlib", "bzp2", "lz4"), "lazy_load": True}
+        with open_checked(file, **settings) as opened:
             roman = opened.tree.get("roman")
             image = roman if hasattr(roman, "get") else {}
             planes = {key: as_plane(np.array(image[key])) for key in ("data", "err", "dq") if key in image}

@@ -16,6 +16,7 @@ from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS, HighLevelWCSWr
 from astropy.wcs.wcsapi.high_level_api import values_to_high_level_objects
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
+from ..runtime.guards.offline import offline
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +26,7 @@ PIXEL_SCALES = (0.0001 / 3600, 0.1)
 REFERENCE_DISTANCE = 20
 
 
+@offline()
 def believable_wcs(wcs, shape, name="", *, level=logging.INFO):
     """The celestial part of a WCS, or None with a log entry if it is not plausible.
 
@@ -87,6 +89,7 @@ def image_wcs(header, hdulist=None):
     return wcs
 
 
+@offline()
 def to_icrs(wcs, xy, *, distortion=True):
     """Right ascension and declination (2, n) [deg, ICRS] of pixels (n, 2), counted from 0, by a believable WCS.
 

@@ -17,6 +17,7 @@ from astropy.table import QTable
 from scipy.optimize import nnls
 
 from ..exceptions import InputError
+from ..inputs.star_lists import text_lists
 from ..inputs.table_files import write_table
 from ..runtime.checks import check_choice, first_line
 from ..runtime.notebook import ShownAsPrinted
@@ -218,10 +219,9 @@ class NoiseCurves(ShownAsPrinted):
         if not Path(path).is_file():
             raise InputError(f"{path} does not exist")
         try:
-            with open(path, "rb") as file:
-                table = QTable.read(file, format="ascii.ecsv")
-        except Exception as error:  # astropy raises what it likes
-            raise InputError(f"{path} is no ECSV table: {first_line(error)}") from error
+            table = QTable(text_lists.read(Path(path).read_bytes(), ".ecsv"))
+        except InputError as error:
+            raise InputError(f"{path} is no ECSV table: {error}") from None
         curves = cls(table)
         try:
             repr(curves)  # which takes all of it

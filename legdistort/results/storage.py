@@ -199,6 +199,8 @@ def _check_consistent(solution):
     if (gauge.drift is None) != (estimate.motions is None):
         raise ValueError("motions of stars and the maps common to them come together")
     basis.degree_of(gauge.n_modes)  # refuses a number that is none of modes
+    if not np.all(gauge.box[1] > 0):
+        raise ValueError(f"entry {ROOT}.gauge.box: half sizes should be positive, got {gauge.box[1].tolist()}")
     if gauge.n_maps > 2 * gauge.n_modes:
         raise ValueError(f"the gauge cannot have {gauge.n_constraints} constraints on {2 * gauge.n_modes} modes")
     if camera and np.count_nonzero(camera.free) != len(camera.changes):
@@ -210,6 +212,12 @@ def _check_consistent(solution):
         if np.any(np.minimum(x, y) < -1e-12) or np.any(xy**2 > (1 + 1e-6) * x * y + 1e-24):
             raise ValueError(f"entry {ROOT}.gauge.tie.shared: takes more from a variance than there is of it")
     table = column_contract.check(solution.residuals, column_contract.MATCHED, "the table of residuals")
+    for name in ("used", "exposure", "detector"):  # quantities select no rows
+        if name in table.colnames and getattr(table[name], "unit", None) is not None:
+            raise ValueError(f"the column {name!r} has a unit, {table[name].unit}")
+    for name in ("x", "y", "dx", "dy"):
+        if getattr(solution.residuals[name], "unit", None) != u.pix:
+            raise ValueError(f"the column {name!r} should be in pixels, its unit is {solution.residuals[name].unit}")
     used = np.asarray(table["used"])
     if used.dtype != bool:
         raise ValueError("the column 'used' should be of booleans")

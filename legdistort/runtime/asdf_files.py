@@ -9,6 +9,7 @@ that fill the memory (a few kilobytes can unpack to any size), name files elsewh
 installed; and against those that were cut off or damaged on the way, for which asdf alone has no words.
 """
 
+import bz2
 import hashlib
 import io
 import math
@@ -17,7 +18,7 @@ import re
 import struct
 import warnings
 import zlib
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from importlib import resources
 from pathlib import Path
 
@@ -29,13 +30,14 @@ from asdf.tags.core.ndarray import asdf_datatype_to_numpy_dtype
 
 from ..exceptions import InputError
 from .checks import check_is_file, first_line
+from .guards.memory import ANY_BYTES, MAX_BYTES, check_memory, most_bytes
+from .guards.offline import offline
+from .guards.yaml_text import LOADER, TooLargeError, check_yaml
 
 #: Version of the ASDF standard that is written.
 ASDF_STANDARD = "1.5.0"
 #: Beginning of the ``id`` of our schemas; version and all stand in the names of their files.
 SCHEMAS = "asdf://legdistort/schemas/"
-#: Bytes that the arrays of a file may take in memory, unless more are allowed.
-MAX_BYTES = 2 << 30
 #: Tags of plain trees: arrays, and what asdf records of itself.
 CORE = ("tag:stsci.edu:asdf/core/",)
 #: Tags of a tree with a gwcs inside.
@@ -49,11 +51,9 @@ WITH_WCS = (
 )
 #: Tags of files that hold a WCS: those of gwcs, and what the archives of JWST and Roman put around it.
 ARCHIVES = (*WITH_WCS, "tag:stsci.edu:jwst_pipeline/", "tag:stsci.edu:jwst_datamodel/", "asdf://stsci.edu/datamodels/")
-_PLAIN = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "seq", "map", "timestamp")}
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-_MAX_DEPTH = 100
 _MOST_AXES = 100
+_AT_ONCE = 1 << 20
 _BYTES_PER_NODE = 2048  # what a node of YAML takes in memory while it is read, about
 _BLOCK = b"\xd3BLK"
 _HEADER = struct.Struct(">I4sQQQ16s")  # flags, compression, allocated, used, unpacked, checksum
@@ -87,21 +87,55 @@ def read_tree(path, *, content=None, tags=CORE, max_bytes=MAX_BYTES):
         check_is_file(path)
     try:
         # absolute, since asdf takes ~x for somebody's home
-        quiet = warnings.catch_warnings(action="ignore", category=asdf.exceptions.AsdfWarning)  # the schema decides
-        with io.BytesIO(content) if inside else Path(path).absolute().open("rb") as file, quiet:
-            with nullcontext(content) if inside else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
-                _check_blocks(whole, _check_yaml(whole, tags, max_bytes), max_bytes)
-            _check_node(asdf.util.load_yaml(file, tagged=True), "", [max_bytes])
-            file.seek(0)
-            with asdf.open(file, memmap=False, lazy_load=False) as opened:
-                return dict(opened.tree)
-    except _TooLargeError as error:
+        source = io.BytesIO(content) if inside else Path(path).absolute().open("rb")
+        with source as file, open_checked(file, tags=tags, max_bytes=max_bytes) as opened:
+            return dict(opened.tree)
+    except TooLargeError as error:
         raise InputError(
-            f"{path} is refused: {error} {max_bytes} bytes are allowed; if you trust the file, allow more "
-            "with max_bytes= (--max-bytes)"
+            f"{path} is refused: {error} bytes are allowed; if you trust the file, allow more with max_bytes= "
+            "(--max-bytes)"
         ) from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except MemoryError:
+        raise MemoryError(f"for {path}") from None
     except Exception as error:  # whatever a broken file provokes
         raise InputError(f"{path} is not a readable ASDF file: {_fault(error)}") from None
+
+
+@contextmanager
+def open_checked(file, *, tags, max_bytes, packings=("zlib",), lazy_load=False):
+    """An ASDF file, open, after all that it declares was checked.
+
+    Parameters
+    ----------
+    file : binary file
+    tags, max_bytes
+        As for `read_tree`.
+    packings : tuple of str
+        Ways to pack arrays that are allowed: "zlib", "bzp2", "lz4".
+    lazy_load : bool
+        Whether arrays are read when they are asked for.
+
+    Raises
+    ------
+    TooLargeError
+        The sentence on what is too large, without the limit.
+    Exception
+        Whatever a broken file provokes.
+    """
+    quiet = warnings.catch_warnings(action="ignore", category=asdf.exceptions.AsdfWarning)  # the schema decides
+    with offline(), quiet:
+        inside = isinstance(file, io.BytesIO)
+        whole = nullcontext(file.getvalue()) if inside else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        with whole as content:
+            start = _check_yaml(content, tags, max_bytes)
+            most = max_bytes if max_bytes != MAX_BYTES else most_bytes(len(content))  # who allows more, trusts it
+            _check_blocks(content, start, most, packings)
+        _check_node(asdf.util.load_yaml(file, tagged=True), "", [most], most)
+        file.seek(0)
+        with asdf.open(file, memmap=False, lazy_load=lazy_load) as opened:
+            yield opened
 
 
 def schema_resources():
@@ -157,7 +191,7 @@ def _without_fits_arrays(path, content):
         return content  # which is reported later
     kept, held, depth, elsewhere = [], [], 0, False
     try:
-        for event in yaml.parse(content[: end.end()], Loader=_LOADER):
+        for event in yaml.parse(content[: end.end()], Loader=LOADER):
             if held or (isinstance(event, yaml.events.MappingStartEvent) and "/core/ndarray-" in (event.tag or "")):
                 held.append(event)
                 depth += isinstance(event, yaml.events.CollectionStartEvent)
@@ -184,10 +218,6 @@ def _fault(error):
     return first_line(error)
 
 
-class _TooLargeError(Exception):
-    """A size beyond the limit; the sentence without the limit."""
-
-
 def _check_yaml(content, tags, max_bytes):
     """Check the text of the tree event by event, and return where it ends."""
     if content[:5] != b"#ASDF":
@@ -197,33 +227,12 @@ def _check_yaml(content, tags, max_bytes):
     if not found:
         raise ValueError("its tree has no end; the file is cut off")
     if found.end() > 32 * most + 10_000:
-        raise _TooLargeError(f"its tree is {found.end()} bytes of text, more than 1 for every 64 of arrays.")
-    counts, anchors = [[None, 0]], {}  # open collections: anchor, number of nodes with aliases written out
-    for event in yaml.parse(content[: found.end()], Loader=_LOADER):
-        if isinstance(event, yaml.events.AliasEvent):
-            if event.anchor not in anchors:
-                raise ValueError(f"alias *{event.anchor} of nothing, or within itself")
-            counts[-1][1] += anchors[event.anchor]
-        elif isinstance(event, yaml.events.CollectionEndEvent):
-            anchor, number = counts.pop()
-            anchors[anchor] = number
-            counts[-1][1] += number
-        elif isinstance(event, yaml.events.NodeEvent):
-            if event.tag and event.tag not in _PLAIN and not event.tag.startswith(tags):
-                raise ValueError(f"tag {event.tag[:100]!r} has no business in such a file; is it the one you mean?")
-            if isinstance(event, yaml.events.CollectionStartEvent):
-                counts.append([event.anchor, 1])
-            else:
-                anchors[event.anchor] = 1
-                counts[-1][1] += 1
-        if len(counts) > _MAX_DEPTH:
-            raise ValueError(f"its tree is nested more than {_MAX_DEPTH} levels deep")
-        if counts[-1][1] > most:
-            raise _TooLargeError(f"its tree has more than {most} nodes, 1 for every {_BYTES_PER_NODE} bytes.")
+        raise TooLargeError(f"its tree is {found.end()} bytes of text, more than 1 for every 64 of arrays. {max_bytes}")
+    check_yaml(content[: found.end()], tags, most, f", 1 for every {_BYTES_PER_NODE} bytes. {max_bytes}")
     return found.end()
 
 
-def _check_blocks(content, start, max_bytes):
+def _check_blocks(content, start, max_bytes, packings):
     """Check what the blocks of arrays declare to hold, before any is unpacked."""
     place, total = content.find(_BLOCK, start), 0
     number = 0
@@ -233,19 +242,42 @@ def _check_blocks(content, start, max_bytes):
         flags, packing, allocated, used, unpacked, checksum = _HEADER.unpack(header)
         if flags & 1:
             raise ValueError(f"block {number} is a stream of unknown length")
-        # bzip2 and lz4 unpack more than they declare before anyone notices
-        if packing not in (b"\0\0\0\0", b"zlib"):
+        kind = packing.rstrip(b"\0").decode("latin-1")
+        if kind and kind not in packings:
             raise ValueError(f"block {number} is packed with {packing!r}; write it anew with zlib, or unpacked")
         place += 6 + size
         if place + allocated > len(content) or used > allocated:
             raise ValueError(f"block {number} reaches beyond the end of the file; it is cut off")
         total += unpacked
         if total > max_bytes:
-            raise _TooLargeError(f"its arrays take {total} bytes and more when unpacked.")
+            raise TooLargeError(f"its arrays take {total} bytes and more when unpacked. {max_bytes}")
+        if not _holds_what_it_declares(content[place : place + used], kind, unpacked):
+            raise ValueError(f"block {number} is damaged: it does not unpack to the {unpacked} bytes that it declares")
         if any(checksum) and not _is_whole(content[place : place + used], checksum, packing, unpacked):
             raise ValueError(f"block {number} is damaged: its checksum is another")
         place += allocated
         number += 1
+    if total > ANY_BYTES:
+        check_memory(total, "its arrays take")
+
+
+def _holds_what_it_declares(data, kind, unpacked):
+    """Whether data unpack to as many bytes as declared, where more could come of them before asdf notices."""
+    if kind == "bzp2":
+        unpacker, found, some = bz2.BZ2Decompressor(), 0, data
+        while not unpacker.eof and found <= unpacked:
+            piece = unpacker.decompress(some, _AT_ONCE)
+            if not piece and unpacker.needs_input:
+                return False
+            found, some = found + len(piece), b""
+        return found == unpacked
+    if kind == "lz4":  # pieces, each behind its length, and each beginning with the length that it unpacks to
+        found = place = 0
+        while place + 8 <= len(data):
+            found += struct.unpack_from("<I", data, place + 4)[0]
+            place += 4 + struct.unpack_from(">I", data, place)[0]
+        return found == unpacked and place == len(data)
+    return True  # zlib, a little at a time
 
 
 def _is_whole(data, checksum, packing, unpacked):
@@ -258,19 +290,19 @@ def _is_whole(data, checksum, packing, unpacked):
     return hashlib.md5(data, usedforsecurity=False).digest() == checksum
 
 
-def _check_node(node, where, left):
+def _check_node(node, where, left, most):
     """Check references and sizes of arrays below a node of the tree; `left` holds the bytes left for arrays."""
     if isinstance(node, dict):
         if "$ref" in node:
             raise ValueError(f"entry {where or 'tree'} refers to another file, which is not followed")
         if "/core/ndarray-" in getattr(node, "_tag", "") and "data" not in node:
-            _check_array(node, where, left)
+            _check_array(node, where, left, most)
         for key, value in node.items():
             _check_count(key, value, where)
-            _check_node(value, f"{where}.{key}" if where else str(key), left)
+            _check_node(value, f"{where}.{key}" if where else str(key), left, most)
     elif isinstance(node, list):
         for k, value in enumerate(node):
-            _check_node(value, f"{where}[{k}]", left)
+            _check_node(value, f"{where}[{k}]", left, most)
 
 
 def _check_count(key, value, where):
@@ -281,13 +313,13 @@ def _check_count(key, value, where):
             raise ValueError(f"entry {where}.{key} has {each}, beyond what can be".replace("entry .", "entry "))
 
 
-def _check_array(node, where, left):
+def _check_array(node, where, left, most):
     if not isinstance(node.get("source"), int):
         raise ValueError(f"array {where} lies in another file ({str(node.get('source'))[:80]!r}), which is not opened")
     itemsize = asdf_datatype_to_numpy_dtype(node["datatype"], node.get("byteorder", "big")).itemsize
     left[0] -= math.prod(int(n) for n in node["shape"]) * itemsize  # strides may make much of little
     if left[0] < 0:
-        raise _TooLargeError(f"array {where} has shape {list(node['shape'])}: too large with those before it.")
+        raise TooLargeError(f"array {where} has shape {list(node['shape'])}: too large with those before it. {most}")
 
 
 def understood(path, function, tree):

@@ -1,7 +1,7 @@
 """FITS files as bytes: opened with their sizes bounded; and changed in some cards, every other byte as it is.
 
-A few kilobytes can unpack to any size, and a header can claim any. What is packed is unpacked here, up to a limit, and
-what a header claims must be in the file, or below it.
+A few kilobytes can unpack to any size, and a header can claim any. What is packed is unpacked here, after it was
+counted how much that is, and what a header claims must be in the file.
 
 Writing a file anew through astropy may reformat cards, scale integers or compress again; here none of that can happen.
 """
@@ -23,13 +23,16 @@ from astropy.io import fits
 
 from ..exceptions import DamagedError, InputError, LegdistortError, without_astropy_warnings
 from .checks import check_is_file
+from .guards.memory import ANY_BYTES, check_memory, most_bytes
+from .guards.offline import offline
 
 BLOCK = 2880
 _CARD = 80
 _MOST_COUNTED = 999
 _LONGEST = 1 << 26  # bytes of a header
-#: Bytes that a packed file may unpack to, and that an image or table may claim beyond what is in its file.
-MAX_BYTES = 2 << 30
+#: Bytes that an image or table may claim beyond what is in its file; if more are missing, no part of it is read.
+_MISSING = 1 << 26
+_AT_ONCE, _PIECE = 1 << 24, 1 << 20
 _UNPACKERS = {
     b"\x1f\x8b": gzip.open,
     b"BZh": bz2.open,
@@ -78,7 +81,7 @@ def unpacked(file, name, max_bytes=None):
     name : str or path
         For the message.
     max_bytes : int, optional
-        `MAX_BYTES` if not given.
+        What can be expected of a file of its size if not given (`legdistort.runtime.guards.memory.most_bytes`).
 
     Raises
     ------
@@ -87,20 +90,35 @@ def unpacked(file, name, max_bytes=None):
     OSError
         If it cannot be unpacked.
     """
-    most = MAX_BYTES if max_bytes is None else max_bytes
     magic = file.read(6)
     file.seek(0)
     unpacker = next((unpacker for start, unpacker in _UNPACKERS.items() if magic.startswith(start)), None)
     if unpacker is None:
         return file
+    most = most_bytes(file.seek(0, io.SEEK_END)) if max_bytes is None else max_bytes
+    file.seek(0)
     try:
-        with unpacker(file) as packed:
-            content = packed.read(most + 1)
+        content, size = _counted(unpacker, file, most)
     except (EOFError, ValueError, IndexError, RuntimeError, zlib.error, lzma.LZMAError, zipfile.BadZipFile) as error:
         raise OSError(f"it cannot be unpacked: {error}") from None
-    if len(content) > most:
+    if size > most:
         raise InputError(f"{name} is refused: it unpacks to more than {most} bytes; if you trust it, unpack it first")
+    if len(content) < size:
+        check_memory(size, f"{name} unpacks to")
+        file.seek(0)
+        with unpacker(file) as packed:
+            content = packed.read()
     return io.BytesIO(content)
+
+
+def _counted(unpacker, file, most):
+    """The first bytes that a packed file unpacks to, and how many these are in all, counted until they are too many."""
+    with unpacker(file) as packed:
+        content = packed.read(_AT_ONCE)
+        size = len(content)
+        while size <= most and (piece := packed.read(_PIECE)):
+            size += len(piece)
+    return content, size
 
 
 def looks_like_fits(path):
@@ -141,12 +159,12 @@ def open_fits(file, name, instead=None):
     Raises
     ------
     InputError
-        For a file that unpacks to more than `MAX_BYTES`.
+        For a file that unpacks to more than its size lets expect, and for more than the memory that is left.
     DamagedError
-        For an image or table that claims more than these and more than the file has, and a compressed image that claims
-        more than these; and for whatever a damaged file provokes in the block.
+        For an image or table that claims far more than the file has, a compressed image that claims more than can come
+        of it; and for whatever a damaged file provokes in the block.
     """
-    with readable(name), unpacked(file, name) as content:
+    with offline(), readable(name), unpacked(file, name) as content:
         size = content.seek(0, io.SEEK_END)
         _check_counts(content, size, name)
         content.seek(0)
@@ -159,13 +177,12 @@ def open_fits(file, name, instead=None):
 
 
 def _opened(content, name, instead):
-    try:
-        return fits.open(content, memmap=False)
-    except OSError as error:
-        if "SIMPLE" not in str(error):
-            raise
-        fault = "cannot be read as FITS, damaged or something else (it has no card SIMPLE)"  # the advice there is none
-        raise DamagedError(f"{name}: {fault}" + (f"; {instead}" if instead else "")) from None
+    start = content.read(9)
+    if not start.startswith(b"SIMPLE  ="):  # before astropy tries what else it could be
+        fault = "cannot be read as FITS, damaged or something else (it has no card SIMPLE)"
+        raise DamagedError(f"{name}: {fault}" + (f"; {instead}" if instead else ""))
+    content.seek(0)
+    return fits.open(content, memmap=False)
 
 
 def _check_counts(content, size, name):
@@ -187,11 +204,16 @@ def _check_counts(content, size, name):
         known = {}
         for start in range(0, len(header), _CARD):
             card = header[start : start + _CARD]
-            if found := re.match(rb"(BITPIX|Z?NAXIS\d*|TFIELDS|[PG]COUNT) *= +(-?\d+)", card):
-                known.setdefault(found[1].decode(), int(found[2]))
-        for key in ("NAXIS", "ZNAXIS", "TFIELDS"):
-            if not 0 <= known.get(key, 0) <= _MOST_COUNTED:
-                raise DamagedError(f"{name}: damaged, {key} = {known[key]} in a header; FITS has 0 to {_MOST_COUNTED}")
+            if found := re.match(rb"(Z?BITPIX|Z?NAXIS\d*|TFIELDS|Z?[PG]COUNT|ZTILE\d+) *= *([-+]?\d+)?", card):
+                key = found[1].decode()
+                if found[2] is None:  # and that many texts would be made of a text
+                    told = card[9:].split(b"/")[0].strip().decode("ascii", "replace")
+                    raise DamagedError(f"{name}: damaged, {key} = {told} in a header is no number")
+                value = int(found[2])
+                if key in ("NAXIS", "ZNAXIS", "TFIELDS") and not 0 <= value <= _MOST_COUNTED:
+                    raise DamagedError(f"{name}: damaged, {key} = {value} in a header; FITS has 0 to {_MOST_COUNTED}")
+                if known.setdefault(key, value) != value:  # astropy takes now the one, now the other
+                    raise DamagedError(f"{name}: damaged, a header has {key} twice, {known[key]} and {value}")
         axes = [known.get(f"NAXIS{k}", 0) for k in range(1, known.get("NAXIS", 0) + 1)]
         n = (known.get("PCOUNT", 0) + math.prod(axes)) * known.get("GCOUNT", 1) if axes else 0
         if n < 0:
@@ -200,14 +222,17 @@ def _check_counts(content, size, name):
 
 
 def _check_claim(i, hdu, size, name):
-    claimed, there = hdu.size, size - (hdu.fileinfo() or {"datLoc": 0})["datLoc"]
+    label = f"HDU {i} {hdu.name}".strip()
     if isinstance(hdu, fits.CompImageHDU):
-        claimed, there = math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8, 0
-    if claimed > max(MAX_BYTES, there):
-        label = f"HDU {i} {hdu.name}".strip()
-        raise DamagedError(
-            f"{name}: {label} claims {claimed} bytes, more than there are in the file and than {MAX_BYTES}"
-        )
+        claimed, most = math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8, most_bytes(size)
+        if claimed > most:
+            raise DamagedError(f"{name}: {label} claims {claimed} bytes, of {size} in the file at most {most} can come")
+    else:
+        claimed, there = hdu.size, size - (hdu.fileinfo() or {"datLoc": 0})["datLoc"]
+        if claimed > there + _MISSING:
+            raise DamagedError(f"{name}: {label} claims {claimed} bytes, there are {there} in the file; it is cut off")
+    if claimed > ANY_BYTES:
+        check_memory(claimed, f"{name}: {label} takes")
 
 
 def open_bytes(raw, **options):

@@ -9,10 +9,11 @@ import threading
 import time
 import warnings
 from collections import deque
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import CancelledError, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from functools import cache, partial
+from importlib.metadata import version
 from logging.handlers import QueueHandler
 from multiprocessing import get_context
 from numbers import Integral
@@ -22,6 +23,7 @@ import scipy.linalg  # noqa: F401  (it comes with a linear algebra library of it
 from threadpoolctl import ThreadpoolController
 
 from ..exceptions import InputError, LegdistortError, warn
+from .checks import first_line
 from .progress import Bar
 
 _END_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl(2)
@@ -58,8 +60,8 @@ def map_items(function, items, *, workers=None, threads=False, progress=False, d
     InputError
         If `workers` is not a positive integer.
     LegdistortError
-        If a worker process dies. What `function` raises for the first item that fails comes as it is; what it warns of
-        and logs in local processes is repeated in this one.
+        If a worker process dies, or the cluster goes away. What `function` raises for the first item that fails comes
+        as it is; what it warns of and logs in local processes is repeated in this one.
     """
     workers, client = check_workers(workers), _client() if workers is None else None
     bar = Bar(
@@ -123,12 +125,13 @@ def _client():
 
 def _shared(function, items, *, workers, threads, client):
     """Results of other threads or processes, in the order of the items, of which few are in flight."""
-    if client is not None:
-        workers = max(1, sum(client.nthreads().values()))
     quiet = not threads and client is None
     work = partial(_attempt, function) if quiet else function
     finish = _finish if quiet else lambda result: result
-    with _executor(workers, threads, client) as submit:
+    with nullcontext() if client is None else _cluster_needed(client), _executor(workers, threads, client) as submit:
+        if client is not None:
+            workers = max(1, sum(client.nthreads().values()))
+            _check_versions(client)
         waiting = deque()
         for item in items:
             with warnings.catch_warnings():
@@ -138,6 +141,44 @@ def _shared(function, items, *, workers, threads, client):
                 yield finish(waiting.popleft().result())
         while waiting:
             yield finish(waiting.popleft().result())
+
+
+@contextmanager
+def _cluster_needed(client):
+    """`LegdistortError` in the place of whatever a cluster leaves behind that went away in the block."""
+    try:
+        yield
+    except Exception as error:  # what `function` raised comes through here as well
+        killed = isinstance(error, sys.modules["distributed"].KilledWorker)
+        whole = client.status == "running" and not isinstance(error, CancelledError)
+        if isinstance(error, LegdistortError) or (whole and not killed):
+            raise
+        lost = "workers of the cluster died again and again at the same work" if killed else "the cluster is gone"
+        cure = "give its workers more memory" if killed else "see why its scheduler ended, connect a new Client"
+        raise LegdistortError(
+            f"{lost} ({type(error).__name__}): {cure}, and call again; or close the Client and give workers=, the "
+            "number of cores of this machine"
+        ) from None
+
+
+def _check_versions(client):
+    """Raise `LegdistortError` if workers of a cluster have another version of the package, or none."""
+    own, cure = _version(), "install the same version there"
+    try:
+        found = client.run(_version)
+    except Exception as error:
+        if client.status != "running":
+            raise
+        raise LegdistortError(
+            f"the workers of the cluster cannot load legdistort ({first_line(error)}): {cure}"
+        ) from None
+    others = sorted(set(found.values()) - {own})
+    if others:
+        raise LegdistortError(f"workers of the cluster have legdistort {', '.join(others)}, here it is {own}: {cure}")
+
+
+def _version():
+    return version("legdistort")
 
 
 @contextmanager

@@ -1,5 +1,7 @@
 """Progress bars."""
 
+import sys
+
 from tqdm import tqdm
 
 
@@ -9,4 +11,6 @@ class Bar(tqdm):
     monitor_interval = 0
 
     def __init__(self, *args, miniters=1, **options):
+        if sys.stderr is None:  # a process without a terminal, or anything in its place
+            options["disable"] = True
         super().__init__(*args, miniters=miniters, **options)  # what the thread is for: slow steps after fast ones

@@ -32,7 +32,9 @@ from legdistort.cli.usage import COMMANDS
 from legdistort.coaddition import preparation
 from legdistort.demo import run_demo
 from legdistort.exceptions import InputError
+from legdistort.inputs.table_files import read_table
 from legdistort.results import in_tables
+from legdistort.runtime.parallel import map_items
 from legdistort.simulation.example_files import write_examples
 from legdistort.simulation.observations import simulate_exposures
 from legdistort.simulation.pupil import PupilPSF
@@ -234,7 +236,7 @@ def test_a_stopped_run_leaves_nothing(night, tmp_path, capsys, monkeypatch, numb
         assert signal.getsignal(number) == usual
     finally:
         signal.signal(number, before)
-    assert "interrupted; nothing was left half-written" in capsys.readouterr().err
+    assert capsys.readouterr().err.endswith("legdistort: interrupted\n")
     assert [p.name for p in tmp_path.rglob("*")] == ["scratch"]
 
 
@@ -414,6 +416,53 @@ except SystemExit as end:
     print(end.code, gc.get_threshold() == (10 * first, *others), gc.get_freeze_count() > 1000)
 """
     assert python("-c", code) == "3 True True\n"
+
+
+STOPPED_AT = """
+import os, signal, sys
+module = sys.argv.pop(1)
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == module:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder())
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from legdistort.cli import command
+sys.exit(command())
+"""
+
+
+@pytest.mark.parametrize("name", ["argparse", "legdistort.exceptions", "numpy.linalg", "astropy.time.core"])
+def test_ctrl_c_while_modules_are_imported_is_one_line(name):
+    done = subprocess.run([sys.executable, "-c", STOPPED_AT, name, "show", "x"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "legdistort: interrupted\n")
+
+
+def test_commands_work_without_any_stream(night, tmp_path):
+    """As a daemon has it, and with ``2>&-``: nothing of theirs is written into files, which would take the numbers."""
+    out = tmp_path / "d.ecsv"
+    command = [sys.executable, "-m", "legdistort", "measure", *map(str, night[:2]), "--out", str(out)]
+    done = subprocess.run(["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *command], capture_output=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+    assert [item.name for item in tmp_path.iterdir()] == ["d.ecsv"]
+    assert len(read_table(out)) > 20
+
+
+@pytest.mark.parametrize("closed", [["stderr"], ["stdout"], ["stdout", "stderr"]])
+def test_main_works_in_programs_without_streams(night, tmp_path, monkeypatch, closed):
+    for name in closed:
+        monkeypatch.setattr(sys, name, None)
+    assert main(["measure", *map(str, night[:2]), "--out", str(tmp_path / "d.ecsv")]) == 0
+    assert main(["show", str(tmp_path / "d.ecsv")]) in (0, 1)
+    assert main(["show", "nowhere"]) == 1
+    assert [getattr(sys, name) for name in closed] == [None] * len(closed)
+    assert list(map_items(abs, [-1], progress=True)) == [1]
+
+
+def test_a_full_standard_error_is_no_reason_to_fail(night, tmp_path):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "legdistort", "show", "nowhere"]
+        assert subprocess.run(command, stderr=full).returncode in (1, 120)  # 120: Python could not empty it
 
 
 @pytest.mark.parametrize("command", ["demo", "run", "measure", "match", "solve", "coadd", "simulate", "show", "report"])

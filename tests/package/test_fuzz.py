@@ -1,6 +1,7 @@
 """Every reader and every argument: read, or refused by an error of the package; see `fuzz.py`."""
 
 import fuzz
+import fuzz_kinds
 import pytest
 
 #: Inputs that once led to other errors, to endless counting or to a full memory.
@@ -11,6 +12,18 @@ KNOWN = [32, 189, 208, 325, 965, 990, 993, 1058, 1082, 1171, 1194, 1303, 1336, 1
 def test_inputs_that_once_broke_something():
     _, faults = fuzz.fuzz(KNOWN)
     assert not faults
+
+
+@pytest.mark.parametrize(("kind", "inputs"), [("fits", 4), ("trees", 4), ("cells", 30)])
+def test_values_without_sense(kind, inputs):
+    """A few of each kind; ``python tests/fuzz_kinds.py`` has the thousands."""
+    assert not fuzz_kinds.fuzz_kind(kind, range(inputs))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", fuzz_kinds.KINDS)
+def test_many_values_without_sense(kind):
+    assert not fuzz_kinds.fuzz_kind(kind, range(100))
 
 
 @pytest.mark.slow

@@ -197,3 +197,26 @@ def test_unchanged(tmp_path):
     solution = plain()
     again = Solution.read(solution.write(tmp_path / "s.asdf"))
     assert_array_equal(again.estimate.uncertainty.bends, solution.estimate.uncertainty.bends)
+
+
+def test_units_and_sizes_that_nothing_can_be_done_with(tmp_path):
+    """Flags and names with a unit would be quantities, which nothing is to be chosen by."""
+    path = tmp_path / "s.asdf"
+    plain().write(path)
+    with asdf.open(path, memmap=False, lazy_load=False) as opened:
+        tree = dict(opened.tree)
+    for name, unit, words in (
+        ("used", "pix", "'used' has a unit, pix"),
+        ("star", "pix", "'star' must hold names or integers"),
+        ("dx", "", "'dx' should be in pixels, its unit is None"),
+        ("dy", "arcsec", "'dy' should be in pixels, its unit is arcsec"),
+    ):
+        changed = copy.deepcopy(tree["legdistort"])
+        changed["observations"][name]["unit"] = unit
+        asdf.AsdfFile({"legdistort": changed}, version="1.5.0").write_to(path)
+        with pytest.raises(InputError, match=rf"s\.asdf is damaged: .*{words}"):
+            Solution.read(path)
+    tree["legdistort"]["gauge"]["box"] = np.array([[1.0, 2.0], [0.0, 3.0]])
+    asdf.AsdfFile({"legdistort": tree["legdistort"]}, version="1.5.0").write_to(path)
+    with pytest.raises(InputError, match=r"gauge\.box: half sizes should be positive, got \[0\.0, 3\.0\]"):
+        Solution.read(path)

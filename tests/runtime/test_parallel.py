@@ -32,7 +32,7 @@ from legdistort.coaddition import block_stack, preparation
 from legdistort.coaddition.resampling import engines
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError, LegdistortError
 from legdistort.inputs.exposure_files import ExposureFile, file_checksums
-from legdistort.runtime import scratch
+from legdistort.runtime import parallel, scratch
 from legdistort.runtime.parallel import map_items, one_blas_thread
 from legdistort.runtime.provenance import checksums
 
@@ -118,6 +118,27 @@ class TestEach:
         with pytest.raises(InputError) as caught:
             list(map_items(work, [1, 99, 2], **WORK[how]))
         assert str(caught.value) == "99 is not a number to work on"  # no traceback of a worker in it
+
+    def test_a_cluster_that_goes_away_is_told(self):
+        distributed = pytest.importorskip("distributed")
+        cluster = distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=None)
+        with cluster, cluster.get_client() as client:
+            results = map_items(time.sleep, [0, 0.1, 0.5])
+            assert next(results) is None
+            client.close()
+            with pytest.raises(
+                LegdistortError, match=r"the cluster is gone \(\w+\): .* connect a new Client, .* workers="
+            ):
+                list(results)
+
+    def test_a_worker_of_another_version_is_told(self, client, monkeypatch):
+        monkeypatch.setattr(parallel, "version", lambda name: "0.0.1")
+        with pytest.raises(LegdistortError, match=r"have legdistort [\d.]+, here it is 0\.0\.1: install the same"):
+            list(map_items(abs, [1]))
+
+    def test_errors_of_the_work_come_as_they_are_from_a_cluster(self, client):
+        with pytest.raises(FileNotFoundError, match="nowhere"):
+            list(map_items(open, ["/nowhere"]))
 
     def test_the_client_of_the_caller_is_used(self, client):
         assert set(map_items(_process, range(8))) == set(client.run(os.getpid).values())

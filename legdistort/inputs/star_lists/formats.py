@@ -10,6 +10,7 @@ from astropy.table import Table, vstack
 from ...exceptions import InputError, without_astropy_warnings
 from ...runtime import checks
 from ...runtime.fits_bytes import open_fits, unpacked
+from ...runtime.guards.offline import offline
 from ..plain_columns import from_fits
 from . import text_lists
 
@@ -33,23 +34,29 @@ def read(path):
     InputError
         Without the name of the file.
     """
-    content = path.read_bytes()
     try:
-        file = unpacked(plain := io.BytesIO(content), "the file")
+        with path.open("rb") as plain:
+            file = unpacked(plain, "the file")
+            content, name = file.read(), path if file is plain else Path(path.stem)
     except OSError as error:
         raise InputError(f"cannot be read as a table: damaged ({error})") from None
-    content, name = file.getvalue(), path if file is plain else Path(path.stem)
     if not content.strip():
         raise InputError("the file is empty; write it again, or leave it out")
     suffix = name.suffix.lower()
     try:
-        if content.startswith(b"SIMPLE") or suffix in (".fits", ".fit", ".fts", ".ldac"):
-            return _read_fits(content)
-        return [text_lists.read(content, suffix)]
-    except InputError:
+        with offline():
+            return _tables(content, suffix)
+    except (InputError, MemoryError):
         raise
     except Exception as error:  # readers raise what they like
         raise InputError(f"cannot be read as a table: {checks.first_line(error)}{text_lists.AGAIN}") from None
+
+
+def _tables(content, suffix):
+    """The tables of the unpacked content of a file."""
+    if content.startswith(b"SIMPLE") or suffix in (".fits", ".fit", ".fts", ".ldac"):
+        return _read_fits(content)
+    return [text_lists.read(content, suffix)]
 
 
 def stack(tables):

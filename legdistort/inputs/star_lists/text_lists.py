@@ -8,9 +8,10 @@ column. Astropy's readers do the reading; what they refuse is looked through her
 import codecs
 import contextlib
 import csv
-import io
 import re
+import textwrap
 from collections import Counter
+from itertools import takewhile
 
 import numpy as np
 from astropy import units as u
@@ -19,11 +20,18 @@ from astropy.table import Table
 
 from ...exceptions import InputError
 from ...runtime import checks
+from ...runtime.guards.yaml_text import check_yaml
 from ..plain_columns import is_number, is_text, numbers, text
+from . import votables
 
 #: What missing values look like: empty fields, and the "null" of the Gaia archive.
 _MISSING = [("", "0"), ("null", "0")]
 _MOST_COLUMNS = 10_000
+#: Beginnings of the tags in the headers of ECSV tables, and nodes that these may have.
+_ECSV_TAGS = ("!astropy.", "!numpy.", "tag:yaml.org,2002:omap", "tag:yaml.org,2002:binary", "tag:yaml.org,2002:set",
+              "tag:yaml.org,2002:python/tuple", "tag:yaml.org,2002:python/unicode", "tag:yaml.org,2002:python/complex",
+              "tag:yaml.org,2002:python/str")  # fmt: skip
+_MOST_NODES = 1_000_000
 #: Lines that are looked at to tell how many columns there are.
 _LOOKED_AT = 1000
 #: Byte order marks, the longer before those that they begin with.
@@ -44,7 +52,6 @@ _NAME = re.compile(r"[A-Za-z_]\S*")
 #: A name of one letter between dots, as wide as its column: ``#....u.... ....v....`` (hst1pass).
 _DOTTED = re.compile(r"\.*[A-Za-z0-9]\.*")
 _HINT = re.compile(r"[dD][-+\d]|\*\*|INDEF")
-_FORTRAN_BYTES = re.compile(rb"(?<=>)(\s*[-+]?\d*\.\d*)[dD]([-+]?\d+\s*)(?=<)")
 AGAIN = "; write it again, or save it as CSV or ECSV"
 _CURE = "correct it or leave it out"
 
@@ -65,7 +72,7 @@ def read(content, suffix):
     """
     words = _decoded(content)
     if "<VOTABLE" in words[:2000] or suffix in (".vot", ".xml"):
-        return _read_votable(content)
+        return votables.read(content, AGAIN)
     words = words.replace("\r\n", "\n").replace("\r", "\n")
     lines = words.split("\n")
     if _HINT.search(words):
@@ -128,15 +135,20 @@ def _place(lines, k, first=None):
     return f"row {row} (line {k + 1})"
 
 
+def _by_astropy(lines, kind, **options):
+    """Lines as a table. They are never given as one text, nor to be guessed: that might be taken for a path or URL."""
+    return Table.read(list(lines), format=kind, guess=False, **options)
+
+
 def _parsed(lines, kind, **options):
     """Lines as a table, by a reader of astropy; with all columns as text, if that is what it takes to read them."""
-    content = "\n".join(line for line in lines if line.strip()) + "\n"
+    full = [line for line in lines if line.strip()]
     try:
-        return Table.read(content, format=kind, **options)
+        return _by_astropy(full, kind, **options)
     except Exception as error:  # readers raise what they like
         as_text = {"*": [astropy_ascii.convert_numpy(str)]}
         try:
-            return Table.read(content, format=kind, converters=as_text, **options)
+            return _by_astropy(full, kind, converters=as_text, **options)
         except Exception:
             rows = [(k, line.split()) for k, line in enumerate(lines) if _is_row(line) and line[0] not in "|\\"]
             _refuse_uneven(rows, lines)
@@ -161,18 +173,6 @@ def _usual(counts):
 
 def _shown(line, most=60):
     return repr(line if len(line) <= most else f"{line[:most]}...")
-
-
-def _read_votable(content):
-    try:
-        return Table.read(io.BytesIO(_FORTRAN_BYTES.sub(rb"\1E\2", content)), format="votable")
-    except Exception as error:  # astropy raises what it likes
-        message = checks.first_line(error)
-        if place := re.search(r"(\d+):(\d+)", message):
-            line = int(place[1])
-            row = sum(text.count("<TR") for text in _decoded(content).splitlines()[:line]) - 1
-            message = f"row {max(row, 0)} (line {line}) is damaged ({message})"
-        raise InputError(f"cannot be read as a table: {message}{AGAIN}") from None
 
 
 def _read_ipac(lines):
@@ -228,9 +228,12 @@ def _read_iraf(lines):
 
 
 def _read_ecsv(lines):
-    content = "\n".join(lines) + "\n"
     try:
-        return Table.read(content, format="ascii.ecsv", fill_values=_MISSING)
+        stripped = (line.strip() for line in lines)
+        header = (line[1:] for line in takewhile(lambda line: line[0] == "#", filter(None, stripped)))
+        known = (line for line in header if line and "%ECSV" not in line)
+        check_yaml(textwrap.dedent("\n".join(known)), _ECSV_TAGS, _MOST_NODES)
+        return _by_astropy(lines, "ascii.ecsv", fill_values=_MISSING)
     except Exception as error:  # astropy raises what it likes
         head = "\n".join(line for line in lines if line.startswith("#"))
         comma = re.search(r"delimiter: '?,", head)
@@ -426,10 +429,9 @@ def _cells(rows, separator):
 
 def _table(rows, names, separator, lines, of):
     """The table of rows ``(number of the line, line)`` below the names of their columns."""
-    options = {"names": names, "delimiter": separator, "guess": False, "fill_values": _MISSING, "comment": None}
-    content = "\n".join(line for _, line in rows) + "\n"
+    options = {"names": names, "delimiter": separator, "fill_values": _MISSING, "comment": None}
     try:
-        table = Table.read(content, format="ascii.no_header", **options)
+        table = _by_astropy([line for _, line in rows], "ascii.no_header", **options)
     except Exception as error:  # astropy raises what it likes
         cells = _cells(rows, separator)
         if separator == " ":
