@@ -6,6 +6,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from ..inputs.frames.working_units import in_working_unit
+from ..measurement.filters import fill_bad
 from ..runtime.scratch import Stored, store
 from .background import Background, measure_background
 
@@ -91,22 +92,3 @@ def rough_pixels(data, bad, full, noise):
 def _around(plane, y, x):
     padded = np.pad(plane, 2, mode="edge")
     return np.stack([padded[y + i, x + k] for i, k in np.ndindex(5, 5)])
-
-
-def fill_bad(data, bad, radius=2):
-    """Replace bad pixels by a weighted mean of the good ones near by, or the median of all good ones."""
-    if not bad.any():
-        return data
-    (y, x), (ny, nx) = np.nonzero(bad), bad.shape
-    total, norm = np.zeros(len(x)), np.zeros(len(x))
-    for dy, dx in np.ndindex(2 * radius + 1, 2 * radius + 1):
-        near = np.clip(y + dy - radius, 0, ny - 1), np.clip(x + dx - radius, 0, nx - 1)
-        weight = np.exp(-((dy - radius) ** 2 + (dx - radius) ** 2) / 2) * ~bad[near]
-        total += weight * np.where(weight > 0, data[near], 0)
-        norm += weight
-    lonely = norm == 0
-    out = data.copy()
-    out[y, x] = total / np.where(lonely, 1, norm)
-    if lonely.any():
-        out[y[lonely], x[lonely]] = np.median(data[~bad])
-    return out

@@ -302,7 +302,7 @@ def _warn_of_doubts(exposures):
     named = {}
     for exposure in exposures:
         for doubt in exposure.stated.doubts:  # of many values that are of one kind the first is shown
-            named.setdefault(re.sub(r" = .*?(?= is )", "", doubt), (doubt, []))[1].append(exposure.name)
+            named.setdefault(re.sub(r" = .*?(?= is )|^\d+", "", doubt), (doubt, []))[1].append(exposure.name)
     if named:
         sentences = "; ".join(f"{some_of(names, 3)}: {doubt}" for doubt, names in named.values())
         warn(f"{sentences} (legdistort show FRAME prints what a frame states)", AssumptionWarning)

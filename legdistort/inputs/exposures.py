@@ -14,6 +14,7 @@ from astropy.io import fits
 from ..exceptions import DamagedError, InputError
 from ..runtime.notebook import ShownAsPrinted
 from .exposure_names import check_exposure_name, whole_name
+from .frames.undefined_pixels import undefined_pixels
 
 if TYPE_CHECKING:
     from astropy.wcs.wcsapi import BaseHighLevelWCS
@@ -48,7 +49,8 @@ class Exposure(ShownAsPrinted):
     data : ndarray of float, shape (ny, nx)
         Integers are converted (float32 up to 16 bits, float64 beyond).
     mask : ndarray of bool, shape (ny, nx)
-        True = bad; pixels that are not finite are always masked. None = all good.
+        True = bad; pixels that are not finite are always masked, and so are those that hold no measurement
+        (`legdistort.inputs.frames.undefined_pixels`): areas of one number at the border. None = all good.
     uncertainty : ndarray or None
         Standard deviation of every pixel, in units of the data.
     wcs : `~astropy.wcs.WCS`, gwcs or other WCS of the shared interface (APE 14), or None
@@ -120,6 +122,11 @@ class Exposure(ShownAsPrinted):
                 "is NaN or blank" if not np.isfinite(data).any() else "is hidden by the mask or the uncertainty plane"
             )
             raise DamagedError(f"{self.name}: every pixel {cause}{LEAVE_OUT}")
+        undefined, words = undefined_pixels(data, mask)
+        if undefined is not None:
+            mask |= undefined
+            log.info("%s: %s", self.name, words)
+            object.__setattr__(self, "stated", self.stated and self.stated.with_doubt(words))
         for key, value in {"data": data, "mask": mask, "uncertainty": uncertainty}.items():
             object.__setattr__(self, key, value)
 

@@ -108,10 +108,13 @@ def _gwcs_of(table, name, shape):
 
 def planes_of(hdulist, hdu, good=None):
     """Data of an image, and the mask and uncertainty that stand beside it in the same file."""
+    blank = hdu.header.get("BLANK") if hdu.header.get("BITPIX", -32) < 0 else None  # of integers astropy makes NaN
     data = hdu.data
     if data is None or data.shape != hdu.shape:
         raise OSError("data incomplete")
     data = data.reshape(plane_shape(hdu))
+    if isinstance(blank, int) and (blanks := data == blank).any():  # of a frame that was made of an integer one
+        data = np.where(blanks, data.dtype.type(np.nan), data)
     telescope = hdu.header.get("TELESCOP", hdulist[0].header.get("TELESCOP", ""))
     planes = {"data": data}
     for other in _alike(hdulist, hdu):

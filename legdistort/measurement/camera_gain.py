@@ -16,6 +16,9 @@ from ..inputs.frames.value_units import value_unit
 #: seen: resampling makes noise up to twice too small, and no honest gain is off by a factor of nine.
 DOUBTFUL = 3.0
 _SKY_SEEN = 5.0  # the level of the sky, in its noise, from which on it has not been taken off
+_STARS_DOUBT = (
+    16.0  # times the variance of photons that the gain implies: the stars of a frame show it to a factor of ten
+)
 _FEWEST, _BRIGHTEST = 5, 20  # stars whose fits show noise that is far too large
 
 #: Keywords that distinguish cameras, their ways of being read, and units.
@@ -59,7 +62,7 @@ def pooled(photons):
     return 1 / photon if photon > 0 else None
 
 
-def contradiction(exposure, frame, flux, chi2):
+def contradiction(exposure, frame, flux, chi2, photon):
     """How much larger the noise of an exposure is than its gain implies, where that is doubtful; None if it is not.
 
     Parameters
@@ -70,6 +73,8 @@ def contradiction(exposure, frame, flux, chi2):
     flux, chi2 : ndarray, shape (n,)
         Of usable stars, the latter per degree of freedom: where most of the noise of a star is that of its photons and
         the fit leaves next to nothing, the gain is too small, whatever the sky.
+    photon : callable
+        Gives the variance per unit of light that the stars show: asked where the sky has been taken off.
 
     Returns
     -------
@@ -91,7 +96,12 @@ def contradiction(exposure, frame, flux, chi2):
         return float(np.sqrt(seen / at_least))
     brightest = np.argsort(-flux)[:_BRIGHTEST]
     left = float(np.median(chi2[brightest])) if len(flux) >= _FEWEST else 1.0
-    return float(np.sqrt(left)) if 0 < left < 1 / DOUBTFUL**2 else None
+    if 0 < left < 1 / DOUBTFUL**2:
+        return float(np.sqrt(left))
+    if level > _SKY_SEEN * np.sqrt(seen) or len(flux) < _FEWEST:
+        return None
+    shown = photon() * exposure.gain
+    return float(np.sqrt(shown)) if shown > _STARS_DOUBT else None
 
 
 def warn_of_contradictions(found, gains):

@@ -40,6 +40,9 @@ class Frame:
         Whether the variance comes from an uncertainty plane.
     floor : float
         The least that the variance of the sky can be.
+    defects : ndarray of bool, shape (ny, nx), or None
+        Pixels that belong to no star (`legdistort.measurement.profiles.defects`): the signal has the light around them,
+        no fit counts them. From `prepare` None.
     """
 
     signal: np.ndarray
@@ -50,6 +53,7 @@ class Frame:
     photon: float | None
     noise_given: bool = False
     floor: float = 0.0
+    defects: np.ndarray | None = None
 
 
 def prepare(exposure, *, mesh=MESH):

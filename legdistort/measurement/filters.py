@@ -93,3 +93,37 @@ def _to_be_compiled(image, weights, odd, down, out):
             else:
                 for c in range(n):
                     sums[c] += (behind[c] + before[c]) * weights[last]
+
+
+def fill_bad(data, bad, radius=2, *, of=None):
+    """Bad pixels replaced by a weighted mean of the good ones near by, or the median of all good ones.
+
+    Parameters
+    ----------
+    data : ndarray, shape (ny, nx)
+    bad : ndarray of bool, shape (ny, nx)
+    radius : int
+        Of what is near by [pix].
+    of : ndarray of bool, shape (ny, nx), optional
+        Those of the bad pixels that are replaced; by default all.
+
+    Returns
+    -------
+    ndarray
+        The data themselves if there is nothing to replace.
+    """
+    if not bad.any():
+        return data
+    (y, x), (ny, nx) = np.nonzero(bad if of is None else of), bad.shape
+    total, norm = np.zeros(len(x)), np.zeros(len(x))
+    for dy, dx in np.ndindex(2 * radius + 1, 2 * radius + 1):
+        near = np.clip(y + dy - radius, 0, ny - 1), np.clip(x + dx - radius, 0, nx - 1)
+        weight = np.exp(-((dy - radius) ** 2 + (dx - radius) ** 2) / 2) * ~bad[near]
+        total += weight * np.where(weight > 0, data[near], 0)
+        norm += weight
+    lonely = norm == 0
+    out = data.copy()
+    out[y, x] = total / np.where(lonely, 1, norm)
+    if lonely.any():
+        out[y[lonely], x[lonely]] = np.median(data[~bad])
+    return out

@@ -8,13 +8,14 @@ class Flag(IntFlag):
 
     SATURATED = 1  #: a saturated pixel within one FWHM of the centre
     EDGE = 2  #: less than one FWHM from the edge of the image, or beside a gap: a third of its pixels are missing
-    HOT = 4  #: much sharper than the stars of the frame: hot pixel or cosmic ray
+    HOT = 4  #: much sharper than the stars of the frame, or fixed on the detector: hot pixel or cosmic ray
     NOT_CONVERGED = 8  #: the fit found no position, or one far from the detection
     INSIGNIFICANT = 16  #: the signal-to-noise ratio of the fit is below 3, or below the detection limit
     BLENDED = 32  #: another detection within two FWHM (fitted together with it, or its model was subtracted)
     MASKED = 64  #: bad or outlying pixels within one FWHM of the centre were left out of the fit
     SHARED_SHAPE = 128  #: too faint or disturbed for a shape of its own: fitted with that of the frame
     DEFORMED = 256  #: the shape is not what is usual at this place: an unresolved companion, see `is_deformed`
+    DEFECT = 512  #: a hot pixel, a bad column or a cosmic ray within one FWHM of the centre was left out of the fit
 
 
 #: Flags that make a detection useless as a star position.

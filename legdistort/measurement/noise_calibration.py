@@ -12,11 +12,12 @@ from astropy.table import vstack
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs.exposure_files import listed
+from ..inputs.frames.working_units import in_working_unit, noise_unit
 from ..runtime import checks, parallel
 from .injection import calibrate_frame
 from .noise_curves import NoiseCurves
 from .options import MeasureOptions
-from .positions import measure_exposure, warn_of_psf
+from .positions import measure_scaled, warn_of_psf
 
 if TYPE_CHECKING:
     from ..inputs.exposures import Exposure
@@ -110,23 +111,27 @@ def calibrate_noise(
     return NoiseCurves(table)
 
 
-def _calibrate(exposure, *, options, widths, **stars):
+def _calibrate(exposure, *, options, widths, fluxes, **stars):
     """Curves of one exposure, and its photon noise if that is an estimate; `stars` put in."""
     exposure = options.with_detector(exposure.read())
-    options = replace(options, errors="fit", max_stars=None)
+    unit, has_gain = noise_unit(exposure), bool(exposure.gain)
+    exposure = in_working_unit(exposure, unit)  # with the gain and saturation that options have
+    options = replace(options, errors="fit", max_stars=None, gain=None, saturation=None)
     psf = None
     if widths is None and options.psf != "moffat":
-        measured = measure_exposure(exposure, options)
+        measured = measure_scaled(exposure, options)
         psf = measured.psf
         if options.psf == "effective":
             warn_of_psf({exposure.name: measured.verdict})
     options = replace(options, psf=psf or "moffat")
 
     def remeasure(image, *, fwhm=options.fwhm):
-        return measure_exposure(image, replace(options, fwhm=fwhm)).table
+        return measure_scaled(image, replace(options, fwhm=fwhm)).table
 
-    curves = calibrate_frame(exposure, remeasure, psf=psf, threshold=options.threshold, widths=widths, **stars)
-    return curves, None if exposure.gain else curves.table.meta["photon"][exposure.name]
+    fluxes = None if fluxes is None else fluxes * unit
+    known = {"psf": psf, "threshold": options.threshold, "widths": widths, "fluxes": fluxes}
+    curves = calibrate_frame(exposure, remeasure, **known, **stars).in_unit(unit)
+    return curves, None if has_gain else curves.table.meta["photon"][exposure.name]
 
 
 def check_injection(fluxes=None, fwhm=None, n_positions=100, seed=0):

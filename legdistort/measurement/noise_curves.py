@@ -161,6 +161,14 @@ class NoiseCurves(ShownAsPrinted):
         own = self.table.meta.get("fwhm", {}).get(exposure) or np.median(widths)
         return widths[np.argmin(np.abs(widths - own))]
 
+    def in_unit(self, unit: float) -> NoiseCurves:
+        """The same for fluxes in a unit of light that is so many times larger."""
+        table = self.table.copy()
+        table["flux"] = table["flux"] / unit
+        photons = {name: photon / unit for name, photon in table.meta.get("photon", {}).items()}
+        table.meta |= {"photon": photons} if photons else {}
+        return NoiseCurves(table)
+
     def apply(self, table: Table, source: str) -> QTable:
         """A table of detections with its errors replaced.
 

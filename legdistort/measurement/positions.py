@@ -16,10 +16,10 @@ from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs.exposure_files import listed
-from ..inputs.frames.working_units import in_working_unit, working_unit
+from ..inputs.frames.working_units import in_working_unit, noise_unit
 from ..runtime import outputs
 from ..runtime.parallel import map_items
-from . import camera_gain
+from . import across_frames, camera_gain
 from .crowding import crowding, is_deformed
 from .effective import frame_psf
 from .effective.building import STARS_NEEDED
@@ -28,8 +28,9 @@ from .filters import use_compiled_loops
 from .flags import LEAST, UNUSABLE, Flag
 from .injection import calibrate_frame
 from .options import MeasureOptions
-from .profiles import frame_fit, moffat
+from .profiles import frame_fit, moffat, pixel_noise
 from .profiles.cutouts import Stamps, box_half
+from .profiles.defects import defect_peaks
 from .profiles.location import locate_stars
 
 if TYPE_CHECKING:
@@ -136,9 +137,9 @@ def measure(
     Warns
     -----
     AssumptionWarning
-        Once, if exposures lack a gain: the photon noise is then estimated from the residuals of the fits, one for all
-        frames of a camera (`legdistort.measurement.camera_gain`). Once, if exposures have too few stars for an
-        effective PSF.
+        Once each: for trailed stars; for a mask that hides most bright stars; if exposures lack a gain, since the
+        photon noise is then estimated from the residuals of the fits, one for all frames of a camera
+        (`legdistort.measurement.camera_gain`); if exposures have too few stars for an effective PSF.
 
     See Also
     --------
@@ -281,6 +282,9 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
     _warn_of_gain({name: one.photon for name, one in zip(names, found, strict=True)})
     doubtful = {name: one.noise_ratio for name, one in zip(names, found, strict=True) if one.noise_ratio is not None}
     camera_gain.warn_of_contradictions(doubtful, {e.name: options.gain or e.gain for e in exposures})
+    across_frames.warn_of_hidden([name for name, one in zip(names, found, strict=True) if one.hidden])
+    across_frames.warn_of_trails({n: one.shape for n, one in zip(names, found, strict=True) if one.shape is not None})
+    across_frames.flag_what_stays([one.table for one in found], exposures)
     verdicts = {name: one.verdict for name, one in zip(names, found, strict=True)}
     if options.psf == "effective" or any(v.psf == "effective" for v in verdicts.values()):
         warn_of_psf(verdicts)
@@ -322,8 +326,8 @@ def _camera_gains(exposures, options, share):
 def _photon_noise(exposure, options):
     """Variance per unit of star light that an exposure determines, None if it is known or there are no stars."""
     exposure = options.with_detector(exposure.read())
-    unit = working_unit(exposure.data[~exposure.mask])
-    stamps, shape = _stamps(in_working_unit(exposure, unit), options)
+    unit = noise_unit(exposure)
+    _, stamps, shape = _stamps(in_working_unit(exposure, unit), options)
     return None if stamps is None or stamps.frame.photon is not None else frame_fit.photon_noise(stamps, shape) / unit
 
 
@@ -362,19 +366,20 @@ def measure_exposure(exposure, options):
     MeasuredExposure
     """
     exposure = options.with_detector(exposure.read())
-    unit = working_unit(exposure.data[~exposure.mask])
+    unit = noise_unit(exposure)
     exposure = in_working_unit(exposure, unit)
-    options = options if unit == 1.0 else replace(options, gain=None, saturation=None)  # the exposure has them
-    measured = _measure_frame(exposure, options)
-    if options.errors != "fit" and np.any((measured.table["flags"] & UNUSABLE) == 0):
-        held = replace(options, max_stars=None, psf=measured.psf or "moffat")
+    options = replace(options, gain=None, saturation=None)  # the exposure has them
+    measured = measure_scaled(exposure, options)
+    found = measured.in_unit(unit)
+    if options.errors == "fit" or not np.any((found.table["flags"] & UNUSABLE) == 0):
+        return found
+    held = replace(options, max_stars=None, psf=measured.psf or "moffat")
 
-        def remeasure(image, *, fwhm=options.fwhm):
-            return _measure_frame(image, replace(held, fwhm=fwhm)).table
+    def remeasure(image, *, fwhm=options.fwhm):
+        return measure_scaled(image, replace(held, fwhm=fwhm)).table
 
-        curves = calibrate_frame(exposure, remeasure, psf=measured.psf, threshold=options.threshold)
-        measured = measured._replace(table=curves.apply(measured.table, options.errors))
-    return measured if unit == 1.0 else measured.in_unit(unit)
+    curves = calibrate_frame(exposure, remeasure, psf=measured.psf, threshold=options.threshold)
+    return found._replace(table=curves.in_unit(unit).apply(found.table, options.errors))
 
 
 class MeasuredExposure(NamedTuple):
@@ -391,6 +396,10 @@ class MeasuredExposure(NamedTuple):
     verdict : `~legdistort.measurement.effective.frame_psf.Verdict`
     noise_ratio : float or None
         Of the noise seen to that which the gain implies, where that is doubtful (`camera_gain.contradiction`).
+    shape : ndarray, shape (4,), or None
+        Of its stars.
+    hidden : bool
+        Whether its mask hides most bright stars.
     """
 
     table: QTable
@@ -398,6 +407,8 @@ class MeasuredExposure(NamedTuple):
     psf: EffectivePSF | None
     verdict: frame_psf.Verdict
     noise_ratio: float | None = None
+    shape: np.ndarray | None = None
+    hidden: bool = False
 
     def in_unit(self, unit):
         """The same in a unit of light that is so many times larger."""
@@ -407,14 +418,15 @@ class MeasuredExposure(NamedTuple):
         return self._replace(table=table, photon=self.photon and self.photon / unit)
 
 
-def _measure_frame(exposure, options):
-    """What `measure_exposure` gives, errors as the fits state them."""
+def measure_scaled(exposure, options):
+    """What `measure_exposure` gives, errors as the fits state them, of an exposure in the unit of its noise."""
     name, max_stars = exposure.name, options.max_stars
     psf = options.psf_of(name)
-    stamps, shape = _stamps(exposure, options)
+    frame, stamps, shape = _stamps(exposure, options)
+    hidden = across_frames.hides_most(exposure, frame, np.zeros((0, 2), int) if stamps is None else stamps.centres)
     if stamps is None:
         log.warning("%s: no star above %g times the noise", name, options.threshold)
-        return MeasuredExposure(_empty(), None, None, frame_psf.Verdict("moffat", 0))
+        return MeasuredExposure(_empty(), None, None, frame_psf.Verdict("moffat", 0), hidden=hidden)
     fwhm = float(moffat.fwhm(shape))
     fitted = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     measured, verdict = frame_psf.measure_frame(stamps, fitted, shape, psf)
@@ -428,6 +440,8 @@ def _measure_frame(exposure, options):
     table = table[_distinct(table, fwhm)]
     table["crowding"] = crowding(table, fwhm)
     table["psf"] = np.full(len(table), verdict.psf)
+    if stamps.frame.defects is not None:
+        table = _with_defects(table, defect_peaks(exposure.data, stamps.frame))
     if max_stars is not None:
         table = table[(table["flags"] & UNUSABLE) == 0][:max_stars]
     log.info("%s: %d detections, FWHM %.2f px, %s", name, len(table), fwhm, verdict.psf)
@@ -435,18 +449,19 @@ def _measure_frame(exposure, options):
     own = None if measured is None else measured.psf.named(exposure=name)
     clean = (stars.flags & UNUSABLE) == 0
     ratio = camera_gain.contradiction(
-        exposure, stamps.frame, stars.flux[clean], stars.chi2[clean] / np.maximum(stars.dof[clean], 1)
-    )
-    return MeasuredExposure(table, None if known else fitted.photon, own, verdict, ratio)
+        exposure, stamps.frame, stars.flux[clean], stars.chi2[clean] / np.maximum(stars.dof[clean], 1),
+        partial(pixel_noise.photon_noise, stamps, fitted.found, fitted.models, moffat.quadrature(fwhm)),
+    )  # fmt: skip
+    return MeasuredExposure(table, None if known else fitted.photon, own, verdict, ratio, shape, hidden)
 
 
 def _stamps(exposure, options):
-    """Stamps around the detections of an exposure, None if there are none, and the usual shape of its stars."""
+    """An exposure as a frame, stamps around its detections, None without any, and the usual shape of its stars."""
     frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
     if options.max_stars is not None:
         centres = centres[: 3 * options.max_stars]  # some will turn out to be hot pixels or saturated
     half = options.box // 2 if options.box else box_half(float(moffat.fwhm(shape)))
-    return (Stamps(frame, centres, half) if len(centres) else None), shape
+    return frame, (Stamps(frame, centres, half) if len(centres) else None), shape
 
 
 def _is_deformed(stamps, fitted, usable):
@@ -521,6 +536,21 @@ def _table(name, stamps, stars):
     columns = (xy[:, 0], xy[:, 1], error[:, 0], error[:, 1], corr, flux, flux_scale * stars.flux_err, width, chi2)
     named = {key: v * u.pix if key in _PIXELS else v for key, v in zip(_COLUMNS, columns, strict=True)}
     return QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})[np.argsort(-flux, kind="stable")]
+
+
+def _with_defects(table, peaks):
+    """The table with a row for every defect, flagged, of which a pixel is all that is known."""
+    xy, height, sigma = peaks
+    if not len(xy) or not len(table):
+        return table
+    rows = table[np.zeros(len(xy), dtype=int)]
+    pixel, none = np.full(len(xy), 12**-0.5), np.zeros(len(xy))
+    values = (xy[:, 0].astype(float), xy[:, 1].astype(float), pixel, pixel, none, height, sigma, none + 1, none + 1)
+    for key, value in zip(_COLUMNS, values, strict=True):
+        rows[key] = value * u.pix if key in _PIXELS else value
+    rows["flags"], rows["crowding"] = int(Flag.HOT | Flag.DEFECT), none
+    table = vstack([table, rows])
+    return table[np.argsort(-table["flux"], kind="stable")]
 
 
 def _scale(chi2, dof):

@@ -21,7 +21,6 @@ from stacks import SHAPE, SIGMA, StandIn, check_stars, covered, expose, plain, s
 from legdistort.coaddition.grids import read_grid, reference_grid
 from legdistort.coaddition.mosaicking import coadd
 from legdistort.coaddition.options import CoaddOptions
-from legdistort.coaddition.preparation import fill_bad
 from legdistort.coaddition.resampling.pixel_maps import map_exposure, tabulate, trace
 from legdistort.exceptions import AssumptionWarning, DiskFullError, InputError
 from legdistort.geometry import similarity
@@ -30,6 +29,7 @@ from legdistort.geometry.distortion import Distortion
 from legdistort.geometry.models import outside
 from legdistort.inputs.exposure_files import read_exposures
 from legdistort.inputs.exposures import Exposure
+from legdistort.measurement.filters import fill_bad
 from legdistort.runtime.checks import options_from
 from legdistort.runtime.words import PLANES
 

@@ -1,15 +1,18 @@
 """A gain that the noise contradicts, and data of any size."""
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from astropy.io import fits
 from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 from star_images import image
 
 from legdistort.exceptions import AssumptionWarning
 from legdistort.inputs.exposures import Exposure
-from legdistort.inputs.frames.working_units import in_working_unit, working_unit
+from legdistort.inputs.frames.working_units import in_working_unit, noise_unit, working_unit
+from legdistort.measurement.noise_calibration import calibrate_noise
 from legdistort.measurement.positions import measure
 
 SHAPE, GAIN, READ_NOISE = (160, 160), 2.0, 5.0
@@ -44,6 +47,12 @@ def test_a_gain_that_the_stars_contradict_is_said():
         measured(exposure(0.02, sky=100.0))
 
 
+def test_a_gain_that_the_stars_contradict_is_said_without_a_sky():
+    """Their own photons are more noise than so large a gain has."""
+    with warns_here(AssumptionWarning, match="times too large for a gain of 300"):
+        measured(exposure(300.0, sky=100.0))
+
+
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0, 5.0])
 def test_a_gain_that_may_be_is_not_doubted(factor):
     measured(exposure(factor * GAIN))
@@ -55,21 +64,60 @@ def test_a_known_noise_needs_no_gain():
     measured(Exposure("e", one.data, gain=300.0, uncertainty=np.full(SHAPE, 8.0)))
 
 
-@pytest.mark.parametrize("size", [1e-30, 1e-21, 1e16, 1e22])
-def test_positions_do_not_depend_on_the_size_of_the_unit(size):
-    right, found = measured(exposure()), measured(exposure(size=size))
+@pytest.mark.parametrize("known", ["gain", "nothing", "uncertainty"])
+@pytest.mark.parametrize("size", [1e-30, 1e-21, 0.1, 1e16, 1e22])
+def test_a_frame_is_the_same_in_any_unit(size, known):
+    """Positions, errors, flags; fluxes are in the unit."""
+
+    def in_unit(size):
+        one = exposure(GAIN if known == "gain" else None, size)
+        one = replace(one, uncertainty=np.full(SHAPE, 8.0) * size) if known == "uncertainty" else one
+        with warnings.catch_warnings():
+            if known == "nothing":
+                warnings.filterwarnings("ignore", "no gain known", AssumptionWarning)
+            return measured(one)
+
+    right, found = in_unit(1.0), in_unit(size)
     assert len(found) == len(right) > 20
-    assert_allclose(found["flux"], right["flux"] * size, rtol=1e-4)
-    assert_allclose(found["flux_err"], right["flux_err"] * size, rtol=1e-4)
-    for name in ("x", "y"):
-        assert_allclose(found[name].value, right[name].value, atol=1e-4)
-        assert_allclose(found[f"{name}_err"].value, right[f"{name}_err"].value, rtol=1e-3)
+    for name in ("flux", "flux_err"):
+        assert_allclose(found[name], right[name] * size, rtol=1e-9)
+    for name in ("x", "y", "x_err", "y_err", "fwhm"):
+        assert_allclose(found[name].value, right[name].value, rtol=0, atol=1e-9)
+    assert_allclose(found["chi2"], right["chi2"], rtol=1e-9)
     assert_allclose(found["flags"], right["flags"])
 
 
-def test_usual_data_are_left_alone():
-    one = exposure(saturation=4e4, header=fits.Header())
-    assert working_unit(one.data) == 1.0
-    assert in_working_unit(one, 1.0) is one
+@pytest.mark.parametrize("power", [-70, -3, 60])
+def test_powers_of_two_are_exact_in_single_precision(power):
+    one = exposure()
+    one = replace(one, data=one.data.astype(np.float32))
+    right, found = measured(one), measured(replace(one, data=one.data * 2.0**power, gain=GAIN / 2.0**power))
+    for name in ("x", "y", "x_err", "y_err"):
+        assert_allclose(found[name], right[name], rtol=0)
+
+
+def test_errors_put_in_are_the_same_in_any_unit():
+    """Noise curves, their fluxes in the unit, and photon noise too."""
+    measuring = {"psf": "moffat"}
+    right, found = (calibrate_noise(exposure(size=size), n_positions=10, measuring=measuring) for size in (1, 1e-21))
+    assert_allclose(found.table["flux"], right.table["flux"] * 1e-21, rtol=1e-9)
+    assert_allclose(found.table["x_rms"].value, right.table["x_rms"].value, rtol=1e-9)
+    assert found.table.meta["photon"]["e"] == pytest.approx(1e-21 / GAIN)
+    fluxes = right.table["flux"][[5, 8]]
+    asked = calibrate_noise(exposure(size=1e-21), fluxes=fluxes * 1e-21, n_positions=10, measuring={"psf": "moffat"})
+    assert (asked.table["found"] > 0.8).all()
+
+
+def test_the_unit_is_that_of_the_noise():
+    one = exposure(saturation=4e4)
+    assert noise_unit(one) == pytest.approx(1 / 7.5, rel=0.3)
+    assert noise_unit(replace(one, data=one.data * 1e-21)) == pytest.approx(1e21 * noise_unit(one))
+    assert noise_unit(Exposure("e", np.full(SHAPE, 7.0))) == 1.0
     scaled = in_working_unit(one, 100.0)
     assert (scaled.gain, scaled.saturation) == (GAIN / 100, 4e6)
+
+
+def test_mosaics_of_usual_data_keep_their_unit():
+    one = exposure()
+    assert working_unit(one.data) == 1.0
+    assert in_working_unit(one, 1.0) is one

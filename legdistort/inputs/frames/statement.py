@@ -73,8 +73,8 @@ class FrameStatement:
         return {name: getattr(self, name).value for name in names} | {"stated": self}
 
     def with_doubt(self, doubt: str) -> FrameStatement:
-        """The same with one doubt more."""
-        return replace(self, doubts=(*self.doubts, doubt))
+        """The same with one doubt more, if it is not there yet."""
+        return self if doubt in self.doubts else replace(self, doubts=(*self.doubts, doubt))
 
     def __str__(self) -> str:
         rows = [("quantity", "value", "source"), *self.rows()]

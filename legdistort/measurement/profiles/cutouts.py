@@ -32,7 +32,8 @@ class Stamps:
         self.data = self.cut(frame.signal)
         self.variance = self.cut(frame.variance)
         self.saturated = self.cut(frame.saturated) & self.inside
-        self.good = self.cut(frame.good) & self.inside & ~self.saturated
+        self.defects = np.zeros_like(self.inside) if frame.defects is None else self.cut(frame.defects) & self.inside
+        self.good = self.cut(frame.good) & self.inside & ~self.saturated & ~self.defects
 
     def _pixels(self):
         (ny, nx), half = self.frame.signal.shape, self.half

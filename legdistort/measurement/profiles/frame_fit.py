@@ -142,6 +142,7 @@ def _flags(stamps, found, good, troubles, width):
         Flag.NOT_CONVERGED: _is_wild(found, width),
         Flag.INSIGNIFICANT: snr < LEAST,
         Flag.MASKED: (near & stamps.inside & ~good & ~stamps.saturated).any(axis=1),
+        Flag.DEFECT: (near & stamps.defects).any(axis=1),
         Flag.SATURATED: (near & stamps.saturated).any(axis=1),
         Flag.EDGE: (near & ~seen).sum(axis=1) > _GAP * near.sum(axis=1),
     }

@@ -6,11 +6,13 @@ from ...exceptions import InputError
 from ..detection import MESH, bright_peaks, detect, prepare
 from . import moffat
 from .cutouts import Stamps, box_half
+from .defects import are_points, without_defects
 from .first_fit import fit_once
 
 _FIRST_FWHM = 3.0
 #: Peaks that determine the width, the brightest: so many that stars remain if a hundred of them are saturated.
 _BRIGHTEST = 300
+_CLEAR = 10.0  # standard deviations of a peak of which one can tell whether it is a point
 _SETTLED = 0.1  # relative change of the width that ends the search
 _POINTLIKE = 0.03  # share of the variance of a stamp outside its peak pixel: no star, however sharp, has so little
 _STEADY = 0.02  # relative error of a width below which stars count alike
@@ -50,6 +52,7 @@ def locate_stars(exposure, *, threshold, fwhm=None):
     if moffat.fwhm(shape) > mesh / 8:  # stars as wide as that would pass for sky
         frame = prepare(exposure, mesh=int(8 * moffat.fwhm(shape)))
         kernel, shape = _frame_shape(frame, fwhm, exposure.name)
+    frame = without_defects(frame, shape)
     before = frame
     centres, frame = detect(before, kernel, threshold)
     if np.median(frame.variance[::8, ::8]) < _CROWDED * np.median(before.variance[::8, ::8]):
@@ -61,7 +64,9 @@ def _frame_shape(frame, fwhm, name):
     """A width that serves to detect stars, and the usual shape of bright ones; found by trying if not known."""
     kernel, shape = fwhm or _FIRST_FWHM, moffat.shape(fwhm or _FIRST_FWHM)
     for _ in range(6):
-        peaks = bright_peaks(frame, kernel)[:_BRIGHTEST]
+        peaks = bright_peaks(frame, kernel)
+        points = are_points(frame.signal, _CLEAR * np.sqrt(frame.variance[peaks[:, 1], peaks[:, 0]]), peaks)
+        peaks = (peaks if points.all() else peaks[~points])[:_BRIGHTEST]
         if len(peaks) == 0:
             break
         shape = _usual_shape(Stamps(frame, peaks, box_half(kernel)), kernel)

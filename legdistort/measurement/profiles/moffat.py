@@ -62,6 +62,14 @@ def fwhm(params):
     return 2 * np.exp(-(log_a + log_b) / 4) * (1 - rho**2) ** -0.25
 
 
+def axes(shape):
+    """Full widths at half maximum of a shape (4,) along its axes, the longer first, and its angle from x to y [deg]."""
+    a, b, c = _form(*shape[:3])
+    values, vectors = np.linalg.eigh([[a, c], [c, b]])
+    wide, narrow = 2 / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    return float(wide), float(narrow), float(np.degrees(np.arctan2(*vectors[::-1, 0])) % 180)
+
+
 def flux(params, covariance=None):
     """Flux of the whole profile (n,), and its standard deviation if a covariance is given."""
     peak, log_a, log_b, rho = params[:, 2:6].T

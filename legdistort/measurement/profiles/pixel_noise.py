@@ -47,7 +47,12 @@ def pixel_noise(stamps, fit, models, nodes):
     photon : float
     """
     sky, photon = stamps.variance, stamps.frame.photon
-    return sky, _photon_noise(stamps, fit, _residuals(stamps, fit, models, nodes)) if photon is None else photon
+    return sky, photon_noise(stamps, fit, models, nodes) if photon is None else photon
+
+
+def photon_noise(stamps, fit, models, nodes):
+    """Variance per unit of light that the stars themselves show; arguments as of `pixel_noise`."""
+    return _photon_noise(stamps, fit, _residuals(stamps, fit, models, nodes))
 
 
 def _residuals(stamps, fit, models, nodes):

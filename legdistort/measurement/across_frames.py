@@ -1,0 +1,114 @@
+"""What is to be said of measured frames: defects that stay on the detector, masks that hide stars, trailed stars."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..exceptions import AssumptionWarning, some_of, warn
+from .camera_gain import camera
+from .flags import UNUSABLE, Flag
+from .profiles import moffat
+from .profiles.defects import are_points
+
+_SAME = 0.5  # pixels within which a defect is found again
+_MOST = 0.6  # of the exposures
+_FEWEST = 3  # exposures in which it is found, at least
+_BRIGHTEST = 30  # rows of an exposure by which it is told whether the sky moves
+_BRIGHT = 20.0  # standard deviations of the sky, of peaks of stars that a mask hides
+_HIDDEN = 5  # such peaks from which on it is said
+_TRAILED = 2.0  # ratio of the axes of stars from which on they are trailed: aberrations make no more of most
+
+
+def flag_what_stays(tables, exposures):
+    """Flag rows that are found on the same pixel in most exposures of a detector while the sky moves.
+
+    Parameters
+    ----------
+    tables : list of `~astropy.table.QTable`
+        Of the exposures; their flags are changed.
+    exposures : list of Exposure or ExposureFile
+    """
+    detectors = {}
+    for table, exposure in zip(tables, exposures, strict=True):
+        detectors.setdefault((exposure.detector, *camera(exposure)[:-2]), []).append(table)
+    for alike in detectors.values():
+        if len(alike) >= _FEWEST:
+            _flag_fixed(alike)
+
+
+def _flag_fixed(tables):
+    xy = [np.column_stack([table["x"].value, table["y"].value]) for table in tables]
+    n = [np.zeros(len(table), dtype=int) for table in tables]
+    trees = [cKDTree(each) if len(each) else None for each in xy]
+    for counts, each in zip(n, xy, strict=True):
+        for tree in trees:
+            if tree is not None and len(each):
+                counts += np.isfinite(tree.query(each, distance_upper_bound=_SAME)[0])  # its own too
+    fixed = [counts >= max(_FEWEST, _MOST * len(tables)) for counts in n]
+    bright = [
+        stays[np.flatnonzero((table["flags"] & UNUSABLE) == 0)[:_BRIGHTEST]]
+        for table, stays in zip(tables, fixed, strict=True)
+    ]
+    if np.mean(np.concatenate(bright) if len(bright) else [1.0]) > 0.5:  # the sky has not moved: stars stay too
+        return
+    for table, stays in zip(tables, fixed, strict=True):
+        stays &= (table["flags"] & Flag.DEFECT) == 0  # a star may lie on a pixel that is left out
+        table["flags"][stays] |= Flag.HOT | Flag.DEFECT
+
+
+def hides_most(exposure, frame, centres):
+    """Whether the mask of an exposure hides more bright stars than it leaves.
+
+    Parameters
+    ----------
+    exposure : `~legdistort.inputs.exposures.Exposure`
+    frame : `~legdistort.measurement.detection.Frame`
+        Made of it.
+    centres : ndarray of int, shape (n, 2)
+        Stars found.
+    """
+    hidden = exposure.mask & np.isfinite(exposure.data)
+    if not hidden.any() or min(hidden.shape) < 3:
+        return False
+    limit = _BRIGHT * np.sqrt(np.median(frame.variance[frame.good][::16]))
+    y, x = np.nonzero(hidden[1:-1, 1:-1])
+    above = exposure.data[y + 1, x + 1] - frame.sky[y + 1, x + 1] > limit
+    y, x = y[above] + 1, x[above] + 1
+    value, highest = exposure.data[y, x], np.ones(len(x), dtype=bool)
+    for k, (dy, dx) in enumerate(np.ndindex(3, 3)):
+        other = exposure.data[y + dy - 1, x + dx - 1]
+        highest &= (value > other) if k < 4 else (value >= other)
+    peaks = np.column_stack([x, y])[highest]
+    stars = np.count_nonzero(~are_points(exposure.data - frame.sky, np.zeros(len(peaks)), peaks))
+    seen = np.count_nonzero(frame.signal[centres[:, 1], centres[:, 0]] > limit)
+    return stars > max(seen, _HIDDEN - 1)
+
+
+def warn_of_hidden(names):
+    """Warn of exposures of which the mask hides most bright stars."""
+    if names:
+        warn(
+            f"{some_of(names, 3)}: most bright stars lie on pixels that the plane of flags calls bad; if a flag only "
+            "describes what is there, name it as good: dq_good= (--dq-good)",
+            AssumptionWarning,
+        )
+
+
+def warn_of_trails(shapes):
+    """Warn of exposures of which the stars are trailed.
+
+    Parameters
+    ----------
+    shapes : dict
+        ``{name: shape (4,)}`` of the stars of exposures.
+    """
+    found = {}
+    for name, shape in shapes.items():
+        wide, narrow, angle = moffat.axes(shape)
+        if wide > _TRAILED * narrow:
+            found[name] = f"{name}: {wide:.1f} by {narrow:.1f} pixels, at {angle:.0f} degrees from x to y"
+    if found:
+        warn(
+            f"the stars are trailed ({some_of(list(found.values()), 3)}): positions are less exact along the trail; "
+            "leave such exposures out if others are sharp",
+            AssumptionWarning,
+        )

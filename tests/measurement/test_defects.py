@@ -1,0 +1,190 @@
+"""Defects that no mask shows, on images of known truth: they are found, and stars are not taken for them."""
+
+import numpy as np
+import pytest
+from caller_warnings import warns_here
+from scipy.spatial import cKDTree
+from star_images import GAIN, READ_NOISE, SKY, errors, image, observe, positions, scattered, usable
+
+from legdistort.exceptions import AssumptionWarning
+from legdistort.inputs.exposures import Exposure
+from legdistort.matching.matcher import match
+from legdistort.measurement.flags import Flag
+from legdistort.measurement.positions import measure
+
+SIZE, N = 200, 49
+SHIFTS = np.array([[0, 0], [11, 5], [-9, 10], [6, -11], [-10, -8]], dtype=float)
+
+
+def stars(fwhm=3.0, n=N, seed=3):
+    """Positions in the first frame and fluxes, from 2,000 to 100,000."""
+    rng = np.random.default_rng(seed)
+    return scattered(rng, n, SIZE), np.exp(rng.uniform(np.log(2e3), np.log(1e5), n))
+
+
+def night(defects=None, fwhm=3.0, frames=5, shifts=SHIFTS):
+    """Exposures, and the light of the defects, `defects(rng)`, in each."""
+    xy, flux = stars(fwhm)
+    exposures, added = [], []
+    for k in range(frames):
+        rng = np.random.default_rng(100 + k)
+        data = observe(image((SIZE, SIZE), xy + shifts[k], flux, fwhm), rng)
+        added.append(np.zeros((SIZE, SIZE)) if defects is None else defects(rng))
+        exposures.append(Exposure(f"e{k}", (data + added[-1]).astype(np.float32), gain=GAIN, read_noise=READ_NOISE))
+    return exposures, added
+
+
+def untouched(table, exposures, added, shifts=SHIFTS):
+    """Of stars with no defect within 6 pixels: how many there are, and which of them are usable and not deformed."""
+    xy, n, kept = stars()[0], 0, 0
+    for exposure, extra, shift in zip(exposures, added, shifts, strict=False):
+        where = xy + shift
+        inside = ((where > 6) & (where < SIZE - 7)).all(axis=1)
+        y, x = np.nonzero(extra)
+        far = inside if not len(x) else inside & (cKDTree(np.column_stack([x, y])).query(where)[0] > 6)
+        rows = usable(table[table["exposure"] == exposure.name])
+        rows = rows[(rows["flags"] & Flag.DEFORMED) == 0]
+        n, kept = n + far.sum(), kept + (cKDTree(positions(rows)).query(where[far])[0] < 1).sum()
+    return n, kept
+
+
+def hits(rng, share=0.01):
+    """Cosmic rays on a part of the pixels: tracks of up to nine pixels."""
+    out, done = np.zeros((SIZE, SIZE)), 0
+    while done < share * out.size:
+        start, angle, length = rng.uniform(5, SIZE - 6, 2), rng.uniform(0, np.pi), rng.integers(1, 10)
+        steps = np.arange(length)[:, None] * [np.sin(angle), np.cos(angle)]
+        y, x = np.clip(np.round(start + steps), 0, SIZE - 1).astype(int).T
+        out[y, x] += np.exp(rng.uniform(np.log(150), np.log(2e4)))
+        done += length
+    return out
+
+
+def columns(rng):
+    """Bright and dark, faint ones of which no pixel stands out, half ones, two beside each other, and a row."""
+    out = np.zeros((SIZE, SIZE))
+    out[:, 90], out[:, 40], out[:, 140], out[77] = 400, -150, 20, 25
+    out[60:140, 170] = 200
+    out[:, 20:22] = 300
+    return out
+
+
+def hot_pixels(rng):
+    """The same in all frames."""
+    rng, out = np.random.default_rng(8), np.zeros((SIZE, SIZE))
+    out[rng.integers(4, SIZE - 4, 80), rng.integers(4, SIZE - 4, 80)] = np.exp(
+        rng.uniform(np.log(200), np.log(2e4), 80)
+    )
+    return out
+
+
+def n_matched(table):
+    """Stars that are matched."""
+    return len(np.unique(match(table, shape=(SIZE, SIZE)).table["star"]))
+
+
+@pytest.fixture(scope="module")
+def clean():
+    exposures, _ = night()
+    table = measure(exposures, psf="moffat")
+    return table, n_matched(table)
+
+
+@pytest.mark.parametrize("defects", [hits, columns, hot_pixels])
+def test_defects_cost_no_star_that_they_do_not_touch(defects, clean):
+    exposures, added = night(defects)
+    table = measure(exposures, psf="moffat")
+    n, kept = untouched(table, exposures, added)
+    assert kept >= 0.98 * untouched(clean[0], exposures, added)[1] > 0.9 * n
+    assert n_matched(table) >= 0.95 * clean[1]
+    rows, false = usable(table), 0
+    for k, exposure in enumerate(exposures):
+        own = positions(rows[rows["exposure"] == exposure.name])
+        false += (cKDTree(stars()[0] + SHIFTS[k]).query(own)[0] > 2).sum()
+    assert false <= 0.04 * len(rows)
+
+
+@pytest.mark.parametrize("fwhm", [1.2, 1.5, 2.0, 3.0, 5.0])
+def test_stars_are_no_defects_however_sharp(fwhm):
+    """Neither bright nor faint ones, at no phase of the pixels."""
+    exposures, _ = night(fwhm=fwhm, frames=2)
+    table = measure(exposures, psf="moffat")
+    assert not (table["flags"] & Flag.DEFECT).any()
+    assert len(usable(table)) > 0.9 * len(table) > 80
+
+
+def test_hot_pixels_are_in_the_table_with_their_flag():
+    exposures, (added,) = night(hot_pixels, frames=1)
+    table = measure(exposures, psf="moffat")
+    y, x = np.nonzero(added > 300)
+    flagged = table[(table["flags"] & Flag.HOT) > 0]
+    assert np.mean(cKDTree(positions(flagged)).query(np.column_stack([x, y]))[0] < 1.5) > 0.9
+    assert (flagged["flags"] & Flag.DEFECT).all()
+    assert np.all(np.diff(table["flux"]) <= 0)
+
+
+def test_a_star_is_measured_beside_the_defects_on_it():
+    """What is hit of it is left out: errors stay true."""
+    pulls = []
+    exposures, _ = night(lambda rng: hits(rng, 0.03))
+    table = usable(measure(exposures, psf="moffat"))
+    for k, exposure in enumerate(exposures):
+        rows = table[(table["exposure"] == exposure.name) & ((table["flags"] & Flag.DEFECT) > 0)]
+        distance, star = cKDTree(stars()[0] + SHIFTS[k]).query(positions(rows))
+        rows, star = rows[distance < 1], star[distance < 1]
+        pulls.append((positions(rows) - stars()[0][star] - SHIFTS[k]) / errors(rows))
+    pulls = np.concatenate(pulls)
+    assert len(pulls) > 25
+    assert 1.4826 * np.median(np.abs(pulls)) < 1.4
+
+
+def soft(rng):
+    """Warm places as wide as stars: nothing but their staying tells what they are."""
+    return image((SIZE, SIZE), scattered(np.random.default_rng(5), 9, SIZE), np.full(9, 5e3), 3.0) - SKY
+
+
+def test_what_stays_on_the_detector_while_the_sky_moves_is_no_star():
+    exposures, _ = night(soft)
+    places = scattered(np.random.default_rng(5), 9, SIZE)
+    table = measure(exposures, psf="moffat")
+    near = cKDTree(places).query(positions(table))[0] < 0.3
+    assert near.sum() > 35
+    assert np.mean((table["flags"][near] & Flag.HOT) > 0) > 0.9
+    far = cKDTree(places).query(positions(table))[0] > 8
+    assert not (table["flags"][far] & Flag.HOT).any()
+
+
+def test_stars_stay_where_the_sky_does_not_move():
+    exposures, _ = night(soft, shifts=np.zeros_like(SHIFTS), frames=3)
+    table = measure(exposures, psf="moffat")
+    assert not (table["flags"] & Flag.HOT).any()
+    assert len(usable(table)) > 3 * 45
+
+
+def test_a_mask_that_hides_most_stars_is_named():
+    """Of all stars or of most; one of hot pixels hides none."""
+    (exposure,), _ = night(frames=1)
+    light = image((SIZE, SIZE), *stars(), 3.0) - SKY
+    for least in (20, 200):
+        with warns_here(AssumptionWarning, match=r"e0: most bright stars lie on pixels .*\(--dq-good\)"):
+            measure(Exposure("e0", exposure.data, light > least, gain=GAIN, read_noise=READ_NOISE), psf="moffat")
+    (exposure,), (added,) = night(hot_pixels, frames=1)
+    measure(Exposure("e0", exposure.data, added > 0, gain=GAIN, read_noise=READ_NOISE), psf="moffat")
+
+
+@pytest.mark.parametrize("angle", [0, 140])
+def test_a_trailed_frame_is_named(angle):
+    """Stars of 3 pixels drawn out to a length of 9 more."""
+    xy, flux = stars()
+    along = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    light = [image((SIZE, SIZE), xy + t * along, flux, 3.0, squash=np.ones(N)) for t in np.linspace(-4.5, 4.5, 10)]
+    data = observe(np.mean(light, axis=0), np.random.default_rng(1))
+    exposures = [*night(frames=2)[0], Exposure("trailed", data, gain=GAIN, read_noise=READ_NOISE)]
+    with pytest.warns(AssumptionWarning, match=r"stars are trailed \(trailed: .* degrees from x to y\)") as caught:
+        measure(exposures, psf="moffat")
+    (message,) = [str(one.message) for one in caught if "trailed" in str(one.message)]
+    words = message.split()
+    wide, narrow, found = (float(words[words.index(key) + step]) for key, step in (("by", -1), ("by", 1), ("at", 1)))
+    assert 7 < wide < 14
+    assert 2.5 < narrow < 4
+    assert abs((found - angle + 90) % 180 - 90) < 5
