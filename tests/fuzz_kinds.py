@@ -549,6 +549,8 @@ def attempt(kind, seed):
 def fuzz_kind(kind, seeds, *, verbose=True):
     """The faults by seed."""
     signal.signal(signal.SIGPROF, fuzz._ring)
+    if kind in ("words", "folders"):
+        small_run()  # before there is a limit of time
     connect, socket.socket.connect = socket.socket.connect, _refuse_connection
     logging.disable(logging.CRITICAL)
     faults = {}
