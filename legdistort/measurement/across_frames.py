@@ -44,11 +44,13 @@ def _flag_fixed(tables):
             if tree is not None and len(each):
                 counts += np.isfinite(tree.query(each, distance_upper_bound=_SAME)[0])  # its own too
     fixed = [counts >= max(_FEWEST, _MOST * len(tables)) for counts in n]
-    bright = [
-        stays[np.flatnonzero((table["flags"] & UNUSABLE) == 0)[:_BRIGHTEST]]
-        for table, stays in zip(tables, fixed, strict=True)
-    ]
-    if np.mean(np.concatenate(bright) if len(bright) else [1.0]) > 0.5:  # the sky has not moved: stars stay too
+    bright = np.concatenate(
+        [
+            stays[np.flatnonzero((table["flags"] & UNUSABLE) == 0)[:_BRIGHTEST]]
+            for table, stays in zip(tables, fixed, strict=True)
+        ]
+    )
+    if not len(bright) or bright.mean() > 0.5:  # the sky has not moved: stars stay too
         return
     for table, stays in zip(tables, fixed, strict=True):
         stays &= (table["flags"] & Flag.DEFECT) == 0  # a star may lie on a pixel that is left out

@@ -121,3 +121,16 @@ def test_mosaics_of_usual_data_keep_their_unit():
     one = exposure()
     assert working_unit(one.data) == 1.0
     assert in_working_unit(one, 1.0) is one
+
+
+def test_what_a_frame_is_filled_with_overflows_unseen():
+    """1e30 beside values of 1e-21 has no place in single precision, in the unit of the noise."""
+    one = exposure(size=1e-21)
+    data = one.data.astype(np.float32)
+    data[:, :30] = 1e30
+    assert len(measured(replace(one, data=data))) > 10
+
+
+def test_frames_without_stars_have_no_defects_in_common():
+    empty = [Exposure(f"e{k}", np.random.default_rng(k).normal(0, 1, SHAPE), gain=1.0) for k in range(3)]
+    assert len(measured(empty)) == 0

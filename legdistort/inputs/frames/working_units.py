@@ -59,7 +59,8 @@ def in_working_unit(exposure, factor):
 
 def _times(values, factor):
     """In the type of the values, by way of double precision: a factor may be out of the range of the type."""
-    return np.multiply(values, factor, dtype=float).astype(values.dtype)
+    with np.errstate(over="ignore"):  # of what a frame is filled with
+        return np.multiply(values, factor, dtype=float).astype(values.dtype)
 
 
 def header_in_working_unit(header, factor):
