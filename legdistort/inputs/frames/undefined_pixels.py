@@ -85,7 +85,8 @@ def _candidates(data, known):
             along = np.flatnonzero(same >= _LEAST - 1)
             found += [strip[0][inwards], edge[along]]
     values, numbers = np.unique(np.concatenate(found), return_counts=True)
-    return values[np.argsort(-numbers, kind="stable")][:_VALUES]
+    order = np.argsort(-numbers, kind="stable")[:_VALUES]
+    return values[order][numbers[order] > 1]  # one alone is a dead column
 
 
 def _area(alike):
