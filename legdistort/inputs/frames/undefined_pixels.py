@@ -94,6 +94,8 @@ def _area(alike):
     rows, columns = _Rows(alike), _Rows(alike.T)
     share = max(rows.by_chance, columns.by_chance)
     length = max(_LEAST, _length(share, alike.size), rows.usual_length, columns.usual_length)
+    if rows.n_longer(length) + columns.n_longer(length) < _SMALL * min(alike.shape):
+        return None
     areas, n = label(rows.longer_than(length) | columns.longer_than(length).T)
     edge = np.concatenate([areas[0], areas[-1], areas[:, 0], areas[:, -1]])
     if not n or not edge.any():
@@ -135,6 +137,11 @@ class _Rows:
         if len(self.first) < _OFTEN * self.shape[0]:
             return 0
         return _length(0.5 ** (1 / np.median(self.behind - self.first)), self.size)
+
+    def n_longer(self, length):
+        """Pixels in rows of at least this length."""
+        lengths = self.behind - self.first
+        return int(lengths[lengths >= length].sum())
 
     def longer_than(self, length):
         lengthy = self.behind - self.first >= length
