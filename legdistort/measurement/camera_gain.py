@@ -16,9 +16,8 @@ from ..inputs.frames.value_units import value_unit
 #: seen: resampling makes noise up to twice too small, and no honest gain is off by a factor of nine.
 DOUBTFUL = 3.0
 _SKY_SEEN = 5.0  # the level of the sky, in its noise, from which on it has not been taken off
-_STARS_DOUBT = (
-    16.0  # times the variance of photons that the gain implies: the stars of a frame show it to a factor of ten
-)
+#: Variance of photons over that which the gain implies: the stars of a frame show it to a factor of ten.
+_STARS_DOUBT = 16.0
 _FEWEST, _BRIGHTEST = 5, 20  # stars whose fits show noise that is far too large
 
 #: Keywords that distinguish cameras, their ways of being read, and units.
