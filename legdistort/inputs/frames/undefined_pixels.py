@@ -51,6 +51,8 @@ def undefined_pixels(data, known):
 
 def _huge(data, known):
     """Pixels with numbers far beyond all others."""
+    if data.dtype == np.float32 and np.isfinite(np.vdot(data, data)):  # no square is beyond single precision
+        return None, ""
     if max(data.max(), -data.min()) <= HUGE and not known.any():  # NaN are known
         return None, ""
     with np.errstate(invalid="ignore"):
