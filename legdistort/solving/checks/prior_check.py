@@ -76,6 +76,7 @@ def _given(solution):
     """What was given, in words."""
     prior = solution.settings.prior
     source = prior.get("source") if isinstance(prior, dict) else None
+    source = source.get("name") if isinstance(source, dict) else source
     return f"the static distortion given ({source})" if source else "the static distortion given"
 
 
