@@ -57,6 +57,13 @@ def dynamic_degrees(n):
     return np.concatenate([[1, 1], degrees, degrees]) if n >= 3 else np.zeros(0, dtype=int)
 
 
+def row_variances(rows, sigma):
+    """Variances (..., k) of rows (..., k, n) of coefficients with widths (..., n); infinite where one of these is."""
+    sigma = sigma[..., None]
+    infinite, known = (rows != 0) @ np.isinf(sigma), rows**2 @ np.where(np.isinf(sigma), 0, sigma) ** 2
+    return np.where(infinite, np.inf, known)[..., 0]
+
+
 def similarity_part(coefficients, shape):
     """The similarity closest to ``q + A b(q)``, as a pose (..., 2, 3) in the detector's pixels.
 

@@ -25,7 +25,7 @@ from pathlib import Path, PurePosixPath
 from ..exceptions import InputError, LegdistortError, some_of
 from . import locks
 from .disk_errors import named_as_given, told_when_full
-from .provenance import SUMMARY, checksum, files_of_run
+from .provenance import SUMMARY, checksum_of, files_of_run
 
 log = logging.getLogger(__name__)
 
@@ -550,8 +550,7 @@ def contents(folder):
     found = {}
     for path in sorted(Path(folder).rglob("*")):
         if path.is_file():
-            with path.open("rb") as file:
-                found[path.relative_to(folder).as_posix()] = checksum(file)
+            found[path.relative_to(folder).as_posix()] = checksum_of(path)
     return found
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ...exceptions import some_of
-from ...geometry.detector_modes import dynamic_basis
+from ...geometry.detector_modes import dynamic_basis, row_variances
 from ...results.check import FALSE_ALARM, Check, state_of
 from ..knowledge.exposures import ExposureModel
 from ..knowledge.reduced_data import drawn, part_of
@@ -43,6 +43,8 @@ def prior_check(solution, problem, state, *, error):
         return None
     if solution.gauge.plane is not None:  # a catalogue has placed the stars
         return None
+    if problem.mean_sigma is not None and np.all(np.isinf(problem.mean_sigma)):  # nothing is believed
+        return None
     keep = drawn(np.broadcast_to(problem.group, problem.n_exposures), MOST // (2 * problem.n_modes))
     problem, state = part_of(problem, state, keep)
     given, variance, group, first = _stated(problem)
@@ -62,9 +64,8 @@ def _stated(problem):
     """
     others = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])
     mean = problem.prior_mean[:, :, : problem.n_modes].reshape(problem.n_exposures, -1, 1)
-    sigma = np.zeros(mean.shape) if problem.mean_sigma is None else problem.mean_sigma.reshape(mean.shape)
-    infinite = (others != 0) @ np.isinf(sigma)
-    variance = np.where(infinite, np.inf, others**2 @ np.where(np.isinf(sigma), 0, sigma) ** 2)[:, :, 0]
+    sigma = np.zeros(mean.shape) if problem.mean_sigma is None else problem.mean_sigma
+    variance = row_variances(others, sigma.reshape(problem.n_exposures, -1))
     given = (others @ mean)[:, :, 0]
     detector = np.broadcast_to(problem.group, problem.n_exposures)
     keys = np.column_stack([detector, given, variance])

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...exceptions import SolveError
 from ...geometry import basis, similarity
-from ...geometry.detector_modes import dynamic_basis, similarity_basis, similarity_poses
+from ...geometry.detector_modes import dynamic_basis, row_variances, similarity_basis, similarity_poses
 from ...results.gauge import Drift, Gauge
 from ...runtime.checks import check_choice
 from ...runtime.words import GAUGES
@@ -183,10 +183,8 @@ def _static_variance(problem, others, group, shared):
     sigma = np.zeros((problem.n_exposures, 2, problem.n_modes)) if problem.mean_sigma is None else problem.mean_sigma
     if shared:
         sigma = np.where(sigma > 0, sigma, np.inf)
-    sigma = sigma.reshape(problem.n_exposures, -1, 1)
-    flat, known = (others != 0) @ np.isinf(sigma), others**2 @ np.where(np.isinf(sigma), 0, sigma) ** 2
     out = np.zeros((group.max() + 1, others.shape[1]))
-    np.maximum.at(out, group, np.where(flat, np.inf, known)[:, :, 0])
+    np.maximum.at(out, group, row_variances(others, sigma.reshape(problem.n_exposures, -1)))
     return out
 
 

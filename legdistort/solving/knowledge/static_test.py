@@ -134,23 +134,27 @@ def static_tests(model, given, variance, shapes):
     shapes : list of (ny, nx), by detector
     """
     posterior, sizes = model.posterior, model.posterior.sizes
-    tests = [_test(model, posterior, *each) for each in enumerate(zip(given, variance, shapes, strict=True))]
+    seen = posterior.without(model.free_statics)
+    tests = [_test(posterior, seen, *each) for each in enumerate(zip(given, variance, shapes, strict=True))]
     share = np.zeros((len(sizes) - 1, len(tests)))
     for j in range(len(share)):
         larger = replace(posterior, sizes=np.where(np.arange(len(sizes)) == j, 1.1 * sizes, sizes))
+        seen = larger.without(model.free_statics)
         for g, test in enumerate(tests):
-            after = _test(model, larger, g, (test.given, test.variance, test.shape), test.directions)
+            after = _test(larger, seen, g, (given[g], variance[g], test.shape), test.directions)
             share[j, g] = np.log((test.statistic() + 1e-9) / (after.statistic() + 1e-9)) / np.log(1.1) / 2
     dof = 1 / (share**2 / np.maximum(posterior.determined[:-1, None], 1) + 1e-12).sum(axis=0)
     return [replace(test, dof_scatter=float(n)) for test, n in zip(tests, dof, strict=True)]
 
 
-def _test(model, posterior, g, known, directions=None):
-    """The test of a detector, whatever the others are; in given directions, or those that are determined."""
-    given, variance, shape = known
-    information, slope = posterior.without(model.free_statics)
+def _test(posterior, seen, g, known, directions=None):
+    """The test of a detector, whatever the others are; in given directions, or those that are determined.
+
+    `seen` are information and slope of all statics from everything but what is known of them.
+    """
+    (given, variance, shape), (information, slope) = known, seen
     stated = np.isfinite(variance)
-    mine = np.zeros((model.n_groups, len(given)), dtype=bool)
+    mine = np.zeros((len(slope) // len(given), len(given)), dtype=bool)
     mine[g] = stated
     mine = mine.ravel()
     others = information[np.ix_(~mine, ~mine)] + np.eye(np.count_nonzero(~mine)) / posterior.sizes[-1] ** 2
