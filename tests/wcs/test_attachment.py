@@ -753,6 +753,14 @@ def everything(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def check_nothing_happened(solution, paths, folder, before):
+    """Files are as they were before a failure, and the next call works, and leaves nothing else."""
+    assert everything(folder) == before
+    attach(solution, paths, in_place=True)
+    assert all(map(has_wcs, paths))
+    assert everything(folder).keys() == before.keys()
+
+
 @pytest.mark.parametrize("good", [0, 1, 2])
 def test_frames_are_changed_all_or_none(three, tmp_path, monkeypatch, good):
     solution, paths = three
@@ -768,10 +776,7 @@ def test_frames_are_changed_all_or_none(three, tmp_path, monkeypatch, good):
         patch.setattr(attachment._Plan, "write", write)
         with pytest.raises(DiskFullError, match=r"No space left on the disk for .*fits, which was left as it was"):
             attach(solution, paths, in_place=True)
-    assert everything(tmp_path) == before
-    attach(solution, paths, in_place=True)
-    assert all(map(has_wcs, paths))
-    assert everything(tmp_path).keys() == before.keys()
+    check_nothing_happened(solution, paths, tmp_path, before)
 
 
 def test_a_disk_that_fails_between_two_files(three, tmp_path, monkeypatch):
@@ -788,10 +793,7 @@ def test_a_disk_that_fails_between_two_files(three, tmp_path, monkeypatch):
         patch.setattr(os, "replace", replace)
         with pytest.raises(OSError, match="Input/output error"):
             attach(solution, paths, in_place=True)
-    assert everything(tmp_path) == before
-    attach(solution, paths, in_place=True)
-    assert all(map(has_wcs, paths))
-    assert everything(tmp_path).keys() == before.keys()
+    check_nothing_happened(solution, paths, tmp_path, before)
 
 
 def test_copies_come_together_beside_other_files(three, tmp_path, monkeypatch):
