@@ -12,11 +12,12 @@ from scipy.optimize import brentq
 from ..exceptions import ConvergenceWarning, LegdistortError, SolveError, warn
 from ..matching.matches import Matches
 from ..runtime import parallel
-from . import agreement, clipping, minimisers, star_motions, start_values
+from . import agreement, clipping, minimisers, most_probable, star_motions, start_values
 from .choices import prior_widths
 from .equations import criterion, effective_modes, elimination
 from .equations.covariances import Uncertainty
 from .equations.problem import Problem, State, build_problem, uses_compiled_loops
+from .gauge import known_maps
 
 log = logging.getLogger(__name__)
 
@@ -200,25 +201,36 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         if trial:
             common |= {"tolerance": TRIAL, "settled": near_by and near.chi2 < EXPLAINED * problem.xy.size}
         result = minimisers.solve_joint(problem, start, **common)
+        problem, result, _ = _unbent(problem, start, result, common)
         return Fit(matches, problem, result, everything, options)
     if start_values.far_off(problem, typical).any() and (astray := agreement.astray(problem)):
         return minimise(matches.without(astray), options, judged=judged)
     as_near = trial and near_by and (near.options.degree, near.options.clip) == (options.degree, None)
     plain = near.result if as_near else _plain(problem, start, common)
+    given, near = problem, start
+    if plain is not None and not clipping.is_explained(problem, plain, clip=options.clip):
+        problem, plain, near = _unbent(problem, start, plain, common, loss="cauchy")
     if plain is not None and clipping.is_explained(problem, plain, clip=options.clip):
+        problem, plain, _ = _unbent(given, near, plain, common, or_else=problem)
         return Fit(matches, problem, plain, everything, options)
-    start = clipping.start_from(problem, plain)
-    if start is None:
-        start, typical = start_values.start(problem, nominal, robust=True)
+    hold = problem is not given
+    if not hold and (near := clipping.start_from(problem, plain)) is None:
+        near, typical = start_values.start(problem, nominal, robust=True)
         if lost := _misplaced(problem, typical):
             return minimise(matches.without(lost), options, judged=judged)
-    result, used, unfollowed = clipping.solve_clipped(problem, start, clip=options.clip, plain=plain, **common)
+    result, used, unfollowed = clipping.solve_clipped(
+        problem, near, clip=options.clip, plain=plain, hold=hold, **common
+    )
     if unfollowed and not judged and plain is not None:
         return Fit(matches, problem, plain, everything, options, unfollowed=unfollowed)
     if unfollowed:
         _check_majority(matches, options, unfollowed)
     if lost := unfollowed or agreement.starved(problem, used):
         return minimise(matches.without(lost), options, judged=judged)
+    if result is not plain:
+        kept = given.scaled(used)
+        whole, result, _ = _unbent(kept, result.state, result, common, or_else=problem)
+        problem = replace(whole, weight=given.weight)
     fit = Fit(matches, problem, result, used, options)
     if plain is not None and plain.converged and not used.all() and fit.dof < 1:  # nothing tells what is wrong then
         return Fit(matches, problem, plain, everything, options)
@@ -243,6 +255,38 @@ def _plain(problem, start, common):
         except SolveError as error:
             log.debug("the plain fit failed: %s", error)
             return None
+
+
+def _unbent(problem, start, result, common, *, loss="linear", or_else=None):
+    """Problem, fit and start of another with the plane where all that is known is most probable.
+
+    Where distortions are large, a plane that a convention holds keeps the data from their minimum. The problem has what
+    was found of the scatter of exposures and of what they have in common. If this is no better, or does not count, the
+    result is the one given, with the problem that it solves (`or_else`).
+    """
+    before = problem if or_else is None else or_else
+    if common["gauge"] == "mean" or not most_probable.counts(problem, result.state):
+        if before.centre is not None:  # distortions seemed large by what is not used any more
+            result = minimisers.solve_joint(problem, _padded(result.state, problem), **common)
+        return problem, result, start
+    with warnings.catch_warnings(action="ignore", category=ConvergenceWarning), contextlib.suppress(SolveError):
+        # the fit with its plane elsewhere is nearer, unless gross errors moved it
+        near = _padded(result.state if result.converged and loss == "linear" else start, problem)
+        found = most_probable.most_probable(problem.scaled(result.robust), near, loss=loss)
+        whole = found.posed(problem)
+        held = minimisers.solve_joint(whole, found.state, hold=True, **common)
+        if held.converged and held.blocks.cost < criterion.linearise(whole, _padded(result.state, whole)).cost:
+            positions = held.state.positions.T[held.blocks.v[0] > 0]
+            gauge = known_maps.as_in_posterior(held.gauge, found.blocks.unknowns, positions, *found.covariances())
+            return whole, replace(held, gauge=gauge), found.state
+    return before, result, start
+
+
+def _padded(state, problem):
+    """A state with as many modes as the prior mean of a problem."""
+    coefficients, n = problem.prior_mean.copy(), state.coefficients.shape[2]
+    coefficients[:, :, :n] = state.coefficients[:, :, : coefficients.shape[2]]
+    return replace(state, coefficients=coefficients)
 
 
 def _misplaced(problem, typical):

@@ -111,19 +111,17 @@ def precise(seed, **settings):
 
 @pytest.mark.parametrize("method", ["direct", "iterative"])
 def test_what_residuals_determine_is_left_to_them(monkeypatch, method):
-    """The convention costs no chi2 where positions are precise enough to contradict it, and J ends at its minimum."""
+    """No convention costs chi2 where positions are precise enough to contradict it: J ends at its minimum."""
     if method == "iterative":
         monkeypatch.setattr(reduced_system, "uses_direct", lambda problem: False)
     sim = precise(1)
     solution = solve(sim.matches)
-    assert solution.gauge.released.shape == (20, 2)
     assert [each.name for each in solution.gauge.unknown] == ["shear", "shear"]
     assert abs(solution.chi2 - solution.dof) < 5 * np.sqrt(2 * solution.dof)
     true = sim.truth.positions[solution.estimate.star_names]
     # maps of the gauge are cubics of cubics here, so a common map of higher degree is taken out
     b, bound = accuracy.bias(solution.estimate.positions, true, removed=6), accuracy.expected_bias(solution, removed=6)
     assert b == pytest.approx(bound, rel=0.25)
-    assert "2 combinations that are not known otherwise are determined by residuals" in str(solution.gauge)
 
 
 def test_the_literal_mean_gauge_is_kept_to_the_letter():

@@ -210,7 +210,7 @@ def test_no_more_than_the_stars_allow():
 @pytest.mark.filterwarnings("ignore::legdistort.exceptions.LegdistortWarning")
 def test_degree_zero_alone_has_an_alarm_too():
     """Where no more than degree 1 is possible beyond it, which maps that are not known cannot bend."""
-    sim = simulate_matches(n_stars=120, n_exposures=8, degree=3, dither=1100.0, seen=0.5, min_exposures=2, seed=12)
+    sim = simulate_matches(n_stars=90, n_exposures=8, degree=3, dither=1100.0, seen=0.5, min_exposures=2, seed=12)
     chosen = solve(sim.matches, degree="auto").diagnostics.selection
     assert (chosen.degree, chosen.degrees) == (0, (0, 1))
     assert [each.degree for each in chosen.aliasing] == [1]
@@ -411,7 +411,7 @@ def test_energy_beyond_what_an_unknown_map_can_do_is_seen_in_few_exposures(n_exp
         sim = simulate_matches(n_exposures=n_exposures, n_stars=300, degree=4, static=static, dynamic=width,
                                sigma=0.02, zero_mean=False, dither=100.0, seed=seed)  # fmt: skip
         with warnings.catch_warnings(action="ignore"):
-            assert folding(sim, 3, 4, top=n_exposures + 2).excess > 2 * degree_choice.ALARM
+            assert folding(sim, 3, 4, top=n_exposures + 2).excess > 1.8 * degree_choice.ALARM
 
 
 @pytest.mark.parametrize("direct", [True, False])

@@ -196,12 +196,12 @@ def test_the_last_system_of_the_minimisation_serves_checks_and_errors(clip):
     assert made.information == pytest.approx(again.information, rel=1e-6, abs=1e-6)
 
 
-def test_second_order_of_the_gauge_is_no_fault_of_the_degree():
-    # Many precise positions show where a common map is held at a value that is not the true one.
+def test_second_order_of_the_gauge_costs_no_chi2_and_is_no_fault_of_the_degree():
+    """Many precise positions show where a common map is held at a value that is not the true one: it is not held."""
     matches = ld.simulate_matches(n_exposures=20, n_stars=400, sigma=0.02, degree=3, static=1.5, seed=5).matches
     solution = ld.solve(matches, degree=3, clip=None)
     found = residuals(solution)
-    assert found.chi2 < solution.chi2 - 30
+    assert solution.chi2 - found.chi2 < 1
     assert states(solution)["degree"] == "unknown"  # not "fail"; there are no dithers
 
 

@@ -3,9 +3,8 @@
 import numpy as np
 
 from ...exceptions import some_of
-from ...geometry.detector_modes import dynamic_basis, row_variances
 from ...results.check import FALSE_ALARM, Check, state_of
-from ..knowledge.exposures import ExposureModel
+from ..knowledge.exposures import ExposureModel, stated
 from ..knowledge.reduced_data import drawn, part_of
 from ..knowledge.static_test import static_tests
 
@@ -47,7 +46,7 @@ def prior_check(solution, problem, state, *, error):
         return None
     keep = drawn(np.broadcast_to(problem.group, problem.n_exposures), MOST // (2 * problem.n_modes))
     problem, state = part_of(problem, state, keep)
-    given, variance, group, first = _stated(problem)
+    given, variance, group, first = stated(problem)
     believed = np.isfinite(variance).any(axis=1) & (given.any(axis=1) | (variance > 0).any(axis=1))
     if not believed.any():
         return None
@@ -55,22 +54,6 @@ def prior_check(solution, problem, state, *, error):
     tests = static_tests(model, given, variance, [problem.shapes[i] for i in first])
     tests = [(problem.names[i], test) for i, test, known in zip(first, tests, believed, strict=True) if known]
     return _in_words(_given(solution), tests, error)
-
-
-def _stated(problem):
-    """Mean and variance (n_priors, K) of every prior, that of each exposure, and the first exposure of each.
-
-    Exposures of one detector with one prior depart from one distortion.
-    """
-    others = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])
-    mean = problem.prior_mean[:, :, : problem.n_modes].reshape(problem.n_exposures, -1, 1)
-    sigma = np.zeros(mean.shape) if problem.mean_sigma is None else problem.mean_sigma
-    variance = row_variances(others, sigma.reshape(problem.n_exposures, -1))
-    given = (others @ mean)[:, :, 0]
-    detector = np.broadcast_to(problem.group, problem.n_exposures)
-    keys = np.column_stack([detector, given, variance])
-    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    return given[first], variance[first], group.ravel(), first
 
 
 def _given(solution):

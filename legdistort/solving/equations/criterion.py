@@ -149,9 +149,8 @@ def linearise(problem, state):
     u_data, penalty = u, 0.0
     if problem.has_prior:
         u = u.copy()
-        for i in range(problem.n_exposures):
+        for i, departure in enumerate(problem.departure(state.coefficients)):
             precision = prior_precision(problem, i)
-            departure = (state.coefficients[i] - problem.prior_mean[i])[:, : problem.n_modes].ravel()
             u[i] += precision
             g_exposure[i] -= precision @ departure
             penalty += float(departure @ precision @ departure)

@@ -56,6 +56,9 @@ class Problem:
         Up to this degree exposures have modes of their own; None: nothing is shared. See `Unknowns`.
     group : ndarray of int, shape (n_exposures,)
         Detector of every exposure; exposures of one share what is not their own.
+    centre : ndarray, shape (n_exposures, 2, n_modes), or None
+        Where the widths of coefficients are centred, beside the prior mean: the most probable static distortion less
+        that; None: nothing beside it.
     moving : StarTerms or None
         How stars move from exposure to exposure; None: they do not.
     """
@@ -75,6 +78,7 @@ class Problem:
     mean_sigma: np.ndarray | None = None
     own_degree: int | None = None
     group: np.ndarray | int = 0
+    centre: np.ndarray | None = None
     moving: StarTerms | None = None
 
     @cached_property
@@ -148,6 +152,14 @@ class Problem:
     def has_prior(self):
         """Whether widths of a prior take part in J."""
         return self.prior_sigma is not None or (self.unknowns.shared and self.static_sigma is not None)
+
+    def departure(self, coefficients):
+        """How far fitted coefficients are from where their widths are centred, of those (n_exposures, 2, n_all) given.
+
+        Shape (n_exposures, 2 n_modes).
+        """
+        out = (coefficients - self.prior_mean)[:, :, : self.n_modes]
+        return (out if self.centre is None else out - self.centre).reshape(len(out), -1)
 
     @property
     def n_modes(self):

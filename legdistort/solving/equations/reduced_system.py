@@ -65,10 +65,10 @@ def is_singular(blocks):
 def uses_direct(problem):
     """Whether the reduced system is small enough to be factorised; it always is where exposures share modes."""
     cost = _FAST_DIRECT_COST if problem.uses_compiled_loops else _DIRECT_COST
-    return problem.unknowns.shared or _is_small(problem, cost)
+    return problem.unknowns.shared or is_small(problem, cost)
 
 
-def _is_small(problem, cost):
+def is_small(problem, cost=_DIRECT_COST):
     """Whether the matrix of the coefficients serves a problem, at no more than some multiplications."""
     n = problem.unknowns.size
     return n <= DIRECT_LIMIT and n * n * 2.0 * problem.n_stars <= cost
@@ -325,7 +325,7 @@ class Iterative(Reduced):
     def step(self, target, accuracy, enough=0.0):
         """As for `Direct`."""
         gradients = self.blocks.g_exposure, self.blocks.g_star
-        limit = _FAST_STEPS if _is_small(self.problem, _DIRECT_COST) else None
+        limit = _FAST_STEPS if is_small(self.problem) else None
         found = self._solve(*gradients, self.rows, target, accuracy, enough, limit=limit)
         if found is None:  # exposures hang together weakly
             return Direct(self.problem, self.blocks, self.gauge).step(target, accuracy)

@@ -195,6 +195,14 @@ def _in_a_word(static, shared):
     return "uncertain" if static.any() else "exact"
 
 
+def pose_rows(problem, state, blocks):
+    """Orthonormal rows (4, n_exposures, 2 n_modes) on coefficients that hold the plane by the poses; see `make`."""
+    box = reference_box(problem, state)
+    motion, error = _motion(problem, state.poses, box), conditional_errors(blocks.u_data)
+    rows = _pose_rows("minimal", motion, error, _by_shape(similarity_basis, problem), box)
+    return np.linalg.qr(rows.reshape(len(rows), -1).T)[0].T.reshape(rows.shape)
+
+
 def _pose_rows(kind, motion, error, similar, box):
     """Rows (4, n_exposures, 2 n) that hold the plane by the poses, mean over the exposures."""
     if kind == "mean":

@@ -206,13 +206,18 @@ def named(maps, gauge, positions):
     """Unknown maps (2 k, m) of a gauge, without those that are similarities, as a tuple of `UnknownMap`."""
     if not maps.shape[1] or len(maps) != 2 * gauge.n_modes:
         return ()
-    size, values = tuple(2 * gauge.box[1, ::-1]), gauge.modes_at(positions[np.isfinite(positions[:, 0])])
-    power = values @ values.T / values.shape[1]
-    pointed = _pointing_off(power, size)
-    metric = _metric(power, pointed)
+    pointed, metric = plane_metric(gauge, positions[np.isfinite(positions[:, 0])])
     moved, vectors = np.linalg.eigh(maps.T @ metric @ maps)
     kept = moved > 0.5
-    return _named(maps @ vectors[:, kept] / np.sqrt(moved[kept]), pointed, metric, size)
+    return _named(maps @ vectors[:, kept] / np.sqrt(moved[kept]), pointed, metric, tuple(2 * gauge.box[1, ::-1]))
+
+
+def plane_metric(gauge, positions):
+    """`Hierarchy.pointed` and `Hierarchy.metric` of a gauge and positions (n, 2)."""
+    values = gauge.modes_at(positions)
+    power = values @ values.T / values.shape[1]
+    pointed = _pointing_off(power, tuple(2 * gauge.box[1, ::-1]))
+    return pointed, _metric(power, pointed)
 
 
 def _pointing_off(power, size):

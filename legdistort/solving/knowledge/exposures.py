@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
+from ...geometry.detector_modes import dynamic_basis, dynamic_degrees, row_variances
 from .factors import GIVEN, Factor
 from .posterior import most_likely
 from .reduced_data import ReducedData, reduced_data
@@ -102,3 +102,19 @@ class ExposureModel:
     def free_statics(self):
         """The factor on S_g - m_g of a size that is found."""
         return self.statics(size=int(self.degrees.max(initial=0)))
+
+
+def stated(problem):
+    """Mean and variance (n_priors, K) of every prior, that of each exposure, and the first exposure of each.
+
+    Exposures of one detector with one prior depart from one distortion.
+    """
+    others = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])
+    mean = problem.prior_mean[:, :, : problem.n_modes].reshape(problem.n_exposures, -1, 1)
+    sigma = np.zeros(mean.shape) if problem.mean_sigma is None else problem.mean_sigma
+    variance = row_variances(others, sigma.reshape(problem.n_exposures, -1))
+    given = (others @ mean)[:, :, 0]
+    detector = np.broadcast_to(problem.group, problem.n_exposures)
+    keys = np.column_stack([detector, given, variance])
+    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return given[first], variance[first], group.ravel(), first

@@ -23,6 +23,8 @@ class Factor:
         Given; not used where a size is found in its place.
     size : ndarray of int, shape (k,)
         Number of the size that is the width of a row, or `GIVEN`.
+    stretch : ndarray, shape (k,), or None
+        Factors on all widths; None: one.
     """
 
     name: str
@@ -30,14 +32,19 @@ class Factor:
     value: np.ndarray
     width: np.ndarray
     size: np.ndarray
+    stretch: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.stretch is None:
+            object.__setattr__(self, "stretch", np.ones(len(self.value)))
 
     def widths(self, sizes):
         """Width of every row (k,) at some sizes."""
-        return np.where(self.size == GIVEN, self.width, np.asarray(sizes)[self.size])
+        return self.stretch * np.where(self.size == GIVEN, self.width, np.append(sizes, np.nan)[self.size])
 
     @classmethod
     def joined(cls, factors):
         """Several factors as one."""
-        parts = zip(*((f.value, f.width, f.size) for f in factors), strict=True)
+        parts = zip(*((f.value, f.width, f.size, f.stretch) for f in factors), strict=True)
         rows = sparse.vstack([f.rows for f in factors], format="csr")
         return cls(", ".join(f.name for f in factors), rows, *map(np.concatenate, parts))

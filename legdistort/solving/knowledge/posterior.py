@@ -6,12 +6,15 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
-from scipy.optimize import minimize
 
 from ...exceptions import SolveError
 from ..equations.elimination import mirrored
 from .factors import GIVEN, Factor
 from .reduced_data import ReducedData
+
+#: Newton steps at most, halvings of each, and the largest change of the logarithm of a size in one.
+_ROUNDS, _HALVINGS, _LARGEST = 50, 8, 2.0
+_FLAT = 0.02  # slope of the cost by the logarithm of a size that counts as none: twice a likelihood ratio of 1 is noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +78,12 @@ class Posterior:
         root, unit = self._root
         return unit * cho_solve(root, unit * self.slope)
 
+    def damped(self, damping):
+        """A step (n,) with the diagonal of the information larger by a part (Marquardt 1963)."""
+        _, unit = self._root
+        root = cho_factor(unit[:, None] * self.information * unit + damping * np.eye(len(unit)), lower=True)
+        return unit * cho_solve(root, unit * self.slope)
+
     @cached_property
     def covariance(self):
         """Of z, (n, n)."""
@@ -83,25 +92,39 @@ class Posterior:
         return unit[:, None] * mirrored(inverse) * unit
 
     @cached_property
+    def of_rows(self):
+        """Covariance of the rows of the factor, (k, k)."""
+        rows = self.factor.rows
+        return rows @ (rows @ self.covariance).T
+
+    @cached_property
     def left(self):
         """Values of the rows of the factor at the mean, and their variances: (k,) each."""
-        rows = self.factor.rows
-        variance = rows.multiply(rows @ self.covariance).sum(axis=1)
-        return self.factor.value + rows @ self.mean, np.asarray(variance).ravel()
+        return self.factor.value + self.factor.rows @ self.mean, np.diag(self.of_rows)
+
+    @cached_property
+    def cost(self):
+        """Minus twice the logarithm of the likelihood, up to a constant."""
+        (root, _), unit = self._root
+        least = self.data.chi2 + ((self.factor.value / self.widths) ** 2).sum() - self.slope @ self.mean
+        return least + 2 * np.log(np.diag(root) / unit).sum() + 2 * np.log(self.widths).sum()
 
     @property
-    def cost(self):
-        """Minus twice the logarithm of the likelihood, up to a constant, and its slopes by those of the sizes.
+    def cost_slopes(self):
+        """First and second derivatives of the cost by the logarithms of the sizes: (n_sizes,) and (n_sizes, n_sizes).
 
-        The slope vanishes where the square of a size is the sum of squares of its rows over the number of them that the
+        The first vanishes where the square of a size is the sum of squares of its rows over the number of them that the
         data determine (MacKay 1992); in mixed models this is restricted maximum likelihood.
         """
-        (root, _), unit = self._root
-        value, variance = self.left
-        least = self.data.chi2 + ((self.factor.value / self.widths) ** 2).sum() - self.slope @ self.mean
-        total = least + 2 * np.log(np.diag(root) / unit).sum() + 2 * np.log(self.widths).sum()
-        slope, found = 2 - 2 * (value**2 + variance) / self.widths**2, self.factor.size != GIVEN
-        return total, np.bincount(self.factor.size[found], slope[found], len(self.sizes))
+        n, found = len(self.sizes), self.factor.size != GIVEN
+        (value, variance), width = self.left, self.widths
+        share = (value**2 + variance) / width**2
+        label = self.factor.size[found]
+        by_size = (label == np.arange(n)[:, None]).astype(float)
+        scaled, within = value[found] / width[found] ** 2, self.of_rows[np.ix_(found, found)]
+        first = 2 * by_size @ (1 - share[found])
+        pairs = 2 * scaled[:, None] * within * scaled + (within / width[found] / width[found, None]) ** 2
+        return first, np.diag(4 * by_size @ share[found]) - 4 * by_size @ pairs @ by_size.T
 
     @property
     def determined(self):
@@ -132,7 +155,7 @@ class Posterior:
 
 
 def most_likely(data, factor, start, bounds):
-    """The posterior at the sizes of the largest likelihood.
+    """The posterior at the sizes of the largest likelihood, by Newton's method.
 
     Parameters
     ----------
@@ -147,10 +170,24 @@ def most_likely(data, factor, start, bounds):
     Posterior
     """
     low, high = np.log(bounds)
-
-    def cost(logs):
-        return Posterior(data, factor, np.exp(logs)).cost
-
-    start = np.clip(np.log(start), low, high)
-    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(low, high)] * len(start))
-    return Posterior(data, factor, np.exp(found.x))
+    here = Posterior(data, factor, np.clip(start, *bounds))
+    for _ in range(_ROUNDS):
+        first, second = here.cost_slopes
+        logs = np.log(here.sizes)
+        free = ~((logs <= low) & (first > 0) | (logs >= high) & (first < 0))
+        if not np.any(np.abs(first[free]) > _FLAT):
+            break
+        curvature, vectors = np.linalg.eigh(second[np.ix_(free, free)])
+        step = np.zeros(len(first))
+        # where the likelihood is not concave yet, at least as far as one fixed-point step
+        step[free] = -vectors @ (vectors.T @ first[free] / np.maximum(np.abs(curvature), _FLAT))
+        step *= min(1.0, _LARGEST / np.abs(step).max())
+        for _ in range(_HALVINGS):
+            there = Posterior(data, factor, np.exp(np.clip(logs + step, low, high)))
+            if there.cost <= here.cost + 1e-9 * abs(here.cost):
+                break
+            step /= 4
+        else:
+            break
+        here = there
+    return here

@@ -1,0 +1,46 @@
+"""What a posterior of the coefficients knows of the common map, in the words of the gauge."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import eigh
+
+from ...geometry.detector_modes import similarity_basis
+from ..equations.criterion import complement
+from .hierarchy import LIMIT, named, plane_metric
+
+_RIDGE = 1e-9  # of the metric: few stars leave maps without any displacement
+
+
+def as_in_posterior(gauge, unknowns, positions, covariance, wide):
+    """The gauge with the covariance of the common map, and what is unknown of it, as a posterior has them.
+
+    Parameters
+    ----------
+    gauge : Gauge
+        With a constraint for every mode of the plane.
+    unknowns : Unknowns
+    positions : ndarray, shape (n, 2)
+        Of stars with observations.
+    covariance, wide : ndarray, shape (size, size)
+        Of the unknowns; and as if nothing were known of static distortions but what priors state. A direction is
+        unknown if the latter has it beyond `LIMIT` pixels.
+    """
+    size, n = 2 * gauge.box[1, ::-1], gauge.n_modes
+    pointed, metric = plane_metric(gauge, positions)
+    similar = similarity_basis(size, n).T
+    maps = complement(similar.T).T
+    rows = gauge.orthonormal.T.reshape(len(gauge.motion), 2, n, -1)
+    rows = np.pad(rows, ((0, 0), (0, 0), (0, unknowns.n_modes - n), (0, 0)))
+    rows = unknowns.gather(rows.reshape(len(rows), 2 * unknowns.n_modes, -1)).T
+    of_rows, wide = rows @ covariance @ rows.T, rows @ wide @ rows.T
+    back = np.linalg.inv(gauge.reach @ np.hstack([maps, similar]))[: maps.shape[1]]
+    inside = maps.T @ metric @ maps
+    inside += _RIDGE * np.trace(inside) / len(inside) * np.eye(len(inside))
+    curvature, vectors = eigh(np.linalg.inv(back @ wide @ back.T), inside)
+    is_unknown = curvature * LIMIT**2 < 1
+    known, unknown = maps @ vectors[:, ~is_unknown], maps @ vectors[:, is_unknown]
+    back = np.linalg.inv(gauge.reach @ np.hstack([known, unknown, similar]))[: known.shape[1]]
+    back = pointed @ known @ back
+    found = back @ of_rows @ back.T
+    return replace(gauge, covariance=(found + found.T) / 2, unknown_maps=named(unknown, gauge, positions))

@@ -1,0 +1,432 @@
+"""The most probable stars, distortions and static distortions together, however large these are.
+
+``J = chi2 + sum_i (A_i - S)' Lambda_i^-1 (A_i - S) + (S - m)' V^-1 (S - m)`` is minimised over everything at once by
+damped Gauss-Newton steps (Marquardt 1963; Nielsen 1999), the stars eliminated from each. Nothing but the mean
+similarity of the poses is held, so that no convention stands between the data and their minimum. The scatter Lambda of
+single exposures, by degree, and the size of a static distortion of which nothing is known are those that make the data
+most likely. A single Gaussian scatter would let one odd exposure widen that of all: each has a factor of its own on it,
+as for Student's t distribution (Lange, Little & Taylor 1989).
+"""
+
+import logging
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+from ..exceptions import SolveError
+from ..geometry import basis
+from ..geometry.detector_modes import dynamic_basis, dynamic_degrees, row_variances, similarity_basis
+from .equations import criterion, elimination, reduced_system
+from .equations.problem import State
+from .gauge import constraints
+from .knowledge.exposures import stated
+from .knowledge.factors import GIVEN, Factor
+from .knowledge.posterior import Posterior, most_likely
+from .knowledge.reduced_data import ReducedData, drawn, part_of
+from .minimisers import loss_factors
+
+log = logging.getLogger(__name__)
+
+#: Degrees of freedom of the t distribution of departures.
+TAILS = 4.0
+#: ... which are those of a Gaussian up to so many standard deviations of the sum of their squares.
+CHANCE = 3.0
+#: Steps at most; converged below such parts of every size, and so many standard errors, rms over the unknowns.
+MAX_STEPS, SETTLED = 60, 0.02
+TOLERANCE = {"linear": 0.01, "huber": 0.1, "cauchy": 0.1}
+#: A bend of the plane shows in residuals if in second order it moves stars by more than so many typical errors.
+SHOWN = 1.0
+#: What exposures have in common beyond their degree is kept if it makes twice the logarithm of the likelihood larger by
+#: so much.
+KEPT = 4.0
+#: Fewer exposures tell nothing of how these scatter; sizes are found from no more coefficients than so many.
+FEWEST, MOST = 3, 800
+#: Sizes are sought within these factors of the typical error of a coefficient.
+RANGE = 1e-2, 1e6
+_DAMPING = 1e-10, 1e6  # of the diagonal: at first, and where a step is given up
+_ROUNDING = 1e-9  # of J
+_NOTHING = 1e3  # what is known, in sizes
+_HELD = 1e-2  # what counts as exact, in errors of a coefficient
+
+
+@dataclass(frozen=True, eq=False)
+class MostProbable:
+    """The minimum of J.
+
+    Attributes
+    ----------
+    state : State
+    statics : ndarray, shape (n_statics,)
+        S - m in the directions that are not exact, of one detector after the other.
+    posterior : Posterior
+        Of the coefficients and statics there.
+    oddness : ndarray, shape (n_exposures,)
+        Factors s_i >= 1 on the scatter of single exposures.
+    blocks : Blocks
+        Of the data alone.
+    known : _Known
+    n_steps : int
+    converged : bool
+    """
+
+    state: State
+    statics: np.ndarray
+    posterior: Posterior
+    oddness: np.ndarray
+    blocks: object
+    known: "_Known"
+    n_steps: int
+    converged: bool
+
+    def posed(self, problem):
+        """A problem with what was found of its coefficients: the scatter of exposures, and about what they scatter."""
+        known, n, sizes = self.known, problem.n_modes, self.posterior.sizes
+        mean = _padded(known.problem.prior_mean, self.state)
+        mean[:, :, known.higher[0]] = self.state.coefficients[:, :, known.higher[0]]
+        static = np.append(self.statics, 0.0)[known.place[known.group]]
+        centre = np.einsum("ik,ika->ia", static, known.others).reshape(-1, 2, n)
+        by_degree = sizes[np.maximum(np.add(*basis.orders(problem.degree)), 1) - 1]
+        widths = np.broadcast_to(self.oddness[:, None, None] * by_degree, centre.shape)
+        if problem.prior_sigma is not None:
+            given = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
+            widths = np.where(given[:, None, None], problem.prior_sigma, widths)
+        return replace(problem, prior_mean=mean, prior_sigma=widths, centre=centre)
+
+    def covariances(self):
+        """Of the unknowns of all exposures, (n, n); and as if nothing told the size of a static distortion."""
+        n, whole = len(self.posterior.data.pull), self.posterior
+        if self.known.static_size is None:
+            return (whole.covariance[:n, :n],) * 2
+        wide = np.where(
+            np.arange(len(whole.sizes)) == self.known.static_size, _NOTHING * whole.sizes.max(), whole.sizes
+        )
+        return whole.covariance[:n, :n], replace(whole, sizes=wide).covariance[:n, :n]
+
+    @property
+    def dof(self):
+        """Degrees of freedom: of the data, less the unknowns that these determine beyond what is known of them."""
+        data, n = self.posterior.data, len(self.posterior.data.pull)
+        return data.n_data - float((self.posterior.covariance[:n, :n] * data.curvature).sum())
+
+
+def counts(problem, state):
+    """Whether a bend of the plane by as much as exposures depart from their prior would show in their residuals.
+
+    To first order it does not. In second order it does, by its product with the gradients of the distortions: then a
+    plane that a convention holds elsewhere keeps the data from their minimum.
+    """
+    if problem.unknowns.shared or problem.terms.n or problem.fixed is not None:
+        return False
+    if problem.degree < 2 or problem.n_exposures < FEWEST or not reduced_system.is_small(problem):
+        return False
+    known = _Known.of(problem, problem.degree)
+    departures = known.values(state, np.zeros(known.n_statics))
+    square = np.sum(departures**2) / problem.n_exposures / 4  # b_m has mean square 1/4
+    gradient = 2 * problem.degree / problem.size.mean()
+    return bool(square * gradient > SHOWN / np.sqrt(np.median(problem.weight[0][problem.weight[0] > 0])))
+
+
+def most_probable(problem, state, *, loss="linear", sizes=None, max_steps=MAX_STEPS):
+    """The minimum of J from a start.
+
+    Parameters
+    ----------
+    problem : Problem
+        Without terms of the stars, and with exposures that share nothing.
+    state : State
+    loss : {"linear", "huber", "cauchy"}
+        Of single observations, as for `legdistort.solving.minimisers.solve_joint`.
+    sizes : ndarray, shape (n_sizes,), optional
+        Held; found if not given, from exposures drawn at random where these are many.
+    max_steps : int
+
+    Returns
+    -------
+    MostProbable
+
+    Raises
+    ------
+    SolveError
+        If data and what is known do not determine the unknowns.
+    """
+    keep = drawn(np.broadcast_to(problem.group, problem.n_exposures), MOST // (2 * problem.n_modes))
+    if sizes is None and len(keep) < problem.n_exposures:
+        sizes = most_probable(*part_of(problem, state, keep), loss=loss, max_steps=max_steps).posterior.sizes
+    has_closure = sizes is not None and len(sizes) > _Known.of(problem, problem.degree).n_sizes
+    search = _Search(problem, state, loss, sizes, 2 * problem.degree - 1 if has_closure else problem.degree)
+    search.descend(max_steps)
+    if sizes is None:
+        closed = _Search(problem, search.state, loss, None, 2 * problem.degree - 1, near=search)
+        if closed.gain > KEPT:
+            closed.descend(max_steps)
+            search = closed
+    return search.found()
+
+
+class _Search:
+    """Where a search is, and what it knows there.
+
+    Parameters
+    ----------
+    problem : Problem
+    state : State
+    loss : str
+    sizes : ndarray, optional
+        Held.
+    top : int
+        Degree up to which the static distortion is unknown, beyond that of the problem in all exposures alike.
+    near : _Search, optional
+        Where one of the degree of the problem has ended: where this one begins.
+    """
+
+    def __init__(self, problem, state, loss, sizes, top, near=None):
+        self.known, n = _Known.of(problem, top), max(problem.prior_mean.shape[2], basis.n_modes(top))
+        mean = np.pad(problem.prior_mean, ((0, 0), (0, 0), (0, n - problem.prior_mean.shape[2])))
+        coefficients = np.pad(state.coefficients, ((0, 0), (0, 0), (0, n - state.coefficients.shape[2])))
+        plain = replace(problem, prior_sigma=None, static_sigma=None)
+        self.stated = self.problem = replace(plain, degree=top, own_degree=problem.degree, prior_mean=mean)
+        self.loss = loss
+        self.sizes, self.holds_sizes, self.settled = sizes, sizes is not None, False
+        self.n_steps, self.size, self.damping = 0, np.inf, _DAMPING[0]
+        if near is None:
+            state = constraints.absorb_similarities(plain, state)
+            blocks = criterion.linearise(plain, state)
+            unit = 1 / np.sqrt(np.median(np.einsum("iaa->ia", blocks.u)))
+            self.pointing = constraints.pose_rows(plain, state, blocks), _HELD * unit
+            self.statics, self.oddness = np.zeros(self.known.n_statics), np.ones(problem.n_exposures)
+            coefficients = np.pad(state.coefficients, ((0, 0), (0, 0), (0, n - state.coefficients.shape[2])))
+        else:
+            self.pointing, self.statics, self.oddness = near.pointing, near.statics, near.oddness
+            self.sizes = np.append(near.sizes, near.unit)
+        self._arrive(replace(state, coefficients=coefficients), self.statics)
+        self.factor = self.known.factor(*self.pointing)
+        self.weigh()
+        if near is not None:
+            without = Posterior(self.posterior.data, self.posterior.factor, np.append(near.sizes, self.unit * RANGE[0]))
+            self.gain = without.cost - self.posterior.cost
+
+    def _arrive(self, state, statics, blocks=None):
+        self.state, self.statics = state, statics
+        self.blocks = criterion.linearise(self.problem, state) if blocks is None else blocks
+        if self.loss != "linear":
+            squares = criterion.squares(self.stated, self.blocks.residual)
+            self.problem = self.stated.scaled(loss_factors(squares, self.loss))
+            self.blocks = criterion.linearise(self.problem, state)
+
+    def descend(self, max_steps):
+        """Step until nothing changes any more."""
+        while self.n_steps < max_steps and not (self.size < TOLERANCE[self.loss] and self.settled):
+            self.step()
+            self.n_steps += 1
+            log.debug("J = %.8g, step %.2g standard errors, sizes %s", self.cost, self.size, self.sizes)
+
+    def found(self):
+        """Where it has ended."""
+        return MostProbable(
+            state=self.state,
+            statics=self.statics,
+            posterior=self.posterior,
+            oddness=self.oddness,
+            blocks=self.blocks,
+            known=self.known,
+            n_steps=self.n_steps,
+            converged=self.size < TOLERANCE[self.loss],
+        )
+
+    def weigh(self):
+        """The posterior where the search is, and the sizes and oddness that follow from it."""
+        problem, blocks, before = self.problem, self.blocks, self.sizes
+        self.inverse = elimination.inverse_star_blocks(blocks.v)
+        moved = elimination.symmetric_times(self.inverse, blocks.g_star)
+        data = ReducedData(
+            curvature=elimination.reduced_matrix(problem, blocks),
+            pull=blocks.unknowns.gather(blocks.g_exposure - elimination.to_exposures(problem, blocks, moved)),
+            chi2=float(blocks.cost - (moved * blocks.g_star).sum()),
+            n_data=2 * np.count_nonzero(problem.weight[0]) - elimination.star_freedom(problem, blocks),
+        )
+        factor = self.known.at(self.factor, self.state, self.statics, self.oddness)
+        self.unit = 1 / np.sqrt(np.median(np.diag(data.curvature)))
+        if self.holds_sizes:
+            self.posterior = Posterior(data, factor, self.sizes)
+        else:
+            start = np.full(self.known.n_sizes, 100 * self.unit) if before is None else before
+            self.posterior = most_likely(data, factor, start, self.unit * np.array(RANGE))
+            self.sizes = self.posterior.sizes
+        odd = self.known.oddness(self.posterior)
+        if before is not None:
+            changes = np.abs(np.log(np.concatenate([self.sizes / before, odd / self.oddness])))
+            self.settled = bool(np.all(changes < SETTLED))
+        self.oddness = odd
+
+    @property
+    def cost(self):
+        """J here."""
+        return self.blocks.cost + self.known.penalty(self.posterior, self.state, self.statics)
+
+    def step(self):
+        """Take a step that makes J smaller, and weigh anew; its size in standard errors, rms over the coefficients."""
+        before = self.cost
+        while True:
+            z = self.posterior.damped(self.damping)
+            self.size = np.sqrt(max(float(z @ self.posterior.slope), 0) / len(z))
+            arrived = self._after(z)
+            after = arrived[2].cost + self.known.penalty(self.posterior, *arrived[:2])
+            if after <= before + _ROUNDING * abs(before) or self.size < TOLERANCE[self.loss]:
+                break
+            self.damping *= 100
+            if self.damping > _DAMPING[1]:
+                raise SolveError("no step, however short, makes the criterion smaller")
+        self.damping = max(self.damping / 30, _DAMPING[0])
+        self._arrive(*arrived)
+        self.weigh()
+
+    def _after(self, z):
+        """State, statics and blocks after a step."""
+        n, n_modes = self.problem.unknowns.size, self.problem.n_modes
+        pulled = elimination.to_stars(self.problem, self.blocks, self.blocks.unknowns.spread(z[:n]))
+        moved = elimination.symmetric_times(self.inverse, self.blocks.g_star - pulled)
+        coefficients = self.state.coefficients.copy()  # poses, which follow, carry the rest along
+        coefficients[:, :, :n_modes] += self.problem.unknowns.spread(z[:n]).reshape(len(coefficients), 2, -1)
+        state = State(self.state.stars + moved, coefficients, self.state.poses)
+        with np.errstate(all="ignore"):  # a step may be far too long
+            state = constraints.absorb_similarities(self.problem, state)
+            return state, self.statics + z[n:], criterion.linearise(self.problem, state)
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What is known of the coefficients of exposures: how far they scatter, and about which static distortion.
+
+    Attributes
+    ----------
+    problem : Problem
+    top : int
+        Degree of the static distortion.
+    others : ndarray, shape (n_exposures, K, 2 n_modes)
+    group : ndarray of int, shape (n_exposures,)
+    width : ndarray, shape (n_exposures, K)
+        Given scatter; NaN where it is found.
+    place : ndarray of int, shape (n_groups, K)
+        Which of the unknown statics each is; -1 where it is exact.
+    static_width : ndarray, shape (n_statics,)
+        Given; infinite where its size is found.
+    degrees : ndarray of int, shape (K,)
+    """
+
+    problem: object
+    top: int
+    others: np.ndarray
+    group: np.ndarray
+    width: np.ndarray
+    place: np.ndarray
+    static_width: np.ndarray
+    degrees: np.ndarray
+
+    @classmethod
+    def of(cls, problem, top):
+        """That of a problem."""
+        others = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])
+        _, variance, group, _ = stated(problem)
+        width = np.full(others.shape[:2], np.nan)
+        for i in range(problem.n_exposures):
+            if problem.has_widths(i):
+                width[i] = np.sqrt(row_variances(others[i], problem.prior_sigma[i].ravel()))
+        place = np.where(variance > 0, np.cumsum(variance > 0).reshape(variance.shape) - 1, -1)
+        found = np.sqrt(variance[variance > 0])
+        return cls(problem, top, others, group, width, place, found, dynamic_degrees(problem.n_modes))
+
+    @property
+    def n_statics(self):
+        """Number of directions of statics that are not exact."""
+        return len(self.static_width)
+
+    @cached_property
+    def higher(self):
+        """Modes beyond the degree of the problem, and an exposure of every detector."""
+        detector = np.broadcast_to(self.problem.group, self.problem.n_exposures)
+        return slice(self.problem.n_modes, basis.n_modes(self.top)), np.unique(detector, return_index=True)[1]
+
+    @property
+    def n_higher(self):
+        """Number of unknowns beyond that degree."""
+        modes, detectors = self.higher
+        return 2 * (modes.stop - modes.start) * len(detectors)
+
+    @property
+    def static_size(self):
+        """Number of the size of statics of which nothing is known; None without them."""
+        return int(self.degrees.max()) if np.isinf(self.static_width).any() else None
+
+    @property
+    def n_sizes(self):
+        """Number of sizes that are found: by degree, that of a static distortion, and of what is beyond the degree."""
+        return int(self.degrees.max()) + (self.static_size is not None) + (self.n_higher > 0)
+
+    def values(self, state, statics):
+        """Departures A_i - S at a state, what is beyond their degree, and S: one vector."""
+        departure = (state.coefficients - _padded(self.problem.prior_mean, state))[:, :, : basis.n_modes(self.top)]
+        modes, detectors = self.higher
+        own = departure[:, :, : modes.start].reshape(len(departure), -1)
+        own = np.einsum("ika,ia->ik", self.others, own) - np.append(statics, 0.0)[self.place[self.group]]
+        return np.concatenate([own.ravel(), departure[detectors, :, modes].ravel(), statics])
+
+    def factor(self, pointing, width):
+        """All that is known, as one factor on the unknowns and then the statics; its values are those of `at`.
+
+        `pointing` (4, n_exposures, 2 n_modes) are rows on the coefficients that are held, as good as exactly, by a
+        width: the data say nothing of them.
+        """
+        n, k, m = self.others.shape
+        similar = np.stack([similarity_basis(shape, m // 2) for shape in self.problem.shapes])
+        own = sparse.kron(sparse.eye_array(n), sparse.eye_array(k, m, k=m - k))
+        place = self.place[self.group].ravel()
+        on = np.flatnonzero(place >= 0)
+        static = sparse.csr_array((-np.ones(len(on)), (on, place[on])), (n * k, self.n_statics))
+        held = np.zeros((len(pointing), n, m))
+        held[:, :, : m - k] = np.einsum("cia,isa->cis", pointing, similar)
+        parts = [
+            [own, None, static],
+            [None, sparse.eye_array(self.n_higher), None],
+            [None, None, sparse.eye_array(self.n_statics)],
+            [held.reshape(len(held), -1), None, None],
+        ]
+        counts = [n * k, self.n_higher, self.n_statics, len(held)]
+        found = np.concatenate(
+            [np.isnan(self.width).ravel(), np.ones(self.n_higher, bool), np.isinf(self.static_width)]
+        )
+        found = np.append(found, np.zeros(len(held), bool))
+        size = [np.tile(self.degrees - 1, n)]
+        size += [np.full(c, k) for c, k in zip(counts[1:], (self.n_sizes - 1, self.degrees.max(), 0), strict=True)]
+        width = [self.width.ravel(), np.ones(self.n_higher), self.static_width, np.full(len(held), width)]
+        size = np.where(found, np.concatenate(size), GIVEN)
+        rows = sparse.block_array(parts, format="csr")
+        return Factor("departures, statics and pointing", rows, np.zeros(len(size)), np.concatenate(width), size)
+
+    def at(self, factor, state, statics, oddness):
+        """The factor where the coefficients and statics are."""
+        value, stretch = self.values(state, statics), np.repeat(oddness, self.width.shape[1])
+        pad = len(factor.value) - np.array([len(value), len(stretch)])
+        return replace(
+            factor, value=np.pad(value, (0, pad[0])), stretch=np.pad(stretch, (0, pad[1]), constant_values=1)
+        )
+
+    def penalty(self, posterior, state, statics):
+        """What is known as part of J, at the sizes of a posterior."""
+        value = self.values(state, statics)
+        return float(((value / posterior.widths[: len(value)]) ** 2).sum())
+
+    def oddness(self, posterior):
+        """Factors s_i on the scatter, as for Student's t distribution, (n_exposures,)."""
+        n, k, _ = self.others.shape
+        value, variance = (each[: n * k].reshape(n, k) for each in posterior.left)
+        width = (posterior.widths / posterior.factor.stretch)[: n * k].reshape(n, k)
+        finite = np.isfinite(width)
+        square = np.where(finite, (value**2 + variance) / width**2, 0).sum(axis=1)
+        count = finite.sum(axis=1)
+        return np.sqrt(np.maximum(1, (TAILS + square) / (TAILS + count + CHANCE * np.sqrt(2 * count))))
+
+
+def _padded(mean, state):
+    return np.pad(mean, ((0, 0), (0, 0), (0, state.coefficients.shape[2] - mean.shape[2])))
