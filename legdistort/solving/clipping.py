@@ -10,7 +10,7 @@ import numpy as np
 from ..exceptions import ConvergenceWarning, SolveError
 from ..geometry import basis
 from . import agreement, minimisers, start_values
-from .equations import criterion
+from .equations import criterion, losses
 from .equations.leverage import leverages
 from .equations.problem import State
 
@@ -20,6 +20,8 @@ BY_CHANCE = 0.01
 USUAL = 0.1
 #: A usual deviation of this many stated errors may be the work of gross errors, whatever the largest one is.
 SUSPECT = 2.0
+#: So many may be the work of distortions that the fit does not follow.
+MISFIT = 1.3
 #: Share of the observations that are taken to be without gross errors where the errors are far above the stated ones.
 MOST = 0.8
 #: Least part of an observation that counts as not taken up by its own fit.
@@ -58,6 +60,11 @@ def _usual(problem):
     return 2 * np.log(2) * max(1 - n_free / (2 * problem.xy.shape[1]), LEAST_FREE)
 
 
+def is_misfit(problem, result):
+    """Whether the usual residual of a fit is too large for gross errors of some observations to be the only cause."""
+    return np.median(criterion.squares(problem, result.blocks.residual)) > MISFIT**2 * _usual(problem)
+
+
 def start_from(problem, result):
     """Start values from a plain fit that follows most observations of every exposure, its stars moved to robust means.
 
@@ -78,14 +85,14 @@ def start_from(problem, result):
         return None
     state, residual = result.state, result.blocks.residual
     squares = criterion.squares(problem, residual)
-    followed, scale2 = squares <= SUSPECT**2 * _usual(problem), minimisers.observed_variance(squares)
+    followed, scale2 = squares <= SUSPECT**2 * _usual(problem), losses.observed_variance(squares)
     if np.any(2 * np.add.reduceat(followed.astype(int), problem.start[:-1]) <= np.diff(problem.start)):
         return None
     weight, positions = problem.weight[:2].mean(axis=0), state.positions
     q = start_values.posed(problem, state.poses, positions[:, problem.star]) + residual
     for _ in range(_SWEEPS):
         squares = weight * start_values.distances(problem, state.poses, q, positions)
-        factors = minimisers.loss_factors(squares, "cauchy", scale2)
+        factors = losses.loss_factors(squares, "cauchy", scale2)
         positions = start_values.mean_positions(problem, state.poses, q, weight * factors)
     return State(np.where(result.blocks.v[0] > 0, positions, state.positions), state.coefficients, state.poses)
 

@@ -19,6 +19,7 @@ from ..runtime.checks import check_choice
 from ..runtime.progress import Bar
 from ..runtime.words import LOSSES
 from .equations import criterion, elimination, reduced_system
+from .equations.losses import loss_factors
 from .equations.problem import State
 from .equations.reduced_base import Reduced
 from .gauge import constraints
@@ -47,7 +48,6 @@ _SMALLER = 0.5
 _ENOUGH = 0.2
 #: Up to so many observations one more pass over them at the start costs less than it saves.
 _BEGIN_UP_TO = 100_000
-_TUNING = {"huber": 2.0, "cauchy": 2.385}  # radii in standard errors
 #: Counts the iterations of all fits that a solution takes.
 _count = ContextVar("count", default=lambda: None)
 
@@ -95,23 +95,6 @@ def iterations_shown(progress):
             yield
         finally:
             _count.reset(before)
-
-
-def loss_factors(squares, loss, scale2=None):
-    """Weight factors of iteratively reweighted least squares for the squared normalised residuals (n,).
-
-    The loss works at the observed scale if that is larger than the stated errors (`observed_variance`), or at the given
-    one.
-    """
-    scale2 = observed_variance(squares) if scale2 is None else scale2
-    s = squares / (scale2 * _TUNING[loss] ** 2)
-    return 1 / np.maximum(1, np.sqrt(s)) if loss == "huber" else 1 / (1 + s)
-
-
-def observed_variance(squares):
-    """Variance over that of the stated errors, at least 1: the median of the squares over that of two axes, 2 ln 2."""
-    seen = squares[squares > 0]
-    return max(1.0, np.median(seen) / (2 * np.log(2))) if len(seen) else 1.0
 
 
 def solve_joint(

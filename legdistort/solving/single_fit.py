@@ -12,12 +12,12 @@ from scipy.optimize import brentq
 from ..exceptions import ConvergenceWarning, LegdistortError, SolveError, warn
 from ..matching.matches import Matches
 from ..runtime import parallel
-from . import agreement, clipping, minimisers, most_probable, star_motions, start_values
+from . import agreement, clipping, minimisers, star_motions, start_values
 from .choices import prior_widths
 from .equations import criterion, effective_modes, elimination
 from .equations.covariances import Uncertainty
 from .equations.problem import Problem, State, build_problem, uses_compiled_loops
-from .gauge import known_maps
+from .gauge import known_maps, most_probable
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +28,9 @@ _EQUAL, _REFITS = 0.005, 4
 #: Accuracy of fits on trial, in standard errors, rms over their unknowns; squares of residuals over those of the errors
 #: below which one leaves nothing that the reference plane could be estimated from.
 TRIAL, EXPLAINED = 0.03, 2.0
+#: Typical errors by which a bend of the plane moves stars in second order where it counts, and so where chance does not
+#: explain the residuals.
+SHOWN, SHOWN_BY_MISFIT = 1.0, 0.25
 
 
 def threads(matches):
@@ -207,20 +210,16 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         return minimise(matches.without(astray), options, judged=judged)
     as_near = trial and near_by and (near.options.degree, near.options.clip) == (options.degree, None)
     plain = near.result if as_near else _plain(problem, start, common)
-    given, near = problem, start
-    if plain is not None and not clipping.is_explained(problem, plain, clip=options.clip):
-        problem, plain, near = _unbent(problem, start, plain, common, loss="cauchy")
-    if plain is not None and clipping.is_explained(problem, plain, clip=options.clip):
-        problem, plain, _ = _unbent(given, near, plain, common, or_else=problem)
+    given = problem
+    problem, plain, near, explained = _first(given, start, plain, common, options.clip)
+    if explained:
         return Fit(matches, problem, plain, everything, options)
-    hold = problem is not given
-    if not hold and (near := clipping.start_from(problem, plain)) is None:
+    if near is None:
         near, typical = start_values.start(problem, nominal, robust=True)
         if lost := _misplaced(problem, typical):
             return minimise(matches.without(lost), options, judged=judged)
-    result, used, unfollowed = clipping.solve_clipped(
-        problem, near, clip=options.clip, plain=plain, hold=hold, **common
-    )
+    how = {"clip": options.clip, "hold": problem is not given}
+    result, used, unfollowed = clipping.solve_clipped(problem, near, plain=plain, **how, **common)
     if unfollowed and not judged and plain is not None:
         return Fit(matches, problem, plain, everything, options, unfollowed=unfollowed)
     if unfollowed:
@@ -229,8 +228,8 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         return minimise(matches.without(lost), options, judged=judged)
     if result is not plain:
         kept = given.scaled(used)
-        whole, result, _ = _unbent(kept, result.state, result, common, or_else=problem)
-        problem = replace(whole, weight=given.weight)
+        problem, result, _ = _unbent(kept, near, result, common, or_else=problem, clip=options.clip)
+        problem = replace(problem, weight=given.weight)
     fit = Fit(matches, problem, result, used, options)
     if plain is not None and plain.converged and not used.all() and fit.dof < 1:  # nothing tells what is wrong then
         return Fit(matches, problem, plain, everything, options)
@@ -257,29 +256,64 @@ def _plain(problem, start, common):
             return None
 
 
-def _unbent(problem, start, result, common, *, loss="linear", or_else=None):
+def _first(given, start, plain, common, clip):
+    """The problem, the fit to all observations, where a robust one may begin, and whether chance explains the fit.
+
+    The fit and the beginning are None where there is none.
+    """
+    problem, near = given, None
+    if plain is not None and not clipping.is_explained(problem, plain, clip=clip):
+        near = clipping.start_from(problem, plain)
+        if near is None or clipping.is_misfit(problem, plain):
+            problem, plain, found = _unbent(given, start, plain, common, loss="cauchy")
+            near = near if problem is given else found
+    if plain is None or not clipping.is_explained(problem, plain, clip=clip):
+        return problem, plain, near, False
+    problem, plain, _ = _unbent(given, start, plain, common, or_else=problem, clip=clip)
+    return problem, plain, near, True
+
+
+def _unbent(problem, start, result, common, *, loss="linear", or_else=None, clip=None):
     """Problem, fit and start of another with the plane where all that is known is most probable.
 
     Where distortions are large, a plane that a convention holds keeps the data from their minimum. The problem has what
     was found of the scatter of exposures and of what they have in common. If this is no better, or does not count, the
-    result is the one given, with the problem that it solves (`or_else`).
+    result is the one given, with the problem that it solves (`or_else`). With a robust loss it is a beginning, and the
+    fit may be None.
     """
     before = problem if or_else is None else or_else
-    if common["gauge"] == "mean" or not most_probable.counts(problem, result.state):
-        if before.centre is not None:  # distortions seemed large by what is not used any more
-            result = minimisers.solve_joint(problem, _padded(result.state, problem), **common)
-        return problem, result, start
+    begun = before.centre is not None
+    if begun and not most_probable.counts(problem, result.state, SHOWN):  # of what is used now alone
+        again = minimisers.solve_joint(problem, _padded(result.state, problem), **common)
+        if clipping.is_explained(problem, again, clip=clip):
+            return problem, again, start
+    shown = SHOWN if loss == "linear" and not begun else SHOWN_BY_MISFIT
+    if common["gauge"] == "mean" or not most_probable.counts(problem, result.state, shown):
+        return before, result, start
     with warnings.catch_warnings(action="ignore", category=ConvergenceWarning), contextlib.suppress(SolveError):
         # the fit with its plane elsewhere is nearer, unless gross errors moved it
         near = _padded(result.state if result.converged and loss == "linear" else start, problem)
         found = most_probable.most_probable(problem.scaled(result.robust), near, loss=loss)
-        whole = found.posed(problem)
-        held = minimisers.solve_joint(whole, found.state, hold=True, **common)
-        if held.converged and held.blocks.cost < criterion.linearise(whole, _padded(result.state, whole)).cost:
+        whole, held = found.posed(problem), None
+        with contextlib.suppress(*[SolveError] * (loss != "linear")):  # gross errors may spoil it
+            held = minimisers.solve_joint(whole, found.state, hold=True, **common)
+        if loss != "linear":
+            better = _typical(problem, found.blocks) < _typical(problem, result.blocks)
+        else:
+            was = criterion.linearise(whole, _padded(result.state, whole))
+            better = held.converged and held.blocks.cost < was.cost
+        if better and held is not None:
             positions = held.state.positions.T[held.blocks.v[0] > 0]
             gauge = known_maps.as_in_posterior(held.gauge, found.blocks.unknowns, positions, *found.covariances())
-            return whole, replace(held, gauge=gauge), found.state
+            held = replace(held, gauge=gauge)
+        if better:
+            return whole, held, found.state
     return before, result, start
+
+
+def _typical(problem, blocks):
+    """Median of the squared residuals in standard errors."""
+    return np.median(criterion.squares(problem, blocks.residual))
 
 
 def _padded(state, problem):

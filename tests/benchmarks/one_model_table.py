@@ -2,10 +2,10 @@
 
 ``python tests/benchmarks/one_model_table.py`` makes all rows, ``--only`` some, ``--sets`` so many sets each. Sets are
 those of `dense_model.drawn_set`: every normalised Legendre coefficient of the static distortion, and of an exposure's
-departure from it, is drawn from N(0, so many pixels), similarities aside; eleven exposures of 2048 pixels, some 65 stars
-each, dithers N(0, 150 px), degree 3, errors log-uniform between 0.005 and 0.08 px by star. The bound is the rms of the
-Cramer-Rao errors of the full model, in dense numpy, after the common cubic maps are projected off with the weights of
-the observations.
+departure from it, is drawn from N(0, so many pixels), similarities aside; eleven exposures of 2048 pixels, some 65
+stars each, dithers N(0, 150 px), degree 3, errors log-uniform between 0.005 and 0.08 px by star. The bound is the rms
+of the Cramer-Rao errors of the full model, in dense numpy, after the common cubic maps are projected off with the
+weights of the observations; it knows nothing of scatter or statics, and estimates that do may be better.
 
 Columns: chi2 over its degrees of freedom; relative errors (a common cubic map, weighted, taken off) over the bound, rms
 over all sets; the sum of their squares over that of the stated variances; rms of absolute errors (a similarity taken

@@ -22,9 +22,11 @@ def as_in_posterior(gauge, unknowns, positions, covariance, wide):
     unknowns : Unknowns
     positions : ndarray, shape (n, 2)
         Of stars with observations.
-    covariance, wide : ndarray, shape (size, size)
-        Of the unknowns; and as if nothing were known of static distortions but what priors state. A direction is
-        unknown if the latter has it beyond `LIMIT` pixels.
+    covariance : ndarray, shape (size, size)
+        Of the unknowns.
+    wide : ndarray, shape (size, size), or None
+        The same as if nothing told the size of a static distortion of which nothing is stated. A direction is unknown
+        if it has an error beyond `LIMIT` pixels there. None: all statics are stated.
     """
     size, n = 2 * gauge.box[1, ::-1], gauge.n_modes
     pointed, metric = plane_metric(gauge, positions)
@@ -33,12 +35,12 @@ def as_in_posterior(gauge, unknowns, positions, covariance, wide):
     rows = gauge.orthonormal.T.reshape(len(gauge.motion), 2, n, -1)
     rows = np.pad(rows, ((0, 0), (0, 0), (0, unknowns.n_modes - n), (0, 0)))
     rows = unknowns.gather(rows.reshape(len(rows), 2 * unknowns.n_modes, -1)).T
-    of_rows, wide = rows @ covariance @ rows.T, rows @ wide @ rows.T
+    of_rows, widest = (rows @ each @ rows.T for each in (covariance, covariance if wide is None else wide))
     back = np.linalg.inv(gauge.reach @ np.hstack([maps, similar]))[: maps.shape[1]]
     inside = maps.T @ metric @ maps
     inside += _RIDGE * np.trace(inside) / len(inside) * np.eye(len(inside))
-    curvature, vectors = eigh(np.linalg.inv(back @ wide @ back.T), inside)
-    is_unknown = curvature * LIMIT**2 < 1
+    curvature, vectors = eigh(np.linalg.inv(back @ widest @ back.T), inside)
+    is_unknown = (wide is not None) & (curvature * LIMIT**2 < 1)
     known, unknown = maps @ vectors[:, ~is_unknown], maps @ vectors[:, is_unknown]
     back = np.linalg.inv(gauge.reach @ np.hstack([known, unknown, similar]))[: known.shape[1]]
     back = pointed @ known @ back

@@ -15,17 +15,17 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from ..exceptions import SolveError
-from ..geometry import basis
-from ..geometry.detector_modes import dynamic_basis, dynamic_degrees, row_variances, similarity_basis
-from .equations import criterion, elimination, reduced_system
-from .equations.problem import State
-from .gauge import constraints
-from .knowledge.exposures import stated
-from .knowledge.factors import GIVEN, Factor
-from .knowledge.posterior import Posterior, most_likely
-from .knowledge.reduced_data import ReducedData, drawn, part_of
-from .minimisers import loss_factors
+from ...exceptions import SolveError
+from ...geometry import basis
+from ...geometry.detector_modes import dynamic_basis, dynamic_degrees, row_variances, similarity_basis
+from ..equations import criterion, elimination, reduced_system
+from ..equations.losses import loss_factors
+from ..equations.problem import State
+from ..knowledge.exposures import stated
+from ..knowledge.factors import GIVEN, Factor
+from ..knowledge.posterior import Posterior, most_likely
+from ..knowledge.reduced_data import ReducedData, drawn, part_of
+from . import constraints
 
 log = logging.getLogger(__name__)
 
@@ -36,11 +36,11 @@ CHANCE = 3.0
 #: Steps at most; converged below such parts of every size, and so many standard errors, rms over the unknowns.
 MAX_STEPS, SETTLED = 60, 0.02
 TOLERANCE = {"linear": 0.01, "huber": 0.1, "cauchy": 0.1}
-#: A bend of the plane shows in residuals if in second order it moves stars by more than so many typical errors.
-SHOWN = 1.0
 #: What exposures have in common beyond their degree is kept if it makes twice the logarithm of the likelihood larger by
 #: so much.
 KEPT = 4.0
+#: Degrees of freedom below which residuals tell nothing of the plane.
+LEFT = 20
 #: Fewer exposures tell nothing of how these scatter; sizes are found from no more coefficients than so many.
 FEWEST, MOST = 3, 800
 #: Sizes are sought within these factors of the typical error of a coefficient.
@@ -95,14 +95,15 @@ class MostProbable:
         return replace(problem, prior_mean=mean, prior_sigma=widths, centre=centre)
 
     def covariances(self):
-        """Of the unknowns of all exposures, (n, n); and as if nothing told the size of a static distortion."""
-        n, whole = len(self.posterior.data.pull), self.posterior
-        if self.known.static_size is None:
-            return (whole.covariance[:n, :n],) * 2
-        wide = np.where(
-            np.arange(len(whole.sizes)) == self.known.static_size, _NOTHING * whole.sizes.max(), whole.sizes
-        )
-        return whole.covariance[:n, :n], replace(whole, sizes=wide).covariance[:n, :n]
+        """Of the unknowns of all exposures, (n, n); and as if nothing told the size of a static distortion.
+
+        The latter is None where something is stated of all of them.
+        """
+        n, whole, k = len(self.posterior.data.pull), self.posterior, self.known.static_size
+        if k is None:
+            return whole.covariance[:n, :n], None
+        sizes = np.where(np.arange(len(whole.sizes)) == k, _NOTHING * whole.sizes.max(), whole.sizes)
+        return whole.covariance[:n, :n], replace(whole, sizes=sizes).covariance[:n, :n]
 
     @property
     def dof(self):
@@ -111,21 +112,25 @@ class MostProbable:
         return data.n_data - float((self.posterior.covariance[:n, :n] * data.curvature).sum())
 
 
-def counts(problem, state):
+def counts(problem, state, shown=1.0):
     """Whether a bend of the plane by as much as exposures depart from their prior would show in their residuals.
 
     To first order it does not. In second order it does, by its product with the gradients of the distortions: then a
-    plane that a convention holds elsewhere keeps the data from their minimum.
+    plane that a convention holds elsewhere keeps the data from their minimum. It would move stars by more than `shown`
+    typical errors.
     """
     if problem.unknowns.shared or problem.terms.n or problem.fixed is not None:
         return False
     if problem.degree < 2 or problem.n_exposures < FEWEST or not reduced_system.is_small(problem):
         return False
+    n_free = problem.n_star * problem.n_stars + problem.unknowns.size - 2 * problem.n_modes
+    if 2 * np.count_nonzero(problem.weight[0]) - n_free < LEFT:
+        return False
     known = _Known.of(problem, problem.degree)
     departures = known.values(state, np.zeros(known.n_statics))
     square = np.sum(departures**2) / problem.n_exposures / 4  # b_m has mean square 1/4
     gradient = 2 * problem.degree / problem.size.mean()
-    return bool(square * gradient > SHOWN / np.sqrt(np.median(problem.weight[0][problem.weight[0] > 0])))
+    return bool(square * gradient > shown / np.sqrt(np.median(problem.weight[0][problem.weight[0] > 0])))
 
 
 def most_probable(problem, state, *, loss="linear", sizes=None, max_steps=MAX_STEPS):

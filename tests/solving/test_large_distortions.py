@@ -1,0 +1,152 @@
+"""Large, unequal and precise distortions: a fit ends where all is most probable, which a dense model finds by itself."""
+
+import warnings
+
+import dense_model
+import drawn_sets
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import legdistort as ld
+from legdistort.exceptions import LegdistortWarning, SolveError
+from legdistort.geometry import basis
+from legdistort.results import accuracy
+from legdistort.runtime import parallel
+from legdistort.solving import start_values
+from legdistort.solving.equations.problem import build_problem
+from legdistort.solving.gauge import most_probable
+
+
+def solved(data, prior=None, **options):
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        return ld.solve(drawn_sets.as_matches(data), degree=data["degree"], prior=prior, **options)
+
+
+def searched(data, prior=None, **options):
+    matches = drawn_sets.as_matches(data)
+    problem = build_problem(matches, data["degree"], prior=prior)
+    start, _ = start_values.start(problem, np.stack([matches.poses[name] for name in matches.names]))
+    with parallel.one_blas_thread():
+        return most_probable.most_probable(problem, start, **options)
+
+
+def off(xy, true, degree):
+    """Rms of positions (n, 2) off the true ones once a common map of a degree is taken off, pixels."""
+    values, offset = dense_model.basis(true, degree, 2048)[0], xy - true
+    return np.sqrt(np.mean((offset - values @ np.linalg.lstsq(values, offset, rcond=None)[0]) ** 2))
+
+
+def positions(solution):
+    """Positions in the order of the stars of a set."""
+    stars = solution.stars
+    out = np.empty((len(stars), 2))
+    out[np.asarray(stars["star"])] = np.column_stack([stars["x"].value, stars["y"].value])
+    return out
+
+
+@pytest.mark.parametrize(
+    ("words", "prior", "closure"),
+    [
+        ({"static": 1.0, "dynamic": 10.0}, True, False),
+        ({"static": 12.0, "dynamic": 3.0, "rolls": 30.0}, False, False),
+        ({"static": 1.5, "dynamic": 0.9, "rolls": 30.0, "higher": 0.02}, False, True),
+    ],
+)
+def test_minimum_sizes_and_errors_are_those_of_the_dense_model(words, prior, closure):
+    data, truth = dense_model.drawn_set(2, n_stars=60, n=6, **words)
+    known = {"mean": truth["static"], "v": 0} if prior else {}
+    dense = dense_model.Model(**data, closure=closure, **known).fit()
+    found = searched(data, ld.Prior(truth["static"]) if prior else None)
+    assert found.converged
+    sizes = np.delete(dense.sizes, [*([3] if prior else []), *([] if closure else [4])])
+    assert_allclose(found.posterior.sizes, sizes, rtol=0.03)
+    assert found.blocks.chi2 == pytest.approx(dense.chi2, rel=1e-3)
+    assert found.dof == pytest.approx(dense.dof, abs=0.5)
+    error = np.sqrt(np.diag(dense.covariance)[: 2 * dense.M].reshape(-1, 2))
+    # a similarity of the plane is a convention, and shears of it are hardly known
+    assert off(found.state.positions.T, dense.X, 1) < 0.02 * np.median(error)
+
+
+ROWS = {
+    "departures of 10 px, exact prior": ({"static": 1.0, "dynamic": 10.0}, True),
+    "static of 12 px": ({"static": 12.0, "dynamic": 3.0}, False),
+    "precise, rolls": ({"static": 1.5, "dynamic": 0.9, "rolls": 30.0, "errors": (0.001, 0.005)}, False),
+    "terms beyond the degree": ({"static": 1.5, "dynamic": 0.9, "rolls": 30.0, "higher": 0.02}, False),
+    "one exposure of 10 px": ({"static": 1.0, "odd": 10.0}, True),
+}
+
+
+@pytest.mark.parametrize("row", ROWS)
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
+def test_large_distortions_cost_no_chi2(row, seed):
+    """Where a convention holds the plane it is 80 and 270 times its degrees of freedom in the first two rows."""
+    words, prior = ROWS[row]
+    data, truth = dense_model.drawn_set(seed, **words)
+    solution = solved(data, ld.Prior(truth["static"]) if prior else None)
+    assert abs(solution.chi2 / solution.dof - 1) < 5 * np.sqrt(2 / solution.dof)
+    assert solution.residuals["used"].all()
+    stated = np.sqrt(np.mean([solution.stars[name].value ** 2 for name in ("x_err", "y_err")]))
+    assert off(positions(solution), truth["stars"], 3) < 1.5 * stated
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("row", "pull"), [("one exposure of 10 px", 0.35), ("terms beyond the degree", 0.35)])
+def test_absolute_errors_are_those_stated(row, pull):
+    """One odd exposure widens nobody's errors; what is common beyond the degree does not make them too small."""
+    words, prior = ROWS[row]
+    true = stated = 0.0
+    for seed in range(10):
+        data, truth = dense_model.drawn_set(seed, **words)
+        solution = solved(data, ld.Prior(truth["static"]) if prior else None)
+        assert np.isfinite(solution.stars["x_err_abs"]).all()
+        order = np.asarray(solution.stars["star"])
+        true += np.sum(accuracy.known_offsets(solution, truth["stars"][order]) ** 2)
+        stated += sum(np.sum(solution.stars[name].value ** 2) for name in ("x_err_known", "y_err_known"))
+    assert true / stated == pytest.approx(1, abs=pull)
+
+
+def test_what_exposures_have_in_common_beyond_the_degree_is_part_of_the_distortion():
+    words = ROWS["terms beyond the degree"][0]
+    data, _ = dense_model.drawn_set(3, **words)
+    solution = solved(data)
+    assert solution.degree == 3
+    assert solution.coefficients.shape[2] == basis.n_modes(5)
+    common = solution.coefficients[:, :, basis.n_modes(3) :]
+    assert np.ptp(common, axis=0).max() < 1e-9
+    assert np.sqrt(np.mean(common**2)) == pytest.approx(0.02, rel=0.4)
+    without = solved(dense_model.drawn_set(3, **words | {"higher": 0.0})[0])
+    assert without.coefficients.shape[2] == basis.n_modes(3)
+
+
+def test_gross_errors_are_found_beside_large_distortions():
+    data, truth = dense_model.drawn_set(0, static=1.0, dynamic=10.0)
+    rng = np.random.default_rng(0)
+    bad = rng.random(len(data["star"])) < 0.02
+    data["xy"] = data["xy"] + bad[:, None] * rng.choice([-3.0, 3.0], size=(len(bad), 2))
+    solution = solved(data, ld.Prior(truth["static"]))
+    used = np.asarray(solution.residuals["used"])
+    assert not used[bad].any()
+    assert np.count_nonzero(~used) <= np.count_nonzero(bad) + 3
+    assert solution.chi2 / solution.dof == pytest.approx(1, abs=0.15)
+
+
+def test_a_static_distortion_that_is_not_known_leaves_the_plane_where_it_is():
+    """Without dithers 10 px of it move along a curved valley, which no short step follows."""
+    sim = ld.simulate_matches(seed=1, sigma=0.01, static=10.0, n_stars=300, dither=0.0, dynamic=0.1)
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        solution = ld.solve(sim.matches)
+    assert abs(solution.chi2 - solution.dof) < 5 * np.sqrt(2 * solution.dof)
+
+
+def test_sizes_that_are_held_are_not_sought():
+    data, truth = dense_model.drawn_set(1, n_stars=60, n=6, dynamic=3.0)
+    found = searched(data, ld.Prior(truth["static"]), sizes=np.array([3.0, 2.5, 2.0]))
+    assert_allclose(found.posterior.sizes, [3.0, 2.5, 2.0])
+
+
+def test_what_nothing_determines_is_refused():
+    data, truth = dense_model.drawn_set(1, n_stars=60, n=6)
+    data["err"] = np.full(data["err"].shape, np.inf)
+    with pytest.raises((SolveError, ld.exceptions.InputError)):
+        searched(data, ld.Prior(truth["static"]))
