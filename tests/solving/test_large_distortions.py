@@ -1,4 +1,4 @@
-"""Large, unequal and precise distortions: a fit ends where all is most probable, which a dense model finds by itself."""
+"""Large, unequal, precise distortions: a fit ends where all is most probable, which a dense model finds by itself."""
 
 import warnings
 
