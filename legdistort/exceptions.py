@@ -113,6 +113,15 @@ def some_of(names, most):
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
+def reasons_of(names, most=5):
+    """Names with their reasons, ``{name: reason}``, for a message: by reason, some of both, and how many more."""
+    alike = {}
+    for name, reason in names.items():
+        alike.setdefault(reason, []).append(name)
+    listed = [f"{some_of(same, most)}: {reason}" for reason, same in alike.items()]
+    return "; ".join(listed[:most]) + (f"; and {len(listed) - most} more reasons" if len(listed) > most else "")
+
+
 #: Frames of these do not count as a caller's: the package, and what calls its functions for it.
 _INSIDE = str(Path(__file__).parent) + os.sep
 _BETWEEN = {functools.__file__, contextlib.__file__}

@@ -12,6 +12,7 @@ Seeds are numbers, so that a fault can be made again: ``--seed 17``.
 import argparse
 import bz2
 import gzip
+import hashlib
 import io
 import json
 import logging
@@ -43,6 +44,7 @@ from legdistort.cli.parser import main
 from legdistort.cli.usage import COMMANDS
 from legdistort.exceptions import LegdistortError
 from legdistort.inputs.table_files import read_table
+from legdistort.runtime import locks
 
 #: What takes the place of a value in a card, a tree or a cell.
 NUMBERS = [
@@ -410,15 +412,20 @@ def use_words(rng, folder):
 
 # --- folders of results -------------------------------------------------------------------------------------------
 
-#: Commands for a folder of results, ``R``, beside which the frames of the run stand; they may write into ``O`` alone.
+#: Commands for a folder of results, ``R``, with two frames of the run, ``F``, copies of them in ``I``, and the matched
+#: table of the run, ``M``. They may write into ``O``, and where they are asked to into ``R`` or ``I``.
 ON_FOLDERS = [
     ["show", "R"], ["show", "R/solution.asdf"], ["report", "R", "--out", "O/r.html"],
-    ["stars", "R", "--out", "O/s.ecsv"], ["solve", "R/matched.ecsv", "--degree", "1", "--out", "R", "--overwrite"],
+    ["stars", "R", "--out", "O/s.ecsv"], ["solve", "M", "--degree", "1", "--out", "R", "--overwrite"],
+    ["solve", "M", "--degree", "1", "--out", "R", "--overwrite", "--keep"],
     ["correct", "R", "R/detections.ecsv", "--out", "O/c.ecsv"], ["attach", "R", "F", "--out", "O/a"],
+    ["attach", "R", "I", "--in-place"], ["coadd", "F", "--solution", "R", "--out", "O/m.fits"],
     ["solve", "R/matched.ecsv", "--out", "O/n"], ["run", "--from", "R", "--degree", "1", "--out", "O/n"],
     ["match", "R/detections.ecsv", "--out", "O/m.ecsv"],
-    ["predict", "R", "--out", "O/p.png"],
+    ["predict", "--n-exposures", "8", "--n-stars", "50", "--sigma", "0.1", "--degree", "1",
+     "--prior", "R/solution.asdf", "--plot", "O/p.png"],
 ]  # fmt: skip
+WORD = "0123456789abcdef" * 2
 
 
 def hostile(rng, results, outside):
@@ -449,22 +456,30 @@ def hostile(rng, results, outside):
         if rng.random() < 0.5:
             summary["files"] = {victim: "0" * 64, name: "1"}
         (results / "summary.json").write_text(json.dumps(summary))
-    elif what in (7, 8):  # plans, hidden folders and locks that somebody planted
-        place = pick(rng, [results, results.parent])
-        hidden = place / pick(rng, [".commit-abc", ".partial-abc", ".commit-", f".{results.name}.old-1", ".old-abc"])
-        hidden.mkdir(exist_ok=True)
-        (hidden / "new.txt").write_text("planted")
-        for plan in ("plan", "plan.json", ".plan", "commit.json"):
-            (hidden / plan).write_text(json.dumps({"remove": [victim], "move": {"new.txt": victim}, "files": [victim]}))
-    elif what == 9:
-        lock = results / ".legdistort.lock"
-        lock.unlink(missing_ok=True)
-        lock.symlink_to(victim)
+    elif what in (7, 8):  # hidden folders that somebody planted, as dead processes leave them
+        plant(rng, pick(rng, [results, results.parent, results / "wcs", results.parent / "I"]), results, victim)
+    elif what == 9:  # and one that shall be taken for the results, which were set aside
+        results.rename(results.with_name(f"{results.name}{locks.OLD}{WORD}"))
     elif what == 10:
         (results / "wcs").exists() and shutil.rmtree(results / "wcs")
         (results / "wcs").symlink_to(outside)
     else:
         path.chmod(0)
+
+
+def plant(rng, place, results, victim):
+    """A hidden folder with links, a plan, and a lock of whatever kind."""
+    word = pick(rng, [WORD, "abc", *(hashlib.sha256(name).hexdigest()[:32] for name in (b"", results.name.encode()))])
+    hidden = place / pick(
+        rng, [f".partial-{word}", f".replaced-{word}", f".commit-{word}", f"{results.name}.old-{word}"]
+    )
+    link = pick(rng, [hidden, hidden / locks.LOCK, hidden / "new", hidden / "solution.asdf", hidden / "exp00.fits"])
+    if link != hidden:
+        hidden.mkdir()
+        (hidden / "summary.json").write_text(json.dumps({"remove": [victim], "files": {victim: "0" * 64}}))
+        (hidden / locks.LOCK).touch()
+    link.unlink(missing_ok=True)
+    link.symlink_to(victim)
 
 
 def use_folder(rng, folder):
@@ -473,19 +488,20 @@ def use_folder(rng, folder):
     results, out = folder / "R", folder / "O"
     out.mkdir()
     shutil.copytree(demo, results, ignore=shutil.ignore_patterns("frames"))
+    frames = [str(path) for path in sorted((demo / "frames").glob("*.fits"))]
+    (folder / "I").mkdir()
+    copies = [shutil.copy(path, folder / "I") for path in frames[:2]]
     outside = folder / "outside"
     outside.mkdir()
     (outside / "thesis.txt").write_text("years of work")
-    (folder / "F").symlink_to(demo / "frames")
+    (results / "frames").symlink_to(demo / "frames")  # where the table says that they are
     for _ in range(rng.integers(1, 3)):
         with suppress(OSError, ValueError, KeyError):
             hostile(rng, results, outside)
     before = snapshot(outside), snapshot(demo)
-    words = [
-        part for word in pick(rng, ON_FOLDERS)
-        for part in ([str(p) for p in sorted((demo / "frames").glob("*.fits"))[:2]] if word == "F" else [word])
-    ]  # fmt: skip
-    mine = None if words[-1] == "--overwrite" else snapshot(results)
+    given = {"F": frames[:2], "I": copies, "M": [str(demo / "matched.ecsv")]}
+    words = [part for word in pick(rng, ON_FOLDERS) for part in given.get(word, [word])]
+    mine = None if "--overwrite" in words else snapshot(results)
     run_words(words, folder)
     assert before == (snapshot(outside), snapshot(demo)), f"{words} changed what lies outside"
     assert mine is None or mine == snapshot(results), f"{words} changed what it read"

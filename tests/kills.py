@@ -32,6 +32,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from errno import EACCES, EBUSY, EDQUOT, EIO, ENOMEM, ENOSPC, EPERM, EROFS, EXDEV
 from pathlib import Path
 
@@ -207,7 +208,7 @@ class Case:
         shutil.copytree(self.root, self.saved, symlinks=True)
         self.after = None
         operations = Operations(self.root)
-        operations.serve = lambda: self._serve(operations, n_kills)
+        operations.serve = lambda: self._serving(operations, n_kills)
         reading, self._pipe = os.pipe()
         status = in_child(lambda: self._working(operations))
         os.close(self._pipe)
@@ -243,6 +244,14 @@ class Case:
     def _restore(self, saved):
         shutil.rmtree(self.root)
         shutil.copytree(saved, self.root, symlinks=True)
+
+    def _serving(self, operations, n_kills):
+        """Faults of `_serve` are not those of the command in which it is called."""
+        try:
+            self._serve(operations, n_kills)
+        except BaseException:
+            traceback.print_exc(file=sys.__stderr__)
+            os._exit(98)
 
     def _serve(self, operations, n_kills):
         """At the first write: one child for every kill, all from the same state of the disk. Only children return.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..exceptions import AssumptionWarning, InputError, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, reasons_of, some_of, warn
 from ..geometry.star_hull import support
 from ..inputs.exposure_names import whole_name
 from ..inputs.frames.value_units import value_unit
@@ -199,7 +199,7 @@ def _coadd(exposures, solution, options, share):
         prepared = {f.name: one for f, one in zip(frames, found, strict=True) if f.name not in unfit}
         frames = [_in_unit(f, unit) for f in frames if f.name in prepared]
         if not frames:
-            raise InputError(f"no exposure meets the output grid: {_reasons(left_out)}")
+            raise InputError(f"no exposure meets the output grid: {reasons_of(left_out)}")
         areas = None if options.conserve == "flux" else {f.name: _area(maps[f.name]) for f in frames}
         views = {f.name: views[f.name] for f in frames}
         factors, origin = flux_scales(frames, options.scale, views, areas)
@@ -309,19 +309,14 @@ def _select(exposures, solution):
             views[frame.name] = view
     if not frames:
         known = f"; the solution has {some_of([v.label for view in solution for v in view.parts], 5)}" * bool(left_out)
-        raise InputError(f"no exposure to co-add: {_reasons(left_out) or 'the list is empty'}{known}")
+        raise InputError(f"no exposure to co-add: {reasons_of(left_out) or 'the list is empty'}{known}")
     _warn(left_out)
     return frames, views, left_out
 
 
 def _warn(left_out):
     if left_out:
-        warn(f"left out of the mosaic: {_reasons(left_out)}", AssumptionWarning)
-
-
-def _reasons(left_out):
-    names = {reason: [n for n, other in left_out.items() if other == reason] for reason in left_out.values()}
-    return "; ".join(f"{some_of(same, 5)}: {reason}" for reason, same in names.items())
+        warn(f"left out of the mosaic: {reasons_of(left_out)}", AssumptionWarning)
 
 
 def _warn_of_misuse(frames, maps, algorithm, views):

@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from astropy.io import fits
 
-from ..exceptions import AssumptionWarning, DamagedError, InputError, some_of, warn, without_astropy_warnings
+from ..exceptions import (
+    AssumptionWarning,
+    DamagedError,
+    InputError,
+    reasons_of,
+    some_of,
+    warn,
+    without_astropy_warnings,
+)
 from ..runtime.checks import check_is_file
 from ..runtime.fits_bytes import open_fits, readable
 from ..runtime.locks import way_back
@@ -242,10 +250,7 @@ def _tell_bad(bad, n_good, stop_at_bad):
     if n_good + len(bad) == 1:
         ((_, _, error),) = bad.values()
         raise error
-    same = {}
-    for label, reason, _ in bad.values():
-        same.setdefault(reason, []).append(label)
-    named = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in same.items())
+    named = reasons_of({label: reason for label, reason, _ in bad.values()})
     unusable = f"{len(bad)} of {n_good + len(bad)} frames cannot be used: {named}"
     if stop_at_bad:
         raise InputError(f"{unusable}; repair them, or leave them out")

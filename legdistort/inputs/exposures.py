@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from astropy.io import fits
 
-from ..exceptions import DamagedError, InputError
+from ..exceptions import DamagedError, InputError, some_of
 from ..runtime.notebook import ShownAsPrinted
 from .exposure_names import check_exposure_name, whole_name
 from .frames.undefined_pixels import undefined_pixels
@@ -189,8 +189,7 @@ def _is_closed(value):
 
 def _listed(values, most=4):
     """Different texts in a line, not more than some."""
-    values = list(dict.fromkeys(filter(None, values)))
-    return ", ".join(values[:most]) + (f" and {len(values) - most} more" if len(values) > most else "")
+    return some_of(list(dict.fromkeys(filter(None, values))), most)
 
 
 def _as_float(data, name):

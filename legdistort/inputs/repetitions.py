@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..exceptions import AssumptionWarning, warn
+from ..exceptions import AssumptionWarning, reasons_of, warn
 
 #: Positions that must agree, and they are more than half of those of the exposure that has fewer.
 FEWEST = 5
@@ -68,6 +68,5 @@ def reasons(names, exposure, xy):
 def warned(repeated):
     """Exposures that repeat another one, ``{name: reason}``, after a warning of them."""
     if repeated:
-        listed = "; ".join(f"{name}: {reason}" for name, reason in repeated.items())
-        warn(f"the same exposure more than once, which counts as one: {listed}", AssumptionWarning)
+        warn(f"the same exposure more than once, which counts as one: {reasons_of(repeated)}", AssumptionWarning)
     return repeated

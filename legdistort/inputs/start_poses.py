@@ -44,26 +44,35 @@ def estimate_poses(exposure, star, xy, *, names=None):
     names = range(n_exposures) if names is None else names
     rows = [np.flatnonzero(exposure == i) for i in range(n_exposures)]
     weighted = np.ones(n_exposures, dtype=bool)
-    found = _tie(rows, star, xy, weighted, names)
+    found = _tie(rows, exposure, star, xy, weighted, names)
     if _far_off(found, rows, star, xy):
         weighted[list(pair_agreement.compare(exposure, star, xy).against)] = False
         if not weighted.all():
-            found = _tie(rows, star, xy, weighted, names)
+            found = _tie(rows, exposure, star, xy, weighted, names)
     return found
 
 
-def _tie(rows, star, xy, weighted, names):
+def _tie(rows, exposure, star, xy, weighted, names):
     """Poses from the positions of exposures that have weight."""
     weighted, n_stars = weighted.copy(), star.max() + 1
+    sums, counts, n_shared = np.zeros((n_stars, 2)), np.zeros(n_stars), np.zeros(len(rows))
+
+    def add(i, positions):
+        """Have the stars of an exposure in the means, and the others know how many of these are theirs."""
+        before = counts > 0
+        np.add.at(sums, star[rows[i]], positions)
+        np.add.at(counts, star[rows[i]], 1)
+        if (fresh := (counts > 0) & ~before).any():
+            n_shared[:] += np.bincount(exposure, fresh[star], len(rows))
+
     first = int(np.argmax([len(r) * weight for r, weight in zip(rows, weighted, strict=True)]))
     found = {first: similarity.identity()}
-    sums, counts = np.zeros((n_stars, 2)), np.zeros(n_stars)
-    np.add.at(sums, star[rows[first]], xy[rows[first]])
-    np.add.at(counts, star[rows[first]], 1)
+    add(first, xy[rows[first]])
     while len(found) < len(rows):
-        shared = {i: r[counts[star[r]] > 0] for i, r in enumerate(rows) if i not in found}
-        best = max(shared, key=lambda i: (weighted[i], len(shared[i])))
-        r = shared[best]
+        order = n_shared + len(star) * weighted  # those with weight come first
+        order[list(found)] = -1
+        best = int(np.argmax(order))
+        r = rows[best][counts[star[rows[best]]] > 0]
         if len(r) < 2 or np.all(np.ptp(xy[r], axis=0) == 0):
             raise MatchError(
                 f"exposure {names[best]} shares {len(r)} star{'s' * (len(r) != 1)} with the other exposures; its shift "
@@ -74,9 +83,7 @@ def _tie(rows, star, xy, weighted, names):
         off = np.hypot(*(similarity.apply(found[best], mean) - xy[r]).T)
         weighted[best] &= np.median(off) <= 0.05 * np.ptp(xy[r], axis=0).max()
         if weighted[best]:
-            back = similarity.apply(similarity.invert(found[best]), xy[rows[best]])
-            np.add.at(sums, star[rows[best]], back)
-            np.add.at(counts, star[rows[best]], 1)
+            add(best, similarity.apply(similarity.invert(found[best]), xy[rows[best]]))
     return _refine_poses([found[i] for i in range(len(rows))], rows, star, xy, weighted)
 
 

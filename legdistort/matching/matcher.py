@@ -13,7 +13,7 @@ from astropy import units as u
 from ..cameras.camera import Camera, check_camera
 from ..cameras.exchanged import check_places
 from ..cameras.focal_planes import focal_planes
-from ..exceptions import AssumptionWarning, InputError, MatchError, warn
+from ..exceptions import AssumptionWarning, InputError, MatchError, reasons_of, some_of, warn
 from ..geometry.epochs import header_epoch, mean_epoch
 from ..inputs import column_contract, repetitions
 from ..inputs.exposure_files import ExposureFile, listed
@@ -270,7 +270,7 @@ def _star_list(table, shape):
 def _associate(lists, names, headers, left_out, options):
     """Star labels by exposure name; exposures without a place are added to `left_out`."""
     if len(lists) < 2:
-        raise MatchError(f"fewer than two exposures have stars: {_reasons(left_out)}")
+        raise MatchError(f"fewer than two exposures have stars: {reasons_of(left_out)}")
 
     tolerance, progress = options.tolerance, options.progress
 
@@ -305,14 +305,14 @@ def _check_groups(groups, lists, names, left_out):
             left_out[names[only]] = f"none of its {len(lists[only])} detections fit other exposures better than chance"
     large = [sorted(names[i] for i in group.poses) for group in groups if len(group.poses) > 1]
     if len(large) > 1:
-        listed = "; ".join(", ".join(group) for group in large)
+        listed = "; ".join(some_of(group, 6) for group in large[:6])
         raise MatchError(
             f"the exposures form {len(large)} groups with no star in common: {listed}; match each group by itself",
             groups=large,
         )
     if not large:
         raise MatchError(
-            f"no two exposures show the same stars (tried {', '.join(names)}); check that they overlap and that the "
+            f"no two exposures show the same stars (tried {some_of(names, 6)}); check that they overlap and that the "
             "detections are stars"
         )
 
@@ -331,7 +331,7 @@ def _keep_common(table, star, min_exposures, left_out):
             raise MatchError(
                 f"no star was found in {min_exposures} exposures or more, the best in {most}; "
                 f"give min_exposures={most} (--min-exposures) or less"
-                + (f"; left out: {_reasons(left_out)}" if left_out else "")
+                + (f"; left out: {reasons_of(left_out)}" if left_out else "")
             )
         left_out.update(
             {str(n): f"only {poor.get(n, 0)} of its stars are in {min_exposures} exposures" for n in [*poor, *absent]}
@@ -341,14 +341,10 @@ def _keep_common(table, star, min_exposures, left_out):
         star = np.where(np.isin(exposure, list(poor)), -1, star)
 
 
-def _reasons(left_out):
-    return "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
-
-
 def _finish(table, star, shapes, headers, left_out, epoch, distortions):
     table["star"] = _numbers(table, star)
-    for name, reason in left_out.items():
-        log.warning("%s is left out: %s", name, reason)
+    if left_out:
+        log.warning("left out: %s", reasons_of(left_out))
     matches = Matches.from_table(table, shape=shapes, left_out=left_out, epoch=epoch)
     poses, sky = headers.place(_undistorted_poses(matches, distortions))
     return replace(matches, poses=poses, sky=sky, header_distortion=describe(distortions))

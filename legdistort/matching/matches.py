@@ -13,7 +13,7 @@ from astropy.table import QTable
 from scipy.sparse.csgraph import connected_components
 
 from ..cameras.camera import Camera, check_camera
-from ..exceptions import AssumptionWarning, InputError, MatchError, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, MatchError, reasons_of, some_of, warn
 from ..geometry import similarity
 from ..geometry.epochs import exposure_years
 from ..geometry.tangent_plane import TangentPlane
@@ -266,9 +266,7 @@ class Matches(ShownAsPrinted):
         """
         rows = ~np.isin(self.table["exposure"], list(reasons))
         if not rows.any():
-            raise MatchError(
-                "no exposure agrees with the others: " + "; ".join(f"{k}: {v}" for k, v in reasons.items())
-            )
+            raise MatchError(f"no exposure agrees with the others: {reasons_of(reasons)}")
         return replace(self.keep(rows), left_out=self.left_out | dict(reasons))
 
     def _by_exposure(self, names):

@@ -12,6 +12,7 @@ from .profiles.defects import are_points
 _SAME = 0.5  # pixels within which a defect is found again
 _MOST = 0.6  # of the exposures
 _FEWEST = 3  # exposures in which it is found, at least
+_COMPARED = 100  # exposures, of more evenly chosen ones, in which it is looked for
 _BRIGHTEST = 30  # rows of an exposure by which it is told whether the sky moves
 _BRIGHT = 20.0  # standard deviations of the sky, of peaks of stars that a mask hides
 _HIDDEN = 5  # such peaks from which on it is said
@@ -37,13 +38,12 @@ def flag_what_stays(tables, exposures):
 
 def _flag_fixed(tables):
     xy = [np.column_stack([table["x"].value, table["y"].value]) for table in tables]
-    n = [np.zeros(len(table), dtype=int) for table in tables]
-    trees = [cKDTree(each) if len(each) else None for each in xy]
-    for counts, each in zip(n, xy, strict=True):
-        for tree in trees:
-            if tree is not None and len(each):
-                counts += np.isfinite(tree.query(each, distance_upper_bound=_SAME)[0])  # its own too
-    fixed = [counts >= max(_FEWEST, _MOST * len(tables)) for counts in n]
+    places, compared = np.concatenate(xy), xy[:: -(-len(xy) // _COMPARED)]
+    n = np.zeros(len(places), dtype=int)
+    for each in compared:  # its own too
+        if len(each):
+            n += np.isfinite(cKDTree(each).query(places, distance_upper_bound=_SAME)[0])
+    fixed = np.split(n >= max(_FEWEST, _MOST * len(compared)), np.cumsum([len(each) for each in xy])[:-1])
     bright = np.concatenate(
         [
             stays[np.flatnonzero((table["flags"] & UNUSABLE) == 0)[:_BRIGHTEST]]

@@ -279,6 +279,8 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
         for i, one in zip(again, anew, strict=True):
             found[i] = one
     names = [exposure.name for exposure in exposures]
+    if empty := [name for name, one in zip(names, found, strict=True) if one.shape is None]:
+        log.warning("%s: no star above %g times the noise", some_of(empty, 6), options.threshold)
     _warn_of_gain({name: one.photon for name, one in zip(names, found, strict=True)})
     doubtful = {name: one.noise_ratio for name, one in zip(names, found, strict=True) if one.noise_ratio is not None}
     camera_gain.warn_of_contradictions(doubtful, {e.name: options.gain or e.gain for e in exposures})
@@ -425,7 +427,6 @@ def measure_scaled(exposure, options):
     frame, stamps, shape = _stamps(exposure, options)
     hidden = across_frames.hides_most(exposure, frame, np.zeros((0, 2), int) if stamps is None else stamps.centres)
     if stamps is None:
-        log.warning("%s: no star above %g times the noise", name, options.threshold)
         return MeasuredExposure(_empty(), None, None, frame_psf.Verdict("moffat", 0), hidden=hidden)
     fwhm = float(moffat.fwhm(shape))
     fitted = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)

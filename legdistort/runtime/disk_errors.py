@@ -1,6 +1,7 @@
 """Whether a disk is full: by the number of an error, or by the disk itself where a library dropped the number."""
 
 import os
+import re
 from contextlib import contextmanager
 from errno import EDQUOT, EFBIG, ENOSPC
 
@@ -16,21 +17,16 @@ def is_full(error, folder):
     ----------
     error : BaseException
     folder : path
-        Where was written. Writers do not always hand the number of an error on (``ndarray.tofile``, astropy): then the
-        disk is asked. The text of the error is not used, since it may contain anything, such as a path.
+        What was written, or where. Writers do not always hand the number of an error on (``ndarray.tofile``, astropy):
+        then the disk is asked. The text of the error is not used, since it may contain anything, such as a path.
     """
-    numbers = {each.errno for each in _with_causes(error) if isinstance(each, OSError)}
-    if numbers & {ENOSPC, EDQUOT, EFBIG}:
-        return True
-    return isinstance(error, OSError) and error.errno is None and free_bytes(folder) < _SOME
-
-
-def _with_causes(error):
-    errors = []
-    while error is not None and error not in errors:
-        errors.append(error)
+    unknown, seen = isinstance(error, OSError) and error.errno is None, []
+    while error is not None and error not in seen:
+        if isinstance(error, OSError) and error.errno in (ENOSPC, EDQUOT, EFBIG):
+            return True
+        seen.append(error)
         error = error.__cause__ or error.__context__
-    return errors
+    return unknown and free_bytes(folder) < _SOME
 
 
 def free_bytes(folder):
@@ -47,35 +43,31 @@ def free_bytes(folder):
 
 
 @contextmanager
-def told_when_full(path, folder):
-    """Errors of a full disk as `DiskFullError`, which names `path`; it is written in `folder`."""
+def errors_name(path, hidden):
+    """Errors name `path` where they would name `hidden`, which is to become it; those of a full disk are told as such.
+
+    Raises
+    ------
+    DiskFullError
+        If the disk of `hidden` is full, in the place of an error that has no message of its own.
+    """
+    whole = re.compile(rf"{re.escape(str(hidden))}(?![\w-]|\.\w)")
+
+    def named(text):
+        text = os.fspath(text) if isinstance(text, os.PathLike) else text
+        # not where it is the beginning of another name beside it
+        return re.sub(whole, lambda _: str(path), text) if isinstance(text, str) else text
+
     try:
         yield
-    except LegdistortError:  # it has a message of its own
-        raise
     except Exception as error:
-        if not is_full(error, folder):
+        error.args = tuple(map(named, error.args))
+        for name in ("filename", "filename2"):
+            if getattr(error, name, None) is not None:
+                setattr(error, name, named(getattr(error, name)))
+        if isinstance(error, LegdistortError) or not is_full(error, hidden):
             raise
         raise DiskFullError(
             f"No space left on the disk for {path}, which was left as it was: free some space (or allow larger files: "
             "ulimit -f), or write elsewhere"
         ) from None
-
-
-@contextmanager
-def named_as_given(hidden, path):
-    """Errors that name a hidden file or folder, or what is in it, name `path` instead, which it is to become."""
-    try:
-        yield
-    except Exception as error:
-        error.args = tuple(_named(each, hidden, path) for each in error.args)
-        for name in ("filename", "filename2"):
-            if getattr(error, name, None) is not None:
-                setattr(error, name, _named(getattr(error, name), hidden, path))
-        raise
-
-
-def _named(text, hidden, path):
-    """A text with another name; whatever else an error has stays."""
-    text = os.fspath(text) if isinstance(text, os.PathLike) else text
-    return text.replace(str(hidden), str(path)) if isinstance(text, str) else text

@@ -186,12 +186,12 @@ def _opened(content, name, instead):
 
 
 def _check_counts(content, size, name):
-    """Refuse headers with more axes or columns than FITS knows: astropy would count them all.
+    """Refuse headers with more axes or columns than FITS knows, since astropy would count them all, or less than none.
 
     Where a header is not understood the rest is left to astropy.
     """
     place = 0
-    while 0 <= place < size:
+    while place < size:
         content.seek(place)
         header = b""
         while not any(
@@ -212,12 +212,12 @@ def _check_counts(content, size, name):
                 value = int(found[2])
                 if key in ("NAXIS", "ZNAXIS", "TFIELDS") and not 0 <= value <= _MOST_COUNTED:
                     raise DamagedError(f"{name}: damaged, {key} = {value} in a header; FITS has 0 to {_MOST_COUNTED}")
+                if value < 0 and not key.endswith("BITPIX"):  # it would be read again and again, from before its start
+                    raise DamagedError(f"{name}: damaged, {key} = {value} in a header; FITS has 0 or more")
                 if known.setdefault(key, value) != value:  # astropy takes now the one, now the other
                     raise DamagedError(f"{name}: damaged, a header has {key} twice, {known[key]} and {value}")
         axes = [known.get(f"NAXIS{k}", 0) for k in range(1, known.get("NAXIS", 0) + 1)]
         n = (known.get("PCOUNT", 0) + math.prod(axes)) * known.get("GCOUNT", 1) if axes else 0
-        if n < 0:
-            return
         place += len(header) + -(-n * abs(known.get("BITPIX", 8)) // 8 // BLOCK) * BLOCK
 
 

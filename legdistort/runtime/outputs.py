@@ -24,7 +24,7 @@ from pathlib import Path, PurePosixPath
 
 from ..exceptions import InputError, LegdistortError, some_of
 from . import locks
-from .disk_errors import named_as_given, told_when_full
+from .disk_errors import errors_name
 from .provenance import SUMMARY, checksum_of, files_of_run
 
 log = logging.getLogger(__name__)
@@ -69,8 +69,8 @@ def try_to_write(path):
     InputError
         If that fails.
     """
-    folder = next(place for place in Path(path).absolute().parents if place.is_dir())
-    folder = Path(path) if Path(path).is_dir() else folder
+    path = Path(path)
+    folder = next(place for place in (path, *path.absolute().parents) if place.is_dir())
     try:
         with locks.temporary_folder(folder, _PARTIAL) as trial:
             (trial / "file").write_bytes(b"0")
@@ -148,7 +148,7 @@ def replacing(path, *, overwrite=False):
         temporary = folder / "file"  # since a long name would become too long
         with _written(temporary, path) as file:
             yield file
-        with named_as_given(temporary, path):
+        with errors_name(path, temporary):
             os.replace(temporary, place)
         _sync(place.parent)
 
@@ -156,7 +156,7 @@ def replacing(path, *, overwrite=False):
 @contextmanager
 def _written(temporary, path):
     """An open file that is on the disk when the block ends; errors name the path that it will have."""
-    with named_as_given(temporary, path), told_when_full(path, temporary.parent), temporary.open("wb") as file:
+    with errors_name(path, temporary), temporary.open("wb") as file:
         yield file
         file.flush()
         os.fsync(file.fileno())
@@ -201,16 +201,16 @@ def replacing_folder(out, *, results=(), overwrite=True, keep=True):
     check_folder(out)
     place = Path(os.path.realpath(out))
     fixed = _why_not_exchanged(place)
-    with told_when_full(out, place), _new_parents(place), ExitStack() as stack:
+    with errors_name(out, place), _made(place.parent), ExitStack() as stack:
         work = None if fixed else stack.enter_context(_work_folder(place.parent, place.name, out))
         _bring_back(place)
-        existed, held = place.is_dir(), stack.enter_context(ExitStack())
-        if existed:
+        held = stack.enter_context(ExitStack())
+        if place.is_dir():
             inside = held.enter_context(_work_folder(place, "", out))
             _check_content(place, out, results, keep, fixed)
         new = (work or inside) / "new"
         new.mkdir()
-        with named_as_given(new, out):
+        with errors_name(out, new):
             yield new
             _check_places(new, place, out, overwrite)
             for path in (*new.rglob("*"), new):  # on the disk, and not in the memory of the system only
@@ -218,12 +218,13 @@ def replacing_folder(out, *, results=(), overwrite=True, keep=True):
             if fixed:
                 names = sorted(_items(new), key=lambda name: (name == SUMMARY, name))
                 _move_all({place / name: new / name for name in names})
-            elif existed and place.is_dir():
+            elif place.is_dir():
                 if os.name == "nt":  # Windows renames no folder in which a file is open
                     held.close()
                 _take_the_place(new, place, _results(place, results))
             else:
-                _rename_new(new, place, out)
+                os.rename(new, place)
+            _sync(place.parent)
 
 
 @contextmanager
@@ -245,14 +246,15 @@ def _work_folder(parent, name, out):
 
 
 @contextmanager
-def _new_parents(place):
-    """Make the folders above a place; those that are empty after an error go again."""
-    made = [folder for folder in place.parents if not folder.exists()]
-    place.parent.mkdir(parents=True, exist_ok=True)
+def _made(*folders):
+    """Make folders, and those above them; those that are empty after an error go again."""
+    new = {place for folder in folders for place in (folder, *folder.parents) if not place.exists()}
     try:
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
-        for folder in made:
+        for folder in sorted(new, reverse=True):  # what is in a folder before the folder
             with suppress(OSError):
                 folder.rmdir()
         raise
@@ -304,9 +306,8 @@ def _refuse_unreadable(error):
 
 def _results(place, patterns):
     """Names in a folder that are those of earlier results: of its summary, if there is one that lists them."""
-    known, listed = {Path(pattern).parts[0] for pattern in patterns if "/" in pattern}, files_of_run(place)
-    for pattern in patterns:
-        known |= {path.relative_to(place).as_posix() for path in place.glob(pattern)}
+    known = {path.relative_to(place).as_posix() for pattern in patterns for path in place.glob(pattern)}
+    known, listed = known | {Path(pattern).parts[0] for pattern in patterns if "/" in pattern}, files_of_run(place)
     return known if listed is None else known & {SUMMARY, *listed, *(name.partition("/")[0] for name in listed)}
 
 
@@ -339,12 +340,9 @@ def _check_places(new, place, out, overwrite):
         target = place / name
         if os.path.lexists(target):
             was_folder = target.is_dir() and not target.is_symlink()
-            if item.is_dir() and not was_folder:
-                raise InputError(
-                    f"{out / name} is a file or a link, in the place of a folder: move it away, or write elsewhere"
-                )
-            if was_folder and not item.is_dir():
-                raise InputError(f"{out / name} is a folder, in the place of a file: move it away, or write elsewhere")
+            if item.is_dir() != was_folder:
+                there, wanted = ("a folder", "a file") if was_folder else ("a file or a link", "a folder")
+                raise InputError(f"{out / name} is {there}, in the place of {wanted}: move it away, or write elsewhere")
             if not item.is_dir() and not overwrite:
                 raise InputError(f"{out / name} exists already; give --overwrite to replace it, or another folder")
 
@@ -368,7 +366,6 @@ def _take_the_place(new, place, results):
             os.rename(aside, place)
             raise
         os.rename(aside, new)
-    _sync(place.parent)
     if late := sorted(_items(new) - names):
         os.rename(new, aside)
         log.warning("%s was put into %s as it was replaced: it lies in %s", late[0], place, aside)
@@ -404,16 +401,6 @@ def exchange(one, other):
     return rename(_CWD, os.fsencode(one), _CWD, os.fsencode(other), _EXCHANGE) == 0
 
 
-def _rename_new(new, place, out):
-    try:
-        os.rename(new, place)
-    except OSError as error:
-        if not os.path.lexists(place):
-            raise
-        raise InputError(f"{out} was made by another process meanwhile ({error.strerror}): give another") from None
-    _sync(place.parent)
-
-
 # -- files among those of others
 
 
@@ -447,7 +434,7 @@ def replacing_files(targets):
         temporary = {}
         for folder in dict.fromkeys(target.parent for target in targets):
             check_folder(folder)
-            stack.enter_context(told_when_full(folder, folder))
+            stack.enter_context(errors_name(folder, folder))
             work = stack.enter_context(_work_folder(folder, "", folder))
             _check_unfinished(folder)
             own = [target for target in targets if target.parent == folder]
@@ -459,10 +446,11 @@ def replacing_files(targets):
 def _check_unfinished(folder):
     """Refuse a folder in which files were replaced one by one until a process was killed."""
     if kept := [each for each in sorted(folder.glob(f"{_KEPT}*")) if _holds_others(each)]:
+        names = [shlex.quote(str(each)) for each in kept]
+        line = " && ".join(f"mv -f {name}/* {shlex.quote(str(folder))}/ && rmdir {name}" for name in names)
         raise InputError(
             f"{kept[0]} holds files as they were before a command replaced them that was stopped on the way; this "
-            f"brings them back: {_line_back(kept)}; or remove it, if the new ones are all there, or no command of "
-            "yours was stopped"
+            f"brings them back: {line}; or remove it, if the new ones are all there, or no command of yours was stopped"
         )
 
 
@@ -478,41 +466,31 @@ def _holds_others(kept):
     return kept.is_dir() and not kept.is_symlink()
 
 
-def _line_back(kept):
-    """Words of the shell that bring former files back."""
-    names = [(shlex.quote(str(folder)), shlex.quote(str(folder.parent))) for folder in kept]
-    return " && ".join(f"mv -f {folder}/* {place}/ && rmdir {folder}" for folder, place in names)
-
-
 def _move_all(sources):
     """Rename files, ``{target: file}``, all or none; former ones are kept beside until the last is in its place."""
     word = f"{_KEPT}{uuid.uuid4().hex}"
-    made = [folder for folder in {target.parent for target in sources} if not folder.exists()]
-    for folder in made:
-        folder.mkdir(parents=True)
     former = [target for target in sources if os.path.lexists(target)]
     places = {target.parent / word: sources[target].parent / word for target in former}
-    try:
-        for hidden in places.values():
-            hidden.mkdir(0o700)
-        for target in former:
-            _link(target, sources[target].parent / word / target.name)
-        for kept, hidden in places.items():
-            _sync(hidden)
-            os.rename(hidden, kept)
-            _sync(kept.parent)
-        for target, source in sources.items():
-            os.replace(source, target)
-        for folder in {target.parent for target in sources}:
-            _sync(folder)
-    except BaseException as error:
-        _put_back(sources, former, word, error)
+    folders = {target.parent for target in sources}
+    with _made(*folders):
+        try:
+            for hidden in places.values():
+                hidden.mkdir(0o700)
+            for target in former:
+                _link(target, sources[target].parent / word / target.name)
+            for kept, hidden in places.items():
+                _sync(hidden)
+                os.rename(hidden, kept)
+                _sync(kept.parent)
+            for target, source in sources.items():
+                os.replace(source, target)
+            for folder in folders:
+                _sync(folder)
+        except BaseException as error:
+            _put_back(sources, former, word, error)  # if that fails, the former files are kept
+            _finish(places)
+            raise
         _finish(places)
-        for folder in made:
-            with suppress(OSError):
-                folder.rmdir()
-        raise
-    _finish(places)
 
 
 def _finish(places):
@@ -546,12 +524,9 @@ def _put_back(sources, former, word, error):
 
 
 def contents(folder):
-    """``{name: SHA-256}`` of the files in a folder and those below it."""
-    found = {}
-    for path in sorted(Path(folder).rglob("*")):
-        if path.is_file():
-            found[path.relative_to(folder).as_posix()] = checksum_of(path)
-    return found
+    """``{name: SHA-256}`` of the files in a folder and those below it, without what could not be removed."""
+    files = {path.relative_to(folder).as_posix(): path for path in sorted(Path(folder).rglob("*")) if path.is_file()}
+    return {name: checksum_of(path) for name, path in files.items() if f"/{_PARTIAL}" not in f"/{name}"}
 
 
 def _sync(path):

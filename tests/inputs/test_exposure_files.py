@@ -1,6 +1,7 @@
 """Files as people have them: read once however many images they hold, blank and truncated ones among good."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -97,6 +98,24 @@ def test_bad_files_are_left_out_together(tmp_path, night):
         assert left_out[name].startswith(reason)
         assert f"{name}.fits: {left_out[name]}" in warning
     assert warning.startswith("4 of 6 frames cannot be used")
+
+
+def test_a_message_of_many_files_is_short(tmp_path, night):
+    """The reason, some names and how many more: for what is bad, and for what is there twice."""
+    many = [tmp_path / f"bad{k:03d}.fits" for k in range(20)]
+    copies = [tmp_path / f"copy{k:03d}.fits" for k in range(20)]
+    for path in many:
+        path.write_text("no FITS")
+    for path in copies:
+        path.write_bytes(night[0].read_bytes())
+    left_out = {}
+    with pytest.warns(AssumptionWarning) as told:
+        ld.open_exposures([*many, *copies, *night[1:]], left_out=left_out)
+    twice, bad = (str(w.message) for w in told)
+    assert len(left_out) == 39
+    assert re.match(r"the same exposure .*: copy001, .*, copy005 and 14 more: its pixels are those of copy000$", twice)
+    assert re.match(r"20 of \d+ frames .*: bad000.fits, .*, bad004.fits and 15 more: cannot be read as FITS", bad)
+    assert max(len(twice), len(bad)) < 500
 
 
 def test_bad_files_are_refused_together(tmp_path, night):

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.table import QTable
 from caller_warnings import warns_here
 from scipy.spatial import cKDTree
 from star_images import GAIN, READ_NOISE, SKY, errors, image, observe, positions, scattered, usable
@@ -9,6 +11,7 @@ from star_images import GAIN, READ_NOISE, SKY, errors, image, observe, positions
 from legdistort.exceptions import AssumptionWarning
 from legdistort.inputs.exposures import Exposure
 from legdistort.matching.matcher import match
+from legdistort.measurement.across_frames import flag_what_stays
 from legdistort.measurement.flags import Flag
 from legdistort.measurement.positions import measure
 
@@ -113,6 +116,22 @@ def test_stars_are_no_defects_however_sharp(fwhm):
     assert len(usable(table)) > 0.9 * len(table) > 80
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_frames_narrower_than_what_is_looked_at_around_a_pixel(axis):
+    """A strip has its broken lines marked, along it and across it, and its stars measured."""
+    xy = np.column_stack([np.linspace(12, 187, 9), np.tile([8.0, 14.0, 10.0], 3)])
+    data = observe(image((24, 200), xy, np.full(9, 2e4), 3.0), np.random.default_rng(1))
+    data[:, 100] += 600
+    data[20, 20:] -= 400
+    shown = data.T if axis else data
+    table = measure([Exposure("strip", shown.copy(), gain=GAIN, read_noise=READ_NOISE)], psf="moffat")
+    rows = usable(table)
+    where = positions(rows)[:, ::-1] if axis else positions(rows)
+    found = cKDTree(where).query(xy[np.abs(xy[:, 0] - 100) > 6])[0]
+    assert (found < 0.2).all()
+    assert len(rows) <= 9
+
+
 def test_hot_pixels_are_in_the_table_with_their_flag():
     exposures, (added,) = night(hot_pixels, frames=1)
     table = measure(exposures, psf="moffat")
@@ -152,6 +171,21 @@ def test_what_stays_on_the_detector_while_the_sky_moves_is_no_star():
     assert np.mean((table["flags"][near] & Flag.HOT) > 0) > 0.9
     far = cKDTree(places).query(positions(table))[0] > 8
     assert not (table["flags"][far] & Flag.HOT).any()
+
+
+def test_what_stays_in_many_exposures():
+    """Two defects and twenty stars in 250 exposures, one of them empty: just the defects have the flag, in all."""
+    rng, tables = np.random.default_rng(1), []
+    defects, sky = np.array([[30.2, 40.1], [150.0, 20.7]]), rng.uniform(0, SIZE, (20, 2))
+    for k in range(250):
+        xy = np.concatenate([defects + rng.normal(0, 0.05, (2, 2)), sky + rng.uniform(-30, 30, 2)])[
+            : 0 if k == 7 else 22
+        ]
+        tables.append(QTable([xy[:, 0] * u.pix, xy[:, 1] * u.pix, np.zeros(len(xy), int)], names=["x", "y", "flags"]))
+    flag_what_stays(tables, [Exposure(f"e{k}", np.ones((8, 8))) for k in range(250)])
+    for k, table in enumerate(tables):
+        assert list(np.flatnonzero(table["flags"])) == ([] if k == 7 else [0, 1])
+        assert (table["flags"][:2] == Flag.HOT | Flag.DEFECT).all()
 
 
 def test_stars_stay_where_the_sky_does_not_move():

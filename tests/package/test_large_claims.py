@@ -86,6 +86,17 @@ def test_sizes_that_are_no_numbers(tmp_path):
             read(path)
 
 
+@pytest.mark.parametrize(("key", "value"), [("GCOUNT", -1), ("PCOUNT", -9), ("NAXIS1", -8), ("NAXIS2", -(2**40))])
+def test_sizes_below_zero(tmp_path, key, value):
+    """They lead back to before the header, which then follows itself without end."""
+    path = tmp_path / "negative.fits"
+    image = {"XTENSION": "'IMAGE   '", "BITPIX": 16, "NAXIS": 2, "NAXIS1": 48, "NAXIS2": 40, "PCOUNT": 0, "GCOUNT": 1}
+    path.write_bytes(header(EMPTY) + header(image | {key: value}) + bytes(2880 * 4))
+    for read in (read_frame, read_psf, read_grid, read_table, ld.Prior.from_file, attach):
+        with pytest.raises(InputError, match=f"{key} = {value} in a header; FITS has 0 or more"):
+            read(path)
+
+
 def test_a_compressed_image_of_nothing(tmp_path):
     path = tmp_path / "packed.fits"
     fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((64, 64), "i2"), name="SCI")]).writeto(path)

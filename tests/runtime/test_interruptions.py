@@ -739,6 +739,31 @@ def test_errors_name_the_file_of_the_user(tmp_path, monkeypatch, existing, error
     assert content(tmp_path) == ({"out/a": "old"} if existing else {})
 
 
+def test_names_that_begin_as_a_hidden_one_stay():
+    """Only what is hidden, and what is in it, has the name of the user."""
+    hidden, out = Path("/data/.partial-0/new"), Path("out")
+    text = "/data/.partial-0/new/a, /data/.partial-0/new2/a, /data/.partial-0/new.old-1 and /data/.partial-0/new."
+    with (
+        pytest.raises(ValueError, match=r"^out/a, /data/.partial-0/new2/a, /data/.partial-0/new.old-1 and out\.$"),
+        disk_errors.errors_name(out, hidden),
+    ):
+        raise ValueError(text)
+
+
+def test_what_could_not_be_removed_is_no_result(tmp_path, monkeypatch):
+    """A hidden folder of a file that was written among the results is not listed with them."""
+    with replacing_folder(tmp_path / "out") as target:
+        (target / "wcs").mkdir()
+        with monkeypatch.context() as patch:
+            patch.setattr(locks, "remove", lambda folder: None)
+            for name in ("a", "wcs/1.asdf"):
+                with replacing(target / name) as file:
+                    file.write(b"new")
+        assert len(list(target.rglob(".partial-*"))) == 2
+        listed = outputs.contents(target)
+    assert listed.keys() == {"a", "wcs/1.asdf"}
+
+
 LIMITED = """
 import resource, sys
 import numpy as np

@@ -171,7 +171,7 @@ def _in_lines(defects, seen, reach):
     out = np.zeros_like(defects)
     for x in np.flatnonzero(np.count_nonzero(defects, axis=0) > reach):
         column, good = defects[:, x] & seen[:, x], seen[:, x]
-        around, n = (np.convolve(each, np.ones(2 * reach + 1), "same") for each in (column, good))
+        around, n = (np.convolve(each, np.ones(2 * reach + 1))[reach:-reach] for each in (column, good))
         share = 0.5 * np.count_nonzero(good)
         out[:, x] = (around >= 0.5 * np.maximum(n, reach)) | (np.count_nonzero(column) >= share)
     return out & seen
