@@ -16,7 +16,8 @@ _COMPARED = 100  # exposures, of more evenly chosen ones, in which it is looked 
 _BRIGHTEST = 30  # rows of an exposure by which it is told whether the sky moves
 _BRIGHT = 20.0  # standard deviations of the sky, of peaks of stars that a mask hides
 _HIDDEN = 5  # such peaks from which on it is said
-_TRAILED = 2.0  # ratio of the axes of stars from which on they are trailed: aberrations make no more of most
+#: Ratio of the axes of stars from which on they are trailed: aberrations make no more of most.
+TRAILED = 2.0
 
 
 def flag_what_stays(tables, exposures):
@@ -106,7 +107,7 @@ def warn_of_trails(shapes):
     found = {}
     for name, shape in shapes.items():
         wide, narrow, angle = moffat.axes(shape)
-        if wide > _TRAILED * narrow:
+        if wide > TRAILED * narrow:
             found[name] = f"{name}: {wide:.1f} by {narrow:.1f} pixels, at {angle:.0f} degrees from x to y"
     if found:
         warn(

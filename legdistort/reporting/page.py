@@ -144,7 +144,7 @@ def _details(gallery, solution, pulls, psfs, facts, comparison, stacks):
             *([compared_corrections(comparison, gallery)] if comparison else []),
             *([compared_stacks(stacks, gallery)] if stacks else []),
         ],
-        "exposures": exposures_table(solution),
+        "exposures": exposures_table(solution, (facts.get("quality") or {}).get("exposures")),
         "stated": stated_table(facts["stated"]) if facts.get("stated") else None,
         "detectors": (camera.name, detectors_table(camera)) if camera.has_focal_plane else None,
         "stars": stars_table(solution, pulls),

@@ -7,11 +7,14 @@ import numpy as np
 from ..assessment.pulls import exposure_rms
 from ..exceptions import some_of
 from ..geometry import similarity
+from ..measurement.across_frames import TRAILED
 
 #: An exposure whose residuals exceed the median by this factor is marked.
 _MARK = 2.0
 #: Different values of what frames state that are listed.
 _MOST_VALUES = 4
+#: Columns on the stars of an exposure: width, longer over shorter axis, direction of the longer one from x to y.
+_SHAPE = {"FWHM of stars": "px", "length / width": "", "at": "deg"}
 #: Stars that are listed, the brightest; all of them are in the file.
 MOST_STARS = 500
 
@@ -55,8 +58,11 @@ def count(n, what):
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-def exposures_table(solution):
-    """One row an exposure: pose, number of stars, residuals, size of the distortion."""
+def exposures_table(solution, shapes=None):
+    """One row an exposure: pose, number of stars, residuals, size of the distortion, shape of its stars.
+
+    `shapes` are ``{name: (FWHM [pix], ellipticity, angle [deg])}``, as far as stars of exposures were measured.
+    """
     dx, dy, n = exposure_rms(solution)
     distortion, dynamic = sizes(solution)
     head = {
@@ -70,7 +76,7 @@ def exposures_table(solution):
         "rms y": "px",
         "distortion": "rms, px",
         "dynamic part": "rms, px",
-    }
+    } | (_SHAPE if shapes else {})
     rows = []
     for i, name in enumerate(solution.names):
         pose = similarity.describe(solution.poses[name])
@@ -86,6 +92,11 @@ def exposures_table(solution):
             f"{dynamic[i]:.3f}",
         ]
         high = tuple(k for k, rms in ((6, dx), (7, dy)) if np.isfinite(rms[i]) and rms[i] > _MARK * np.nanmedian(rms))
+        if shapes:
+            fwhm, ellipticity, angle = shapes.get(name, (np.nan,) * 3)
+            ratio = 1 / max(1 - ellipticity, 1e-3)
+            cells += [_number(fwhm, 2), _number(ratio, 2), _number(angle, 0)]
+            high += (len(cells) - 2,) if ratio > TRAILED else ()
         rows.append(Row(cells, high, exposure=i))
     reference = "static distortion" if np.any(solution.estimate.prior_mean) else "mean of the exposures"
     return Table(
@@ -93,7 +104,8 @@ def exposures_table(solution):
         rows,
         "Shift, rotation and scale lead from the reference plane to the detector. Distortion: length of the "
         "displacement over the detector, less its mean; dynamic part: the same of the departure from the "
-        f"{reference}. Residuals above {_MARK:g} times the median are marked.",
+        f"{reference}. Residuals above {_MARK:g} times the median are marked"
+        + (f", and stars longer than {TRAILED:g} times their width: they are trailed." if shapes else "."),
     )
 
 

@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+from dataclasses import asdict
 from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
@@ -18,6 +19,7 @@ from matplotlib import pyplot, style
 from PIL import Image
 
 from legdistort.assessment.pulls import pulls_of
+from legdistort.assessment.stack_quality import Quality
 from legdistort.cameras.detector import Place
 from legdistort.exceptions import InputError
 from legdistort.geometry import basis
@@ -261,6 +263,20 @@ def test_outlying_exposures_are_marked(tables_only):
     text = report.render(solution)
     marked = re.findall(r'<td class="high">([\d.]+)</td>', text)
     assert marked == [Page(text).row(solution.names[3])[7]]
+
+
+def test_trailed_exposures_have_a_row_and_are_marked(solution, tables_only):
+    """Three times as long as wide is an ellipticity of 2/3; where no star was measured nothing is stated."""
+    names = solution.names
+    shapes = {names[0]: (3.1, 0.1, 12.0), names[1]: (5.4, 2 / 3, -40.0)}
+    text = report.render(solution, summary={"quality": asdict(Quality(9, 4.0, 0.1, 0.05, 0.01, 1.0, 1.0, shapes))})
+    page = Page(text)
+    assert page.cells[page.cells.index(names[0]) + 10 :][:3] == ["3.10", "1.11", "12"]
+    assert page.cells[page.cells.index(names[1]) + 10 :][:3] == ["5.40", "3.00", "-40"]
+    assert page.cells[page.cells.index(names[2]) + 10 :][:3] == ["–", "–", "–"]
+    assert re.findall(r'<td class="high">([\d.]+)</td>', text) == ["3.00"]
+    assert "trailed" in text
+    assert "trailed" not in report.render(solution)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 6])
