@@ -311,6 +311,9 @@ class Diagnostics:
     validation : Validation or None
     motion_scatter : MotionScatter or None
         Whether stars move, where the set was asked.
+    higher_static : float or None
+        Rms per axis over the detector, pixels, of what exposures were found to have in common beyond the degree of the
+        fit; it is part of every distortion. None: nothing was found.
     """
 
     error_floor: float = field(default=0.0, metadata=_PIXELS)
@@ -327,6 +330,7 @@ class Diagnostics:
     epoch: float | None = field(default=None, metadata=YEARS)
     correlated: CorrelatedErrors | None = None
     motion_scatter: MotionScatter | None = None
+    higher_static: float | None = field(default=None, metadata=_PIXELS)
 
     def found_errors(
         self,
@@ -379,7 +383,7 @@ class Diagnostics:
         Returns
         -------
         dict
-            ``{"errors" | "widths" | "modes" | "degree" | "motion" | "kept": sentence}``, those that apply.
+            ``{"errors" | "widths" | "modes" | "higher" | "degree" | "motion" | "kept": sentence}``, those that apply.
         """
         found = self.error_law or self.correlated
         words = {} if found is None else {"errors": str(found)}
@@ -396,6 +400,11 @@ class Diagnostics:
                     f"; departures from the prior mean are {self.departure_ratio:.2f} of those that its widths lead to "
                     "expect"
                 )
+        if self.higher_static is not None:
+            words["higher"] = (
+                f"terms beyond the degree that all exposures of a detector have in common, {self.higher_static:.2g} px "
+                "rms per axis, are part of every distortion"
+            )
         if self.selection is not None:
             words["degree"] = self.selection.sentence
         if self.motion_scatter is not None:
@@ -407,7 +416,7 @@ class Diagnostics:
     def summary(self) -> dict[str, Any]:
         """What there is of it as plain numbers and strings by name, for summaries."""
         names = "widths", "effective_modes", "departure_ratio", "selection", "validation", "error_law", "correlated"
-        names += ("motion_scatter",)
+        names += ("motion_scatter", "higher_static")
         return {name: found for name, found in asdict(self).items() if name in names and found is not None}
 
 

@@ -418,8 +418,16 @@ def _diagnostics(fit, prior, scale):
         widths=None if fit.widths is None else fit.widths.describe(prior, scale),
         prior_has_widths=any(p is not None and p.sigma is not None for p in each),
         effective_modes=dict(zip(fit.problem.names, fit.effective_modes.round(3).tolist(), strict=True)),
+        higher_static=_higher(fit.problem),
         departure_ratio=effective_modes.departure_ratio(fit.problem, fit.result.gauge, fit.blocks, fit.uncertainty),
     )
+
+
+def _higher(problem):
+    """Rms per axis of what was found that exposures have in common beyond the degree, pixels; None for nothing."""
+    if problem.centre is None or not (higher := problem.centre[:, :, problem.n_modes :]).any():
+        return None
+    return float(np.sqrt(np.sum(higher**2) / len(higher) / 8))  # a mode has mean square 1/4
 
 
 def _settings(asked, options, form):

@@ -305,7 +305,8 @@ def _unbent(problem, start, result, common, *, loss="linear", or_else=None, clip
         if better and held is not None:
             positions = held.state.positions.T[held.blocks.v[0] > 0]
             gauge = known_maps.as_in_posterior(held.gauge, found.blocks.unknowns, positions, *found.covariances())
-            held = replace(held, gauge=gauge)
+            widths = any(problem.has_widths(i) for i in range(problem.n_exposures))  # those that were given
+            held = replace(held, gauge=replace(gauge, prior=widths))
         if better:
             return whole, held, found.state
     return before, result, start

@@ -115,8 +115,11 @@ def test_what_exposures_have_in_common_beyond_the_degree_is_part_of_the_distorti
     common = solution.coefficients[:, :, basis.n_modes(3) :]
     assert np.ptp(common, axis=0).max() < 1e-9
     assert np.sqrt(np.mean(common**2)) == pytest.approx(0.02, rel=0.4)
+    assert solution.diagnostics.higher_static == pytest.approx(np.sqrt(np.mean(np.sum(common**2, axis=(1, 2))) / 8))
+    assert "higher  terms beyond the degree" in str(solution)
     without = solved(dense_model.drawn_set(3, **words | {"higher": 0.0})[0])
     assert without.coefficients.shape[2] == basis.n_modes(3)
+    assert without.diagnostics.higher_static is None
 
 
 def test_gross_errors_are_found_beside_large_distortions():

@@ -56,9 +56,9 @@ class Problem:
         Up to this degree exposures have modes of their own; None: nothing is shared. See `Unknowns`.
     group : ndarray of int, shape (n_exposures,)
         Detector of every exposure; exposures of one share what is not their own.
-    centre : ndarray, shape (n_exposures, 2, n_modes), or None
-        Where the widths of coefficients are centred, beside the prior mean: the most probable static distortion less
-        that; None: nothing beside it.
+    centre : ndarray, shape (n_exposures, 2, n_all), or None
+        What was found of the static distortion beside the prior: about it the widths of coefficients are centred, and
+        beyond the degree it is in the mean already. None: nothing.
     moving : StarTerms or None
         How stars move from exposure to exposure; None: they do not.
     """
@@ -159,7 +159,7 @@ class Problem:
         Shape (n_exposures, 2 n_modes).
         """
         out = (coefficients - self.prior_mean)[:, :, : self.n_modes]
-        return (out if self.centre is None else out - self.centre).reshape(len(out), -1)
+        return (out if self.centre is None else out - self.centre[:, :, : self.n_modes]).reshape(len(out), -1)
 
     @property
     def n_modes(self):

@@ -83,12 +83,14 @@ class MostProbable:
     def posed(self, problem):
         """A problem with what was found of its coefficients: the scatter of exposures, and about what they scatter."""
         known, n, sizes = self.known, problem.n_modes, self.posterior.sizes
-        mean = _padded(known.problem.prior_mean, self.state)
-        mean[:, :, known.higher[0]] = self.state.coefficients[:, :, known.higher[0]]
+        given, higher = _padded(known.problem.prior_mean, self.state), known.higher[0]
+        mean, centre = given.copy(), np.zeros(given.shape)
+        mean[:, :, higher] = self.state.coefficients[:, :, higher]
+        centre[:, :, higher] = (mean - given)[:, :, higher]
         static = np.append(self.statics, 0.0)[known.place[known.group]]
-        centre = np.einsum("ik,ika->ia", static, known.others).reshape(-1, 2, n)
+        centre[:, :, :n] = np.einsum("ik,ika->ia", static, known.others).reshape(-1, 2, n)
         by_degree = sizes[np.maximum(np.add(*basis.orders(problem.degree)), 1) - 1]
-        widths = np.broadcast_to(self.oddness[:, None, None] * by_degree, centre.shape)
+        widths = np.broadcast_to(self.oddness[:, None, None] * by_degree, (len(mean), 2, n))
         if problem.prior_sigma is not None:
             given = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
             widths = np.where(given[:, None, None], problem.prior_sigma, widths)
