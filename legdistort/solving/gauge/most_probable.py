@@ -1,7 +1,7 @@
 """The most probable stars, distortions and static distortions together, however large these are.
 
 ``J = chi2 + sum_i (A_i - S)' Lambda_i^-1 (A_i - S) + (S - m)' V^-1 (S - m)`` is minimised over everything at once by
-damped Gauss-Newton steps (Marquardt 1963; Nielsen 1999), the stars eliminated from each. Nothing but the mean
+damped Gauss-Newton steps (Marquardt 1963), the stars eliminated from each. Nothing but the mean
 similarity of the poses is held, so that no convention stands between the data and their minimum. The scatter Lambda of
 single exposures, by degree, and the size of a static distortion of which nothing is known are those that make the data
 most likely. A single Gaussian scatter would let one odd exposure widen that of all: each has a factor of its own on it,
