@@ -204,14 +204,14 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         if trial:
             common |= {"tolerance": TRIAL, "settled": near_by and near.chi2 < EXPLAINED * problem.xy.size}
         result = minimisers.solve_joint(problem, start, **common)
-        problem, result, _ = _unbent(problem, start, result, common)
+        problem, result, _ = _unbent(matches, problem, start, result, common)
         return Fit(matches, problem, result, everything, options)
     if start_values.far_off(problem, typical).any() and (astray := agreement.astray(problem)):
         return minimise(matches.without(astray), options, judged=judged)
     as_near = trial and near_by and (near.options.degree, near.options.clip) == (options.degree, None)
     plain = near.result if as_near else _plain(problem, start, common)
     given = problem
-    problem, plain, near, explained = _first(given, start, plain, common, options.clip)
+    problem, plain, near, explained = _first(matches, given, start, plain, common, options.clip)
     if explained:
         return Fit(matches, problem, plain, everything, options)
     if near is None:
@@ -228,7 +228,7 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         return minimise(matches.without(lost), options, judged=judged)
     if result is not plain:
         kept = given.scaled(used)
-        problem, result, _ = _unbent(kept, near, result, common, or_else=problem, clip=options.clip)
+        problem, result, _ = _unbent(matches, kept, near, result, common, or_else=problem, clip=options.clip)
         problem = replace(problem, weight=given.weight)
     fit = Fit(matches, problem, result, used, options)
     if plain is not None and plain.converged and not used.all() and fit.dof < 1:  # nothing tells what is wrong then
@@ -256,7 +256,7 @@ def _plain(problem, start, common):
             return None
 
 
-def _first(given, start, plain, common, clip):
+def _first(matches, given, start, plain, common, clip):
     """The problem, the fit to all observations, where a robust one may begin, and whether chance explains the fit.
 
     The fit and the beginning are None where there is none.
@@ -265,15 +265,15 @@ def _first(given, start, plain, common, clip):
     if plain is not None and not clipping.is_explained(problem, plain, clip=clip):
         near = clipping.start_from(problem, plain)
         if near is None or clipping.is_misfit(problem, plain):
-            problem, plain, found = _unbent(given, start, plain, common, loss="cauchy")
+            problem, plain, found = _unbent(matches, given, start, plain, common, loss="cauchy")
             near = near if problem is given else found
     if plain is None or not clipping.is_explained(problem, plain, clip=clip):
         return problem, plain, near, False
-    problem, plain, _ = _unbent(given, start, plain, common, or_else=problem, clip=clip)
+    problem, plain, _ = _unbent(matches, given, start, plain, common, or_else=problem, clip=clip)
     return problem, plain, near, True
 
 
-def _unbent(problem, start, result, common, *, loss="linear", or_else=None, clip=None):
+def _unbent(matches, problem, start, result, common, *, loss="linear", or_else=None, clip=None):
     """Problem, fit and start of another with the plane where all that is known is most probable.
 
     Where distortions are large, a plane that a convention holds keeps the data from their minimum. The problem has what
@@ -288,7 +288,10 @@ def _unbent(problem, start, result, common, *, loss="linear", or_else=None, clip
         if clipping.is_explained(problem, again, clip=clip):
             return problem, again, start
     shown = SHOWN if loss == "linear" and not begun else SHOWN_BY_MISFIT
-    if common["gauge"] == "mean" or not most_probable.counts(problem, result.state, shown):
+    possible = (
+        common["gauge"] != "mean" and not matches.camera.has_focal_plane
+    )  # whose detectors have statics of theirs
+    if not possible or not most_probable.counts(problem, result.state, shown):
         return before, result, start
     with warnings.catch_warnings(action="ignore", category=ConvergenceWarning), contextlib.suppress(SolveError):
         # the fit with its plane elsewhere is nearer, unless gross errors moved it
