@@ -288,9 +288,8 @@ def _unbent(matches, problem, start, result, common, *, loss="linear", or_else=N
         if clipping.is_explained(problem, again, clip=clip):
             return problem, again, start
     shown = SHOWN if loss == "linear" and not begun else SHOWN_BY_MISFIT
-    possible = (
-        common["gauge"] != "mean" and not matches.camera.has_focal_plane
-    )  # whose detectors have statics of theirs
+    # the detectors of a camera have statics of theirs
+    possible = common["gauge"] != "mean" and not matches.camera.has_focal_plane
     if not possible or not most_probable.counts(problem, result.state, shown):
         return before, result, start
     with warnings.catch_warnings(action="ignore", category=ConvergenceWarning), contextlib.suppress(SolveError):
