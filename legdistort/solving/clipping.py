@@ -22,6 +22,8 @@ USUAL = 0.1
 SUSPECT = 2.0
 #: So many may be the work of distortions that the fit does not follow.
 MISFIT = 1.3
+#: ... those of a single exposure, with that many observations or more.
+MISFIT_OF_ONE, ENOUGH_SEEN = 1.6, 20
 #: Share of the observations that are taken to be without gross errors where the errors are far above the stated ones.
 MOST = 0.8
 #: Least part of an observation that counts as not taken up by its own fit.
@@ -61,8 +63,11 @@ def _usual(problem):
 
 
 def is_misfit(problem, result):
-    """Whether the usual residual of a fit is too large for gross errors of some observations to be the only cause."""
-    return np.median(criterion.squares(problem, result.blocks.residual)) > MISFIT**2 * _usual(problem)
+    """Whether usual residuals, of all or of an exposure, are too large for gross errors to be the only cause."""
+    squares = criterion.squares(problem, result.blocks.residual) / _usual(problem)
+    parts = [squares[problem.part(i)] for i in range(problem.n_exposures)]
+    worst = max((np.median(part) for part in parts if len(part) >= ENOUGH_SEEN), default=0.0)
+    return np.median(squares) > MISFIT**2 or worst > MISFIT_OF_ONE**2
 
 
 def start_from(problem, result):
