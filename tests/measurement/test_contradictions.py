@@ -2,13 +2,12 @@
 
 import warnings
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 from caller_warnings import warns_here
 from numpy.testing import assert_allclose
-from star_images import image, scattered
+from star_images import image
 
 from legdistort.exceptions import AssumptionWarning
 from legdistort.inputs.exposures import Exposure
@@ -86,45 +85,6 @@ def test_a_frame_is_the_same_in_any_unit(size, known):
         assert_allclose(found[name].value, right[name].value, rtol=0, atol=1e-9)
     assert_allclose(found["chi2"], right["chi2"], rtol=1e-9)
     assert_allclose(found["flags"], right["flags"])
-
-
-@pytest.mark.parametrize("size", [1e-30, 1e-21, 3e-7, 1e5, 1e16, 1e22])
-@pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_no_decision_hangs_on_the_rounding_of_pixels(size, kind, field):
-    """Factors that are no power of two round the pixels of single precision, by 6e-8."""
-    assert_alike(field(kind, "moffat", size), field(kind, "moffat", 1.0), 1e-6 if kind is np.float32 else 1e-9)
-
-
-@pytest.mark.parametrize("size", [3e-7, 1e22])
-def test_effective_psfs_are_the_same_in_any_unit(size, field):
-    assert_alike(field(np.float32, "effective", size), field(np.float32, "effective", 1.0), 1e-6)
-
-
-def assert_alike(found, right, strict):
-    """Positions, errors, flags; of a hundred stars three may be off by ten times as much."""
-    assert len(found) == len(right) > 60
-    assert_allclose(found["flags"], right["flags"])
-    off = np.hypot(found["x"] - right["x"], found["y"] - right["y"]).value
-    errors = np.abs([found[name] / right[name] - 1 for name in ("x_err", "y_err")])
-    assert np.mean(off < strict) >= 0.97
-    assert off.max() < 10 * strict
-    assert np.mean(errors < 3 * strict) > 0.9
-    assert errors.max() < 50 * strict
-
-
-@pytest.fixture(scope="module")
-def field():
-    """A frame of 81 stars, faint and bright, measured in a precision, with a PSF, in a unit."""
-    rng = np.random.default_rng(4)
-    light = image((240, 240), scattered(rng, 81, 240), np.geomspace(500, 1e5, 81), 2.5)
-    data = (rng.poisson(light * GAIN) + rng.normal(0, READ_NOISE, light.shape)) / GAIN
-
-    @cache
-    def measured(kind, psf, size):
-        values = (data.astype(kind).astype(float) * size).astype(kind)
-        return measure(Exposure("e", values, gain=GAIN / size, read_noise=READ_NOISE), psf=psf)
-
-    return measured
 
 
 @pytest.mark.parametrize("power", [-70, -3, 60])

@@ -12,7 +12,6 @@ SHAPE_SIGMA = np.array([0.7, 0.7, 0.5, 0.7])
 #: That of a prior that holds the shape.
 HELD = np.full(4, 1e-3)
 
-_NEAR = 0.1  # change of a shape by the last step: what the pixels do not determine may go anywhere
 _CHUNK = 36_000  # pixels: their Jacobian stays in the processor's cache
 _SMALLEST = 0.3  # smallest full width at half maximum [pix]: anything narrower lies within one pixel
 #: Bounds of the shape, and of the background, which has none.
@@ -215,34 +214,19 @@ def minimise(pixels, start, *, prior, bounds, limits):
         damping[active[~legal]] *= 10
         if len(rows) == 0:
             continue
-        new, least = linearise(trial, rows), limits.gain * np.maximum(1, chi2[rows] / pixels.dof[rows])
-        better = new[1] <= cost[rows] + least  # rounding, of a chi2 in single precision, decides nothing
+        new = linearise(trial, rows)
+        better = new[1] <= cost[rows]
         good = rows[better]
         params[good] = trial[better]
         for kept, value in zip((chi2, cost, gradient, hessian), new, strict=True):
             kept[good] = value[better]
         # A step that would lower chi2 by 1e-4 moves a position by a hundredth of its error, which is larger where the
         # fit is bad. The damping must be small for the foreseen gain to mean that.
-        small = gain < least
+        small = gain < limits.gain * np.maximum(1, chi2[rows] / pixels.dof[rows])
         converged[rows] = small & ((damping[rows] <= 1) | ~better)
         damping[good] /= 5
         damping[rows[~better]] *= 8
-    least = limits.gain * np.maximum(1, chi2 / pixels.dof)
-    return _last_step(params, gradient, hessian, bounds, converged * least), _covariance(hessian), chi2, converged
-
-
-def _last_step(params, gradient, hessian, bounds, least):
-    """Parameters after an undamped step more, which needs no pixels: what is left of a fit that has converged.
-
-    It makes positions a smooth function of the pixels, wherever the iterations ended: they are the same in any unit.
-    A foreseen gain above four times the `least`, or a shape that would change, is not that of a fit near its minimum:
-    no step is taken.
-    """
-    step, gain = _step(params, gradient, hessian, np.full(len(params), 1e-6), bounds)
-    trial, common = params + step, len(bounds[0])
-    trial[:, -common:] = np.clip(trial[:, -common:], *bounds)
-    near = (gain < 4 * least) & (np.abs(step[:, -common:-1]) < _NEAR).all(axis=1)
-    return np.where(near[:, None], trial, params)
+    return params, _covariance(hessian), chi2, converged
 
 
 def _step(params, gradient, hessian, damping, bounds):
