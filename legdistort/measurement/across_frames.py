@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, some_of, warn
 from .camera_gain import camera
-from .flags import UNUSABLE, Flag
+from .flags import TRAILED, UNUSABLE, Flag
 from .profiles import moffat
 from .profiles.defects import are_points
 
@@ -16,8 +16,6 @@ _COMPARED = 100  # exposures, of more evenly chosen ones, in which it is looked 
 _BRIGHTEST = 30  # rows of an exposure by which it is told whether the sky moves
 _BRIGHT = 20.0  # standard deviations of the sky, of peaks of stars that a mask hides
 _HIDDEN = 5  # such peaks from which on it is said
-#: Ratio of the axes of stars from which on they are trailed: aberrations make no more of most.
-TRAILED = 2.0
 
 
 def flag_what_stays(tables, exposures):

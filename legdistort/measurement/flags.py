@@ -22,3 +22,5 @@ class Flag(IntFlag):
 UNUSABLE = Flag.SATURATED | Flag.EDGE | Flag.HOT | Flag.NOT_CONVERGED | Flag.INSIGNIFICANT
 #: Signal-to-noise ratio of a fit below which no star is significant.
 LEAST = 3.0
+#: Ratio of the axes of stars from which on they are trailed: aberrations make no more of most.
+TRAILED = 2.0

@@ -7,7 +7,7 @@ import numpy as np
 from ..assessment.pulls import exposure_rms
 from ..exceptions import some_of
 from ..geometry import similarity
-from ..measurement.across_frames import TRAILED
+from ..measurement.flags import TRAILED
 
 #: An exposure whose residuals exceed the median by this factor is marked.
 _MARK = 2.0

@@ -16,7 +16,7 @@ from . import agreement, clipping, minimisers, star_motions, start_values
 from .choices import prior_widths
 from .equations import criterion, effective_modes, elimination
 from .equations.covariances import Uncertainty
-from .equations.problem import Problem, State, build_problem, uses_compiled_loops
+from .equations.problem import Problem, build_problem, uses_compiled_loops
 from .gauge import known_maps, most_probable
 
 log = logging.getLogger(__name__)
@@ -190,7 +190,8 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
     nominal = np.stack([matches.poses[name] for name in matches.names])
     near_by = near is not None and near.matches is matches and near.result.converged
     if near_by:
-        start, typical = _from(near, problem), np.zeros(problem.n_exposures)
+        shared = min(problem.n_modes, near.problem.n_modes)
+        start, typical = _padded(near.result.state, problem, shared), np.zeros(problem.n_exposures)
     else:
         start, typical = start_values.start(problem, nominal, robust=options.loss != "linear")
     everything = np.ones(problem.xy.shape[1], dtype=bool)
@@ -236,13 +237,6 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
     if result is plain and not plain.converged:
         warn(plain.status, ConvergenceWarning)
     return fit
-
-
-def _from(near, problem):
-    """Start values from another fit, with the modes that both have."""
-    state, coefficients, n = near.result.state, problem.prior_mean.copy(), min(problem.n_modes, near.problem.n_modes)
-    coefficients[:, :, :n] = state.coefficients[:, :, :n]
-    return State(state.stars, coefficients, state.poses)
 
 
 def _plain(problem, start, common):
@@ -319,10 +313,11 @@ def _typical(problem, blocks):
     return np.median(criterion.squares(problem, blocks.residual))
 
 
-def _padded(state, problem):
-    """A state with as many modes as the prior mean of a problem."""
-    coefficients, n = problem.prior_mean.copy(), state.coefficients.shape[2]
-    coefficients[:, :, :n] = state.coefficients[:, :, : coefficients.shape[2]]
+def _padded(state, problem, n=None):
+    """A state with the modes of a problem: its own first n, by default all it has, then those of the prior mean."""
+    coefficients, own = problem.prior_mean.copy(), state.coefficients[:, :, :n]
+    k = min(own.shape[2], coefficients.shape[2])
+    coefficients[:, :, :k] = own[:, :, :k]
     return replace(state, coefficients=coefficients)
 
 

@@ -141,8 +141,7 @@ class Hierarchy:
             reached = np.concatenate([self.motion @ self.maps.T, self.drifts], axis=2)
             full = flat @ reached.reshape(flat.shape[1], -1)
             information = information - full[:n, n:] @ np.linalg.solve(full[n:, n:], full[n:, :n])
-        metric = self.maps @ self.metric @ self.maps.T
-        metric += _RIDGE * np.trace(metric) / len(metric) * np.eye(len(metric))
+        metric = of_maps(self.metric, self.maps)
         curvature, vectors = eigh((information + information.T) / 2, metric)
         is_unknown = np.isinf(self.static).any() & (curvature * LIMIT**2 < 1)
         known, unknown = vectors[:, ~is_unknown], vectors[:, is_unknown]
@@ -210,6 +209,12 @@ def named(maps, gauge, positions):
     moved, vectors = np.linalg.eigh(maps.T @ metric @ maps)
     kept = moved > 0.5
     return _named(maps @ vectors[:, kept] / np.sqrt(moved[kept]), pointed, metric, tuple(2 * gauge.box[1, ::-1]))
+
+
+def of_maps(metric, maps):
+    """The metric (m, m) of maps, rows (m, 2 n), from that of their modes (2 n,) squared."""
+    out = maps @ metric @ maps.T
+    return out + _RIDGE * np.trace(out) / len(out) * np.eye(len(out))
 
 
 def plane_metric(gauge, positions):

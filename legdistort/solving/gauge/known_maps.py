@@ -7,9 +7,7 @@ from scipy.linalg import eigh
 
 from ...geometry.detector_modes import similarity_basis
 from ..equations.criterion import complement
-from .hierarchy import LIMIT, named, plane_metric
-
-_RIDGE = 1e-9  # of the metric: few stars leave maps without any displacement
+from .hierarchy import LIMIT, named, of_maps, plane_metric
 
 
 def as_in_posterior(gauge, unknowns, positions, covariance, wide):
@@ -37,9 +35,7 @@ def as_in_posterior(gauge, unknowns, positions, covariance, wide):
     rows = unknowns.gather(rows.reshape(len(rows), 2 * unknowns.n_modes, -1)).T
     of_rows, widest = (rows @ each @ rows.T for each in (covariance, covariance if wide is None else wide))
     back = np.linalg.inv(gauge.reach @ np.hstack([maps, similar]))[: maps.shape[1]]
-    inside = maps.T @ metric @ maps
-    inside += _RIDGE * np.trace(inside) / len(inside) * np.eye(len(inside))
-    curvature, vectors = eigh(np.linalg.inv(back @ widest @ back.T), inside)
+    curvature, vectors = eigh(np.linalg.inv(back @ widest @ back.T), of_maps(metric, maps.T))
     is_unknown = (wide is not None) & (curvature * LIMIT**2 < 1)
     known, unknown = maps @ vectors[:, ~is_unknown], maps @ vectors[:, is_unknown]
     back = np.linalg.inv(gauge.reach @ np.hstack([known, unknown, similar]))[: known.shape[1]]

@@ -24,7 +24,7 @@ from ..equations.problem import State
 from ..knowledge.exposures import stated
 from ..knowledge.factors import GIVEN, Factor
 from ..knowledge.posterior import Posterior, most_likely
-from ..knowledge.reduced_data import ReducedData, drawn, part_of
+from ..knowledge.reduced_data import drawn, part_of, without_stars
 from . import constraints
 
 log = logging.getLogger(__name__)
@@ -67,7 +67,6 @@ class MostProbable:
     blocks : Blocks
         Of the data alone.
     known : _Known
-    n_steps : int
     converged : bool
     """
 
@@ -77,14 +76,13 @@ class MostProbable:
     oddness: np.ndarray
     blocks: object
     known: "_Known"
-    n_steps: int
     converged: bool
 
     def posed(self, problem):
         """A problem with what was found of its coefficients: the scatter of exposures, and about what they scatter."""
         known, n, sizes = self.known, problem.n_modes, self.posterior.sizes
         given, higher = _padded(known.problem.prior_mean, self.state), known.higher[0]
-        mean, centre = given.copy(), np.zeros(given.shape)
+        mean, centre = given.copy(), np.zeros_like(given)
         mean[:, :, higher] = self.state.coefficients[:, :, higher]
         centre[:, :, higher] = (mean - given)[:, :, higher]
         static = np.append(self.statics, 0.0)[known.place[known.group]]
@@ -189,24 +187,24 @@ class _Search:
     """
 
     def __init__(self, problem, state, loss, sizes, top, near=None):
-        self.known, n = _Known.of(problem, top), max(problem.prior_mean.shape[2], basis.n_modes(top))
-        mean = np.pad(problem.prior_mean, ((0, 0), (0, 0), (0, n - problem.prior_mean.shape[2])))
-        coefficients = np.pad(state.coefficients, ((0, 0), (0, 0), (0, n - state.coefficients.shape[2])))
+        self.known = _Known.of(problem, top)
+        highest = max(top, basis.degree_of(problem.prior_mean.shape[2]))
+        mean = basis.change_degree(problem.prior_mean, highest)
         plain = replace(problem, prior_sigma=None, static_sigma=None)
         self.stated = self.problem = replace(plain, degree=top, own_degree=problem.degree, prior_mean=mean)
         self.loss = loss
         self.sizes, self.holds_sizes, self.settled = sizes, sizes is not None, False
-        self.n_steps, self.size, self.damping = 0, np.inf, _DAMPING[0]
+        self.size, self.damping = np.inf, _DAMPING[0]
         if near is None:
             state = constraints.absorb_similarities(plain, state)
             blocks = criterion.linearise(plain, state)
             unit = 1 / np.sqrt(np.median(np.einsum("iaa->ia", blocks.u)))
             self.pointing = constraints.pose_rows(plain, state, blocks), _HELD * unit
             self.statics, self.oddness = np.zeros(self.known.n_statics), np.ones(problem.n_exposures)
-            coefficients = np.pad(state.coefficients, ((0, 0), (0, 0), (0, n - state.coefficients.shape[2])))
         else:
             self.pointing, self.statics, self.oddness = near.pointing, near.statics, near.oddness
             self.sizes = np.append(near.sizes, near.unit)
+        coefficients = basis.change_degree(state.coefficients, highest)
         self._arrive(replace(state, coefficients=coefficients), self.statics)
         self.factor = self.known.factor(*self.pointing)
         self.weigh()
@@ -224,10 +222,11 @@ class _Search:
 
     def descend(self, max_steps):
         """Step until nothing changes any more."""
-        while self.n_steps < max_steps and not (self.size < TOLERANCE[self.loss] and self.settled):
+        for _ in range(max_steps):
+            if self.size < TOLERANCE[self.loss] and self.settled:
+                break
             self.step()
-            self.n_steps += 1
-            log.debug("J = %.8g, step %.2g standard errors, sizes %s", self.cost, self.size, self.sizes)
+            log.debug("chi2 %.8g, step %.2g standard errors, sizes %s", self.blocks.chi2, self.size, self.sizes)
 
     def found(self):
         """Where it has ended."""
@@ -238,21 +237,12 @@ class _Search:
             oddness=self.oddness,
             blocks=self.blocks,
             known=self.known,
-            n_steps=self.n_steps,
             converged=self.size < TOLERANCE[self.loss],
         )
 
     def weigh(self):
         """The posterior where the search is, and the sizes and oddness that follow from it."""
-        problem, blocks, before = self.problem, self.blocks, self.sizes
-        self.inverse = elimination.inverse_star_blocks(blocks.v)
-        moved = elimination.symmetric_times(self.inverse, blocks.g_star)
-        data = ReducedData(
-            curvature=elimination.reduced_matrix(problem, blocks),
-            pull=blocks.unknowns.gather(blocks.g_exposure - elimination.to_exposures(problem, blocks, moved)),
-            chi2=float(blocks.cost - (moved * blocks.g_star).sum()),
-            n_data=2 * np.count_nonzero(problem.weight[0]) - elimination.star_freedom(problem, blocks),
-        )
+        before, data = self.sizes, without_stars(self.problem, self.blocks)
         factor = self.known.at(self.factor, self.state, self.statics, self.oddness)
         self.unit = 1 / np.sqrt(np.median(np.diag(data.curvature)))
         if self.holds_sizes:
@@ -293,7 +283,8 @@ class _Search:
         """State, statics and blocks after a step."""
         n, n_modes = self.problem.unknowns.size, self.problem.n_modes
         pulled = elimination.to_stars(self.problem, self.blocks, self.blocks.unknowns.spread(z[:n]))
-        moved = elimination.symmetric_times(self.inverse, self.blocks.g_star - pulled)
+        inverse = elimination.inverse_star_blocks(self.blocks.v)
+        moved = elimination.symmetric_times(inverse, self.blocks.g_star - pulled)
         coefficients = self.state.coefficients.copy()  # poses, which follow, carry the rest along
         coefficients[:, :, :n_modes] += self.problem.unknowns.spread(z[:n]).reshape(len(coefficients), 2, -1)
         state = State(self.state.stars + moved, coefficients, self.state.poses)
@@ -436,4 +427,5 @@ class _Known:
 
 
 def _padded(mean, state):
-    return np.pad(mean, ((0, 0), (0, 0), (0, state.coefficients.shape[2] - mean.shape[2])))
+    """A mean of a prior with as many modes as a state has."""
+    return basis.change_degree(mean, basis.degree_of(state.coefficients.shape[2]))

@@ -38,6 +38,25 @@ class ReducedData:
         return ReducedData(self.curvature, self.pull - change, float(chi2), self.n_data)
 
 
+def without_stars(problem, blocks):
+    """The data of a fit as all its unknown coefficients see them, the stars eliminated.
+
+    Parameters
+    ----------
+    problem : Problem
+        With the weights that were in force.
+    blocks : Blocks
+        Where J and its derivatives are taken.
+    """
+    moved = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
+    return ReducedData(
+        curvature=elimination.reduced_matrix(problem, blocks),
+        pull=blocks.unknowns.gather(blocks.g_exposure - elimination.to_exposures(problem, blocks, moved)),
+        chi2=float(blocks.cost - (moved * blocks.g_star).sum()),
+        n_data=2 * np.count_nonzero(problem.weight[0]) - elimination.star_freedom(problem, blocks),
+    )
+
+
 def reduced_data(problem, state, rows, motion):
     """The data of a fit as some coefficients see them.
 
@@ -53,11 +72,8 @@ def reduced_data(problem, state, rows, motion):
         How maps of the reference plane change the coefficients (`legdistort.results.gauge.Gauge`); they are the
         null space of the data, along which the linear model follows the noise.
     """
-    blocks, unknowns = criterion.linearise(problem, state), problem.unknowns
-    n = problem.n_modes
-    moved = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
-    pull = blocks.unknowns.gather(blocks.g_exposure - elimination.to_exposures(problem, blocks, moved))
-    matrix = elimination.reduced_matrix(problem, blocks)
+    data, unknowns = without_stars(problem, criterion.linearise(problem, state)), problem.unknowns
+    n, pull, matrix = problem.n_modes, data.pull, data.curvature
     common = motion.reshape(problem.n_exposures, 2, -1, motion.shape[2])
     common = np.pad(common, ((0, 0), (0, 0), (0, n - common.shape[2]), (0, 0)))
     common = np.linalg.qr(unknowns.gather(common.reshape(problem.n_exposures, 2 * n, -1)))[0]
@@ -72,8 +88,8 @@ def reduced_data(problem, state, rows, motion):
     return ReducedData(
         curvature=(curvature + curvature.T) / 2,
         pull=rows @ pull - across @ solved[:, -1],
-        chi2=float(blocks.cost - (moved * blocks.g_star).sum() - others @ pull @ solved[:, -1]),
-        n_data=2 * np.count_nonzero(problem.weight[0]) - elimination.star_freedom(problem, blocks) - len(others) + 4,
+        chi2=float(data.chi2 - others @ pull @ solved[:, -1]),
+        n_data=data.n_data - len(others) + 4,
     )
 
 
