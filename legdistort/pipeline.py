@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
     from astropy.table import Table
     from astropy.time import Time
+    from astropy.units import Quantity
 
     from .coaddition.mosaic import Mosaic
     from .priors.prior import Prior
@@ -107,6 +108,7 @@ def run(
     clip: float | None = CLIP,
     psf: Any = "auto",
     reference: Table | SkyCoord | StrPath | None = None,
+    reference_error: float | Quantity | str | None = None,
     epoch: float | Time | None = None,
     pixel_scale: float | None = None,
     measuring: Mapping[str, Any] | None = None,
@@ -149,8 +151,8 @@ def run(
         Leave out observations beyond this many standard errors, see `legdistort.solve`.
     psf : str, EffectivePSF, path, photutils model or dict of those
         What the stars are fitted with, see `legdistort.measure`.
-    reference, epoch, pixel_scale : optional
-        Catalogue to tie the positions to, see `legdistort.solve`.
+    reference, reference_error, epoch, pixel_scale : optional
+        Catalogue whose positions are known, see `legdistort.solve`.
     measuring, matching, solving, coadding : dict, optional
         Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`, all of them checked before a frame is
         read. The stack is ``"clipped"`` here: hot pixels and cosmic rays do not get into it.
@@ -202,7 +204,7 @@ def run(
     matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures, progress=progress)
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
-    tying = _tying(reference, epoch, pixel_scale, solving)
+    tying = _tying(reference, reference_error, epoch, pixel_scale, solving)
     _check_others(workers, truth)
     paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
     share, timings = {"workers": workers, "progress": progress}, _of_start()
@@ -305,9 +307,10 @@ def _where_to_begin(paths, earlier, measuring, **reading):
     return before.frames if paths is None else paths, before.reading | {"camera": before.camera}, before
 
 
-def _tying(reference, epoch, pixel_scale, solving):
+def _tying(reference, error, epoch, pixel_scale, solving):
     """What ties the solution to the sky, as arguments of `solve`."""
-    reference, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=solving.method)
+    how = {"error": error, "epoch": epoch, "pixel_scale": pixel_scale, "method": solving.method}
+    reference, epoch = check_reference(reference, **how)
     return {"reference": reference, "epoch": epoch, "pixel_scale": pixel_scale}
 
 

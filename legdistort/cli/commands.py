@@ -67,7 +67,7 @@ def do_run(a):
         given(a, options.MATCHING),
         _solving(a, with_headers=True),
     )
-    own = ("psf", "degree", "prior", "clip", "reference", "epoch", "pixel_scale", "min_exposures")
+    own = ("psf", "degree", "prior", "clip", "reference", "reference_error", "epoch", "pixel_scale", "min_exposures")
     with pipeline.counted_from(a.begun):
         result = legdistort.run(
             **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING),
@@ -367,7 +367,8 @@ def _refuse(given, reason):
 def _refuse_ignored(a):
     """Options of `run` and `solve` that others leave without effect."""
     if a.reference is None:
-        _refuse({"epoch": a.epoch, "pixel_scale": a.pixel_scale}, "is for the catalogue of --reference")
+        tying = {"reference_error": a.reference_error, "epoch": a.epoch, "pixel_scale": a.pixel_scale}
+        _refuse(tying, "is for the catalogue of --reference")
     if a.command == "run":
         _refuse_drops(a)
 

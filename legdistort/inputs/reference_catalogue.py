@@ -7,6 +7,7 @@ of stars of solutions. Where a table has both, the sky is taken.
 import warnings
 from dataclasses import dataclass, replace
 from itertools import combinations
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,8 @@ _UNITS |= dict.fromkeys(("vx", "vy"), u.pix / u.yr) | {"parallax": u.mas}
 _MAS = np.radians(1 / 3.6e6)
 #: Error of what is taken as exact: mas, and mas a year.
 EXACT = 1e-3
+#: In place of an error: it is to be found.
+FOUND = "found"
 #: Years between catalogue and exposures within which a star without proper motion still serves.
 _SAME_TIME = 0.01
 
@@ -67,6 +70,8 @@ class Reference:
         Proper motions to the east and north, mas a year, or along x and y, pixels a year; perhaps parallaxes, mas.
     epoch : ndarray, shape (n,), or None
         Years of the positions.
+    finds_errors : bool
+        Whether the errors are known up to a common factor only, which is to be found.
     """
 
     label: str
@@ -77,6 +82,7 @@ class Reference:
     covariance: np.ndarray
     motion: np.ndarray | None = None
     epoch: np.ndarray | None = None
+    finds_errors: bool = False
 
     def __len__(self):
         return len(self.covariance)
@@ -182,7 +188,7 @@ def _degrees(place):
     return np.stack([lon % 360, lat], axis=1)
 
 
-def read_reference(reference):
+def read_reference(reference, error=None):
     """The `Reference` in a table or file.
 
     Parameters
@@ -190,6 +196,9 @@ def read_reference(reference):
     reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord`, str, path or Reference
         Of a table the column that holds a `~astropy.coordinates.SkyCoord`, if there is one, gives positions, motions
         and epoch. A `~astropy.coordinates.SkyCoord` alone is taken as exact.
+    error : float, `~astropy.units.Quantity` or "found", optional
+        Of positions for which it states none, per axis: mas on the sky, else pixels. Found: stated errors count only
+        relative to one another, all others are equal, and their size follows from how the stars agree.
 
     Raises
     ------
@@ -203,12 +212,13 @@ def read_reference(reference):
     """
     if isinstance(reference, Reference):
         return reference
+    _check_error(error)
     if isinstance(reference, (str, Path)):
         label, table = f"the reference {reference}", read_table(reference)
     elif isinstance(reference, Table):
         label, table = "the reference", Table(reference)  # Quantities become columns with a unit
     elif isinstance(reference, SkyCoord):
-        label, table = "the reference", _exact(reference)
+        label, table = "the reference", _exact(reference) if error is None else Table({"sky": reference})
     else:
         raise InputError(f"reference must be a table, the path of one, or a SkyCoord, got {type(reference).__name__}")
     table = _named(_with_coordinates(table, label))
@@ -218,6 +228,7 @@ def read_reference(reference):
             f"{label} has neither ra, dec nor x, y; it has {', '.join(table.colnames)}: rename its columns"
         )
     try:
+        table = _with_errors(table, ("ra", "dec") if celestial else ("x", "y"), error)
         made = (_celestial if celestial else _planar)(table, label)
     except InputError as error:
         raise InputError(f"{label}: {error}" if label not in str(error) else str(error)) from None
@@ -228,7 +239,43 @@ def read_reference(reference):
     if made.star is not None and len(np.unique(made.star[good])) < np.count_nonzero(good):
         names, count = np.unique(made.star[good], return_counts=True)
         raise InputError(f"{label} names star {names[count > 1][0]} more than once")
-    return made.subset(good)
+    return replace(made.subset(good), finds_errors=is_found(error))
+
+
+def is_found(error):
+    """Whether an error is one to be found."""
+    return isinstance(error, str) and error == FOUND
+
+
+def _check_error(error):
+    """Raise `InputError` for what is no error of positions."""
+    if error is None or is_found(error):
+        return
+    value = error.value if isinstance(error, u.Quantity) else error
+    if not (isinstance(value, (Real, np.ndarray)) and np.ndim(value) == 0 and 0 < value < np.inf):
+        raise InputError(
+            f"reference_error must be a positive number, a Quantity, or {FOUND!r}, got {error!r}: the error per axis "
+            "of positions for which the reference states none, mas on the sky, else pixels"
+        )
+
+
+def _with_errors(table, places, error):
+    """The table with errors of positions where it states none."""
+    if error is None:
+        return table
+    unit = u.mas if places[0] == "ra" else u.pix
+    if is_found(error):
+        size = 1.0
+    else:
+        try:
+            size = float(u.Quantity(error, unit).value) if isinstance(error, u.Quantity) else float(error)
+        except u.UnitsError:
+            raise InputError(f"reference_error must be in {unit} for its positions, got {error}") from None
+    out = table.copy()
+    for name in (_ERRORS.get(place, f"{place}_error") for place in places):
+        stated = column_contract.values(table, name, unit) if name in table.colnames else np.full(len(table), np.nan)
+        out[name] = np.where(np.isfinite(stated), stated, size)
+    return out
 
 
 def _exact(coordinates):

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis, similarity
+from .errors.absolute_errors import map_directions
 from .errors.coefficient_covariance import exposure_blocks, times
 from .errors.star_covariance import star_matrix
 from .estimate import StoredUncertainty
@@ -190,8 +191,9 @@ def expected_bias(solution, *, removed=None, absolute=False):
     covariance = between[np.ix_(np.tile(good, 2), np.tile(good, 2))]
     if absolute:
         hidden = solution.gauge.absolute_covariance
-        modes = np.kron(np.eye(2), solution.gauge.modes_at(xy, len(hidden) // 2)).T
-        covariance = covariance + modes @ hidden @ modes.T
+        moved = map_directions(solution.gauge, solution.estimate.positions)[good]
+        moved = moved.transpose(1, 0, 2).reshape(2 * len(xy), -1)
+        covariance = covariance + moved @ hidden @ moved.T
     columns = _columns(xy, removed)
     left = np.trace(covariance) - np.trace(columns.T @ covariance @ columns)
     return float(np.sqrt(left / len(covariance)))

@@ -26,6 +26,8 @@ def stars(solution):
     used = solution.residuals[solution.residuals["used"]]
     index = np.searchsorted(estimate.star_names, used["star"])
     table["n"] = np.bincount(index, minlength=len(table))
+    if (tie := solution.gauge.tie) is not None and tie.known is not None:
+        table["reference_used"] = np.isin(estimate.star_names, tie.stars[tie.used])
     if "flux" in used.colnames:
         with np.errstate(invalid="ignore"):
             table["flux"] = np.bincount(index, used["flux"], len(table)) / table["n"]

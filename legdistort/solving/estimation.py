@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from astropy.modeling import Model
     from astropy.table import Table
     from astropy.time import Time
+    from astropy.units import Quantity
 
     from ..results.solution import Solution
     from ..runtime.annotations import StrPath
@@ -67,6 +68,7 @@ def solve(
     motion_sigma: float | str | None = None,
     motion_epoch: float | Time | None = None,
     reference: Table | SkyCoord | StrPath | None = None,
+    reference_error: float | Quantity | str | None = None,
     epoch: float | Time | None = None,
     pixel_scale: float | None = None,
     progress: bool = False,
@@ -141,14 +143,17 @@ def solve(
     motion_epoch : float or `~astropy.time.Time`, optional
         Of the positions in ``stars``; by default the mean of the observations, where they are most precise.
     reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord` or path, optional
-        Positions with errors that tie shift, rotation and scale, and the maps that the exposures do not determine;
-        relative positions stay as precise as they are. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error``
+        Positions with errors: what is known beforehand of its stars, and so of shift, rotation and scale, and of maps
+        that the exposures do not determine. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error``
         [mas] and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``parallax``,
         ``parallax_error`` [mas], ``ref_epoch`` [yr] and correlations, as in the Gaia catalogue; or ``x``, ``y``,
         ``x_err``, ``y_err`` in pixels of the reference plane, perhaps with ``vx``, ``vy`` and their errors; and perhaps
         ``star``, the stars of the matches, which are otherwise found by their positions. A column that holds a
-        `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch. With `motion` the reference is also a
-        prior on the positions, motions and parallaxes of its stars.
+        `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch. With `motion` its motions and
+        parallaxes are known beforehand too. Errors that prove too small are taken larger, with a warning.
+    reference_error : float, `~astropy.units.Quantity` or "found", optional
+        Error per axis of its positions where it states none: mas on the sky, else pixels. Found: the size of its errors
+        is the one at which its stars agree with the exposures, and stated errors count relative to one another alone.
     epoch : float or `~astropy.time.Time`, optional
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
@@ -197,7 +202,8 @@ def solve(
         max_iterations=max_iterations, validate=validate, motion=motion, motion_sigma=motion_sigma,
         motion_epoch=motion_epoch,
     )  # fmt: skip
-    catalogue, epoch = check_reference(reference, epoch=epoch, pixel_scale=pixel_scale, method=method)
+    tying = {"error": reference_error, "epoch": epoch, "pixel_scale": pixel_scale, "method": method}
+    catalogue, epoch = check_reference(reference, **tying)
     if model is None:
         _warn_of_header(matches, prior)
     options, form = replace(asked, static=None, layout=None) if matches.camera.has_focal_plane else asked, None

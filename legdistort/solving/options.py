@@ -163,7 +163,7 @@ def check_detectors(several, layout, static, dynamic):
             )
 
 
-def check_reference(reference, *, epoch=None, pixel_scale=None, method="joint"):
+def check_reference(reference, *, error=None, epoch=None, pixel_scale=None, method="joint"):
     """The arguments of `solve` that concern a reference catalogue, checked: the catalogue read, and the epoch in years.
 
     Raises
@@ -175,7 +175,9 @@ def check_reference(reference, *, epoch=None, pixel_scale=None, method="joint"):
         raise InputError(f"pixel_scale must be a positive number of arcsec, got {pixel_scale!r}")
     epoch = year(epoch)
     if reference is None:
+        if error is not None:
+            raise InputError("reference_error is for the catalogue of reference: leave it out, or give that")
         return None, epoch
     if method == "alternating":
         raise InputError("method='alternating' is the published scheme: it takes no reference")
-    return read_reference(reference), epoch
+    return read_reference(reference, error), epoch

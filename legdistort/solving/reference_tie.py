@@ -1,10 +1,10 @@
-"""A converged solution tied to a reference catalogue: its gauge alone moves, not the relative positions.
+"""A converged solution with what a reference catalogue knows of its stars.
 
 The shift, rotation and scale by the reference move positions and poses exactly; the other modes of a common map by the
 reference become the value at which the constraints of the gauge are held.
 
-Where the motions of stars are fitted, the reference is a prior on the stars that it has: on positions, motions and
-parallaxes with their full covariance. It comes in two steps that are the posterior together, so that nothing counts
+The reference is a prior on the stars that it has: on positions and, where they are fitted, motions and parallaxes, with
+their full covariance. It comes in two steps that are the posterior together, so that nothing counts
 twice: the common maps g from the offsets of the reference, all else integrated out, p(g | data, reference); then the
 stars with these maps held, p(stars | g, data, reference), in which the reference stands in the normal equations of its
 stars. The covariance is that of the second step and, through the directions in which the stars follow g, that of g.
@@ -24,7 +24,7 @@ from ..geometry.similarity import robust_similarity
 from ..inputs import column_contract
 from ..matching.cross_identification import identify
 from ..results.diagnostics import UsedReference
-from ..results.errors.absolute_errors import plain_directions
+from ..results.errors.absolute_errors import plain_directions, variances
 from . import minimisers
 from .equations import criterion, elimination
 from .equations.covariances import Uncertainty
@@ -45,6 +45,10 @@ _LARGE = 2.0
 _ELSEWHERE = 25.0
 #: A map moves the solution to first order; what is left comes from another round.
 _MAP_ROUNDS = 2
+#: Factor on errors that are to be found.
+_TINY = 1e-6
+#: Modes of maps from which stars are held: of fewer, shear is one that exposures determine by themselves.
+FEWEST_MODES = 3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,6 +70,8 @@ class ReferenceTie:
         ``solve(problem, state, common=None)``: `legdistort.solving.minimisers.solve_joint` with the options of the fit.
     common : dict
         Errors that stars have in common, as `Uncertainty` takes them.
+    finds_errors : bool
+        Whether the errors of the reference are found, its own only those of stars relative to others.
     """
 
     identified: object
@@ -75,6 +81,7 @@ class ReferenceTie:
     scale: float
     solve: object
     common: dict
+    finds_errors: bool = False
 
     def tie(self, problem, result):
         """The `Result` with the plane where the reference puts it and the `Tie` in its gauge, and the `MapPrior` there.
@@ -94,14 +101,14 @@ class ReferenceTie:
         status, first = result.status, self._rough(result.state)
         if first is not None:
             result = self.solve(problem, _moved(result.state, first))
-        prior, rest = None, ""
+        prior, made, rest = None, None, ""
         for count in range(_ROUNDS):
             if count < 2:  # afterwards the plane moves too little for another
                 errors = self._errors(problem, result)
                 directions = self._directions(result.gauge, errors, result.state.positions.T)
                 prior = self._prior(result.gauge, directions) if prior is None else prior
             equations = self._equations(result, directions, errors, prior)
-            step, made = catalogue_map.estimate(equations, catalogue_map.accepted(equations, self.label), self.names)
+            equations, step, made = self._estimate(equations, near=None if made is None else made.used)
             moved, error = self._move(directions, step, made)
             if count and moved < max(_SETTLED * error, 1e-8):
                 break
@@ -117,7 +124,7 @@ class ReferenceTie:
                 gauge = result.gauge
                 step = np.pad(step, (0, len(gauge.drift.covariance)))
                 state = _drifted(problem, replace(result, state=state), step)[1]
-                result = self._kept(self.solve(problem, state, hold=True), gauge, gauge.drift)
+                result = self._kept(self.solve(problem, state, hold=True), gauge)
             else:
                 result = self.solve(problem, state, common=common)
         else:
@@ -149,7 +156,6 @@ class ReferenceTie:
         Parameters
         ----------
         problem : Problem
-            In which stars move.
         result : Result
             Of `tie`.
         prior : `legdistort.solving.gauge.catalogue_map.MapPrior`
@@ -158,15 +164,47 @@ class ReferenceTie:
         Raises
         ------
         InputError
-            At degree 0, and if most motions deviate.
+            Where stars move: at degree 0, and if most motions deviate.
         """
-        gauge, status, scale2 = result.gauge, result.status, self.scale**2
-        if gauge.n_modes < 3:
+        gauge, status = result.gauge, result.status
+        values, covariance = self._offered(self.identified, problem.terms.n, gauge.tie.factor)
+        used, joint, map_covariance = gauge.tie.used, None, gauge.tie.covariance
+        if problem.terms.n:
+            problem, result, used, joint = self._drifts_tied(problem, result, prior, values, covariance)
+            map_covariance = joint[: 2 * gauge.n_modes, : 2 * gauge.n_modes]
+        log.info("stars are held at what %s knows of %d of them", self.label, np.count_nonzero(used))
+        rows = self.identified.rows
+        offsets = self.identified.xy - result.state.positions.T[rows]
+        more, more_covariance = self._offered(self.others, problem.terms.n, gauge.tie.factor)
+        catalogue = StarPrior.of(
+            len(self.names),
+            np.concatenate([rows[used], self.others.rows]),
+            np.concatenate([values[used], more]),
+            np.concatenate([covariance[used], more_covariance]) / self.scale**2,
+        )
+        problem = replace(problem, moving=replace(problem.terms, catalogue=catalogue))
+        result = self._kept(self.solve(problem, result.state, hold=True), gauge)
+        known = {"known": covariance[:, :2, :2], "shared": 0 * gauge.tie.shared}
+        tie = replace(gauge.tie, covariance=map_covariance, offsets=offsets, used=used, **known)
+        drift = gauge.drift
+        if joint is not None:
+            n_tied = int(np.count_nonzero(np.isfinite(values[used, 2])))
+            parallax = values.shape[1] > 4 and bool(np.isfinite(values[used, 4]).any())
+            drift = result.gauge.drift.tied(joint, n_tied, parallax)
+        result = replace(result, gauge=replace(result.gauge, tie=tie, drift=drift))
+        return problem, replace(result, status=status if result.converged else result.status)
+
+    def _drifts_tied(self, problem, result, prior, values, covariance):
+        """Problem and result with the plane, and what changes it with time, where positions and motions put it.
+
+        With the stars that agree, and the covariance (2 n_modes + q,) squared of all these maps.
+        """
+        gauge = result.gauge
+        if gauge.n_modes < FEWEST_MODES:
             raise InputError(
                 f"motions are tied to {self.label} at degree 1 or more: raise the degree, or leave out one of the two"
             )
         size, before = 2 * gauge.n_modes, gauge.drift
-        values, covariance = self._offered(self.identified, problem.terms.n)
         information = block_diag(prior.information, catalogue_motions.drift_information(before))
         centre = np.concatenate([prior.centre, np.zeros(len(before.covariance))])
         used, step = gauge.tie.used, np.zeros(len(centre))
@@ -176,32 +214,26 @@ class ReferenceTie:
         for _ in range(_MAP_ROUNDS):
             problem, state = _drifted(problem, result, step)
             centre = centre - step
-            result = self._kept(self.solve(problem, state, hold=True), gauge, before)
+            result = self._kept(self.solve(problem, state, hold=True), gauge)
             step, joint = self._whole_map(problem, result, values, covariance, used, information, centre)
-        log.info("stars are held at what %s knows of %d of them", self.label, np.count_nonzero(used))
-        rows = self.identified.rows
-        offsets = self.identified.xy - result.state.positions.T[rows]
-        more, more_covariance = self._offered(self.others, problem.terms.n)
-        catalogue = StarPrior.of(
-            len(self.names),
-            np.concatenate([rows[used], self.others.rows]),
-            np.concatenate([values[used], more]),
-            np.concatenate([covariance[used], more_covariance]) / scale2,
-        )
         problem, state = _drifted(problem, result, step)
-        problem = replace(problem, moving=replace(problem.terms, catalogue=catalogue))
-        result = self._kept(self.solve(problem, state, hold=True), gauge, before)
-        n_tied = int(np.count_nonzero(np.isfinite(values[used, 2])))
-        parallax = values.shape[1] > 4 and bool(np.isfinite(values[used, 4]).any())
-        drift = result.gauge.drift.tied(joint, n_tied, parallax)
-        tie = replace(
-            gauge.tie, covariance=joint[:size, :size], shared=0 * gauge.tie.shared, offsets=offsets, used=used
-        )
-        result = replace(result, gauge=replace(result.gauge, tie=tie, drift=drift))
-        return problem, replace(result, status=status if result.converged else result.status)
+        return problem, replace(result, state=state), used, joint
+
+    def _estimate(self, equations, near):
+        """Equations with errors of the reference as they turn out, the map that these give, and the `Tie`."""
+        # errors that are to be found let no mismatch pass
+        offered = equations.times(_TINY) if self.finds_errors else equations
+        used = catalogue_map.accepted(offered, self.label, near)
+        step, made = catalogue_map.estimate(equations, used, self.names)
+        factor = catalogue_map.error_factor(equations, used, found=self.finds_errors)
+        if factor != 1:
+            equations = equations.times(factor)
+            step, again = catalogue_map.estimate(equations, used, self.names)
+            made = replace(again, ratio=made.ratio, factor=factor)
+        return equations, step, made
 
     @staticmethod
-    def _offered(found, k):
+    def _offered(found, k, factor):
         """Positions and motions in a reference: values (n, 2 + k) and covariances, NaN for what it does not have."""
         n = len(found.rows)
         values, covariance = np.full((n, 2 + k), np.nan), np.full((n, 2 + k, 2 + k), np.nan)
@@ -209,12 +241,16 @@ class ReferenceTie:
         m = min(known.shape[1], 2 + k)
         values[:, :m], covariance[:, :m, :m] = known[:, :m], found.covariance[:, :m, :m]
         values[~np.isfinite(np.einsum("jaa->ja", covariance))] = np.nan
-        return values, covariance
+        return values, factor**2 * covariance
 
-    def _kept(self, result, gauge, drift):
-        """A result with what an earlier `gauge` knew of the common map, and `drift` of those that change with time."""
-        kept = replace(result.gauge.drift, covariance=drift.covariance, held=drift.held)
-        return replace(result, gauge=replace(result.gauge, tie=gauge.tie, unknown_maps=gauge.unknown_maps, drift=kept))
+    @staticmethod
+    def _kept(result, gauge):
+        """A result with what an earlier `gauge` knew of common maps."""
+        kept = {"tie": gauge.tie, "unknown_maps": gauge.unknown_maps}
+        if gauge.drift is not None:
+            known = {"covariance": gauge.drift.covariance, "held": gauge.drift.held}
+            kept["drift"] = replace(result.gauge.drift, **known)
+        return replace(result, gauge=replace(result.gauge, **kept))
 
     def _rates(self, problem, result, values, covariance):
         """A map (2 n_modes,) of the motions to those of the reference, and the stars that agree with it."""
@@ -257,12 +293,11 @@ class ReferenceTie:
 
     def _warn(self, made):
         """Warn of what makes the absolute errors too small."""
-        n = np.count_nonzero(made.used)
-        if made.ratio > _LARGE and made.ratio > 1 + 6 * np.sqrt(1 / n):
+        if not self.finds_errors and made.factor > 1 and made.ratio > _LARGE:
             warn(
                 f"the offsets of the stars from {self.label} are {np.sqrt(made.ratio):.1f} times larger than the "
                 "errors of both imply: errors stated too small, motions left out, or a static distortion that the "
-                "exposures cannot compensate; the absolute errors rest on the stated ones",
+                f"exposures cannot compensate; the errors of the reference are taken {made.factor:.2g} times as large",
                 AssumptionWarning,
             )
 
@@ -286,9 +321,9 @@ class ReferenceTie:
 
     def _directions(self, gauge, errors, positions):
         """How maps of three modes at least move the stars."""
-        if gauge.n_modes >= 3:
+        if gauge.n_modes >= FEWEST_MODES:
             return errors.directions
-        return plain_directions(gauge, positions, 3)
+        return plain_directions(gauge, positions, FEWEST_MODES)
 
     def _prior(self, gauge, directions):
         """What is known of the common map beforehand."""
@@ -411,13 +446,30 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         scale=scale,
         solve=partial(minimisers.solve_joint, gauge=of.gauge, loss=of.loss, max_iterations=of.max_iterations),
         common={"shared_errors": fit.shared_errors, "camera": fit.camera_errors},
+        finds_errors=reference.finds_errors,
     )
     problem = fit.problem.scaled(fit.used.astype(float))
     result, prior = tying.tie(problem, result)
-    if problem.terms.n:
+    if result.gauge.n_modes >= FEWEST_MODES or problem.terms.n:
         problem, result = tying.hold_stars(problem, result, prior)
-        fit = replace(fit, problem=replace(fit.problem, moving=problem.moving))
+        fit = replace(fit, problem=replace(fit.problem, moving=problem.moving), **_held_back(fit, problem))
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
+
+
+def _held_back(fit, problem):
+    """Errors that stars have in common, by as much smaller as what is known of them holds the stars, as fields."""
+    shared, camera = fit.shared_errors, fit.camera_errors
+    if shared is None and camera is None:
+        return {}
+    own = unpacked(fit.blocks.v)
+    follow = own @ np.linalg.pinv(own + unpacked(problem.terms.catalogue.precision), hermitian=True)
+    follow = follow.transpose(0, 2, 1)[:, :2, :2]
+    out = {}
+    if shared is not None:
+        out["shared_errors"] = variances(follow @ unpacked(shared) @ follow.transpose(0, 2, 1))
+    if camera is not None:
+        out["camera_errors"] = replace(camera, stars=follow @ camera.stars)
+    return out
 
 
 def _flux(matches):

@@ -230,6 +230,8 @@ SOLVE = [
     row(motion_sigma=0.01, refused=dict.fromkeys(("plain", "one", "pair"), "belong to motion='proper'")),
     row(reference=catalogue, epoch=2016.5, pixel_scale=0.036),
     row(reference=catalogue, motion="proper"),
+    row(reference=catalogue, reference_error="found"),
+    row(reference_error=0.1, refused=dict.fromkeys(("plain", "one", "pair"), "is for the catalogue of reference")),
     row(progress=True),
 ]
 

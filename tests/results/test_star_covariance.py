@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.table import Table
 from numpy.testing import assert_allclose
 
 from legdistort.exceptions import InputError
@@ -19,6 +20,8 @@ SIM = simulate_matches(
     zero_mean=False, seed=3,
 )  # fmt: skip
 WIDE = Prior(SIM.truth.static, sigma=0.5, static_sigma=0.1)
+CATALOGUE = Table({"star": np.arange(12), "x": SIM.truth.positions[:12, 0], "y": SIM.truth.positions[:12, 1]})
+CATALOGUE["x_err"] = CATALOGUE["y_err"] = 0.02
 
 
 def wrong():
@@ -44,6 +47,8 @@ def read_back(solution, path):
         {"errors": "scale"},
         {"static": "fit"},
         {"degree": 0},
+        {"reference": CATALOGUE},
+        {"reference": CATALOGUE, "errors": "scale"},
     ],
     ids=str,
 )

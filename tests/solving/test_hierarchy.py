@@ -256,6 +256,17 @@ def test_mismatches_are_judged_by_the_scatter_that_is_seen():
         assert used.tolist() == [fair or k != 7 for k in range(200)]
 
 
+def test_where_many_are_mismatches_an_offset_is_one_sooner():
+    """30 of 100 offsets are 20 errors long: one of 4.3, which 1 of 10,000 good ones have, is rather one of them."""
+    for share, fair in ((0.0, True), (0.3, False)):
+        pulls = np.random.default_rng(3).normal(size=100)
+        pulls[: int(100 * share)] = np.random.default_rng(4).choice([-20.0, 20.0], int(100 * share))
+        pulls[50] = 4.3
+        used = catalogue_map.accepted(offsets(pulls), "a catalogue")
+        assert used[50] == fair
+        assert used[int(100 * share) :].sum() >= 100 - int(100 * share) - (not fair)
+
+
 def test_a_star_of_a_reference_is_a_mismatch_from_five_standard_errors():
     for pull, fair in ((4.7, True), (5.4, False)):
         used = catalogue_map.accepted(offsets(np.where(np.arange(80) == 7, pull, 0.0)), "a catalogue")

@@ -18,7 +18,7 @@ def plain_directions(gauge, xy, n):
     return np.kron(np.eye(2), modes.T).reshape(2, len(xy), 2 * len(modes)).transpose(1, 0, 2)
 
 
-def _directions(gauge, xy):
+def map_directions(gauge, xy):
     """Directions (n_stars, 2, 2 n) for the modes of `Gauge.absolute_covariance`."""
     n = len(gauge.absolute_covariance) // 2
     return gauge.directions if n == gauge.n_modes else plain_directions(gauge, xy, n)
@@ -46,7 +46,8 @@ def relative_blocks(gauge, uncertainty, xy):
         return out
     directions, hidden = (each if k else each[good] for k, each in enumerate(_common(gauge, uncertainty, xy)))
     own = None
-    if gauge.drift is not None and gauge.drift.joint is not None:
+    held = gauge.tie is not None and gauge.tie.known is not None
+    if held or (gauge.drift is not None and gauge.drift.joint is not None):
         own = np.einsum("jaa->ja", out[good])
     if uncertainty.bends is not None:
         bent = directions[:, :, : 2 * gauge.n_modes] if gauge.drift is not None else gauge.directions[good]
@@ -70,7 +71,7 @@ def absolute_blocks(gauge, uncertainty, xy):
 def _common(gauge, uncertainty, xy):
     """How common maps move the unknowns of the stars, (n_stars, 2 + k, c), and the covariance (c, c) of these maps."""
     if gauge.drift is None:
-        return _directions(gauge, xy), gauge.absolute_covariance
+        return map_directions(gauge, xy), gauge.absolute_covariance
     return uncertainty.drift_directions, gauge.joint_covariance
 
 

@@ -36,7 +36,13 @@ class Tie:
     used : ndarray of bool, shape (n_reference,)
         False for what was rejected as a mismatch.
     ratio : float
-        chi2 of the offsets over its degrees of freedom; NaN if there are hardly any.
+        chi2 of the offsets over its degrees of freedom, at the errors that the reference states; NaN if there are
+        hardly any.
+    factor : float
+        By which the errors of the reference were taken larger (or smaller) than stated, for the offsets to be expected.
+    known : ndarray, shape (n_reference, 2, 2), or None
+        Covariance of positions in the reference, px^2, with which the used ones held their stars; None if they tied the
+        common map alone.
     """
 
     covariance: np.ndarray = field(metadata=array("2 k", "2 k", unit="pix2", covariance=True))
@@ -46,6 +52,10 @@ class Tie:
     offsets: np.ndarray = field(metadata=array("n_reference", 2, unit="pix"))
     used: np.ndarray = field(metadata=array("n_reference", holds="booleans"))
     ratio: float = field(metadata=number(minimum=0, nan=True))
+    factor: float = field(default=1.0, metadata=number(minimum=0))
+    known: np.ndarray | None = field(
+        default=None, metadata=array("n_reference", 2, 2, unit="pix2", nan=True, covariance=True)
+    )
 
     @property
     def rms(self) -> float:
@@ -95,7 +105,8 @@ class Tie:
     def statement(self) -> str:
         """What was used and how well it agrees, in sentences."""
         ratio = "" if np.isnan(self.ratio) else f" (chi2 {self.ratio:.2g} per degree of freedom)"
-        return f"The plane is {self.sentence}{ratio}."
+        taken = "" if self.factor == 1 else f"; its errors are taken {self.factor:.2g} times as large as stated"
+        return f"The plane is {self.sentence}{ratio}{taken}."
 
     def __repr__(self) -> str:
         return f"<Tie: {np.count_nonzero(self.used)} of {len(self.used)} reference stars, {self.rms:.2g} px rms>"

@@ -1,7 +1,8 @@
 """Covariance between the stars of a solution without its equations, one from a file or a pickle.
 
-With the observations used and their errors the normal equations of stars with known coefficients are there again,
-``V_j = sum_i J' W J`` and ``E_ij = J' W B``, and with the covariance C of the coefficients in the gauge
+With the observations used and their errors, and those of a reference, the normal equations of stars with known
+coefficients are there again,
+``V_j = sum_i J' W J + P_j`` and ``E_ij = J' W B``, and with the covariance C of the coefficients in the gauge
 ``cov = V^-1 + V^-1 E C E' V^-1``.
 """
 
@@ -28,8 +29,8 @@ def star_matrix(solution):
     Raises
     ------
     InputError
-        If it is not what the errors of the stars call for: the weights of observations by a robust loss, motions and
-        what is known of stars from a reference are not in the table.
+        If it is not what the errors of the stars call for: the weights of observations by a robust loss and motions are
+        not in the table.
     """
     uncertainty, n = solution.estimate.uncertainty, len(solution.estimate.star_names)
     own, coupling = _normal_equations(solution)
@@ -47,7 +48,7 @@ def star_matrix(solution):
     if not np.allclose(variance, stored, rtol=_ROUNDING, atol=0, equal_nan=True):
         raise InputError(
             "covariances between the stars of a solution that was read do not follow from its residuals where a robust "
-            "loss, motions, a reference or correlated errors took part; call solve again"
+            "loss, motions, fitted errors or correlated errors took part; call solve again"
         )
     return out
 
@@ -68,4 +69,6 @@ def _normal_equations(solution):
         np.add.at(own, star[rows], pull @ slope)
         values = basis.values(solution.degree, *basis.normalize(q, view.shape))
         np.add.at(coupling, (star[rows], i), np.einsum("nac,mn->nacm", pull, values))
+    if (tie := solution.gauge.tie) is not None and tie.known is not None:
+        own[np.searchsorted(solution.estimate.star_names, tie.stars[tie.used])] += np.linalg.inv(tie.known[tie.used])
     return own, coupling.transpose(0, 2, 1, 3, 4).reshape(n, 2, -1)

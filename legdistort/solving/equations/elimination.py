@@ -81,8 +81,6 @@ def star_freedom(problem, blocks):
     """Number of star unknowns that the observations determine, what is known of them beforehand counted out."""
     inverse, places = inverse_star_blocks(blocks.v), np.diag(packed(problem.n_star))
     number = 2 * int(np.count_nonzero(blocks.v[0] > 0))
-    if not problem.terms.n:
-        return number
     return number + np.count_nonzero(inverse[places[2:]] > 0) - problem.terms.done_by_prior(inverse)
 
 

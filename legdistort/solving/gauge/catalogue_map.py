@@ -6,10 +6,11 @@ prior determine of g (`legdistort.solving.gauge.hierarchy`) counts with its info
 scale nothing. What neither determines to `LIMIT` stays where the convention has it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
+from scipy.optimize import brentq
 
 from ...exceptions import InputError
 from ...results.errors.catalogue_tie import Tie, map_parts
@@ -21,7 +22,14 @@ CLIP = 5.0
 #: Up to so many stars their relative errors are taken with all covariances, beyond star by star.
 DENSE = 1000
 _ROUNDS = 20
+#: Degrees of freedom below which offsets tell nothing of errors.
+FEWEST = 10
+_CHANCE = 5.0  # standard deviations of chi2 by which chance explains offsets
 _EXACT = 1e-12  # px^2: what counts as known without error
+#: Beginnings of a search for the majority; a median pull, in those expected, up to which chance explains it.
+_STARTS, _BEST, _USUAL = 100, 10, 1.3
+#: Mismatches from which their share tells from which pull an offset is one, and the least of these.
+_SEVERAL, _LEAST = 3, 3.0
 _SQRT = np.sqrt(2 * np.log(2))  # median of the length of a normal vector in two dimensions
 
 
@@ -109,6 +117,11 @@ class MapEquations:
         self.design = directions[rows]
         self.metric = _metric(directions)
 
+    def times(self, factor):
+        """The same with other errors of the reference, by a factor."""
+        covariance = factor**2 * self.offsets.covariance
+        return MapEquations(replace(self.offsets, covariance=covariance), self.directions, self.relative, self.prior)
+
     def matrix(self, used):
         """Covariance (2 n, 2 n) of the used offsets, x and y of a star side by side."""
         n = len(self.directions)
@@ -153,18 +166,31 @@ class MapEquations:
         value = covariance @ self.prior.information @ self.prior.centre + gain @ self.offsets.values[used].ravel()
         return value, covariance, gain
 
-    def pulls(self, used, weights=None):
-        """Length of every offset less the map, in its standard errors.
+    def agreement(self, used):
+        """chi2 of the used offsets less the map, and its degrees of freedom."""
+        value, covariance, _ = self.solve(used)
+        left = (self.offsets.values - self.design @ value)[used]
+        dof = left.size - np.trace(covariance @ self.gain(used)[0])
+        if self.dense:
+            return left.ravel() @ np.linalg.solve(self.matrix(used), left.ravel()), dof
+        return np.einsum("na,nab,nb->", left, np.linalg.inv(self.blocks[used]), left), dof
 
-        Without `weights` it is allowed for that the used ones have drawn the map towards them.
-        """
-        value, covariance, _ = self.solve(used, None if weights is None else weights[used])
+    def pulls(self, used):
+        """Length of every offset less the map, in its standard errors; those of the used ones without their own say."""
+        value, covariance, _ = self.solve(used)
         left = self.offsets.values - self.design @ value
-        whole = self.blocks
-        if weights is None:
-            spread = self.design @ covariance @ self.design.transpose(0, 2, 1)
-            whole = whole - 0.9 * _at_most(spread, whole)
+        spread = self.design @ covariance @ self.design.transpose(0, 2, 1)
+        whole = np.where(used[:, None, None], self.blocks - 0.9 * _at_most(spread, self.blocks), self.blocks + spread)
         return np.sqrt(np.einsum("na,nab,nb->n", left, np.linalg.inv(whole), left))
+
+    def squares(self, used):
+        """Squares of all offsets less the map of the used ones, in their standard errors, and that of the map.
+
+        Every star counts by itself, whatever errors they have in common.
+        """
+        value = self.solve(used, np.ones(np.count_nonzero(used)))[0]
+        left, off = self.offsets.values - self.design @ value, value - self.prior.centre
+        return np.einsum("na,nab,nb->n", left, np.linalg.inv(self.blocks), left), off @ self.prior.information @ off
 
 
 def _at_most(spread, blocks):
@@ -180,8 +206,19 @@ def _own(relative, star, n, dense):
     return np.array([[xx, xy], [xy, yy]])
 
 
-def accepted(equations, label):
-    """Which offsets are no mismatches: those that deviate are taken away, round by round, and never come back.
+def accepted(equations, label, near=None):
+    """Which offsets are no mismatches.
+
+    Where not all are as expected, those of the majority that agrees best (least trimmed squares: Rousseeuw & Van
+    Driessen 2006), and then all others that agree with these.
+
+    Parameters
+    ----------
+    equations : MapEquations
+    label : str
+        How messages call the reference.
+    near : ndarray of bool, shape (n,), optional
+        Those of equations that hardly differ.
 
     Raises
     ------
@@ -189,28 +226,104 @@ def accepted(equations, label):
         If most of them deviate.
     """
     n = len(equations.offsets.rows)
-    used, weights = np.ones(n, dtype=bool), np.ones(n)
+    used = np.ones(n, dtype=bool)
     if n < 3:
         return used
-    for _ in range(_ROUNDS):  # a robust start, which a few gross errors hardly move
-        pull = equations.pulls(used, weights)
-        scale = max(1.0, np.median(pull) / _SQRT)
-        weights, before = 1 / (1 + (pull / (2.385 * scale)) ** 2), weights
-        if np.abs(weights - before).max() < 0.01:
-            break
+    pull = equations.pulls(used)
+    if pull.max() <= CLIP and np.median(pull) < _USUAL * _SQRT:
+        return used
+    used = _majority(equations) if near is None else near
     for count in range(_ROUNDS):
-        if count:
-            pull = equations.pulls(used)
-        fresh = used & (pull > CLIP * max(1.0, np.median(pull[used]) / _SQRT))
-        if count and not fresh.any():
+        pull = equations.pulls(used)
+        of_scale = pull[used] if count or near is not None else pull  # those that agree best are no fair sample
+        scale = max(1.0, np.median(of_scale) / _SQRT)
+        agrees = pull <= scale * _limit(pull / scale, used)
+        if np.array_equal(agrees, used):
             break
-        used &= ~fresh
+        used = agrees
         if 2 * np.count_nonzero(used) < n:
             raise InputError(
                 f"most of the {n} stars that {label} shares with the exposures lie elsewhere in it: other stars under "
                 "the same names, or another field?"
             )
     return used
+
+
+def _limit(pull, used):
+    """From which pull an offset is rather one of the mismatches: the nearer, the more of these there are.
+
+    They are taken to be normally distributed like those that are known.
+    """
+    n_lost = np.count_nonzero(~used)
+    if n_lost < _SEVERAL:
+        return CLIP
+    share, size = n_lost / len(used), np.median(pull[~used]) / _SQRT
+    return min(np.sqrt(max(2 * np.log((1 - share) / share * max(size, 1) ** 2), _LEAST**2)), CLIP)
+
+
+def _majority(equations):
+    """As many of the offsets as are a majority whatever the others are: those that agree best among themselves."""
+    n, rng = len(equations.offsets.rows), np.random.default_rng(0)
+    order = np.argsort(equations.offsets.rows)  # whatever the order of the reference
+    modes = equations.design.shape[2] // 2
+    few, enough = min(n, modes + 1), min(n, (n + modes + 1) // 2)
+
+    def nearest(used):
+        squares, of_map = equations.squares(used)
+        part = np.argsort(squares)[:enough]
+        return squares[part].sum() + of_map, np.isin(np.arange(n), part)
+
+    starts = [np.ones(n, dtype=bool)]
+    starts += [np.isin(np.arange(n), order[rng.permutation(n)[:few]]) for _ in range(_STARTS)]
+    found = []
+    for used in starts:
+        for _ in range(2):
+            size, used = nearest(used)
+        found.append((size, used))
+    best = []
+    for size, used in sorted(found, key=lambda each: each[0])[:_BEST]:
+        for _ in range(_ROUNDS):
+            before = used
+            size, used = nearest(before)
+            if np.array_equal(used, before):
+                break
+        best.append((size, used))
+    return min(best, key=lambda each: each[0])[1]
+
+
+def error_factor(equations, used, *, found):
+    """By what factor the errors of a reference should be larger, or smaller, for the offsets to be as expected.
+
+    Parameters
+    ----------
+    equations : MapEquations
+    used : ndarray of bool, shape (n,)
+    found : bool
+        Whether errors are sought, not only tested: else they are larger than stated, and where chance explains the
+        offsets as stated. Errors that do not show beside those of the exposures are found as large as they could be
+        without showing.
+
+    Returns
+    -------
+    float
+    """
+    chi2, dof = equations.agreement(used)
+    if dof < FEWEST or not (found or chi2 / dof > 1 + _CHANCE * np.sqrt(2 / dof)):
+        return 1.0
+
+    def excess(log_factor):
+        chi2, dof = equations.times(np.exp(log_factor)).agreement(used)
+        return np.log(chi2 / dof)
+
+    offered, own, both = (
+        np.sqrt(np.mean(np.einsum("naa->na", each[used])))
+        for each in (equations.offsets.covariance, equations.own, equations.blocks)
+    )
+    low = np.log(own * (2 / dof) ** 0.25 / offered) if found else 0.0
+    high = max(low, np.log(3 * np.sqrt(chi2 / dof) * both / offered))
+    if not excess(low) > 0:
+        return float(np.exp(low))
+    return float(np.exp(brentq(excess, low, high, xtol=1e-3) if excess(high) < 0 else high))
 
 
 def estimate(equations, used, names):
@@ -231,18 +344,12 @@ def estimate(equations, used, names):
     """
     value, covariance, gain = equations.solve(used)
     left = equations.offsets.values - equations.design @ value
-    offered_matrix = equations.matrix(used) if equations.dense else None
     information = equations.gain(used)[0]
     share = covariance @ information
     parts = map_parts(equations.prior.size, equations.prior.n_modes)[1:]
     pointing = 1.0 if np.count_nonzero(used) > 1 else 0.5  # a single star determines the shift alone
     measured = [pointing, *(np.trace(part.T @ share @ part) / part.shape[1] for part in parts)]
-    whitened = left[used].ravel()
-    if offered_matrix is None:
-        chi2 = np.einsum("na,nab,nb->", left[used], np.linalg.inv(equations.blocks[used]), left[used])
-    else:
-        chi2 = whitened @ np.linalg.solve(offered_matrix, whitened)
-    dof = len(whitened) - np.trace(share)
+    chi2, dof = equations.agreement(used)
     return value, Tie(
         covariance=covariance,
         shared=_shared(equations, used, gain),
