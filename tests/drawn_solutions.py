@@ -53,7 +53,7 @@ def make_solution(
             positions=positions,
             shapes=dict.fromkeys(names, shape),
             prior_mean=mean if prior else np.zeros(size),
-            uncertainty=SimpleNamespace(coefficients=1e-4 * np.eye(coefficients.size), bends=None, camera=None),
+            uncertainty=SimpleNamespace(coefficients=1e-4 * np.eye(coefficients.size), common=None, camera=None),
         ),
         left_out={"bad <one>": "only 2 stars matched, <i>10</i> & more are needed"},
     )

@@ -77,15 +77,19 @@ class DenseOracle:
             np.add.at(count, self.obs.star[on], 1)
         return out / count[:, None]
 
-    def covariance(self, x):
-        """Covariance of all unknowns under hard constraints: null-space method on the numerical Jacobian."""
+    def jacobian(self, x):
+        """Numerical derivatives of the whitened residuals by all unknowns."""
         step = 1e-4
         columns = []
         for k in range(len(x)):
             e = np.zeros(len(x))
             e[k] = step
             columns.append((self.residuals(x + e) - self.residuals(x - e)) / (2 * step))
-        jacobian = np.array(columns).T
+        return np.array(columns).T
+
+    def covariance(self, x):
+        """Covariance of all unknowns under hard constraints: null-space method on the numerical Jacobian."""
+        jacobian = self.jacobian(x)
         rows = np.hstack([np.zeros((len(self.rows), 2 * self.n_stars)), self.rows])
         free = np.linalg.svd(rows)[2][len(rows) :].T
         return free @ np.linalg.inv(free.T @ jacobian.T @ jacobian @ free) @ free.T

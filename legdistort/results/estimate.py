@@ -10,6 +10,7 @@ import numpy as np
 from ..geometry.distortion import Distortion
 from ..runtime.trees.facts import array
 from .errors.camera_errors import CameraErrors
+from .errors.common_maps import CommonFit
 from .gauge import UnknownDirection
 from .motions import StarMotions
 
@@ -72,9 +73,7 @@ class StoredUncertainty:
     stars: np.ndarray = field(metadata=array(3, "n_stars", unit="pix2", packed=True, nan=True))
     directions: np.ndarray = field(metadata=array("n_stars", 2, "2 n_map_modes", nan=True))
     weak: tuple[UnknownDirection, ...]
-    bends: np.ndarray | None = field(
-        default=None, metadata=array("n_stars", "2 + n_terms", "2 n_map_modes", unit="pix2", nan=True)
-    )
+    common: CommonFit | None = None
     star_unknowns: np.ndarray | None = field(
         default=None, metadata=array("n_star_pairs", "n_stars", packed=True, nan=True)
     )

@@ -219,10 +219,6 @@ class Gauge(ShownAsPrinted):
         Maps of the reference plane, as columns, that the residuals determine.
     tie : `legdistort.results.errors.catalogue_tie.Tie` or None
         How a reference catalogue measured the common map.
-    convention : ndarray, same shape as `constraint`, or None
-        Rows of the convention by itself, where something else takes its place in `constraint`. Relative errors are
-        those under the convention: what determines a common map otherwise is less precise than positions are, and
-        that is a matter of the absolute error.
     responses : object
         With ``directions``: see there.
     plane : str or None
@@ -245,7 +241,6 @@ class Gauge(ShownAsPrinted):
     values: np.ndarray | None = field(default=None, metadata=array("n_constraints", unit="pix"))
     released: np.ndarray | None = field(default=None, metadata=array("2 n_map_modes", "released"))
     tie: Tie | None = None
-    convention: np.ndarray | None = field(default=None, metadata=_ROWS)
     responses: Any = field(default=None, repr=False, compare=False, metadata=NOT_STORED)
     plane: str | None = None
     drift: Drift | None = None
@@ -296,37 +291,6 @@ class Gauge(ShownAsPrinted):
     def reach(self) -> np.ndarray:
         """Reference-plane modes -> values of the orthonormal constraints, shape (n_constraints, 2 n_modes)."""
         return self.orthonormal @ self.motion.reshape(-1, 2 * self.n_modes)
-
-    @cached_property
-    def to_convention(self) -> np.ndarray | None:
-        """Errors of all A_i -> bend of the plane (2 n_modes,) that takes them to the convention; None if it holds.
-
-        Shape (2 n_modes, n_exposures * 2 n_modes). The bend g moves stars by `directions` g and each A_i by
-        ``-motion`` g.
-        """
-        if self.convention is None:
-            return None
-        rows = self.convention.reshape(len(self.convention), -1)
-        return np.linalg.pinv(rows @ self.all_motion.reshape(rows.shape[1], -1))[: 2 * self.n_modes] @ rows
-
-    def bend_errors(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Covariance of the bend to the convention with all coefficients, and its own, of theirs.
-
-        Parameters
-        ----------
-        covariance : ndarray, shape (n_exposures * 2 k,) squared
-            Of the fitted coefficients, k >= n_modes, px^2.
-
-        Returns
-        -------
-        ndarray, shape (n_exposures * 2 k, 2 n_modes)
-        ndarray, shape (2 n_modes, 2 n_modes)
-        """
-        n, degree = len(self.motion), basis.degree_of(len(covariance) // (2 * len(self.motion)))
-        rows = self.to_convention.reshape(2 * self.n_modes, n, 2, -1)
-        rows = basis.change_degree(rows, degree).reshape(len(rows), -1)
-        shared = covariance @ rows.T
-        return shared, rows @ shared
 
     @property
     def measured(self) -> np.ndarray:

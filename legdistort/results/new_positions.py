@@ -20,7 +20,7 @@ from ..geometry import basis, similarity
 from ..geometry.epochs import year
 from ..geometry.models import like, to_pixels
 from ..inputs import column_contract
-from .errors import absolute_errors
+from .errors import absolute_errors, common_maps
 from .motions import fitted
 
 #: Positions that a warning names.
@@ -220,7 +220,7 @@ def covariances(view, q, measured, moved=None):
     directions = plain
     if len(hidden) == 2 * gauge.n_modes:
         directions = by_modes @ widened(gauge.motion[i], solution.degree)
-        relative = relative + carried(directions - plain @ _taken_off(gauge, positions), hidden)
+        relative = relative + carried(directions - plain @ _taken_off(gauge, uncertainty, positions), hidden)
     if gauge.drift is not None and len(hidden) == 2 * gauge.n_modes:  # at the time of this exposure
         directions, hidden = by_modes @ widened(gauge.all_motion[i], solution.degree), gauge.joint_covariance
     if moved is not None:
@@ -238,8 +238,17 @@ def covariances(view, q, measured, moved=None):
     return relative, absolute
 
 
+def _taken_off(gauge, uncertainty, positions):
+    """The modes (2 n, 2 n) of a map that a fit to the stars takes off each of the gauge's directions."""
+    good = np.isfinite(positions[:, 0])
+    plain, directions = absolute_errors.plain_directions(gauge, positions[good], gauge.n_modes), gauge.directions[good]
+    common = uncertainty.common
+    weights = np.broadcast_to(np.eye(2), (len(plain), 2, 2)) if common is None else common.weights[good][:, :2, :2]
+    return common_maps.fitted(plain, weights, directions)
+
+
 def relative_errors(view, q):
-    """Covariance (n, 2, 2) of the correction of positions q (n, 2) of an exposure under the convention of the gauge."""
+    """Relative covariance (n, 2, 2) of the correction of positions q (n, 2) of an exposure."""
     by_modes, back = response(view, q)
     own = absolute_errors.relative_coefficients(view.solution.gauge, view.solution.estimate.uncertainty, view.index)
     return carried(by_modes, own) + by_camera(view, q, by_modes, back)
@@ -272,15 +281,6 @@ def widened(changes, degree):
 def widened_all(motion, degree):
     """Maps of all exposures (n_exposures, 2 n, k) on all modes fitted, (n_exposures, 2 n_modes, k); see `widened`."""
     return np.stack([widened(each, degree) for each in motion])
-
-
-def _taken_off(gauge, positions):
-    """The modes (2 n, 2 n) of a map that a fit to the stars takes off each of the gauge's directions."""
-    good = np.isfinite(positions[:, 0])
-    directions = gauge.directions[good]
-    plain = absolute_errors.plain_directions(gauge, positions[good], gauge.n_modes)
-    flat = (-1, directions.shape[2])
-    return np.linalg.lstsq(plain.reshape(flat), directions.reshape(flat), rcond=None)[0]
 
 
 def correct_table(solution, table, epoch=None):

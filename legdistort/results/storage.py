@@ -205,8 +205,8 @@ def _check_consistent(solution):
         raise ValueError(f"the gauge cannot have {gauge.n_constraints} constraints on {2 * gauge.n_modes} modes")
     if camera and np.count_nonzero(camera.free) != len(camera.changes):
         raise ValueError(f"{np.count_nonzero(camera.free)} modes of the camera are free, {len(camera.changes)} change")
-    if estimate.uncertainty.bends is not None:
-        _check_bends(gauge, estimate.uncertainty)
+    if estimate.uncertainty.common is not None:
+        _check_common(gauge, estimate.uncertainty)
     if gauge.tie is not None:
         x, y, xy = absolute_variance(gauge, estimate.uncertainty, estimate.positions, without_unknown=True)
         if np.any(np.minimum(x, y) < -1e-12) or np.any(xy**2 > (1 + 1e-6) * x * y + 1e-24):
@@ -233,10 +233,10 @@ def _check_consistent(solution):
             raise ValueError(f"the table of residuals names {column}s that are not in the list of them")
 
 
-def _check_bends(gauge, uncertainty):
-    """Raise if covariances of the stars with the bend to the convention are larger than the variances of both allow."""
+def _check_common(gauge, uncertainty):
+    """Raise if covariances of the stars with the maps that fit their errors are larger than the variances allow."""
     stars = np.einsum("jaa->ja", own_blocks(gauge, uncertainty))[:, :, None]
-    bend = np.maximum(np.diag(gauge.bend_errors(uncertainty.coefficients)[1]), 0)
-    rounding = 1e-9 * stars * np.max(bend) + 1e-24
-    if np.any(uncertainty.bends**2 > stars * bend + rounding):
-        raise ValueError(f"entry {ROOT}.covariance.bends: covariances that are larger than the variances allow")
+    maps = np.maximum(np.diag(uncertainty.common.covariance), 0)
+    rounding = 1e-9 * stars * np.max(maps) + 1e-24
+    if np.any(uncertainty.common.stars**2 > stars * maps + rounding):
+        raise ValueError(f"entry {ROOT}.covariance.common.stars: covariances larger than the variances allow")

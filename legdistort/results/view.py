@@ -502,7 +502,7 @@ class View(ShownAsPrinted):
     def relative_errors(self) -> np.ndarray:
         """Standard deviations (2, n_modes) of the coefficients without the error of the common map, pixels.
 
-        Under the convention of the gauge (`Gauge.convention`).
+        After a common map is taken off the stars.
 
         Examples
         --------
@@ -530,9 +530,9 @@ class View(ShownAsPrinted):
 
     @property
     def relative_covariance(self) -> np.ndarray:
-        """Covariance (2 n_modes, 2 n_modes) of the coefficients under the convention of the gauge alone, px^2.
+        """Covariance (2 n_modes, 2 n_modes) of the coefficients after a common map is taken off the stars, px^2.
 
-        See `Gauge.convention`.
+        So that it is free of what is hardly known of that map.
 
         Examples
         --------

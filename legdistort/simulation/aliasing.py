@@ -12,7 +12,6 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis
-from ..results.errors.absolute_errors import relative_variance
 from ..results.errors.coefficient_covariance import times
 from ..solving.equations import criterion, elimination
 from ..solving.equations.covariances import Uncertainty
@@ -147,6 +146,6 @@ def alias(problem, state, gauge, covariance, *, independent, common):
     factor = np.hstack([left * np.tile(independent, n_exposures), together * common])
     spread = Uncertainty(full, blocks, gauge, coefficients=factor @ factor.T)
     noise = Uncertainty(full, blocks, gauge, coefficients=np.zeros_like(blocks.u))
-    all_errors, own = (relative_variance(gauge, each, state.positions.T)[:2] for each in (spread, noise))
+    all_errors, own = (each.stars[:2] for each in (spread, noise))
     folded = np.einsum("kc,kc->k", factor, factor)[fitted].reshape(n_exposures, 2, n_fit)
     return Aliasing(spread.coefficients, all_errors - own, np.sqrt(folded.mean(axis=0)))

@@ -37,12 +37,18 @@ def noiseless_solution(matches, problem, layout, kind, scatter):
     -------
     Solution
     State
+    Uncertainty
+        With the plane held by the convention of the gauge, whatever else determines it.
     """
     positions = layout.positions[np.asarray(matches.stars)]
     stars = np.concatenate([positions.T, np.zeros((problem.terms.n, len(positions)))])
     state = State(stars, problem.prior_mean.copy(), np.stack(list(layout.poses.values())))
     blocks = criterion.linearise(problem, state)
     gauge = _gauge(kind, problem, state, blocks, scatter, layout.sigma)
+    uncertainty = held = Uncertainty(problem, blocks, gauge)
+    if gauge.static in ("none", "fitted", "uncertain"):
+        plain = replace(problem, mean_sigma=None)
+        held = Uncertainty(problem, blocks, _gauge(kind, plain, state, blocks, scatter, layout.sigma))
     exact = replace(blocks, residual=np.zeros_like(blocks.residual), chi2=0.0)
     solution = assemble(
         matches,
@@ -50,12 +56,12 @@ def noiseless_solution(matches, problem, layout, kind, scatter):
         state,
         exact,
         gauge,
-        Uncertainty(problem, blocks, gauge),
+        uncertainty,
         settings=Settings(problem.degree, method="predicted", gauge=kind),
         status="predicted: nothing was measured",
         dof=0,
     )
-    return solution, state
+    return solution, state, held
 
 
 def _gauge(kind, problem, state, blocks, scatter, sigma):

@@ -16,7 +16,7 @@ from astropy.table import Table
 from ..exceptions import LegdistortError
 from ..geometry import basis
 from ..results import accuracy
-from ..results.errors.absolute_errors import relative_blocks, relative_variance
+from ..results.errors.absolute_errors import relative_blocks
 from ..results.solution import Solution
 from ..runtime.notebook import ShownAsPrinted
 from ..solving import star_motions
@@ -51,7 +51,8 @@ class Prediction(ShownAsPrinted):
     sigma_meas : float
         Error of one measured position: rms over all, and that of new positions.
     b : float
-        Expected error of the reference positions, relative: under the convention of the gauge, as ``x_err``.
+        Expected error of the reference positions, the plane held by the convention of the gauge (paper, section 3.4).
+        ``solution.stars`` has the errors ``x_err`` that are left once a common map is taken off.
     b_abs : float
         With the common map: mean dynamic distortion of the set, uncertainty of the static one; pointing, rotation and
         scale of the field aside, and what is unknown (``solution.gauge.unknown``: without a prior, shears at least).
@@ -354,7 +355,7 @@ def _predict(plan):
     problem = build_problem(matches, plan.degree, prior=plan.prior, motion=motion)
     fitted = independent[:, : problem.n_modes]
     known = bool(np.isfinite(fitted).all())
-    solution, state = noiseless_solution(matches, problem, layout, plan.gauge, fitted if known else None)
+    solution, state, held = noiseless_solution(matches, problem, layout, plan.gauge, fitted if known else None)
     x, y = layout.axes(plan.n_grid)
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     noise = accuracy.expected_scatter(solution, grid, layout.sigma)
@@ -364,7 +365,7 @@ def _predict(plan):
             problem,
             state,
             solution.gauge,
-            solution.estimate.uncertainty.coefficients,
+            held.coefficients,
             independent=independent,
             common=common,
         )
@@ -376,9 +377,7 @@ def _predict(plan):
     return Prediction(
         solution=solution,
         sigma_meas=layout.sigma,
-        b=finite_rms(
-            np.sqrt(relative_variance(solution.gauge, solution.estimate.uncertainty, solution.estimate.positions)[:2])
-        ),
+        b=finite_rms(np.sqrt(held.stars[:2])),
         b_abs=accuracy.expected_bias(solution, absolute=True) if known or solution.gauge.prior else np.nan,
         sigma=finite_rms(noise[inside]),
         sigma_field=finite_rms(noise),

@@ -153,8 +153,8 @@ def test_covariance_between_stars_is_the_oracles(corr):
     matrix = solution.estimate.uncertainty.star_matrix
     assert_allclose(matrix, expected[np.ix_(by_axis, by_axis)], rtol=1e-3, atol=1e-7)
     errors = np.concatenate([solution.stars[c].value for c in ("x_err", "y_err")])
-    assert_allclose(np.sqrt(np.diag(matrix)), errors, rtol=1e-6)
-    assert accuracy.expected_bias(solution) == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-6)
+    assert np.all(errors**2 < np.diag(matrix))  # an affine map taken off
+    assert accuracy.expected_bias(solution) == pytest.approx(np.sqrt(np.mean(np.diag(matrix))), rel=1e-6)
 
 
 # --- the plain figures -------------------------------------------------------------------------------------------

@@ -90,7 +90,7 @@ def test_errors_of_new_positions_are_true(errors, without):
         found.append(pulls(solution, table[~fitted], sky))
         stated.append(pulls(replace(solution, diagnostics=Diagnostics()), table[~fitted], sky))
     found, stated = (np.sqrt(np.mean(np.square(each), axis=0)) for each in (found, stated))
-    assert_allclose(found, 1, atol=0.1)
+    assert_allclose(found, 1, atol=0.12)
     assert np.mean(stated) == pytest.approx(without, rel=0.1)
 
 

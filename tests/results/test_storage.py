@@ -337,8 +337,8 @@ def test_cut_files_are_refused(solution, tmp_path, share):
         (lambda t: t["gauge"].update(kind="none"), "gauge.kind: 'none'; it should be one of minimal, mean, sh"),
         (lambda t: t["exposures"][0].update(coefficients=np.zeros((2, 4))), "is damaged"),
         (
-            lambda t: t["covariance"].update(bends=np.ones((15, 2, 12))),
-            r"covariance\.bends: covariances that are larger than the variances allow",
+            lambda t: t["covariance"]["common"].update(stars=np.ones((15, 2, 6))),
+            r"covariance\.common\.stars: covariances larger than the variances allow",
         ),
         (lambda t: t["stars"].update(position=np.full((15, 2), np.nan)), "a star without a position has observations"),
         (lambda t: t["observations"]["dx"]["values"].__setitem__(3, 1e300), "'dx' should hold finite numbers of pix"),

@@ -8,7 +8,6 @@ relative errors.
 
 import numpy as np
 
-from ...geometry import basis
 from .coefficient_covariance import exposure_block
 
 
@@ -27,7 +26,7 @@ def map_directions(gauge, xy):
 def relative_variance(gauge, uncertainty, xy):
     """Covariance xx, yy, xy (3, n_stars) of positions (n_stars, 2) once a common map of the fitted degree is taken off.
 
-    That under the convention of the gauge, and the part of the common map that is of second order.
+    See `legdistort.results.errors.common_maps`; with the part of the common map that is of second order.
     """
     return variances(relative_blocks(gauge, uncertainty, xy))
 
@@ -40,24 +39,14 @@ def variances(blocks):
 def relative_blocks(gauge, uncertainty, xy):
     """The same of all unknowns of the stars, (n_stars, 2 + k, 2 + k), maps that change with time taken off too."""
     good = np.isfinite(xy[:, 0]) & np.isfinite(uncertainty.stars[0])
-    out = own_blocks(gauge, uncertainty)
+    out, common = own_blocks(gauge, uncertainty), uncertainty.common
     out[~np.isfinite(xy[:, 0])] = np.nan
-    if gauge.plane is not None or not np.count_nonzero(good):
+    if gauge.plane is not None or common is None or not np.count_nonzero(good):
         return out
-    directions, hidden = (each if k else each[good] for k, each in enumerate(_common(gauge, uncertainty, xy)))
-    own = None
-    held = gauge.tie is not None and gauge.tie.known is not None
-    if held or (gauge.drift is not None and gauge.drift.joint is not None):
-        own = np.einsum("jaa->ja", out[good])
-    if uncertainty.bends is not None:
-        bent = directions[:, :, : 2 * gauge.n_modes] if gauge.drift is not None else gauge.directions[good]
-        shared = uncertainty.bends[good] @ bent.transpose(0, 2, 1)
-        out[good] += shared + shared.transpose(0, 2, 1)
-        out[good] += bent @ gauge.bend_errors(uncertainty.coefficients)[1] @ bent.transpose(0, 2, 1)
-    n = gauge.n_modes if gauge.drift is not None else directions.shape[2] // 2
-    left = without_plain_map(directions, gauge.modes_at(xy[good], n).T, own)
-    out[good] += left @ hidden @ left.transpose(0, 2, 1)
-    return out
+    directions, hidden = _common(gauge, uncertainty, xy)
+    directions = np.ascontiguousarray(np.where(good[:, None, None], directions, 0))  # rounded alike, read or not
+    left = common.left(gauge, xy, directions)
+    return common.without_maps(gauge, xy, out) + left @ hidden @ left.mT
 
 
 def absolute_blocks(gauge, uncertainty, xy):
@@ -84,21 +73,6 @@ def own_blocks(gauge, uncertainty):
     index[:2, :2] = [[0, 2], [2, 1]]
     out = np.moveaxis(blocks[index], -1, 0).copy()
     out[:, :2, :2] = np.moveaxis(uncertainty.stars[index[:2, :2]], -1, 0)
-    return out
-
-
-def without_plain_map(directions, plain, variance=None):
-    """Displacements (n_stars, k, c) of stars without a map of modes (n_stars, n_modes), fitted to all of them.
-
-    With their variances (n_stars, k), NaN for unknown, it is fitted with these weights: where a reference holds single
-    stars, they follow a map less than the others.
-    """
-    if variance is None:
-        return directions - np.einsum("jm,mac->jac", plain, np.einsum("mj,jac->mac", np.linalg.pinv(plain), directions))
-    out = directions.copy()
-    for k, each in enumerate(variance.T):
-        root = np.where(np.isfinite(each), 1 / np.sqrt(each), 0.0)[:, None]
-        out[:, k] -= plain @ (np.linalg.pinv(root * plain) @ (root * directions[:, k]))
     return out
 
 
@@ -129,22 +103,12 @@ def own_coefficients(gauge, uncertainty, i):
 
 
 def relative_coefficients(gauge, uncertainty, i):
-    """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i under the convention of the gauge.
+    """Covariance (2 n_modes, 2 n_modes) of the coefficients of exposure i once a common map is taken off the stars.
 
     A camera is taken as known.
     """
-    block = own_coefficients(gauge, uncertainty, i)
-    size = len(block)
-    mine = slice(i * size, (i + 1) * size)
-    if uncertainty.bends is None:
-        return block
-    shared, bend = gauge.bend_errors(uncertainty.coefficients)
-    moved = basis.change_degree(
-        gauge.motion[i].reshape(2, gauge.n_modes, -1).swapaxes(1, 2), basis.degree_of(size // 2)
-    )
-    moved = moved.swapaxes(1, 2).reshape(size, -1)
-    both = shared[mine] @ moved.T
-    return block - both - both.T + moved @ bend @ moved.T
+    block, common = own_coefficients(gauge, uncertainty, i), uncertainty.common
+    return block if common is None or gauge.plane is not None else common.of_coefficients(gauge, block, i)
 
 
 def coefficient_variance(gauge, block, i, response=None):

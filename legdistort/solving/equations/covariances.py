@@ -9,6 +9,7 @@ import numpy as np
 
 from ...exceptions import AssumptionWarning, warn
 from ...results.errors.coefficient_covariance import times
+from ...results.errors.common_maps import CommonFit, modes_for, plain_maps
 from ...results.gauge import UnknownDirection
 from . import criterion, elimination, reduced_system
 from .problem import State
@@ -246,20 +247,52 @@ class Uncertainty:
         return np.sqrt(np.mean(stars[:, self._blocks.v[0] > 0] ** 2))
 
     @cached_property
-    def bends(self) -> np.ndarray | None:
-        """Covariance of the unknowns of stars with the bend to the convention, (n_stars, 2 + k, 2 n_modes).
+    def common(self) -> CommonFit | None:
+        """The common maps that fit the errors of the stars, for their relative errors.
 
-        See `legdistort.results.gauge.Gauge.to_convention`; None where the convention holds, or the covariance of the
-        coefficients is approximated.
+        None for a simpler correction, and where the covariance of the coefficients is approximated.
         """
-        problem, blocks = self._problem, self._blocks
-        if self._gauge.to_convention is None or not self._is_dense:
+        if self._gauge.plane is not None or not (self._is_dense or self._given is not None or self._on_stars):
             return None
-        inverse, moved = elimination.inverse_star_blocks(blocks.v), []
-        for errors in self._gauge.bend_errors(self.coefficients)[0].T:
-            on_stars = elimination.to_stars(problem, blocks, errors.reshape(problem.n_exposures, -1))
-            moved.append(-elimination.symmetric_times(inverse, on_stars))
-        return np.stack(moved, axis=2).transpose(1, 0, 2)
+        weights = self._weights
+        n = modes_for(self._gauge.n_modes, np.count_nonzero(weights[:, 0, 0]))
+        maps = plain_maps(self._gauge, self._blocks.stars[:2].T, n)
+        weighted = weights @ maps
+        follow = [self._follow(pull) for pull in np.moveaxis(weighted, 2, 0)]
+        stars, coefficients = (np.stack(each, axis=-1) for each in zip(*follow, strict=True))
+        fit = np.linalg.pinv(np.einsum("jam,jan->mn", weighted, maps), rcond=1e-12, hermitian=True)
+        covariance = fit @ np.einsum("jam,jan->mn", weighted, stars) @ fit
+        parts = weights, stars @ fit, coefficients @ fit, (covariance + covariance.T) / 2
+        return CommonFit(*map(np.ascontiguousarray, parts))
+
+    @cached_property
+    def _weights(self):
+        """W_j (n_stars, 2 + k, 2 + k): what observations say of position, of motion and of parallax of every star."""
+        v, catalogue = self._blocks.v, self._problem.terms.catalogue
+        inverse = unpacked(elimination.inverse_star_blocks(v if catalogue is None else v - catalogue.precision))
+        out = np.zeros_like(inverse)
+        for part in (slice(0, 2), slice(2, 4), slice(4, 5)):
+            block = inverse[:, part, part]
+            known = (np.einsum("jaa->ja", block) > 0).all(axis=1) if block.shape[1] else slice(0)
+            out[known, part, part] = np.linalg.inv(block[known])
+        return out
+
+    def _follow(self, pull):
+        """Covariance of stars (n_stars, 2 + k) and coefficients (n_exposures, 2 n_modes) with a sum over the stars.
+
+        Of pull (n_stars, 2 + k) times their unknowns.
+        """
+        problem, blocks, nothing = self._problem, self._blocks, np.zeros_like(self._blocks.g_exposure)
+        if self._given is None:
+            system = self._on_stars or self._direct
+            stars, coefficients = system.settle(nothing, pull.T)
+            return self._scale**2 * stars.T, self._scale**2 * coefficients.reshape(nothing.shape)
+        inverse = elimination.inverse_star_blocks(blocks.v)
+        alone = elimination.symmetric_times(inverse, pull.T)
+        moved = elimination.to_exposures(problem, blocks, alone)
+        coefficients = -times(self._given, moved.reshape(-1, 1)).reshape(nothing.shape)
+        following = elimination.symmetric_times(inverse, elimination.to_stars(problem, blocks, coefficients))
+        return (self._scale**2 * alone - following).T, coefficients
 
     @cached_property
     def weak(self) -> tuple[UnknownDirection, ...]:

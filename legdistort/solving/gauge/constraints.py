@@ -95,7 +95,6 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         unknown_maps=known.unknown,
         static=_in_a_word(static, shared),
         prior=bool(held.any()),
-        convention=np.concatenate([hierarchy.convention(kind), poses]) if static.any() else None,
         drift=Drift(problem.terms.names, drifting, pointed @ drift_covariance @ pointed.T, drifts, rates)
         if problem.terms.n
         else None,
