@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..geometry import similarity
+from ..measurement.flags import PERSISTS
 from ..runtime.progress import Bar
 from .registration import Registration, continue_from_pairs, continue_from_pose, outwards, register
 from .star_labels import label_stars
@@ -97,6 +98,9 @@ def _gather(lists, hub, left, guess, tolerance):
 def standing(lists, group, *, radius=0.6, moved=1.5):
     """Detections that stay at the same pixel while the sky moves: hot pixels.
 
+    A star of which an image persists at its place in the next exposures is ten times as bright as that, or more: what
+    is so much fainter says nothing of a detection.
+
     Parameters
     ----------
     lists : list of StarList
@@ -118,12 +122,16 @@ def standing(lists, group, *, radius=0.6, moved=1.5):
     poses = np.array([group.poses[i] for i in members])
     whose = np.repeat(np.arange(len(members)), [len(lists[i]) for i in members])
     tree = cKDTree(np.concatenate([lists[i].xy for i in members]))
+    known = all(lists[i].flux is not None for i in members)
+    flux = np.concatenate([lists[i].flux for i in members]) if known else np.zeros(len(whose))
     for i in members:
         xy = lists[i].xy
         near = tree.query_ball_point(xy, radius)
         star = np.repeat(np.arange(len(xy)), [len(rows) for rows in near])
         here = np.zeros((len(members), len(xy)), bool)
-        here[whose[np.concatenate(near).astype(int)], star] = True
+        rows = np.concatenate(near).astype(int)
+        like = flux[rows] >= PERSISTS * lists[i].flux[star] if known else np.ones(len(rows), bool)
+        here[whose[rows[like]], star[like]] = True
         several = np.flatnonzero(np.count_nonzero(here, axis=0) > 3)  # three and itself
         away = np.hypot(*(_carried(poses, group.poses[i], xy[several]) - xy[several].T[:, None])) > moved
         same = np.count_nonzero(here[:, several] & away, axis=0)

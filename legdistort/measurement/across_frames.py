@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, some_of, warn
 from .camera_gain import camera
-from .flags import TRAILED, UNUSABLE, Flag
+from .flags import PERSISTS, TRAILED, UNUSABLE, Flag
 from .profiles import moffat
 from .profiles.defects import are_points
 
@@ -20,6 +20,8 @@ _HIDDEN = 5  # such peaks from which on it is said
 
 def flag_what_stays(tables, exposures):
     """Flag rows that are found on the same pixel in most exposures of a detector while the sky moves.
+
+    What is ten times fainter does not count: an image of a star that persists, not the star, is a defect.
 
     Parameters
     ----------
@@ -37,11 +39,14 @@ def flag_what_stays(tables, exposures):
 
 def _flag_fixed(tables):
     xy = [np.column_stack([table["x"].value, table["y"].value]) for table in tables]
-    places, compared = np.concatenate(xy), xy[:: -(-len(xy) // _COMPARED)]
+    flux = [np.asarray(table["flux"]) for table in tables]
+    step = -(-len(xy) // _COMPARED)
+    places, least, compared = np.concatenate(xy), PERSISTS * np.concatenate(flux), xy[::step]
     n = np.zeros(len(places), dtype=int)
-    for each in compared:  # its own too
+    for each, light in zip(compared, flux[::step], strict=True):  # its own too
         if len(each):
-            n += np.isfinite(cKDTree(each).query(places, distance_upper_bound=_SAME)[0])
+            distance, row = cKDTree(each).query(places, distance_upper_bound=_SAME)
+            n += np.isfinite(distance) & (np.append(light, 0)[row] >= least)
     fixed = np.split(n >= max(_FEWEST, _MOST * len(compared)), np.cumsum([len(each) for each in xy])[:-1])
     bright = np.concatenate(
         [

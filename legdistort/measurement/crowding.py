@@ -136,12 +136,12 @@ def crowding(table, fwhm):
     return np.where(np.isnan(ratio), np.inf, ratio)
 
 
-def is_deformed(shapes, covariance, *, xy, snr, chi2, usable):
+def is_deformed(shapes, covariance, *, xy, peak, snr, chi2, usable):
     """Whether shapes differ by more than their noise from what is usual at their place in the frame.
 
-    What is usual is a polynomial of degree 2 in x and y through the shapes of bright stars (`shape_field`). Allowed
-    for, besides noise, are what Moffat profiles leave of bright stars whose images are none, and the scatter of shapes
-    among the best quarter of the stars.
+    What is usual is a polynomial of degree 2 in x and y, and linear in the height of the star, through the shapes of
+    bright stars (`shape_field`). Allowed for, besides noise, are what Moffat profiles leave of bright stars whose
+    images are none, and the scatter of shapes among the best quarter of the stars.
 
     Parameters
     ----------
@@ -150,6 +150,8 @@ def is_deformed(shapes, covariance, *, xy, snr, chi2, usable):
     covariance : ndarray, shape (n, 4, 4)
     xy : ndarray, shape (n, 2)
         Positions [pix].
+    peak : ndarray, shape (n,)
+        Heights of the stars.
     snr : ndarray, shape (n,)
     chi2 : ndarray, shape (n,)
         Of the fits, reduced.
@@ -169,7 +171,8 @@ def is_deformed(shapes, covariance, *, xy, snr, chi2, usable):
     covariance = covariance * (1 + misfit * snr**2)[:, None, None]
     bright = np.zeros(len(shapes), dtype=bool)
     bright[order[: max(len(best), np.count_nonzero(snr[order] > _SHAPELY))]] = True
-    off = shapes - shape_field(shapes, covariance, xy, bright, degree=2, fallback=np.median(shapes[best], axis=0))
+    fallback = np.median(shapes[best], axis=0)
+    off = shapes - shape_field(shapes, covariance, xy, bright, degree=2, fallback=fallback, peak=peak)
     spread = (np.quantile(np.abs(off[best]), 0.25, axis=0) / _QUARTILE) ** 2
     noise = np.median(np.einsum("nii->ni", covariance[best]), axis=0)
     deviations = deviation(off, np.linalg.inv(covariance + np.diag(np.maximum(spread - noise, 0))))

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from ..inputs.frames.statement import piled_up
-from .background import is_steep, mean_light, sky_and_noise, sky_variance, smooth_light
+from .background import amplifier_levels, is_steep, mean_light, sky_and_noise, sky_variance, smooth_light
 from .filters import gaussian_sums
 from .sidelobes import side_light
 
@@ -40,6 +40,8 @@ class Frame:
         Whether the variance comes from an uncertainty plane.
     floor : float
         The least that the variance of the sky can be.
+    levels : ndarray, shape (ny, nx), or None
+        Of amplifiers, the part of the sky that has steps (`legdistort.measurement.background.amplifier_levels`).
     defects : ndarray of bool, shape (ny, nx), or None
         Pixels that belong to no star (`legdistort.measurement.profiles.defects`): the signal has the light around them,
         no fit counts them. From `prepare` None.
@@ -53,6 +55,7 @@ class Frame:
     photon: float | None
     noise_given: bool = False
     floor: float = 0.0
+    levels: np.ndarray | None = None
     defects: np.ndarray | None = None
 
 
@@ -63,6 +66,9 @@ def prepare(exposure, *, mesh=MESH):
     saturation = saturation or piled_up(data)  # flat tops that no header mentions
     saturated = (data >= saturation) & ~exposure.mask if saturation else np.zeros(data.shape, dtype=bool)
     bad = exposure.mask | saturated
+    levels = amplifier_levels(data, bad)
+    if levels is not None:
+        data -= levels
     sky, rms = sky_and_noise(data, bad, mesh)
     if is_steep(sky, rms, mesh):  # the slope within the meshes has passed for noise
         sky, _ = sky_and_noise(data, bad, mesh, steep=True)
@@ -70,11 +76,18 @@ def prepare(exposure, *, mesh=MESH):
         sky += rest
     if exposure.uncertainty is not None:
         variance = np.where(exposure.mask, 1, exposure.uncertainty**2).astype(np.float32)
-        return Frame(data - sky, variance, sky, ~exposure.mask, saturated, 0.0, noise_given=True)
+        noise = {"photon": 0.0, "noise_given": True}
+        return _frame(data, sky, levels, variance=variance, good=~exposure.mask, saturated=saturated, **noise)
     floor = max(1e-6 * np.ptp(data[~exposure.mask]), read_noise / gain if gain and read_noise else 0.0)
     floor = float(floor or 1.0) ** 2
     variance = np.maximum((rms / np.float32(_CLIPPED)) ** 2, np.float32(floor))
-    return Frame(data - sky, variance, sky, ~exposure.mask, saturated, 1 / gain if gain else None, floor=floor)
+    noise = {"photon": 1 / gain if gain else None, "floor": floor}
+    return _frame(data, sky, levels, variance=variance, good=~exposure.mask, saturated=saturated, **noise)
+
+
+def _frame(data, sky, levels, **rest):
+    signal = data - sky
+    return Frame(signal=signal, sky=sky if levels is None else sky + levels, levels=levels, **rest)
 
 
 def bright_peaks(frame, fwhm):
@@ -128,11 +141,12 @@ def detect(frame, fwhm, threshold):
     sigma = _kernel(fwhm)
     seen = frame.good & ~frame.saturated
     # The sky is put back: in crowded fields its map follows the halos, in steps that would pass for stars.
-    residual = frame.signal + frame.sky
+    sky = frame.sky if frame.levels is None else frame.sky - frame.levels
+    residual = frame.signal + sky
     light, extrapolated, step = smooth_light(residual, seen, _LOCAL * sigma, variance=frame.variance)
     residual -= light
     residual[~frame.good] = 0
-    light -= frame.sky
+    light -= sky
     filtered, norm = _blur(residual, sigma), np.float32(_norm(sigma))
     variance = frame.variance
     if not frame.noise_given:

@@ -24,3 +24,5 @@ UNUSABLE = Flag.SATURATED | Flag.EDGE | Flag.HOT | Flag.NOT_CONVERGED | Flag.INS
 LEAST = 3.0
 #: Ratio of the axes of stars from which on they are trailed: aberrations make no more of most.
 TRAILED = 2.0
+#: Part of the light of a star that persists where it was, at most; defects of one place differ by less.
+PERSISTS = 0.1

@@ -470,7 +470,8 @@ def _is_deformed(stamps, fitted, usable):
     found = fitted.found
     shapes, covariance = found.params[:, 3:7], found.covariance[:, 3:7, 3:7]
     xy, chi2 = stamps.centres + found.params[:, :2], found.chi2 / np.maximum(found.dof, 1)
-    return is_deformed(shapes, covariance, xy=xy, snr=fitted.snr, chi2=chi2, usable=usable)
+    peak = found.params[:, 2]
+    return is_deformed(shapes, covariance, xy=xy, peak=peak, snr=fitted.snr, chi2=chi2, usable=usable)
 
 
 class _Stars(NamedTuple):

@@ -55,6 +55,22 @@ GAINS = {
     "ESO": ({"HIERARCH ESO DET OUT1 CONAD": 2.5}, 2.5),
     "none": ({}, None),
 }
+#: Headers as observatories write them: seconds, electrons per value, saturation.
+OBSERVATORIES = {
+    "NACO": ({"HIERARCH ESO DET DIT": 2.0, "HIERARCH ESO DET NDIT": 15, "EXPTIME": 2.0}, 30, None, None),
+    "VIRCAM": ({"EXPTIME": 10.0, "HIERARCH ESO DET NDIT": 6, "GAIN": 4.19, "MAGZPT": 23.1}, 60, 6 * 4.19, None),
+    "WFC3 IR": ({"BUNIT": "ELECTRONS/S", "EXPTIME": 349.23, "CCDGAIN": 2.5}, 349.23, 349.23, None),
+    "JWST": ({"BUNIT": "MJy/sr", "EFFEXPTM": 857.5, "XPOSURE": 857.5, "PHOTMJSR": 2.3}, 857.5, None, None),
+    "Euclid": ({"BUNIT": "electron", "EXPTIME": 566.0, "GAIN": 3.48}, 566, 1, None),
+    "DECam": ({"BUNIT": "electrons", "ARAWGAIN": 4.1, "EXPTIME": 90.0, "SATURATE": 160000.0}, 90, 1, 160000),
+    "IRCS": ({"EXPTIME": 60.0, "EXP1TIME": 6.0, "COADDS": 10, "GAIN": (5.6, "(electron/ADU)")}, 60, 5.6, None),
+    "Pan-STARRS": (
+        {"EXPTIME": 40.0, "HIERARCH CELL.GAIN": 1.04, "HIERARCH CELL.SATURATION": 52000.0}, 40, 1.04, 52000,
+    ),
+    "LRIS": ({"ELAPTIME": 300, "GAIN": 1.2}, 300, 1.2, None),
+    "GSAOI": ({"EXPTIME": 15.01, "COADDS": 3, "GAIN": 2.434, "LNRS": 8}, 45.03, 2.434, None),
+    "LCO": ({"EXPTIME": 30.0, "GAIN": (1.0, "[electrons/count]"), "SATURATE": (128e3, "[ADU]")}, 30, 1, 128000),
+}  # fmt: skip
 SHAPE = (40, 50)
 
 
@@ -64,6 +80,16 @@ def header_of(*groups):
         for key, value in cards.items():
             header[key] = value
     return header
+
+
+@pytest.mark.parametrize("observatory", OBSERVATORIES)
+def test_headers_of_observatories(observatory):
+    cards, time, electrons, saturation = OBSERVATORIES[observatory]
+    stated = read_statement(header_of(cards), np.zeros(SHAPE), integer=False)
+    assert stated.exposure_time.value == pytest.approx(time)
+    assert stated.gain.value == (electrons and pytest.approx(electrons))
+    if electrons != 1 or saturation is None:  # in electrons nothing reaches it here
+        assert stated.saturation.value == (saturation and pytest.approx(saturation))
 
 
 @pytest.mark.parametrize("unit", UNITS, ids=str)

@@ -2,12 +2,13 @@
 
 import warnings
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from caller_warnings import warns_here
 from numpy.testing import assert_allclose
-from star_images import image
+from star_images import image, scattered
 
 from legdistort.exceptions import AssumptionWarning
 from legdistort.inputs.exposures import Exposure
@@ -85,6 +86,36 @@ def test_a_frame_is_the_same_in_any_unit(size, known):
         assert_allclose(found[name].value, right[name].value, rtol=0, atol=1e-9)
     assert_allclose(found["chi2"], right["chi2"], rtol=1e-9)
     assert_allclose(found["flags"], right["flags"])
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-21, 3e-7, 0.7, 1e5, 1e22])
+@pytest.mark.parametrize("psf", ["moffat", "effective"])
+def test_single_precision_is_the_same_in_any_unit(size, psf, field):
+    """Factors that are no power of two round the pixels, by 6e-8: no more of an error than 1e-3."""
+    right, found = field(psf, 1.0), field(psf, size)
+    assert len(found) == len(right) > 75
+    assert_allclose(found["flags"], right["flags"])
+    off = np.hypot(found["x"] - right["x"], found["y"] - right["y"])
+    assert np.mean(off.value < 1e-6) >= 0.95
+    assert np.mean(off < 1e-3 * right["x_err"]) >= 0.97
+    assert (off < 0.02 * right["x_err"]).all()
+    for name in ("x_err", "y_err"):
+        assert np.abs(found[name] / right[name] - 1).max() < 1e-4
+
+
+@pytest.fixture(scope="module")
+def field():
+    """A frame of 81 stars, faint and bright, measured with a PSF, in a unit."""
+    rng = np.random.default_rng(4)
+    light = image((240, 240), scattered(rng, 81, 240), np.geomspace(500, 1e5, 81), 2.5)
+    data = (rng.poisson(light * GAIN) + rng.normal(0, READ_NOISE, light.shape)) / GAIN
+
+    @cache
+    def measured(psf, size):
+        values = (data.astype(np.float32).astype(float) * size).astype(np.float32)
+        return measure(Exposure("e", values, gain=GAIN / size, read_noise=READ_NOISE), psf=psf)
+
+    return measured
 
 
 @pytest.mark.parametrize("power", [-70, -3, 60])

@@ -164,10 +164,26 @@ def test_shapes_that_scatter_make_no_star_deformed():
     shapes = np.array([-1.2, -1.2, 0.0, 1.0]) + 0.1 * rng.standard_normal((200, 4))
     covariance = np.tile(np.diag(np.full(4, 1e-6)), (200, 1, 1))
     usable, snr = np.ones(200, dtype=bool), rng.uniform(10, 100, 200)
-    given = {"xy": rng.uniform(0, 500, (200, 2)), "snr": snr, "chi2": np.ones(200), "usable": usable}
+    given = {"xy": rng.uniform(0, 500, (200, 2)), "peak": snr**2, "snr": snr, "chi2": np.ones(200), "usable": usable}
     assert is_deformed(shapes, covariance, **given).mean() < 0.05
     few = {name: values[:5] for name, values in given.items()}
     assert not is_deformed(shapes[:5], covariance[:5], **few).any()  # too few to tell
+
+
+def test_bright_stars_that_the_detector_widens_are_not_deformed():
+    """A response that falls towards the full well widens stars in proportion to their height."""
+    rng = np.random.default_rng(6)
+    peak = np.geomspace(1e2, 5e4, 150)
+    snr = np.sqrt(peak) * 4
+    noise = 1.0 / snr
+    shapes = np.array([-1.2, -1.1, 0.1, 1.0]) + noise[:, None] * rng.standard_normal((150, 4))
+    shapes[:, :2] -= 0.03 * peak[:, None] / peak.max()
+    shapes[:, 3] += 0.01 * peak / peak.max()
+    shapes[[30, 100, 140]] += [-0.2, -0.1, 0.1, 0.0]  # companions
+    given = {"xy": rng.uniform(0, 500, (150, 2)), "peak": peak, "snr": snr, "usable": np.ones(150, dtype=bool)}
+    found = is_deformed(shapes, np.eye(4) * noise[:, None, None] ** 2, chi2=np.ones(150), **given)
+    assert found[[100, 140]].all()
+    assert found.mean() < 0.04
 
 
 def test_limit():

@@ -181,11 +181,35 @@ def test_what_stays_in_many_exposures():
         xy = np.concatenate([defects + rng.normal(0, 0.05, (2, 2)), sky + rng.uniform(-30, 30, 2)])[
             : 0 if k == 7 else 22
         ]
-        tables.append(QTable([xy[:, 0] * u.pix, xy[:, 1] * u.pix, np.zeros(len(xy), int)], names=["x", "y", "flags"]))
+        columns = {"x": xy[:, 0] * u.pix, "y": xy[:, 1] * u.pix, "flux": np.full(len(xy), 1e3)}
+        tables.append(QTable({**columns, "flags": np.zeros(len(xy), int)}))
     flag_what_stays(tables, [Exposure(f"e{k}", np.ones((8, 8))) for k in range(250)])
     for k, table in enumerate(tables):
         assert list(np.flatnonzero(table["flags"])) == ([] if k == 7 else [0, 1])
         assert (table["flags"][:2] == Flag.HOT | Flag.DEFECT).all()
+
+
+def test_a_star_is_none_of_its_own_images_that_persist():
+    """For three exposures there is light where it was, ever less; the images are defects, the star is none."""
+    xy, flux = stars()
+    bright = np.argsort(-flux)[:8]
+    light = [xy[bright] + shift for shift in SHIFTS]
+    persists = [np.zeros((SIZE, SIZE)) for _ in SHIFTS]
+    for k in range(1, len(SHIFTS)):
+        for ago in range(1, k + 1):
+            persists[k] += 0.03 * 0.9**ago * (image((SIZE, SIZE), light[k - ago], flux[bright], 3.0) - SKY)
+    frames = [
+        Exposure(f"e{k}", (one.data + extra).astype(np.float32), gain=GAIN, read_noise=READ_NOISE)
+        for k, (one, extra) in enumerate(zip(night()[0], persists, strict=True))
+    ]
+    table = measure(frames, psf="moffat")
+    first = table[table["exposure"] == "e0"]
+    row = cKDTree(positions(first)).query(xy[bright])[1]
+    assert not (first["flags"][row] & Flag.HOT).any()
+    matches = match(table, shape=(SIZE, SIZE)).table
+    there = matches[np.asarray(matches["exposure"]) == "e0"]
+    where = np.column_stack([np.asarray(there[name].value) for name in "xy"])
+    assert (cKDTree(where).query(xy[bright])[0] < 0.1).all()
 
 
 def test_stars_stay_where_the_sky_does_not_move():

@@ -6,7 +6,9 @@ from .cards import Stated, positive
 from .value_units import value_unit
 
 #: Where headers have the time of a frame, in order of preference ...
-WHOLE = ("EXPTIME", "EXPOSURE", "XPOSURE", "ITIME", "EFFEXPTM", "INTTIME", "EXP_TIME", "ESO DET DIT", "DIT")
+WHOLE = (
+    "EXPTIME", "EXPOSURE", "XPOSURE", "ITIME", "EFFEXPTM", "INTTIME", "EXP_TIME", "ELAPTIME", "ESO DET DIT", "DIT",
+)  # fmt: skip
 #: ... and that of one of its integrations: NIRC2, Gemini after preparation, NEWFIRM, IRCS, ESO.
 SINGLE = ("ITIME", "COADDEXP", "EXPCOADD", "EXP1TIME", "ESO DET DIT", "DIT")
 #: Their number: detectors that add them up, and those that hand on the mean (ESO).

@@ -18,11 +18,12 @@ if TYPE_CHECKING:
 
 #: Header keywords in order of preference. EGAIN comes first: cameras that write it use GAIN for a setting without unit.
 KEYWORDS = {
-    "saturation": ("SATURATE", "SATLEVEL"),
+    "saturation": ("SATURATE", "SATLEVEL", "CELL.SATURATION"),
     "gain": (
         "EGAIN", "GAIN", "CCDGAIN", "ESO DET OUT1 CONAD", "CONAD", "ATODGAIN", "ADCGAIN", "GAINEFF",
+        "CELL.GAIN",
     ),
-    "read_noise": ("RDNOISE", "READNOIS", "READNSE", "RON", "ESO DET OUT1 RON", "ENOISE", "RONOISE"),
+    "read_noise": ("RDNOISE", "READNOIS", "READNSE", "RON", "ESO DET OUT1 RON", "ENOISE", "RONOISE", "CELL.READNOISE"),
 }  # fmt: skip
 _COUNTS, _ELECTRONS = r"\b(adu|dn|du|counts?|cts?|data unit)s?", r"(e-|e\b|el|photo-?el|ph)"
 _PER = r"['\]) ]*(/|per)['\[( ]*"

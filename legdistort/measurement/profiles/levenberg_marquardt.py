@@ -215,15 +215,17 @@ def minimise(pixels, start, *, prior, bounds, limits):
         if len(rows) == 0:
             continue
         new = linearise(trial, rows)
-        better = new[1] <= cost[rows]
+        # A step that would lower chi2 by 1e-4 moves a position by a hundredth of its error, which is larger where the
+        # fit is bad. The damping must be small for the foreseen gain to mean that. Such a step is taken: whether it
+        # lowers a chi2 that was computed in single precision is for the rounding of the pixels to decide.
+        small = gain < limits.gain * np.maximum(1, chi2[rows] / pixels.dof[rows])
+        last = small & (damping[rows] <= 1)
+        better = last | (new[1] <= cost[rows])
         good = rows[better]
         params[good] = trial[better]
         for kept, value in zip((chi2, cost, gradient, hessian), new, strict=True):
             kept[good] = value[better]
-        # A step that would lower chi2 by 1e-4 moves a position by a hundredth of its error, which is larger where the
-        # fit is bad. The damping must be small for the foreseen gain to mean that.
-        small = gain < limits.gain * np.maximum(1, chi2[rows] / pixels.dof[rows])
-        converged[rows] = small & ((damping[rows] <= 1) | ~better)
+        converged[rows] = last | (small & ~better)
         damping[good] /= 5
         damping[rows[~better]] *= 8
     return params, _covariance(hessian), chi2, converged

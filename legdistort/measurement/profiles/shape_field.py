@@ -10,7 +10,7 @@ _ENOUGH = 4  # stars for every unknown of a component
 _QUARTILE_OF_CHI2 = 1.923  # with 4 degrees of freedom
 
 
-def shape_field(shapes, covariance, xy, use, *, degree, fallback):
+def shape_field(shapes, covariance, xy, use, *, degree, fallback, peak=None):
     """Shapes expected at the stars, from those fitted to some of them.
 
     A polynomial in x and y of squared widths, fitted with the inverse of the covariances as weights; deviant shapes are
@@ -29,17 +29,22 @@ def shape_field(shapes, covariance, xy, use, *, degree, fallback):
         Of the polynomial; lower where stars are few.
     fallback : ndarray, shape (4,)
         Shape where there are not enough stars for an average.
+    peak : ndarray, shape (n,), optional
+        Heights of the stars: a term more, of the polynomial. Detectors whose response falls towards their full well,
+        or whose charge spreads the more the more there is, widen stars in proportion to their height.
 
     Returns
     -------
     ndarray, shape (n, 4)
     """
-    terms = _polynomials(xy, degree)
-    while degree and np.count_nonzero(use) < _ENOUGH * terms.shape[1]:
+    n_used, extra = np.count_nonzero(use), [] if peak is None else [peak / np.abs(peak[use]).max(initial=1e-30)]
+    while degree and n_used < _ENOUGH * ((degree + 1) * (degree + 2) // 2 + len(extra)):
         degree -= 1
-        terms = terms[:, : (degree + 1) * (degree + 2) // 2]
-    if np.count_nonzero(use) < _ENOUGH:
+    if n_used < _ENOUGH:
         return np.tile(fallback, (len(xy), 1))
+    terms = _polynomials(xy, degree)
+    if n_used >= _ENOUGH * (terms.shape[1] + len(extra)):
+        terms = np.column_stack([terms, *extra])
     information = np.linalg.inv(covariance + _SCATTER**2 * np.eye(4))
     moments, slope = _moments(shapes)
     weight = np.linalg.inv(slope)
