@@ -4,7 +4,7 @@ import numpy as np
 from scipy import special
 
 from ..exceptions import FoldError
-from ..results.check import Check
+from ..results.check import CERTAIN, FALSE_ALARM, STATES, Check
 from ..results.in_tables import largest_inverse_error
 
 #: A stack whose stars are this much wider than those of single exposures has lost sharpness that can be seen.
@@ -14,6 +14,8 @@ BLURRED = 1.05
 WIDE, ELONGATED = 0.08, 0.08
 #: ... if it is no more probable than this by chance, as the others scatter: few exposures determine no more.
 ODD = 0.001
+#: Parts of the bright peaks that may have no star, and of the stars that may stand around brighter ones beyond chance.
+LOST, FALSE = 0.1, 0.1
 _FEWEST = 4  # exposures, to determine how much they usually differ
 
 
@@ -38,6 +40,31 @@ def check_run(solution, quality=None):
 
 
 def image_check(quality):
+    """Are the stars of the solution those of the frames, and are those of all exposures alike?"""
+    made = [*_light_checks(quality.light if quality else None), _shapes_check(quality)]
+    return max(made, key=lambda check: STATES.index(check.state))
+
+
+def _light_checks(light):
+    """What the list of stars lacks, and what it has too much of, where that is more than usual."""
+    if light is None:
+        return
+    lost, false = light.share_without, light.share_around
+    if lost > LOST and light.p_without(LOST / 2) < FALSE_ALARM:
+        state = "fail" if lost > 2 * LOST and light.p_without(LOST / 2) < CERTAIN else "warn"
+        yield Check("images", state, lost, LOST,
+                    f"{light.n_without} of {light.n_peaks} bright peaks of the stack have no star in the solution",
+                    "look at what was cut: flags of the detections (deformed, blended), or matches that were not found"
+                    )  # fmt: skip
+    if false > FALSE and light.p_around < FALSE_ALARM:
+        state = "fail" if false > 2 * FALSE and light.p_around < CERTAIN else "warn"
+        yield Check("images", state, false, FALSE,
+                    f"{light.n_around} of {light.n_stars} stars stand around much brighter ones, "
+                    f"{light.by_chance:.0f} would by chance: speckles, spikes or rings taken for stars",
+                    "a higher --threshold, or --psf effective, whose profile holds them")  # fmt: skip
+
+
+def _shapes_check(quality):
     """Are the stars of all exposures alike?"""
     found = quality.exposures if quality else {}
     if len(found) < _FEWEST:

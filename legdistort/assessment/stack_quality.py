@@ -18,6 +18,7 @@ from ..results.view import image_view
 from ..runtime.notebook import ShownAsPrinted
 from . import baselines
 from .star_shapes import measure_shapes
+from .unexplained_light import UnexplainedLight, unexplained_light
 
 #: Name of the single exposures in a comparison of stacks.
 SINGLE = "single exposures"
@@ -50,6 +51,8 @@ class Quality(ShownAsPrinted):
     exposures : dict
         ``{name: (FWHM [pix], ellipticity, position angle [deg])}``, medians over the stars of single exposures, the
         angle of the major axis from x to y; empty without exposures.
+    light : UnexplainedLight or None
+        What the stars of the solution do not explain of the image; None where it was not looked for.
     """
 
     n_stars: int
@@ -60,6 +63,7 @@ class Quality(ShownAsPrinted):
     fwhm_ratio: float = np.nan
     peak_ratio: float = np.nan
     exposures: dict = field(default_factory=dict)
+    light: UnexplainedLight | None = None
 
     def __str__(self):
         return (
@@ -150,7 +154,8 @@ def assess(mosaic, solution, *, exposures=(), fwhm=None, max_stars=500):
     found = sample.of_mosaic(mosaic, solution)
     keep = _common([found], single, bool(len(exposures)))
     quality = _summary(found[keep], single and single[0][keep], sample.positions(solution)[keep])
-    return replace(quality, exposures=single[2]) if single else quality
+    light = None if solution.estimate.motions else unexplained_light(mosaic, solution, fwhm=sample.fwhm)
+    return replace(quality, exposures=single[2] if single else {}, light=light)
 
 
 def compare_stacks(exposures, comparison, *, mosaic, fwhm=None, max_stars=500, **coadding):

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.optimize import nnls
 
 from ..inputs import column_contract
 from ..runtime.trees.facts import YEARS, number, text
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 #: distribution of half a chi2 with one degree of freedom: 0.5 % of motionless sets exceed it
 #: (measured: none of 100, tests/benchmarks/motions_table.py).
 MOVING = 6.6
+
+#: Fits of a law of errors one after the other, each with the weights of that before.
+_ROUNDS = 20
 
 _COUNT, _SCALE, _PIXELS = number(minimum=0), number(minimum=0), number(minimum=0, unit="pix")
 
@@ -147,6 +151,22 @@ class ErrorLaw:
     b: float = field(metadata=_PIXELS)
     floor: float = field(metadata=_PIXELS)
     factors: dict[str, float] = field(metadata=_SCALE)
+
+    @classmethod
+    def of(cls, flux: ArrayLike, variance: ArrayLike, factors: dict[str, float] | None = None) -> ErrorLaw:
+        """The law that variances [pix^2] follow, measured at some fluxes (n,): as the mean of a gamma distribution.
+
+        The spread of a measured variance goes with the true one: weights of the law itself, from a constant on.
+        """
+        flux = np.asarray(flux, dtype=float)
+        terms = np.column_stack([flux**-2.0, 1 / flux, np.ones(len(flux))])
+        model = np.full(len(flux), np.mean(variance))
+        for _ in range(_ROUNDS):
+            weighted = terms / model[:, None]
+            norm = np.sqrt((weighted**2).sum(axis=0))
+            size = nnls(weighted / norm, variance / model)[0] / norm
+            model = np.maximum(terms @ size, 1e-6 * np.mean(variance))
+        return cls(*map(float, np.sqrt(size)), factors or {})
 
     def sigma(self, flux: ArrayLike, exposure: ArrayLike | None = None) -> np.ndarray:
         """Error [pix] of positions with a flux (n,), in the exposures named (n,); by default of the average one."""

@@ -34,7 +34,8 @@ def by_detector(matches, static):
         If detectors have no star in common with others.
     """
     camera, table = matches.camera, matches.camera.on_detectors(matches.table)
-    parts = list(dict.fromkeys(zip(table["exposure"], camera.ids(table), strict=True)))
+    table["detector"] = camera.ids(table)
+    parts = list(dict.fromkeys(zip(table["exposure"], table["detector"], strict=True)))
     table["exposure"] = [detector_name(*part) for part in zip(table["exposure"], table["detector"], strict=True)]
     own = {key: _known(detector, static) for key, detector in camera.detectors.items()}
     made = replace(

@@ -55,6 +55,14 @@ class Picture:
     def shape(self):
         return self.data.shape
 
+    @property
+    def flags(self):
+        return np.zeros(self.shape, dtype=np.uint8)
+
+    @property
+    def footprint(self):
+        return np.ones(self.shape, dtype=np.int32)
+
 
 @pytest.fixture(scope="module")
 def night():

@@ -1,13 +1,15 @@
 """How often checks warn of sets in which nothing is wrong, and how surely they see what is.
 
 ``python tests/benchmarks/checks_table.py alarms --sets 2000``, ``... power --sets 200``, and ``... images --sets 100``
-for runs on simulated frames; ``... priors --sets 40`` for priors that are wrong; ``... cost`` for what the checks cost.
+for runs on simulated frames; ``... priors --sets 40`` for priors that are wrong; ``... names --sets 30`` for what
+displaces stars, ``... cures --sets 20`` for cures that are applied; ``... cost`` for what the checks cost.
 Distortions of all but the frames are Chebyshev polynomials (`calibration_table.simulated`) or those of
 `dense_model.drawn_set`, none of them made by the package.
 """
 
 import argparse
 import logging
+import re
 import sys
 import tempfile
 import time
@@ -30,6 +32,8 @@ from legdistort.simulation.pupil import PupilPSF
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import dense_model
 import drawn_sets
+import flawed_sets
+import known_displacements
 
 SIGMA = 0.02
 #: Pixels: the largest of the distortion in the headers that is not used.
@@ -45,7 +49,7 @@ def solved(matches, prior=None, **options):
     """The solution; messages on what is not known are not what is looked at."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LegdistortWarning)
-        return ld.solve(matches, degree=3, prior=prior, **options)
+        return ld.solve(matches, prior=prior, **{"degree": 3} | options)
 
 
 def clean(seed):
@@ -274,6 +278,61 @@ def _ratio(solution, stars):
     return np.sqrt(np.mean(np.abs(off[known]) ** 2) / np.mean((stated[known] ** 2).sum(axis=1)))
 
 
+#: A part of the words for what displaces stars.
+WORDS = {
+    "refraction by colour": "displaced by their colours",
+    "refraction by magnitude": "displaced by their magnitudes",
+    "pixel phase": "(pixel phase)",
+    "charge trails": "(charge trails)",
+    "step": "(stitching",
+    "pattern of the detector": "it is of the detector",
+    "pattern of the telescope": "it is of the telescope",
+    "turbulence": "(turbulence)",
+}
+
+
+def _named(data):
+    text = "; ".join(check.sentence for check in solved(drawn_sets.as_matches(data), clip=None).checks)
+    return {name for name, words in WORDS.items() if words in text}
+
+
+def names(n_sets):
+    """Print how often what displaces stars is named, where it does by the size of the errors and where it does not."""
+    for name in WORDS:
+        found = [_named(known_displacements.displaced(name, 100 + seed)[0]) for seed in range(n_sets)]
+        print(f"{name:24s} named in {sum(name in each for each in found):3d} of {n_sets}; "
+              f"another in {sum(bool(each - {name}) for each in found)}", flush=True)  # fmt: skip
+    taken, false = (known_displacements.TAKEN, known_displacements.ROLLED, {}, {"dither": 0.5}, {"n": 5}), Counter()
+    rng = np.random.default_rng(1)
+    for seed in range(3 * n_sets):
+        data = dense_model.drawn_set(1000 + seed, **taken[seed % 5])[0]
+        if seed % 2:
+            data["err"] = data["err"] * np.where(data["exposure"] == 3, 0.5, rng.uniform(0.5, 1))[:, None]
+        false.update(found := _named(data))
+        false["any"] += bool(found)
+    print(f"none, errors right and wrong: {false['any']} of {3 * n_sets} name one {dict(false)}")
+
+
+def cures(n_sets):
+    """Print what a cure promises of chi2/dof, and what it is when the cure is applied."""
+    for kind, (option, value) in flawed_sets.CURES.items():
+        right, passed, off = 0, 0, []
+        for seed in range(n_sets):
+            matches = drawn_sets.as_matches(flawed_sets.flawed(kind, seed))
+            named = next(filter(None, (PROMISE.search(c.cure) for c in solved(matches, clip=None).checks)), None)
+            if named is None:
+                continue
+            right += named.groups()[:2] == (option, value)
+            how = {named[1]: int(named[2]) if named[1] == "degree" else named[2]}
+            after = {check.name: check for check in solved(matches, clip=None, **how).checks}
+            passed += not {after[k].state for k in ("chi2", "brightness", "degree")} & {"warn", "fail"}
+            off.append(after["chi2"].value - float(named[3]))
+        print(f"{kind:12s} --{option} {value}: named in {right} of {n_sets}, passes in {passed}; chi2/dof less promise "
+              f"{np.mean(off):+.3f} +- {np.std(off):.3f}", flush=True)  # fmt: skip
+
+
+PROMISE = re.compile(r"--(errors|degree) (\S+) would bring chi2/dof to (\S+)")
+
 #: Exposures, stars on a frame, part of the observations that are gross errors.
 SIZES = ((11, 120, 0.0), (65, 700, 0.0), (40, 1000, 0.0), (100, 300, 0.0), (65, 700, 0.01))
 
@@ -302,7 +361,7 @@ def cost(n_rounds):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("alarms", "power", "images", "priors", "cost"))
+    parser.add_argument("what", choices=("alarms", "power", "images", "priors", "names", "cures", "cost"))
     parser.add_argument("--sets", type=int, default=100, help="how many; rounds of `cost`")
     parser.add_argument("--fault", nargs="+", choices=FAULTS, default=list(FAULTS), help="of `power` (default: all)")
     arguments = parser.parse_args()
@@ -310,4 +369,5 @@ if __name__ == "__main__":
     if arguments.what == "power":
         power(arguments.sets, arguments.fault)
     else:
-        {"alarms": alarms, "images": images, "priors": priors, "cost": cost}[arguments.what](arguments.sets)
+        made = (alarms, images, priors, names, cures, cost)
+        {each.__name__: each for each in made}[arguments.what](arguments.sets)

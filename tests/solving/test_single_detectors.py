@@ -92,6 +92,9 @@ def test_one_detector_is_as_without_camera(gsaoi):
     table = table[np.bincount(table["star"])[table["star"]] >= 3]
     camera = legdistort.Camera("one", {"2": gsaoi["2"]})
     found = legdistort.solve(legdistort.Matches.from_table(table, camera=camera), dynamic="detector")
+    table["detector"] = 2  # a number names it as well
+    again = legdistort.solve(legdistort.Matches.from_table(table, camera=camera), dynamic="detector")
+    assert np.array_equal(again.coefficients, found.coefficients)
     prior = legdistort.Prior(gsaoi["2"].static, sigma="evidence")
     usual = legdistort.solve(legdistort.Matches.from_table(table, shape=(2048, 2048)), prior=prior)
     both = [gsaoi_images.without_common_map(s.estimate.positions, usual.estimate.positions, 3) for s in (found, usual)]

@@ -256,8 +256,8 @@ def spoiled(kind):
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ("chi2", "errors are too small"),
-        ("chi2, too large", "errors are too large"),
+        ("chi2", r"; --errors scale would bring chi2/dof to 1\.00"),
+        ("chi2, too large", r"; --errors scale would bring chi2/dof to 1\.00"),
         ("time", "stars move in the order of the exposures"),
         ("degree", "--degree 3"),
         ("duplicates", "residuals of exp03 and exp99 are the same"),
@@ -308,7 +308,7 @@ def test_what_may_be_the_cause_is_named_first():
     noisy = table["exposure"] == "exp05"
     table["y"][noisy] += np.random.default_rng(2).normal(0, 4 * SIGMA, noisy.sum()) * u.pix
     checks = {check.name: check for check in solved(changed(simulated(3, n_exposures=9).matches, table)).checks}
-    assert checks["degree"].cure == "--degree 3, or --degree auto"
+    assert checks["degree"].cure.startswith("--degree 3 would bring chi2/dof to ")
     assert checks["exposures"].cure.startswith("see degree first, which may be the cause; else look at the frame")
 
 
@@ -373,16 +373,22 @@ def test_exposures_that_are_not_distorted_are_said_to_be_so():
     assert states(solved(matches))["dynamic part"] == "warn"
 
 
-def test_a_floor_does_not_hide_that_stated_errors_are_too_small():
+def test_errors_that_were_found_are_said_to_be_and_judged_as_they_are():
     table = simulated(5).matches.table.copy()
     table["x_err"] /= 2
     table["y_err"] /= 2
     matches = changed(simulated(5).matches, table)
-    for errors, word in (("floor", "a floor of"), ("scale", "scaled by")):
+    assert solved(matches).checks[0].state == "fail"
+    for errors, words in (
+        ("floor", "errors from a floor of .* px found here"),
+        ("scale", r"errors scaled by \S+, found here"),
+    ):
         check = solved(matches, errors=errors).checks[0]
-        assert check.state == "fail"
-        assert check.value == pytest.approx(4, rel=0.3)
-        assert word in check.sentence
+        assert check.state == "pass"
+        assert check.value == pytest.approx(1, abs=0.05)
+        stated = re.search(rf"{words}.*\((\S+) at the stated errors\)", check.sentence)
+        assert float(stated[1]) == pytest.approx(4, rel=0.3)
+    assert not check.cure
 
 
 def test_a_distortion_of_the_headers_that_is_not_used_is_a_warning():

@@ -6,6 +6,7 @@ variance of chi2 with nu degrees of freedom. It is compared with what is left of
 of a common factor on the errors: chi2 alone judges that one.
 """
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,7 +22,9 @@ _DETERMINED = 1e-4  # information [1/px^2]: what is held wrong by some pixels sh
 _PROBES = 64  # patterns up to which a trace is exact, and random combinations beyond: right to 2 %
 _TELLING = 4  # degrees of freedom, both axes, of a star whose residuals tell noise that two exposures share
 _ROUNDS = 4
-_RANK = 1e-3  # part of its variance without a fit that a combination must keep to count
+# Parts of its variance without a fit that a combination must keep to count: of a pattern and of modes. Of a pattern
+# that keeps less, what is undetermined shows as much by its second order (2 of 50 clean sets had a warning at 0.005).
+_SHOWN, _RANK = 1e-2, 1e-3
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,38 @@ class Score:
     nu: float
     p: float
     rms: float
+
+
+def in_cells(cells, displacements):
+    """Columns as of `Residuals.of_columns`: some displacements in every cell alone, negative cells having none.
+
+    Parameters
+    ----------
+    cells : ndarray of int, shape (n,)
+        From 0.
+    displacements : ndarray, shape (m, 2) or (m, 2, n)
+        Pixels.
+    """
+    n, rows = cells.max(initial=0) + 1, np.flatnonzero(cells >= 0)
+    m = len(displacements)
+    each = np.broadcast_to(np.reshape(displacements, (m, 2, -1)), (m, 2, len(cells)))[:, :, rows]
+    where = np.tile(rows, m), (cells[rows] + n * np.arange(m)[:, None]).ravel()
+    return [csr_array((each[:, axis].ravel(), where), shape=(len(cells), m * n)) for axis in (0, 1)]
+
+
+def part_of_chi2(gradient, information):
+    """What falls into a subspace, with its gradient (k,) and their covariance (k, k); what stars hide does not count.
+
+    Returns
+    -------
+    float
+    vectors, values : ndarray, shape (k, n) and (n,)
+        Directions that show, and how much.
+    """
+    values, vectors = np.linalg.eigh(information)
+    kept = values > _SHOWN
+    values, vectors = values[kept], vectors[:, kept]
+    return float(np.sum((vectors.T @ gradient) ** 2 / values)), vectors, values
 
 
 class Residuals:
@@ -173,7 +208,7 @@ class Residuals:
         """Part of every observation's variance that the position of its star takes up, mean of the axes, (n,)."""
         return self._leverages[0]
 
-    @cached_property
+    @property
     def freedom(self):
         """Degrees of freedom, both axes, that are left to every observation, shape (n,); their sum is that of chi2."""
         free = 2 * (1 - self.star_share) * self.used
@@ -201,11 +236,15 @@ class Residuals:
         sums = np.transpose([np.bincount(labels[rows], each[rows]) for each in sums])
         return [self.score(t, nu, tests=len(sums), weight=weight) for t, nu, weight in sums]
 
-    @cached_property
+    @property
     def next_degree(self):
         """`Score` of the modes of one degree more in every exposure, and that degree."""
-        problem, weight, n = self.problem, self.problem.weight, self.problem.n_modes
-        degree, n_used = problem.degree + 1, np.bincount(self.exposure[self.used], minlength=problem.n_exposures)
+        return self.of_degree(self.problem.degree + 1), self.problem.degree + 1
+
+    def of_degree(self, degree):
+        """`Score` of the modes of a degree beyond that of the fit in every exposure, all lower ones fitted too."""
+        problem, weight, n = self.problem, self.problem.weight, basis.n_modes(degree - 1)
+        n_used = np.bincount(self.exposure[self.used], minlength=problem.n_exposures)
         enough = np.flatnonzero(n_used > n + 1)
         seen, free = np.concatenate([self.whitened[:, :, None], self.released], axis=2), 1 - self.star_share
         products, apart, g = [], [], []
@@ -220,7 +259,7 @@ class Residuals:
                 apart.append(apart[-1] if equal else (p * free[part]) @ p.T)
                 g.append(p @ seen[k, part])
         if not products:
-            return self.score(0.0, 0.0), degree
+            return self.score(0.0, 0.0)
         products, apart, g = np.stack(products), np.stack(apart), np.stack(g)
         # modes of the next degree with what the others can do taken off, then orthonormal combinations of them
         own = -products[:, n:, :n] @ np.linalg.pinv(products[:, :n, :n], hermitian=True)
@@ -233,7 +272,13 @@ class Residuals:
         rows = (vectors * unit[:, None, :]).transpose(0, 2, 1) @ rows
         size = rows @ g
         nu = np.sum((rows @ apart) * rows) - np.sum(size[:, :, 1:] ** 2)
-        return self.score(float(np.sum(size[:, :, 0] ** 2)), float(nu)), degree
+        return self.score(float(np.sum(size[:, :, 0] ** 2)), float(nu))
+
+    def modes_of(self, degree):
+        """Columns, as of `of_columns`, of the modes of a degree in every exposure."""
+        parts = [self.problem.part(i) for i in range(self.problem.n_exposures)]
+        modes = np.concatenate([self._values(i, part, degree)[-degree - 1 :] for i, part in enumerate(parts)], axis=1)
+        return in_cells(self.exposure, (modes[:, None, None] * np.eye(2)[:, :, None]).reshape(-1, 2, modes.shape[1]))
 
     def _values(self, i, part, degree):
         problem, pose = self.problem, self.state.poses[i]
@@ -284,7 +329,16 @@ class Residuals:
         return float(np.vdot(rest, self.system.respond(rest))) / probes.shape[1]
 
     def of_cells(self, cells):
-        """`Score` of a displacement common to all observations of a cell, for cells (n,) from 0, and what shows of it.
+        """As `of_columns`, of a displacement common to all observations of a cell, for cells (n,) from 0."""
+        return self.of_columns(in_cells(cells, np.eye(2)))
+
+    def of_columns(self, columns):
+        """`Score` of displacements that are a combination of columns, and what shows of these.
+
+        Parameters
+        ----------
+        columns : sequence of two sparse arrays, shape (n, k)
+            Displacement of the observations in x and in y, pixels, by a unit of each.
 
         Returns
         -------
@@ -292,47 +346,92 @@ class Residuals:
         float
             By how much T would grow for displacements of one pixel rms, 1/pix^2; the rest of them is in the stars.
         """
-        n = cells.max() + 1
-        seen = np.concatenate([self.whitened[:, :, None], self.released], axis=2)
-        inside = csr_array((np.ones(len(cells)), (cells, np.arange(len(cells)))), shape=(n, len(cells)))
-        pull = np.concatenate([inside @ each for each in self._gradient(seen)])
-        g, taken = pull[:, 0], pull[:, 1:]
-        xx, yy, xy = (np.diag(inside @ x) for x in self.problem.weight)
-        plain = np.block([[xx, xy], [xy, yy]])
-        stars, moved, rest = self._followed(cells, n)
-        covariance = plain - np.tensordot(stars, moved, ([0, 1], [0, 1])) - taken @ taken.T
-        covariance -= np.tensordot(rest, self.system.respond(rest), ([0, 1], [0, 1]))
+        g, information, plain = self.information(columns)
         unit = 1 / np.sqrt(np.maximum(np.diag(plain), 1e-300))
-        values, vectors = np.linalg.eigh((covariance + covariance.T) / 2 * unit[:, None] * unit)
-        kept = values > _RANK
-        t = np.sum((vectors[:, kept].T @ (unit * g)) ** 2 / values[kept])
-        shown = float(np.sum((vectors[:, kept] / unit[:, None]) ** 2 * values[kept]))
-        return self.score(t, float(np.count_nonzero(kept))), shown
+        t, vectors, values = part_of_chi2(unit * g, information * unit[:, None] * unit)
+        shown = float(np.sum((vectors / unit[:, None]) ** 2 * values))
+        return self.score(t, float(len(values))), shown
 
-    def _followed(self, cells, n):
-        """Gradients of the unknowns by displacements (2 n) of cells, the stars eliminated.
+    def information(self, columns):
+        """Gradient (k,) of the units of columns and its covariance (k, k), and what this would be were nothing fitted.
+
+        The columns are those of `of_columns`.
+        """
+        pulling = [self._gradient_of(columns, axis) for axis in (0, 1)]
+        plain = sum((c.T @ p).toarray() for c, p in zip(columns, pulling, strict=True))
+        seen = self._gradient(np.concatenate([self.whitened[:, :, None], self.released], axis=2))
+        pull = sum(c.T @ each for c, each in zip(columns, seen, strict=True))
+        stars, moved, rest = self._followed(columns, pulling)
+        covariance = plain - np.tensordot(stars, moved, ([0, 1], [0, 1])) - pull[:, 1:] @ pull[:, 1:].T
+        covariance -= np.tensordot(rest, self.system.respond(rest), ([0, 1], [0, 1]))
+        return pull[:, 0], (covariance + covariance.T) / 2, plain
+
+    def _gradient_of(self, columns, axis):
+        """How displacements along columns pull at the model positions along an axis, sparse (n, k)."""
+        w, (x, y) = self.problem.weight, columns
+        return x.multiply(w[2 * axis][:, None]).tocsr() + y.multiply(w[2 - axis][:, None]).tocsr()
+
+    def _followed(self, columns, pulling):
+        """Gradients of the unknowns by the units of columns, the stars eliminated.
 
         Returns
         -------
-        stars, moved : ndarray, shape (2 + k, n_stars, 2 n)
+        stars, moved : ndarray, shape (2 + k, n_stars, k)
             Gradient of the stars, and how they follow with the coefficients held.
-        rest : ndarray, shape (n_exposures, 2 n_modes, 2 n)
+        rest : ndarray, shape (n_exposures, 2 n_modes, k)
             What is left for the coefficients.
         """
-        problem, pulled = self.problem, self.problem.pulled(self.blocks.coupling)
-        index = problem.star * n + cells
-        stars = np.stack([[np.bincount(index, f, problem.n_stars * n) for f in row] for row in pulled])
-        stars = stars.reshape(-1, 2, problem.n_stars, n).transpose(0, 2, 1, 3).reshape(-1, problem.n_stars, 2 * n)
+        problem, pulled, k = self.problem, self.problem.pulled(self.blocks.coupling), columns[0].shape[1]
+        rows, first = self._rows_of_stars
+        shape = len(first) - 1, len(rows)
+        stars = np.stack(
+            [sum((csr_array((f[rows], rows, first), shape) @ c).toarray() for f, c in zip(each, columns, strict=True))
+             for each in pulled]
+        )  # fmt: skip
         moved = elimination.symmetric_times(self._inverse, stars)
         rest = -self._at_exposures(pulled, moved)
-        own = rest.reshape(problem.n_exposures, 2, problem.n_modes, 2, n)
+        own = rest.reshape(problem.n_exposures, 2, problem.n_modes, k)
         for i in range(problem.n_exposures):
             part = problem.part(i)
-            cell = np.zeros((part.stop - part.start, n))
-            cell[np.arange(len(cell)), cells[part]] = 1
-            xx, yy, xy = ((self.blocks.values[:, part] * w) @ cell for w in problem.weight[:, part])
-            own[i] += np.stack([[xx, xy], [xy, yy]]).transpose(0, 2, 1, 3)
+            own[i] += np.stack([self.blocks.values[:, part] @ p[part] for p in pulling])
         return stars, moved, rest
+
+    def without(self, columns):
+        """What is left of these `Residuals` when a combination of columns, as of `of_columns`, is fitted too."""
+        problem, k = self.problem, columns[0].shape[1]
+        _, _, rest = self._followed(columns, [self._gradient_of(columns, axis) for axis in (0, 1)])
+        step = self.system.respond(rest).reshape(problem.n_exposures, 2, problem.n_modes, k)
+        fields = np.stack([c.toarray() for c in columns])
+        for i in range(problem.n_exposures):
+            part = problem.part(i)
+            fields[:, part] -= self.blocks.values[:, part].T @ step[i]
+        stars = elimination.symmetric_times(self._inverse, self._at_stars(problem.pulled(self.blocks.coupling), fields))
+        out = self._whiten(fields)
+        size = np.sqrt(np.sum(out**2, axis=(0, 1)))
+        for column, star in zip(self._columns, stars, strict=True):
+            out -= column[:, :, None] * star[problem.star]
+        flat = out.reshape(2 * len(self.used), k) / np.where(size > 0, size, 1)
+        known = self.released.reshape(len(flat), -1)
+        flat -= known @ (known.T @ flat)
+        values, vectors = np.linalg.eigh(flat.T @ flat)
+        kept = values > _RANK
+        taken = (flat @ (vectors[:, kept] / np.sqrt(values[kept]))).reshape(2, len(self.used), -1)
+        return self._with(released=np.concatenate([self.released, taken], axis=2),
+                          whitened=self.whitened - taken @ np.einsum("anm,an->m", taken, self.whitened),
+                          dof=self.dof - taken.shape[2])  # fmt: skip
+
+    def at_errors(self, factor):
+        """These `Residuals` with the errors of the observations multiplied by factors (n,), nothing fitted again."""
+        return self._with(whitened=self.whitened / factor)
+
+    def _with(self, **changed):
+        """A copy with some attributes changed, and what follows from the residuals."""
+        out = copy(self)
+        for name, value in changed.items():
+            setattr(out, name, value)
+        out.squares = np.sum(out.whitened**2, axis=0)
+        out.chi2 = float(out.squares.sum())
+        return out
 
     def correlations(self):
         """Correlation of the noise of every two exposures, and of how many values it is.

@@ -7,6 +7,7 @@ anything left out? Limits follow from the null distribution of each statistic
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy import special
@@ -15,6 +16,8 @@ from ...exceptions import some_of
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, Check, state_of
+from .cures import with_cures
+from .known_effects import Observed
 from .prior_check import prior_check
 from .residual_tests import Residuals
 
@@ -23,9 +26,15 @@ NEGLIGIBLE = 0.05
 #: Usual share of gross errors (Hampel et al. 1986: 1 to 10 % in routine data).
 GROSS_ERRORS = 0.05
 #: What else may be behind a check that does not pass.
-_CAUSES = dict.fromkeys(("time", "prior"), ("degree",))
+_CAUSES = dict.fromkeys(("time", "prior"), ("degree",)) | {"chi2": ("exposures", "place", "time", "degree")}
 _CAUSES |= dict.fromkeys(("exposures", "brightness", "place"), ("degree", "time"))
 _CAUSES["duplicates"] = "degree", "time", "place"
+#: In this order checks are told.
+_ORDER = (
+    "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "prior", "absolute", "extrapolation",
+    "rejection", "completeness", "duplicates", "header distortion",
+)  # fmt: skip
+_WRONG = "warn", "fail"
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
 _SEEN = 3.0  # errors of a star: a pattern of so much must show, else the question is open
@@ -56,27 +65,40 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     tuple of Check
     """
     residuals = Residuals(problem, state, blocks, uncertainty.system, solution.dof)
-    place = place_check(residuals)
-    made = [
-        errors_check(solution, residuals),
-        exposures_check(solution, residuals),
-        brightness_check(solution, residuals),
-        place,
-        time_check(residuals, times),
-        degree_check(solution, residuals, shows_static=place.state != "unknown"),
+    judged = partial(_by_residuals, solution, times=times)
+    made, explained = judged(residuals), ()
+    if residuals.dof >= 1 and any(check.state in _WRONG for check in made.values()):
+        observed = Observed(problem, state, solution.residuals[problem.order], times[0])
+        made, explained = with_cures(made, solution, residuals, observed, judged)
+    others = (
         dynamic_check(solution, blocks),
         prior_check(solution, problem, state, error=_star_error(residuals)),
         absolute_check(solution),
         extrapolation_check(residuals),
         rejection_check(solution),
         completeness_check(solution, residuals),
-        duplicates_check(solution, residuals),
         header_check(header_distortion),
-    ]
-    made = [check for check in made if check is not None]
+    )
+    made |= {check.name: check for check in others if check is not None}
+    made = [made[name] for name in _ORDER if name in made]
     if residuals.dof < 1:
         made = [_unjudged(check) if check.name in _BY_RESIDUALS else check for check in made]
-    return _causes_first(made)
+    return _causes_first(made, explained)
+
+
+def _by_residuals(solution, residuals, *, times):
+    """The checks that residuals tell alone, by name."""
+    place = place_check(residuals)
+    made = (
+        errors_check(solution, residuals),
+        exposures_check(solution, residuals),
+        brightness_check(solution, residuals),
+        place,
+        time_check(solution, residuals, times),
+        degree_check(solution, residuals, shows_static=place.state != "unknown"),
+        duplicates_check(solution, residuals),
+    )
+    return {check.name: check for check in made if check is not None}
 
 
 def _unjudged(check):
@@ -84,13 +106,13 @@ def _unjudged(check):
     return Check(check.name, "unknown", None, None, "no degrees of freedom are left to judge it by", _MORE)
 
 
-def _causes_first(checks):
-    """Checks whose cures name those that do not pass either and may be the cause of theirs."""
-    wrong = [check.name for check in checks if check.state in ("warn", "fail")]
+def _causes_first(checks, explained):
+    """Checks whose cures name those that do not pass either and may be the cause of theirs, but for those explained."""
+    wrong = [check.name for check in checks if check.state in _WRONG]
 
     def with_cause(check):
         causes = [name for name in _CAUSES.get(check.name, ()) if name in wrong]
-        if not causes or check.name not in wrong:
+        if not causes or check.name not in wrong or check.name in explained:
             return check
         return replace(check, cure=f"see {' and '.join(causes)} first, which may be the cause; else {check.cure}")
 
@@ -115,21 +137,30 @@ def _pattern_state(score, residuals):
     return state, ""
 
 
-def _stated(solution, residuals):
-    """Chi2 at the stated errors, without floor or scale, and its degrees of freedom."""
-    if not solution.diagnostics.error_floor:
-        return residuals.chi2, residuals.dof
+def _chi2_at_stated_errors(solution):
+    """Weighted squares of the residuals at the errors of the table, without floor or scale."""
     table = solution.residuals
     rows = np.asarray(table["used"])
     x, y, a, b = (table[name][rows].value for name in ("dx", "dy", "x_err", "y_err"))
     c = np.asarray(table["xy_corr"])[rows] if "xy_corr" in table.colnames else np.zeros(len(x))
     square = ((x / a) ** 2 + (y / b) ** 2 - 2 * c * x * y / (a * b)) / (1 - c**2)
-    return float(square.sum()), solution.dof
+    return float(square.sum())
+
+
+def _errors_in_force(solution):
+    """Where errors come from that are not those of the table, in words; "" for these."""
+    found, how = solution.diagnostics, solution.settings.errors
+    if found.error_law is not None:
+        return "errors by brightness found here"
+    if found.error_floor:
+        here = " found here" if how != "stated" else ""
+        return f"errors from a floor of {found.error_floor:.3g} px{here}"
+    return f"errors scaled by {found.error_scale:.3g}, found here" if found.error_scale != 1 else ""
 
 
 def errors_check(solution, residuals):
-    """Do residuals scatter as the stated errors lead to expect?"""
-    chi2, dof = _stated(solution, residuals)
+    """Do residuals scatter as the errors in force lead to expect?"""
+    chi2, dof = residuals.chi2 / solution.diagnostics.error_scale**2, residuals.dof
     if dof < 1:
         held = solution.dof - dof
         beside = f" beside {'that' if held == 1 else f'the {held:.0f}'} of the common map that is held" * (held >= 1)
@@ -138,21 +169,20 @@ def errors_check(solution, residuals):
     ratio, whole = chi2 / dof, solution.chi2 / solution.dof
     low, high = (special.chdtri(dof, p) / dof for p in (1 - FALSE_ALARM / 2, FALSE_ALARM / 2))
     low, high = min(low, (1 - NEGLIGIBLE) ** 2), max(high, (1 + NEGLIGIBLE) ** 2)
-    floor, scale = solution.diagnostics.error_floor, solution.diagnostics.error_scale
-    found = f"chi2/dof {ratio:.3g} at the stated errors, {low:.2f} to {high:.2f} by chance"
-    if not floor and abs(ratio - whole) > 5e-3 * ratio:
-        found += f" ({whole:.3g} with what holding the common map leaves in the residuals)"
-    if floor:
-        found += f"; a floor of {floor:.3g} px was added to them"
-    elif scale != 1:
-        found += f"; they were scaled by {scale:.3g}"
+    if found := _errors_in_force(solution):
+        found += f": chi2/dof {ratio:.3g} with them, {low:.2f} to {high:.2f} by chance"
+        if solution.diagnostics.error_law is None:
+            found += f" ({_chi2_at_stated_errors(solution) / solution.dof:.3g} at the stated errors)"
+    else:
+        found = f"chi2/dof {ratio:.3g} at the stated errors, {low:.2f} to {high:.2f} by chance"
+        if abs(ratio - whole) > 5e-3 * ratio:
+            found += f" ({whole:.3g} with what holding the common map leaves in the residuals)"
     if ratio > high:
         state = "fail" if special.chdtrc(dof, ratio * dof) < CERTAIN and ratio > 2 else "warn"
-        cure = "stated errors are too small, or stars move, or the distortion is more complex"
-        cure += "" if floor or scale != 1 else ": see the other checks, or --errors floor"
+        cure = "errors are too small, or stars move, or the distortion is more complex: see the other checks"
         return Check("chi2", state, ratio, high, found, cure)
-    if ratio < low:
-        return Check("chi2", "warn", ratio, low, found, "stated errors are too large: --errors scale takes the scatter")
+    if ratio < low and not solution.diagnostics.correlated:  # weights hold all errors, residuals not what is shared
+        return Check("chi2", "warn", ratio, low, found, "errors are too large")
     return Check("chi2", "pass", ratio, high, found)
 
 
@@ -233,7 +263,7 @@ def _would_show(score, more):
     return special.ndtr((score.nu + more - limit) / np.sqrt(2 * (score.nu + 2 * more) + 1e-300)) > 0.95
 
 
-def time_check(residuals, times):
+def time_check(solution, residuals, times):
     """Do stars move through the set? Not checked where their motions are fitted."""
     if residuals.problem.terms.n:
         return None
@@ -248,9 +278,10 @@ def time_check(residuals, times):
     state, little = _pattern_state(score, residuals)
     if state == "pass":
         return Check("time", "pass", score.rms, None, f"stars do not move {how}{little}")
-    return Check("time", state, score.rms, error,
-                 f"stars move {how}, by {score.rms:.2g} px rms (typical error of a star "
-                 f"{error:.2g} px)", cure)  # fmt: skip
+    found = f"stars move {how}, by {score.rms:.2g} px rms (typical error of a star {error:.2g} px)"
+    if (shared := solution.diagnostics.correlated) and shared.along == "time":
+        return Check("time", "pass", score.rms, error, f"{found}; the errors found here count that")
+    return Check("time", state, score.rms, error, found, cure)
 
 
 def degree_check(solution, residuals, *, shows_static):
@@ -430,10 +461,11 @@ def duplicates_check(solution, residuals):
                          f"residuals of {names[i[worst]]} and {names[j[worst]]} are the same "
                          f"(correlation {value[worst]:.2f})", "leave one of them out")  # fmt: skip
     shared = some_of([names[k] for k in np.unique([i[same], j[same]])], _LOOKED_AT)
-    return Check("duplicates", "warn", value[same[0]], _SAME,
-                 f"residuals of {shared} have a pattern in common, beyond their noise (correlation "
-                 f"{value[same[0]]:.2f})", "exposures that are close in time or place share a distortion or errors of "
-                 "the measurement: --errors correlated counts that")  # fmt: skip
+    found = f"residuals of {shared} have a pattern in common, beyond their noise (correlation {value[same[0]]:.2f})"
+    if (counted := solution.diagnostics.correlated) and counted.along:
+        return Check("duplicates", "pass", value[same[0]], _SAME, f"{found}; the errors found here count that")
+    cure = "exposures that are close in time or place share a distortion or errors of the measurement: "
+    return Check("duplicates", "warn", value[same[0]], _SAME, found, f"{cure}--errors correlated counts that")
 
 
 def header_check(header_distortion):

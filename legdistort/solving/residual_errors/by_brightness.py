@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 from astropy import units as u
-from scipy.optimize import nnls
 
 from ...exceptions import InputError
 from ...results.diagnostics import ErrorLaw
@@ -90,25 +89,9 @@ def _law(fit, before):
     measured = (pull**2 / 2 * obs.covariance[:, :2].mean(axis=1))[used]
     flux, exposure = _fluxes(fit.matches)[used], obs.exposure[used]
     factor = np.array([before.factors.get(name, 1.0) if before else 1.0 for name in names])
-    terms = np.column_stack([flux**-2.0, 1 / flux, np.ones(len(flux))])
     count = np.bincount(exposure, minlength=len(names))
     for _ in range(2):
-        size = _gamma_fit(terms, measured / factor[exposure] ** 2)
-        ratio = np.bincount(exposure, measured / (terms @ size), len(names))
+        law = ErrorLaw.of(flux, measured / factor[exposure] ** 2)
+        ratio = np.bincount(exposure, measured / law.sigma(flux) ** 2, len(names))
         factor = np.sqrt((ratio + COMMON_STARS) / (count + COMMON_STARS))
-    a, b, floor = map(float, np.sqrt(size))
-    return ErrorLaw(a, b, floor, dict(zip(names, factor.tolist(), strict=True)))
-
-
-def _gamma_fit(terms, variance, n_iterations=20):
-    """Coefficients, none negative, of terms (n, 3) whose sum is the mean of measured variances (n,).
-
-    The spread of a measured variance goes with the true one: weights of the law itself, from a constant on.
-    """
-    model = np.full(len(variance), variance.mean())
-    for _ in range(n_iterations):
-        weighted = terms / model[:, None]
-        norm = np.sqrt((weighted**2).sum(axis=0))
-        size = nnls(weighted / norm, variance / model)[0] / norm
-        model = np.maximum(terms @ size, 1e-6 * variance.mean())
-    return size
+    return replace(law, factors=dict(zip(names, factor.tolist(), strict=True)))

@@ -1,0 +1,210 @@
+"""Cures of checks that do not pass, tried on the residuals at hand before they are named.
+
+What would be left of the residuals with an effect fitted, with other errors or with a higher degree is judged by the
+same checks; the first cure that brings a check to pass is its cure, with the figure that it would reach.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ...geometry import basis
+from ...results.check import FALSE_ALARM, STATES
+from ...results.diagnostics import ErrorLaw
+from .known_effects import MOTIONS, SHARE, effects_in
+from .smooth_fields import smooth_fields
+
+#: Part of what chi2 is too large by that an effect must explain to be named as its reason.
+REASON = 0.3
+#: Degrees beyond that of the fit that are tried.
+HIGHER = 4
+#: Stars for every mode that make a degree worth a trial, and observations a law of errors takes.
+_STARS, _FEWEST = 2, 20
+#: Numbers of the modes of a degree up to which they are fitted on trial.
+_VALUES = 30_000_000
+_WRONG = "warn", "fail"
+_WOULD = {"pass": "this check would pass", "unknown": "this check would be unknown", "warn": "this check would warn"}
+#: Checks whose value is an rms, and those that smooth fields of single exposures may be behind.
+_RMS = "place", "time", "degree"
+_OF_ERRORS = "chi2", "brightness"
+_BY_FIELDS = "chi2", "brightness", "degree"
+
+
+def with_cures(checks, solution, residuals, observed, judged):
+    """Checks of residuals with the names of what displaces stars, and with cures that cure.
+
+    Parameters
+    ----------
+    checks : dict
+        ``{name: Check}`` of the residuals.
+    solution : Solution
+    residuals : Residuals
+    observed : `legdistort.solving.checks.known_effects.Observed`
+    judged : callable
+        ``judged(residuals)`` makes these checks of other residuals.
+
+    Returns
+    -------
+    checks : dict
+    explained : set of str
+        Those that do not pass for a reason that they name.
+    """
+    effects = effects_in(residuals, observed)
+    checks, explained = _named(checks, effects, judged)
+    wrong = [name for name, check in checks.items() if check.state in _WRONG and name not in explained]
+    if not wrong:
+        return checks, explained
+    cure, cured = _errors_cure(wrong, solution, residuals, observed, judged)
+    left, higher, ends = effects[-1].left if effects else residuals, "", False
+    if set(wrong) == cured:  # tests that compare places, times and degrees take errors to be right but for a factor
+        checks |= {name: replace(checks[name], cure=cure) for name in wrong}
+        explained |= cured
+    elif "degree" in wrong and residuals.next_degree[0].p <= FALSE_ALARM:
+        higher, ends, after = _higher_degree(left)
+        rest = "" if ends else cure or "--errors floor counts the rest"
+        found = solution.settings.errors != "stated"
+        checks["degree"] = _with_degree(checks["degree"], higher, rest, counted=found)
+        explained |= {*_OF_ERRORS, "degree"} & {*wrong} if higher else set()
+    checks |= {
+        name: replace(checks[name], cure=higher or cure) for name in _OF_ERRORS if name in wrong and higher + cure
+    }
+    if ends and judged(after)["chi2"].state not in _WRONG:  # then it is the degree and no more
+        return checks, explained
+    fields = smooth_fields(left)
+    return checks | {name: _with_fields(checks[name], fields) for name in wrong if name in _BY_FIELDS}, explained
+
+
+def _named(checks, effects, judged):
+    """Checks that name the effects which explain why they do not pass, and the names of these checks."""
+    reasons, before = {}, checks
+    for effect in effects:
+        after = judged(effect.left)
+        for name in before.keys() & after.keys():
+            if _is_better(after[name], before[name]):
+                reasons.setdefault(name, []).append((effect, after[name]))
+        before = before | after
+    checks = dict(checks)
+    moving = checks["time"].cure if "time" in checks else ""
+    for name, found in reasons.items():
+        words = "; ".join(f"{each.words}, by {each.rms:.2g} px rms" for each, _ in found)
+        last = found[-1][1]
+        reached = f"chi2/dof would be {last.value:.2f}" if name == "chi2" else _WOULD[last.state]
+        cure = "; ".join(moving if each.effect is MOTIONS else each.effect.cure for each, _ in found)
+        check = checks[name]
+        checks[name] = replace(check, sentence=f"{check.sentence}; {words}: without that {reached}", cure=cure)
+    return checks, set(reasons)
+
+
+def _is_better(after, before):
+    """Whether what was taken off is a reason for a check that does not pass."""
+    if before.state not in _WRONG:
+        return False
+    if before.name == "chi2":
+        return before.value - after.value > REASON * (before.value - 1)
+    if before.name in _RMS and after.value**2 > (1 - REASON) * before.value**2:
+        return False
+    return STATES.index(after.state) < STATES.index(before.state)
+
+
+def _with_fields(check, fields):
+    """A check that names smooth fields, if they are a reason for what it found."""
+    if not fields.are_there or (check.name == "chi2" and fields.share * check.value < SHARE * (check.value - 1)):
+        return check
+    words = "neighbouring stars of an exposure are displaced alike, in every exposure in another way (turbulence), by "
+    return replace(check, sentence=f"{check.sentence}; {words}{fields.rms:.2g} px rms")
+
+
+def _higher_degree(residuals):
+    """The lowest degree after which one more explains nothing.
+
+    Returns
+    -------
+    str
+        In words; "" where the stars allow none.
+    bool
+        Whether they allow that one.
+    Residuals
+        What it leaves.
+    """
+    problem = residuals.problem
+    stars = np.bincount(residuals.exposure[residuals.used], minlength=problem.n_exposures).min()
+    best, left = "", residuals
+    for degree in range(problem.degree + 1, problem.degree + 1 + HIGHER):
+        if stars < _STARS * basis.n_modes(degree):
+            break
+        best = best or f"--degree {degree}"
+        columns = left.modes_of(degree)
+        if 2 * len(residuals.used) * columns[0].shape[1] > _VALUES:
+            break
+        after = left.without(columns)
+        if after.dof < 1:
+            break
+        best, left = f"--degree {degree} would bring chi2/dof to {after.chi2 / after.dof:.2f}", after
+        if left.of_degree(degree + 1).p > FALSE_ALARM:
+            return best, True, left
+    return best, False, left
+
+
+def _with_degree(check, higher, rest, *, counted):
+    """The check of the degree with a higher one as its cure, and one of the rest that this leaves.
+
+    Where the stars allow none, errors that are the scatter of the residuals have `counted` it.
+    """
+    if counted and not higher:
+        return replace(check, state="pass", sentence=f"{check.sentence}; the errors found here count that", cure="")
+    rest = rest and f"no degree that the stars allow ends it: {rest}"
+    return replace(check, cure="; ".join(filter(None, (higher, rest))))
+
+
+def _errors_cure(wrong, solution, residuals, observed, judged):
+    """The simplest errors with which residuals scatter as they lead to expect.
+
+    Returns
+    -------
+    str
+        In words, with the figure that they would reach; "" if nothing is wrong with the errors, or none are better.
+    set of str
+        Checks of those that are wrong that would pass.
+    """
+    if residuals.dof < 1 or not any(name in _OF_ERRORS for name in wrong):
+        return "", set()
+    tried = []
+    for name, factor in _other_errors(solution, residuals, observed):
+        after = judged(residuals.at_errors(factor))
+        left = [after[each] for each in _OF_ERRORS if each in after and after[each].state in _WRONG]
+        cured = {each for each in wrong if each in after and after[each].state not in _WRONG}
+        off = max((abs(np.log(check.value)) for check in left), default=0.0)
+        tried.append((len(left), off, f"--errors {name} would bring chi2/dof to {after['chi2'].value:.2f}", cured))
+        if not left:
+            break
+    return min(tried, key=lambda each: each[:2])[2:] if tried else ("", set())
+
+
+def _other_errors(solution, residuals, observed):
+    """Names of errors that `legdistort.solve` finds, and what they multiply those in force by, (n,); simplest first."""
+    squares, free, dof = residuals.squares, residuals.freedom, residuals.dof
+    errors, in_force = solution.settings.errors, solution.diagnostics.error_scale
+    w = residuals.problem.weight[:2].mean(axis=0)
+    variance = 1 / np.where(residuals.used, w, 1)
+    square = residuals.chi2 / dof
+    alike = {}
+    if errors == "stated" and square > 0:
+        alike["scale"] = np.full(len(w), np.sqrt(square))
+    if errors in ("stated", "scale") and square > 1:
+
+        def left(log):  # of chi2, with a floor, over its degrees of freedom
+            return np.sum(squares * variance / (variance + np.exp(2 * log))) / dof - 1
+
+        top = np.log(residuals.chi2 * variance.max() + variance.max()) / 2
+        alike["floor"] = np.sqrt(1 + np.exp(2 * brentq(left, top - 30, top)) / variance) / in_force
+    yield from sorted(alike.items(), key=lambda each: round(np.mean(free * np.log(each[1])), 3))  # the likelier first
+    if errors == "by-brightness" or "flux" not in observed.table.colnames:
+        return
+    flux = np.asarray(observed.table["flux"], dtype=float)
+    known = residuals.used & (flux > 0) & np.isfinite(flux) & (free > 0.1)
+    if np.count_nonzero(known) < _FEWEST:
+        return
+    law = ErrorLaw.of(flux[known], (squares / np.maximum(free, 0.1) * variance)[known])
+    factor = law.sigma(np.where(flux > 0, flux, flux[known].min())) / np.sqrt(variance)
+    yield "by-brightness", factor * np.sqrt(np.sum(squares / factor**2) / dof) / in_force

@@ -1,0 +1,371 @@
+"""Patterns of residuals that have a name: what astronomers know that displaces stars, as columns that may explain them.
+
+Every entry of `EFFECTS` is one: its columns, the sentence, and the cure. Which of them are there is asked where a check
+does not pass, and answered as everywhere: by the part of chi2 that falls into the columns once all that is fitted is
+fitted again (`Residuals.of_columns`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+from ...geometry import basis
+from ...results.check import CERTAIN
+from .residual_tests import in_cells, part_of_chi2
+
+#: Effects that are named at most, and part of what chi2 is too large by that one must explain.
+MOST_NAMED, SHARE = 3, 0.15
+#: Columns of one effect at most, and their values: exposures are taken together, or not all of them, to keep to that.
+_COLUMNS, _VALUES = 240, 30_000_000
+_MOVING = 1000  # columns of motions
+_EDGES = 32  # parts of the detector at whose edges a step is looked for
+_BEYOND = 4  # degrees of a pattern beyond that of the fit
+_FEWEST_LEFT = 10  # degrees of freedom beside an effect that tell whether it is one
+_TURNED = 0.1  # rad: less is no turned camera
+_COLOURS = "colour", "color", "bp_rp", "colour_index"
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Observations as effects need them, in the order of the problem.
+
+    Attributes
+    ----------
+    problem : Problem
+    state : State
+    table : `~astropy.table.QTable`
+        The rows behind the observations.
+    times : ndarray, shape (n_exposures,)
+        Of the exposures, or their order.
+    """
+
+    problem: object
+    state: object
+    table: object
+    times: np.ndarray
+
+    @cached_property
+    def exposure(self):
+        """Exposure of every observation, (n,)."""
+        return self.problem.exposure
+
+    @cached_property
+    def pixels(self):
+        """Positions on the detectors, pixels, (2, n)."""
+        names = ("x_detector", "y_detector") if "x_detector" in self.table.colnames else ("x", "y")
+        return np.stack([np.asarray(self.table[name].value, dtype=float) for name in names])
+
+    @cached_property
+    def size(self):
+        """Width and height of the detectors, pixels, (2, n)."""
+        if "x_detector" in self.table.colnames:
+            return np.ceil(self.pixels.max(axis=1, keepdims=True) + 1) * np.ones_like(self.pixels)
+        return self.problem.size[self.exposure].T
+
+    @cached_property
+    def place(self):
+        """Positions on the detectors from -1 to 1, (2, n)."""
+        return np.clip((2 * self.pixels + 1) / self.size - 1, -1, 1)
+
+    @cached_property
+    def linear(self):
+        """Linear parts of the poses without their scale, (n_exposures, 2, 2)."""
+        linear = self.state.poses[:, :, :2]
+        return linear / np.sqrt(np.abs(np.linalg.det(linear)))[:, None, None]
+
+    @property
+    def is_turned(self):
+        """Whether the camera is turned between exposures."""
+        return bool(np.any(np.abs(self.linear - self.linear[0]) > _TURNED))
+
+    @cached_property
+    def detector(self):
+        """Number of the detector of every observation, from 0, where a camera has several; else None."""
+        if "x_detector" not in self.table.colnames:
+            return None
+        found, number = np.unique(np.asarray(self.table["detector"]), return_inverse=True)
+        return number if len(found) > 1 else None
+
+    @cached_property
+    def faintness(self):
+        """Magnitudes about their mean over their scatter, (n,), of fluxes or else of the errors; None if all alike."""
+        if "flux" in self.table.colnames:
+            flux = np.asarray(self.table["flux"], dtype=float)
+            return _standard(-np.log(np.where(flux > 0, flux, np.nan)))
+        return _standard(np.log(np.hypot(self.table["x_err"].value, self.table["y_err"].value)))
+
+    @cached_property
+    def colour(self):
+        """Colours of the stars about their mean over their scatter, (n,); None if the table has none."""
+        for name in _COLOURS:
+            if name in self.table.colnames and np.issubdtype(self.table[name].dtype, np.number):
+                return _standard(np.asarray(getattr(self.table[name], "value", self.table[name]), dtype=float))
+        return None
+
+    def by_exposure(self, n_each):
+        """Labels (n,) of the exposures for columns of which every one needs so many: together if they are too many."""
+        n, most = self.problem.n_exposures, min(_COLUMNS, _VALUES // (2 * len(self.exposure)))
+        return self.exposure * min(n, max(most // n_each, 2)) // n
+
+
+def _standard(values):
+    """Values about their mean in units of their scatter, 0 where there is none; None if they do not differ."""
+    known = np.isfinite(values)
+    if np.count_nonzero(known) < 2 or np.ptp(values[known]) < 1e-6:
+        return None
+    return np.where(known, (values - values[known].mean()) / values[known].std(), 0.0)
+
+
+def _along_a_direction(observed, size):
+    """Displacements in proportion to a size (n,), in every exposure along a direction of its own."""
+    if size is None:
+        return None
+    directions = observed.linear[observed.exposure].transpose(2, 1, 0)  # of the plane, on the detector
+    return in_cells(observed.by_exposure(2), directions * size)
+
+
+def _by_colour(observed):
+    return _along_a_direction(observed, observed.colour)
+
+
+def _by_brightness(observed):
+    return _along_a_direction(observed, observed.faintness)
+
+
+def _by_pixel_phase(observed):
+    """First two waves of the fraction of a pixel, along the same axis."""
+    phase = 2 * np.pi * (observed.pixels + 0.5)
+    waves = np.stack([f(k * phase) for k in (1, 2) for f in (np.sin, np.cos)])
+    return _all_alike(waves[:, None] * np.eye(2)[None, :, :, None])
+
+
+def _by_charge_trails(observed):
+    """Displacements along an axis that grow with the way to the edge, on one side or both, for fainter stars more."""
+    if observed.faintness is None:
+        return None
+    way = np.concatenate([np.ones_like(observed.place[:1]), observed.place, np.abs(observed.place)])
+    faint = np.stack([observed.faintness, observed.faintness**2])
+    return _all_alike((faint[:, None] * way)[:, :, None, None] * np.eye(2)[:, :, None])
+
+
+def _all_alike(displacements):
+    """Columns of displacements (..., 2, n) that all observations have."""
+    each = displacements.reshape(-1, *displacements.shape[-2:])
+    return in_cells(np.zeros(each.shape[-1], dtype=int), each)
+
+
+def _by_strips(observed):
+    """Displacements of every strip of columns, and of every strip of rows."""
+    strips = [np.minimum(((v + 1) / 2 * _EDGES).astype(int), _EDGES - 1) for v in observed.place]
+    strips = [np.append(each, _EDGES - 1) for each in strips]  # so that none is lacking at the end
+    columns = [[c[:-1] for c in in_cells(each, np.eye(2))] for each in strips]
+    return [sparse.hstack([x, y], format="csr") for x, y in zip(*columns, strict=True)]
+
+
+def _edges():
+    """Combinations of strips that move all that lies beyond an edge, in x and in y: (2 (n - 1), 4 n, 2)."""
+    beyond = np.arange(_EDGES) >= np.arange(1, _EDGES)[:, None]
+    return np.einsum("ij,ab,en->iejanb", np.eye(2), np.eye(2), beyond).reshape(2 * (_EDGES - 1), -1, 2)
+
+
+def _as_series(observed, place, directions):
+    """A series beyond the degree of the fit along two directions (2, 2) or (2, 2, n), at places of a turned frame."""
+    degree = observed.problem.degree
+    modes = basis.values(degree + _BEYOND, *np.clip(place / np.sqrt(2), -1, 1))[basis.n_modes(degree) :]
+    along = np.broadcast_to(np.reshape(directions, (2, 2, -1)), (2, 2, modes.shape[1]))
+    return _all_alike(modes[:, None, None] * along)
+
+
+def _on_the_detector(observed):
+    if not observed.is_turned or observed.detector is not None:
+        return None
+    return _as_series(observed, observed.place, np.eye(2))
+
+
+def _on_the_sky(observed):
+    """A pattern that keeps its orientation while the camera turns, in its place about the middle of the field."""
+    if not observed.is_turned or observed.detector is not None:
+        return None
+    linear = observed.linear[observed.exposure]
+    place = np.einsum("nba,bn->an", linear, observed.place)  # the inverse of a rotation is its transpose
+    return _as_series(observed, place, linear.transpose(2, 1, 0))
+
+
+def _similarity(place):
+    (x, y), one, zero = place, np.ones(place.shape[1]), np.zeros(place.shape[1])
+    return np.stack([[one, zero], [zero, one], [x, y], [-y, x]])
+
+
+def _by_layout(observed):
+    return None if observed.detector is None else in_cells(observed.detector, _similarity(observed.place))
+
+
+def _by_detector_statics(observed):
+    """All of the lower degrees but a similarity, for every detector."""
+    if observed.detector is None:
+        return None
+    modes = basis.values(3, *observed.place)[1:]
+    return in_cells(observed.detector, (modes[:, None, None] * np.eye(2)[:, :, None]).reshape(-1, 2, modes.shape[1]))
+
+
+def _by_detector_departures(observed):
+    """A similarity of every detector in every exposure."""
+    if observed.detector is None:
+        return None
+    n = observed.detector.max() + 1
+    return in_cells(observed.by_exposure(4 * n) * n + observed.detector, _similarity(observed.place))
+
+
+def _by_motions(observed):
+    """Motions of single stars, where they are not fitted and few enough to be tried."""
+    n, n_stars = len(observed.exposure), observed.problem.n_stars
+    if observed.problem.terms.n or 2 * n_stars > _MOVING or 4 * n * n_stars > _VALUES:
+        return None
+    time = np.asarray(observed.times, dtype=float)[observed.exposure]
+    if np.ptp(time) == 0:
+        return None
+    along = observed.linear[observed.exposure].transpose(2, 1, 0)
+    return in_cells(observed.problem.star, along * (time - time.mean()) / time.std())
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Something that displaces stars in a way of its own.
+
+    Attributes
+    ----------
+    name : str
+    columns : callable
+        ``columns(observed)`` gives those of `Residuals.of_columns`; None where there is nothing to look for.
+    found : str
+        What it does, as a clause; ``{where}`` is a place on the detector.
+    cure : str
+    parts : callable, optional
+        ``parts()`` gives combinations (n, k, m) of the k columns, of which the best is sought; None: all together.
+    """
+
+    name: str
+    columns: Callable
+    found: str
+    cure: str
+    parts: Callable | None = None
+
+
+MOTIONS = Effect("motions", _by_motions,
+                 "every star moves by itself",
+                 "see time")  # fmt: skip
+EFFECTS = (
+    MOTIONS,
+    Effect("refraction by colour", _by_colour,
+           "stars are displaced by their colours, in every exposure along a direction of its own, as refraction does",
+           "correct the positions for differential refraction, or observe nearer the zenith or in a narrower band"),
+    Effect("refraction by magnitude", _by_brightness,
+           "stars are displaced by their magnitudes, in every exposure along a direction of its own, as refraction "
+           "does where colours go with magnitudes",
+           "correct the positions for differential refraction, or solve stars of like brightness"),
+    Effect("pixel phase", _by_pixel_phase,
+           "positions depend on the fraction of a pixel on which a star falls (pixel phase)",
+           "measure with --psf effective, or correct the positions for it"),
+    Effect("charge trails", _by_charge_trails,
+           "fainter stars are displaced more, the further they are from an edge of the detector (charge trails)",
+           "correct the frames for charge transfer, or leave faint stars out"),
+    Effect("step", _by_strips,
+           "positions step at {where} (stitching of the detector)",
+           "give both sides as detectors of a camera, or correct the positions by the step", parts=_edges),
+    Effect("pattern of the detector", _on_the_detector,
+           "the pattern turns with the camera: it is of the detector",
+           "raise --degree, or give a prior of the static distortion"),
+    Effect("pattern of the telescope", _on_the_sky,
+           "the pattern stays as it is while the camera turns: it is of the telescope, not the detector",
+           "raise --degree; a prior of the detector does not describe it"),
+    Effect("layout", _by_layout,
+           "detectors do not lie as their layout has it, in all exposures alike",
+           "--layout fit"),
+    Effect("statics of the detectors", _by_detector_statics,
+           "detectors have distortions of their own, in all exposures alike",
+           "--static fit"),
+    Effect("departures of the detectors", _by_detector_departures,
+           "detectors move against each other from exposure to exposure",
+           "--dynamic detector"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """An effect that is there.
+
+    Attributes
+    ----------
+    effect : Effect
+    rms : float
+        Of the displacements that show, pixels per axis.
+    words : str
+        What it does.
+    left : Residuals
+        What is left without it, and without those found before.
+    """
+
+    effect: Effect
+    rms: float
+    words: str
+    left: object
+
+
+def effects_in(residuals, observed):
+    """The effects that residuals show, the one that explains most first, each beside those before it.
+
+    Parameters
+    ----------
+    residuals : Residuals
+    observed : Observed
+
+    Returns
+    -------
+    list of Found
+    """
+    made = [(effect, effect.columns(observed)) for effect in EFFECTS]
+    made = [(effect, columns) for effect, columns in made if columns is not None]
+    found = []
+    while len(found) < MOST_NAMED and made:
+        tried = [_tried(residuals, effect, columns) for effect, columns in made]
+        best = int(np.argmin([cost for cost, *_ in tried]))
+        _, score, which, taken = tried[best]
+        effect, columns = made.pop(best)
+        too_large = residuals.chi2 - residuals.dof
+        if score.p * len(EFFECTS) > CERTAIN or score.t - score.nu < SHARE * too_large:
+            break
+        residuals = residuals.without([sparse.csr_array(c @ taken) for c in columns])
+        words = effect.found.format(where=_edge(observed, which))
+        found.append(Found(effect, score.rms, words, residuals))
+    return found
+
+
+def _tried(residuals, effect, columns):
+    """How well an effect explains residuals: its cost (Schwarz 1978), its `Score`, which part, and of what columns."""
+    g, information, plain = residuals.information(columns)
+    parts = np.eye(len(g))[None] if effect.parts is None else effect.parts()
+    best = np.inf, residuals.score(0.0, 0.0), 0, parts[0]
+    for i, part in enumerate(parts):
+        t, _, values = part_of_chi2(*(_combined(part, g, information, plain)))
+        if residuals.dof - len(values) < _FEWEST_LEFT:
+            continue
+        cost = residuals.dof * np.log(max(residuals.chi2 - t, 1e-300)) + len(values) * np.log(max(residuals.dof, 2))
+        if cost < best[0]:
+            best = cost, residuals.score(t, float(len(values)), tests=len(parts)), i, part
+    return best
+
+
+def _combined(part, g, information, plain):
+    """Gradient and information of combinations of columns, in units of what they would have were nothing fitted."""
+    unit = 1 / np.sqrt(np.maximum(np.diag(part.T @ plain @ part), 1e-300))
+    return unit * (part.T @ g), unit[:, None] * (part.T @ information @ part) * unit
+
+
+def _edge(observed, number):
+    """The edge of a step in words."""
+    axis, edge = divmod(number, _EDGES - 1)
+    size = float(np.median(observed.size[axis]))
+    return f"{('column', 'row')[axis]} {(edge + 1) / _EDGES * size:.0f}, to {size / _EDGES / 2:.0f} pixels"

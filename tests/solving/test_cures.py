@@ -1,0 +1,125 @@
+"""Cures are applied as named: the check passes, with the figure promised. Sets of `dense_model`, numpy alone."""
+
+import re
+import warnings
+
+import dense_model
+import drawn_sets
+import flawed_sets
+import four_detectors
+import known_displacements
+import numpy as np
+import pytest
+
+import legdistort as ld
+from legdistort.exceptions import LegdistortWarning
+
+
+def solved(data, **options):
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        return ld.solve(drawn_sets.as_matches(data), **{"clip": None} | options)
+
+
+def checks_of(solution):
+    return {check.name: check for check in solution.checks}
+
+
+def promise(check):
+    """Option, its value and the figure of a cure."""
+    found = re.fullmatch(r"--(\S+) (\S+) would bring chi2/dof to (\S+)", check.cure)
+    return (found[1], found[2]), float(found[3])
+
+
+def assert_cured(kind, seed):
+    data = flawed_sets.flawed(kind, seed)
+    checks = checks_of(solved(data))
+    wrong = next(check for check in checks.values() if check.state in ("warn", "fail") and "would bring" in check.cure)
+    (option, value), figure = promise(wrong)
+    assert (option, value) == flawed_sets.CURES[kind]
+    cured = solved(data, **{option: int(value) if option == "degree" else value})
+    after = checks_of(cured)
+    assert {after[name].state for name in ("chi2", "brightness", "degree")} <= {"pass", "unknown"}
+    assert after["chi2"].value == pytest.approx(figure, abs=0.07)
+    if option == "errors":
+        assert "found here" in after["chi2"].sentence
+
+
+@pytest.mark.parametrize("kind", ["half", "one for all", "degree"])
+def test_the_cure_that_is_named_cures(kind):
+    assert_cured(kind, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", flawed_sets.CURES)
+@pytest.mark.parametrize("seed", range(1, 11))
+def test_the_cure_that_is_named_cures_other_sets(kind, seed):
+    assert_cured(kind, seed)
+
+
+def test_motions_are_the_cure_of_all_that_they_cause():
+    """Places, degrees and errors do not pass either where stars move; fitting their motions brings what is promised."""
+    data, rng = dense_model.drawn_set(1)[0], np.random.default_rng(1)
+    motion = rng.normal(0, 0.02, (data["star"].max() + 1, 2))[data["star"]]
+    data["epoch"] = 2010.0 + data["exposure"]
+    data["xy"] = data["xy"] + motion * (data["exposure"] - 5)[:, None]
+    wrong = [check for check in checks_of(solved(data)).values() if check.state in ("warn", "fail")]
+    assert {"chi2", "time", "degree", "duplicates"} <= {check.name for check in wrong}
+    assert {check.cure for check in wrong} == {"fit the motions of the stars: --motion proper"}
+    promised = float(wrong[0].sentence.partition("chi2/dof would be ")[2])
+    after = checks_of(solved(data, motion="proper"))["chi2"]
+    assert after.state == "pass"
+    assert after.value == pytest.approx(promised, abs=0.05)
+
+
+def test_errors_that_are_wrong_are_not_taken_for_patterns():
+    """Bright stars with errors too small make tests of places and degrees fail; it is the errors that are named."""
+    data = dense_model.drawn_set(2)[0]
+    bright = data["err"][:, :1] < np.quantile(data["err"], 1 / 3)
+    checks = checks_of(solved(data | {"err": np.where(bright, data["err"] / 2, data["err"])}))
+    wrong = [check for check in checks.values() if check.state in ("warn", "fail")]
+    assert {"chi2", "degree"} <= {check.name for check in wrong}
+    assert {check.cure for check in wrong} == {"--errors floor would bring chi2/dof to 1.00"}
+
+
+def test_turbulence_that_no_degree_ends_is_counted_in_the_errors():
+    data = known_displacements.displaced("turbulence", 0, size=5.0, n_stars=70)[0]
+    degree = checks_of(solved(data))["degree"]
+    assert degree.state == "fail"
+    assert degree.cure == "no degree that the stars allow ends it: --errors floor would bring chi2/dof to 1.00"
+    after = checks_of(solved(data, errors="floor"))
+    assert after["chi2"].state == after["degree"].state == "pass"
+    assert "the errors found here count that" in after["degree"].sentence
+
+
+@pytest.mark.slow
+def test_a_degree_that_was_chosen_by_itself_is_not_advised_again():
+    data = known_displacements.displaced("turbulence", 0, size=5.0, n_stars=70)[0]
+    degree = checks_of(solved(data, degree="auto"))["degree"]
+    assert degree.state == "fail"
+    assert "auto" not in str(degree)
+
+
+def assert_camera_is_cured(kind, seed, **size):
+    """Of the three the one that was named: chi2 over its degrees of freedom falls a hundredfold."""
+    matches = four_detectors.matches(kind, seed, **size)
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        wrong = ld.solve(matches, clip=None)
+        chi2 = checks_of(wrong)["chi2"]
+        assert chi2.state == "fail"
+        assert chi2.cure == four_detectors.CURES[kind]
+        promised = float(chi2.sentence.partition("chi2/dof would be ")[2])
+        assert promised < 2
+        option, value = chi2.cure[2:].split()
+        cured = ld.solve(matches, clip=None, **{option: value})
+    assert cured.chi2 / cured.dof < min(2, chi2.value / 50)
+
+
+def test_of_three_cures_of_a_camera_the_right_one_is_named():
+    assert_camera_is_cured("layout", 0, n=5, n_stars=100)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", four_detectors.CURES)
+@pytest.mark.parametrize("seed", range(6))
+def test_of_three_cures_of_a_camera_the_right_one_is_named_in_other_sets(kind, seed):
+    assert_camera_is_cured(kind, seed)
