@@ -258,8 +258,7 @@ class Uncertainty:
         n = modes_for(self._gauge.n_modes, np.count_nonzero(weights[:, 0, 0]))
         maps = plain_maps(self._gauge, self._blocks.stars[:2].T, n)
         weighted = weights @ maps
-        follow = [self._follow(pull) for pull in np.moveaxis(weighted, 2, 0)]
-        stars, coefficients = (np.stack(each, axis=-1) for each in zip(*follow, strict=True))
+        stars, coefficients = self._follow(weighted)
         fit = np.linalg.pinv(np.einsum("jam,jan->mn", weighted, maps), rcond=1e-12, hermitian=True)
         covariance = fit @ np.einsum("jam,jan->mn", weighted, stars) @ fit
         parts = weights, stars @ fit, coefficients @ fit, (covariance + covariance.T) / 2
@@ -277,22 +276,26 @@ class Uncertainty:
             out[known, part, part] = np.linalg.inv(block[known])
         return out
 
-    def _follow(self, pull):
-        """Covariance of stars (n_stars, 2 + k) and coefficients (n_exposures, 2 n_modes) with a sum over the stars.
+    def _follow(self, pulls):
+        """Covariance of stars (n_stars, 2 + k, c) and coefficients (n_exposures, 2 n_modes, c) with sums over stars.
 
-        Of pull (n_stars, 2 + k) times their unknowns.
+        Of pulls (n_stars, 2 + k, c) times their unknowns.
         """
-        problem, blocks, nothing = self._problem, self._blocks, np.zeros_like(self._blocks.g_exposure)
+        problem, blocks, shape = self._problem, self._blocks, self._blocks.g_exposure.shape
+        if self._on_stars is not None:
+            found = [self._on_stars.settle(np.zeros(shape), each.T) for each in np.moveaxis(pulls, 2, 0)]
+            stars, coefficients = (self._scale**2 * np.stack(each, axis=-1) for each in zip(*found, strict=True))
+            return stars.transpose(1, 0, 2), coefficients
+        inverse = unpacked(elimination.inverse_star_blocks(blocks.v))
+        alone = inverse @ pulls
+        moved = [elimination.to_exposures(problem, blocks, each.T) for each in np.moveaxis(alone, 2, 0)]
+        moved = np.stack(moved, axis=-1).reshape(*shape, -1)
         if self._given is None:
-            system = self._on_stars or self._direct
-            stars, coefficients = system.settle(nothing, pull.T)
-            return self._scale**2 * stars.T, self._scale**2 * coefficients.reshape(nothing.shape)
-        inverse = elimination.inverse_star_blocks(blocks.v)
-        alone = elimination.symmetric_times(inverse, pull.T)
-        moved = elimination.to_exposures(problem, blocks, alone)
-        coefficients = -times(self._given, moved.reshape(-1, 1)).reshape(nothing.shape)
-        following = elimination.symmetric_times(inverse, elimination.to_stars(problem, blocks, coefficients))
-        return (self._scale**2 * alone - following).T, coefficients
+            coefficients = -(self._scale**2) * self._direct.respond(moved)
+        else:
+            coefficients = -times(self._given, moved.reshape(-1, moved.shape[2])).reshape(moved.shape)
+        following = [elimination.to_stars(problem, blocks, each) for each in np.moveaxis(coefficients, 2, 0)]
+        return self._scale**2 * alone - inverse @ np.stack(following, axis=-1).transpose(1, 0, 2), coefficients
 
     @cached_property
     def weak(self) -> tuple[UnknownDirection, ...]:
