@@ -31,7 +31,7 @@ _AWAY = 0.5  # of a step, by which it may differ in a block
 _SINGLE = 5  # columns of which the median is taken
 _JUMP = 3  # of them next to it, which have the whole step
 _SHOWN = 100_000  # pixels of either half of a frame that serve for that
-_SURE = 6.0  # standard deviations: none in 240 frames of noise, curved skies and stars
+_SURE = 10.5  # standard deviations: columns of dense fields, where a star is in every block, have up to 10
 
 
 def amplifier_levels(data, mask):
@@ -59,7 +59,7 @@ def amplifier_levels(data, mask):
 def _half_levels(data, mask, known):
     """Levels of columns, of the upper and the lower half by themselves where they differ; `known` ones are off."""
     ny, nx = data.shape
-    if nx < 4 * _BESIDE or ny < _BESIDE:
+    if nx <= 4 * _BESIDE or ny < _BESIDE:
         return None
     halves = np.arange(ny // 2), np.arange(ny // 2, ny)
     steps = []
@@ -103,7 +103,7 @@ def _steps(data, mask):
     """
     rows = len(data) // _BLOCKS * _BLOCKS
     few = np.count_nonzero(mask, axis=0) > len(data) / 2
-    if np.count_nonzero(~few) < 4 * _BESIDE:
+    if np.count_nonzero(~few) <= 4 * _BESIDE:
         return _Steps(np.zeros(len(few)), np.zeros(len(few), dtype=bool), 0.0, np.zeros(len(few)))
     columns = np.array(data[:rows].T, dtype=np.float32)
     if mask.any():

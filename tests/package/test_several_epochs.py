@@ -88,7 +88,9 @@ def test_stars_at_another_time_are_those_of_a_solution_of_that_time(tied):
     left = off if tied else without_a_map(off, sim.truth.positions)[0]
     assert np.abs(left).max() < 0.25 * there["x_err"].value.min()
     for name in ("x_err", "y_err_abs", "ra_error", "dec_error_abs"):
-        assert_allclose(there[name].value, again[name].value, rtol=0.12, err_msg=name)
+        # the map that is taken off has the weights of the epoch of the positions
+        tolerance = 0.12 if name.endswith("abs") else 0.2
+        assert_allclose(there[name].value, again[name].value, rtol=tolerance, err_msg=name)
     assert there["sky"].obstime.jyear == pytest.approx(2018.0)
     assert there.meta["epoch"] == 2018.0
 
