@@ -229,7 +229,8 @@ class ReferenceTie:
         if factor != 1:
             equations = equations.times(factor)
             step, again = catalogue_map.estimate(equations, used, self.names)
-            made = replace(again, ratio=made.ratio, factor=factor)
+            said = {"found": True} if self.finds_errors else {"ratio": made.ratio}
+            made = replace(again, factor=factor, **said)
         return equations, step, made
 
     @staticmethod

@@ -237,6 +237,7 @@ def test_errors_that_a_catalogue_does_not_state(sim, stated, asked):
     solution = solve(sim.matches, prior=Prior(sim.truth.static), reference=reference, reference_error=asked)
     tie = solution.gauge.tie
     assert np.sqrt(tie.known[0, 0, 0]) == pytest.approx(error, rel=0.0 if asked == error else 0.2)
+    assert ("its errors were found: 0.0" in str(solution.gauge)) == (asked == "found")
     assert sorted(tie.stars[~tie.used]) == sorted(reference["star"][:3])
     assert np.mean(pulls(sim, solution) ** 2) == pytest.approx(1, abs=0.4)
 

@@ -36,10 +36,12 @@ class Tie:
     used : ndarray of bool, shape (n_reference,)
         False for what was rejected as a mismatch.
     ratio : float
-        chi2 of the offsets over its degrees of freedom, at the errors that the reference states; NaN if there are
-        hardly any.
+        chi2 of the offsets over its degrees of freedom, at the errors that the reference states, or that were found;
+        NaN if there are hardly any.
     factor : float
         By which the errors of the reference were taken larger (or smaller) than stated, for the offsets to be expected.
+    found : bool
+        Whether the size of its errors was found, whatever was stated.
     known : ndarray, shape (n_reference, 2, 2), or None
         Covariance of positions in the reference, px^2, with which the used ones held their stars; None if they tied the
         common map alone.
@@ -53,6 +55,7 @@ class Tie:
     used: np.ndarray = field(metadata=array("n_reference", holds="booleans"))
     ratio: float = field(metadata=number(minimum=0, nan=True))
     factor: float = field(default=1.0, metadata=number(minimum=0))
+    found: bool = False
     known: np.ndarray | None = field(
         default=None, metadata=array("n_reference", 2, 2, unit="pix2", nan=True, covariance=True)
     )
@@ -106,6 +109,9 @@ class Tie:
         """What was used and how well it agrees, in sentences."""
         ratio = "" if np.isnan(self.ratio) else f" (chi2 {self.ratio:.2g} per degree of freedom)"
         taken = "" if self.factor == 1 else f"; its errors are taken {self.factor:.2g} times as large as stated"
+        if self.found and self.known is not None:
+            variance = np.einsum("jaa->ja", self.known[self.used])
+            taken = f"; its errors were found: {np.sqrt(np.mean(variance)):.2g} px rms per axis"
         return f"The plane is {self.sentence}{ratio}{taken}."
 
     def __repr__(self) -> str:
