@@ -173,7 +173,10 @@ def test_the_common_rates_are_unknown_and_said():
 
 @pytest.mark.parametrize(("size", "chosen"), [(0.0, None), (1.1, "proper")])
 def test_auto_decides_by_evidence(size, chosen):
-    """Motionless sets stay so, sets whose motions scatter by one error of a star's motion do not."""
+    """Motionless sets stay so, sets whose motions scatter by one error of a star's motion do not.
+
+    That is 1.1 relative errors of these 60 stars, of which a cubic map is taken off.
+    """
     right = 0
     for seed in range(5):
         still = field(60, motion=0.0, seed=seed)
@@ -190,7 +193,8 @@ def test_auto_decides_by_evidence_in_many_sets():
         still = field(60, motion=0.0, seed=seed)
         error = np.median(solve(still.matches, motion="proper", clip=None).stars["vx_err"].value)
         wrong += solve(still.matches, motion="auto", clip=None).settings.motion is not None
-        missed += solve(field(60, motion=error, seed=seed).matches, motion="auto", clip=None).settings.motion is None
+        moving = field(60, motion=1.1 * error, seed=seed)
+        missed += solve(moving.matches, motion="auto", clip=None).settings.motion is None
     assert wrong <= 5
     assert missed <= 5
 
