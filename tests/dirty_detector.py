@@ -49,7 +49,7 @@ def night(seed, *, dirty=True, n=7, size=SIZE, without=()):
         if dirty and "persistence" not in without:
             extra += before
         if dirty and "hits" not in without:
-            extra += _cosmic_rays(hits, size)
+            extra += cosmic_rays(hits, size)
         if dirty and "streaks" not in without and k % 2:
             extra += _streak(hits, size)
         electrons = own.poisson(np.maximum(light + extra, 0) * GAIN) + own.normal(0, READ_NOISE, light.shape)
@@ -110,14 +110,14 @@ def _amplifiers(rng, size):
     return np.repeat(rng.normal(0, 15, 8), size // 8)[None, :] * np.ones((size, 1))
 
 
-def _cosmic_rays(rng, size):
-    """Tracks of one to nine pixels on a thousandth and a half of the pixels."""
+def cosmic_rays(rng, size, share=1.5e-3, faintest=100):
+    """Tracks of one to nine pixels on a part of the pixels."""
     out, done = np.zeros((size, size)), 0
-    while done < 1.5e-3 * out.size:
+    while done < share * out.size:
         start, angle, length = rng.uniform(5, size - 6, 2), rng.uniform(0, np.pi), rng.integers(1, 10)
         steps = np.arange(length)[:, None] * [np.sin(angle), np.cos(angle)]
         y, x = np.clip(np.round(start + steps), 0, size - 1).astype(int).T
-        out[y, x] += np.exp(rng.uniform(np.log(100), np.log(2e4)))
+        out[y, x] += np.exp(rng.uniform(np.log(faintest), np.log(2e4)))
         done += length
     return out
 

@@ -20,7 +20,7 @@ from ..inputs.exposure_names import detector_name
 from ..inputs.star_lists.formats import stack
 from ..inputs.table_files import read_table, write_stars
 from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
-from ..results.check import Check, worst
+from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from . import options
@@ -350,7 +350,7 @@ def _report(a, solution, summary):
     if a.json:
         print(json.dumps(summary, indent=1))
         for check in summary["checks"]:
-            if check["state"] in ("warn", "fail"):
+            if check["state"] in WRONG:
                 print(Check(**check), file=sys.stderr)
     else:
         checked = tuple(Check(**check) for check in summary["checks"])

@@ -15,6 +15,8 @@ FALSE_ALARM = 1e-3
 CERTAIN = 1e-6
 #: From best to worst; "unknown" is a question that the data cannot answer.
 STATES = ("pass", "unknown", "warn", "fail")
+#: ... of which these are of something wrong.
+WRONG = STATES[2:]
 
 
 @dataclass(frozen=True)

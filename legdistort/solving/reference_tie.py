@@ -224,11 +224,11 @@ class ReferenceTie:
         # errors that are to be found let no mismatch pass
         offered = equations.times(_TINY) if self.finds_errors else equations
         used = catalogue_map.accepted(offered, self.label, near)
-        step, made = catalogue_map.estimate(equations, used, self.names)
-        factor = catalogue_map.error_factor(equations, used, found=self.finds_errors)
+        step, made, dof = catalogue_map.estimate(equations, used, self.names)
+        factor = catalogue_map.error_factor(equations, used, made.ratio, dof, found=self.finds_errors)
         if factor != 1:
             equations = equations.times(factor)
-            step, again = catalogue_map.estimate(equations, used, self.names)
+            step, again, _ = catalogue_map.estimate(equations, used, self.names)
             said = {"found": True} if self.finds_errors else {"ratio": made.ratio}
             made = replace(again, factor=factor, **said)
         return equations, step, made

@@ -5,6 +5,7 @@ import pytest
 from astropy import units as u
 from astropy.table import QTable
 from caller_warnings import warns_here
+from dirty_detector import cosmic_rays
 from scipy.spatial import cKDTree
 from star_images import GAIN, READ_NOISE, SKY, errors, image, observe, positions, scattered, usable
 
@@ -52,15 +53,8 @@ def untouched(table, exposures, added, shifts=SHIFTS):
 
 
 def hits(rng, share=0.01):
-    """Cosmic rays on a part of the pixels: tracks of up to nine pixels."""
-    out, done = np.zeros((SIZE, SIZE)), 0
-    while done < share * out.size:
-        start, angle, length = rng.uniform(5, SIZE - 6, 2), rng.uniform(0, np.pi), rng.integers(1, 10)
-        steps = np.arange(length)[:, None] * [np.sin(angle), np.cos(angle)]
-        y, x = np.clip(np.round(start + steps), 0, SIZE - 1).astype(int).T
-        out[y, x] += np.exp(rng.uniform(np.log(150), np.log(2e4)))
-        done += length
-    return out
+    """Cosmic rays on a part of the pixels."""
+    return cosmic_rays(rng, SIZE, share, faintest=150)
 
 
 def columns(rng):

@@ -9,12 +9,12 @@ relative errors.
 import numpy as np
 
 from .coefficient_covariance import exposure_block
+from .common_maps import plain_maps
 
 
 def plain_directions(gauge, xy, n):
     """Displacements (n_stars, 2, 2 n) by the modes of the reference plane themselves."""
-    modes = gauge.modes_at(xy, n)
-    return np.kron(np.eye(2), modes.T).reshape(2, len(xy), 2 * len(modes)).transpose(1, 0, 2)
+    return plain_maps(gauge, xy, n)[:, :2, : 2 * n]
 
 
 def map_directions(gauge, xy):

@@ -85,6 +85,10 @@ def plain_maps(gauge, xy, n):
 
 def fitted(maps, weights, values):
     """P (c, ...) of values (n_stars, 2 + k, ...): the maps that fit them with the weights of the stars."""
-    weighted = weights @ maps
-    normal = np.einsum("jam,jan->mn", weighted, maps)
-    return np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ np.einsum("jam,ja...->m...", weighted, values)
+    return of_normal(maps, weights) @ np.einsum("jam,ja...->m...", weights @ maps, values)
+
+
+def of_normal(maps, weights):
+    """Inverse (c, c) of the normal matrix of a fit of maps (n_stars, 2 + k, c)."""
+    normal = np.einsum("jam,jan->mn", weights @ maps, maps)
+    return np.linalg.pinv(normal, rcond=1e-12, hermitian=True)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from ...geometry import basis
-from ...results.check import FALSE_ALARM, STATES
+from ...results.check import FALSE_ALARM, STATES, WRONG
 from ...results.diagnostics import ErrorLaw
 from .known_effects import MOTIONS, SHARE, effects_in
 from .smooth_fields import smooth_fields
@@ -23,7 +23,6 @@ HIGHER = 4
 _STARS, _FEWEST = 2, 20
 #: Numbers of the modes of a degree up to which they are fitted on trial.
 _VALUES = 30_000_000
-_WRONG = "warn", "fail"
 _WOULD = {"pass": "this check would pass", "unknown": "this check would be unknown", "warn": "this check would warn"}
 #: Checks whose value is an rms, and those that smooth fields of single exposures may be behind.
 _RMS = "place", "time", "degree"
@@ -52,7 +51,7 @@ def with_cures(checks, solution, residuals, observed, judged):
     """
     effects = effects_in(residuals, observed)
     checks, explained = _named(checks, effects, judged)
-    wrong = [name for name, check in checks.items() if check.state in _WRONG and name not in explained]
+    wrong = [name for name, check in checks.items() if check.state in WRONG and name not in explained]
     if not wrong:
         return checks, explained
     cure, cured = _errors_cure(wrong, solution, residuals, observed, judged)
@@ -69,7 +68,7 @@ def with_cures(checks, solution, residuals, observed, judged):
     checks |= {
         name: replace(checks[name], cure=higher or cure) for name in _OF_ERRORS if name in wrong and higher + cure
     }
-    if ends and judged(after)["chi2"].state not in _WRONG:  # then it is the degree and no more
+    if ends and judged(after)["chi2"].state not in WRONG:  # then it is the degree and no more
         return checks, explained
     fields = smooth_fields(left)
     return checks | {name: _with_fields(checks[name], fields) for name in wrong if name in _BY_FIELDS}, explained
@@ -98,7 +97,7 @@ def _named(checks, effects, judged):
 
 def _is_better(after, before):
     """Whether what was taken off is a reason for a check that does not pass."""
-    if before.state not in _WRONG:
+    if before.state not in WRONG:
         return False
     if before.name == "chi2":
         return before.value - after.value > REASON * (before.value - 1)
@@ -172,8 +171,8 @@ def _errors_cure(wrong, solution, residuals, observed, judged):
     tried = []
     for name, factor in _other_errors(solution, residuals, observed):
         after = judged(residuals.at_errors(factor))
-        left = [after[each] for each in _OF_ERRORS if each in after and after[each].state in _WRONG]
-        cured = {each for each in wrong if each in after and after[each].state not in _WRONG}
+        left = [after[each] for each in _OF_ERRORS if each in after and after[each].state in WRONG]
+        cured = {each for each in wrong if each in after and after[each].state not in WRONG}
         off = max((abs(np.log(check.value)) for check in left), default=0.0)
         tried.append((len(left), off, f"--errors {name} would bring chi2/dof to {after['chi2'].value:.2f}", cured))
         if not left:

@@ -15,7 +15,7 @@ from scipy import special
 from ...exceptions import some_of
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...geometry.star_hull import enclosed_area
-from ...results.check import CERTAIN, FALSE_ALARM, Check, state_of
+from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from .cures import with_cures
 from .known_effects import Observed
 from .prior_check import prior_check
@@ -34,7 +34,6 @@ _ORDER = (
     "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "prior", "absolute", "extrapolation",
     "rejection", "completeness", "duplicates", "header distortion",
 )  # fmt: skip
-_WRONG = "warn", "fail"
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
 _SEEN = 3.0  # errors of a star: a pattern of so much must show, else the question is open
@@ -67,7 +66,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     residuals = Residuals(problem, state, blocks, uncertainty.system, solution.dof)
     judged = partial(_by_residuals, solution, times=times)
     made, explained = judged(residuals), ()
-    if residuals.dof >= 1 and any(check.state in _WRONG for check in made.values()):
+    if residuals.dof >= 1 and any(check.state in WRONG for check in made.values()):
         observed = Observed(problem, state, solution.residuals[problem.order], times[0])
         made, explained = with_cures(made, solution, residuals, observed, judged)
     others = (
@@ -108,7 +107,7 @@ def _unjudged(check):
 
 def _causes_first(checks, explained):
     """Checks whose cures name those that do not pass either and may be the cause of theirs, but for those explained."""
-    wrong = [check.name for check in checks if check.state in _WRONG]
+    wrong = [check.name for check in checks if check.state in WRONG]
 
     def with_cause(check):
         causes = [name for name in _CAUSES.get(check.name, ()) if name in wrong]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...exceptions import AssumptionWarning, warn
 from ...results.errors.coefficient_covariance import times
-from ...results.errors.common_maps import CommonFit, modes_for, plain_maps
+from ...results.errors.common_maps import CommonFit, modes_for, of_normal, plain_maps
 from ...results.gauge import UnknownDirection
 from . import criterion, elimination, reduced_system
 from .problem import State
@@ -259,7 +259,7 @@ class Uncertainty:
         maps = plain_maps(self._gauge, self._blocks.stars[:2].T, n)
         weighted = weights @ maps
         stars, coefficients = self._follow(weighted)
-        fit = np.linalg.pinv(np.einsum("jam,jan->mn", weighted, maps), rcond=1e-12, hermitian=True)
+        fit = of_normal(maps, weights)
         covariance = fit @ np.einsum("jam,jan->mn", weighted, stars) @ fit
         parts = weights, stars @ fit, coefficients @ fit, (covariance + covariance.T) / 2
         return CommonFit(*map(np.ascontiguousarray, parts))

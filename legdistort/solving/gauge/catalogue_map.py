@@ -169,11 +169,15 @@ class MapEquations:
     def agreement(self, used):
         """chi2 of the used offsets less the map, and its degrees of freedom."""
         value, covariance, _ = self.solve(used)
-        left = (self.offsets.values - self.design @ value)[used]
-        dof = left.size - np.trace(covariance @ self.gain(used)[0])
+        left = self.offsets.values - self.design @ value
+        return self.chi2(left, used), 2 * np.count_nonzero(used) - np.trace(covariance @ self.gain(used)[0])
+
+    def chi2(self, left, used):
+        """That of what is left (n, 2) of the used offsets."""
+        left = left[used]
         if self.dense:
-            return left.ravel() @ np.linalg.solve(self.matrix(used), left.ravel()), dof
-        return np.einsum("na,nab,nb->", left, np.linalg.inv(self.blocks[used]), left), dof
+            return left.ravel() @ np.linalg.solve(self.matrix(used), left.ravel())
+        return np.einsum("na,nab,nb->", left, np.linalg.inv(self.blocks[used]), left)
 
     def pulls(self, used):
         """Length of every offset less the map, in its standard errors; those of the used ones without their own say."""
@@ -291,13 +295,15 @@ def _majority(equations):
     return min(best, key=lambda each: each[0])[1]
 
 
-def error_factor(equations, used, *, found):
+def error_factor(equations, used, ratio, dof, *, found):
     """By what factor the errors of a reference should be larger, or smaller, for the offsets to be as expected.
 
     Parameters
     ----------
     equations : MapEquations
     used : ndarray of bool, shape (n,)
+    ratio, dof : float
+        chi2 over its degrees of freedom as the errors are, and these.
     found : bool
         Whether errors are sought, not only tested: else they are larger than stated, and where chance explains the
         offsets as stated. Errors that do not show beside those of the exposures are found as large as they could be
@@ -307,8 +313,7 @@ def error_factor(equations, used, *, found):
     -------
     float
     """
-    chi2, dof = equations.agreement(used)
-    if dof < FEWEST or not (found or chi2 / dof > 1 + _CHANCE * np.sqrt(2 / dof)):
+    if dof < FEWEST or not (found or ratio > 1 + _CHANCE * np.sqrt(2 / dof)):
         return 1.0
 
     def excess(log_factor):
@@ -320,7 +325,7 @@ def error_factor(equations, used, *, found):
         for each in (equations.offsets.covariance, equations.own, equations.blocks)
     )
     low = np.log(own * (2 / dof) ** 0.25 / offered) if found else 0.0
-    high = max(low, np.log(3 * np.sqrt(chi2 / dof) * both / offered))
+    high = max(low, np.log(3 * np.sqrt(ratio) * both / offered))
     if not excess(low) > 0:
         return float(np.exp(low))
     return float(np.exp(brentq(excess, low, high, xtol=1e-3) if excess(high) < 0 else high))
@@ -341,6 +346,8 @@ def estimate(equations, used, names):
     value : ndarray, shape (2 k,)
     Tie
         With offsets as if that map were taken out already.
+    dof : float
+        Degrees of freedom of these offsets.
     """
     value, covariance, gain = equations.solve(used)
     left = equations.offsets.values - equations.design @ value
@@ -349,16 +356,17 @@ def estimate(equations, used, names):
     parts = map_parts(equations.prior.size, equations.prior.n_modes)[1:]
     pointing = 1.0 if np.count_nonzero(used) > 1 else 0.5  # a single star determines the shift alone
     measured = [pointing, *(np.trace(part.T @ share @ part) / part.shape[1] for part in parts)]
-    chi2, dof = equations.agreement(used)
-    return value, Tie(
+    dof = 2 * np.count_nonzero(used) - np.trace(share)
+    tie = Tie(
         covariance=covariance,
         shared=_shared(equations, used, gain),
         measured=np.clip(measured, 0, 1),
         stars=np.asarray(names)[equations.offsets.rows],
         offsets=left,
         used=used,
-        ratio=float(chi2 / dof) if dof > 2 else np.nan,
+        ratio=float(equations.chi2(left, used) / dof) if dof > 2 else np.nan,
     )
+    return value, tie, dof
 
 
 def _shared(equations, used, gain):
