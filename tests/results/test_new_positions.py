@@ -59,6 +59,11 @@ def test_without_errors_positions_alone(solution):
         corrected.xy = 0
 
 
+def test_no_positions_have_no_errors(solution):
+    corrected = solution[solution.names[1]].correct(np.zeros((0, 2)), errors=np.zeros((0, 2)))
+    assert [part.shape for part in corrected] == [(0, 2), (0, 2, 2), (0, 2, 2)]
+
+
 def test_measurement_goes_through_the_inverse_by_finite_differences(solution):
     name, step = solution.names[2], 1e-3
     columns = [(solution[name].correct(PIXELS + e) - solution[name].correct(PIXELS - e)) / (2 * step)

@@ -80,7 +80,7 @@ def plain_maps(gauge, xy, n):
     out = np.zeros((len(xy), rows, 2 + terms, n))
     index = np.r_[0, 1, np.arange(rows - terms, rows)]
     out[:, index, np.arange(2 + terms)] = values[:, None]
-    return out.reshape(len(xy), rows, -1)
+    return out.reshape(len(xy), rows, (2 + terms) * n)
 
 
 def fitted(maps, weights, values):
