@@ -10,15 +10,15 @@ SIZE, GAP = 1024, 60
 CURES = {"layout": "--layout fit", "static": "--static fit", "departures": "--dynamic detector"}
 
 
-def matches(kind, seed, *, n=9, n_stars=160, sigma=0.02):
-    """Detectors are misplaced, distorted, or displaced in every exposure by other shifts; rms of a pixel or two."""
+def matches(kind, seed, *, n=9, n_stars=160, sigma=0.02, dither=250.0):
+    """Detectors are right, or misplaced, distorted, displaced in every exposure by other shifts: a pixel or two rms."""
     rng, step = np.random.default_rng(seed), SIZE + GAP
     nominal = {k: np.array([k % 2, k // 2]) * step for k in range(4)}
     stars, rows, poses = rng.uniform(-400, 2 * step + 340, (n_stars, 2)), [], {}
     turn, move = rng.normal(0, 0.001, 4), rng.normal(0, 2, (4, 2))
     bend = rng.normal(size=(4, 2, 3))
     for i in range(n):
-        shift = rng.normal(0, 250, 2) * (i > 0)
+        shift = rng.normal(0, dither, 2) * (i > 0)
         poses[f"e{i}"] = np.column_stack([np.eye(2), shift])
         for k, corner in nominal.items():
             q = stars + shift - corner

@@ -17,7 +17,7 @@ import numpy as np
 from ..cameras.detector import Detector, affine_of
 from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, warn
 from ..geometry import basis, similarity
-from ..results.errors.camera_errors import CameraErrors, moved_by
+from ..results.errors.camera_errors import CameraErrors, Departure, moved_by
 from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
@@ -25,6 +25,8 @@ from ..runtime.words import CAMERA
 #: Part of what the data would determine of a direction alone below which it is not determined beside all else: what
 #: detectors and exposures can exchange is so to first order, and by the gradient of one times the other beyond.
 _WEAK = 1e-5
+#: Part of the variance stated that exposures must take away for a direction to count as tested by them.
+_TOLD = 0.1
 #: Variances below this part of the largest are rounding.
 _ROUNDING = 1e-13
 #: Weight of a change of a layout beside that of a static distortion, where a map can be put into either.
@@ -187,8 +189,27 @@ class CameraFit:
         camera = with_errors(fit.matches.camera, step, unknown)
         camera = replace(camera, common_sigma=common_widths(camera, self.sought))
         matches = replace(fit.matches, camera=camera)
-        errors = _errors(fit, step, unknown)
+        errors = replace(_errors(fit, step, unknown), departure=self._from_stated(camera))
         return replace(fit, matches=matches, camera_errors=errors, shared_unknowns=step.freedom)
+
+    def _from_stated(self, camera):
+        """The `Departure` of what was found from what was stated, None if nothing was.
+
+        With V of what was stated and C of what was found, ``C = (V^-1 + N^-1)^-1``, the departure of the two has the
+        covariance V - C: what was stated tested by the exposures alone, whose covariance is N.
+        """
+        stated = np.isfinite(self.sought.prior[self.sought.free])
+        if not stated.any():
+            return None
+        sigma = self.sought.prior[self.sought.free][stated]
+        pull = self._departure[self.sought.free][stated] / sigma
+        left = np.eye(len(sigma)) - self.step.covariance[np.ix_(stated, stated)] / np.outer(sigma, sigma)
+        share, along = np.linalg.eigh(left)
+        told = share > _TOLD
+        of_detector = np.argwhere(self.sought.free)[stated, 0]
+        most = np.argmax(np.bincount(of_detector, pull**2))
+        chi2 = np.sum((along[:, told].T @ pull) ** 2 / share[told])
+        return Departure(float(chi2), float(np.count_nonzero(told)), list(camera.detectors)[most])
 
 
 def _errors(fit, step, unknown):

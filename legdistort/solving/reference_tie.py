@@ -31,6 +31,7 @@ from .equations.covariances import Uncertainty
 from .equations.problem import State
 from .equations.star_terms import StarPrior, packed, unpacked
 from .gauge import catalogue_map, catalogue_motions, hierarchy
+from .gauge.catalogue_agreement import agreement
 
 log = logging.getLogger(__name__)
 
@@ -144,6 +145,9 @@ class ReferenceTie:
                 f"the errors of both at {problem.terms.epoch:.2f}, the epoch of the positions: give the year that they "
                 "belong to as column ref_epoch, or their proper motions"
             )
+        motions = None if self.identified.motion is None else self.identified.motion[:, :2]
+        stated = equations if self.finds_errors else equations.times(1 / made.factor)
+        made = replace(made, agreement=agreement(equations, stated, made.used, motions))
         self._warn(made)
         log.info("%s", made.sentence)
         if result.converged:

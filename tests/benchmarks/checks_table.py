@@ -1,7 +1,7 @@
 """How often checks warn of sets in which nothing is wrong, and how surely they see what is.
 
 ``python tests/benchmarks/checks_table.py alarms --sets 2000``, ``... power --sets 200``, and ``... images --sets 100``
-for runs on simulated frames; ``... priors --sets 40`` for priors that are wrong; ``... names --sets 30`` for what
+for runs on simulated frames; ``... priors --sets 40`` for priors that are wrong, ``... references --sets 40`` for catalogues; ``... names --sets 30`` for what
 displaces stars, ``... cures --sets 20`` for cures that are applied; ``... cost`` for what the checks cost.
 Distortions of all but the frames are Chebyshev polynomials (`calibration_table.simulated`) or those of
 `dense_model.drawn_set`, none of them made by the package.
@@ -34,6 +34,7 @@ import dense_model
 import drawn_sets
 import flawed_sets
 import known_displacements
+import made_catalogues
 
 SIGMA = 0.02
 #: Pixels: the largest of the distortion in the headers that is not used.
@@ -267,6 +268,38 @@ def priors(n_sets):
             print(f"{taken:22s} {given:22s} {counts}  {ratio}", flush=True)
 
 
+#: How exposures of `references` are taken, and whether with the exact prior.
+TIED = {
+    "prior, dithers of 150 px": ({}, True),
+    "prior, rolls of 30 degrees": ({"rolls": 30.0}, True),
+    "dithers of 150 px": ({}, False),
+    "rolls of 30 degrees": ({"rolls": 30.0}, False),
+}
+
+
+def references(n_sets):
+    """Print what the check "reference" says of right and wrong catalogues, and how large absolute errors are."""
+    print(
+        f"{'':28s} {'catalogue':16s}  pass unknown warn fail  true over stated absolute error: all, without a warning"
+    )
+    for taken, (changes, with_prior) in TIED.items():
+        for fault in (None, *made_catalogues.FAULTS):
+            states, ratios, silent = Counter(), [], []
+            for seed in range(n_sets):
+                data, truth = dense_model.drawn_set(seed, **changes)
+                table = made_catalogues.catalogue(truth["stars"], seed, fault)
+                prior = ld.Prior(truth["static"]) if with_prior else None
+                options = {"reference": table, "epoch": made_catalogues.EPOCH}
+                solution = solved(drawn_sets.as_matches(data), prior, **options)
+                state = next(check.state for check in solution.checks if check.name == "reference")
+                states[state] += 1
+                ratios.append(_ratio(solution, truth["stars"]))
+                silent += [ratios[-1]] * (state in ("pass", "unknown"))
+            ratio = " ".join(f"{np.sqrt(np.mean(np.square(each))):.2f}" for each in (ratios, silent) if each)
+            counts = " ".join(f"{states[each]:5d}" for each in ("pass", "unknown", "warn", "fail"))
+            print(f"{taken:28s} {fault or 'right':16s} {counts}  {ratio}", flush=True)
+
+
 def _ratio(solution, stars):
     """Absolute errors of the stars over those stated, rms, after a similarity."""
     found = np.stack([solution.stars[k].value for k in "xy"], axis=1)
@@ -361,7 +394,7 @@ def cost(n_rounds):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("alarms", "power", "images", "priors", "names", "cures", "cost"))
+    parser.add_argument("what", choices=("alarms", "power", "images", "priors", "references", "names", "cures", "cost"))
     parser.add_argument("--sets", type=int, default=100, help="how many; rounds of `cost`")
     parser.add_argument("--fault", nargs="+", choices=FAULTS, default=list(FAULTS), help="of `power` (default: all)")
     arguments = parser.parse_args()
@@ -369,5 +402,5 @@ if __name__ == "__main__":
     if arguments.what == "power":
         power(arguments.sets, arguments.fault)
     else:
-        made = (alarms, images, priors, names, cures, cost)
+        made = (alarms, images, priors, references, names, cures, cost)
         {each.__name__: each for each in made}[arguments.what](arguments.sets)

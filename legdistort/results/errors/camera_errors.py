@@ -7,16 +7,33 @@ them. A common map of the plane is taken off, as relative errors have it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...geometry import basis, similarity
-from ...runtime.trees.facts import array
+from ...runtime.trees.facts import array, number
 
 if TYPE_CHECKING:
     from ...cameras.camera import Camera
+
+
+@dataclass(frozen=True)
+class Departure:
+    """By how much a camera that was fitted departs from what was stated of it with its widths.
+
+    Attributes
+    ----------
+    chi2, dof : float
+        Of what the exposures determine of layouts and statics.
+    detector : str
+        That which departs most.
+    """
+
+    chi2: float = field(metadata=number(minimum=0))
+    dof: float = field(metadata=number(minimum=0))
+    detector: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +52,8 @@ class CameraErrors:
         Of the fitted coefficients, pixels.
     unknown : ndarray, shape (n_stars, 2, m)
         How stars move with directions of the camera that nothing determines, of unit rms.
+    departure : Departure or None
+        None where nothing was stated.
     """
 
     free: np.ndarray = field(metadata=array("n_detectors", 2, "modes", holds="booleans"))
@@ -44,11 +63,12 @@ class CameraErrors:
     unknown: np.ndarray = field(
         default_factory=lambda: np.zeros((0, 2, 0)), metadata=array("n_stars", 2, "m", blocks=(0, 2, 0))
     )
+    departure: Departure | None = None
 
     def scaled(self, factor: float) -> CameraErrors:
         """The same with all errors times a factor."""
-        parts = (factor * part for part in (self.changes, self.stars, self.coefficients))
-        return CameraErrors(self.free, *parts, self.unknown)
+        names = "changes", "stars", "coefficients"
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
 
     @property
     def of_stars(self) -> np.ndarray:

@@ -15,6 +15,34 @@ if TYPE_CHECKING:
     from ...runtime.annotations import Shape
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """What the offsets of a reference say of it, tested against what everything else says.
+
+    Attributes
+    ----------
+    chi2, dof : float
+        Of the offsets of the used stars, at the errors that the reference states, about the common map that fits them
+        best.
+    bend_chi2, bend_dof : float
+        Of that map against what exposures and the prior know of it, shift, rotation and scale aside.
+    bend : float
+        By how much it departs from that, pixels, rms over the stars and axes; NaN where it was not determined.
+    unseen : float
+        Rms [px] up to which a bend of the reference would not be found, 19 times of 20; infinite if nothing tests it.
+    years : float
+        By which its epochs would have to be later for its stars to agree; NaN where no other epoch is better.
+    """
+
+    chi2: float = field(metadata=number(minimum=0))
+    dof: float = field(metadata=number(minimum=0))
+    bend_chi2: float = field(metadata=number(minimum=0))
+    bend_dof: float = field(metadata=number(minimum=0))
+    bend: float = field(metadata=number(minimum=0, nan=True))
+    unseen: float = field(metadata=number(minimum=0, infinite=True))
+    years: float = field(default=float("nan"), metadata=number(nan=True))
+
+
 @dataclass(frozen=True, eq=False)
 class Tie:
     """How a reference tied the star positions.
@@ -45,6 +73,8 @@ class Tie:
     known : ndarray, shape (n_reference, 2, 2), or None
         Covariance of positions in the reference, px^2, with which the used ones held their stars; None if they tied the
         common map alone.
+    agreement : Agreement or None
+        None where a file does not have it.
     """
 
     covariance: np.ndarray = field(metadata=array("2 k", "2 k", unit="pix2", covariance=True))
@@ -59,6 +89,7 @@ class Tie:
     known: np.ndarray | None = field(
         default=None, metadata=array("n_reference", 2, 2, unit="pix2", nan=True, covariance=True)
     )
+    agreement: Agreement | None = None
 
     @property
     def rms(self) -> float:

@@ -257,6 +257,15 @@ class Effect:
 MOTIONS = Effect("motions", _by_motions,
                  "every star moves by itself",
                  "see time")  # fmt: skip
+LAYOUT = Effect("layout", _by_layout,
+                "detectors do not lie as their layout has it, in all exposures alike",
+                "--layout fit")  # fmt: skip
+STATICS = Effect("statics of the detectors", _by_detector_statics,
+                 "detectors have distortions of their own, in all exposures alike",
+                 "--static fit")  # fmt: skip
+DEPARTURES = Effect("departures of the detectors", _by_detector_departures,
+                    "detectors move against each other from exposure to exposure",
+                    "--dynamic detector")  # fmt: skip
 EFFECTS = (
     MOTIONS,
     Effect("refraction by colour", _by_colour,
@@ -281,15 +290,9 @@ EFFECTS = (
     Effect("pattern of the telescope", _on_the_sky,
            "the pattern stays as it is while the camera turns: it is of the telescope, not the detector",
            "raise --degree; a prior of the detector does not describe it"),
-    Effect("layout", _by_layout,
-           "detectors do not lie as their layout has it, in all exposures alike",
-           "--layout fit"),
-    Effect("statics of the detectors", _by_detector_statics,
-           "detectors have distortions of their own, in all exposures alike",
-           "--static fit"),
-    Effect("departures of the detectors", _by_detector_departures,
-           "detectors move against each other from exposure to exposure",
-           "--dynamic detector"),
+    LAYOUT,
+    STATICS,
+    DEPARTURES,
 )  # fmt: skip
 
 
@@ -352,9 +355,9 @@ def _tried(residuals, effect, columns):
         t, _, values = part_of_chi2(*(_combined(part, g, information, plain)))
         if residuals.dof - len(values) < _FEWEST_LEFT:
             continue
-        cost = residuals.dof * np.log(max(residuals.chi2 - t, 1e-300)) + len(values) * np.log(max(residuals.dof, 2))
-        if cost < best[0]:
-            best = cost, residuals.score(t, float(len(values)), tests=len(parts)), i, part
+        score = residuals.score(t, float(len(values)), tests=len(parts))
+        if (cost := residuals.cost(score)) < best[0]:
+            best = cost, score, i, part
     return best
 
 

@@ -229,6 +229,10 @@ class Residuals:
         weight = np.sum(self.problem.weight[:2]) if weight is None else weight
         return Score(t, nu, min(1.0, tests * p), float(np.sqrt(max(t - nu * scale, 0) / max(weight, 1e-300))))
 
+    def cost(self, score):
+        """How badly residuals are explained with a part of chi2 taken out (Schwarz 1978), a `Score`."""
+        return self.dof * np.log(max(self.chi2 - score.t, 1e-300)) + score.nu * np.log(max(self.dof, 2))
+
     def of_groups(self, labels):
         """The `Score` by group of observations, for labels (n,) from 0; negative ones belong to none."""
         rows = labels >= 0

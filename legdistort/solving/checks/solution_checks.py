@@ -16,30 +16,29 @@ from ...exceptions import some_of
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
+from .camera_check import camera_check
 from .cures import with_cures
 from .known_effects import Observed
+from .limits import GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
+from .reference_check import reference_check
 from .residual_tests import Residuals
+from .star_checks import overlaps_check, stars_check
 
-#: Errors right to this fraction pass, however many observations prove the rest.
-NEGLIGIBLE = 0.05
-#: Usual share of gross errors (Hampel et al. 1986: 1 to 10 % in routine data).
-GROSS_ERRORS = 0.05
 #: What else may be behind a check that does not pass.
 _CAUSES = dict.fromkeys(("time", "prior"), ("degree",)) | {"chi2": ("exposures", "place", "time", "degree")}
 _CAUSES |= dict.fromkeys(("exposures", "brightness", "place"), ("degree", "time"))
+_CAUSES["reference"] = "chi2", "degree", "time"
 _CAUSES["duplicates"] = "degree", "time", "place"
 #: In this order checks are told.
 _ORDER = (
-    "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "prior", "absolute", "extrapolation",
-    "rejection", "completeness", "duplicates", "header distortion",
+    "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "prior", "reference", "camera",
+    "absolute", "overlaps", "extrapolation", "rejection", "stars", "completeness", "duplicates", "header distortion",
 )  # fmt: skip
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
-_SEEN = 3.0  # errors of a star: a pattern of so much must show, else the question is open
 _TELL_STATIC = "dithers by a good part of the field, or a turned camera, show it"
 _TOO_MUCH = 0.5  # of a frame without stars around
-_LOOKED_AT = 6  # pairs of exposures of which the residuals are compared; names in a sentence
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
 
 
@@ -66,20 +65,31 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     residuals = Residuals(problem, state, blocks, uncertainty.system, solution.dof)
     judged = partial(_by_residuals, solution, times=times)
     made, explained = judged(residuals), ()
+    observed = Observed(problem, state, solution.residuals[problem.order], times[0])
     if residuals.dof >= 1 and any(check.state in WRONG for check in made.values()):
-        observed = Observed(problem, state, solution.residuals[problem.order], times[0])
         made, explained = with_cures(made, solution, residuals, observed, judged)
     others = (
         dynamic_check(solution, blocks),
         prior_check(solution, problem, state, error=_star_error(residuals)),
-        absolute_check(solution),
+        reference_check(solution),
+        camera_check(
+            solution,
+            residuals,
+            observed,
+            camera=uncertainty.camera,
+            error=_star_error(residuals),
+            judged=partial(_pattern_state, residuals=residuals),
+        ),
+        overlaps_check(solution, residuals),
         extrapolation_check(residuals),
         rejection_check(solution),
+        stars_check(solution, observed),
         completeness_check(solution, residuals),
         header_check(header_distortion),
     )
     made |= {check.name: check for check in others if check is not None}
-    made = [made[name] for name in _ORDER if name in made]
+    made["absolute"] = absolute_check(solution, made)
+    made = [made[name] for name in _ORDER if made.get(name) is not None]
     if residuals.dof < 1:
         made = [_unjudged(check) if check.name in _BY_RESIDUALS else check for check in made]
     return _causes_first(made, explained)
@@ -166,8 +176,7 @@ def errors_check(solution, residuals):
         found = f"no degrees of freedom are left to judge the errors by{beside}"
         return Check("chi2", "unknown", None, None, found, _MORE)
     ratio, whole = chi2 / dof, solution.chi2 / solution.dof
-    low, high = (special.chdtri(dof, p) / dof for p in (1 - FALSE_ALARM / 2, FALSE_ALARM / 2))
-    low, high = min(low, (1 - NEGLIGIBLE) ** 2), max(high, (1 + NEGLIGIBLE) ** 2)
+    low, high = of_chi2(dof)
     if found := _errors_in_force(solution):
         found += f": chi2/dof {ratio:.3g} with them, {low:.2f} to {high:.2f} by chance"
         if solution.diagnostics.error_law is None:
@@ -201,7 +210,7 @@ def exposures_check(solution, residuals):
     found = [f"{names[i]} ({ratios[i]:.3g} times)" for i in order if p[i] <= FALSE_ALARM]
     which, them = ("frames", "them") if len(found) > 1 else ("frame", "it")
     return Check("exposures", state, ratios[worst], None,
-                 f"residuals are larger than those of the others in {some_of(found, _LOOKED_AT)}",
+                 f"residuals are larger than those of the others in {some_of(found, MOST_NAMED)}",
                  f"look at the {which} (seeing, guiding, clouds), or leave {them} out")  # fmt: skip
 
 
@@ -245,7 +254,7 @@ def place_check(residuals):
     score, shown = residuals.of_cells((groups * n + y) * n + x)
     error = _star_error(residuals)
     state, little = _pattern_state(score, residuals)
-    if state == "pass" and not _would_show(score, shown * (_SEEN * error) ** 2):
+    if state == "pass" and not shown * (SEEN * error) ** 2 >= addition_that_shows(score.nu):
         found = "a pattern on the detector would go into the stars, these exposures would not show it"
         return Check("place", "unknown", score.rms, error, found, _TELL_STATIC)
     if state == "pass":
@@ -254,12 +263,6 @@ def place_check(residuals):
                  f"residuals have a pattern of {score.rms:.2g} px rms in {n} x {n} cells of the detector "
                  f"(typical error of a star {error:.2g} px)",
                  "raise --degree, or give a prior of the static distortion")  # fmt: skip
-
-
-def _would_show(score, more):
-    """Whether a pattern that adds so much to T of a score would not be taken for chance, 19 times of 20."""
-    limit = special.chdtri(score.nu, FALSE_ALARM) if score.nu >= 1 else np.inf
-    return special.ndtr((score.nu + more - limit) / np.sqrt(2 * (score.nu + 2 * more) + 1e-300)) > 0.95
 
 
 def time_check(solution, residuals, times):
@@ -334,8 +337,8 @@ def dynamic_check(solution, blocks):
                  "a lower --degree fits as well, with smaller errors")  # fmt: skip
 
 
-def absolute_check(solution):
-    """Are absolute positions known?"""
+def absolute_check(solution, others):
+    """Are absolute positions known, and on what do they rest? With the other checks by name."""
     if solution.gauge.plane is not None:
         return None
     unknown, warning = solution.gauge.unknown_names, solution.gauge.warning
@@ -351,7 +354,20 @@ def absolute_check(solution):
                      "detector to the others")  # fmt: skip
     error = float(np.sqrt(np.nanmean(variance) / 2))
     known = f"absolute positions of the stars are known to {error:.2g} px rms per axis"
-    return Check("absolute", "pass", error, None, known)
+    return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")
+
+
+def _grounds(gauge, others):
+    """What absolute positions rest on, in words; that which no check has tested is said to be so."""
+    grounds = {}
+    if gauge.tie is not None:
+        grounds["reference"] = "the reference"
+    if gauge.static in ("exact", "uncertain"):
+        grounds["prior"] = "the static distortion given"
+    for name in grounds.keys() & others.keys():
+        if others[name].state == "unknown":
+            grounds[name] += " (not tested)"
+    return " and ".join(grounds.values()) or "dithers and rolls alone"
 
 
 def extrapolation_check(residuals):
@@ -453,13 +469,13 @@ def duplicates_check(solution, residuals):
         return Check("duplicates", "pass", np.max(value[free > 0]), _SAME, "no two exposures have the same noise")
     same = same[np.argsort(-z[same], kind="stable")]
     noise = min(1.0, residuals.chi2 / residuals.dof) if residuals.dof > 0 else 1.0
-    for worst in same[:_LOOKED_AT]:
+    for worst in same[:MOST_NAMED]:
         square, n = residuals.difference(i[worst], j[worst])
         if square < _SAME * noise * n and special.chdtr(n, square / noise) < FALSE_ALARM:
             return Check("duplicates", "fail", value[worst], _SAME,
                          f"residuals of {names[i[worst]]} and {names[j[worst]]} are the same "
                          f"(correlation {value[worst]:.2f})", "leave one of them out")  # fmt: skip
-    shared = some_of([names[k] for k in np.unique([i[same], j[same]])], _LOOKED_AT)
+    shared = some_of([names[k] for k in np.unique([i[same], j[same]])], MOST_NAMED)
     found = f"residuals of {shared} have a pattern in common, beyond their noise (correlation {value[same[0]]:.2f})"
     if (counted := solution.diagnostics.correlated) and counted.along:
         return Check("duplicates", "pass", value[same[0]], _SAME, f"{found}; the errors found here count that")

@@ -122,6 +122,15 @@ class MapEquations:
         covariance = factor**2 * self.offsets.covariance
         return MapEquations(replace(self.offsets, covariance=covariance), self.directions, self.relative, self.prior)
 
+    def without_prior(self):
+        """The same with nothing known of the map beforehand."""
+        prior = replace(self.prior, information=0 * self.prior.information, centre=0 * self.prior.centre)
+        return MapEquations(self.offsets, self.directions, self.relative, prior)
+
+    def of_values(self, values):
+        """The same for other offsets (n, 2)."""
+        return MapEquations(replace(self.offsets, values=values), self.directions, self.relative, self.prior)
+
     def matrix(self, used):
         """Covariance (2 n, 2 n) of the used offsets, x and y of a star side by side."""
         n = len(self.directions)
@@ -166,23 +175,27 @@ class MapEquations:
         value = covariance @ self.prior.information @ self.prior.centre + gain @ self.offsets.values[used].ravel()
         return value, covariance, gain
 
+    def left(self, value):
+        """What a map (2 k,) leaves of all offsets, (n, 2)."""
+        return self.offsets.values - self.design @ value
+
     def agreement(self, used):
         """chi2 of the used offsets less the map, and its degrees of freedom."""
         value, covariance, _ = self.solve(used)
-        left = self.offsets.values - self.design @ value
+        left = self.left(value)
         return self.chi2(left, used), 2 * np.count_nonzero(used) - np.trace(covariance @ self.gain(used)[0])
 
-    def chi2(self, left, used):
-        """That of what is left (n, 2) of the used offsets."""
-        left = left[used]
+    def chi2(self, left, used, other=None):
+        """That of what is left (n, 2) of the used offsets; or its product with something else of that kind."""
+        left, other = left[used], (left if other is None else other)[used]
         if self.dense:
-            return left.ravel() @ np.linalg.solve(self.matrix(used), left.ravel())
-        return np.einsum("na,nab,nb->", left, np.linalg.inv(self.blocks[used]), left)
+            return left.ravel() @ np.linalg.solve(self.matrix(used), other.ravel())
+        return np.einsum("na,nab,nb->", left, np.linalg.inv(self.blocks[used]), other)
 
     def pulls(self, used):
         """Length of every offset less the map, in its standard errors; those of the used ones without their own say."""
         value, covariance, _ = self.solve(used)
-        left = self.offsets.values - self.design @ value
+        left = self.left(value)
         spread = self.design @ covariance @ self.design.transpose(0, 2, 1)
         whole = np.where(used[:, None, None], self.blocks - 0.9 * _at_most(spread, self.blocks), self.blocks + spread)
         return np.sqrt(np.einsum("na,nab,nb->n", left, np.linalg.inv(whole), left))
@@ -193,7 +206,7 @@ class MapEquations:
         Every star counts by itself, whatever errors they have in common.
         """
         value = self.solve(used, np.ones(np.count_nonzero(used)))[0]
-        left, off = self.offsets.values - self.design @ value, value - self.prior.centre
+        left, off = self.left(value), value - self.prior.centre
         return np.einsum("na,nab,nb->n", left, np.linalg.inv(self.blocks), left), off @ self.prior.information @ off
 
 
@@ -350,7 +363,7 @@ def estimate(equations, used, names):
         Degrees of freedom of these offsets.
     """
     value, covariance, gain = equations.solve(used)
-    left = equations.offsets.values - equations.design @ value
+    left = equations.left(value)
     information = equations.gain(used)[0]
     share = covariance @ information
     parts = map_parts(equations.prior.size, equations.prior.n_modes)[1:]

@@ -1,0 +1,100 @@
+"""The check of a reference catalogue: do its stars agree with the exposures, is it bent, and would that have shown?"""
+
+import numpy as np
+from scipy import special
+
+from ...exceptions import some_of
+from ...results.check import FALSE_ALARM, Check, state_of
+from .limits import GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, as_one, of_chi2
+
+#: Degrees of freedom that tell whether the errors of a reference are right.
+_FEWEST = 10
+#: Part of what is uncertain of a map that a reference must take away to tie it.
+_TIED = 0.1
+_TESTED = "more of its stars, dithers by a good part of the field, a turned camera, or a prior test it"
+
+
+def reference_check(solution):
+    """Does a reference agree with the exposures? None without one."""
+    tie, label = solution.gauge.tie, solution.diagnostics.reference
+    if tie is None or tie.agreement is None:
+        return None
+    made, name = tie.agreement, f"the reference {label.name}" if label and label.name else "the reference"
+    ratio = np.sqrt(made.chi2 / made.dof) if made.dof >= _FEWEST else np.nan
+    wrong = as_one(judge(name, tie, ratio, solution) for judge in (_scatter, _mismatches, _bend))
+    if wrong is not None:
+        return wrong
+    told, error = np.isfinite(ratio), _error(solution)
+    agrees = f"stars of {name} do not contradict the exposures"
+    if told:
+        agrees = f"stars of {name} agree with the exposures (offsets {ratio:.2g} times the errors of both)"
+    ties = np.any(tie.measured[1:] > _TIED)
+    untested = [] if told or tie.found else [f"its errors (of {np.count_nonzero(tie.used)} stars) are believed"]
+    if ties and not made.unseen <= SEEN * error:
+        least = f" by less than {made.unseen:.2g} px rms" if np.isfinite(made.unseen) else ""
+        untested.append(f"that it is not bent{least} is believed")
+    if untested:
+        found = f"{agrees}; {' and '.join(untested)}, not tested"
+        return Check("reference", "unknown", made.unseen, SEEN * error, found, _TESTED)
+    bent = f"; a bend of {made.unseen:.2g} px rms would show" if ties else "; they tie shift, rotation and scale alone"
+    return Check("reference", "pass", ratio, None, agrees + bent)
+
+
+def _error(solution):
+    """Typical absolute error of a star, pixels."""
+    errors = np.stack([solution.stars[f"{axis}_err_abs"].value for axis in "xy"])
+    return float(np.sqrt(np.nanmedian(errors**2))) if np.isfinite(errors).any() else np.inf
+
+
+def _scatter(name, tie, ratio, solution):
+    """Are the errors that it states right?"""
+    made = tie.agreement
+    if tie.found or not np.isfinite(ratio):
+        return None
+    low, high = of_chi2(made.dof)
+    if low <= ratio**2 <= high:
+        return None
+    found = f"offsets of stars from {name} are {ratio:.2g} times what the errors of both lead to expect"
+    if ratio**2 < low:
+        return Check("reference", "warn", ratio, np.sqrt(low), f"{found}: its errors are smaller than it states",
+                     "--reference-error found")  # fmt: skip
+    state = state_of(special.chdtrc(made.dof, made.chi2), ratio**2 > 2)
+    state = "warn" if state == "pass" else state
+    if tie.factor != 1:
+        found += f"; its errors were taken {tie.factor:.2g} times as large"
+    if np.isfinite(made.years):
+        when = "later" if made.years > 0 else "earlier"
+        return Check("reference", state, ratio, np.sqrt(high),
+                     f"{found}; they agree with epochs that are {abs(made.years):.2g} years {when}",
+                     "look at its epoch (ref_epoch) and that of the exposures (--epoch)")  # fmt: skip
+    return Check("reference", state, ratio, np.sqrt(high), found,
+                 "look at its errors and their unit, its epoch (ref_epoch), its proper motions; "
+                 "--reference-error found takes its errors from this")  # fmt: skip
+
+
+def _mismatches(name, tie, ratio, solution):
+    """Are many of its stars elsewhere?"""
+    n, out = len(tie.used), np.count_nonzero(~tie.used)
+    lost = some_of([str(star) for star in tie.stars[~tie.used]], MOST_NAMED)
+    if not out or special.bdtrc(out - 1, n, GROSS_ERRORS) > FALSE_ALARM:
+        return None
+    return Check("reference", "warn", out / n, GROSS_ERRORS,
+                 f"{out} of {n} stars of {name} lie elsewhere in it: {lost}",
+                 "mismatches, binaries, or fast stars without a proper motion: look at these")  # fmt: skip
+
+
+def _bend(name, tie, ratio, solution):
+    """Is it bent against what exposures and the prior know?"""
+    made = tie.agreement
+    if made.bend_dof < 1:
+        return None
+    state = state_of(special.chdtrc(made.bend_dof, made.bend_chi2), True)
+    error = _error(solution)
+    if state == "pass" or made.bend < NEGLIGIBLE * error:
+        return None
+    by = f" by {made.bend:.2g} px rms" if np.isfinite(made.bend) else ""
+    more = np.sqrt(made.bend_chi2 / made.bend_dof)
+    return Check("reference", state, made.bend, None,
+                 f"{name} is bent against what the exposures show{by} ({more:.2g} times the errors of both)",
+                 "its positions have a distortion of their own, or the static distortion given is not that of these "
+                 "exposures: leave one of them out")  # fmt: skip

@@ -1,0 +1,93 @@
+"""Checks of the stars: are they worse than their measurements, and do some contradict themselves?"""
+
+import numpy as np
+from scipy import special
+
+from ...exceptions import some_of
+from ...results.check import FALSE_ALARM, Check
+from ..equations.elimination import inverse_star_blocks
+from .limits import MOST_NAMED
+
+#: Errors of stars over those of their measurements beyond which exposures hang together by too little. Of 80 sets with
+#: 4 to 40 exposures and 20 to 1000 stars on a frame the largest has 1.7; a mosaic of 3 x 3 has 2.3 with overlaps of a
+#: half, 16 with a third.
+_WORSE = 3.0
+#: Observations, and of these left out, from which a star may be said to contradict itself.
+_FEWEST, _LEFT_OUT = 4, 2
+
+
+def overlaps_check(solution, residuals):
+    """Are stars much worse than their measurements, as exposures hang together by too little?"""
+    own = inverse_star_blocks(residuals.blocks.v)[:2]
+    errors = np.stack([solution.stars[f"{axis}_err"].value for axis in "xy"]) / solution.diagnostics.error_scale
+    good = np.isfinite(errors).all(axis=0) & (own > 0).all(axis=0)
+    if not good.any():
+        return None
+    ratio = float(np.median(np.sqrt(np.mean(errors[:, good] ** 2 / own[:, good], axis=0))))
+    found = f"stars are {ratio:.2g} times as uncertain as their measurements"
+    if ratio < _WORSE:
+        return Check("overlaps", "pass", ratio, _WORSE, found)
+    return Check("overlaps", "warn", ratio, _WORSE, f"{found}: too few of them join the exposures",
+                 "exposures that overlap by more, fainter stars (a lower --threshold), a lower --degree, or a "
+                 "--reference")  # fmt: skip
+
+
+def stars_check(solution, observed):
+    """Are there stars whose observations contradict each other?"""
+    table, star = observed.table, observed.problem.star
+    out = ~np.asarray(table["used"])
+    n, lost = np.bincount(star), np.bincount(star, out)
+    usual = (lost.sum() - lost + 1) / (n.sum() - n + 1)  # of the other stars
+    p = special.bdtrc(lost - 1, n, np.minimum(usual, 1))
+    odd = np.flatnonzero((n >= _FEWEST) & (lost >= _LEFT_OUT) & (p * len(n) < FALSE_ALARM))
+    if not len(odd):
+        return Check("stars", "pass", 0, None, "no star contradicts itself")
+    covariance = solution.diagnostics.errors_of(table)
+    off = np.einsum("nba,bn->na", observed.linear[observed.exposure], np.stack([table["dx"].value, table["dy"].value]))
+    sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+    found = []
+    for j in odd[np.argsort(p[odd], kind="stable")]:
+        rows = np.flatnonzero((star == j) & np.isfinite(off).all(axis=1))
+        time = np.asarray(observed.times, dtype=float)[observed.exposure[rows]]
+        flux = np.asarray(table["flux"], dtype=float)[rows] if "flux" in table.colnames else None
+        found.append(f"{solution.estimate.star_names[j]} ({_looks_like(off[rows], sigma[rows], time, flux)})")
+    return Check("stars", "warn", len(odd), 0,
+                 f"observations of {_counted(len(odd))} contradict each other: {some_of(found, MOST_NAMED)}",
+                 "look at these; leave out what is no single star, fit what moves (--motion)")  # fmt: skip
+
+
+def _counted(n):
+    return "one star" if n == 1 else f"{n} stars"
+
+
+def _looks_like(off, sigma, time, flux):
+    """What offsets (n, 2) of a star with errors (n,) look like, in words (Schwarz 1978)."""
+    n, one = len(off), np.ones_like(sigma)
+    tried = {"it scatters": (_left(off, sigma, [one]), 2)}
+    first = _groups(off, sigma)
+    apart = np.hypot(*(off[first].mean(axis=0) - off[~first].mean(axis=0)))
+    two = _left(off, sigma, [first, ~first])
+    tried[f"two places {apart:.2g} px apart: mismatches, or a binary"] = two, 4 + n / np.log(2 * n)
+    if n > 4 and np.ptp(time) > 0:
+        t = (time - time.mean()) / np.ptp(time)
+        tried["it moves"] = _left(off, sigma, [one, t]), 4
+        tried["it moves on a curve: acceleration"] = _left(off, sigma, [one, t, t**2]), 6
+    if flux is not None and n > 3 and np.all(flux > 0) and np.ptp(flux) > 0:
+        tried["it moves with its flux: a blend that varies"] = _left(off, sigma, [one, np.log(flux)]), 4
+    return min(tried, key=lambda words: 2 * n * np.log(max(tried[words][0], 1e-9)) + tried[words][1] * np.log(2 * n))
+
+
+def _left(off, sigma, columns):
+    """Mean square, in errors, of offsets less the best combination of columns."""
+    design = np.stack([np.asarray(c, dtype=float) for c in columns], axis=1) / sigma[:, None]
+    values = off / sigma[:, None]
+    return float(np.mean((values - design @ np.linalg.lstsq(design, values, rcond=None)[0]) ** 2)) + 0.5
+
+
+def _groups(off, sigma):
+    """Which of the offsets belong to the first of two groups, those of the best cut along their widest direction."""
+    middle = off - np.median(off, axis=0)
+    along = middle @ np.linalg.svd(middle, full_matrices=False)[2][0]
+    order = np.argsort(along, kind="stable")
+    cuts = [np.isin(np.arange(len(off)), order[:k]) for k in range(1, len(off))]
+    return min(cuts, key=lambda cut: _left(off, sigma, [cut, ~cut]))
