@@ -1,8 +1,9 @@
 """How often checks warn of sets in which nothing is wrong, and how surely they see what is.
 
 ``python tests/benchmarks/checks_table.py alarms --sets 2000``, ``... power --sets 200``, and ``... images --sets 100``
-for runs on simulated frames; ``... priors --sets 40`` for priors that are wrong, ``... references --sets 40`` for catalogues; ``... names --sets 30`` for what
-displaces stars, ``... cures --sets 20`` for cures that are applied; ``... cost`` for what the checks cost.
+for runs on simulated frames; ``... priors --sets 40`` and ``... references --sets 40`` for those that are wrong;
+``... names --sets 30`` for what displaces stars, ``... cures --sets 20`` for cures that are applied; ``... cost`` for
+what the checks cost.
 Distortions of all but the frames are Chebyshev polynomials (`calibration_table.simulated`) or those of
 `dense_model.drawn_set`, none of them made by the package.
 """
