@@ -22,6 +22,7 @@ from ..inputs.table_files import read_table, write_stars
 from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
 from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
+from ..runtime.trees.codec import from_tree
 from ..solving.choices.degree_choice import AUTO, HIGHEST
 from . import options
 from .arguments import given, wants_progress
@@ -349,12 +350,16 @@ def _report(a, solution, summary):
     """Print a solution with its checks, those of a run included."""
     if a.json:
         print(json.dumps(summary, indent=1))
-        for check in summary["checks"]:
-            if check["state"] in WRONG:
-                print(Check(**check), file=sys.stderr)
+        for check in _checks(summary):
+            if check.state in WRONG:
+                print(check, file=sys.stderr)
     else:
-        checked = tuple(Check(**check) for check in summary["checks"])
-        print(replace(solution, estimate=replace(solution.estimate, checked=checked)))
+        print(replace(solution, estimate=replace(solution.estimate, checked=_checks(summary))))
+
+
+def _checks(summary):
+    """Those of a summary."""
+    return from_tree(tuple[Check, ...], summary["checks"], "checks")
 
 
 def _refuse(given, reason):
@@ -383,7 +388,7 @@ def _refuse_drops(a):
 
 def _status(a, summary):
     """Exit status 3 where a check fails and `--strict` asks for it."""
-    return 3 if a.strict and worst(Check(**check) for check in summary["checks"]) == "fail" else 0
+    return 3 if a.strict and worst(_checks(summary)) == "fail" else 0
 
 
 def _say(a, sentence, figures):

@@ -6,8 +6,10 @@ import textwrap
 from dataclasses import dataclass, field
 from math import isfinite
 
+from scipy import special
+
 from ..runtime.notebook import ShownAsPrinted
-from ..runtime.trees.facts import text
+from ..runtime.trees.facts import number, text
 
 #: Probability with which a check warns of a set in which nothing is wrong; all of them together make 2 %.
 FALSE_ALARM = 1e-3
@@ -17,6 +19,38 @@ CERTAIN = 1e-6
 STATES = ("pass", "unknown", "warn", "fail")
 #: ... of which these are of something wrong.
 WRONG = STATES[2:]
+
+
+@dataclass(frozen=True)
+class FactorTest:
+    """What was known beforehand, against what everything else shows of the same.
+
+    Attributes
+    ----------
+    name : str
+        "static distortion", "reference: positions", "reference: map", "layout" and so on.
+    source : str
+        From where it was known.
+    rows : int
+        Numbers that were known.
+    chi2, dof : float
+        Of the difference of both, under the sum of their covariances, where everything else determines it.
+    p : float
+        Probability of so large a difference by chance; 1 without degrees of freedom.
+    """
+
+    name: str
+    source: str
+    rows: int = field(metadata=number(minimum=0))
+    chi2: float = field(metadata=number(minimum=0))
+    dof: float = field(metadata=number(minimum=0))
+    p: float = field(metadata=number(minimum=0, maximum=1))
+
+    @classmethod
+    def of_chi2(cls, name: str, source: str, rows: int, chi2: float, dof: float) -> FactorTest:
+        """With the probability that chi2 has."""
+        p = float(special.chdtrc(dof, chi2)) if dof > 0 else 1.0
+        return cls(name, source, int(rows), float(chi2), float(dof), p)
 
 
 @dataclass(frozen=True)
@@ -34,6 +68,8 @@ class Check(ShownAsPrinted):
         What was found, in words.
     cure : str
         What to do about it; empty for a pass.
+    tests : tuple of FactorTest
+        Of what was known beforehand, where the check is of that.
     """
 
     name: str
@@ -42,6 +78,7 @@ class Check(ShownAsPrinted):
     limit: float | None
     sentence: str
     cure: str = ""
+    tests: tuple[FactorTest, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("value", "limit"):

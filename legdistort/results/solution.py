@@ -154,6 +154,19 @@ class Solution(ShownAsPrinted):
         """Tests of the solution with their results: a tuple of `legdistort.results.check.Check`; made at first use."""
         return self.estimate.checked(self) if callable(self.estimate.checked) else self.estimate.checked
 
+    @cached_property
+    def factors(self) -> QTable:
+        """One row for all that was known beforehand of something: is it what everything else shows?
+
+        ``name``, ``source``, ``rows`` (numbers that were known), ``chi2``, ``dof``, ``p``: the difference of both under
+        the sum of their covariances, as the checks have it that ask the same (`checks`). Nothing else tests what has no
+        degrees of freedom.
+        """
+        tests = [test for check in self.checks for test in check.tests]
+        types = {"name": str, "source": str, "rows": int, "chi2": float, "dof": float, "p": float}
+        columns = [[getattr(test, name) for test in tests] for name in types]
+        return QTable(columns, names=list(types), dtype=list(types.values()))
+
     # -- stars
 
     @cached_property

@@ -209,7 +209,7 @@ class CameraFit:
         of_detector = np.argwhere(self.sought.free)[stated, 0]
         most = np.argmax(np.bincount(of_detector, pull**2))
         chi2 = np.sum((along[:, told].T @ pull) ** 2 / share[told])
-        return Departure(float(chi2), float(np.count_nonzero(told)), list(camera.detectors)[most])
+        return Departure(len(sigma), float(chi2), float(np.count_nonzero(told)), list(camera.detectors)[most])
 
 
 def _errors(fit, step, unknown):

@@ -72,6 +72,18 @@ def test_widths_that_are_stated_are_tested():
     assert "--layout fit" in wrong.cure
 
 
+def test_factors_are_those_of_the_camera():
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        held = ld.solve(four_detectors.matches("layout", 0), degree=2).factors
+        found = ld.solve(stated(four_detectors.matches(None, 0), 1.0, 0), degree=2).factors
+    assert list(held["name"]) == ["layout", "statics of the detectors"]
+    assert list(held["source"]) == ["FOUR", "FOUR"]
+    assert held["p"].max() < 1e-6
+    assert list(found["name"]) == ["statics of the detectors", "detectors as stated"]
+    assert found["rows"][1] == 8
+    assert found["p"].min() > 1e-3
+
+
 @pytest.mark.slow
 def test_departures_of_right_widths_are_those_of_chance():
     chi2 = dof = 0

@@ -7,6 +7,7 @@ import drawn_sets
 import made_catalogues
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import stats
 
 import legdistort as ld
@@ -88,11 +89,21 @@ def test_many_mismatches_are_named():
     assert "of 40 stars of the reference lie elsewhere in it" in check.sentence
 
 
+def test_factors_have_what_was_known_beforehand():
+    factors = solved(0, "five years off").factors
+    assert list(factors["name"]) == ["static distortion", "reference: positions", "reference: map"]
+    assert list(factors["rows"][:2]) == [16, 80]
+    assert factors["p"][0] > 1e-3
+    assert factors["p"][1] < 1e-6
+    assert_allclose(factors["p"][1:], stats.chi2.sf(factors["chi2"][1:], factors["dof"][1:]))
+
+
 def test_a_file_has_what_was_tested(tmp_path):
     solution = solved(0, "five years off")
     again = ld.Solution.read(solution.write(tmp_path / "solution.asdf"))
     assert again.gauge.tie.agreement == solution.gauge.tie.agreement
     assert check_of(again) == check_of(solution)
+    assert list(again.factors.pformat()) == list(solution.factors.pformat())
 
 
 @pytest.mark.parametrize("nu", [3, 20, 200])

@@ -25,12 +25,15 @@ class Departure:
 
     Attributes
     ----------
+    rows : int
+        Numbers that were stated.
     chi2, dof : float
         Of what the exposures determine of layouts and statics.
     detector : str
         That which departs most.
     """
 
+    rows: int = field(metadata=number(minimum=0))
     chi2: float = field(metadata=number(minimum=0))
     dof: float = field(metadata=number(minimum=0))
     detector: str = ""

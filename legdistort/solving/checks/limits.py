@@ -36,9 +36,13 @@ def of_chi2(dof):
 def as_one(checks):
     """One check of several of the same name: those in the worst state, their sentences joined; None of none."""
     checks = [check for check in checks if check is not None]
-    worst = max((check.state for check in checks), key=STATES.index, default=None)
-    checks = [check for check in checks if check.state == worst]
-    if len(checks) < 2:
-        return next(iter(checks), None)
-    cures = dict.fromkeys(check.cure for check in checks if check.cure)
-    return replace(checks[0], sentence="; ".join(check.sentence for check in checks), cure="; ".join(cures))
+    if not checks:
+        return None
+    worst = max((check.state for check in checks), key=STATES.index)
+    told = [check for check in checks if check.state == worst]
+    return replace(
+        told[0],
+        sentence="; ".join(check.sentence for check in told),
+        cure="; ".join(dict.fromkeys(check.cure for check in told if check.cure)),
+        tests=tuple(test for check in checks for test in check.tests),
+    )

@@ -1,9 +1,11 @@
 """The check of what was believed of the static distortion: do the exposures agree with it, and could they tell?"""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ...exceptions import some_of
-from ...results.check import FALSE_ALARM, Check, state_of
+from ...results.check import FALSE_ALARM, Check, FactorTest, state_of
 from ..knowledge.exposures import ExposureModel, stated
 from ..knowledge.reduced_data import drawn, part_of
 from ..knowledge.static_test import static_tests
@@ -35,12 +37,11 @@ def prior_check(solution, problem, state, *, error):
     Returns
     -------
     Check or None
-        None where nothing was stated of a single detector, where the exposures share its distortion, or where a
-        catalogue tells what the absolute positions are.
+        None where nothing was stated of a single detector, or where the exposures share its distortion.
     """
     if problem.unknowns.shared or solution.camera.has_focal_plane or problem.degree < 1:
         return None
-    if solution.gauge.plane is not None:  # a catalogue has placed the stars
+    if solution.gauge.plane is not None:  # a simpler correction
         return None
     if problem.mean_sigma is not None and np.all(np.isinf(problem.mean_sigma)):  # nothing is believed
         return None
@@ -53,19 +54,27 @@ def prior_check(solution, problem, state, *, error):
     model = ExposureModel.of(problem, state, solution.gauge.all_motion[keep], group)
     tests = static_tests(model, given, variance, [problem.shapes[i] for i in first])
     tests = [(problem.names[i], test) for i, test, known in zip(first, tests, believed, strict=True) if known]
-    return _in_words(_given(solution), tests, error)
+    source = _source(solution)
+    return replace(_in_words(source, tests, error), tests=tuple(_factors(source, tests)))
 
 
-def _given(solution):
-    """What was given, in words."""
+def _source(solution):
+    """Where the prior is from, in words; "" if that is not known."""
     prior = solution.settings.prior
     source = prior.get("source") if isinstance(prior, dict) else None
-    source = source.get("name") if isinstance(source, dict) else source
-    return f"the static distortion given ({source})" if source else "the static distortion given"
+    return (source.get("name") if isinstance(source, dict) else source) or ""
 
 
-def _in_words(given, tests, error):
+def _factors(source, tests):
+    """The `FactorTest` of every prior."""
+    for name, test in tests:
+        name = "static distortion" + f" for {name}" * (len(tests) > 1)
+        yield FactorTest(name, source or "prior", len(test.given), test.statistic(), len(test.directions), test.p)
+
+
+def _in_words(source, tests, error):
     """The check of some priors, each tested and with the name of an exposure that it was given for."""
+    given = "the static distortion given" + f" ({source})" * bool(source)
     p = np.array([test.p for _, test in tests])
     name, worst = tests[int(np.argmin(p))]
     alarm = FALSE_ALARM / len(tests)

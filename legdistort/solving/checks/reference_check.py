@@ -1,10 +1,12 @@
 """The check of a reference catalogue: do its stars agree with the exposures, is it bent, and would that have shown?"""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import special
 
 from ...exceptions import some_of
-from ...results.check import FALSE_ALARM, Check, state_of
+from ...results.check import FALSE_ALARM, Check, FactorTest, state_of
 from .limits import GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, as_one, of_chi2
 
 #: Degrees of freedom that tell whether the errors of a reference are right.
@@ -19,6 +21,17 @@ def reference_check(solution):
     tie, label = solution.gauge.tie, solution.diagnostics.reference
     if tie is None or tie.agreement is None:
         return None
+    made, source = tie.agreement, label.name if label and label.name else "reference"
+    n = 2 * int(np.count_nonzero(tie.used))
+    tests = (
+        FactorTest.of_chi2("reference: positions", source, n, made.chi2, made.dof),
+        FactorTest.of_chi2("reference: map", source, n, made.bend_chi2, made.bend_dof),
+    )
+    return replace(_in_words(solution, tie, label), tests=tests)
+
+
+def _in_words(solution, tie, label):
+    """The check without its tests."""
     made, name = tie.agreement, f"the reference {label.name}" if label and label.name else "the reference"
     ratio = np.sqrt(made.chi2 / made.dof) if made.dof >= _FEWEST else np.nan
     wrong = as_one(judge(name, tie, ratio, solution) for judge in (_scatter, _mismatches, _bend))
