@@ -38,6 +38,7 @@ from .results.check import Check
 from .runtime import checks, outputs, parallel, provenance
 from .runtime.notebook import ShownAsPrinted
 from .runtime.progress import Bar
+from .runtime.trees.codec import to_tree
 from .simulation.truth import Truth
 from .solving.estimation import solve
 from .solving.options import CLIP, DEGREE, SolveOptions, check_detectors, check_reference
@@ -346,7 +347,7 @@ def _check_others(workers, truth):
 def _assessed(solution, exposures, quality, comparison, stacks, truth):
     """The entries of the summary on images, mosaic and other corrections, as far as known, with all checks."""
     checked = solution.checks + run_checks.check_run(solution, quality)
-    figures = {"checks": [asdict(check) for check in checked], "fwhm_ratio": quality and quality.fwhm_ratio}
+    figures = {"checks": [to_tree(check) for check in checked], "fwhm_ratio": quality and quality.fwhm_ratio}
     figures |= {"observed": observed(exposures), "stated": stated_rows(exposures)}
     if quality:
         figures["quality"] = asdict(quality)

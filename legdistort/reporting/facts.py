@@ -1,12 +1,11 @@
 """The sentences of a report: what was observed, the figures of the solution, and a paragraph for a paper."""
 
-from dataclasses import asdict
-
 import numpy as np
 from markupsafe import Markup, escape
 
 from ..exceptions import FoldError
 from ..results import in_tables
+from ..runtime.trees.codec import to_tree
 from .tables import count
 
 #: The paper whose method this is.
@@ -32,7 +31,7 @@ def facts_of(solution, summary):
         "dof": solution.dof,
         "rms_px": in_tables.rms(solution),
         "left_out": solution.left_out,
-        "checks": [asdict(check) for check in solution.checks],
+        "checks": [to_tree(check) for check in solution.checks],
         "observed": {},
     } | summary
     if "max_inverse_error_px" not in facts:

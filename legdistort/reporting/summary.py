@@ -6,6 +6,7 @@ import numpy as np
 
 from ..results import accuracy, in_tables
 from ..runtime import provenance
+from ..runtime.trees.codec import to_tree
 
 
 def summarise(solution, *, timings=None):
@@ -23,7 +24,7 @@ def summarise(solution, *, timings=None):
         "dof": int(solution.dof),
         "rms_px": float(np.sqrt(np.mean(in_tables.rms(solution) ** 2))),
         "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
-        "checks": [asdict(check) for check in solution.checks],
+        "checks": [to_tree(check) for check in solution.checks],
         "gauge": solution.gauge.sentence,
         "unknown": list(solution.gauge.unknown_names),
         "sky": in_tables.sky_sentence(solution),

@@ -24,6 +24,8 @@ import drawn_sets
 import outside_settings
 
 LIMIT = 1.3
+#: Stars with errors so many times the median are hardly known, and are a sum by themselves.
+_HARDLY = 10.0
 #: Checks that say that something is believed.
 BELIEVED = "prior", "reference", "camera", "absolute", "place"
 
@@ -43,6 +45,7 @@ def looked_at(make, seed):
     for names, removed in ((("x_err", "y_err"), 3), (("x_err_abs", "y_err_abs"), None)):
         stated = np.stack([solution.stars[name].value for name in names], axis=1)
         known = np.isfinite(stated).all(axis=1) & np.isfinite(found).all(axis=1)
+        known &= (stated < _HARDLY * np.median(stated[known])).all(axis=1) if known.any() else known
         off = _without_common(found[known], true[known], stated[known], removed)
         out += [np.sum(off**2), np.sum(stated[known] ** 2)]
     return np.array(out), said
