@@ -3,7 +3,8 @@
 ``python tests/benchmarks/settings_table.py --sets 4``, or with a part of the names: ``... prior``. Errors are wrong if
 true ones are more than 1.3 times larger or smaller than stated, rms over the sets: relative ones after a common map of
 the fitted degree, absolute ones after shift, rotation and scale. What is not tested ("unknown": a prior, reference,
-camera, absolute positions, places) counts as said. Truth comes from numpy alone (`outside_settings`).
+camera, absolute positions, places) counts as said. Cures that promise a chi2/dof are applied. Truth comes from numpy
+alone (`outside_settings`).
 """
 
 import argparse
@@ -14,6 +15,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from checks_table import PROMISE
 
 import legdistort as ld
 from legdistort.exceptions import LegdistortError, LegdistortWarning
@@ -31,14 +33,17 @@ BELIEVED = "prior", "reference", "camera", "absolute", "place"
 
 
 def looked_at(make, seed):
-    """Squares of errors, true and stated: relative, absolute; the names of checks that say something."""
+    """Squares of errors, true and stated: relative, absolute; who says something; chi2/dof promised and reached."""
     data, stars, options = make(seed)
     given, sigma = options.pop("prior", None), options.pop("static_sigma", None)
     prior = None if given is None else ld.Prior(given, static_sigma=sigma)
     with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
-        solution = ld.solve(drawn_sets.as_matches(data), prior=prior, **{"degree": 3} | options)
+        matches, options = drawn_sets.as_matches(data), {"degree": 3, "prior": prior} | options
+        solution = ld.solve(matches, **options)
         said = Counter(c.name for c in solution.checks if c.state in ("warn", "fail"))
         said.update(f"({c.name})" for c in solution.checks if c.state == "unknown" and c.name in BELIEVED)
+        promise = next(filter(None, (PROMISE.search(check.cure) for check in solution.checks)), None)
+        kept = () if promise is None else (float(promise[3]), _cured(matches, options, *promise.groups()[:2]))
     true = stars[solution.stars["star"]]
     found = np.stack([solution.stars[axis].value for axis in "xy"], axis=1)
     out = []
@@ -48,7 +53,13 @@ def looked_at(make, seed):
         known &= (stated < _HARDLY * np.median(stated[known])).all(axis=1) if known.any() else known
         off = _without_common(found[known], true[known], stated[known], removed)
         out += [np.sum(off**2), np.sum(stated[known] ** 2)]
-    return np.array(out), said
+    return np.array(out), said, kept
+
+
+def _cured(matches, options, name, value):
+    """chi2/dof once a cure is applied."""
+    solution = ld.solve(matches, **options | {name: int(value) if name == "degree" else value})
+    return next(check.value for check in solution.checks if check.name == "chi2")
 
 
 def _without_common(found, true, stated, degree):
@@ -82,16 +93,17 @@ def main():
     for name, make in outside_settings.settings().items():
         if arguments.part not in name:
             continue
-        squares, names, said, refused = np.zeros(4), Counter(), 0, 0
+        squares, names, said, refused, cures = np.zeros(4), Counter(), 0, 0, []
         for seed in range(arguments.sets):
             try:
-                each, by = looked_at(make, seed)
+                each, by, kept = looked_at(make, seed)
             except LegdistortError:
                 refused += 1
                 continue
             squares += each
             names.update(by)
             said += bool(by)
+            cures += [kept] * bool(kept)
         with np.errstate(invalid="ignore", divide="ignore"):
             ratios = np.sqrt(squares[[0, 2]] / squares[[1, 3]])
         solved = arguments.sets - refused
@@ -99,6 +111,9 @@ def main():
         wrong += is_wrong
         silent += [name] * (is_wrong and 2 * said < solved)
         words = ", ".join(f"{each} {n}" for each, n in names.most_common(6)) + f"; refused {refused}" * bool(refused)
+        if cures:
+            promised, reached = np.median(cures, axis=0)
+            words += f"; cures promise {promised:.2f}, reach {reached:.2f}"
         mark = "*" * is_wrong + "!" * (is_wrong and 2 * said < solved)
         print(f"{name:60s} {ratios[0]:8.2f} {ratios[1]:8.2f} {mark:2s} {said} of {solved}  {words}", flush=True)
     print(f"{wrong} settings with an error wrong by more than 30 %; nothing said in {len(silent)}: {'; '.join(silent)}")
