@@ -3,9 +3,10 @@
 import numpy as np
 from scipy import special
 
-from ..exceptions import FoldError
+from ..exceptions import FoldError, some_of
 from ..results.check import CERTAIN, FALSE_ALARM, STATES, Check
 from ..results.in_tables import largest_inverse_error
+from .model_misfits import model_misfits
 
 #: A stack whose stars are this much wider than those of single exposures has lost sharpness that can be seen.
 BLURRED = 1.05
@@ -16,6 +17,13 @@ WIDE, ELONGATED = 0.08, 0.08
 ODD = 0.001
 #: Parts of the bright peaks that may have no star, and of the stars that may stand around brighter ones beyond chance.
 LOST, FALSE = 0.1, 0.1
+#: Deviation of bright stars from their model, in parts of their light, that is odd where others have none; else its
+#: square may be so many times the usual one. Beyond the second of each the check fails.
+MISFIT, TIMES = (0.02, 0.06), (2.5, 10.0)
+#: Deviation in the typical exposure that shows a PSF not to be that of the frames, and that at which the check fails.
+WRONG_PSF = 0.2, 0.4
+_BEYOND = 4.0  # errors by noise
+_NAMED = 6  # exposures in a sentence
 _FEWEST = 4  # exposures, to determine how much they usually differ
 
 
@@ -33,15 +41,27 @@ def check_run(solution, quality=None):
     tuple of Check
     """
     return (
-        image_check(quality),
+        image_check(quality, model_misfits(solution.residuals)),
         stack_check(quality, moving=solution.estimate.motions is not None),
         inverse_check(solution),
     )
 
 
-def image_check(quality):
-    """Are the stars of the solution those of the frames, and are those of all exposures alike?"""
-    made = [*_light_checks(quality.light if quality else None), _shapes_check(quality)]
+def image_check(quality, misfits=None):
+    """Are the stars of the solution those of the frames, are those of all exposures alike, and as their model has them?
+
+    Parameters
+    ----------
+    quality : `~legdistort.assessment.stack_quality.Quality` or None
+    misfits : dict, optional
+        ``{exposure: Misfit}``, see `~legdistort.assessment.model_misfits.model_misfits`.
+
+    Returns
+    -------
+    Check
+    """
+    light = quality.light if quality else None
+    made = [*_light_checks(light), *_misfit_checks(misfits or {}), _shapes_check(quality)]
     return max(made, key=lambda check: STATES.index(check.state))
 
 
@@ -62,6 +82,36 @@ def _light_checks(light):
                     f"{light.n_around} of {light.n_stars} stars stand around much brighter ones, "
                     f"{light.by_chance:.0f} would by chance: speckles, spikes or rings taken for stars",
                     "a higher --threshold, or --psf effective, whose profile holds them")  # fmt: skip
+
+
+def _misfit_checks(misfits):
+    """Exposures whose bright stars deviate more from their model than those of others, and a PSF that fits nowhere."""
+    if not misfits:
+        return
+    names, found = list(misfits), list(misfits.values())
+    square = np.array([each.square for each in found])
+    least, usual = square - _BEYOND * np.array([each.error for each in found]), max(float(np.median(square)), 0.0)
+    given = sorted({each.model for each in found} - {"moffat"})
+    if given and np.median(least) > WRONG_PSF[0] ** 2:
+        state = "fail" if np.median(least) > WRONG_PSF[1] ** 2 else "warn"
+        yield Check("images", state, float(np.sqrt(usual)), WRONG_PSF[0],
+                    f"bright stars deviate from their PSF ({', '.join(given)}) by {np.sqrt(usual):.0%} of their light "
+                    "in most exposures", "the PSF is not that of these frames: --psf auto, or one made from them"
+                    )  # fmt: skip
+        return
+    if len(found) < _FEWEST:
+        return
+    limits = [times * usual + size**2 for size, times in zip(MISFIT, TIMES, strict=True)]
+    odd = np.flatnonzero(least > limits[0])
+    if len(odd):
+        odd = odd[np.argsort(-least[odd], kind="stable")]
+        each = [f"{names[i]} ({found[i].size:.1%})" for i in odd]
+        yield Check("images", "fail" if least[odd[0]] > limits[1] else "warn", found[odd[0]].size,
+                    float(np.sqrt(limits[0])),
+                    f"bright stars deviate from their model by more of their light than the usual "
+                    f"{np.sqrt(usual):.1%} in {some_of(each, _NAMED)}",
+                    "look at the frame (trailed, a jump of the guiding, a ghost, the PSF of another), or leave it out"
+                    )  # fmt: skip
 
 
 def _shapes_check(quality):

@@ -27,6 +27,7 @@ from ..runtime import parallel
 from . import detector_layout
 from .exposure_groups import interlink, link, standing, unite, without
 from .header_poses import HeaderPoses
+from .lattices import warn_of_lattice
 from .matches import Matches, in_focal_plane, shapes_by_exposure
 from .options import MatchOptions, check_enough
 from .star_labels import label_stars
@@ -179,6 +180,7 @@ def match(
     _add_epochs(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
     matches = _finish(table, star, shapes, headers, left_out, epoch, distortions)
+    warn_of_lattice(matches, headers)
     return replace(matches, left_out=copies | left_out, camera=camera)
 
 

@@ -2,8 +2,8 @@
 
 ``python tests/benchmarks/checks_table.py alarms --sets 2000``, ``... power --sets 200``, and ``... images --sets 100``
 for runs on simulated frames; ``... priors --sets 40`` and ``... references --sets 40`` for those that are wrong;
-``... names --sets 30`` for what displaces stars, ``... cures --sets 20`` for cures that are applied; ``... cost`` for
-what the checks cost.
+``... names --sets 30`` for what displaces stars, ``... cures --sets 20`` for cures that are applied,
+``... lattices --sets 100`` for masks; ``... cost`` for what the checks cost.
 Distortions of all but the frames are Chebyshev polynomials (`calibration_table.simulated`) or those of
 `dense_model.drawn_set`, none of them made by the package.
 """
@@ -23,11 +23,13 @@ from astropy import units as u
 from astropy.table import vstack
 from astropy.wcs import WCS, Sip
 from calibration_table import SIZE, simulated
+from photutils.psf import ImagePSF
 from scipy.stats import beta
 
 import legdistort as ld
 from legdistort.exceptions import LegdistortWarning
 from legdistort.inputs.exposures import Exposure
+from legdistort.matching.lattices import periods
 from legdistort.simulation.pupil import PupilPSF
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -36,6 +38,8 @@ import drawn_sets
 import flawed_sets
 import known_displacements
 import made_catalogues
+import masks
+import outside_settings
 
 SIGMA = 0.02
 #: Pixels: the largest of the distortion in the headers that is not used.
@@ -157,11 +161,17 @@ def headers_with_sip(rng, poses):
     return exposures
 
 
-#: One exposure trailed by 1 FWHM: of cores in a halo; of Moffat profiles, whose width and angle change.
-TRAILED = {
-    "a trail of 1 FWHM, adaptive optics": PupilPSF(strehl=0.3, elongation=0.5),
-    "a trail of 1 FWHM, seeing": None,
+#: One exposure trailed by 1 FWHM: of cores in a halo; of Moffat profiles, whose width and angle change. Others in which
+#: the guiding jumped by 1 FWHM, or a ghost of 5 % lies beside every star. The profile of the stars, and what is done to
+#: them along a direction, as a function of cycles a FWHM.
+BLURRED = {
+    "a trail of 1 FWHM, adaptive optics": (PupilPSF(strehl=0.3, elongation=0.5), np.sinc),
+    "a trail of 1 FWHM, seeing": (None, np.sinc),
+    "a jump of 1 FWHM, seeing": (None, lambda f: 0.6 + 0.4 * np.exp(-2j * np.pi * f)),
+    "a ghost of 5 %, seeing": (None, lambda f: 1 + 0.05 * np.exp(-3j * np.pi * f)),
 }
+#: Frames of 4.2 to 4.9 px FWHM, measured with a Moffat profile of this many.
+OF_OTHERS = {"a PSF file of 6 px": 6.0, "a PSF file of 3 px": 3.0}
 #: What is wrong, and the check that should say so.
 FAULTS = {
     "errors 1.3 x too small": "chi2",
@@ -172,11 +182,11 @@ FAULTS = {
     "an exposure twice as noisy": "exposures",
     "an exposure with a third of its stars": "completeness",
     "SIP of 1 px unused": "header distortion",
-} | dict.fromkeys(TRAILED, "images")
+} | dict.fromkeys([*BLURRED, *OF_OTHERS], "images")
 
 
-def trailed(psf, seed):
-    """A night of 11 frames; in one the telescope has drifted during the exposure by the FWHM, in any direction."""
+def blurred(psf, transfer, seed):
+    """A night of 11 frames, to one of which something was done during the exposure, along any direction."""
     settings = {"small": True, "seed": 100 + seed, "n_exposures": 11, "psf": psf}
     night, still = (ld.simulate_exposures(noise=noise, **settings) for noise in (True, False))
     rng = np.random.default_rng(seed)
@@ -185,11 +195,18 @@ def trailed(psf, seed):
     fy, fx = (np.fft.fftfreq(n) for n in image.shape)
     length = still.psfs[name].fwhm if psf is None else psf.resolution
     along = length * (np.cos(angle) * fx + np.sin(angle) * fy[:, None])
-    drifted = np.fft.ifft2(np.fft.fft2(image) * np.sinc(along)).real
-    electrons = rng.poisson(np.clip(drifted, 0, None) * header["GAIN"]) + rng.normal(0, header["RDNOISE"], image.shape)
+    image = np.fft.ifft2(np.fft.fft2(image) * transfer(along)).real
+    electrons = rng.poisson(np.clip(image, 0, None) * header["GAIN"]) + rng.normal(0, header["RDNOISE"], image.shape)
     counts = np.clip(np.rint(electrons / header["GAIN"]), 0, header["SATURATE"])
     night.hdus[name][0].data = counts.astype(np.uint16)
     return night
+
+
+def moffat(fwhm, *, fine=4):
+    """A round Moffat profile as a PSF of others."""
+    y, x = np.mgrid[-12 * fine : 12 * fine + 1, -12 * fine : 12 * fine + 1] / fine
+    image = (1 + (x**2 + y**2) / fwhm**2) ** -3.0  # of 1.02 times this width
+    return ImagePSF(image * fine**2 / image.sum(), oversampling=fine)
 
 
 def checks_of_run(night, **options):
@@ -204,8 +221,11 @@ def power(n_sets, faults):
     for kind in faults:
         seen, expected = Counter(), FAULTS[kind]
         for seed in range(n_sets):
-            if kind in TRAILED:
-                checks = checks_of_run(trailed(TRAILED[kind], seed), psf="moffat")  # of shapes, not positions
+            if kind in BLURRED:
+                checks = checks_of_run(blurred(*BLURRED[kind], seed), psf="moffat")  # of shapes, not positions
+            elif kind in OF_OTHERS:
+                night = ld.simulate_exposures(small=True, seed=100 + seed, n_exposures=6)
+                checks = checks_of_run(night, psf=moffat(OF_OTHERS[kind]))
             else:
                 checks = solved(spoiled(kind, seed), clip=5).checks
             bad = {check.name for check in checks if check.state in ("warn", "fail")}
@@ -237,17 +257,7 @@ TAKEN = {
     "six exposures, rolls": {"rolls": 30.0, "n": 6},
     "no dithers": {"dither": 1.0},
 }
-#: Number of every cubic mode with x and y exchanged.
-_EXCHANGED = [dense_model.orders(3).index((j, i)) for i, j in dense_model.orders(3)]
-GIVEN = {
-    "right": lambda static, rng: static,
-    "wrong sign": lambda static, rng: -static,
-    "x and y exchanged": lambda static, rng: static[::-1, _EXCHANGED],
-    "turned by 90 degrees": lambda static, rng: (-1.0) ** np.array(dense_model.orders(3))[:, 0]
-    * np.array([[-1], [1]]) * static[::-1, _EXCHANGED],
-    "of another detector": lambda static, rng: rng.normal(size=static.shape) * np.sqrt(np.mean(static**2)),
-    "times 0.8": lambda static, rng: 0.8 * static,
-}  # fmt: skip
+GIVEN = {"right": lambda static, rng: static} | outside_settings.PRIORS
 
 
 def priors(n_sets):
@@ -347,25 +357,52 @@ def names(n_sets):
     print(f"none, errors right and wrong: {false['any']} of {3 * n_sets} name one {dict(false)}")
 
 
+def _promised(matches):
+    """The first cure with a figure, a match of `PROMISE` or None, and the checks by name once it was applied."""
+    named = next(filter(None, (PROMISE.search(check.cure) for check in solved(matches, clip=None).checks)), None)
+    if named is None:
+        return None, {}
+    how = {named[1]: int(named[2]) if named[1] == "degree" else named[2]}
+    return named, {check.name: check for check in solved(matches, clip=None, **how).checks}
+
+
 def cures(n_sets):
     """Print what a cure promises of chi2/dof, and what it is when the cure is applied."""
     for kind, (option, value) in flawed_sets.CURES.items():
         right, passed, off = 0, 0, []
         for seed in range(n_sets):
-            matches = drawn_sets.as_matches(flawed_sets.flawed(kind, seed))
-            named = next(filter(None, (PROMISE.search(c.cure) for c in solved(matches, clip=None).checks)), None)
+            named, after = _promised(drawn_sets.as_matches(flawed_sets.flawed(kind, seed)))
             if named is None:
                 continue
             right += named.groups()[:2] == (option, value)
-            how = {named[1]: int(named[2]) if named[1] == "degree" else named[2]}
-            after = {check.name: check for check in solved(matches, clip=None, **how).checks}
             passed += not {after[k].state for k in ("chi2", "brightness", "degree")} & {"warn", "fail"}
             off.append(after["chi2"].value - float(named[3]))
         print(f"{kind:12s} --{option} {value}: named in {right} of {n_sets}, passes in {passed}; chi2/dof less promise "
               f"{np.mean(off):+.3f} +- {np.std(off):.3f}", flush=True)  # fmt: skip
+    for size in (0.5, 1.0, 3.0):
+        ratios = {"": [], "about ": []}
+        for seed in range(n_sets):
+            data = known_displacements.displaced("turbulence", 100 + seed, size=size)[0]
+            named, after = _promised(drawn_sets.as_matches(data))
+            if named is not None and named[1] == "degree":
+                ratios["about " * ("about " in named[0])].append(float(named[3]) / after["chi2"].value)
+        for about, found in ratios.items():
+            low, high = (min(found), max(found)) if found else (np.nan, np.nan)
+            print(f"turbulence of {size} errors: in {len(found)} of {n_sets} a degree would bring chi2/dof to "
+                  f"{about}{low:.2f} to {high:.2f} times what is reached", flush=True)  # fmt: skip
 
 
-PROMISE = re.compile(r"--(errors|degree) (\S+) would bring chi2/dof to (\S+)")
+def lattices(n_sets):
+    """Print how often the periods of a mask are found, and how often stars are taken for one."""
+    for kind in ({}, {"turned": 10}, {"hexagonal": True}, {"lost": 0.3}, {"wrong": 2.0}, {"distortion": 30.0}):
+        found = [len(periods(masks.mask(np.random.default_rng(seed), **kind))) for seed in range(n_sets)]
+        print(f"mask {kind}: both periods in {sum(n == 2 for n in found)} of {n_sets}", flush=True)
+    n = 40 * n_sets
+    false = sum(len(periods(masks.field(10_000 + seed))) > 0 for seed in range(n))
+    print(f"stars: {false} of {n}, upper 95 % limit {limits(false, n):.2%}")
+
+
+PROMISE = re.compile(r"--(errors|degree) (\S+) would bring chi2/dof to (?:about )?([\d.]+)")
 
 #: Exposures, stars on a frame, part of the observations that are gross errors.
 SIZES = ((11, 120, 0.0), (65, 700, 0.0), (40, 1000, 0.0), (100, 300, 0.0), (65, 700, 0.01))
@@ -395,7 +432,8 @@ def cost(n_rounds):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("alarms", "power", "images", "priors", "references", "names", "cures", "cost"))
+    made = (alarms, images, priors, references, names, cures, lattices, cost)
+    parser.add_argument("what", choices=("power", *(each.__name__ for each in made)))
     parser.add_argument("--sets", type=int, default=100, help="how many; rounds of `cost`")
     parser.add_argument("--fault", nargs="+", choices=FAULTS, default=list(FAULTS), help="of `power` (default: all)")
     arguments = parser.parse_args()
@@ -403,5 +441,4 @@ if __name__ == "__main__":
     if arguments.what == "power":
         power(arguments.sets, arguments.fault)
     else:
-        made = (alarms, images, priors, references, names, cures, cost)
         {each.__name__: each for each in made}[arguments.what](arguments.sets)

@@ -21,6 +21,11 @@ REASON = 0.3
 HIGHER = 4
 #: Stars for every mode that make a degree worth a trial, and observations a law of errors takes.
 _STARS, _FEWEST = 2, 20
+#: Part of their variance that combinations of a higher degree must keep to be fitted: those that the stars nearly hide
+#: take up much of turbulence.
+_FITTED = 1e-6
+#: Figure of chi2/dof beyond which it is not foretold to 5 %: the higher degree itself bends what the lower one fitted.
+_EXACT = 1.25
 #: Numbers of the modes of a degree up to which they are fitted on trial.
 _VALUES = 30_000_000
 _WOULD = {"pass": "this check would pass", "unknown": "this check would be unknown", "warn": "this check would warn"}
@@ -136,10 +141,12 @@ def _higher_degree(residuals):
         columns = left.modes_of(degree)
         if 2 * len(residuals.used) * columns[0].shape[1] > _VALUES:
             break
-        after = left.without(columns)
+        after = left.without(columns, rank=_FITTED)
         if after.dof < 1:
             break
-        best, left = f"--degree {degree} would bring chi2/dof to {after.chi2 / after.dof:.2f}", after
+        reached, left = after.chi2 / after.dof, after
+        best = f"--degree {degree} would bring chi2/dof to "
+        best += f"{reached:.2f}" if reached < _EXACT else f"about {reached:.2g}"
         if left.of_degree(degree + 1).p > FALSE_ALARM:
             return best, True, left
     return best, False, left

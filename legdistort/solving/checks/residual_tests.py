@@ -400,8 +400,11 @@ class Residuals:
             own[i] += np.stack([self.blocks.values[:, part] @ p[part] for p in pulling])
         return stars, moved, rest
 
-    def without(self, columns):
-        """What is left of these `Residuals` when a combination of columns, as of `of_columns`, is fitted too."""
+    def without(self, columns, *, rank=_RANK):
+        """What is left of these `Residuals` when a combination of columns, as of `of_columns`, is fitted too.
+
+        Those combinations that keep more than a part `rank` of their variance.
+        """
         problem, k = self.problem, columns[0].shape[1]
         _, _, rest = self._followed(columns, [self._gradient_of(columns, axis) for axis in (0, 1)])
         step = self.system.respond(rest).reshape(problem.n_exposures, 2, problem.n_modes, k)
@@ -418,7 +421,7 @@ class Residuals:
         known = self.released.reshape(len(flat), -1)
         flat -= known @ (known.T @ flat)
         values, vectors = np.linalg.eigh(flat.T @ flat)
-        kept = values > _RANK
+        kept = values > rank
         taken = (flat @ (vectors[:, kept] / np.sqrt(values[kept]))).reshape(2, len(self.used), -1)
         return self._with(released=np.concatenate([self.released, taken], axis=2),
                           whitened=self.whitened - taken @ np.einsum("anm,an->m", taken, self.whitened),
