@@ -15,7 +15,7 @@ from .file_images import find_image, is_image, named_images, plane_shape
 from .frames.cards import Stated
 from .frames.pixel_flags import bad_pixels, descriptive_flags
 from .frames.statement import read_statement
-from .frames.wcs_cards import header_of_image, is_left_out, make_numbers
+from .frames.wcs_cards import header_of_image, is_left_out, make_numbers, two_matrices
 from .sky_wcs import believable_wcs, header_wcs
 
 log = logging.getLogger(__name__)
@@ -45,6 +45,7 @@ def from_hdulist(hdulist, ext, label, path, good=None):
         header = header_of_image(primary, own)
         lacking = make_numbers(header, label)
         integer = own.get("BITPIX", -32) > 0  # before the data are touched: scaling changes it
+        _refuse_other_shapes(hdulist, hdu, label)
         planes = planes_of(hdulist, hdu, good)
     name, shape = exposure_name(label, ext), plane_shape(hdu)
     wcs = None if lacking else header_wcs(header, hdulist, shape, name)
@@ -63,6 +64,8 @@ def from_hdulist(hdulist, ext, label, path, good=None):
     )  # fmt: skip
     if lacking:
         stated = stated.with_doubt(f"the WCS of the header has no card {lacking} and is not used")
+    if not lacking and (words := two_matrices(header)):
+        stated = stated.with_doubt(words)
     if is_left_out(primary, own):
         stated = stated.with_doubt(
             "the primary header has a WCS, the image none, and not INHERIT = T: it is not that of the image and is not "
@@ -142,3 +145,20 @@ def _alike(hdulist, hdu):
         for other in hdulist
         if other is not hdu and is_image(other) and plane_shape(other) == shape and other.ver == hdu.ver
     ]
+
+
+def _refuse_other_shapes(hdulist, hdu, label):
+    """Raise `InputError` for a plane of flags or errors of the version of an image that has the shape of no image."""
+    same = [other for other in hdulist if is_image(other) and other.ver == hdu.ver]
+    shapes = {plane_shape(other) for other in same if not _is_plane(other)}
+    for other in filter(_is_plane, same):
+        if other is not hdu and plane_shape(other) not in shapes:
+            named = f"{other.name},{other.ver}" if other.ver != 1 else other.name
+            raise InputError(
+                f"{label}: the plane {named} has the shape {plane_shape(other)}, the image {plane_shape(hdu)} "
+                "(ny, nx): write it in the shape of the image, or remove or rename it"
+            )
+
+
+def _is_plane(hdu):
+    return hdu.name in MASK_NAMES or hdu.name in UNCERTAINTY_NAMES

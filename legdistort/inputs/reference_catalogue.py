@@ -4,6 +4,7 @@ Columns are those of Gaia (also as VizieR writes them), or ``x``, ``y`` in the r
 of stars of solutions. Where a table has both, the sky is taken.
 """
 
+import re
 import warnings
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import Angle, SkyCoord
-from astropy.table import Table
+from astropy.table import Column, Table
 from astropy.time import Time
 
 from ..exceptions import AssumptionWarning, InputError, warn
@@ -39,6 +40,9 @@ _PARTS = ("rah", "ram", "ras", "ded", "dem", "des", "de-")
 _ERRORS = {"x": "x_err", "y": "y_err", "vx": "vx_err", "vy": "vy_err"}
 _UNITS = dict.fromkeys(("ra", "dec"), u.deg) | dict.fromkeys(("pmra", "pmdec"), u.mas / u.yr)
 _UNITS |= dict.fromkeys(("vx", "vy"), u.pix / u.yr) | {"parallax": u.mas}
+_HOURS = 24  # of a day
+#: mas a year, below which all motions of a catalogue are those of another unit: no star's is known so well.
+_SMALLEST_MOTION = 1e-3
 _MAS = np.radians(1 / 3.6e6)
 #: Error of what is taken as exact: mas, and mas a year.
 EXACT = 1e-3
@@ -352,10 +356,23 @@ def _moving(table, places, motions, unit, label):
     if places[0] == "ra" and {"parallax", "parallax_error"} <= set(table.colnames):
         motions = (*motions, "parallax")
     motion = np.column_stack([column_contract.values(table, name, _UNITS[name]) for name in motions])
+    _doubt_units(table, motions[:2], motion[:, :2], label)
     epoch = _epochs(table, label)
     parts = ((places, unit), (motions[:2], unit / u.yr), (motions[2:], unit))
     errors = np.hstack([_errors(table, names, of, label) for names, of in parts if names])
     return motion, epoch, _covariance(table, errors, (*places, *motions))
+
+
+def _doubt_units(table, names, motion, label):
+    """Warn of motions without a unit that are smaller than any that are measured."""
+    bare = names[0] == "pmra" and all(getattr(table[name], "unit", None) is None for name in names)
+    largest = np.nanmax(np.abs(motion), initial=0.0)
+    if bare and 0 < largest < _SMALLEST_MOTION:
+        warn(
+            f"{label}: no motion is larger than {largest:.2g} mas/yr, the unit of motions without one; if theirs is "
+            "another (rad/yr, deg/yr, arcsec/yr), state it as the unit of the columns",
+            AssumptionWarning,
+        )
 
 
 def _celestial(table, label):
@@ -373,6 +390,8 @@ def _degrees_of(table, name, usual):
     The unit of a column, or letters (5h35m12s, -5d24m), go before.
     """
     column = table[name]
+    if name == "ra" and not is_text(column) and getattr(column, "unit", None) == u.hour:
+        table = Table({name: Column(column, unit=u.hourangle)})
     found, is_none = numbers(column) if is_text(column) else (np.zeros(len(table)), np.zeros(len(table), dtype=bool))
     is_number = np.isfinite(found)
     if np.count_nonzero(is_none) <= np.count_nonzero(is_number):  # a column of numbers, but for some
@@ -392,6 +411,13 @@ def _degrees_of(table, name, usual):
                 f"{'hours' if unit is u.hourangle else 'degrees'} ({checks.first_line(error)}): correct it or leave "
                 "the row out; or give all in degrees as numbers, or the column its unit, deg or hourangle"
             ) from None
+    if usual is u.hourangle and stated.startswith("deg") and not np.nanmax(out, initial=0.0) >= _HOURS:
+        first = str(words[np.argmax(np.isfinite(out))])
+        if not re.search("[a-z]", first):
+            raise InputError(
+                f"column {name!r} has the unit {stated}, but sexagesimal values below {_HOURS}, {first!r} the first, "
+                "which may be hours: give it the unit hourangle, or letters (5h35m12s, 83d48m), or degrees as numbers"
+            )
     return out
 
 

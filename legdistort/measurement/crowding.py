@@ -20,11 +20,12 @@ from .profiles.shape_field import deviation, shape_field, usual
 LIMIT = 3.0
 #: Chi2 of a shape, per parameter, beyond which it is not that of a single star; chance alone gives 1 in 300.
 DEFORMED = 4.0
+#: Signal-to-noise ratio of stars that determine what shape is usual.
+SHAPELY = 20
 
 _BETA = 3.0
 _REACH = 6.0  # FWHM: neighbours farther away than this pull at nothing but the background
 _QUARTILE = 0.3186  # of the absolute value of a unit normal
-_SHAPELY = 20  # signal-to-noise ratio of stars that determine what shape is usual
 _FEWEST = 20  # stars that determine what shape is usual
 
 
@@ -140,8 +141,8 @@ def is_deformed(shapes, covariance, *, xy, peak, snr, chi2, usable):
     """Whether shapes differ by more than their noise from what is usual at their place in the frame.
 
     What is usual is a polynomial of degree 2 in x and y, and linear in the height of the star, through the shapes of
-    bright stars (`shape_field`). Allowed for, besides noise, are what Moffat profiles leave of bright stars whose
-    images are none, and the scatter of shapes among the best quarter of the stars.
+    bright stars (`shape_field`). Allowed for, besides noise, are the error of that polynomial, what Moffat profiles
+    leave of bright stars whose images are none, and the scatter of shapes among the best quarter of the stars.
 
     Parameters
     ----------
@@ -170,10 +171,11 @@ def is_deformed(shapes, covariance, *, xy, peak, snr, chi2, usable):
     misfit = max(0.0, np.quantile((chi2[best] - 1) / snr[best] ** 2, 0.25))
     covariance = covariance * (1 + misfit * snr**2)[:, None, None]
     bright = np.zeros(len(shapes), dtype=bool)
-    bright[order[: max(len(best), np.count_nonzero(snr[order] > _SHAPELY))]] = True
+    bright[order[: max(len(best), np.count_nonzero(snr[order] > SHAPELY))]] = True
     fallback = np.median(shapes[best], axis=0)
-    off = shapes - shape_field(shapes, covariance, xy, bright, degree=2, fallback=fallback, peak=peak)
+    field, known = shape_field(shapes, covariance, xy, bright, degree=2, fallback=fallback, peak=peak)
+    off = shapes - field
     spread = (np.quantile(np.abs(off[best]), 0.25, axis=0) / _QUARTILE) ** 2
     noise = np.median(np.einsum("nii->ni", covariance[best]), axis=0)
-    deviations = deviation(off, np.linalg.inv(covariance + np.diag(np.maximum(spread - noise, 0))))
+    deviations = deviation(off, np.linalg.inv(covariance + known + np.diag(np.maximum(spread - noise, 0))))
     return deviations > DEFORMED * shapes.shape[1] * usual(deviations[best])  # the spread is known from few stars

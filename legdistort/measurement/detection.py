@@ -6,9 +6,11 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from ..inputs.frames.statement import piled_up
-from .background import amplifier_levels, is_steep, mean_light, sky_and_noise, sky_variance, smooth_light
 from .filters import gaussian_sums
 from .sidelobes import side_light
+from .sky.amplifiers import amplifier_levels
+from .sky.background import is_steep, sky_and_noise, sky_variance
+from .sky.smooth_light import mean_light, smooth_light
 
 _CLIPPED = 0.986  # standard deviation of a unit normal after clipping at 3 sigma until nothing changes
 _KERNEL = 0.7  # width relative to the stars: costs 6 % of the signal-to-noise ratio, distinguishes closer pairs
@@ -41,7 +43,7 @@ class Frame:
     floor : float
         The least that the variance of the sky can be.
     levels : ndarray, shape (ny, nx), or None
-        Of amplifiers, the part of the sky that has steps (`legdistort.measurement.background.amplifier_levels`).
+        Of amplifiers, the part of the sky that has steps (`legdistort.measurement.sky.amplifiers.amplifier_levels`).
     defects : ndarray of bool, shape (ny, nx), or None
         Pixels that belong to no star (`legdistort.measurement.profiles.defects`): the signal has the light around them,
         no fit counts them. From `prepare` None.
@@ -59,14 +61,27 @@ class Frame:
     defects: np.ndarray | None = None
 
 
-def prepare(exposure, *, mesh=MESH):
-    """An `Exposure` as a `Frame`; `mesh` is that of the sky [pix]."""
+def prepare(exposure, *, mesh=MESH, before=None):
+    """An `Exposure` as a `Frame`.
+
+    Parameters
+    ----------
+    exposure : Exposure
+    mesh : int
+        Pixels over which the sky is taken as constant.
+    before : Frame, optional
+        The same exposure with another mesh: its amplifiers are not looked for once more.
+
+    Returns
+    -------
+    Frame
+    """
     gain, read_noise, saturation = exposure.gain, exposure.read_noise, exposure.saturation
     data = np.where(exposure.mask, 0, exposure.data).astype(np.float32)
     saturation = saturation or piled_up(data)  # flat tops that no header mentions
     saturated = (data >= saturation) & ~exposure.mask if saturation else np.zeros(data.shape, dtype=bool)
     bad = exposure.mask | saturated
-    levels = amplifier_levels(data, bad)
+    levels = amplifier_levels(data, bad) if before is None else before.levels
     if levels is not None:
         data -= levels
     sky, rms = sky_and_noise(data, bad, mesh)

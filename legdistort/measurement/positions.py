@@ -20,7 +20,7 @@ from ..inputs.frames.working_units import in_working_unit, noise_unit
 from ..runtime import outputs
 from ..runtime.parallel import map_items
 from . import across_frames, camera_gain
-from .crowding import crowding, is_deformed
+from .crowding import SHAPELY, crowding, is_deformed
 from .effective import frame_psf
 from .effective.building import STARS_NEEDED
 from .effective.model import EffectivePSF
@@ -431,8 +431,8 @@ def measure_scaled(exposure, options):
     fwhm = float(moffat.fwhm(shape))
     fitted = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     measured, verdict = frame_psf.measure_frame(stamps, fitted, shape, psf)
-    usable = ((fitted.flags & UNUSABLE) == 0) & (options.profile == "own")  # other profiles have nothing to compare
-    deformed = _is_deformed(stamps, fitted, usable)
+    own_shapes = options.profile == "own"  # other profiles have nothing to compare
+    deformed = _is_deformed(stamps, fitted) if own_shapes else np.zeros(len(fitted.flags), dtype=bool)
     stars = _moffat_stars(fitted) if measured is None else _psf_stars(fitted, measured)
     faint = stars.snr < max(LEAST, options.threshold)  # what passed the limit with noise that the whole star lacks
     flags = np.where(deformed, Flag.DEFORMED, 0) | np.where(faint, Flag.INSIGNIFICANT, 0)
@@ -465,13 +465,15 @@ def _stamps(exposure, options):
     return frame, (Stamps(frame, centres, half) if len(centres) else None), shape
 
 
-def _is_deformed(stamps, fitted, usable):
-    """`is_deformed` of the stars of a frame."""
-    found = fitted.found
+def _is_deformed(stamps, fitted):
+    """`is_deformed` of the stars of a frame; so are bright ones that could only be fitted with the shape of all."""
+    found, shared = fitted.found, (fitted.flags & Flag.SHARED_SHAPE) != 0
+    usable = ((fitted.flags & UNUSABLE) == 0) & ~shared
     shapes, covariance = found.params[:, 3:7], found.covariance[:, 3:7, 3:7]
     xy, chi2 = stamps.centres + found.params[:, :2], found.chi2 / np.maximum(found.dof, 1)
     peak = found.params[:, 2]
-    return is_deformed(shapes, covariance, xy=xy, peak=peak, snr=fitted.snr, chi2=chi2, usable=usable)
+    deformed = is_deformed(shapes, covariance, xy=xy, peak=peak, snr=fitted.snr, chi2=chi2, usable=usable)
+    return np.where(shared, fitted.snr > SHAPELY, deformed)
 
 
 class _Stars(NamedTuple):

@@ -1,4 +1,6 @@
-"""Stars that a detector with every kind of defect costs: ``python tests/benchmarks/dirty_table.py [--seeds N]``.
+"""Stars that a detector with every kind of defect costs.
+
+``python tests/benchmarks/dirty_table.py [--seeds N] [--first N]``
 
 Nights with the defects and without (`dirty_detector`), measured and matched without any mask. A star is kept if it is
 among the matches in 60 % of the frames that it lies in, or more. Two of the 22 bright stars are saturated. Untouched
@@ -48,11 +50,12 @@ def row(name, seed, clean, **options):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--kinds", action="store_true", help="every kind by itself, too")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     print("seed night                bright  faint   untouched stars lost")
-    for seed in range(args.seeds):
+    for seed in range(args.first, args.first + args.seeds):
         clean, _ = row("clean", seed, None, dirty=False)
         row("dirty", seed, clean)
         for kind in KINDS if args.kinds else ():

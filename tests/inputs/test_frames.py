@@ -10,7 +10,7 @@ from astropy.wcs import WCS
 
 import legdistort as ld
 from legdistort.cli import main
-from legdistort.exceptions import AssumptionWarning, DamagedError
+from legdistort.exceptions import AssumptionWarning, DamagedError, InputError
 from legdistort.geometry.epochs import header_epoch
 from legdistort.inputs.frames.pixel_flags import descriptive_flags
 from legdistort.inputs.frames.statement import read_statement
@@ -146,6 +146,25 @@ def test_what_contradicts_is_said(cards, words):
         ld.read_exposures(fits.HDUList([fits.PrimaryHDU(data, header_of(cards))]))
 
 
+def test_amplifiers_of_one_image_have_one_gain():
+    """Those of DECam, and of a camera of HST: the mean, unless one keyword is of all."""
+    data = np.zeros(SHAPE)
+    decam = {"GAINA": 4.1, "GAINB": 4.0, "RDNOISEA": 6.0, "RDNOISEB": 8.0, "SATURATA": 150000.0, "SATURATB": 140000.0}
+    found = read_statement(header_of(decam), data, integer=False)
+    assert found.gain == (pytest.approx(4.05), "mean of GAINA and GAINB")
+    assert found.read_noise == (pytest.approx(np.sqrt(50)), "rms of RDNOISEA and RDNOISEB")
+    assert found.saturation == (140000.0, "lowest of SATURATA and SATURATB")
+    assert not found.doubts
+    assert read_statement(header_of(decam, {"GAIN": 1.5}), data, integer=False).gain == (1.5, "GAIN")
+    assert read_statement(header_of({"GAINB": 4.0}), data, integer=False).gain == (4.0, "GAINB")
+    rate = header_of(decam, {"BUNIT": "DN/s", "EXPTIME": 10.0, "GAINB": 3.0})
+    found = read_statement(rate, data, integer=False)
+    assert found.gain == (pytest.approx(35.5), "mean of GAINA and GAINB x exposure time")
+    assert found.doubts == ("GAINA = 4.1 and GAINB = 3 differ by 31%; their mean is taken for all pixels",)
+    hst = {f"ATODGN{k}": value for k, value in zip("ABCD", (1.52, 1.56, 1.51, 1.57), strict=True)}
+    assert read_statement(header_of(hst), data, integer=False).gain.value == pytest.approx(1.54)
+
+
 def test_labels_are_no_numbers():
     """As JWST has it."""
     label = {"EXPOSURE": ("1", "Exposure request number")}
@@ -202,6 +221,29 @@ def test_descriptive_flags_hide_nothing():
     assert descriptive_flags(header_of({"MSKNAM00": "GHOST", "MSKVAL00": 2, "MSKNAM01": "STAR", "MSKVAL01": 8})) == {
         "STAR": 8
     }
+    named = header_of({"BIT01": (1, "OBJECT (detected by SExtractor)"), "BIT09": (9, "DEAD/BAD"), "BIT5": "DETECTED"})
+    named["BITPIX"] = 16
+    assert descriptive_flags(named) == {"OBJECT": 2, "DETECTED": 32}
+
+
+@pytest.mark.parametrize("name", ["DQ", "ERR"])
+@pytest.mark.parametrize("shape", [(20, 50), (40, 49), (3, 40, 50)])
+def test_planes_of_another_shape_are_refused(tmp_path, name, shape):
+    data = np.random.default_rng(0).normal(size=SHAPE)
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(data, name="SCI"), fits.ImageHDU(np.ones(shape, np.int16), name=name)]
+    fits.HDUList(hdus).writeto(tmp_path / "f.fits")
+    with pytest.raises(
+        InputError, match=rf"f.fits: the plane {name} has the shape .*, the image \(40, 50\) \(ny, nx\)"
+    ):
+        ld.read_exposures([tmp_path / "f.fits"])
+
+
+def test_a_plane_of_another_image_is_not_refused(tmp_path):
+    data, other = np.random.default_rng(0).normal(size=SHAPE), np.ones((20, 50), np.int16)
+    hdus = [fits.ImageHDU(data, name="SCI"), fits.ImageHDU(other, name="DQ"), fits.ImageHDU(other, name="GUIDE")]
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(tmp_path / "f.fits")
+    (exposure,) = ld.read_exposures([tmp_path / "f.fits"], ext="SCI")
+    assert not exposure.mask.any()
 
 
 def wcs_header(**more):
@@ -260,9 +302,19 @@ def test_the_primary_wcs_is_inherited_if_that_is_said():
     for key in ("CD1_1", "CD1_2", "CD2_1", "CD2_2"):
         del right[key]
     assert separation(WCS(header_of_image(primary, moved)), WCS(right)) < 1e-6
+    (exposure,) = ld.read_exposures(image_with(primary, header_of({"INHERIT": "T"})))  # as text
+    assert separation(exposure.wcs, WCS(primary)) < 1e-6
     with pytest.warns(AssumptionWarning, match="the primary header has a WCS, the image none, and not INHERIT = T"):
         (exposure,) = ld.read_exposures(image_with(primary, fits.Header()))
     assert exposure.wcs is None
+
+
+def test_two_matrices_that_differ_are_said():
+    both = {"PC1_1": 1.0, "PC2_2": 1.0, "PC1_2": -0.02, "PC2_1": 0.02, "CDELT1": -5e-6, "CDELT2": 5e-6}
+    (exposure,) = ld.read_exposures(image_with(fits.Header(), wcs_header(**both)))  # one matrix, twice
+    assert separation(exposure.wcs, WCS(wcs_header())) < 1e-6
+    with pytest.warns(AssumptionWarning, match="two matrices of its WCS that differ, CDi_j and PCi_j with CDELTi"):
+        ld.read_exposures(image_with(fits.Header(), wcs_header(**both | {"CDELT1": -1e-5, "CDELT2": 1e-5})))
 
 
 @pytest.mark.parametrize("key", ["CRVAL1", "CRPIX2", "CD1_1", "EQUINOX"])

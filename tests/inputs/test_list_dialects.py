@@ -9,10 +9,11 @@ from astropy.table import Table
 from numpy.testing import assert_allclose, assert_array_equal
 
 from legdistort.cli.parser import main
-from legdistort.exceptions import InputError
+from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs import column_contract
 from legdistort.inputs.reference_catalogue import read_reference
 from legdistort.inputs.table_files import read_table, write_by_ending
+from legdistort.measurement.flags import Flag
 
 #: Lists that were once misread, or refused without a reason or the row.
 KNOWN = [8, 11, 14, 27, 30, 35, 42, 44, 107, 121, 128, 228, 354, 416, 651, 922, 1683, 5006]
@@ -219,6 +220,65 @@ def test_the_unit_of_a_column_goes_before(tmp_path):
     table["ra"] = ["05:30:00", "05:00:00"]
     table["ra"].unit = "hourangle"
     assert_allclose(read_reference(table).sky[:, 0], [82.5, 75])
+
+
+def test_hours_under_the_unit_of_degrees_are_refused():
+    table = Table({"ra": ["05:35:12", "05:36:00"], "dec": ["10:30:00", "11:00:00"], "ra_error": [0.1] * 2})
+    table["dec_error"] = 0.1
+    table["ra"].unit = "deg"
+    with pytest.raises(
+        InputError, match="'ra' has the unit deg, but sexagesimal values below 24, '05:35:12' the first"
+    ):
+        read_reference(table)
+    table["ra"] = ["5d35m12s", "5d36m0s"]
+    table["ra"].unit = "deg"
+    assert_allclose(read_reference(table).sky[:, 0], [5 + 35.2 / 60, 5.6])
+    table["ra"] = [5.5, 5.6]
+    table["ra"].unit = "h"  # of right ascensions as numbers
+    assert_allclose(read_reference(table).sky[:, 0], [82.5, 84])
+
+
+def test_motions_in_radians(tmp_path):
+    table = Table({name: [1.0, 2.0] for name in ("ra", "dec", "ra_error", "dec_error", "pmra", "pmdec")})
+    table["pmra_error"] = table["pmdec_error"] = 0.1
+    table["ref_epoch"] = 2016.0
+    right = read_reference(table).motion
+    for name in ("pmra", "pmdec", "pmra_error", "pmdec_error"):
+        table[name] = table[name] * np.radians(1 / 3.6e6)
+    with pytest.warns(AssumptionWarning, match="no motion is larger than 9.7e-09 mas/yr, the unit of motions without"):
+        read_reference(table)
+    for name in ("pmra", "pmdec", "pmra_error", "pmdec_error"):
+        table[name].unit = "rad/yr"
+    table.write(tmp_path / "c.fits")
+    assert_allclose(read_reference(tmp_path / "c.fits").motion, right)
+
+
+IRAF_PHOT = """\
+#K IRAF       = NOAO/IRAFV2.16          version    %-23s
+#N IMAGE               XINIT     YINIT     ID    COORDS                 LID    \\
+#U imagename           pixels    pixels    ##    filename               ##     \\
+#F %-23s               %-10.3f   %-10.3f   %-6d  %-23s                  %-6d
+#
+#N XCENTER    YCENTER    XSHIFT  YSHIFT  XERR    YERR            CIER CERROR   \\
+#U pixels     pixels     pixels  pixels  pixels  pixels          ##   cerrors  \\
+#F %-14.3f    %-11.3f    %-8.3f  %-8.3f  %-8.3f  %-15.3f         %-5d %-9s
+#
+test.fits           46.0      47.0      1     coords.txt             1      \\
+   46.123     47.345      0.123   0.345   0.012   0.015           0    NoError
+test.fits           246.0     247.0     3     coords.txt             3      \\
+   246.123    247.345     0.123   0.345   0.013   0.016           103  NoConverge
+test.fits           2.0       3.0       4     coords.txt             4      \\
+   INDEF      INDEF       INDEF   INDEF   INDEF   INDEF           105  EdgeImage
+"""
+
+
+def test_centres_of_iraf_come_with_errors(tmp_path):
+    """What it found no centre of is left out."""
+    (tmp_path / "a.mag.1").write_text(IRAF_PHOT)
+    table = read_table(tmp_path / "a.mag.1")
+    assert_allclose(table["x"], [45.123, 245.123])
+    assert_allclose(table["y_err"], [0.015, 0.016])
+    assert list(table["flags"]) == [0, Flag.NOT_CONVERGED]
 
 
 def test_parts_in_columns_of_their_own(tmp_path):

@@ -6,9 +6,9 @@ from numpy.testing import assert_allclose
 from star_images import GAIN, READ_NOISE, errors, image, observe, positions, scattered, usable
 
 from legdistort.inputs.exposures import Exposure
-from legdistort.measurement.background import amplifier_levels
 from legdistort.measurement.detection import prepare
 from legdistort.measurement.positions import measure
+from legdistort.measurement.sky.amplifiers import amplifier_levels
 
 SIZE = 320
 XY = scattered(np.random.default_rng(1), 64, SIZE) + np.random.default_rng(2).uniform(-9, 9, (64, 2))
@@ -51,7 +51,7 @@ def test_no_levels_where_there_are_none(curved):
         assert amplifier_levels(frame(seed, curved), np.zeros((SIZE, SIZE), dtype=bool)) is None
 
 
-@pytest.mark.parametrize("shape", [(20, 20), (12, 400), (400, 12)])
+@pytest.mark.parametrize("shape", [(20, 20), (12, 400), (400, 12), (40, 40_000)])
 def test_strips_and_masked_frames_have_none(shape):
     data = np.random.default_rng(1).normal(100, 5, shape).astype(np.float32)
     assert amplifier_levels(data, np.zeros(shape, dtype=bool)) is None
@@ -75,3 +75,10 @@ def test_what_was_taken_off_is_in_the_sky():
     made = prepare(Exposure("e", data, gain=GAIN))
     assert_allclose(made.signal + made.sky, data, atol=0.02)
     assert abs(np.median(made.signal[:, :160]) - np.median(made.signal[:, 160:])) < 1
+
+
+def test_a_frame_prepared_again_has_the_same_levels():
+    """As where stars turn out to be wide: a step is not looked for twice."""
+    exposure = Exposure("e", frame() + levels("stripes"), gain=GAIN)
+    first = prepare(exposure)
+    assert prepare(exposure, mesh=96, before=first).levels is first.levels

@@ -152,10 +152,41 @@ def test_expected_shape_is_that_of_images_blurred_across_the_field():
     shapes[:23, :2] -= rng.uniform(0.1, 0.5, (23, 1))
     covariance, use = np.tile(np.diag(np.full(4, 1e-4)), (80, 1, 1)), np.arange(80) < 70
     options = {"degree": 2, "fallback": np.median(truth, axis=0)}
-    found = shape_field(shapes, covariance, xy, use, **options)
+    found, _ = shape_field(shapes, covariance, xy, use, **options)
     np.testing.assert_allclose(found[:70], truth[:70], atol=0.05)
-    with_few = shape_field(shapes, covariance, xy, use & (np.arange(80) < 3), **options)
+    with_few, error = shape_field(shapes, covariance, xy, use & (np.arange(80) < 3), **options)
     np.testing.assert_array_equal(with_few, np.tile(options["fallback"], (80, 1)))
+    assert not error.any()
+
+
+def test_expected_shapes_differ_from_the_truth_by_their_errors():
+    """Where 30 stars determine a polynomial of degree 2 and a term of the height, inside and in the corners."""
+    rng, pulls = np.random.default_rng(16), []
+    for _ in range(60):
+        xy = np.vstack([rng.uniform(0, 500, (30, 2)), [[0, 0], [500, 500]]])
+        u, v = (xy / 250 - 1).T
+        truth = np.column_stack([-1.2 + 0.05 * u, -1.1 + 0.05 * v, 0.1 + 0 * u, 1.0 + 0 * u])
+        noise = np.geomspace(0.005, 0.05, 32)
+        shapes = truth + np.hypot(noise, 0.02)[:, None] * rng.standard_normal((32, 4))
+        found, error = shape_field(
+            shapes, noise[:, None, None] ** 2 * np.eye(4), xy, np.arange(32) < 30, degree=2,
+            fallback=truth[0], peak=1 / noise,
+        )  # fmt: skip
+        pulls.append((found - truth) / np.sqrt(np.einsum("nii->ni", error)))
+    np.testing.assert_allclose(np.std(pulls, axis=(0, 2)), 1.0, atol=0.35)
+    assert abs(np.std(pulls) - 1.0) < 0.12
+
+
+def test_few_bright_stars_are_compared_with_what_they_determine():
+    """Their shapes are ten times as exact as the polynomial that the faint ones determine with them."""
+    rng, found = np.random.default_rng(17), []
+    for _ in range(40):
+        snr = np.concatenate([np.geomspace(400, 1000, 8), np.geomspace(60, 200, 24)])
+        noise = 4 / snr
+        shapes = np.array([-1.2, -1.1, 0.1, 1.0]) + noise[:, None] * rng.standard_normal((32, 4))
+        given = {"xy": rng.uniform(0, 500, (32, 2)), "peak": snr**2, "snr": snr, "usable": np.ones(32, dtype=bool)}
+        found.append(is_deformed(shapes, np.eye(4) * noise[:, None, None] ** 2, chi2=np.ones(32), **given)[:8])
+    assert np.mean(found) < 0.01
 
 
 def test_shapes_that_scatter_make_no_star_deformed():

@@ -13,13 +13,14 @@ from star_images import image as render
 from legdistort.exceptions import InputError
 from legdistort.inputs.exposures import Exposure
 from legdistort.measurement import filters
-from legdistort.measurement.background import _mode, sky_and_noise, smooth_light
 from legdistort.measurement.crowding import is_isolated
 from legdistort.measurement.detection import detect, prepare
 from legdistort.measurement.filters import gaussian_sums
 from legdistort.measurement.positions import measure
 from legdistort.measurement.profiles import moffat
 from legdistort.measurement.profiles.location import locate_stars
+from legdistort.measurement.sky.background import _mode, sky_and_noise
+from legdistort.measurement.sky.smooth_light import smooth_light
 from legdistort.simulation.pupil import PupilPSF
 from legdistort.simulation.rendering import add_noise, as_psf
 from legdistort.simulation.rendering import render as render_psf

@@ -11,7 +11,7 @@ from legdistort.measurement.positions import measure
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_bright_stars_are_kept(seed):
-    """Of 22, of which two are saturated, a clean detector keeps 20, this one 19; 16 to 19 when no step was known."""
+    """Of 22, of which two are saturated, a clean detector keeps 20, as this one; 16 to 19 when no step was known."""
     night = detector.night(seed)
     table = measure(detector.exposures(night.frames))
     matched = detector.seen(match(table, shape=night.frames[0].shape).table, night.xy)

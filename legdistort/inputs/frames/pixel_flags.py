@@ -74,9 +74,15 @@ def bad_pixels(flags, good=None, *, do_not_use=False):
 def descriptive_flags(header):
     """``{name: flag}`` of those that only describe, by the names in the header of a plane of flags.
 
-    ``MP_NAME = bit`` (LSST), or ``MSKNAMnn = name`` with ``MSKVALnn = flag`` (Pan-STARRS).
+    ``MP_NAME = bit`` (LSST), ``MSKNAMnn = name`` with ``MSKVALnn = flag`` (Pan-STARRS), ``BITnn = name`` or
+    ``BITnn = bit / name (more)`` (PTF, ZTF).
     """
     named = {key[3:]: 1 << header[key] for key in header if key.startswith("MP_") and _is_bit(header[key])}
+    for key in filter(re.compile(r"BIT_?\d{1,2}").fullmatch, header):
+        value, bit = header[key], int(key.removeprefix("BIT").lstrip("_"))
+        words = value if isinstance(value, str) else header.comments[key] if value == bit else ""
+        if _is_bit(bit):
+            named[words.split("(")[0].strip()] = 1 << bit
     for key in header:
         value = header.get(key.replace("NAM", "VAL")) if re.fullmatch(r"MSKNAM\d+", key) else None
         if isinstance(value, int):

@@ -25,6 +25,13 @@ KEYWORDS = {
     ),
     "read_noise": ("RDNOISE", "READNOIS", "READNSE", "RON", "ESO DET OUT1 RON", "ENOISE", "RONOISE", "CELL.READNOISE"),
 }  # fmt: skip
+#: Keywords of single amplifiers of one image, which count where none of all does: DECam; ACS, WFC3 and STIS of HST.
+AMPLIFIERS = {
+    "gain": (("GAINA", "GAINB"), ("ATODGNA", "ATODGNB", "ATODGNC", "ATODGND")),
+    "read_noise": (("RDNOISEA", "RDNOISEB"), ("READNSEA", "READNSEB", "READNSEC", "READNSED")),
+    "saturation": (("SATURATA", "SATURATB"),),
+}
+_DIFFER = 0.05  # of their mean, by which gains of amplifiers may differ unsaid
 _COUNTS, _ELECTRONS = r"\b(adu|dn|du|counts?|cts?|data unit)s?", r"(e-|e\b|el|photo-?el|ph)"
 _PER = r"['\]) ]*(/|per)['\[( ]*"
 _SETTING = r"setting|unit-?less|\bdb\b|\biso\b|no unit"
@@ -140,6 +147,8 @@ def read_statement(header: Header, data, *, integer, own=None, wcs=None, seen=No
         of_value = Stated(time.value / averaged, time.source + share)
     year, keyword = epochs.stated_epoch(header)
     doubts = (*_of_unit(unit, time.value), *taken.doubts, *epochs.unreadable_dates(header))
+    if gain.source.startswith("mean of"):
+        doubts += _of_amplifiers(header)
     return FrameStatement(
         unit=Stated(unit, told.of("BUNIT") if unit.text else "no BUNIT: taken as counts"),
         gain=told.where(gain),
@@ -221,11 +230,32 @@ def _gain_card(header):
         card = positive(header, [key])
         if card is not None and (card.says(_ELECTRONS + _PER + _COUNTS) or not card.says(_SETTING)):
             return card
+    return _of_all(header, "gain", np.mean, "mean")
+
+
+def _of_all(header, quantity, combine, words):
+    """One card for the cards of single amplifiers, None without any."""
+    for keys in AMPLIFIERS[quantity]:
+        cards = [card for card in (positive(header, [key]) for key in keys) if card is not None]
+        if cards:
+            key = f"{words} of {' and '.join(card.key for card in cards)}" if len(cards) > 1 else cards[0].key
+            return Card(key, float(combine([card.value for card in cards])), cards[0].words)
     return None
 
 
+def _of_amplifiers(header):
+    """What is to be said of gains of amplifiers that differ."""
+    keys = next((keys for keys in AMPLIFIERS["gain"] if any(key in header for key in keys)), ())
+    cards = [card for card in (positive(header, [key]) for key in keys) if card is not None]
+    gains = [card.value for card in cards]
+    if len(gains) < 2 or np.ptp(gains) <= _DIFFER * np.mean(gains):
+        return ()
+    named = " and ".join(f"{card.key} = {card.value:g}" for card in cards)
+    return (f"{named} differ by {np.ptp(gains) / np.mean(gains):.0%}; their mean is taken for all pixels",)
+
+
 def _read_noise(header, unit, number):
-    card = positive(header, KEYWORDS["read_noise"])
+    card = positive(header, KEYWORDS["read_noise"]) or _of_all(header, "read_noise", _rms, "rms")
     if card is None:
         return Stated(None)
     value, source = card.value, card.key
@@ -238,9 +268,13 @@ def _read_noise(header, unit, number):
     return Stated(value, source)
 
 
+def _rms(values):
+    return np.sqrt(np.mean(np.square(values)))
+
+
 def _saturation(header, unit, gain, data):
     """The level at which pixels are saturated: in units of the data, if its comment states no other."""
-    card = positive(header, KEYWORDS["saturation"])
+    card = positive(header, KEYWORDS["saturation"]) or _of_all(header, "saturation", min, "lowest")
     if card is None:
         return Stated(None)
     if unit.kind == "counts" and not unit.per_time and not unit.per_area:

@@ -6,6 +6,7 @@ primary header is meant: half of one and half of the other is no WCS.
 
 import re
 
+import numpy as np
 from astropy.io import fits
 
 from ...exceptions import DamagedError
@@ -30,6 +31,7 @@ _NEEDED = re.compile(r"(CRVAL|CRPIX|CDELT)\d+|(CD|PC)\d+_\d+|(PC|CD)\d{6}")
 _FURTHER = re.compile(
     r"WCSAXES|NAXIS[3-9]|(CTYPE|CUNIT|CRVAL|CRPIX|CDELT|CROTA|CNAME|CRDER|CSYER)[3-9]|(CD|PC)([3-9]_\d|\d_[3-9])|PV[3-9]_\d+"
 )
+_ALIKE = 1e-3  # of a scale: matrices that differ by less are one
 _SKY = re.compile(r"(RA--|DEC-|[GESH]L(ON|AT)|[A-Z]{2}(LN|LT))")
 
 
@@ -51,7 +53,7 @@ def header_of_image(primary, own):
     header = primary.copy()
     if primary is own:
         return _of_two_axes(header)
-    inherits = own.get("INHERIT") is True and not _has_sky(own)
+    inherits = _inherits(own) and not _has_sky(own)
     others = any(_MATRIX.fullmatch(key) for key in own)
     for key in {
         key for key in header if _ANY.fullmatch(key) and not (inherits and not (others and _MATRIX.match(key)))
@@ -71,7 +73,30 @@ def _of_two_axes(header):
 
 def is_left_out(primary, own):
     """Whether the primary header has a WCS, and an extension neither that nor one of its own."""
-    return primary is not own and _has_sky(primary) and not _has_sky(own) and own.get("INHERIT") is not True
+    return primary is not own and _has_sky(primary) and not _has_sky(own) and not _inherits(own)
+
+
+def _inherits(own):
+    """Whether ``INHERIT = T`` stands in a header, as a word of FITS or as text."""
+    return own.get("INHERIT") is True or str(own.get("INHERIT")).strip().upper() in ("T", "TRUE")
+
+
+def two_matrices(header):
+    """What is to be said of a header with both CDi_j and PCi_j that are different matrices, or None.
+
+    Either is allowed, not both; libraries differ in which they take.
+    """
+    places = [(i, j) for i in (1, 2) for j in (1, 2)]
+    if not (_has_sky(header) and all(any(f"{kind}{i}_{j}" in header for i, j in places) for kind in ("CD", "PC"))):
+        return None
+    cd = np.array([float(header.get(f"CD{i}_{j}", 0.0)) for i, j in places])
+    pc = np.array([float(header.get(f"PC{i}_{j}", i == j) * header.get(f"CDELT{i}", 1.0)) for i, j in places])
+    if np.abs(cd - pc).max() <= _ALIKE * np.abs(cd).max():
+        return None
+    return (
+        "the header has two matrices of its WCS that differ, CDi_j and PCi_j with CDELTi, and the latter is taken; "
+        "remove the cards of the wrong one"
+    )
 
 
 def _has_sky(header):

@@ -55,6 +55,12 @@ def _positive(name, bit):
     return lambda table: np.where(values(table, name) > 0, bit, 0) if name in table.colnames else None
 
 
+def _iraf_flags(table):
+    """Stars of which IRAF has an error of the fit (PIER), or of the centre (CIER)."""
+    stated = [name for name in ("PIER", "CIER") if name in table.colnames]
+    return np.where(sum(values(table, name) > 0 for name in stated), _NOT_CONVERGED, 0) if stated else None
+
+
 def _photutils_flags(table):
     """Those of ``PSFPhotometry``: 1 = masked pixels, higher bits = no positive flux, not converged, no errors."""
     if "flags" not in table.colnames:
@@ -76,10 +82,10 @@ DIALECTS = (
     Dialect("DAOPHOT", {"x": ("X",), "y": ("Y",), "mag": ("MAG",)}, origin=1),
     Dialect(
         "DAOPHOT of IRAF",
-        {"x": ("XCENTER",), "y": ("YCENTER",), "mag": ("MAG", "MAG1")},
+        {"x": ("XCENTER",), "y": ("YCENTER",), "x_err": ("XERR",), "y_err": ("YERR",), "mag": ("MAG", "MAG1")},
         ("XCENTER", "YCENTER"),
         origin=1,
-        flags=_positive("PIER", _NOT_CONVERGED),
+        flags=_iraf_flags,
     ),
     Dialect(
         "PSFPhotometry of photutils",
@@ -137,7 +143,20 @@ def understand(table, columns, *, without_errors=False):
     if flags is not None and "flags" not in columns:
         table = table.copy(copy_data=False)
         table["flags"] = flags
+        table = _without_lost(table, columns | found)
     return table, columns | found, dialect.origin
+
+
+def _without_lost(table, columns):
+    """The table without rows for which their program found no position, and says so."""
+    places = [columns[name] for name in "xy" if columns.get(name) in table.colnames]
+    lost = (table["flags"] & _NOT_CONVERGED) != 0
+    for name in places:
+        lost = lost & np.isnan(values(table, name))
+    if not places or not lost.any():
+        return table
+    log.warning("%d of %d rows state no position, nor has their program found one: left out", lost.sum(), len(table))
+    return table[~lost]
 
 
 def _check_pixels(found, columns, present):

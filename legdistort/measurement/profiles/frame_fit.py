@@ -86,7 +86,7 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
             use = ~hot & ~_is_wild(found, width) & (_ratio(models, weights) > _SHAPELY)
             xy = stamps.centres + found.params[:, :2]
             known = found.params[:, 3:7], found.covariance[:, 3:7, 3:7]
-            centre = shape_field(*known, xy, use, degree=int(profile == "linear"), fallback=shape)
+            centre = shape_field(*known, xy, use, degree=int(profile == "linear"), fallback=shape)[0]
             sigma = HELD
         labels = _touching(stamps, found, hot, done, radius)
         pixels = _, weights = _separate(stamps, found, models, labels, noise, nodes)

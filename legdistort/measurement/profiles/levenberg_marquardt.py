@@ -175,7 +175,8 @@ def minimise(pixels, start, *, prior, bounds, limits):
     ----------
     pixels : object
         What is fitted: ``linearise(params, rows)`` gives chi2, negative half gradient and half Hessian of some groups;
-        ``half`` is half the side of a stamp, ``dof`` (n,) the degrees of freedom.
+        ``target`` (n, k) are the pixels in units of their noise, in the precision ``kind`` in which the model is
+        computed; ``half`` is half the side of a stamp, ``dof`` (n,) the degrees of freedom.
     start : ndarray, shape (n, 3 g + c)
         As `Fit.params`.
     prior : tuple of ndarray
@@ -201,6 +202,7 @@ def minimise(pixels, start, *, prior, bounds, limits):
     params = start.copy()
     chi2, cost, gradient, hessian = linearise(params, np.arange(len(start)))
     damping = np.full(len(start), 1e-2)
+    rounding = np.finfo(pixels.kind).eps * np.linalg.norm(pixels.target, axis=1)  # of the residuals
     converged = np.zeros(len(start), dtype=bool)
     for _ in range(limits.iterations):
         active = np.flatnonzero(~converged & (damping < 1e10))
@@ -216,11 +218,11 @@ def minimise(pixels, start, *, prior, bounds, limits):
             continue
         new = linearise(trial, rows)
         # A step that would lower chi2 by 1e-4 moves a position by a hundredth of its error, which is larger where the
-        # fit is bad. The damping must be small for the foreseen gain to mean that. Such a step is taken: whether it
-        # lowers a chi2 that was computed in single precision is for the rounding of the pixels to decide.
+        # fit is bad. The damping must be small for the foreseen gain to mean that. Such a step is taken, and any that
+        # raises chi2 by no more than rounding may: else the last bits of the pixels would decide where a fit ends.
         small = gain < limits.gain * np.maximum(1, chi2[rows] / pixels.dof[rows])
         last = small & (damping[rows] <= 1)
-        better = last | (new[1] <= cost[rows])
+        better = last | (new[1] <= cost[rows] + rounding[rows] * np.sqrt(chi2[rows]))
         good = rows[better]
         params[good] = trial[better]
         for kept, value in zip((chi2, cost, gradient, hessian), new, strict=True):

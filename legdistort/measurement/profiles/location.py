@@ -50,7 +50,7 @@ def locate_stars(exposure, *, threshold, fwhm=None):
     frame, mesh = prepare(exposure), MESH
     kernel, shape = _frame_shape(frame, fwhm, exposure.name)
     if moffat.fwhm(shape) > mesh / 8:  # stars as wide as that would pass for sky
-        frame = prepare(exposure, mesh=int(8 * moffat.fwhm(shape)))
+        frame = prepare(exposure, mesh=int(8 * moffat.fwhm(shape)), before=frame)
         kernel, shape = _frame_shape(frame, fwhm, exposure.name)
     frame = without_defects(frame, shape)
     before = frame

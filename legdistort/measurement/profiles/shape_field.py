@@ -35,13 +35,15 @@ def shape_field(shapes, covariance, xy, use, *, degree, fallback, peak=None):
 
     Returns
     -------
-    ndarray, shape (n, 4)
+    field : ndarray, shape (n, 4)
+    covariance : ndarray, shape (n, 4, 4)
+        Of the field; 0 of the fallback.
     """
     n_used, extra = np.count_nonzero(use), [] if peak is None else [peak / np.abs(peak[use]).max(initial=1e-30)]
     while degree and n_used < _ENOUGH * ((degree + 1) * (degree + 2) // 2 + len(extra)):
         degree -= 1
     if n_used < _ENOUGH:
-        return np.tile(fallback, (len(xy), 1))
+        return np.tile(fallback, (len(xy), 1)), np.zeros((len(xy), 4, 4))
     terms = _polynomials(xy, degree)
     if n_used >= _ENOUGH * (terms.shape[1] + len(extra)):
         terms = np.column_stack([terms, *extra])
@@ -51,7 +53,8 @@ def shape_field(shapes, covariance, xy, use, *, degree, fallback, peak=None):
     weight = weight.swapaxes(1, 2) @ information @ weight
     kept = use
     for halved in (*[True] * 6, *[False] * 10):
-        field = _shapes(terms @ _adjusted(terms[kept], moments[kept], weight[kept]), fallback)
+        coefficients, variances = _adjusted(terms[kept], moments[kept], weight[kept])
+        field = _shapes(terms @ coefficients, fallback)
         chi2 = deviation(shapes - field, information)
         if halved:
             kept = use & (chi2 <= np.median(chi2[use]))
@@ -59,7 +62,9 @@ def shape_field(shapes, covariance, xy, use, *, degree, fallback, peak=None):
         before, kept = kept, use & (chi2 < _DEVIANT * usual(chi2[use]))
         if (kept == before).all():
             break
-    return field
+    back = np.linalg.inv(_moments(field)[1])
+    known = np.einsum("na,aibj,nb->nij", terms, variances, terms, optimize=True)
+    return field, back @ known @ back.swapaxes(1, 2)
 
 
 def deviation(off, information):
@@ -107,8 +112,8 @@ def _polynomials(xy, degree):
 
 
 def _adjusted(terms, shapes, information):
-    """Coefficients (n terms, 4) by weighted least squares."""
+    """Coefficients (n terms, 4) by weighted least squares, and their covariance (n terms, 4, n terms, 4)."""
     k = terms.shape[1]
     normal = np.einsum("na,nij,nb->aibj", terms, information, terms, optimize=True).reshape(4 * k, 4 * k)
     right = np.einsum("na,nij,nj->ai", terms, information, shapes).ravel()
-    return np.linalg.solve(normal, right).reshape(k, 4)
+    return np.linalg.solve(normal, right).reshape(k, 4), np.linalg.inv(normal).reshape(k, 4, k, 4)
