@@ -402,7 +402,7 @@ def lattices(n_sets):
     print(f"stars: {false} of {n}, upper 95 % limit {limits(false, n):.2%}")
 
 
-PROMISE = re.compile(r"--(errors|degree) (\S+) would bring chi2/dof to (?:about )?([\d.]+)")
+PROMISE = re.compile(r"--(errors|degree) (\S+) would bring chi2/dof to (?:about )?([\d.]+(?:e[+-]?\d+)?)")
 
 #: Exposures, stars on a frame, part of the observations that are gross errors.
 SIZES = ((11, 120, 0.0), (65, 700, 0.0), (40, 1000, 0.0), (100, 300, 0.0), (65, 700, 0.01))
