@@ -6,8 +6,8 @@ from ...results.check import WRONG, Check, FactorTest, state_of
 from .known_effects import DEPARTURES, LAYOUT, STATICS
 from .limits import SEEN, addition_that_shows, as_one
 
-#: Columns of the detectors up to which their statics are looked at.
-_MOST_COLUMNS = 1000
+#: Columns of the detectors, and their values for all stars, up to which they are looked at.
+_MOST_COLUMNS, _MOST_VALUES = 1000, 30_000_000
 _TELL = "dithers larger than the gaps, which carry stars from one detector to the others, test it"
 
 
@@ -40,7 +40,9 @@ def _held(effects, name, residuals, observed, error, judged):
 
     def tried(effect):
         columns = effect.columns(observed)
-        return None if columns[0].shape[1] > _MOST_COLUMNS else residuals.of_columns(columns)
+        n = columns[0].shape[1]
+        too_many = n > _MOST_COLUMNS or 2 * n * residuals.problem.n_stars > _MOST_VALUES
+        return None if too_many else residuals.of_columns(columns)
 
     tests = {effect: test for effect in effects if (test := tried(effect)) is not None}
     if not tests:

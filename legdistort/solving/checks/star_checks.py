@@ -3,7 +3,6 @@
 import numpy as np
 from scipy import special
 
-from ...exceptions import some_of
 from ...results.check import FALSE_ALARM, Check
 from ..equations.elimination import inverse_star_blocks
 from .limits import MOST_NAMED
@@ -14,6 +13,8 @@ from .limits import MOST_NAMED
 _WORSE = 5.0
 #: Observations, and of these left out, from which a star may be said to contradict itself.
 _FEWEST, _LEFT_OUT = 4, 2
+#: Cuts between two groups of observations that are tried at most.
+_CUTS = 64
 
 
 def overlaps_check(solution, residuals):
@@ -46,13 +47,14 @@ def stars_check(solution, observed):
     off = np.einsum("nba,bn->na", observed.linear[observed.exposure], np.stack([table["dx"].value, table["dy"].value]))
     sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
     found = []
-    for j in odd[np.argsort(p[odd], kind="stable")]:
+    for j in odd[np.argsort(p[odd], kind="stable")][:MOST_NAMED]:
         rows = np.flatnonzero((star == j) & np.isfinite(off).all(axis=1))
         time = np.asarray(observed.times, dtype=float)[observed.exposure[rows]]
         flux = np.asarray(table["flux"], dtype=float)[rows] if "flux" in table.colnames else None
         found.append(f"{solution.estimate.star_names[j]} ({_looks_like(off[rows], sigma[rows], time, flux)})")
+    more = f" and {len(odd) - len(found)} more" * (len(odd) > len(found))
     return Check("stars", "warn", len(odd), 0,
-                 f"observations of {_counted(len(odd))} contradict each other: {some_of(found, MOST_NAMED)}",
+                 f"observations of {_counted(len(odd))} contradict each other: {', '.join(found)}{more}",
                  "look at these; leave out what is no single star, fit what moves (--motion)")  # fmt: skip
 
 
@@ -63,6 +65,8 @@ def _counted(n):
 def _looks_like(off, sigma, time, flux):
     """What offsets (n, 2) of a star with errors (n,) look like, in words (Schwarz 1978)."""
     n, one = len(off), np.ones_like(sigma)
+    if n < _FEWEST:
+        return "hardly any is left"
     tried = {"it scatters": (_left(off, sigma, [one]), 2)}
     first = _groups(off, sigma)
     apart = np.hypot(*(off[first].mean(axis=0) - off[~first].mean(axis=0)))
@@ -72,7 +76,7 @@ def _looks_like(off, sigma, time, flux):
         t = (time - time.mean()) / np.ptp(time)
         tried["it moves"] = _left(off, sigma, [one, t]), 4
         tried["it moves on a curve: acceleration"] = _left(off, sigma, [one, t, t**2]), 6
-    if flux is not None and n > 3 and np.all(flux > 0) and np.ptp(flux) > 0:
+    if flux is not None and np.all(flux > 0) and np.ptp(flux) > 0:
         tried["it moves with its flux: a blend that varies"] = _left(off, sigma, [one, np.log(flux)]), 4
     return min(tried, key=lambda words: 2 * n * np.log(max(tried[words][0], 1e-9)) + tried[words][1] * np.log(2 * n))
 
@@ -89,5 +93,6 @@ def _groups(off, sigma):
     middle = off - np.median(off, axis=0)
     along = middle @ np.linalg.svd(middle, full_matrices=False)[2][0]
     order = np.argsort(along, kind="stable")
-    cuts = [np.isin(np.arange(len(off)), order[:k]) for k in range(1, len(off))]
+    sizes = np.unique(np.linspace(1, len(off) - 1, _CUTS).round().astype(int))
+    cuts = [np.isin(np.arange(len(off)), order[:k]) for k in sizes]
     return min(cuts, key=lambda cut: _left(off, sigma, [cut, ~cut]))

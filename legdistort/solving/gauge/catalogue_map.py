@@ -6,10 +6,11 @@ prior determine of g (`legdistort.solving.gauge.hierarchy`) counts with its info
 scale nothing. What neither determines to `LIMIT` stays where the convention has it.
 """
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import eigh
+from scipy.linalg import eigh, lu_factor, lu_solve
 from scipy.optimize import brentq
 
 from ...exceptions import InputError
@@ -110,6 +111,7 @@ class MapEquations:
 
     def __init__(self, offsets, directions, relative, prior):
         self.offsets, self.directions, self.relative, self.prior = offsets, directions, relative, prior
+        self._factors = {}
         rows, n = offsets.rows, len(directions)
         self.dense = len(relative) == 2 * n
         self.own = np.stack([_own(relative, star, n, self.dense) for star in rows])
@@ -124,12 +126,15 @@ class MapEquations:
 
     def without_prior(self):
         """The same with nothing known of the map beforehand."""
-        prior = replace(self.prior, information=0 * self.prior.information, centre=0 * self.prior.centre)
-        return MapEquations(self.offsets, self.directions, self.relative, prior)
+        out = copy(self)
+        out.prior = replace(self.prior, information=0 * self.prior.information, centre=0 * self.prior.centre)
+        return out
 
     def of_values(self, values):
         """The same for other offsets (n, 2)."""
-        return MapEquations(replace(self.offsets, values=values), self.directions, self.relative, self.prior)
+        out = copy(self)
+        out.offsets = replace(self.offsets, values=values)
+        return out
 
     def matrix(self, used):
         """Covariance (2 n, 2 n) of the used offsets, x and y of a star side by side."""
@@ -140,6 +145,14 @@ class MapEquations:
             out[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += block
         return out
 
+    def _weighted(self, used, values):
+        """The inverse of that covariance times values (2 n, ...), factorised once for the same stars."""
+        key = used.tobytes()
+        if key not in self._factors:
+            self._factors.clear()
+            self._factors[key] = lu_factor(self.matrix(used), check_finite=False)
+        return lu_solve(self._factors[key], values, check_finite=False)
+
     def gain(self, used, weights=None):
         """Information (2 k, 2 k) of the map and the matrix (2 k, 2 n) that takes the used offsets to its right side.
 
@@ -147,7 +160,7 @@ class MapEquations:
         """
         design = self.design[used].reshape(-1, self.design.shape[2])
         if self.dense and weights is None:
-            weighted = np.linalg.solve(self.matrix(used), design).T
+            weighted = self._weighted(used, design).T
         else:
             precision = np.linalg.inv(self.blocks[used])
             precision = precision if weights is None else precision * weights[:, None, None]
@@ -189,7 +202,7 @@ class MapEquations:
         """That of what is left (n, 2) of the used offsets; or its product with something else of that kind."""
         left, other = left[used], (left if other is None else other)[used]
         if self.dense:
-            return left.ravel() @ np.linalg.solve(self.matrix(used), other.ravel())
+            return left.ravel() @ self._weighted(used, other.ravel())
         return np.einsum("na,nab,nb->", left, np.linalg.inv(self.blocks[used]), other)
 
     def pulls(self, used):
