@@ -133,7 +133,7 @@ def _higher_degree(residuals):
     """
     problem = residuals.problem
     stars = np.bincount(residuals.exposure[residuals.used], minlength=problem.n_exposures).min()
-    best, left = "", residuals
+    best, left, told = "", residuals, residuals  # what a solve would reach is told, what surely shows decides
     for degree in range(problem.degree + 1, problem.degree + 1 + HIGHER):
         if stars < _STARS * basis.n_modes(degree):
             break
@@ -141,10 +141,10 @@ def _higher_degree(residuals):
         columns = left.modes_of(degree)
         if 2 * len(residuals.used) * columns[0].shape[1] > _VALUES:
             break
-        after = left.without(columns, rank=_FITTED)
-        if after.dof < 1:
+        after, told = left.without(columns), told.without(columns, rank=_FITTED)
+        if after.dof < 1 or told.dof < 1:
             break
-        reached, left = after.chi2 / after.dof, after
+        reached, left = told.chi2 / told.dof, after
         best = f"--degree {degree} would bring chi2/dof to "
         best += f"{reached:.2f}" if reached < _EXACT else f"about {reached:.2g}"
         if left.of_degree(degree + 1).p > FALSE_ALARM:
