@@ -146,7 +146,8 @@ class ReferenceTie:
                 "belong to as column ref_epoch, or their proper motions"
             )
         motions = None if self.identified.motion is None else self.identified.motion[:, :2]
-        stated = equations if self.finds_errors else equations.times(1 / made.factor)
+        as_stated = self.finds_errors or made.factor == 1
+        stated = equations if as_stated else equations.times(1 / made.factor)
         made = replace(made, agreement=agreement(equations, stated, made.used, motions))
         self._warn(made)
         log.info("%s", made.sentence)
