@@ -4,6 +4,7 @@ All settings are in ``benchmarks/calibration_table.py``.
 """
 
 import calibration_table as table
+import dense_model
 import numpy as np
 import pytest
 import relative_errors_table
@@ -71,6 +72,30 @@ def test_relative_errors_are_calibrated_after_any_common_map(prior, least):
         linear.append(relative_errors_table.squared_pull(wrong, solution.estimate.uncertainty.star_matrix, directions))
     assert np.mean(after) == pytest.approx(1, abs=0.15)
     assert least < np.mean(linear) < least + 2
+
+
+def few_undithered(n_stars, seed):
+    """Solution of few stars that no dithers or rolls move over the detector, without a prior, and their truth."""
+    matches, sky, _ = table.simulated(seed, n_exposures=30, n_stars=n_stars, dither=0.0, static=0.3, dynamic=0.3)
+    solution = ld.solve(matches, degree=3)
+    return solution, sky[solution.estimate.star_names]
+
+
+def test_relative_errors_of_few_stars_are_those_after_what_nothing_determines():
+    squares = np.zeros(2)
+    for seed in range(8):
+        solution, true = few_undithered(23, seed)
+        if "degree 3" not in solution.gauge.unknown_names:  # a map of degree 2 is taken off then
+            continue
+        design, off = dense_model.basis(true, 3, table.SIZE)[0], solution.estimate.positions - true
+        squares += np.sum((off - design @ np.linalg.lstsq(design, off)[0]) ** 2), 0
+        squares[1] += sum(np.sum(solution.stars[name].value ** 2) for name in ("x_err", "y_err"))
+    assert squares[0] / squares[1] == pytest.approx(1, abs=0.3)
+
+
+def test_as_many_stars_as_unknown_modes_have_no_relative_errors():
+    solution, *_ = few_undithered(10, 0)
+    assert not np.isfinite(solution.stars["x_err"]).any()
 
 
 def test_known_offsets_refuse_what_they_cannot_do(tmp_path):

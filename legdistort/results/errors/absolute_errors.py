@@ -43,6 +43,8 @@ def relative_blocks(gauge, uncertainty, xy):
     out[~np.isfinite(xy[:, 0])] = np.nan
     if gauge.plane is not None or common is None or not np.count_nonzero(good):
         return out
+    if common.n_modes(gauge) >= np.count_nonzero(good):  # maps that nothing determines explain any position
+        return np.full_like(out, np.nan)
     directions, hidden = _common(gauge, uncertainty, xy)
     directions = np.ascontiguousarray(np.where(good[:, None, None], directions, 0))  # rounded alike, read or not
     left = common.left(gauge, xy, directions)

@@ -3,7 +3,8 @@
 Of errors e of all stars ``(1 - B P) e`` is left, with B the plain maps of the degree of the gauge at the stars and P
 their fit, in which every star has the weight of its observations, ``W_j = sum_i J' W_ij J``. So a star or an exposure
 that is worth little hardly moves the map that is taken off from the others. Few stars would have no errors left beside
-so free a map: then it is of the highest degree that has a mode for every `PER_MODE` stars.
+so free a map: then it is of the highest degree that has a mode for every `PER_MODE` stars, but for maps that nothing
+determines, which are always taken off.
 """
 
 from dataclasses import dataclass, field
@@ -43,7 +44,7 @@ class CommonFit:
 
     def without_maps(self, gauge, xy, blocks):
         """Covariances (n_stars, 2 + k, 2 + k) of the stars, given those in the gauge, once the maps are taken off."""
-        maps = plain_maps(gauge, xy, self._n_modes(gauge))
+        maps = plain_maps(gauge, xy, self.n_modes(gauge))
         shared = self.stars @ maps.mT
         return blocks - shared - shared.mT + maps @ self.covariance @ maps.mT
 
@@ -57,20 +58,21 @@ class CommonFit:
 
         The plane is bent back by the maps then, which the exposures follow by `Gauge.all_motion`.
         """
-        moved = gauge.all_motion[i].reshape(2, gauge.n_modes, -1, gauge.n_modes)[..., : self._n_modes(gauge)]
+        moved = gauge.all_motion[i].reshape(2, gauge.n_modes, -1, gauge.n_modes)[..., : self.n_modes(gauge)]
         moved = basis.change_degree(moved.transpose(0, 2, 3, 1), basis.degree_of(len(block) // 2))
         moved = moved.transpose(0, 3, 1, 2).reshape(len(block), -1)
         shared = self.coefficients[i] @ moved.T
         return block + shared + shared.T + moved @ self.covariance @ moved.T
 
-    def _n_modes(self, gauge):
+    def n_modes(self, gauge):
+        """Modes per axis of the maps that are taken off."""
         return len(self.covariance) // (gauge.all_motion.shape[2] // gauge.n_modes)
 
 
-def modes_for(n_modes, n_stars):
-    """How many of the modes of a gauge the map that is taken off so many stars has."""
+def modes_for(n_modes, n_stars, unknown=0):
+    """How many of the modes of a gauge, unknown up to a degree, the map that is taken off so many stars has."""
     degrees = [d for d in range(basis.degree_of(n_modes) + 1) if PER_MODE * basis.n_modes(d) <= n_stars]
-    return basis.n_modes(max(degrees, default=0))
+    return basis.n_modes(max(*degrees, 0, unknown))
 
 
 def plain_maps(gauge, xy, n):

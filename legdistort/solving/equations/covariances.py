@@ -255,7 +255,8 @@ class Uncertainty:
         if self._gauge.plane is not None or not (self._is_dense or self._given is not None or self._on_stars):
             return None
         weights = self._weights
-        n = modes_for(self._gauge.n_modes, np.count_nonzero(weights[:, 0, 0]))
+        unknown = max((each.degree for each in self._gauge.unknown_maps), default=0)
+        n = modes_for(self._gauge.n_modes, np.count_nonzero(weights[:, 0, 0]), unknown)
         maps = plain_maps(self._gauge, self._blocks.stars[:2].T, n)
         weighted = weights @ maps
         stars, coefficients = self._follow(weighted)
