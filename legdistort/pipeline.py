@@ -20,12 +20,13 @@ from .cameras.camera import Camera, check_camera
 from .coaddition.mosaic_header import is_mosaic
 from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
-from .exceptions import InputError, MatchError
+from .exceptions import InputError
 from .inputs import exposure_files, table_files
 from .inputs.exposure_names import whole_name
 from .inputs.exposures import observed
 from .inputs.frames.statement import stated_rows
 from .matching.matcher import match
+from .matching.matches import alone
 from .matching.options import MatchOptions, check_enough
 from .measurement.earlier import EarlierRun, write_detections
 from .measurement.options import MeasureOptions
@@ -212,7 +213,7 @@ def run(
     with outputs.replacing_folder(out, results=RESULTS, keep=keep) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
         with timed(timings, "read"):
-            exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, **reading)
+            exposures, bad = _open_frames(paths, min_exposures, stop_at_bad, progress, reference is not None, **reading)
             solving = _known_of(exposures, solving, prior, reading["camera"])
         with timed(timings, "measure"):
             detections, psfs = _detected(exposures, before, measuring, share)
@@ -273,13 +274,13 @@ def _of_start():
     return {} if since is None else {"start": time.perf_counter() - since}
 
 
-def _open_frames(paths, min_exposures, stop_at_bad, progress, *, ext, dq_good, camera):
+def _open_frames(paths, min_exposures, stop_at_bad, progress, tied, *, ext, dq_good, camera):
     """Exposures that can be solved together, and the bad ones as ``{name: reason}``."""
     bad = {}
     options = {"ext": ext, "dq_good": dq_good, "stop_at_bad": stop_at_bad, "progress": progress}
     exposures = exposure_files.open_exposures(paths, left_out=bad, **options)
     exposures = camera.of_detectors(exposures) if camera else exposures
-    _check_exposures(exposures, min_exposures, bad)
+    _check_exposures(exposures, min_exposures, bad, tied)
     return exposures, bad
 
 
@@ -433,14 +434,11 @@ def check_results(out, overwrite):
         )
 
 
-def _check_exposures(exposures, min_exposures, bad):
+def _check_exposures(exposures, min_exposures, bad, tied):
     """There are enough, and all show one detector: a run on a mixture would co-add nonsense."""
     n_frames = len({whole_name(exposure) for exposure in exposures})
-    if n_frames < 2:
-        raise MatchError(
-            f"only one exposure ({whole_name(exposures[0])}): the distortion is found from the "
-            "differences between exposures, give at least two of the same field"
-        )
+    if n_frames < 2 and not tied:
+        raise alone(whole_name(exposures[0]))
     detectors = {}
     for exposure in exposures:
         first = detectors.setdefault(exposure.detector, exposure)
@@ -454,7 +452,8 @@ def _check_exposures(exposures, min_exposures, bad):
                     else "give frames of one detector, or solve their tables with a shape for each"
                 )
             )
-    check_enough(n_frames, min_exposures, "usable exposures" if bad else "exposures")
+    if n_frames > 1:
+        check_enough(n_frames, min_exposures, "usable exposures" if bad else "exposures")
 
 
 def _detected(exposures, before, measuring, share):

@@ -83,7 +83,8 @@ def match(
         focal plane. Without it their layout is that of the headers of `exposures`; without these the dithers determine
         it, where stars cross from one detector to another.
     min_exposures : int
-        A star is kept when it was found in that many exposures.
+        A star is kept when it was found in that many exposures. Of a single exposure, which a reference catalogue may
+        solve, every detection is a star.
     columns : dict, optional
         ``{name expected: name in the table}``.
     tolerance : float, optional
@@ -111,7 +112,7 @@ def match(
         For missing columns, bad values, a missing shape, fewer exposures than `min_exposures`, or detectors that
         seem to lie in each other's places.
     MatchError
-        For a single exposure, exposures in groups without a star in common, or no star in `min_exposures` exposures.
+        For exposures in groups without a star in common, or no star in `min_exposures` exposures.
 
     See Also
     --------
@@ -164,8 +165,12 @@ def match(
     left_out = {n: f"only {len(r)} usable detections of at least {FEWEST}" for n, r in rows.items() if len(r) < FEWEST}
     kept = [name for name in names if name not in left_out]
     lists = [_star_list(table[rows[name]], shapes[name]) for name in kept]
-    with parallel.one_blas_thread():  # matrices are small
-        stars = _associate(lists, kept, headers, left_out, options)
+    if len(names) == 1 and kept:
+        log.info("one exposure (%s): every detection is a star; a reference catalogue solves it", names[0])
+        min_exposures, stars = 1, {names[0]: np.arange(len(lists[0]))}
+    else:
+        with parallel.one_blas_thread():  # matrices are small
+            stars = _associate(lists, kept, headers, left_out, options)
     star = np.full(len(table), -1)
     for name, labels in stars.items():
         star[rows[name]] = labels
@@ -244,9 +249,8 @@ def _check_names(table, names, min_exposures):
         raise InputError(
             f"the table of detections names exposure {unknown[0]!r}, which is not among exposures= ({', '.join(names)})"
         )
-    if len(names) == 1:
-        raise MatchError(f"only one exposure ({names[0]}): give at least two of the same field")
-    check_enough(len(names), min_exposures)
+    if len(names) > 1:
+        check_enough(len(names), min_exposures)
 
 
 def _shapes(table, names, named, shape):
@@ -272,7 +276,7 @@ def _star_list(table, shape):
 def _associate(lists, names, headers, left_out, options):
     """Star labels by exposure name; exposures without a place are added to `left_out`."""
     if len(lists) < 2:
-        raise MatchError(f"fewer than two exposures have stars: {reasons_of(left_out)}")
+        raise MatchError(f"fewer than two exposures have stars enough: {reasons_of(left_out)}")
 
     tolerance, progress = options.tolerance, options.progress
 

@@ -90,7 +90,7 @@ class Observations:
         InputError
             For a star that stands twice in an exposure, or positions that all lie on one line.
         MatchError
-            For one exposure only, or exposures in groups without a common star.
+            For exposures in groups without a common star.
         """
         _check_duplicates(self)
         _check_connected(self)
@@ -244,14 +244,14 @@ class Matches(ShownAsPrinted):
         InputError
             For another number of them, a row that comes twice, or positions on one line.
         MatchError
-            If what is left is one exposure or none, or falls apart.
+            If nothing is left, or what is left falls apart.
         """
         rows = rows if isinstance(rows, slice) else np.asarray(rows)
         if not isinstance(rows, slice) and rows.dtype == bool and rows.shape != (len(self.table),):
             raise InputError(f"rows must be one truth value a row ({len(self.table)}), got shape {rows.shape}")
         table = self.table[rows]
         if len(table) == 0:
-            raise MatchError("no position is left: keep those of two exposures at least")
+            raise MatchError("no position is left: keep those of an exposure at least")
         seen = Observations.of(table)
         seen.check()
         return replace(self, table=table, observations=seen, **self._by_exposure(seen.names))
@@ -267,7 +267,10 @@ class Matches(ShownAsPrinted):
         rows = ~np.isin(self.table["exposure"], list(reasons))
         if not rows.any():
             raise MatchError(f"no exposure agrees with the others: {reasons_of(reasons)}")
-        return replace(self.keep(rows), left_out=self.left_out | dict(reasons))
+        kept = self.keep(rows)
+        if len(kept.names) == 1 < len(self.names):
+            raise alone(kept.names[0], f"; left out: {reasons_of(reasons)}")
+        return replace(kept, left_out=self.left_out | dict(reasons))
 
     def _by_exposure(self, names):
         """Fields that have an entry for every exposure, with those of these only."""
@@ -347,7 +350,7 @@ class Matches(ShownAsPrinted):
         InputError
             For missing columns, bad values, duplicate (exposure, star) rows, a missing shape or pose.
         MatchError
-            For one exposure only, or exposures in groups without a common star.
+            For exposures in groups without a common star.
 
         Warns
         -----
@@ -539,13 +542,16 @@ def in_focal_plane(table, camera):
     return camera.in_focal_plane(table)
 
 
+def alone(name, more=""):
+    """The `MatchError` that there is one exposure, and nothing to compare it with."""
+    return MatchError(
+        f"only one exposure ({name}): the distortion is found from the differences between exposures, or from a "
+        f"catalogue; give two of the same field at least, or reference= (--reference){more}"
+    )
+
+
 def _check_connected(seen):
     n = len(seen.names)
-    if n < 2:
-        raise MatchError(
-            f"only one exposure ({seen.names[0]}): the distortion is found from the differences between exposures, "
-            "give at least two of the same field"
-        )
     for rows in _some_then_all(seen):
         # tie every exposure to the first one of each of its stars: the same groups as all pairs, in a small graph
         star, exposure, first = seen.star[rows], seen.exposure[rows], np.full(len(seen.stars), n)

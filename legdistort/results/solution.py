@@ -279,8 +279,9 @@ class Solution(ShownAsPrinted):
     def __repr__(self) -> str:
         lost = np.count_nonzero(np.isnan(self.estimate.positions[:, 0]))
         stars = f"{len(self.estimate.star_names)} stars{f' ({lost} without a position)' if lost else ''}"
+        exposures = f"{len(self.names)} exposure{'s' * (len(self.names) != 1)}"
         return (
-            f"<Solution: {len(self.names)} exposures, {stars}, degree {self.degree}, "
+            f"<Solution: {exposures}, {stars}, degree {self.degree}, "
             f"chi2 {self.chi2:.1f} for {self.dof} degrees of freedom>"
         )
 

@@ -15,6 +15,7 @@ from astropy.table import Table
 
 from ..exceptions import LegdistortError
 from ..geometry import basis
+from ..matching.matches import alone
 from ..results import accuracy
 from ..results.errors.absolute_errors import relative_blocks
 from ..results.solution import Solution
@@ -349,6 +350,8 @@ def _predict(plan):
     independent, common = assumed_spectra(plan)
     layout = lay_out(plan)
     matches = layout.matches(np.zeros((2, 1)) if plan.prior is None or plan.prior.mean is None else plan.prior.mean)
+    if len(matches.names) == 1:
+        raise alone(*matches.names)
     if plan.motion is not None:
         star_motions.check_epochs(matches, plan.motion)
     motion = star_motions.terms_of(SolveOptions(motion=plan.motion))

@@ -25,7 +25,7 @@ from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
 from .equations import effective_modes
 from .motion_choice import resolve as resolve_motion
-from .options import CLIP, DEGREE, SolveOptions, Unasked, check_detectors, check_reference
+from .options import CLIP, DEGREE, SolveOptions, Unasked, check_detectors, check_tie
 from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
 from .single_detectors import by_detector
@@ -172,6 +172,8 @@ def solve(
     SolveError
         If an exposure has fewer stars than modes, the unknowns are not determined, or exposures contradict one another
         and no majority shows which are right.
+    MatchError
+        For one exposure without a reference.
 
     See Also
     --------
@@ -202,8 +204,8 @@ def solve(
         max_iterations=max_iterations, validate=validate, motion=motion, motion_sigma=motion_sigma,
         motion_epoch=motion_epoch,
     )  # fmt: skip
-    tying = {"error": reference_error, "epoch": epoch, "pixel_scale": pixel_scale, "method": method}
-    catalogue, epoch = check_reference(reference, **tying)
+    tying = {"error": reference_error, "epoch": epoch, "pixel_scale": pixel_scale}
+    catalogue, epoch = check_tie(matches.names, asked, reference, **tying)
     if model is None:
         _warn_of_header(matches, prior)
     options, form = replace(asked, static=None, layout=None) if matches.camera.has_focal_plane else asked, None

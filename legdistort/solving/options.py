@@ -9,6 +9,7 @@ from ..exceptions import InputError
 from ..geometry import basis, fitter
 from ..geometry.epochs import year
 from ..inputs.reference_catalogue import read_reference
+from ..matching.matches import alone
 from ..results.settings import Settings
 from ..runtime.checks import LARGEST, check_choice
 from ..runtime.words import CAMERA, DYNAMIC, ERRORS, GAUGES, LOSSES, METHODS, MOTIONS
@@ -181,3 +182,29 @@ def check_reference(reference, *, error=None, epoch=None, pixel_scale=None, meth
     if method == "alternating":
         raise InputError("method='alternating' is the published scheme: it takes no reference")
     return read_reference(reference, error), epoch
+
+
+def check_tie(names, asked, reference, **tying):
+    """What `check_reference` gives, for exposures of these names and the `SolveOptions` asked for.
+
+    Raises
+    ------
+    MatchError
+        For one exposure without a reference.
+    InputError
+        As there; with one exposure for options that compare exposures with one another.
+    """
+    catalogue, epoch = check_reference(reference, method=asked.method, **tying)
+    if len(names) > 1:
+        return catalogue, epoch
+    (name,) = names
+    if catalogue is None:
+        raise alone(name)
+    comparing = {"errors": asked.errors != "stated", "degree": asked.chooses_degree, "static": asked.static == "fit"}
+    comparing |= {option: getattr(asked, option) is not None for option in ("validate", "motion")}
+    for option in filter(comparing.get, comparing):
+        raise InputError(
+            f"{option}={getattr(asked, option)!r} compares exposures with one another, and there is only one ({name}): "
+            "leave it out"
+        )
+    return catalogue, epoch

@@ -459,6 +459,8 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     if result.gauge.n_modes >= FEWEST_MODES or problem.terms.n:
         problem, result = tying.hold_stars(problem, result, prior)
         fit = replace(fit, problem=replace(fit.problem, moving=problem.moving), **_held_back(fit, problem))
+    else:  # the map moves the plane alone
+        result = replace(result, gauge=replace(result.gauge, tie=replace(result.gauge.tie, freedom=0.0)))
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
 
 

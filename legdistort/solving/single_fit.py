@@ -121,7 +121,7 @@ class Fit:
         """Degrees of freedom: the directions fixed by the gauge are no unknowns, and a prior does part of the work."""
         problem = self.problem
         n_free = elimination.star_freedom(self.weighted, self.blocks) + self.effective_modes.sum()
-        n_free += self.shared_unknowns
+        n_free += self.shared_unknowns + (0.0 if self.result.gauge.tie is None else self.result.gauge.tie.freedom)
         if problem.unknowns.shared:
             priors = problem, replace(problem, static_sigma=None)
             by_prior, by_widths = (effective_modes.done_by_prior(p, self.uncertainty).sum() for p in priors)

@@ -352,13 +352,22 @@ def test_an_empty_table_is_told_from_one_without_columns():
         match(make_field(40, *six_poses(0.5, 100), seed=1)[:0], shape=SHAPE)
 
 
+def test_of_one_exposure_every_detection_is_a_star():
+    table = make_field(40, *six_poses(0.5, 100), seed=1)
+    one = table[table["exposure"] == "e02"]
+    one["flags"] = 0
+    one["flags"][3] = int(Flag.SATURATED)
+    matches = match(one, shape=SHAPE)
+    assert matches.names == ("e02",)
+    assert len(matches.stars) == len(one) - 1
+    assert np.array_equal(np.sort(matches.observations.xy[:, 0]), np.sort(np.delete(one["x"].value, 3)))
+
+
 def test_bad_arguments():
     table = make_field(40, *six_poses(0.5, 100), seed=1)
     three = table[np.isin(table["exposure"], ["e00", "e01", "e02"])]
     with pytest.raises(InputError, match=r"only 3 exposures: give min_exposures=3 \(--min-exposures\)"):
         match(three, shape=SHAPE)
-    with pytest.raises(MatchError, match="only one exposure"):
-        match(table[table["exposure"] == "e00"], shape=SHAPE)
     with pytest.raises(InputError, match="min_exposures must be"):
         match(table, shape=SHAPE, min_exposures=1)
     with pytest.raises(InputError, match="tolerance must be a positive"):

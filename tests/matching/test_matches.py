@@ -11,6 +11,7 @@ from legdistort.geometry import similarity
 from legdistort.inputs.table_files import read_table
 from legdistort.matching.matches import Matches
 from legdistort.simulation.observations import simulate_gsaoi_matches, simulate_matches
+from legdistort.solving.estimation import solve
 
 SHAPE = (2048, 2048)
 
@@ -92,10 +93,12 @@ def test_duplicates_are_named(sim):
         Matches.from_table(vstack([given, given[3:5]]), shape=SHAPE)
 
 
-def test_one_exposure_is_refused(sim):
+def test_one_exposure_is_solved_by_a_reference_alone(sim):
     given = table_of(sim)
-    with pytest.raises(MatchError, match=r"only one exposure \(exp00\).*give at least two"):
-        Matches.from_table(given[given["exposure"] == "exp00"], shape=SHAPE)
+    matches = Matches.from_table(given[given["exposure"] == "exp00"], shape=SHAPE)
+    assert matches.names == ("exp00",)
+    with pytest.raises(MatchError, match=r"only one exposure \(exp00\).*give two of the same field.*reference="):
+        solve(matches)
 
 
 def test_groups_without_a_common_star_are_listed(sim):

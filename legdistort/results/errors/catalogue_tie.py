@@ -75,6 +75,8 @@ class Tie:
         common map alone.
     agreement : Agreement or None
         None where a file does not have it.
+    freedom : float
+        Of the residuals of the exposures, taken by the map: what of it they determine, not the reference.
     """
 
     covariance: np.ndarray = field(metadata=array("2 k", "2 k", unit="pix2", covariance=True))
@@ -90,6 +92,7 @@ class Tie:
         default=None, metadata=array("n_reference", 2, 2, unit="pix2", nan=True, covariance=True)
     )
     agreement: Agreement | None = None
+    freedom: float = field(default=0.0, metadata=number(minimum=0))
 
     @property
     def rms(self) -> float:

@@ -45,6 +45,9 @@ def prior_check(solution, problem, state, *, error):
         return None
     if problem.mean_sigma is not None and np.all(np.isinf(problem.mean_sigma)):  # nothing is believed
         return None
+    if problem.n_exposures < 2:
+        given = "the static distortion given" + f" ({_source(solution)})" * bool(_source(solution))
+        return Check("prior", "unknown", None, None, f"{given} is believed, not tested: there is one exposure", _CURE)
     keep = drawn(np.broadcast_to(problem.group, problem.n_exposures), MOST // (2 * problem.n_modes))
     problem, state = part_of(problem, state, keep)
     given, variance, group, first = stated(problem)

@@ -100,10 +100,10 @@ class Residuals:
         self.problem, self.state, self.blocks, self.system, self.dof = problem, state, blocks, system, dof
         self.exposure = problem.exposure
         self.used = problem.weight[0] > 0
-        self.released = self._released()
-        flat, e = self.released.reshape(2 * len(self.used), -1), self._whiten(blocks.residual)
-        self.whitened = e - (flat @ (flat.T @ e.ravel())).reshape(e.shape)
-        self.dof = dof - flat.shape[1]
+        self.released, held = self._released()
+        e = self._whiten(blocks.residual)
+        self.whitened = e - self.released @ (np.einsum("anm,an->m", self.released, e) - held)
+        self.dof = dof - float(np.sum(self.released**2))
         self.squares = np.sum(self.whitened**2, axis=0)
         self.chi2 = float(self.squares.sum())
 
@@ -111,7 +111,8 @@ class Residuals:
         """What the values at which the gauge holds the common map may do to the whitened residuals, all else refitted.
 
         Holding it at values that are not the true ones leaves residuals of second order, which precise data show. They
-        are no fault of the form of the distortion, so that they are taken off. Orthonormal, shape (2, n, k).
+        are no fault of the form of the distortion, so that they are taken off. Shape (2, n, k), in units in which the
+        information of these values is one; and how stars that a reference holds resist them, (k,).
         """
         problem, system, n_modes = self.problem, self.system, self.problem.n_modes
         coupling = problem.pulled(self.blocks.coupling)
@@ -127,12 +128,16 @@ class Residuals:
         out = self._whiten(fields)
         for column, star in zip(self._columns, stars, strict=True):
             out += column[:, :, None] * star[problem.star]
-        flat = out.reshape(2 * len(self.used), -1)
-        size = np.sqrt(np.sum(flat**2, axis=0))
-        flat /= np.where(size > 0, size, 1)
-        values, vectors = np.linalg.eigh(flat.T @ flat)  # nearly unity: they are those of one information
+        information, held = np.einsum("anm,ank->mk", out, out), np.zeros(out.shape[2])
+        if (catalogue := problem.terms.catalogue) is not None:
+            moved = elimination.symmetric_times(catalogue.precision[:, :, None], stars)
+            information += np.einsum("ajm,ajk->mk", stars, moved)
+            held = np.einsum("ajm,aj->m", moved, self.state.stars - catalogue.mean)
+        unit = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
         kept = values > 1e-12
-        return (flat @ (vectors[:, kept] / np.sqrt(values[kept]))).reshape(2, len(self.used), -1)
+        turn = unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])
+        return out @ turn, held @ turn
 
     @cached_property
     def _roots(self):

@@ -62,7 +62,8 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     -------
     tuple of Check
     """
-    residuals = Residuals(problem, state, blocks, uncertainty.system, solution.dof)
+    of_map = 0.0 if solution.gauge.tie is None else solution.gauge.tie.freedom  # which `Residuals` takes off itself
+    residuals = Residuals(problem, state, blocks, uncertainty.system, solution.dof + of_map)
     judged = partial(_by_residuals, solution, times=times)
     made, explained = judged(residuals), ()
     observed = Observed(problem, state, solution.residuals[problem.order], times[0])
@@ -195,8 +196,10 @@ def errors_check(solution, residuals):
 
 
 def exposures_check(solution, residuals):
-    """Does an exposure scatter more than the others?"""
+    """Does an exposure scatter more than the others? None where there are no others."""
     names = residuals.problem.names
+    if len(names) < 2:
+        return None
     scores = residuals.of_groups(residuals.exposure)
     p = np.array([s.p for s in scores])
     squares = np.array([s.t / max(s.nu, 1e-9) for s in scores])
@@ -266,8 +269,8 @@ def place_check(residuals):
 
 
 def time_check(solution, residuals, times):
-    """Do stars move through the set? Not checked where their motions are fitted."""
-    if residuals.problem.terms.n:
+    """Do stars move through the set? Not checked where their motions are fitted, or there is one exposure."""
+    if residuals.problem.terms.n or residuals.problem.n_exposures < 2:
         return None
     times, unit = times
     how = "with time" if unit == "days" else "in the order of the exposures"

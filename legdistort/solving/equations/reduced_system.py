@@ -35,6 +35,8 @@ _DIRECT_COST = 4e9
 _FAST_DIRECT_COST, _FAST_STEPS = 1e8, 60
 _CLEAR_PIVOT = 0.03  # of an exposure whose stars determine its coefficients well
 _LEAST_PIVOT = 1e-7  # of the normalised equations, below which they count as singular
+_ALONE = 1e-6  # of what the stars would determine if they were known: where nothing else does, as in one exposure
+_ROUNDING = 1e-12  # of a variance, what is left where the constraints hold all of it
 _WEAK = 1e-3  # eigenvalue of the normalised equations below which a common distortion is not determined
 
 
@@ -111,7 +113,7 @@ class Direct(Reduced):
     def __init__(self, problem, blocks, gauge, weak=None):
         super().__init__(problem, blocks, gauge)
         s = elimination.reduced_triangle(problem, blocks)
-        self.scale = np.mean(np.diag(s))
+        self.scale = max(np.mean(np.diag(s)), _ALONE * np.mean(np.einsum("iaa->ia", blocks.u)))
         s += (self.scale * self.rows.T @ self.rows).T  # lifts the gauge directions; undone by the multipliers
         # unit diagonal: coefficients of bright and faint exposures then compare
         diagonal = np.diag(s).copy()
@@ -259,7 +261,11 @@ class Direct(Reduced):
         out = elimination.mirrored(dpotri(self._factor[0], lower=1)[0])  # a third of solving for every unit vector
         out *= self._unit[:, None]
         out *= self._unit
+        free = np.diag(out).copy()
         out -= self._lifted @ self._border @ self._lifted.T
+        held = np.diag(out) < _ROUNDING * free  # as all of one exposure
+        out[held] = 0
+        out[:, held] = 0
         return self.unknowns.covariance((out + out.T) / 2)
 
 

@@ -10,7 +10,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import eigh, lu_factor, lu_solve
+from scipy.linalg import block_diag, eigh, lu_factor, lu_solve
 from scipy.optimize import brentq
 
 from ...exceptions import InputError
@@ -138,12 +138,17 @@ class MapEquations:
 
     def matrix(self, used):
         """Covariance (2 n, 2 n) of the used offsets, x and y of a star side by side."""
-        n = len(self.directions)
-        index = (self.offsets.rows[used, None] + [0, n]).ravel()
-        out = self.relative[np.ix_(index, index)].copy()
+        out = self.of_exposures(used)
         for k, block in enumerate(self.offsets.covariance[used]):
             out[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += block
         return out
+
+    def of_exposures(self, used):
+        """What of that covariance is the exposures'."""
+        if not self.dense:
+            return block_diag(*self.own[used])
+        index = (self.offsets.rows[used, None] + [0, len(self.directions)]).ravel()
+        return self.relative[np.ix_(index, index)]
 
     def _weighted(self, used, values):
         """The inverse of that covariance times values (2 n, ...), factorised once for the same stars."""
@@ -377,7 +382,7 @@ def estimate(equations, used, names):
     """
     value, covariance, gain = equations.solve(used)
     left = equations.left(value)
-    information = equations.gain(used)[0]
+    information, weighted = equations.gain(used)
     share = covariance @ information
     parts = map_parts(equations.prior.size, equations.prior.n_modes)[1:]
     pointing = 1.0 if np.count_nonzero(used) > 1 else 0.5  # a single star determines the shift alone
@@ -391,6 +396,7 @@ def estimate(equations, used, names):
         offsets=left,
         used=used,
         ratio=float(equations.chi2(left, used) / dof) if dof > 2 else np.nan,
+        freedom=float(np.einsum("km,ma,ka->", covariance, weighted, weighted @ equations.of_exposures(used))),
     )
     return value, tie, dof
 
