@@ -59,7 +59,8 @@ def looked_at(make, seed):
 def _cured(matches, options, name, value):
     """chi2/dof once a cure is applied."""
     solution = ld.solve(matches, **options | {name: int(value) if name == "degree" else value})
-    return next(check.value for check in solution.checks if check.name == "chi2")
+    found = next(check.value for check in solution.checks if check.name == "chi2")
+    return np.nan if found is None else found  # no degrees of freedom are left
 
 
 def _without_common(found, true, stated, degree):
@@ -112,7 +113,7 @@ def main():
         silent += [name] * (is_wrong and 2 * said < solved)
         words = ", ".join(f"{each} {n}" for each, n in names.most_common(6)) + f"; refused {refused}" * bool(refused)
         if cures:
-            promised, reached = np.median(cures, axis=0)
+            promised, reached = np.nanmedian(cures, axis=0)
             words += f"; cures promise {promised:.2f}, reach {reached:.2f}"
         mark = "*" * is_wrong + "!" * (is_wrong and 2 * said < solved)
         print(f"{name:60s} {ratios[0]:8.2f} {ratios[1]:8.2f} {mark:2s} {said} of {solved}  {words}", flush=True)
