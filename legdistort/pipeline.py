@@ -109,7 +109,7 @@ def run(
     min_exposures: int = 4,
     clip: float | None = CLIP,
     psf: Any = "auto",
-    reference: Table | SkyCoord | StrPath | None = None,
+    reference: Table | SkyCoord | Solution | StrPath | None = None,
     reference_error: float | Quantity | str | None = None,
     epoch: float | Time | None = None,
     pixel_scale: float | None = None,

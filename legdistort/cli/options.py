@@ -195,7 +195,9 @@ SOLVING = Group(
             metavar="PX/YR",
         ),
         "motion_epoch": Option("year of the positions (default: mean)", type=float, metavar="YEAR"),
-        "reference": Option("catalogue whose positions are known, such as one of Gaia", metavar="TABLE", path="read"),
+        "reference": Option(
+            "catalogue whose positions are known, such as one of Gaia, or a solution", metavar="TABLE", path="read"
+        ),
         "reference_error": Option(
             "of its positions where it states none, mas on the sky, else pixels; found: the size of all its errors",
             type=word_or(float, "found"),

@@ -76,6 +76,11 @@ class Reference:
         Years of the positions.
     finds_errors : bool
         Whether the errors are known up to a common factor only, which is to be found.
+    maps : ndarray, shape (n, 2, m), or None
+        Errors that all its positions have in common, as displacements in the units of these: their sum times normal
+        deviates.
+    unknown : ndarray, shape (n, 2, k), or None
+        Displacements that may be in its positions by any amount.
     """
 
     label: str
@@ -87,6 +92,8 @@ class Reference:
     motion: np.ndarray | None = None
     epoch: np.ndarray | None = None
     finds_errors: bool = False
+    maps: np.ndarray | None = None
+    unknown: np.ndarray | None = None
 
     def __len__(self):
         return len(self.covariance)
@@ -153,12 +160,12 @@ class Reference:
         return replace(moved, sky=_degrees(place)).subset(known | still)
 
     def on_plane(self, plane):
-        """Positions (n, 2), motions (n, k) and covariances (n, 2 + k, 2 + k) in pixels of a tangent plane.
+        """The reference with positions, motions and covariances in pixels of a tangent plane.
 
-        NaN far off its tangent point. Motions are None where there are none; parallaxes are in pixels too.
+        NaN far off its tangent point. Parallaxes are in pixels too.
         """
         if self.xy is not None:
-            return self.xy, self.motion, self.covariance
+            return self
         place, east, north = _axes(self.sky)
         middle = directions(*np.radians([plane.lon, plane.lat]))
         far = place @ middle < 0.5  # beyond 60 degrees; the projection ends at 90
@@ -174,11 +181,13 @@ class Reference:
         lost = np.isnan(self.covariance)
         covariance = turn @ np.where(lost, 0, self.covariance) @ turn.transpose(0, 2, 1)
         covariance[lost] = np.nan
-        if self.motion is None:
-            return xy, None, covariance
-        inner = turn[:, 2:, 2:]
-        moved = np.einsum("jab,jb->ja", inner, np.nan_to_num(self.motion))
-        return xy, np.where(np.isnan(self.motion), np.nan, moved), covariance
+        maps, unknown = (None if each is None else slope @ each for each in (self.maps, self.unknown))
+        motion = None
+        if self.motion is not None:
+            moved = np.einsum("jab,jb->ja", turn[:, 2:, 2:], np.nan_to_num(self.motion))
+            motion = np.where(np.isnan(self.motion), np.nan, moved)
+        found = {"motion": motion, "covariance": covariance, "maps": maps, "unknown": unknown}
+        return replace(self, sky=None, xy=xy, **found)
 
 
 def _axes(sky):

@@ -1,7 +1,7 @@
 """Which star of a solution is which star of a reference catalogue, and where that lies in the reference plane."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -43,6 +43,8 @@ class Identified:
     motion : ndarray, shape (n, k), or None
         Proper motions of the reference, pixels of the reference plane a year, and perhaps parallaxes, pixels; NaN for
         stars without one.
+    maps, unknown : ndarray, shape (n, 2, m), or None
+        What its positions have in common, see `legdistort.inputs.reference_catalogue.Reference`; pixels.
     """
 
     rows: np.ndarray
@@ -50,11 +52,12 @@ class Identified:
     covariance: np.ndarray
     sky: TangentPlane | None
     motion: np.ndarray | None = None
+    maps: np.ndarray | None = None
+    unknown: np.ndarray | None = None
 
     def subset(self, these):
         """The same with some of its stars."""
-        motion = None if self.motion is None else self.motion[these]
-        return Identified(self.rows[these], self.xy[these], self.covariance[these], self.sky, motion)
+        return replace(self, **{k: v[these] for k, v in vars(self).items() if isinstance(v, np.ndarray)})
 
     def __repr__(self):
         return f"<Identified: {len(self.rows)} reference stars>"
@@ -96,14 +99,19 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
     elif reference.xy is None and sky is None:
         mine, theirs = _by_pattern(reference, positions[rows], flux, pixel_scale)
     else:
-        plane = reference.xy if reference.xy is not None else reference.on_plane(sky)[0]
-        mine, theirs = _on_plane(reference, plane, positions[rows], flux)
+        try:
+            mine, theirs = _on_plane(reference, reference.on_plane(sky).xy, positions[rows], flux)
+        except InputError:  # another plane of this field
+            found = None if reference.xy is None else _turned(reference, positions[rows], flux)
+            if found is None:
+                raise
+            (mine, theirs), sky = found, None
     rows, reference = rows[mine], reference.subset(theirs)
     if reference.xy is None and sky is None:
         sky = _tangent_plane(reference, positions[rows])
-    xy, motion, covariance = reference.on_plane(sky)
-    _check_agreement(reference.label, positions[rows], xy, np.ptp(positions[solved], axis=0).max())
-    return Identified(rows, xy, covariance, sky, motion)
+    found = reference.on_plane(sky)
+    _check_agreement(reference.label, positions[rows], found.xy, np.ptp(positions[solved], axis=0).max())
+    return Identified(rows, found.xy, found.covariance, sky, found.motion, found.maps, found.unknown)
 
 
 def _by_name(reference, names):
@@ -139,6 +147,11 @@ def _on_plane(reference, plane, positions, flux):
     )
 
 
+def _turned(reference, positions, flux):
+    """Rows of the stars and of a reference in pixels of another plane, however turned; None if it is not found."""
+    return _registered(positions, reference.xy, flux, reference.flux, slice(None), guess=False)
+
+
 def _registered(source, target, source_flux, target_flux, near, *, guess):
     """Rows of source and target by `registration.register`; None if nothing stands out from chance."""
     if min(len(source), len(target)) < 5:
@@ -169,7 +182,7 @@ def _by_pattern(reference, positions, flux, pixel_scale):
             f"the exposures have no WCS, and {len(reference)} stars of {reference.label} and {len(positions)} of the "
             "exposures are too few to find one by their pattern: name them in a column star, or take more"
         )
-    xy = reference.on_plane(_middle(reference.sky, _ARCSEC))[0]
+    xy = reference.on_plane(_middle(reference.sky, _ARCSEC)).xy
     scales = scale_candidates(positions, xy)
     if pixel_scale is not None:
         scales = [s for s in scales if abs(np.log(s / pixel_scale)) < _SCALE] + [pixel_scale]
@@ -201,7 +214,7 @@ def _tangent_plane(reference, positions):
             "rotation, scale and parity: 3 are needed"
         )
     plane = _middle(reference.sky, 1.0)
-    return TangentPlane(plane.lon, plane.lat, similarity.robust_similarity(positions, reference.on_plane(plane)[0]))
+    return TangentPlane(plane.lon, plane.lat, similarity.robust_similarity(positions, reference.on_plane(plane).xy))
 
 
 def _check_agreement(label, positions, xy, size):

@@ -67,7 +67,7 @@ def solve(
     motion: str | None = None,
     motion_sigma: float | str | None = None,
     motion_epoch: float | Time | None = None,
-    reference: Table | SkyCoord | StrPath | None = None,
+    reference: Table | SkyCoord | Solution | StrPath | None = None,
     reference_error: float | Quantity | str | None = None,
     epoch: float | Time | None = None,
     pixel_scale: float | None = None,
@@ -142,7 +142,7 @@ def solve(
         None: nothing is known of them.
     motion_epoch : float or `~astropy.time.Time`, optional
         Of the positions in ``stars``; by default the mean of the observations, where they are most precise.
-    reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord` or path, optional
+    reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord`, Solution or path, optional
         Positions with errors: what is known beforehand of its stars, and so of shift, rotation and scale, and of maps
         that the exposures do not determine. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error``
         [mas] and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``parallax``,
@@ -151,6 +151,7 @@ def solve(
         ``star``, the stars of the matches, which are otherwise found by their positions. A column that holds a
         `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch. With `motion` its motions and
         parallaxes are known beforehand too. Errors that prove too small are taken larger, with a warning.
+        A `Solution`, its file or folder: the stars of that, found by their positions, and its plane with its errors.
     reference_error : float, `~astropy.units.Quantity` or "found", optional
         Error per axis of its positions where it states none: mas on the sky, else pixels. Found: the size of its errors
         is the one at which its stars agree with the exposures, and stated errors count relative to one another alone.

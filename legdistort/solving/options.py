@@ -1,7 +1,8 @@
 """Options of `legdistort.solve`, checked before anything is computed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
+from pathlib import Path
 
 import numpy as np
 
@@ -11,10 +12,12 @@ from ..geometry.epochs import year
 from ..inputs.reference_catalogue import read_reference
 from ..matching.matches import alone
 from ..results.settings import Settings
+from ..results.solution import Solution
 from ..runtime.checks import LARGEST, check_choice
 from ..runtime.words import CAMERA, DYNAMIC, ERRORS, GAUGES, LOSSES, METHODS, MOTIONS
 from .choices.degree_choice import AUTO
 from .equations.problem import check_error_floor, check_prior
+from .knowledge.known_stars import known_stars
 
 
 class Unasked:
@@ -181,7 +184,14 @@ def check_reference(reference, *, error=None, epoch=None, pixel_scale=None, meth
         return None, epoch
     if method == "alternating":
         raise InputError("method='alternating' is the published scheme: it takes no reference")
-    return read_reference(reference, error), epoch
+    is_file = isinstance(reference, (str, Path)) and (Path(reference).is_dir() or Path(reference).suffix == ".asdf")
+    solution = Solution.read(reference) if is_file else reference
+    if not isinstance(solution, Solution):
+        return read_reference(reference, error), epoch
+    if error is not None:
+        raise InputError("a solution states the errors of its stars: leave reference_error out")
+    known = known_stars(solution)
+    return replace(known, label=f"the reference {reference}") if is_file else known, epoch
 
 
 def check_tie(names, asked, reference, **tying):
@@ -195,6 +205,11 @@ def check_tie(names, asked, reference, **tying):
         As there; with one exposure for options that compare exposures with one another.
     """
     catalogue, epoch = check_reference(reference, method=asked.method, **tying)
+    if catalogue is not None and catalogue.maps is not None and asked.motion is not None:
+        raise InputError(
+            f"motion={asked.motion!r} with a solution as reference, of whose rates common errors are not kept: "
+            "solve all exposures together, or give its table of stars (stars.ecsv)"
+        )
     if len(names) > 1:
         return catalogue, epoch
     (name,) = names

@@ -107,7 +107,7 @@ class ReferenceTie:
             if count < 2:  # afterwards the plane moves too little for another
                 errors = self._errors(problem, result)
                 directions = self._directions(result.gauge, errors, result.state.positions.T)
-                prior = self._prior(result.gauge, directions) if prior is None else prior
+                prior = self._prior(result, directions) if prior is None else prior
             equations = self._equations(result, directions, errors, prior)
             equations, step, made = self._estimate(equations, near=None if made is None else made.used)
             moved, error = self._move(directions, step, made)
@@ -138,7 +138,10 @@ class ReferenceTie:
                 else "absolute positions may be off by as much; look for mismatched stars, or give a prior",
             )
             rest = ", not settled"
-        unknown = hierarchy.named(equations.determined(made.used)[2], result.gauge, result.state.positions.T)
+        common, open_maps = self._of_reference(result.gauge, prior.n_modes, result.state.positions.T)
+        made = replace(made, covariance=made.covariance + common @ common.T, moves=self.identified.maps is not None)
+        unknown = np.hstack([equations.determined(made.used)[2], open_maps])
+        unknown = hierarchy.named(unknown, result.gauge, result.state.positions.T)
         if problem.terms.n and self.identified.motion is None and made.ratio > _ELSEWHERE:
             raise InputError(
                 f"the stars of {self.label}, which has no proper motions, are off by {np.sqrt(made.ratio):.0f} times "
@@ -285,7 +288,7 @@ class ReferenceTie:
         own = unpacked(errors.star_unknowns)
         seen = used & np.isfinite(own[rows]).all(axis=(1, 2))
         stars, size = rows[seen], 2 * gauge.n_modes
-        equations = self._equations(result, errors.directions, errors, self._prior(gauge, errors.directions))
+        equations = self._equations(result, errors.directions, errors, self._prior(result, errors.directions))
         return catalogue_motions.estimate(
             values[seen] - result.state.stars.T[stars],
             errors.covariance_between(stars, len(own[0])) if len(stars) <= catalogue_map.DENSE else own[stars],
@@ -331,17 +334,27 @@ class ReferenceTie:
             return errors.directions
         return plain_directions(gauge, positions, FEWEST_MODES)
 
-    def _prior(self, gauge, directions):
-        """What is known of the common map beforehand."""
+    def _of_reference(self, gauge, k, positions):
+        """Maps of k modes that the positions of the reference have in common, and unknown ones, as columns (2 k, m)."""
+        if self.identified.maps is None:
+            return np.zeros((2, 2 * k, 0))
+        fit = np.linalg.pinv(gauge.modes_at(positions[self.identified.rows], k).T)
+        each = self.identified.maps, self.identified.unknown
+        return [np.einsum("kn,nam->akm", fit, fields).reshape(2 * k, -1) for fields in each]
+
+    def _prior(self, result, directions):
+        """What is known beforehand of the common map by which this plane and that of the reference differ."""
+        gauge = result.gauge
         n, k = gauge.n_modes, directions.shape[2] // 2
         covariance = np.zeros((2, k, 2, k))
         covariance[:, :n, :, :n] = gauge.covariance.reshape(2, n, 2, n)
         maps = np.zeros((2, k, len(gauge.unknown_maps)))
         for j, each in enumerate(gauge.unknown_maps):
             maps[:, :n, j] = each.map.reshape(2, n)
-        return catalogue_map.map_prior(
-            covariance.reshape(2 * k, -1), maps.reshape(2 * k, -1), directions, tuple(2 * gauge.box[1, ::-1])
-        )
+        common, unknown = self._of_reference(gauge, k, result.state.positions.T)
+        covariance = covariance.reshape(2 * k, -1) + common @ common.T
+        maps = np.hstack([maps.reshape(2 * k, -1), unknown])
+        return catalogue_map.map_prior(covariance, maps, directions, tuple(2 * gauge.box[1, ::-1]))
 
     def _equations(self, result, directions, errors, prior):
         positions = result.state.positions.T

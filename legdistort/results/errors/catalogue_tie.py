@@ -75,6 +75,8 @@ class Tie:
         common map alone.
     agreement : Agreement or None
         None where a file does not have it.
+    moves : bool
+        Whether its stars move with the plane where common maps do, as those of a solution, whose errors these are.
     freedom : float
         Of the residuals of the exposures, taken by the map: what of it they determine, not the reference.
     """
@@ -92,6 +94,7 @@ class Tie:
         default=None, metadata=array("n_reference", 2, 2, unit="pix2", nan=True, covariance=True)
     )
     agreement: Agreement | None = None
+    moves: bool = False
     freedom: float = field(default=0.0, metadata=number(minimum=0))
 
     @property

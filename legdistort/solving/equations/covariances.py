@@ -192,7 +192,14 @@ class Uncertainty:
     def _directions(self, system):
         gauge = self._gauge
         moved = np.stack([system.follow(d)[:2] for d in system.moves[: gauge.n_constraints]], axis=2)
-        return -(moved @ gauge.reach).transpose(1, 0, 2)
+        out = -(moved @ gauge.reach).transpose(1, 0, 2)
+        catalogue = self._problem.terms.catalogue
+        if gauge.tie is not None and gauge.tie.moves and catalogue is not None:
+            precision, values = unpacked(catalogue.precision), gauge.modes_at(self._blocks.stars[:2].T)
+            for k, m in np.ndindex(2, gauge.n_modes):
+                pull = precision[:, :, k].T * values[m]
+                out[:, :, k * gauge.n_modes + m] += system.settle(np.zeros_like(self._blocks.g_exposure), pull)[0][:2].T
+        return out
 
     @cached_property
     def drift_directions(self) -> np.ndarray:
