@@ -584,3 +584,30 @@ def test_without_degrees_of_freedom_residuals_tell_nothing():
         "chi2", "exposures", "place", "time", "degree", "absolute", "duplicates"
     }  # fmt: skip
     assert "no degrees of freedom are left to judge it by" in str(solution.checks[1])
+
+
+def departures(seed, *, prior=True, **setting):
+    """Exposures that `factors` names as odd, and what the check says, of a set made of numpy alone."""
+    data, truth = dense_model.drawn_set(seed, **setting)
+    prior = ld.Prior(truth["static"]) if prior else None
+    solution = ld.solve(drawn_sets.as_matches(data), degree=3, prior=prior, clip=None)
+    sentence = next(check.sentence for check in solution.checks if check.name == "dynamic part")
+    return [t["name"] for t in solution.factors if t["name"].startswith("departure")], sentence
+
+
+@pytest.mark.parametrize("prior", [True, False])
+def test_an_exposure_that_departs_more_than_the_others_is_named(prior):
+    found, sentence = departures(0, prior=prior, odd=10.0)
+    assert found == ["departure of e10"]
+    assert re.search(r"e10 2\d times as far as the others", sentence)
+
+
+def test_exposures_that_depart_alike_or_are_poor_are_not_named(seeds=range(6)):
+    for seed in seeds:
+        assert departures(seed)[0] == []
+        data, truth = dense_model.drawn_set(seed, dynamic=0.02)  # departures smaller than errors of a poor exposure
+        rows = data["exposure"] == 5
+        data["xy"][rows] += 50 * data["err"][rows] * np.random.default_rng(seed).normal(size=(rows.sum(), 2))
+        data["err"][rows] *= 50
+        solution = ld.solve(drawn_sets.as_matches(data), degree=3, prior=ld.Prior(truth["static"]))
+        assert not [t["name"] for t in solution.factors if t["name"].startswith("departure")]

@@ -13,11 +13,11 @@ import numpy as np
 from scipy import special
 
 from ...exceptions import some_of
-from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from .camera_check import camera_check
 from .cures import with_cures
+from .dynamic_check import dynamic_check, significance
 from .known_effects import Observed
 from .limits import GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
@@ -70,7 +70,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     if residuals.dof >= 1 and any(check.state in WRONG for check in made.values()):
         made, explained = with_cures(made, solution, residuals, observed, judged)
     others = (
-        dynamic_check(solution, blocks),
+        dynamic_check(solution, problem, blocks),
         prior_check(solution, problem, state, error=_star_error(residuals)),
         reference_check(solution),
         camera_check(
@@ -299,7 +299,7 @@ def degree_check(solution, residuals, *, shows_static):
                      f"degree {more} would explain {score.rms:.2g} px rms more (typical error of a star "
                      f"{error:.2g} px)",
                      f"--degree {more}, or --degree auto")  # fmt: skip
-    p = _significance(solution, residuals.blocks, top_only=True)
+    p = significance(solution, residuals.blocks, top_only=True)
     if solution.degree > 1 and p > 0.05 and not solution.diagnostics.prior_has_widths:
         return Check("degree", "warn", score.rms, error,
                      f"no exposure has modes of degree {solution.degree} beyond noise",
@@ -309,35 +309,6 @@ def degree_check(solution, residuals, *, shows_static):
         found += " of what changes between exposures; what they have in common would go into the stars"
         return Check("degree", "unknown", score.rms, error, found, _TELL_STATIC)
     return Check("degree", "pass", score.rms, error, found)
-
-
-def _significance(solution, blocks, *, top_only=False):
-    """Probability by chance of the largest distortion of an exposure, shift, rotation and scale taken off."""
-    n, size = len(solution.names), blocks.u.shape[1] // 2
-    best, scale = 1.0, max(1.0, solution.chi2 / max(solution.dof, 1)) * n / max(n - 1, 1)
-    for i, name in enumerate(solution.names):
-        rows = dynamic_basis(solution.estimate.shapes[name], size)
-        if top_only:
-            rows = rows[dynamic_degrees(size) == solution.degree]
-        if not len(rows):
-            continue
-        a = rows @ (solution.coefficients[i] - solution.estimate.prior_mean[i])[:, :size].ravel()
-        t = a @ np.linalg.solve(rows @ np.linalg.inv(blocks.u[i]) @ rows.T, a) / scale
-        best = min(best, n * special.chdtrc(len(rows), t))
-    return best
-
-
-def dynamic_check(solution, blocks):
-    """Is any exposure distorted beyond noise?"""
-    if solution.degree < 1 or solution.settings.static == "fit":
-        return None
-    p = _significance(solution, blocks)
-    static = "the static distortion" if np.any(solution.estimate.prior_mean) else "shift, rotation and scale"
-    if p < FALSE_ALARM:
-        return Check("dynamic part", "pass", p, FALSE_ALARM, f"exposures depart from {static} beyond noise")
-    return Check("dynamic part", "warn", p, FALSE_ALARM,
-                 f"none of {len(solution.names)} exposures departs from {static} beyond noise",
-                 "a lower --degree fits as well, with smaller errors")  # fmt: skip
 
 
 def absolute_check(solution, others):
