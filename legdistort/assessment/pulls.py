@@ -100,7 +100,11 @@ def pulls_of(solution):
 
 def _freedom(solution, table, exposure, star, weight):
     """Degrees of freedom (n,) that are left to every observation."""
-    of_star = weight / np.bincount(star, weight)[star]
+    whole = np.bincount(star, weight)
+    if (tie := solution.gauge.tie) is not None and tie.known is not None:  # what a reference knows of its stars
+        rows = np.searchsorted(solution.estimate.star_names, tie.stars[tie.used])
+        whole[rows[rows < len(whole)]] += 2 / np.einsum("jaa->j", tie.known[tie.used])[rows < len(whole)]
+    of_star = weight / whole[star]
     of_exposure = np.zeros(len(weight))
     x, y = (column_contract.values(table, axis, "pix") for axis in "xy")
     for i, name in enumerate(solution.names):

@@ -118,7 +118,8 @@ def _shapes_check(quality):
     """Are the stars of all exposures alike?"""
     found = quality.exposures if quality else {}
     if len(found) < _FEWEST:
-        return Check("images", "unknown", None, None, f"stars were measured in {len(found)} exposures, too few to "
+        frames = f"{len(found)} exposure{'s' * (len(found) != 1)}"
+        return Check("images", "unknown", None, None, f"stars were measured in {frames}, too few to "
                      "determine whether one differs from the others", "")  # fmt: skip
     names, (fwhm, ellipticity, angle) = list(found), np.array(list(found.values())).T
     stretch = ellipticity * np.exp(2j * np.radians(angle))

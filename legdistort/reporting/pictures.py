@@ -50,7 +50,9 @@ class Gallery:
         return self.drawn[-1]
 
     def steps(self, solution):
-        """What the correction does; none where a distortion folds, or too few stars are left to show it."""
+        """What the correction does; none of one exposure, where a distortion folds, or too few stars show it."""
+        if len(solution) < 2:
+            return None
         try:
             panels = residual_plots.plot_steps(solution, fig=_quick_figure())
         except LegdistortError:

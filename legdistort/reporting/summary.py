@@ -13,9 +13,9 @@ def summarise(solution, *, timings=None):
     """Figures of a solution as plain numbers and strings, as ``--json`` prints them.
 
     ``rms_px``: unweighted rms residual per axis, used observations. ``sigma_px``: the paper's sigma (section 3.4) over
-    the fitted stars, per axis.
+    the fitted stars, per axis; None of one exposure.
     """
-    found, sigma = solution.diagnostics, accuracy.scatter(accuracy.corrected_positions(solution))
+    found, square = solution.diagnostics, accuracy.scatter(accuracy.corrected_positions(solution)) ** 2
     return {
         "n_exposures": len(solution.names),
         "n_stars": int(np.count_nonzero(np.isfinite(solution.estimate.positions[:, 0]))),
@@ -23,7 +23,7 @@ def summarise(solution, *, timings=None):
         "chi2": float(solution.chi2),
         "dof": int(solution.dof),
         "rms_px": float(np.sqrt(np.mean(in_tables.rms(solution) ** 2))),
-        "sigma_px": float(np.sqrt(np.nanmean(sigma**2))),
+        "sigma_px": float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else None,
         "checks": [to_tree(check) for check in solution.checks],
         "gauge": solution.gauge.sentence,
         "unknown": list(solution.gauge.unknown_names),

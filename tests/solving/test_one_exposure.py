@@ -1,5 +1,7 @@
 """One exposure and a catalogue of some of its stars: a distortion, and positions of the others; truth from numpy."""
 
+import json
+
 import dense_model
 import numpy as np
 import pytest
@@ -7,8 +9,11 @@ from astropy.coordinates import SkyCoord
 from astropy.table import Table
 
 import legdistort as ld
+from legdistort.assessment.pulls import pulls_of
 from legdistort.cli.parser import main
 from legdistort.exceptions import InputError, MatchError
+from legdistort.reporting.page import render
+from legdistort.reporting.summary import summarise
 from legdistort.results.errors.catalogue_tie import Tie
 
 SIZE, DEGREE = 2048, 3
@@ -144,3 +149,18 @@ def test_options_that_compare_exposures_are_refused(options, words):
         ld.solve(matches, reference=catalogue, **options)
     with pytest.raises(MatchError, match=r"only one exposure \(e00\)"):
         ld.solve(matches)
+
+
+def test_the_report_has_no_empty_pictures():
+    """Expected residuals count what the catalogue knows of its stars, as those that are there do."""
+    table, catalogue, _ = one_exposure(2)
+    table["flux"] = np.geomspace(1, 100, len(table))
+    solution = ld.solve(ld.Matches.from_table(table, shape=(SIZE, SIZE)), reference=catalogue)
+    shown = pulls_of(solution)
+    assert shown.freedom.sum() == pytest.approx(solution.dof, abs=2)
+    assert np.sum(shown.squares) / shown.freedom.sum() == pytest.approx(1, abs=0.4)
+    summary = json.loads(json.dumps(summarise(solution), allow_nan=False, default=str))
+    assert summary["sigma_px"] is None
+    page = render(solution)
+    assert "registration alone" not in page
+    assert "nan px" not in page

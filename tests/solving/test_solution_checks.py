@@ -602,8 +602,8 @@ def test_an_exposure_that_departs_more_than_the_others_is_named(prior):
     assert re.search(r"e10 2\d times as far as the others", sentence)
 
 
-def test_exposures_that_depart_alike_or_are_poor_are_not_named(seeds=range(6)):
-    for seed in seeds:
+def test_exposures_that_depart_alike_or_are_poor_are_not_named():
+    for seed in range(6):
         assert departures(seed)[0] == []
         data, truth = dense_model.drawn_set(seed, dynamic=0.02)  # departures smaller than errors of a poor exposure
         rows = data["exposure"] == 5
