@@ -73,17 +73,16 @@ def _odd(solution, problem, blocks):
 def _beyond(a, noise, degrees, n_tests):
     """Which of departures (n, k), with variances of their errors and degrees (k,), are odd: row, ratio, chi2 and p."""
     n = len(a)
-    for i in range(n):
-        others, errors = np.delete(a, i, axis=0), np.delete(noise, i, axis=0)
-        square = (a[i] - others.mean(axis=0)) ** 2
-        p = []
-        for degree in np.unique(degrees):
-            of = degrees == degree
-            m = np.count_nonzero(of)
-            whole = np.sum((others - others.mean(axis=0))[:, of] ** 2) / (m * (n - 2))
-            scatter = max(whole - errors[:, of].mean(), 0)
-            square[of] /= scatter + noise[i, of] + whole / (n - 1)
-            p.append(special.fdtrc(m, m * (n - 2), square[of].mean()))
-        p = min(1.0, len(p) * min(p))
-        if p < FALSE_ALARM / n_tests and square.mean() > _ODD**2:
-            yield i, np.sqrt(square.mean()), square.sum(), p
+    off = (a - a.mean(axis=0)) * n / (n - 1)  # from the mean of the others
+    square, p = off**2, []
+    for degree in (each := np.unique(degrees)):
+        of = degrees == degree
+        m = np.count_nonzero(of)
+        whole = (np.sum((a - a.mean(axis=0))[:, of] ** 2) - square[:, of].sum(axis=1) * (n - 1) / n) / (m * (n - 2))
+        errors = (noise[:, of].sum() - noise[:, of].sum(axis=1)) / (m * (n - 1))
+        scatter = np.maximum(whole - errors, 0)
+        square[:, of] /= (scatter + whole / (n - 1))[:, None] + noise[:, of]
+        p.append(special.fdtrc(m, m * (n - 2), square[:, of].mean(axis=1)))
+    p = np.minimum(1, len(each) * np.min(p, axis=0))
+    for i in np.flatnonzero((p < FALSE_ALARM / n_tests) & (square.mean(axis=1) > _ODD**2)):
+        yield i, np.sqrt(square[i].mean()), square[i].sum(), float(p[i])
