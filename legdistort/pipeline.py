@@ -146,7 +146,8 @@ def run(
         Static distortion. "header": that of the headers, see `legdistort.Prior.from_headers`.
     camera : Camera, optional
         Where exposures have several detectors: `ext` is the name of several extensions, or each detector has a file of
-        its own (`legdistort.Camera.of_detectors`). By default the layout of the detectors is that of the headers.
+        its own (`legdistort.Camera.of_detectors`). By default the layout of the detectors is that of the headers
+        to begin with, and found with the rest.
     min_exposures : int
         Stars seen in fewer exposures are not used.
     clip : float or None

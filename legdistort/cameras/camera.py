@@ -48,8 +48,8 @@ IMAGE = "image"
 GSAOI_DEGREE = 6
 #: Size of a pixel of the focal plane of GSAOI [arcsec], about that of its detectors.
 GSAOI_SCALE = 0.0197
-#: They may stick out of the field by this part of it: layouts that were fitted do, by some pixels.
-MARGIN = 0.02
+#: They may stick out of the field by this part of it, of small ones too where headers have them wrong by pixels.
+MARGIN, MARGIN_FITTED = 0.02, 0.1
 _SIDE = 32  # points along a side of a detector that are sought on others
 
 
@@ -128,7 +128,7 @@ class Camera(ShownAsPrinted):
             if np.any(first):
                 detectors = {key: _shifted(each, first) for key, each in detectors.items()}
         field = check_shape(field)
-        outside = [key for key, each in detectors.items() if not _within(each.outline, field)]
+        outside = [key for key, each in detectors.items() if not _within(each, field)]
         if outside:
             raise InputError(
                 f"detector{'s' * (len(outside) > 1)} {', '.join(outside)} of camera {self.name} "
@@ -255,12 +255,18 @@ class Camera(ShownAsPrinted):
         table : `~astropy.table.Table`
             Columns ``detector`` and ``star``. Detectors without a position are in none.
         """
-        keys, detector = np.unique(self.ids(table), return_inverse=True)
-        stars, star = np.unique(np.asarray(table["star"]), return_inverse=True)
-        seen = np.zeros((len(keys), len(stars)), dtype=bool)
+        keys, group = np.array(list(self.detectors)), self.group_of(table)
+        detector = self.ids(table)
+        return [[str(key) for key in keys if key in detector[group == g]] for g in range(group.max(initial=-1) + 1)]
+
+    def group_of(self, table: Table) -> np.ndarray:
+        """Number of the group of detectors (see `groups`) of every row of a table, int (n,)."""
+        _, detector = np.unique(self.ids(table), return_inverse=True)
+        _, star = np.unique(np.asarray(table["star"]), return_inverse=True)
+        seen = np.zeros((detector.max(initial=-1) + 1, star.max(initial=-1) + 1), dtype=bool)
         seen[detector, star] = True
         _, group = connected_components(seen.astype(int) @ seen.T, directed=False)
-        return [[str(key) for key in keys[group == g]] for g in np.unique(group)]
+        return group[detector]
 
     def __repr__(self) -> str:
         ny, nx = self.field
@@ -377,6 +383,9 @@ class Camera(ShownAsPrinted):
     ) -> Camera:
         """Camera from the WCSs of the detectors of one exposure (see `legdistort.cameras.from_wcs`).
 
+        Of several detectors the layout is a start value: its `layout_sigma` is infinite, and `legdistort.solve` finds
+        it, unless it is held (``layout="hold"``).
+
         Parameters
         ----------
         exposures : dict or list of Exposure
@@ -442,9 +451,10 @@ def _shifted(detector, first):
     return replace(detector, layout=layout)
 
 
-def _within(outline, field):
-    size = np.array(field[::-1])
-    return bool(np.all(outline >= -MARGIN * size - 0.5) and np.all(outline <= (1 + MARGIN) * size - 0.5))
+def _within(detector, field):
+    size, outline = np.array(field[::-1]), detector.outline
+    margin = (MARGIN if detector.layout_sigma is None else MARGIN_FITTED) * size
+    return bool(np.all(outline >= -margin - 0.5) and np.all(outline <= size + margin - 0.5))
 
 
 def _overlap(first, second):

@@ -177,7 +177,10 @@ SOLVING = Group(
             "fit one static distortion for all exposures of a detector; of a camera also hold, prior",
             choices=words.CAMERA,
         ),
-        "layout": Option("the same for the layout of the detectors of a camera", choices=words.CAMERA),
+        "layout": Option(
+            "the same for the layout of the detectors of a camera (default: that of headers is fitted)",
+            choices=words.CAMERA,
+        ),
         "dynamic": Option("of a camera: what has a distortion of its own in every exposure", choices=words.DYNAMIC),
         "exposure_degree": Option(
             "with --static fit: degree of what every exposure has for itself (default 1)", type=int

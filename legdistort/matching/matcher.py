@@ -24,7 +24,7 @@ from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE, Flag
 from ..priors.from_headers import describe, header_distortions
 from ..runtime import parallel
-from . import detector_layout
+from . import detector_layout, detector_places
 from .exposure_groups import interlink, link, standing, unite, without
 from .header_poses import HeaderPoses
 from .lattices import warn_of_lattice
@@ -45,6 +45,8 @@ log = logging.getLogger(__name__)
 FEWEST = 5
 #: With a smaller part of hot pixels among the detections of every exposure these are not linked anew without them.
 FEW_HOT = 0.05
+#: How often detectors are placed by the stars that were found with the placing before.
+_MOST_PLACINGS = 4
 #: Larger numbers are no flags: the bits of 32.
 LARGEST_FLAGS = 2.0**32 - 1
 
@@ -81,7 +83,8 @@ def match(
     camera : `legdistort.Camera`, optional
         Where exposures have several detectors, distinguished by the column ``detector``: they are matched as one, the
         focal plane. Without it their layout is that of the headers of `exposures`; without these the dithers determine
-        it, where stars cross from one detector to another.
+        it, where stars cross from one detector to another. Where the layout is not exact (`Detector.layout_sigma`;
+        that of headers is not), such stars are found though it is wrong by some ten pixels and tenths of a degree.
     min_exposures : int
         A star is kept when it was found in that many exposures. Of a single exposure, which a reference catalogue may
         solve, every detection is a star.
@@ -161,32 +164,63 @@ def match(
     table, names = table[~np.isin(table["exposure"], list(copies))], [name for name in names if name not in copies]
     headers = HeaderPoses.from_wcs({n: e.wcs for n, e in (named or {}).items() if e.wcs is not None}, shapes)
 
-    rows = {name: np.flatnonzero(table["exposure"] == name) for name in names}
-    left_out = {n: f"only {len(r)} usable detections of at least {FEWEST}" for n, r in rows.items() if len(r) < FEWEST}
-    kept = [name for name in names if name not in left_out]
-    lists = [_star_list(table[rows[name]], shapes[name]) for name in kept]
-    if len(names) == 1 and kept:
-        log.info("one exposure (%s): every detection is a star; a reference catalogue solves it", names[0])
-        min_exposures, stars = 1, {names[0]: np.arange(len(lists[0]))}
-    else:
-        with parallel.one_blas_thread():  # matrices are small
-            stars = _associate(lists, kept, headers, left_out, options)
-    star = np.full(len(table), -1)
-    for name, labels in stars.items():
-        star[rows[name]] = labels
+    with parallel.one_blas_thread():  # matrices are small
+        label = _label_over_gaps if camera is not None and detector_places.is_free(camera) else _label
+        star, left_out = label(table, names, shapes, headers, options, camera)
     isolated = is_isolated(table, isolation)
     if not isolated.all():
         log.info("%d of %d detections are not isolated and left out", np.count_nonzero(~isolated), len(table))
         star[~isolated] = -1
-    if camera is not None:
+    if camera is not None and len(names) > 1:
         _check_detectors(camera, table, star, shapes)
-    table, star = _keep_common(table, star, min_exposures, left_out)
+    table, star = _keep_common(table, star, 1 if len(names) == 1 else min_exposures, left_out)
     epoch = mean_epoch(e.header for e in named.values()) if named else None
     _add_epochs(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
     matches = _finish(table, star, shapes, headers, left_out, epoch, distortions)
     warn_of_lattice(matches, headers)
     return replace(matches, left_out=copies | left_out, camera=camera)
+
+
+def _label(table, names, shapes, headers, options, camera=None):
+    """Number of the star of every detection, -1 for none, and exposures that are left out, with the reason."""
+    rows = {name: np.flatnonzero(table["exposure"] == name) for name in names}
+    left_out = {n: f"only {len(r)} usable detections of at least {FEWEST}" for n, r in rows.items() if len(r) < FEWEST}
+    kept = [name for name in names if name not in left_out]
+    lists = [_star_list(table[rows[name]], shapes[name]) for name in kept]
+    star = np.full(len(table), -1)
+    if len(names) == 1 and kept:
+        log.info("one exposure (%s): every detection is a star; a reference catalogue solves it", names[0])
+        star[:] = np.arange(len(table))
+        return star, left_out
+    for name, labels in _associate(lists, kept, headers, left_out, options).items():
+        star[rows[name]] = labels
+    return star, left_out
+
+
+def _label_over_gaps(table, names, shapes, headers, options, camera):
+    """The same where the layout of the camera is not exact: labels in that which the stars call for.
+
+    It is sought anew with the stars that were found, as long as more detections become the same star.
+    """
+    keys = {key: c for c, key in enumerate(camera.detectors)}
+    detector = np.array([keys[key] for key in camera.ids(table)])
+    exposure, moved = np.unique(table["exposure"], return_inverse=True)[1], table.copy()
+    found = _label(table, names, shapes, headers, options)
+    for _ in range(_MOST_PLACINGS):
+        xy = np.stack([moved["x"].to_value(u.pix), moved["y"].to_value(u.pix)], axis=1)
+        xy = detector_places.nearer(camera, xy, exposure, detector, found[0])
+        if xy is None:
+            break
+        moved["x"], moved["y"] = xy.T * u.pix
+        try:
+            again = _label(moved, names, shapes, headers, options)
+        except MatchError:
+            break
+        if detector_places.n_tied(again[0]) <= detector_places.n_tied(found[0]):
+            break
+        found = again
+    return found
 
 
 def _check_detectors(camera, table, star, shapes):

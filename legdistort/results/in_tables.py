@@ -28,6 +28,9 @@ def stars(solution):
     table["n"] = np.bincount(index, minlength=len(table))
     if (tie := solution.gauge.tie) is not None and tie.known is not None:
         table["reference_used"] = np.isin(estimate.star_names, tie.stars[tie.used])
+    if solution.camera.has_focal_plane and _are_apart(solution, used):
+        table["group"] = np.full(len(table), -1)
+        table["group"][index] = solution.camera.group_of(used)
     if "flux" in used.colnames:
         with np.errstate(invalid="ignore"):
             table["flux"] = np.bincount(index, used["flux"], len(table)) / table["n"]
@@ -42,6 +45,12 @@ def stars(solution):
             table["sky"] = SkyCoord(table["ra"], table["dec"], **moving, frame="icrs", obstime=obstime)
     table.meta = _meta(solution)
     return column_contract.describe_stars(table)
+
+
+def _are_apart(solution, used):
+    """Whether nothing determines how groups of detectors lie to each other, by the observations used."""
+    errors = solution.estimate.uncertainty.camera
+    return errors is not None and errors.unknown.shape[2] > 0 and len(solution.camera.groups(used)) > 1
 
 
 def stars_at(solution, time):

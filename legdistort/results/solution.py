@@ -176,7 +176,9 @@ class Solution(ShownAsPrinted):
         ``x_err``, ``y_err`` are relative: the errors once a common map of the fitted degree is taken off.
         ``x_err_abs``, ``y_err_abs`` add that map: the mean dynamic distortion of the set and the uncertainty of the
         static one; NaN where they are not known (`Gauge.unknown`). ``x_err_known``, ``y_err_known`` are those after the
-        unknown directions are taken off; infinite where nothing determines how the detectors of a camera lie.
+        unknown directions are taken off; infinite where nothing determines how the detectors of a camera lie. Where no
+        star ties some detectors to others, ``group`` is the number of those that saw it, and ``x_err``, ``y_err`` hold
+        among the stars of a group, once a map that these have in common is taken off.
         Pointing, rotation and scale common to all exposures are those of the nominal
         poses. These errors include them only where a reference ties them. On the sky:
         ``ra``, ``dec`` [deg, ICRS], ``ra_error`` (of ra cos(dec)), ``dec_error`` [mas], ``ra_dec_corr``,

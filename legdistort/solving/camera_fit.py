@@ -29,8 +29,9 @@ _WEAK = 1e-5
 _TOLD = 0.1
 #: Variances below this part of the largest are rounding.
 _ROUNDING = 1e-13
-#: Weight of a change of a layout beside that of a static distortion, where a map can be put into either.
-_LAYOUT_WEIGHT = 0.03
+#: Weights of a change of a layout, its shift and the rest, beside that of a static distortion, where a map can be put
+#: into either: shifts are the least known.
+_SHIFT_WEIGHT, _LAYOUT_WEIGHT = 0.003, 0.03
 #: Steps at most, and their length in standard errors at which they end.
 _STEPS, _SMALL = 10, 0.01
 
@@ -222,7 +223,10 @@ def _errors(fit, step, unknown):
     stars, unknown_stars = np.zeros((len(good), 2, changes.shape[1])), np.zeros((len(good), 2, len(unknown)))
     spread = step.spread[:, good] @ changes
     common = np.linalg.pinv(plain) @ spread
-    stars[good] = (spread - plain @ common).transpose(1, 0, 2)
+    stars[good] = spread.transpose(1, 0, 2)
+    for group in _groups(fit) if len(unknown) else [good]:  # errors are relative to what something ties a star to
+        own = gauge.modes_at(fit.result.state.positions.T[group], gauge.n_modes).T
+        stars[group] -= np.einsum("nm,mak->nak", own @ np.linalg.pinv(own), stars[group])
     motion = widened_all(gauge.motion, fit.problem.degree)
     coefficients = step.response @ changes + motion @ common.reshape(-1, changes.shape[1])
     if len(unknown):
@@ -230,6 +234,14 @@ def _errors(fit, step, unknown):
         moved -= plain @ (np.linalg.pinv(plain) @ moved)
         unknown_stars[good] = (moved / np.sqrt(np.mean(moved**2, axis=(0, 1)))).transpose(1, 0, 2)
     return CameraErrors(step.free, changes, stars, coefficients, unknown_stars)
+
+
+def _groups(fit):
+    """Masks (n_stars,) of the stars of detectors that are tied to one another by stars."""
+    used = fit.matches.table[fit.problem.order][fit.used]
+    group = np.full(fit.problem.n_stars, -1)
+    group[fit.problem.star[fit.used]] = fit.matches.camera.group_of(used)
+    return [group == g for g in range(group.max(initial=-1) + 1)]
 
 
 def _unknown(camera, step):
@@ -287,6 +299,16 @@ def _tell_unknown(matches, step, unknown):
         "another in the next determine how these lie; dither over the gaps, or give uncertainties (layout_sigma)",
         AssumptionWarning,
     )
+
+
+def held(matches, layout, static):
+    """Matches whose camera states as exact what is to be held of it ("hold")."""
+    exact = {"layout_sigma": None, "layout_covariance": None} if layout == "hold" else {}
+    exact |= {"static_sigma": None} if static == "hold" else {}
+    if not exact:
+        return matches
+    detectors = {key: replace(each, **exact) for key, each in matches.camera.detectors.items()}
+    return replace(matches, camera=replace(matches.camera, detectors=detectors))
 
 
 def in_camera(matches, camera):
@@ -387,7 +409,7 @@ def _held(weak, modes):
     modes : ndarray of int, shape (k,)
         That each unknown belongs to.
     """
-    weights = np.where(modes < 3, _LAYOUT_WEIGHT, 1.0)
+    weights = np.select([modes == 0, modes < 3], [_SHIFT_WEIGHT, _LAYOUT_WEIGHT], 1.0)
     return np.eye(len(modes)) - weak.T @ np.linalg.pinv(weak.T * weights[:, None]) * weights
 
 

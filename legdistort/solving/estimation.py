@@ -19,7 +19,7 @@ from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
 from . import minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
-from .camera_fit import CameraFit, Sought, common_widths, with_errors_times
+from .camera_fit import CameraFit, Sought, common_widths, held, with_errors_times
 from .choices import prior_widths
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
@@ -102,7 +102,9 @@ def solve(
         With a camera: fit the static distortion of every detector, common to all exposures, from what is known of it
         on ("prior"; the default where uncertainties are given) or from nothing ("fit", up to `degree`); or "hold" it.
     layout : {None, "hold", "prior", "fit"}
-        The same for the layout of the detectors of a camera. The result is in ``solution.camera``, with its errors.
+        The same for the layout of the detectors of a camera: as exact, with the uncertainties that are stated of it
+        (the default where any are), or without any. That of headers has infinite ones, so that it is fitted by default.
+        The result is in ``solution.camera``, with its errors.
     dynamic : {None, "focal_plane", "detector"}
         With a camera: what an exposure adds is a distortion of the focal plane as a whole (None does the same), or one
         for every detector by itself, which then is an exposure of its own, ``NAME-DETECTOR``, with a pose of its own;
@@ -238,7 +240,7 @@ def _of_detectors(matches, prior, layout, static, dynamic):
     """The matches, of single detectors if they are asked for, what is known of these, and what to do about statics."""
     check_detectors(matches.camera.has_focal_plane, layout, static, dynamic)
     if dynamic != "detector":
-        return matches, prior, static
+        return held(matches, layout, static), prior, static
     if layout is not None:
         raise InputError(
             "with dynamic='detector' every detector of every exposure has a pose of its own: leave layout out"

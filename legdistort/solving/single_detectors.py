@@ -62,7 +62,8 @@ def _known(detector, static):
         return (detector.to_pixels(similarity.apply(back, place)) - place).T
 
     degree = max(basis.degree_of(detector.static.shape[1]), 1)
-    widths = [detector.layout_sigma, detector.static_sigma]
+    placed = detector.layout_sigma is None or np.isinf(detector.layout_sigma).all()  # nothing but its shear counts
+    widths = [None if placed else detector.layout_sigma, detector.static_sigma]
     sigma = None
     if static in (None, "prior") and any(w is not None for w in widths):
         layout, own = (0.0 if w is None else basis.change_degree(w, degree) for w in widths)

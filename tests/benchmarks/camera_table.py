@@ -9,6 +9,11 @@ frames to mosaic, 11 exposures of 512 px detectors, each CPU time the least of s
 
 ``python tests/benchmarks/camera_table.py --calibrate 40``: layouts and static distortions found from dithers alone, and
 from dithers with rolls; errors beside the bound of a dense matrix of all unknowns, over so many draws.
+
+``python tests/benchmarks/camera_table.py --headers 5``: layouts of headers that are wrong, so many seeds each; stars
+that cross from detector to detector, found and all of them, and squared pulls of stars and of the middles of detectors
+after the map that these have in common; where no star crosses, those of the stars of each detector by themselves
+(`tests/header_layouts.py`).
 """
 
 import argparse
@@ -28,6 +33,7 @@ from legdistort.wcs.storage import write_wcs
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import gsaoi_calibration
 import gsaoi_images
+import header_layouts
 
 SIGMA, LEAST = 0.01, 3
 
@@ -152,16 +158,60 @@ def calibrate(draws):
             )
 
 
+def headers(n_seeds):
+    """Print whether stars are found over the gaps, and errors are true, where headers have the detectors elsewhere."""
+    print(f"{'positions':10s} {'off':>5s} {'turned':>7s} {'dither':>7s} {'found':>6s} {'of':>5s}  "
+          f"{'pull^2':>7s} {'layout':>7s}  camera, absolute")  # fmt: skip
+    wrong = [(1.0, 0.0), (2.5, 0.0), (5.0, 0.0), (10.0, 0.1)]
+    rows = [("lists", *each, 80.0) for each in wrong] + [("lists", 2.5, 0.0, 13.0)]
+    for source, off, turn, dither in [*rows, ("images", 2.5, 0.0, 80.0), ("images", 2.5, 0.0, 13.0)]:
+        known = {"off": off, "turn": turn, "dither": dither}
+        found = np.array([_of_headers(source, seed, **known) for seed in range(n_seeds)], dtype=object)
+        n, total = found[:, :2].sum(axis=0)
+        stars, layout = found[:, 2:4].astype(float).mean(axis=0)
+        states = " | ".join(sorted(set(found[:, 4])))
+        row = f"{source:10s} {off:5.1f} {turn:7.1f} {dither:7.0f} {n:6d} {total:5d}  {stars:7.2f} {layout:7.2f}"
+        print(f"{row}  {states}")
+
+
+def _of_headers(source, seed, **known):
+    """Stars found over the gaps, all of them, squared pulls of stars and layout, states of two checks."""
+    night = header_layouts.Night(seed, **known)
+    if source == "lists":
+        matches = ld.match(night.table, exposures=night.exposures)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            night.write(Path(folder))
+            exposures = ld.read_exposures(f"{folder}/e*.fits", ext="SCI")
+            matches = ld.match(ld.measure(exposures), exposures=exposures)
+    solution = ld.solve(matches)
+    true, seen = night.true_stars(solution), {}
+    number = dict(zip(solution.stars["star"], true, strict=True))
+    for star, detector in zip(solution.residuals["star"], solution.residuals["detector"], strict=True):
+        seen.setdefault(star, set()).add(detector)
+    crossing = night.crossing() & set(true.tolist())
+    found = {number[star] for star, detectors in seen.items() if len(detectors) > 1} & crossing
+    apart = "group" in solution.stars.colnames
+    groups = [np.asarray(solution.stars["group"]) == g for g in range(4)] if apart else None
+    layout = np.nan if apart else night.layout_pull(solution.camera)
+    states = {check.name: check.state for check in solution.checks}
+    stars = np.mean(night.pulls(solution, groups=groups))
+    return len(found), len(crossing), stars, layout, f"{states['camera']}, {states['absolute']}"
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=20)
     parser.add_argument("--cost", type=int, default=0, metavar="ROUNDS")
     parser.add_argument("--calibrate", type=int, default=0, metavar="DRAWS")
+    parser.add_argument("--headers", type=int, default=0, metavar="SEEDS")
     warnings.simplefilter("ignore", LegdistortWarning)
     logging.disable(logging.WARNING)
     arguments = parser.parse_args()
     if arguments.cost:
         cost(arguments.cost)
+    elif arguments.headers:
+        headers(arguments.headers)
     elif arguments.calibrate:
         calibrate(arguments.calibrate)
     else:

@@ -6,8 +6,14 @@ from ...results.check import WRONG, Check, FactorTest, state_of
 from .known_effects import DEPARTURES, LAYOUT, STATICS
 from .limits import SEEN, addition_that_shows, as_one
 
+#: Stars that cross, from which on it tells something that they are left out.
+_FEWEST = 4
 #: Columns of the detectors, and their values for all stars, up to which they are looked at.
 _MOST_COLUMNS, _MOST_VALUES = 1000, 30_000_000
+_TIE = (
+    "dithers larger than the gaps, which carry stars from one detector to the others, or a camera file with what is "
+    "known of the layout (layout_sigma); --layout hold takes it as exact"
+)
 _TELL = "dithers larger than the gaps, which carry stars from one detector to the others, test it"
 
 
@@ -31,8 +37,40 @@ def camera_check(solution, residuals, observed, *, camera, error, judged):
     free = np.zeros(1, dtype=bool) if camera is None else camera.free.any(axis=(0, 1))
     held = {LAYOUT: not free[:3].any(), STATICS: not free[3:].any()}
     held = [effect for effect, is_held in held.items() if is_held]
-    stated = _stated(solution, camera and camera.departure)
-    return as_one([_held(held, solution.camera.name, residuals, observed, error, judged), stated])
+    stated, apart = _stated(solution, camera and camera.departure), undetermined(solution)
+    apart = Check("camera", "unknown", None, None, *apart) if apart else None
+    lost = _lost(solution) if LAYOUT in held else None
+    return as_one([_held(held, solution.camera.name, residuals, observed, error, judged), stated, apart, lost])
+
+
+def _lost(solution):
+    """The check of a layout that is held by the stars that cross from detector to detector and are left out for it."""
+    residuals, used = solution.residuals, solution.residuals["used"]
+    crossing, agree = (_crossing(rows["star"], rows["detector"]) for rows in (residuals, residuals[used]))
+    if len(crossing) < _FEWEST or len(agree) > len(crossing) / 2:
+        return None
+    found = (
+        f"{len(crossing) - len(agree)} of {len(crossing)} stars that cross to another detector are left out on one "
+        "of them: they do not agree with the layout that was given"
+    )
+    return Check("camera", "fail", len(agree), len(crossing) / 2, found, LAYOUT.cure)
+
+
+def _crossing(star, detector):
+    """Stars that several detectors see."""
+    pairs = set(zip(np.asarray(star).tolist(), np.asarray(detector).tolist(), strict=True))
+    stars, count = np.unique([star for star, _ in pairs], return_counts=True)
+    return stars[count > 1]
+
+
+def undetermined(solution):
+    """That nothing determines how detectors lie to each other, and the cure; None where something does."""
+    errors = solution.estimate.uncertainty.camera
+    if errors is None or not errors.unknown.shape[2]:
+        return None
+    groups = solution.camera.groups(solution.residuals[solution.residuals["used"]])
+    apart = f" (no star in common: {' | '.join(', '.join(group) for group in groups)})" * (len(groups) > 1)
+    return f"these exposures do not determine how the detectors lie to each other{apart}", _TIE
 
 
 def _held(effects, name, residuals, observed, error, judged):

@@ -15,7 +15,7 @@ from scipy import special
 from ...exceptions import some_of
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
-from .camera_check import camera_check
+from .camera_check import camera_check, undetermined
 from .cures import with_cures
 from .dynamic_check import dynamic_check, significance
 from .known_effects import Observed
@@ -315,17 +315,15 @@ def absolute_check(solution, others):
     """Are absolute positions known, and on what do they rest? With the other checks by name."""
     if solution.gauge.plane is not None:
         return None
+    if apart := undetermined(solution):
+        return Check("absolute", "unknown", len(solution.stars), 0, f"absolute positions are not known: {apart[0]}",
+                     apart[1])  # fmt: skip
     unknown, warning = solution.gauge.unknown_names, solution.gauge.warning
     if unknown:
         sentence, _, cure = warning.partition("; ")
         return Check("absolute", "unknown", len(unknown), 0, sentence, cure)
     stars = solution.stars
     variance = stars["x_err_abs"].value ** 2 + stars["y_err_abs"].value ** 2
-    if not np.isfinite(variance).any():
-        return Check("absolute", "unknown", len(stars), 0,
-                     "absolute positions are not known: these exposures do not determine how the detectors lie",
-                     "give layouts with their uncertainties (layout='prior'), or dithers that carry stars from one "
-                     "detector to the others")  # fmt: skip
     error = float(np.sqrt(np.nanmean(variance) / 2))
     known = f"absolute positions of the stars are known to {error:.2g} px rms per axis"
     return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")

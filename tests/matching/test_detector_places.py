@@ -1,0 +1,58 @@
+"""Stars that cross from detector to detector, where headers have the detectors elsewhere."""
+
+from dataclasses import replace
+
+import header_layouts
+import numpy as np
+import pytest
+
+import legdistort
+from legdistort.matching import detector_places
+
+
+def matched(night, **known):
+    return legdistort.match(night.table, exposures=night.exposures, min_exposures=3, **known)
+
+
+@pytest.mark.parametrize(("seed", "off", "turn", "rolls"), [(2, 10.0, 0.1, (0,)), (3, 5.0, 0.1, (0, 90))])
+def test_stars_cross(seed, off, turn, rolls):
+    """Nearly all of those that several detectors see, and no two that are not one."""
+    night = header_layouts.Night(seed, off=off, turn=turn, rolls=rolls, n=6, n_stars=250)
+    true, found = night.crossing(3), night.found(matched(night))
+    assert len(true) > 20
+    assert len(true & found) >= 0.98 * len(true)
+
+
+def test_an_exact_layout_is_believed():
+    """Detectors of a camera without uncertainties, or small ones, stay where they are; with others they are sought."""
+    night = header_layouts.Night(4, off=5.0, n=5, n_stars=200)
+    camera = legdistort.Camera.of_frames(night.exposures)
+    exact, near, wide = (
+        replace(camera, detectors={key: replace(each, layout_sigma=w) for key, each in camera.detectors.items()})
+        for w in (None, 0.1, 3.0)
+    )
+    assert len(night.found(matched(night, camera=exact))) < 3
+    assert not detector_places.is_free(exact)
+    assert not detector_places.is_free(near)
+    assert detector_places.is_free(wide)
+
+
+def test_what_headers_state_is_a_start_value():
+    night = header_layouts.Night(5, n=2, n_stars=50)
+    camera = legdistort.Camera.of_frames(night.exposures)
+    assert detector_places.is_free(camera)
+    assert all(np.isinf(each.layout_sigma).all() for each in camera.detectors.values())
+    alone = legdistort.Camera.from_exposures([night.exposures[0]])
+    assert alone["1"].layout_sigma is None
+
+
+def test_detectors_without_a_common_star_stay():
+    night = header_layouts.Night(6, dither=10.0, n=4, n_stars=120)
+    assert not night.crossing(2)
+    matches = matched(night)
+    assert not night.found(matches)
+    camera = matches.camera
+    xy = np.stack([matches.table[name].value for name in ("x", "y")], axis=1)
+    exposure = np.unique(matches.table["exposure"], return_inverse=True)[1]
+    detector = np.unique(matches.table["detector"], return_inverse=True)[1]
+    assert detector_places.nearer(camera, xy, exposure, detector, np.asarray(matches.table["star"])) is None

@@ -1,0 +1,127 @@
+"""Layouts of headers, found with everything else; what no star ties is not determined."""
+
+import warnings
+from dataclasses import replace
+
+import header_layouts
+import numpy as np
+import pytest
+
+import legdistort
+from legdistort.exceptions import AssumptionWarning
+
+STATES = ("camera", "absolute")
+
+
+def states(solution):
+    return {check.name: check.state for check in solution.checks if check.name in STATES}
+
+
+@pytest.fixture(scope="module")
+def near():
+    night = header_layouts.Night(11, off=1.0, n=7, n_stars=250)
+    return night, legdistort.match(night.table, exposures=night.exposures)
+
+
+@pytest.fixture(scope="module")
+def far():
+    return header_layouts.Night(11, off=10.0, turn=0.1, n=7, n_stars=250)
+
+
+@pytest.fixture(scope="module")
+def solution(far):
+    return legdistort.solve(legdistort.match(far.table, exposures=far.exposures))
+
+
+def test_it_is_found_by_default(far, solution):
+    """Errors of the stars are true though the layout was wrong by 10 px."""
+    assert solution.settings.layout is None
+    assert far.pulls(solution)[0] == pytest.approx(1, abs=0.4)
+    assert solution.chi2 == pytest.approx(solution.dof, rel=0.06)
+    assert states(solution)["camera"] == "pass"
+    assert "group" not in solution.stars.colnames
+
+
+def test_it_does_not_matter_how_wrong_it_was(near, far, solution):
+    """The same night by headers that are ten times nearer: the same stars after the map that nothing determines."""
+    night, matches = near
+    again = legdistort.solve(matches, layout="fit")
+    a = dict(zip(far.true_stars(solution), solution.estimate.positions, strict=True))
+    b = dict(zip(night.true_stars(again), again.estimate.positions, strict=True))
+    assert a.keys() == b.keys()
+    a, b = (np.array([each[star] for star in sorted(a)]) for each in (a, b))
+    design = np.column_stack([a, np.ones(len(a))])
+    assert np.abs(b - design @ np.linalg.lstsq(design, b, rcond=None)[0]).max() < 2e-3
+    assert np.allclose(again.stars["x_err"].value.mean(), solution.stars["x_err"].value.mean(), rtol=0.01)
+    for key in header_layouts.KEYS:  # what the headers have right of scale and rotation is not given up for shifts
+        assert abs(again.camera[key].place.scale - 1) < 1e-3
+        assert abs(solution.camera[key].place.scale - 1) < 2e-3
+
+
+def test_held(near):
+    """As exact: the stars do not agree with it, and that is said."""
+    solution = legdistort.solve(near[1], layout="hold")
+    assert states(solution)["camera"] == "fail"
+    assert solution.camera["1"].place.errors is None
+    assert "fit" in next(check.cure for check in solution.checks if check.name == "camera")
+
+
+@pytest.fixture(scope="module")
+def apart():
+    return header_layouts.Night(12, off=2.5, dither=12.0, n=6, n_stars=250)
+
+
+@pytest.fixture(scope="module")
+def groups(apart):
+    matches = legdistort.match(apart.table, exposures=apart.exposures)
+    with pytest.warns(AssumptionWarning, match=r"no star in common: 1 \| 2 \| 3 \| 4"):
+        return legdistort.solve(matches)
+
+
+def test_what_no_star_ties_is_not_determined(apart, groups):
+    """Errors are true within the stars of a detector, NaN and infinite beyond; no check passes it."""
+    stars, own = groups.stars, np.asarray(groups.stars["group"])
+    detector = dict(zip(groups.residuals["star"], groups.residuals["detector"], strict=True))
+    assert len({(g, detector[star]) for g, star in zip(own, stars["star"], strict=True)}) == 4
+    assert np.mean(apart.pulls(groups, groups=[own == g for g in range(4)])) == pytest.approx(1, abs=0.15)
+    assert np.isnan(stars["x_err_abs"]).all()
+    assert np.isinf(stars["x_err_known"]).all()
+    assert states(groups) == {"camera": "unknown", "absolute": "unknown"}
+    for check in groups.checks:
+        if check.name in STATES:
+            assert "1 | 2 | 3 | 4" in check.sentence
+            assert "dithers larger than the gaps" in check.cure
+    assert groups.camera["2"].place.errors == (np.inf,) * 3
+
+
+def test_stated_widths_determine_it(apart):
+    """Shifts known to 2.5 px stand for what no star tells: finite errors, no groups."""
+    camera = legdistort.Camera.of_frames(apart.exposures)
+    stated = {key: replace(each, layout_sigma=[5.0, 0.5, 0.5]) for key, each in camera.detectors.items()}
+    matches = legdistort.match(apart.table, exposures=apart.exposures, camera=replace(camera, detectors=stated))
+    solution = legdistort.solve(matches)
+    assert "group" not in solution.stars.colnames
+    assert np.isfinite(solution.stars["x_err_abs"]).all()
+    assert 0.1 < apart.pulls(solution)[0] < 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dither", [80.0, 12.0])
+def test_frames(tmp_path, dither):
+    """From images with headers to the stars: across the gaps if dithers are larger, else within detectors."""
+    night = header_layouts.Night(13, off=2.5, dither=dither, n=8, n_stars=300)
+    night.write(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AssumptionWarning)  # of what is not determined
+        solution = legdistort.run(str(tmp_path / "e*.fits"), out=tmp_path / "out", ext="SCI").solution
+    detectors = {}
+    for star, true in zip(solution.stars["star"], night.true_stars(solution), strict=True):
+        detectors.setdefault(true, set()).update(solution.residuals["detector"][solution.residuals["star"] == star])
+    crossing = {true for true, seen in detectors.items() if len(seen) > 1}
+    if dither > header_layouts.GAP:
+        assert len(crossing & night.crossing()) > 0.9 * len(night.crossing() & detectors.keys())
+        assert night.pulls(solution)[0] == pytest.approx(1, abs=0.4)
+    else:
+        group = np.asarray(solution.stars["group"])
+        assert np.mean(night.pulls(solution, groups=[group == g for g in range(4)])) == pytest.approx(1, abs=0.4)
+        assert states(solution)["absolute"] == "unknown"
