@@ -179,6 +179,21 @@ def detect(frame, fwhm, threshold):
     return np.column_stack([x, y])[star][np.argsort(-ratio[star], kind="stable")], frame
 
 
+def peaks_above(image, limit, reach):
+    """Pixels, x and y, that exceed a limit and are the highest of the square around them.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+    limit : float
+    reach : int
+        Half the side of the square [pix].
+    """
+    y, x = _exceeding(image, limit)
+    peak = _is_highest(image, x, y, reach)
+    return x[peak], y[peak]
+
+
 def _kernel(fwhm):
     """Standard deviation of the kernel [pix]."""
     return _KERNEL * np.sqrt((fwhm / 2.3548) ** 2 + 1 / 12)  # 1/12: the pixel

@@ -14,7 +14,9 @@ class Flag(IntFlag):
     BLENDED = 32  #: another detection within two FWHM (fitted together with it, or its model was subtracted)
     MASKED = 64  #: bad or outlying pixels within one FWHM of the centre were left out of the fit
     SHARED_SHAPE = 128  #: too faint or disturbed for a shape of its own: fitted with that of the frame
-    DEFORMED = 256  #: the shape is not what is usual at this place, or a bright star has none: see `is_deformed`
+    #: The shape is not what is usual at this place, or a bright star has none: see `is_deformed`.
+    #: In a crowd: chi2 of the core above 4.
+    DEFORMED = 256
     DEFECT = 512  #: a hot pixel, a bad column or a cosmic ray within one FWHM of the centre was left out of the fit
 
 

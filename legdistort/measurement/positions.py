@@ -10,9 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from astropy import units as u
 from astropy.table import QTable, vstack
-from scipy.spatial import cKDTree
 
 from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs.exposure_files import listed
@@ -21,6 +19,7 @@ from ..runtime import outputs
 from ..runtime.parallel import map_items
 from . import across_frames, camera_gain
 from .crowding import SHAPELY, crowding, is_deformed
+from .detections import FrameStars, Stars, distinct, empty_table, table_of, with_defects
 from .effective import frame_psf
 from .effective.building import STARS_NEEDED
 from .effective.model import EffectivePSF
@@ -32,15 +31,14 @@ from .profiles import frame_fit, moffat, pixel_noise
 from .profiles.cutouts import Stamps, box_half
 from .profiles.defects import defect_peaks
 from .profiles.location import locate_stars
+from .scene.measuring import is_crowded, measure_crowd
+from .scene.search import SAME
 
 if TYPE_CHECKING:
     from ..inputs.exposures import Exposure
     from ..runtime.annotations import StrPath
 
 log = logging.getLogger(__name__)
-
-_COLUMNS = ("x", "y", "x_err", "y_err", "xy_corr", "flux", "flux_err", "fwhm", "chi2")
-_PIXELS = ("x", "y", "x_err", "y_err", "fwhm")
 
 
 def measure(
@@ -70,6 +68,9 @@ def measure(
     neighbours subtracted. (Photon noise taken from the data instead of a model would bias the fit.) In images
     with stars narrower than 3 pixels the profile is averaged over every pixel.
 
+    In a crowd (more than 5 % of the detections, and ten, have another one within two FWHM) all stars share one PSF, are
+    fitted together, subtracted, and the rest is searched for more (`legdistort.measurement.scene`).
+
     Pixel variances are ``uncertainty**2`` if the exposure has that plane, else the observed variance of the sky (at
     least that of the read noise) plus ``star light / gain``. Where the residuals exceed the noise (reduced chi2 above 1
     by more than chance), errors are scaled up accordingly. With an effective PSF made from the stars of the exposure
@@ -95,7 +96,7 @@ def measure(
         detection limit and fluxes are more precise, and ``DEFORMED`` is not flagged.
     blends : {"together", "alone"}
         Whether stars within two FWHM of each other are fitted together, with one shape and one background, or one by
-        one with the models of the others subtracted.
+        one with the models of the others subtracted, in a crowd too.
     gain, read_noise, saturation : float, optional
         In e-/ADU, e-, ADU; for all exposures instead of their own values.
     errors : {"fit", "injected", "scaled"}
@@ -292,7 +293,7 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
         warn_of_psf(verdicts)
     filled = [_of_frame(one.table, e) for e, one in zip(exposures, found, strict=True) if len(one.table)]
     psfs = {name: one.psf for name, one in zip(names, found, strict=True) if one.psf is not None}
-    return vstack(filled) if filled else _empty(), psfs
+    return vstack(filled) if filled else empty_table(), psfs
 
 
 def _of_frame(table, exposure):
@@ -329,7 +330,7 @@ def _photon_noise(exposure, options):
     """Variance per unit of star light that an exposure determines, None if it is known or there are no stars."""
     exposure = options.with_detector(exposure.read())
     unit = noise_unit(exposure)
-    _, stamps, shape = _stamps(in_working_unit(exposure, unit), options)
+    _, stamps, shape, _ = _stamps(in_working_unit(exposure, unit), options)
     return None if stamps is None or stamps.frame.photon is not None else frame_fit.photon_noise(stamps, shape) / unit
 
 
@@ -423,46 +424,61 @@ class MeasuredExposure(NamedTuple):
 def measure_scaled(exposure, options):
     """What `measure_exposure` gives, errors as the fits state them, of an exposure in the unit of its noise."""
     name, max_stars = exposure.name, options.max_stars
-    psf = options.psf_of(name)
-    frame, stamps, shape = _stamps(exposure, options)
+    frame, stamps, shape, crowd = _stamps(exposure, options)
     hidden = across_frames.hides_most(exposure, frame, np.zeros((0, 2), int) if stamps is None else stamps.centres)
     if stamps is None:
-        return MeasuredExposure(_empty(), None, None, frame_psf.Verdict("moffat", 0), hidden=hidden)
+        return MeasuredExposure(empty_table(), None, None, frame_psf.Verdict("moffat", 0), hidden=hidden)
     fwhm = float(moffat.fwhm(shape))
+    found = measure_crowd(stamps, shape, options, options.psf_of(name)) if crowd else None
+    joint = found is not None
+    if not joint:
+        found = _measure_groups(stamps, shape, options, options.psf_of(name))
+    stamps, stars = found.stamps, found.stars
+    faint = stars.snr < max(LEAST, options.threshold)  # what passed the limit with noise that the whole star lacks
+    stars = stars._replace(flags=stars.flags | np.where(faint, Flag.INSIGNIFICANT, 0))
+    table = table_of(name, stamps, stars)
+    table = table[distinct(table, fwhm, SAME if joint else 0.5)]
+    table["crowding"] = crowding(table, fwhm)
+    table["psf"] = np.full(len(table), found.verdict.psf)
+    if stamps.frame.defects is not None:
+        table = with_defects(table, defect_peaks(exposure.data, stamps.frame))
+    if max_stars is not None:
+        table = table[(table["flags"] & UNUSABLE) == 0][:max_stars]
+    log.info("%s: %d detections, FWHM %.2f px, %s", name, len(table), fwhm, found.verdict.psf)
+    known = exposure.gain or exposure.uncertainty is not None or not len(table)
+    psf = None if found.psf is None else found.psf.named(exposure=name)
+    clean = (stars.flags & UNUSABLE) == 0
+    ratio = camera_gain.contradiction(
+        exposure, stamps.frame, stars.flux[clean], stars.chi2[clean] / np.maximum(stars.dof[clean], 1), found.shown
+    )
+    return MeasuredExposure(table, None if known else found.photon, psf, found.verdict, ratio, shape, hidden)
+
+
+def _measure_groups(stamps, shape, options, psf):
+    """All stars of a frame that is no crowd, in groups of those that touch."""
     fitted = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     measured, verdict = frame_psf.measure_frame(stamps, fitted, shape, psf)
     own_shapes = options.profile == "own"  # other profiles have nothing to compare
     deformed = _is_deformed(stamps, fitted) if own_shapes else np.zeros(len(fitted.flags), dtype=bool)
     stars = _moffat_stars(fitted) if measured is None else _psf_stars(fitted, measured)
-    faint = stars.snr < max(LEAST, options.threshold)  # what passed the limit with noise that the whole star lacks
-    flags = np.where(deformed, Flag.DEFORMED, 0) | np.where(faint, Flag.INSIGNIFICANT, 0)
-    stars = stars._replace(flags=stars.flags | flags)
-    table = _table(name, stamps, stars)
-    table = table[_distinct(table, fwhm)]
-    table["crowding"] = crowding(table, fwhm)
-    table["psf"] = np.full(len(table), verdict.psf)
-    if stamps.frame.defects is not None:
-        table = _with_defects(table, defect_peaks(exposure.data, stamps.frame))
-    if max_stars is not None:
-        table = table[(table["flags"] & UNUSABLE) == 0][:max_stars]
-    log.info("%s: %d detections, FWHM %.2f px, %s", name, len(table), fwhm, verdict.psf)
-    known = exposure.gain or exposure.uncertainty is not None or not len(table)
-    own = None if measured is None else measured.psf.named(exposure=name)
-    clean = (stars.flags & UNUSABLE) == 0
-    ratio = camera_gain.contradiction(
-        exposure, stamps.frame, stars.flux[clean], stars.chi2[clean] / np.maximum(stars.dof[clean], 1),
-        partial(pixel_noise.photon_noise, stamps, fitted.found, fitted.models, moffat.quadrature(fwhm)),
-    )  # fmt: skip
-    return MeasuredExposure(table, None if known else fitted.photon, own, verdict, ratio, shape, hidden)
+    stars = stars._replace(flags=stars.flags | np.where(deformed, Flag.DEFORMED, 0))
+    nodes = moffat.quadrature(float(moffat.fwhm(shape)))
+    shown = partial(pixel_noise.photon_noise, stamps, fitted.found, fitted.models, nodes)
+    return FrameStars(stamps, stars, verdict, None if measured is None else measured.psf, fitted.photon, shown)
 
 
 def _stamps(exposure, options):
-    """An exposure as a frame, stamps around its detections, None without any, and the usual shape of its stars."""
+    """An exposure as a frame, stamps around its detections, the usual shape of its stars, whether it is crowded.
+
+    The stamps are None without any detection.
+    """
     frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
-    if options.max_stars is not None:
+    width = float(moffat.fwhm(shape))
+    crowd = options.blends == "together" and is_crowded(frame, centres, width)
+    if options.max_stars is not None and not crowd:
         centres = centres[: 3 * options.max_stars]  # some will turn out to be hot pixels or saturated
-    half = options.box // 2 if options.box else box_half(float(moffat.fwhm(shape)))
-    return frame, (Stamps(frame, centres, half) if len(centres) else None), shape
+    half = options.box // 2 if options.box else box_half(width)
+    return frame, (Stamps(frame, centres, half) if len(centres) else None), shape, crowd
 
 
 def _is_deformed(stamps, fitted):
@@ -476,26 +492,11 @@ def _is_deformed(stamps, fitted):
     return np.where(shared, fitted.snr > SHAPELY, deformed)
 
 
-class _Stars(NamedTuple):
-    """Fits of all stars of a frame: x, y from the central pixels and their covariance, fluxes, widths, quality."""
-
-    xy: np.ndarray
-    covariance: np.ndarray
-    flux: np.ndarray
-    flux_err: np.ndarray
-    width: np.ndarray
-    chi2: np.ndarray
-    dof: np.ndarray
-    snr: np.ndarray
-    flags: np.ndarray
-    misfit: float = 0.0
-
-
 def _moffat_stars(fitted):
     found = fitted.found
     flux = moffat.flux(found.params, found.covariance)
     width = moffat.fwhm(found.params)
-    return _Stars(
+    return Stars(
         found.params[:, :2], found.covariance[:, :2, :2], *flux, width, found.chi2, found.dof, fitted.snr, fitted.flags
     )
 
@@ -507,70 +508,7 @@ def _psf_stars(fitted, measured):
     flags = known | np.where(lost, Flag.NOT_CONVERGED, 0)
     flux_err = np.sqrt(np.maximum(fit.covariance[:, 2, 2], 0))
     width = moffat.fwhm(fitted.found.params)
-    return _Stars(
+    return Stars(
         fit.params[:, :2], fit.covariance[:, :2, :2], fit.params[:, 2], flux_err, width, fit.chi2, fit.dof,
         measured.snr, flags, measured.misfit,
     )  # fmt: skip
-
-
-def _empty():
-    columns = {name: np.zeros(0) * (u.pix if name in _PIXELS else 1) for name in _COLUMNS}
-    kinds = {"flags": np.zeros(0, dtype=int), "crowding": np.zeros(0), "psf": np.zeros(0, dtype="U1")}
-    return QTable({"exposure": np.zeros(0, dtype="U1"), **columns, **kinds})
-
-
-def _table(name, stamps, stars):
-    """Table of one frame, brightest first; errors scaled where the fit leaves more than noise."""
-    ny, nx = stamps.frame.signal.shape
-    flags, flux, width = stars.flags, stars.flux, stars.width
-    dof = np.maximum(stars.dof, 1)
-    chi2 = stars.chi2 / dof
-    # Near the detection limit the fit is no longer linear (measured at a ratio of 7: errors 8 to 15 % too small).
-    faint = 1 + 5 / np.maximum(stars.snr, 1) ** 2
-    # What all bright stars leave is the error of their PSF: the errors of positions have it, those of fluxes do not.
-    scale, flux_scale = (faint * _scale(c, dof) for c in (chi2 / (1 + (stars.misfit * stars.snr) ** 2 / dof), chi2))
-    error = np.sqrt(np.einsum("nii->ni", stars.covariance))
-    lost = ~(error < stamps.half).all(axis=1)
-    corr = np.where(lost, 0.0, stars.covariance[:, 0, 1] / error.prod(axis=1))
-    error = np.where(lost[:, None], stamps.half, scale[:, None] * error)
-    hot = (flags & Flag.HOT) != 0  # they stay on their pixel: a profile fitted to one pixel wanders off
-    xy = stamps.centres + np.where(hot[:, None], 0.0, stars.xy)
-    to_edge = np.minimum(xy + 0.5, np.array([nx, ny]) - 0.5 - xy).min(axis=1)
-    flags = flags | np.where(lost, Flag.NOT_CONVERGED, 0) | np.where(to_edge < width, Flag.EDGE, 0)
-    columns = (xy[:, 0], xy[:, 1], error[:, 0], error[:, 1], corr, flux, flux_scale * stars.flux_err, width, chi2)
-    named = {key: v * u.pix if key in _PIXELS else v for key, v in zip(_COLUMNS, columns, strict=True)}
-    return QTable({"exposure": np.full(len(xy), name), **named, "flags": flags})[np.argsort(-flux, kind="stable")]
-
-
-def _with_defects(table, peaks):
-    """The table with a row for every defect, flagged, of which a pixel is all that is known."""
-    xy, height, sigma = peaks
-    if not len(xy) or not len(table):
-        return table
-    rows = table[np.zeros(len(xy), dtype=int)]
-    pixel, none = np.full(len(xy), 12**-0.5), np.zeros(len(xy))
-    values = (xy[:, 0].astype(float), xy[:, 1].astype(float), pixel, pixel, none, height, sigma, none + 1, none + 1)
-    for key, value in zip(_COLUMNS, values, strict=True):
-        rows[key] = value * u.pix if key in _PIXELS else value
-    rows["flags"], rows["crowding"] = int(Flag.HOT | Flag.DEFECT), none
-    table = vstack([table, rows])
-    return table[np.argsort(-table["flux"], kind="stable")]
-
-
-def _scale(chi2, dof):
-    """Factor on errors; three standard deviations of chi2 are chance, which must not raise those of good fits."""
-    return np.sqrt(np.maximum(1, chi2 - 3 * np.sqrt(2 / dof)))
-
-
-def _distinct(table, fwhm):
-    """Rows to keep: of detections that ended on the same star the better one; flags the close pairs that stay."""
-    tree = cKDTree(np.column_stack([table["x"].value, table["y"].value]))
-    keep = np.ones(len(table), dtype=bool)
-    unusable = (table["flags"] & UNUSABLE) != 0
-    for i, j in sorted(tree.query_pairs(0.5 * fwhm)):  # i < j: i is the brighter
-        if keep[i] and keep[j]:
-            keep[i if unusable[i] and not unusable[j] else j] = False
-    close = tree.query_pairs(2 * fwhm, output_type="ndarray")
-    close = close[keep[close].all(axis=1)]
-    table["flags"][close.ravel()] |= Flag.BLENDED
-    return keep

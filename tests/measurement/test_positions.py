@@ -193,7 +193,8 @@ def test_blends_fitted_together_are_better():
     assert np.all(1.4826 * alone[2:] > 1.3)
 
 
-def test_isolated_stars_of_a_crowded_field_stay_calibrated():
+@pytest.mark.parametrize("blends", ["alone", "together"])
+def test_isolated_stars_of_a_crowded_field_stay_calibrated(blends):
     """One star every 4 FWHM: those without another one in 3 FWHM, detected or not."""
     rng, fwhm, size, z = np.random.default_rng(14), 3.5, 450, []
     n = int((size / (4 * fwhm)) ** 2)
@@ -201,14 +202,16 @@ def test_isolated_stars_of_a_crowded_field_stay_calibrated():
     for i in range(2):
         xy = rng.uniform(5, size - 5, (n, 2))
         frame = observe(image((size, size), xy, rng.permutation(flux), fwhm), rng)
-        table = usable(measure(Exposure(f"f{i}", frame, gain=GAIN)))
+        table = usable(measure(Exposure(f"f{i}", frame, gain=GAIN), blends=blends))
         star = identify(table, xy)
         lonely = cKDTree(xy).query(xy, k=2)[0][:, 1] > 3 * fwhm
         rows = (star >= 0) & lonely[star]
         z.append(((positions(table) - xy[star]) / errors(table))[rows])
     z = np.concatenate(z)
     assert len(z) > 200
-    assert np.std(z) == pytest.approx(1, abs=0.08)
+    # the errors of a crowd allow for neighbours that are not seen: of these stars nobody knows that they have none
+    low, high = (0.92, 1.08) if blends == "alone" else (0.7, 1.08)
+    assert low < np.std(z) < high
 
 
 def test_groups_are_those_of_photutils():

@@ -92,21 +92,45 @@ def measure_frame(stamps, fitted, shape, psf):
     if not isinstance(psf, str):
         fit = fit_all(stamps, fitted, started(fitted, psf), psf, models=fitted.models)
         return measure_with(stamps, fitted, fit, psf), Verdict(psf.source)
+    first, rows, verdict = judged(stamps, fitted, shape, psf)
+    if first is None:
+        return None, verdict
+    built, start = make_psf(stamps, fitted, first, rows)
+    return measure_with(stamps, fitted, start, built.psf, built), verdict
+
+
+def judged(stamps, fitted, shape, psf):
+    """Whether an effective PSF is asked for and can be made, or describes the stars better than Moffat profiles.
+
+    Parameters
+    ----------
+    stamps, fitted, shape
+        As of `measure_frame`; the stars from which a PSF can be made suffice.
+    psf : {"auto", "moffat", "effective"}
+
+    Returns
+    -------
+    first : `~legdistort.measurement.effective.building.Built` or None
+        A PSF from some of the stars; None if the Moffat profiles stand.
+    rows : ndarray of int
+        Stars from which a PSF can be made.
+    verdict : Verdict
+    """
+    none = np.zeros(0, dtype=int)
     if psf == "moffat":
-        return None, Verdict("moffat")
+        return None, none, Verdict("moffat")
     rows = usable_stars(stamps, fitted, float(moffat.fwhm(shape)))
     if len(rows) < building.STARS_NEEDED:
-        return None, Verdict("moffat", len(rows))
+        return None, none, Verdict("moffat", len(rows))
     if psf == "auto" and _leaves_nothing(fitted, rows):
-        return None, Verdict("moffat", len(rows), decided=True)
+        return None, none, Verdict("moffat", len(rows), decided=True)
     # too few to be divided: then the stars that make the PSF judge it, too
     brightest = rows[:_DECIDE]
     making, judging = (brightest[1::2], brightest[::2]) if len(rows) >= 2 * building.STARS_NEEDED else (rows, rows)
     first = _first_psf(stamps, fitted, making)
     if psf == "auto" and not _is_better(stamps, fitted, first.psf, judging):
-        return None, Verdict("moffat", len(rows), decided=True)
-    built, start = make_psf(stamps, fitted, first, rows)
-    return measure_with(stamps, fitted, start, built.psf, built), Verdict("effective", len(rows), decided=True)
+        return None, none, Verdict("moffat", len(rows), decided=True)
+    return first, rows, Verdict("effective", len(rows), decided=True)
 
 
 def _chi2_of_moffat(fitted, rows):

@@ -227,6 +227,29 @@ class EffectivePSF(ShownAsPrinted):
         r = np.hypot(u - offsets[:, :1], v - offsets[:, 1:])
         return light + self.halo * np.cos(np.pi / 2 * np.clip(2 * r / self.reach - 1, 0, 1)) ** 2
 
+    def light(
+        self, params: np.ndarray, centres: np.ndarray, half: int, *, slopes: bool = False
+    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
+        """Light of stars on square stamps around pixels, without the halo; (n, npix), rows (y) first.
+
+        Parameters
+        ----------
+        params : ndarray, shape (n, 3)
+            x, y of the middle of the grid, from the central pixels of the stamps, flux. Their kind is that of the
+            results.
+        centres : ndarray of int, shape (n, 2)
+            Central pixels (x, y).
+        half : int
+            Stamps reach from -half to half.
+        slopes : bool
+            Whether to give the derivatives by x, y and flux too, (n, 3, npix).
+        """
+        flux, grids = params[:, 2:3], self.grids(centres + params[:, :2])
+        if not slopes:
+            return flux * splines.on_stamps(grids, params[:, :2], half, self.spacing)
+        value, by_x, by_y = splines.on_stamps(grids, params[:, :2], half, self.spacing, slopes=True)
+        return flux * value, np.stack([flux * by_x, flux * by_y, value], axis=1)
+
     @classmethod
     def from_array(
         cls, data: ArrayLike, *, oversampling: float, positions: ArrayLike | None = None, source: str = "array"

@@ -76,9 +76,9 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
     """
     width = float(moffat.fwhm(shape))
     nodes = moffat.quadrature(width)
-    found, models, noise = _first_pass(stamps, shape, nodes)
+    found, models, noise = first_pass(stamps, shape, nodes)
     radius = min(2 * width, stamps.half) if blends == "together" else 0.0
-    hot, weights = _is_hot(stamps, found, models, stamps.good), None
+    hot, weights = is_hot(stamps, models, found.params[:, 7:], stamps.good), None
     done = hot & (moffat.fwhm(found.params) < 0.6 * width)
     centre, sigma = shape, SHAPE_SIGMA
     for last in (False, True):
@@ -95,14 +95,14 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
         found = fit_groups(found, labels, pixels, start, stamps=stamps, centre=centre, fitting=fitting)
         found = _without_wide(stamps, found, shape)
         models = stamps.models(found.params, nodes)
-        done = _is_hot(stamps, found, models, weights > 0)
+        done = is_hot(stamps, models, found.params[:, 7:], weights > 0)
         hot = done | (hot if sigma is HELD else moffat.fwhm(found.params) < 0.6 * width)
     wild = _is_wild(found, width) & ~done
     if wild.any():
         known = np.broadcast_to(centre, (len(hot), 4))[wild]
         found = _share_shape(stamps.data - models[1], weights, found, wild, shape=known, nodes=nodes)
         models[0][wild] = moffat.evaluate(found.params[wild], stamps.half, nodes)
-        hot[wild] |= _is_hot(stamps, found, models, weights > 0)[wild]
+        hot[wild] |= is_hot(stamps, models, found.params[:, 7:], weights > 0)[wild]
     snr = _ratio(models, weights)
     flags = _flags(stamps, found, weights > 0, (wild, hot, snr), width)
     return FrameFit(found, flags, snr, models, labels, *noise)
@@ -110,11 +110,28 @@ def fit_stars(stamps, shape, *, profile="own", blends="together"):
 
 def photon_noise(stamps, shape):
     """Variance per unit of star light, as `fit_stars` takes it, by its first pass alone."""
-    return _first_pass(stamps, shape, moffat.quadrature(float(moffat.fwhm(shape))))[2][1]
+    return first_pass(stamps, shape, moffat.quadrature(float(moffat.fwhm(shape))))[2][1]
 
 
-def _first_pass(stamps, shape, nodes):
-    """Stars fitted with the noise of the sky, models from that, and the noise of the pixels that they determine."""
+def first_pass(stamps, shape, nodes):
+    """Stars fitted one by one with the noise of the sky alone.
+
+    Parameters
+    ----------
+    stamps : `~legdistort.measurement.profiles.cutouts.Stamps`
+    shape : ndarray, shape (4,)
+        Of the stars of the frame.
+    nodes : tuple
+        From `legdistort.measurement.profiles.moffat.quadrature`.
+
+    Returns
+    -------
+    found : `~legdistort.measurement.profiles.levenberg_marquardt.Fit`
+    models : tuple of ndarray, shape (n, npix)
+        Every star on its own stamp, and the sum of all others there.
+    noise : tuple
+        From `legdistort.measurement.profiles.pixel_noise.pixel_noise`.
+    """
     found = _without_wide(stamps, fit_once(stamps, shape, nodes)[0], shape)
     models = stamps.models(found.params, nodes)
     return found, models, pixel_noise(stamps, found, models, nodes)
@@ -134,13 +151,22 @@ def _ratio(models, weights):
 
 def _flags(stamps, found, good, troubles, width):
     wild, hot, snr = troubles
-    near = stamps.near(found.params, width)
-    seen = stamps.inside & stamps.cut(stamps.frame.good)
     raised = {
         Flag.SHARED_SHAPE: wild,
         Flag.HOT: hot,
         Flag.NOT_CONVERGED: _is_wild(found, width),
         Flag.INSIGNIFICANT: snr < LEAST,
+    }
+    return sum(np.where(stars, flag, 0) for flag, stars in raised.items()) + pixel_flags(
+        stamps, found.params, good, width
+    )
+
+
+def pixel_flags(stamps, params, good, width):
+    """Flags of stars for what is wrong with the pixels within one width; `good` (n, npix) are those that count."""
+    near = stamps.near(params, width)
+    seen = stamps.inside & stamps.cut(stamps.frame.good)
+    raised = {
         Flag.MASKED: (near & stamps.inside & ~good & ~stamps.saturated).any(axis=1),
         Flag.DEFECT: (near & stamps.defects).any(axis=1),
         Flag.SATURATED: (near & stamps.saturated).any(axis=1),
@@ -172,10 +198,10 @@ def _separate(stamps, found, models, labels, noise, nodes):
     )[:2]  # fmt: skip
 
 
-def _is_hot(stamps, found, models, good):
-    """Stars explained better by one bright pixel than by a profile."""
+def is_hot(stamps, models, background, good):
+    """Whether stars are explained better by one bright pixel than by their models, with a background (n, 1); (n,)."""
     data, weights = stamps.data - models[1], weighted(good, stamps.variance)
-    residual = data - models[0] - found.params[:, 7:]
+    residual = data - models[0] - background
     return point_chi2(data, weights)[:, 0] <= (weights * residual**2).sum(axis=1)
 
 

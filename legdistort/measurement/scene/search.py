@@ -1,0 +1,163 @@
+"""What is found is subtracted, the rest searched for more, and all fitted again until nothing changes."""
+
+import logging
+
+import numpy as np
+from scipy.signal import fftconvolve
+from scipy.spatial import cKDTree
+
+from ..detection import peaks_above
+from . import splitting
+
+_PASSES = 8
+_CHANGED = 0.002  # of the stars: a pass that changes less is the last
+_AGAIN = 0.5  # FWHM from what was dropped: it is not tried again
+_BESIDE = 0.7  # FWHM from a star: a peak there is a matter of splitting it
+#: FWHM: two stars nearer than that are one.
+SAME = 0.2
+_DISTURBS = 1.5  # FWHM: a change within it is a reason to look at a star anew
+_ALONE = 0.8  # of the threshold, asked of a star where its neighbours are unknown too
+_COVERED = 0.2  # part of a star, by its weight in the detection, on good pixels
+_KERNEL = 1.3  # FWHM, radius of what is looked for
+_STARTING = 3  # passes in which PSF and sky are found anew
+
+log = logging.getLogger(__name__)
+
+
+def search(scene, threshold, retune):
+    """Search a scene for more stars, until a pass changes next to nothing.
+
+    Parameters
+    ----------
+    scene : `~legdistort.measurement.scene.joint_fit.Scene`
+        With the stars that are known.
+    threshold : float
+        Signal-to-noise ratio.
+    retune : callable, optional
+        ``retune(scene)`` gives it the PSF that its stars show; by default it is known.
+    """
+    state = _Search(scene, threshold)
+    for k in range(_PASSES):
+        state.active = scene.fit(state.active, 4)
+        if k < _STARTING:
+            scene.update_sky()
+            if retune is not None:
+                retune(scene)
+            state.active = scene.fit(np.ones_like(state.active), 2)
+            scene.update_sky()
+        scene.update_misfit()
+        changed = state.drop()
+        places, flux = candidates(scene, threshold)
+        fresh = _away(places, state.dropped, _AGAIN * scene.psf.fwhm) & _away(
+            places, scene.xy, _BESIDE * scene.psf.fwhm
+        )
+        if k >= _STARTING - 1:
+            changed += state.split(places[~fresh])
+        changed += state.add(places[fresh], flux[fresh])
+        log.debug("pass %d: %d stars, %d changes", k + 1, len(scene.flux), changed)
+        if k >= _STARTING and changed < _CHANGED * len(scene.flux):
+            break
+    scene.fit(np.ones(len(scene.flux), dtype=bool), 3)
+    state.drop()
+
+
+class _Search:
+    """A scene with what has been tried: stars to be fitted again, stars that are beyond doubt, places."""
+
+    def __init__(self, scene, threshold):
+        self.scene, self.threshold = scene, threshold
+        self.active, self.sure = np.ones(len(scene.flux), dtype=bool), np.zeros(len(scene.flux), dtype=bool)
+        self.dropped, self.tried = np.zeros((0, 2)), np.zeros((0, 2))
+
+    def drop(self):
+        """Stars that are none taken off; their number."""
+        scene = self.scene
+        lost = ~_stand(scene, self.threshold, self.sure)
+        gone = scene.xy[lost]
+        scene.remove(lost)
+        self.active, self.sure = self.active[~lost], self.sure[~lost]
+        self.dropped = np.vstack([self.dropped, gone])
+        self._disturb(gone)
+        return len(gone)
+
+    def add(self, places, flux, *, sure=False):
+        """New stars; their number."""
+        self.scene.add(places, flux)
+        self.active = np.append(self.active, np.ones(len(flux), dtype=bool))
+        self.sure = np.append(self.sure, np.full(len(flux), sure))
+        self._disturb(places)
+        return len(flux)
+
+    def split(self, peaks):
+        """Stars replaced by two where that explains more, alone and together with their neighbours; their number."""
+        scene = self.scene
+        rows = splitting.doubtful(scene, peaks, scene.snr()) & _away(scene.xy, self.tried, _AGAIN * scene.psf.fwhm)
+        rows = np.flatnonzero(rows)
+        self.tried = np.vstack([self.tried, scene.xy[rows]])
+        params, gain = splitting.pairs(scene, rows)
+        two = gain > splitting.GAIN
+        rows, params = rows[two], params[two]
+        if not len(rows):
+            return 0
+        before, n = (scene.xy[rows], scene.flux[rows]), len(scene.flux)
+        chi2 = scene.chi2_around(before[0])
+        scene.set(rows, params[:, 0, :2], params[:, 0, 2])
+        scene.add(params[:, 1, :2], params[:, 1, 2])
+        new = np.zeros(len(scene.flux), dtype=bool)
+        new[rows] = new[n:] = True
+        scene.fit(scene.around(new), 4)
+        back = chi2 - scene.chi2_around(before[0]) < splitting.GAIN
+        scene.set(rows[back], before[0][back], before[1][back])
+        places, flux = scene.xy[n:][~back], scene.flux[n:][~back]
+        scene.remove(np.arange(len(scene.flux)) >= n)
+        self.sure[rows[~back]] = True
+        return self.add(places, flux, sure=True)
+
+    def _disturb(self, places):
+        """What is near a change is fitted again, and may be tried again."""
+        reach = _DISTURBS * self.scene.psf.fwhm
+        self.active |= ~_away(self.scene.xy, places, reach)
+        self.tried = self.tried[_away(self.tried, places, reach)]
+
+
+def candidates(scene, threshold):
+    """Peaks of what is left that look like stars: places (n, 2), of whole pixels, and fluxes (n,)."""
+    half = int(np.ceil(_KERNEL * scene.psf.fwhm))
+    middle = np.array([scene.light.shape[::-1]]) // 2
+    kernel = scene.psf.light(np.array([[0.0, 0.0, 1.0]], dtype=np.float32), middle, half)[0]
+    kernel = np.maximum(kernel, 0).reshape(2 * half + 1, -1)[::-1, ::-1].astype(np.float32)
+    weights = scene.weights
+    signal = fftconvolve(weights * scene.residual.astype(np.float32), kernel, mode="same")
+    norm = fftconvolve(weights, kernel**2, mode="same")
+    seen = norm > _COVERED * (kernel**2).sum() * np.median(weights)
+    bright = ~seen & (weights > 0)  # under bright stars weights are small, and tell nothing of what is covered
+    if bright.any():
+        seen |= fftconvolve(scene.good.astype(np.float32), kernel**2, mode="same") > _COVERED * (kernel**2).sum()
+    ratio = np.where(seen, signal / np.sqrt(np.maximum(norm, 1e-12 * norm.max())), 0).astype(np.float32)
+    x, y = peaks_above(ratio, threshold, max(1, int(scene.psf.fwhm / 2)))
+    return np.column_stack([x, y]).astype(float), (signal / np.maximum(norm, 1e-30))[y, x]
+
+
+def _away(places, others, distance):
+    """Whether places are farther than a distance from all others; (n,)."""
+    if not len(others) or not len(places):
+        return np.ones(len(places), dtype=bool)
+    return np.isinf(cKDTree(others).query(places, distance_upper_bound=distance)[0])
+
+
+def _stand(scene, threshold, sure):
+    """Stars that stay: significant by themselves and beside their neighbours, and no two in one place; (n,)."""
+    if not len(scene.flux):
+        return np.ones(0, dtype=bool)
+    ratio = scene.flux / np.sqrt(np.maximum(scene.covariance()[:, 2, 2], 1e-30))
+    doubtful = ~sure & (ratio < _ALONE * threshold)
+    # of stars that leave each other undetermined one goes at a time: two lights may have been fitted with three
+    i, j = cKDTree(scene.xy).query_pairs(scene.psf.fwhm, output_type="ndarray").T
+    both = doubtful[i] & doubtful[j]
+    doubtful[np.where(ratio[i] < ratio[j], j, i)[both]] = False
+    stay = (scene.snr() > threshold) & ~doubtful
+    ny, nx = scene.light.shape
+    stay &= ((scene.xy > -1.5) & (scene.xy < (nx + 0.5, ny + 0.5))).all(axis=1)
+    i, j = cKDTree(scene.xy).query_pairs(SAME * scene.psf.fwhm, output_type="ndarray").T
+    stay[np.where(scene.flux[i] < scene.flux[j], i, j)] = False
+    return stay
