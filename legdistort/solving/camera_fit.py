@@ -302,7 +302,9 @@ def _tell_unknown(matches, step, unknown):
 
 
 def held(matches, layout, static):
-    """Matches whose camera states as exact what is to be held of it ("hold")."""
+    """Matches whose camera states as exact what is to be held of it ("hold"); all that one exposure is not asked of."""
+    if len(matches.names) == 1:  # no star goes from one detector to another
+        layout, static = layout or "hold", static or "hold"
     exact = {"layout_sigma": None, "layout_covariance": None} if layout == "hold" else {}
     exact |= {"static_sigma": None} if static == "hold" else {}
     if not exact:

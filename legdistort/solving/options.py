@@ -215,7 +215,8 @@ def check_tie(names, asked, reference, **tying):
     (name,) = names
     if catalogue is None:
         raise alone(name)
-    comparing = {"errors": asked.errors != "stated", "degree": asked.chooses_degree, "static": asked.static == "fit"}
+    comparing = {"errors": asked.errors != "stated", "degree": asked.chooses_degree}
+    comparing |= {option: getattr(asked, option) in ("fit", "prior") for option in ("static", "layout")}
     comparing |= {option: getattr(asked, option) is not None for option in ("validate", "motion")}
     for option in filter(comparing.get, comparing):
         raise InputError(

@@ -3,6 +3,7 @@
 import json
 
 import dense_model
+import header_layouts
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
@@ -130,6 +131,38 @@ def test_one_frame_runs_with_a_catalogue(tmp_path, capsys):
     nearest = np.argmin(np.hypot(*(found[:, None] - place[None]).transpose(2, 0, 1)), axis=1)
     off = (found - sim.truth.positions[nearest]) / stated(solution)
     assert np.sqrt(np.mean(off**2)) < 1.5
+
+
+def test_an_exact_prior_does_not_hold_the_distortion_of_a_single_exposure():
+    """Nothing tells how far it departs from that, so that the catalogue decides."""
+    solution, true, _ = solved(0, prior=ld.Prior(np.zeros((2, 10))))
+    assert np.sqrt(np.mean(((solution.estimate.positions - true) / stated(solution)) ** 2)) < 1.4
+
+
+def test_one_exposure_of_a_camera_keeps_the_layout_of_its_headers():
+    night = header_layouts.Night(1, off=0.0, n=1)
+    table = Table(night.table)
+    if "star" in table.colnames:
+        table.remove_column("star")
+    rng = np.random.default_rng(0)
+    place = night.sky + 0.01 * rng.normal(size=night.sky.shape)
+    catalogue = Table({"x": place[:, 0], "y": place[:, 1], "x_err": np.full(len(place), 0.01)})
+    catalogue["y_err"] = 0.01
+    matches = ld.match(table, exposures=night.exposures)
+    solution = ld.solve(matches, reference=catalogue)
+    assert solution.chi2 / solution.dof == pytest.approx(1, abs=0.35)
+    assert np.isfinite(solution.stars["x_err_abs"]).all()
+    with pytest.raises(InputError, match="layout='fit' compares exposures"):
+        ld.solve(matches, reference=catalogue, layout="fit")
+
+
+def test_no_cure_is_named_that_is_refused():
+    table, catalogue, _ = one_exposure(0)
+    table["x_err"] = table["y_err"] = 0.08
+    solution = ld.solve(ld.Matches.from_table(table, shape=(SIZE, SIZE)), reference=catalogue)
+    chi2 = next(check for check in solution.checks if check.name == "chi2")
+    assert chi2.state in ("warn", "fail")
+    assert "--errors" not in chi2.cure
 
 
 @pytest.mark.parametrize(

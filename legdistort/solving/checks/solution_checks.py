@@ -67,7 +67,8 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     judged = partial(_by_residuals, solution, times=times)
     made, explained = judged(residuals), ()
     observed = Observed(problem, state, solution.residuals[problem.order], times[0])
-    if residuals.dof >= 1 and any(check.state in WRONG for check in made.values()):
+    several = problem.n_exposures > 1  # errors are not found from one
+    if several and residuals.dof >= 1 and any(check.state in WRONG for check in made.values()):
         made, explained = with_cures(made, solution, residuals, observed, judged)
     others = (
         dynamic_check(solution, problem, blocks),

@@ -177,13 +177,16 @@ def _taken_back(problem, motion, box, shared_shears):
 def _static_variance(problem, others, group, shared):
     """Variance (n_groups, K) of the static distortion of every detector: infinite where it is not known beforehand.
 
-    Where exposures share it and its uncertainty is not stated, it is sought and not known.
+    Where exposures share it and its uncertainty is not stated, it is sought and not known; neither is that of a single
+    exposure, from which it may depart by any amount, unless widths say by how much.
     """
     sigma = np.zeros((problem.n_exposures, 2, problem.n_modes)) if problem.mean_sigma is None else problem.mean_sigma
     if shared:
         sigma = np.where(sigma > 0, sigma, np.inf)
     out = np.zeros((group.max() + 1, others.shape[1]))
     np.maximum.at(out, group, row_variances(others, sigma.reshape(problem.n_exposures, -1)))
+    if problem.n_exposures == 1 and not problem.has_widths(0):  # nothing tells how far a single exposure departs
+        out[out == 0] = np.inf
     return out
 
 
