@@ -101,8 +101,9 @@ def identify(reference, names, positions, *, flux=None, sky=None, pixel_scale=No
     else:
         try:
             mine, theirs = _on_plane(reference, reference.on_plane(sky).xy, positions[rows], flux)
-        except InputError:  # another plane of this field
-            found = None if reference.xy is None else _turned(reference, positions[rows], flux)
+        except InputError:  # the plane of a solution of its own
+            is_own = reference.maps is not None and reference.xy is not None
+            found = _turned(reference, positions[rows], flux) if is_own else None
             if found is None:
                 raise
             (mine, theirs), sky = found, None

@@ -513,8 +513,8 @@ def test_errors_on_the_plane_follow_east_and_north():
     """ra_error belongs to ra cos(dec); near the pole the ellipse turns with the right ascension."""
     table = Table({"ra": [0.0, 90.0], "dec": [89.9, 89.9], "ra_error": [3.0] * 2, "dec_error": [1.0] * 2})
     plane = TangentPlane(0.0, 90.0, np.eye(2, 3) / 3600)  # 1 arcsec a pixel; at the pole xi, eta turn with ra
-    *_, covariance = read_reference(table).on_plane(plane)
-    errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) * 1000
+    found = read_reference(table).on_plane(plane)
+    errors = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)) * 1000
     assert_allclose(errors, [[3, 1], [1, 3]], rtol=1e-4)
 
 

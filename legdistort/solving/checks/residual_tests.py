@@ -103,7 +103,7 @@ class Residuals:
         self.released, held = self._released()
         e = self._whiten(blocks.residual)
         self.whitened = e - self.released @ (np.einsum("anm,an->m", self.released, e) - held)
-        self.dof = dof - float(np.sum(self.released**2))
+        self.dof = dof - round(float(np.sum(self.released**2)), 6)  # a whole number where no reference holds stars
         self.squares = np.sum(self.whitened**2, axis=0)
         self.chi2 = float(self.squares.sum())
 
