@@ -22,6 +22,7 @@ from .shared_psf import moffat_field, profiles
 
 _CLOSE = 2.0  # FWHM
 _CROWD, _FEWEST = 0.05, 10  # of the detections, at least so many, have another one as close as that
+_DIRTY = 0.1  # of the detections, hot pixels and hits of particles: in crowds of stars they are some per cent
 _SHARP = 0.6  # of the width of stars: what is narrower is none
 _DEFORMED = 4.0  # chi2 of a core that is no single star's
 _DEGREE = {"own": 2, "linear": 1, "shared": 0}
@@ -71,15 +72,18 @@ def measure_crowd(stamps, shape, options, psf):
     Returns
     -------
     `~legdistort.measurement.detections.FrameStars` or None
-        None if no star stays, or the stars ask for an effective PSF of their own: it ends some 3 FWHM from a star, and
-        what is left of their light beyond would pass for stars.
+        None if no star stays, hits of particles pass for a crowd, or the stars ask for an effective PSF of their own: it
+        ends some 3 FWHM from a star, and what is left of their light beyond would pass for stars.
     """
     if psf == "effective":
         return None
     width = float(moffat.fwhm(shape))
     found, models, noise = frame_fit.first_pass(stamps, shape, moffat.quadrature(width))
     sharp = moffat.fwhm(found.params) < _SHARP * width
-    hot = sharp & frame_fit.is_hot(stamps, models, found.params[:, 7:], stamps.good)
+    hits = frame_fit.is_hot(stamps, models, found.params[:, 7:], stamps.good)
+    if np.count_nonzero(hits) > _DIRTY * len(hits):  # others are pieces of them, side by side as stars of a crowd are
+        return None
+    hot = sharp & hits
     frame = _without(stamps.frame, stamps.centres[hot])
     known = not isinstance(psf, str)
     scene = Scene(frame, psf if known else MoffatField.constant(shape, frame.signal.shape), stamps.half, noise[1])
