@@ -72,8 +72,8 @@ def measure_crowd(stamps, shape, options, psf):
     Returns
     -------
     `~legdistort.measurement.detections.FrameStars` or None
-        None if no star stays, hits of particles pass for a crowd, or the stars ask for an effective PSF of their own: it
-        ends some 3 FWHM from a star, and what is left of their light beyond would pass for stars.
+        None if no star stays, hits of particles pass for a crowd, or the stars ask for an effective PSF of their own:
+        it ends some 3 FWHM from a star, and what is left of their light beyond would pass for stars.
     """
     if psf == "effective":
         return None
