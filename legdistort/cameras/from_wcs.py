@@ -34,9 +34,9 @@ def camera_of(kind, exposures, name=None):
     centre = np.degrees(tangent_plane.angles(tangent_plane.directions(lon, lat).mean(axis=0)))
     found = {key: _expanded(each, centre) for key, each in named.items()}
     plane = _focal_plane([pose for _, pose in found.values()])
-    known = {"layout_sigma": np.inf} if len(found) > 1 else {}  # headers are rarely better than a pixel
+    sigma = np.inf if len(found) > 1 else None  # headers are rarely better than a pixel
     detectors = {
-        key: Detector(named[key].shape, layout=similarity.compose(pose, plane), static=static, **known)
+        key: Detector(named[key].shape, layout=similarity.compose(pose, plane), static=static, layout_sigma=sigma)
         for key, (static, pose) in found.items()
     }
     return kind(name or str(first.header.get("INSTRUME", "camera")).strip() or "camera", detectors)

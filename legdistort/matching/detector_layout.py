@@ -117,6 +117,5 @@ def _layouts(poses, part_of, shapes):
                 f"how detectors {first} and {key} lie to each other is not known: no exposure has both; give the camera"
             )
         layout = similarity.fit_similarity(np.median(there, axis=0), corners)
-        known = {"layout_sigma": np.inf} if len(keys) > 1 else {}
-        out[key] = Detector(tuple(shapes[key]), layout=layout, **known)
+        out[key] = Detector(tuple(shapes[key]), layout=layout, layout_sigma=np.inf if len(keys) > 1 else None)
     return out

@@ -1,6 +1,6 @@
 """Options of `legdistort.solve`, checked before anything is computed."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
 
@@ -190,8 +190,8 @@ def check_reference(reference, *, error=None, epoch=None, pixel_scale=None, meth
         return read_reference(reference, error), epoch
     if error is not None:
         raise InputError("a solution states the errors of its stars: leave reference_error out")
-    known = known_stars(solution)
-    return replace(known, label=f"the reference {reference}") if is_file else known, epoch
+    name = reference if is_file else "solution"
+    return known_stars(solution, f"the reference {name}"), epoch
 
 
 def check_tie(names, asked, reference, **tying):

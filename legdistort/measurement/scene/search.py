@@ -123,8 +123,7 @@ class _Search:
 def candidates(scene, threshold):
     """Peaks of what is left that look like stars: places (n, 2), of whole pixels, and fluxes (n,)."""
     half = int(np.ceil(_KERNEL * scene.psf.fwhm))
-    middle = np.array([scene.light.shape[::-1]]) // 2
-    kernel = scene.psf.light(np.array([[0.0, 0.0, 1.0]], dtype=np.float32), middle, half)[0]
+    kernel = scene.psf.light(np.array([[0.0, 0.0, 1.0]], dtype=np.float32), scene.middle, half)[0]
     kernel = np.maximum(kernel, 0).reshape(2 * half + 1, -1)[::-1, ::-1].astype(np.float32)
     weights = scene.weights
     signal = fftconvolve(weights * scene.residual.astype(np.float32), kernel, mode="same")

@@ -73,12 +73,12 @@ def _odd(solution, problem, blocks):
 def _beyond(a, noise, degrees, n_tests):
     """Which of departures (n, k), with variances of their errors and degrees (k,), are odd: row, ratio, chi2 and p."""
     n = len(a)
-    off = (a - a.mean(axis=0)) * n / (n - 1)  # from the mean of the others
-    square, p = off**2, []
+    squares = (a - a.mean(axis=0)) ** 2
+    square, p = squares * (n / (n - 1)) ** 2, []  # from the mean of the others
     for degree in (each := np.unique(degrees)):
         of = degrees == degree
         m = np.count_nonzero(of)
-        whole = (np.sum((a - a.mean(axis=0))[:, of] ** 2) - square[:, of].sum(axis=1) * (n - 1) / n) / (m * (n - 2))
+        whole = (squares[:, of].sum() - squares[:, of].sum(axis=1) * n / (n - 1)) / (m * (n - 2))
         errors = (noise[:, of].sum() - noise[:, of].sum(axis=1)) / (m * (n - 1))
         scatter = np.maximum(whole - errors, 0)
         square[:, of] /= (scatter + whole / (n - 1))[:, None] + noise[:, of]

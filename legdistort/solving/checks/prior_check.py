@@ -46,7 +46,7 @@ def prior_check(solution, problem, state, *, error):
     if problem.mean_sigma is not None and np.all(np.isinf(problem.mean_sigma)):  # nothing is believed
         return None
     if problem.n_exposures < 2:
-        given = "the static distortion given" + f" ({_source(solution)})" * bool(_source(solution))
+        given = _given(_source(solution))
         return Check("prior", "unknown", None, None, f"{given} is believed, not tested: there is one exposure", _CURE)
     keep = drawn(np.broadcast_to(problem.group, problem.n_exposures), MOST // (2 * problem.n_modes))
     problem, state = part_of(problem, state, keep)
@@ -68,6 +68,10 @@ def _source(solution):
     return (source.get("name") if isinstance(source, dict) else source) or ""
 
 
+def _given(source):
+    return "the static distortion given" + f" ({source})" * bool(source)
+
+
 def _factors(source, tests):
     """The `FactorTest` of every prior."""
     for name, test in tests:
@@ -77,7 +81,7 @@ def _factors(source, tests):
 
 def _in_words(source, tests, error):
     """The check of some priors, each tested and with the name of an exposure that it was given for."""
-    given = "the static distortion given" + f" ({source})" * bool(source)
+    given = _given(source)
     p = np.array([test.p for _, test in tests])
     name, worst = tests[int(np.argmin(p))]
     alarm = FALSE_ALARM / len(tests)

@@ -14,8 +14,8 @@ _MAS = 3.6e6  # of a degree
 _COMMON = ("_abs", "_known")
 
 
-def known_stars(solution):
-    """What a `Solution` knows of its stars, as a `legdistort.inputs.reference_catalogue.Reference`.
+def known_stars(solution, name):
+    """What a `Solution` knows of its stars, as a `legdistort.inputs.reference_catalogue.Reference` of this name.
 
     Relative errors are those of single stars; the error of the common map is common to all, and maps that the solution
     does not determine are unknown.
@@ -25,7 +25,6 @@ def known_stars(solution):
     InputError
         For a simpler correction, whose plane is not known, or if no star has a position with errors.
     """
-    name = "the reference solution"
     if solution.gauge.plane is not None:
         raise InputError(f"{name} is a simpler correction ({solution.gauge.kind}), whose plane is not known")
     stars = solution.stars
