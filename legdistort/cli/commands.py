@@ -136,7 +136,7 @@ def do_match(a):
     from ..measurement.earlier import measured_frames
     from ..pipeline import timed, write_matched
 
-    contract = column_contract.DETECTED | {"epoch": column_contract.MATCHED["epoch"]}
+    contract = column_contract.DETECTED | {name: column_contract.MATCHED[name] for name in ("epoch", "block")}
     read = {Path(path): _read_table(path, a, contract) for path in a.tables}
     tables = list(read.values())
     if not any(map(len, tables)):

@@ -198,6 +198,11 @@ SOLVING = Group(
             metavar="PX/YR",
         ),
         "motion_epoch": Option("year of the positions (default: mean)", type=float, metavar="YEAR"),
+        "night_sigma": Option(
+            "what exposures of a night have in common, by coefficient; 0: nothing (default: found)",
+            type=float,
+            metavar="PX",
+        ),
         "reference": Option(
             "catalogue whose positions are known, such as one of Gaia, or a solution", metavar="TABLE", path="read"
         ),

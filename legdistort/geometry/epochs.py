@@ -113,6 +113,19 @@ def exposure_years(names, exposure, values):
     return found
 
 
+def nights(years):
+    """Numbers of the nights, integers (n,) from 0, of epochs (n,) in years: gaps of more than half a day part them.
+
+    One night for all if some epoch is not known.
+    """
+    if not np.isfinite(years).all():
+        return np.zeros(len(years), dtype=int)
+    order = np.argsort(years, kind="stable")
+    out = np.empty(len(years), dtype=int)
+    out[order] = np.cumsum(np.diff(years[order], prepend=years[order[0]]) > ONE_EPOCH / 2)
+    return out
+
+
 def mean_epoch(headers):
     """Mean epoch of exposures by their headers (`KEYWORDS`), a Julian year, or None."""
     found = [value for value in map(header_epoch, headers) if value is not None]

@@ -24,6 +24,7 @@ MATCHED = {
     "flux": (None, False),
     "mag": (None, False),
     "epoch": (u.yr, False),
+    "block": (None, False),
 }
 
 #: Columns of a table of detections.
@@ -324,7 +325,7 @@ def check(table, contract, what):
 
 def _kept(table, name, contract):
     """A column as a table that keeps the contract has it."""
-    if name in ("exposure", "star", "detector"):
+    if name in ("exposure", "star", "detector", "block"):
         return labels(table, name).copy()
     if name not in contract:
         column = table[name]

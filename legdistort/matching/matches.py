@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from ..cameras.camera import Camera, check_camera
 from ..exceptions import AssumptionWarning, InputError, MatchError, reasons_of, some_of, warn
 from ..geometry import similarity
-from ..geometry.epochs import exposure_years
+from ..geometry.epochs import exposure_years, nights
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract, exposure_names, repetitions, start_poses
 from ..runtime.checks import check_choice
@@ -231,6 +231,29 @@ class Matches(ShownAsPrinted):
             )
         return exposure_years(self.names, self.observations.exposure, column_contract.values(self.table, "epoch", u.yr))
 
+    @cached_property
+    def blocks(self) -> np.ndarray:
+        """Night, or other block of exposures that may share a departure from the static distortion, of every exposure.
+
+        Integers (n_exposures,): by the column ``block``, else by gaps of more than half a day in ``epoch``, else one.
+
+        Raises
+        ------
+        InputError
+            For an exposure with several values in ``block``.
+        """
+        obs = self.observations
+        first = np.unique(obs.exposure, return_index=True)[1]
+        if "block" in self.table.colnames:
+            label = np.asarray(self.table["block"])
+            if np.any(several := label != label[first][obs.exposure]):
+                name = self.names[obs.exposure[int(np.argmax(several))]]
+                raise InputError(f"column 'block' has several values for exposure {name}: give one night for each")
+            return np.unique(label[first], return_inverse=True)[1]
+        if "epoch" in self.table.colnames:
+            return nights(column_contract.values(self.table, "epoch", u.yr)[first])
+        return np.zeros(len(self.names), dtype=int)
+
     def keep(self, rows: ArrayLike | slice) -> Matches:
         """The same matches with some rows of the table; exposures without any go.
 
@@ -323,7 +346,8 @@ class Matches(ShownAsPrinted):
         table : `~astropy.table.Table`
             Columns ``exposure``, ``star`` (int or str), ``x``, ``y``, ``x_err``, ``y_err`` (pixels,
             0-based, standard deviations), optional ``xy_corr``, ``detector``, ``flux`` or ``mag``, and
-            ``epoch``, when the exposure was taken: decimal years, MJD, or `~astropy.time.Time`.
+            ``epoch``, when the exposure was taken: decimal years, MJD, or `~astropy.time.Time`, and ``block``, the
+            night or other block of exposures that it is of: a name or an integer (see `blocks`).
         shape : tuple or dict
             ``(ny, nx)``, or that by exposure; not needed with a camera.
         poses : dict, optional

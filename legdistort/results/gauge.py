@@ -225,6 +225,9 @@ class Gauge(ShownAsPrinted):
         What the plane of a simpler correction is, in words. How far it is from the sky is not known then.
     drift : Drift or None
         Common maps that change with time, where the motions of stars are fitted.
+    nights : float or None
+        What exposures of a night have in common beside the static distortion, pixels, rms over the nights, the detector
+        and axis; None where there is one night.
     """
 
     kind: str = field(metadata=text(*_CONVENTIONS, "shift", "static + shift", "relative polynomial"))
@@ -244,6 +247,7 @@ class Gauge(ShownAsPrinted):
     responses: Any = field(default=None, repr=False, compare=False, metadata=NOT_STORED)
     plane: str | None = None
     drift: Drift | None = None
+    nights: float | None = field(default=None, metadata=number(minimum=0, unit="pix"))
 
     @property
     def n_constraints(self) -> int:
@@ -430,9 +434,10 @@ class Gauge(ShownAsPrinted):
         if self.static == "open":
             return "\n".join(lines)
         dynamic = np.sqrt(np.sum(self.scatter**2) / 8)
+        nights = "" if self.nights is None else f", and those of a night together by {self.nights:.2g} px"
         lines.append(
             f"Absolute errors (rms over the field, per axis) come from {_STATIC[self.static][1]}; single exposures "
-            f"depart from their mean by {dynamic:.2g} px rms per axis. "
+            f"depart from their mean by {dynamic:.2g} px rms per axis{nights}. "
             + ("No external reference was used." if self.tie is None else self.tie.statement)
         )
         return "\n".join(lines)

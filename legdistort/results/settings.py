@@ -36,6 +36,8 @@ class Settings:
         Scatter of proper motions per axis, pixels a year, that was in force.
     motion_epoch : float or None
         Year of the positions, as it was asked for.
+    night_sigma : float or None
+        What was stated of the scatter of nights, pixels.
     max_iterations : int or None
     """
 
@@ -55,5 +57,6 @@ class Settings:
     motion: str | None = field(default=None, metadata=text("proper", "parallax"))
     motion_sigma: float | str | None = field(default=None, metadata=number(minimum=0, unit="pix/yr"))
     motion_epoch: float | None = field(default=None, metadata=YEARS)
+    night_sigma: float | None = field(default=None, metadata=_PIXELS)
     max_iterations: int | None = field(default=None, metadata=number(minimum=0))
     validate: float | None = field(default=None, metadata=number(minimum=0, maximum=1))

@@ -67,6 +67,7 @@ def solve(
     motion: str | None = None,
     motion_sigma: float | str | None = None,
     motion_epoch: float | Time | None = None,
+    night_sigma: float | None = None,
     reference: Table | SkyCoord | Solution | StrPath | None = None,
     reference_error: float | Quantity | str | None = None,
     epoch: float | Time | None = None,
@@ -144,6 +145,9 @@ def solve(
         None: nothing is known of them.
     motion_epoch : float or `~astropy.time.Time`, optional
         Of the positions in ``stars``; by default the mean of the observations, where they are most precise.
+    night_sigma : float, optional
+        What the exposures of a night (`Matches.blocks`) have in common beside the static distortion: standard deviation
+        of every normalised coefficient, pixels. None: found from the nights, where there are several; 0: nothing.
     reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord`, Solution or path, optional
         Positions with errors: what is known beforehand of its stars, and so of shift, rotation and scale, and of maps
         that the exposures do not determine. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error``
@@ -205,7 +209,7 @@ def solve(
         exposure_degree=exposure_degree,
         gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
         max_iterations=max_iterations, validate=validate, motion=motion, motion_sigma=motion_sigma,
-        motion_epoch=motion_epoch,
+        motion_epoch=motion_epoch, night_sigma=night_sigma,
     )  # fmt: skip
     tying = {"error": reference_error, "epoch": epoch, "pixel_scale": pixel_scale}
     catalogue, epoch = check_tie(matches.names, asked, reference, **tying)
@@ -449,7 +453,7 @@ def _settings(asked, options, form):
     made = {field.name: getattr(asked, field.name) for field in fields(Settings)}
     made |= {"degree": int(options.degree), "exposure_degree": options.own_degree}
     made |= {name: getattr(options, name) for name in ("motion", "motion_sigma")}
-    for name in ("clip", "error_floor", "validate", "motion_sigma"):
+    for name in ("clip", "error_floor", "validate", "motion_sigma", "night_sigma"):
         made[name] = None if made[name] is None else float(made[name])
     prior = asked.prior
     if isinstance(prior, dict):

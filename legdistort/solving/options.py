@@ -74,10 +74,17 @@ class SolveOptions(Settings):
         if self.max_iterations is not None and not (isinstance(self.max_iterations, int) and self.max_iterations > 0):
             raise InputError(f"max_iterations must be a positive integer, got {self.max_iterations!r}")
         self._check_motion()
+        self._check_nights()
         if self.clip is not None and not (isinstance(self.clip, Real) and 1 < self.clip < LARGEST):
             raise InputError(
                 f"clip must be a number of standard errors above 1, got {self.clip!r}; clip=None (--clip 0) keeps all"
             )
+
+    def _check_nights(self):
+        sigma = self.night_sigma
+        real = isinstance(sigma, Real) and not isinstance(sigma, bool)
+        if sigma is not None and not (real and 0 <= sigma < LARGEST):
+            raise InputError(f"night_sigma must be a finite number of pixels, 0 or more, got {sigma!r}")
 
     def _check_motion(self):
         """What is sought of the motions of stars, and what is known of them beforehand."""

@@ -186,6 +186,7 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         error_floor=options.error_floor,
         own_degree=options.own_degree,
         motion=star_motions.terms_of(options),
+        night_sigma=options.night_sigma,
     )
     nominal = np.stack([matches.poses[name] for name in matches.names])
     near_by = near is not None and near.matches is matches and near.result.converged
@@ -299,7 +300,7 @@ def _unbent(matches, problem, start, result, common, *, loss="linear", or_else=N
             was = criterion.linearise(whole, _padded(result.state, whole))
             better = held.converged and held.blocks.cost < was.cost
         if better and held is not None:
-            positions = held.state.positions.T[held.blocks.v[0] > 0]
+            positions = held.state.positions.T[elimination.typical_stars(held.blocks.v)]
             gauge = known_maps.as_in_posterior(held.gauge, found.blocks.unknowns, positions, *found.covariances())
             widths = any(problem.has_widths(i) for i in range(problem.n_exposures))  # those that were given
             held = replace(held, gauge=replace(gauge, prior=widths))

@@ -227,6 +227,7 @@ SOLVE = [
     row(motion="auto"),
     row(motion="proper", motion_sigma="evidence"),
     row(motion="proper", motion_epoch=Time("2016-07-01")),
+    row(night_sigma=0.1),
     row(motion_sigma=0.01, refused=dict.fromkeys(("plain", "one", "pair"), "belong to motion='proper'")),
     row(reference=catalogue, epoch=2016.5, pixel_scale=0.036),
     row(reference=catalogue, motion="proper"),

@@ -94,7 +94,7 @@ def test_relative_errors_of_few_stars_are_those_after_what_nothing_determines():
 
 
 def test_as_many_stars_as_unknown_modes_have_no_relative_errors():
-    solution, *_ = few_undithered(10, 0)
+    solution, *_ = few_undithered(10, 4)
     assert not np.isfinite(solution.stars["x_err"]).any()
 
 

@@ -107,7 +107,9 @@ def test_scatter_is_that_of_exposures_of_less_than_ten_times_the_usual_variance(
         error = 1e-4 * np.where(np.arange(n) == n - 1, ratio, 1.0)[:, None, None] * np.eye(2 * modes)
         problem = SimpleNamespace(n_modes=modes, n_exposures=n, prior_mean=0.0, has_widths=lambda i: False)
         state, maps, exact = SimpleNamespace(coefficients=own), np.zeros((n, 8, 0)), np.zeros((1, 8))
-        return dynamic_scatter.dynamic_covariance(problem, state, error, maps, others, np.zeros(n, int), exact)[0]
+        return dynamic_scatter.dynamic_covariance(problem, state, error, maps, others, None, np.zeros(n, int), exact)[
+            0
+        ][0]
 
     assert (np.trace(scatter(3.0)) > 2 * np.trace(scatter(0.1))) == counts
 

@@ -55,7 +55,7 @@ def _odd(solution, problem, blocks):
     Name, how many times as far as these, and the `FactorTest`: squares by degree over those of the others, beyond the
     errors of the coefficients. If all scatter alike, by degree, they are distributed as F.
     """
-    found, group = [], np.broadcast_to(problem.group, problem.n_exposures)
+    found, group = [], problem.detectors
     size, degrees = problem.n_modes, dynamic_degrees(problem.n_modes)
     for detector in np.unique(group):
         each = np.flatnonzero(group == detector)

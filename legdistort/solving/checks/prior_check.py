@@ -48,7 +48,7 @@ def prior_check(solution, problem, state, *, error):
     if problem.n_exposures < 2:
         given = _given(_source(solution))
         return Check("prior", "unknown", None, None, f"{given} is believed, not tested: there is one exposure", _CURE)
-    keep = drawn(np.broadcast_to(problem.group, problem.n_exposures), MOST // (2 * problem.n_modes))
+    keep = drawn(problem.detectors, MOST // (2 * problem.n_modes))
     problem, state = part_of(problem, state, keep)
     given, variance, group, first = stated(problem)
     believed = np.isfinite(variance).any(axis=1) & (given.any(axis=1) | (variance > 0).any(axis=1))

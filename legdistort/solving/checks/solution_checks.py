@@ -252,7 +252,7 @@ def place_check(residuals):
     """Is there a pattern on the detector that all exposures have in common?"""
     problem = residuals.problem
     n = problem.degree + 2
-    groups = np.broadcast_to(problem.group, problem.n_exposures)[residuals.exposure]
+    groups = problem.detectors[residuals.exposure]
     size = np.array(problem.shapes)[residuals.exposure][:, ::-1].T
     x, y = np.clip(((problem.xy + 0.5) / size * n).astype(int), 0, n - 1)
     score, shown = residuals.of_cells((groups * n + y) * n + x)

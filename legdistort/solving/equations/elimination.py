@@ -6,13 +6,25 @@ from scipy.linalg.blas import dsyrk
 from .star_terms import outer_packed, packed, size_of, symmetric_times
 
 #: Curvature of an unknown, the others fitted, below this part of its own is rounding: it is not determined.
-_ROUNDING = 1e-11
+_ROUNDING = 1e-8
+#: Times the typical error of a position: one beyond it tells nothing of the plane.
+FAR = 10.0
 _TILE = 256  # of a matrix that is mirrored
 
 
 def inverse_star_blocks(v):
     """Inverse of symmetric packed blocks (m, n_stars); zero for what the observations of a star do not determine."""
     return _inverted(v)[0]
+
+
+def typical_stars(v):
+    """Which stars (n_stars,) have positions with errors below `FAR` typical ones, from packed blocks (m, n_stars).
+
+    Others, seen once and moving, may lie anywhere; means over the stars are those of these.
+    """
+    variance = inverse_star_blocks(v)[:2].sum(axis=0)
+    known = variance > 0
+    return known & (variance < FAR**2 * np.median(variance[known])) if known.any() else known
 
 
 def of_one_axis(u):

@@ -56,6 +56,10 @@ class Problem:
         Up to this degree exposures have modes of their own; None: nothing is shared. See `Unknowns`.
     group : ndarray of int, shape (n_exposures,)
         Detector of every exposure; exposures of one share what is not their own.
+    night : ndarray of int, shape (n_exposures,)
+        Night of every exposure.
+    night_sigma : float or None
+        Standard deviation of every coefficient of what the exposures of a night have in common, pixels; None: found.
     centre : ndarray, shape (n_exposures, 2, n_all), or None
         What was found of the static distortion beside the prior: about it the widths of coefficients are centred, and
         beyond the degree it is in the mean already. None: nothing.
@@ -78,6 +82,8 @@ class Problem:
     mean_sigma: np.ndarray | None = None
     own_degree: int | None = None
     group: np.ndarray | int = 0
+    night: np.ndarray | int = 0
+    night_sigma: float | None = None
     centre: np.ndarray | None = None
     moving: StarTerms | None = None
 
@@ -128,6 +134,23 @@ class Problem:
     def exposure(self):
         """Exposure of every observation, ndarray of int, shape (n,)."""
         return np.repeat(np.arange(self.n_exposures), np.diff(self.start))
+
+    @property
+    def detectors(self):
+        """Number of the detector of every exposure, (n_exposures,)."""
+        return np.broadcast_to(self.group, self.n_exposures)
+
+    @cached_property
+    def nights(self):
+        """Number of the night of every exposure, each detector with nights of its own, (n_exposures,); or None.
+
+        None where those of a night have nothing in common beside the others: every detector has one night, every night
+        one exposure, or it is stated.
+        """
+        pairs = np.column_stack([self.detectors, np.broadcast_to(self.night, self.n_exposures)])
+        number = np.unique(pairs, axis=0, return_inverse=True)[1].ravel()
+        several = self.detectors.max() < number.max() < self.n_exposures - 1
+        return number if several and self.night_sigma != 0 else None
 
     @cached_property
     def size(self):
@@ -240,7 +263,7 @@ def as_given(prior):
     return type(prior).__name__
 
 
-def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=None, motion=None):
+def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=None, motion=None, night_sigma=None):
     """The problem posed by `legdistort.matching.matches.Matches`.
 
     Parameters
@@ -254,6 +277,8 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
     own_degree : int, optional
         Exposures have modes of their own only up to this degree (0: a similarity alone); the rest is common to
         those of a detector.
+    night_sigma : float, optional
+        See `Problem`; 0: exposures of a night have nothing in common.
     motion : callable, optional
         ``motion(matches, weight)`` gives the `StarTerms` for weights (n,) in the order of the table; None: stars do not
         move.
@@ -317,6 +342,8 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         mean_sigma=_mean_sigma(priors, degree),
         own_degree=own_degree,
         group=_groups(matches),
+        night=matches.blocks,
+        night_sigma=night_sigma,
     )
     if motion is None:
         return problem

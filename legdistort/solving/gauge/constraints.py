@@ -11,6 +11,7 @@ from ...geometry.detector_modes import dynamic_basis, row_variances, similarity_
 from ...results.gauge import Drift, Gauge
 from ...runtime.checks import check_choice
 from ...runtime.words import GAUGES
+from ..equations import elimination
 from ..equations.criterion import complement
 from ..equations.problem import State
 from .dynamic_scatter import conditional_errors, dynamic_covariance, influence
@@ -51,9 +52,9 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         If the "mean" gauge leaves a direction free, as for rolls that cancel.
     """
     check_choice(kind, GAUGES, "gauge")
-    used = blocks.v[0] > 0
+    used = elimination.typical_stars(blocks.v)
     shared, shared_shears = problem.unknowns.shared, problem.own_degree == 0
-    group = np.broadcast_to(problem.group, problem.n_exposures)
+    group, night = problem.detectors, problem.nights
     problem, state, blocks = own_part(problem, state, blocks)
     box = reference_box(problem, state)
     motion = _motion(problem, state.poses, box)
@@ -66,17 +67,20 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     static = _static_variance(problem, others, group, shared)
     if settled:
         static, dynamic = np.zeros_like(static), np.broadcast_to(np.eye(motion.shape[1]), motion.shape)
+    nightly = np.zeros((0, others.shape[1]))
     drifting, drifts, rates = _drifts(problem, motion, others, shared_shears, all_drifts)
     if dynamic is None:
         moved = np.concatenate([others @ motion @ maps.T, others @ drifting @ drifts.T], axis=2)
-        dynamic = dynamic_covariance(problem, state, error, moved, others, group, static)
+        dynamic, nightly = dynamic_covariance(problem, state, error, moved, others, night, group, static)
     spread = others @ (dynamic + np.where(held, 0, 1)[:, None, None] * error) @ others.transpose(0, 2, 1)
     weight = np.where(held, 1, influence(error, others))[:, None, None] * np.linalg.inv(spread)
     positions = state.positions.T[used]
     values = basis.values(problem.degree, *((positions - box[0]) / box[1]).T)
     power = values @ values.T / values.shape[1]
     size = tuple(2 * box[1, ::-1])
-    hierarchy = Hierarchy(motion, others, dynamic, weight, group, static, maps, size, power, drifting @ drifts.T)
+    hierarchy = Hierarchy(
+        motion, others, dynamic, weight, night, nightly, group, static, maps, size, power, drifting @ drifts.T
+    )
     poses = _pose_rows(kind, motion, error, similar, box)
     if len(rates):
         carried = influence(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
@@ -98,6 +102,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         drift=Drift(problem.terms.names, drifting, pointed @ drift_covariance @ pointed.T, drifts, rates)
         if problem.terms.n
         else None,
+        nights=float(np.sqrt(nightly.mean(axis=0).sum() / 8)) if len(nightly) else None,  # a mode has mean square 1/4
     )
     if common is None:
         return made

@@ -1,4 +1,4 @@
-"""How far single exposures scatter around their static distortion, how well each is known, and its weight."""
+"""How far exposures and nights scatter around their static distortion, how well each is known, and its weight."""
 
 import numpy as np
 
@@ -12,6 +12,13 @@ _ROUNDS, _NEWTON = 20, 50  # at most
 #: rolls.
 _SHARED, _BORROWED = 10.0, 0.3
 
+#: Degrees of freedom of Student's t distribution of the departures of nights, which up to so many standard deviations
+#: of the sum of their squares are those of a Gaussian.
+TAILS, CHANCE = 4.0, 3.0
+#: Nights scatter if the squares of their means exceed what is expected of independent exposures by so many standard
+#: deviations.
+SEEN = 2.0
+
 _SMALLEST = 1e-6  # scatter, pixels: where none is seen beyond the errors, Lambda stays invertible
 
 
@@ -22,8 +29,11 @@ def conditional_errors(u_data):
     return inverse_exposure_blocks(u_data + ridge * np.eye(size))
 
 
-def dynamic_covariance(problem, state, error, moved, others, group, static):
+def dynamic_covariance(problem, state, error, moved, others, night, group, static):
     """Lambda of every exposure: from the prior if it has widths, else from the scatter seen beyond the errors.
+
+    And the variances (n_nights, K) of what exposures of a night have in common, from the scatter of their means, if
+    that is more than chance.
 
     A common map of the reference plane is fitted to the departures A_i - A_0 and taken out, so that the result does not
     depend on the gauge of the state; with it what of the static distortion of every detector is not known beforehand.
@@ -39,7 +49,8 @@ def dynamic_covariance(problem, state, error, moved, others, group, static):
     moved : ndarray, shape (n_exposures, K, m)
         How the m maps of the reference plane change the K modes `others` of every exposure.
     others : ndarray, shape (n_exposures, K, 2 n)
-    group : ndarray of int, shape (n_exposures,)
+    night, group : ndarray of int, shape (n_exposures,)
+        See `legdistort.solving.gauge.hierarchy.Hierarchy`.
     static : ndarray, shape (n_groups, K)
         Variance of the static distortion of every detector: infinite where it is not known, zero where it is exact.
     """
@@ -48,18 +59,11 @@ def dynamic_covariance(problem, state, error, moved, others, group, static):
     own = np.einsum("ika,ia->ik", others, departure)
     variance = (others @ error * others).sum(axis=2)
     counts = variance <= 10 * np.median(variance, axis=0)  # values less certain would add noise and nothing else
-    fitted = [_static(others, group == g, variance > 0) for g, variance in enumerate(static)]
-    design = np.concatenate([moved, *fitted], axis=2)
-    stated = np.concatenate([np.zeros(moved.shape[2]), 1 / static[static > 0]])
-    scatter2 = np.mean((own - own.mean(axis=0)) ** 2, axis=0)
-    for _ in range(_ROUNDS if own.size else 0):
-        weight = counts / (variance + scatter2 + 1e-300)
-        left, leverage = _fitted(design, weight, own, stated)
-        dof = np.maximum(counts.sum(axis=0) - leverage, 0.0)
-        new = _pooled(_excess(left, variance, counts, dof), dof, np.mean(own**2))
-        change, scatter2 = np.abs(new - scatter2).max(initial=0), new
-        if change <= 1e-3 * new.max(initial=0):  # equal where exposures do not scatter, as at a start
-            break
+    nightly = np.zeros((0 if night is None else night.max() + 1, own.shape[1]))
+    if len(nightly):
+        scatter2, nightly = _of_nights(problem, own, variance, counts, moved, night, group, static)
+    if not nightly.any():
+        scatter2, _ = _scatter(own, variance, counts, moved, group, static)
     out = others.transpose(0, 2, 1) * scatter2 @ others
     for i in range(problem.n_exposures):
         if problem.has_widths(i):
@@ -67,15 +71,102 @@ def dynamic_covariance(problem, state, error, moved, others, group, static):
             seen = np.maximum(np.diag(out[i]), _SMALLEST**2)
             given = np.where(np.isfinite(width) & (width > 0), width**2, seen)
             out[i] = others[i].T @ (others[i] * given @ others[i].T) @ others[i]
+    return out, nightly
+
+
+def _of_nights(problem, own, variance, counts, moved, night, group, static):
+    """Variance (K,) of exposures about their nights, and that (n_nights, K) of nights, zero if it is chance.
+
+    Parameters are those of `_scatter`, of exposures, and `night` and `group` of `dynamic_covariance`.
+    """
+    free = np.full((night.max() + 1, own.shape[1]), np.inf)
+    scatter2, _ = _scatter(own, variance, counts, moved, night, free)
+    if problem.night_sigma is not None:
+        return scatter2, np.full(free.shape, problem.night_sigma**2)
+    weight = counts / (variance + scatter2 + 1e-300)
+    total = _sums(weight, night) + 1e-300
+    means, moved = _sums(weight * own, night) / total, _sums(weight[:, :, None] * moved, night) / total[:, :, None]
+    owner, counts = group[np.unique(night, return_index=True)[1]], _sums(weight, night) > 0
+    left, leverage = _fitted(*_common(means, moved, owner, static), counts * total, means)
+    dof = np.maximum(counts.sum(axis=0) - leverage, 0.0).sum()
+    if dof > 1 and np.sum(counts * total * left**2) < dof + SEEN * np.sqrt(2 * dof):
+        return scatter2, np.zeros(free.shape)
+    found, odd = _scatter(means, 1 / total, counts, moved, owner, static, robust=True)
+    return scatter2, odd[:, None] ** 2 * found
+
+
+def _common(own, moved, owner, static):
+    """Design (n, K, m) of maps and of what those of an owner have in common, and inverse variances (m,) known of it."""
+    common = [(owner == g)[:, None, None] * np.eye(own.shape[1])[:, of > 0] for g, of in enumerate(static)]
+    return np.concatenate([moved, *common], axis=2), np.concatenate([np.zeros(moved.shape[2]), 1 / static[static > 0]])
+
+
+def _scatter(own, variance, counts, moved, owner, static, *, robust=False):
+    """Variance (K,) by mode of values (n, K) beyond that of their errors, about what those of an owner have in common.
+
+    Parameters
+    ----------
+    own, variance : ndarray, shape (n, K)
+    counts : ndarray of bool, shape (n, K)
+        Which of them count.
+    moved : ndarray, shape (n, K, m)
+        How maps of the reference plane change them, which are fitted and taken out.
+    owner : ndarray of int, shape (n,)
+    static : ndarray, shape (n_owners, K)
+        Variance of what is common to those of an owner.
+    robust : bool
+        Give each of the n a factor of its own on the scatter.
+
+    Returns
+    -------
+    ndarray, shape (K,)
+    ndarray, shape (n,)
+        These factors.
+    """
+    design, stated = _common(own, moved, owner, static)
+    scatter2, odd = np.mean((own - own.mean(axis=0)) ** 2, axis=0), np.ones(len(own))
+    for _ in range(_ROUNDS if own.size else 0):
+        wide = odd[:, None] ** 2
+        weight = counts / (variance + wide * scatter2 + 1e-300)
+        left, leverage = _fitted(design, stated, weight, own)
+        dof = np.maximum(counts.sum(axis=0) - leverage, 0.0)
+        terms = left / odd[:, None], variance / wide, counts
+        new = _pooled(_by_degree(*terms, dof) if robust else _excess(*terms, dof), dof, np.mean(own**2))
+        change, scatter2 = np.abs(new - scatter2).max(initial=0), new
+        if robust:
+            before, odd = odd, _oddness(left, variance, counts, wide, new)
+            change = max(change, np.abs(np.log(odd / before)).max() * new.max(initial=0))
+        if change <= 1e-3 * new.max(initial=0):  # equal where exposures do not scatter, as at a start
+            break
+    return scatter2, odd
+
+
+def _by_degree(left, variance, counts, dof):
+    """`_excess` of all modes of a degree together: few values scatter too widely to be floored one by one."""
+    degree, out = dynamic_degrees(left.shape[1] // 2 + 2), np.zeros(left.shape[1])
+    for d in np.unique(degree):
+        of = degree == d
+        out[of] = _excess(*(each[:, of].reshape(-1, 1) for each in (left, variance, counts)), dof[of].sum())
     return out
 
 
-def _static(others, mine, modes):
-    """Columns (n_exposures, K, n) of some modes (K,) of a static distortion of some exposures."""
-    return mine[:, None, None] * np.eye(others.shape[1])[:, modes]
+def _oddness(left, variance, counts, wide, scatter2):
+    """Factors (n,) on the scatter of values (n, K), as for Student's t distribution (Lange, Little & Taylor 1989)."""
+    prior = wide * scatter2 + 1e-300
+    share = prior / (prior + variance)
+    square = (counts * ((share * left) ** 2 + share * variance) / (prior / wide)).sum(axis=1)
+    count = counts.sum(axis=1)
+    return np.sqrt(np.where(square > count + CHANCE * np.sqrt(2 * count), (TAILS + square) / (TAILS + count), 1))
 
 
-def _fitted(design, weight, own, stated):
+def _sums(values, label):
+    """Sums of values (n, ...) by their labels, integers (n,)."""
+    out = np.zeros((label.max() + 1, *values.shape[1:]))
+    np.add.at(out, label, values)
+    return out
+
+
+def _fitted(design, stated, weight, own):
     """What a weighted fit leaves of values (n, K), and the leverage of the fit by mode (K,).
 
     `stated` is the inverse variance that is known beforehand of every column of the design.

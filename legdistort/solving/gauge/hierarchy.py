@@ -3,13 +3,15 @@
 A bend of the reference plane that every exposure compensates leaves all residuals as they are, so the positions alone
 never determine it. What determines it is that single exposures depart from one static distortion by little::
 
-    A_i = A_0 + N_i g + d_i,      d_i ~ N(0, Lambda_i + C_i)
+    A_i = A_0 + B_n + N_i g + d_i,      d_i ~ N(0, Lambda_i + C_i)
 
 A_i are the coefficients as they come out with the plane bent by g, N_i is how a bend changes those of exposure i,
-Lambda is the scatter of single exposures and C_i the error of A_i. A_0, one for each detector, has the caller's
-prior: nothing (flat), a mean with its uncertainty, or a mean that is exact. With A_0 integrated out, g has a Gaussian
-posterior whose mean is linear in the A_i: it is where ``R (A - A_0) = 0`` with the rows ``R = M' (D + 1 S 1')^-1``, M
-the N_i one upon another, D the block diagonal of Lambda_i + C_i and S the variance of A_0. These rows are the
+Lambda is the scatter of single exposures and C_i the error of A_i. What the exposures of a night have in common beside
+A_0 is ``B_n ~ N(0, Lambda_n)``; with one night there is none. A_0, one for each detector, has the caller's
+prior: nothing (flat), a mean with its uncertainty, or a mean that is exact. With B and A_0 integrated out, g has a
+Gaussian posterior whose mean is linear in the A_i: it is where ``R (A - A_0) = 0`` with the rows
+``R = M' (D + E B E' + 1 S 1')^-1``, M the N_i one upon another, D the block diagonal of Lambda_i + C_i, E the nights of
+the exposures and S the variance of A_0. These rows are the
 constraints of the gauge, so that the positions and coefficients published are the posterior mean, and the variance of
 g under them is the absolute error.
 
@@ -57,6 +59,10 @@ class Hierarchy:
         Lambda_i.
     weight : ndarray, shape (n_exposures, K, K)
         Inverse of Lambda_i + C_i on these rows.
+    night : ndarray of int, shape (n_exposures,), or None
+        Night of every exposure, each detector with nights of its own.
+    nightly : ndarray, shape (n_nights, K)
+        Variance of B by night; none without nights.
     group : ndarray of int, shape (n_exposures,)
         Detector of every exposure.
     static : ndarray, shape (n_groups, K)
@@ -75,6 +81,8 @@ class Hierarchy:
     others: np.ndarray
     dynamic: np.ndarray
     weight: np.ndarray
+    night: np.ndarray
+    nightly: np.ndarray
     group: np.ndarray
     static: np.ndarray
     maps: np.ndarray
@@ -83,24 +91,23 @@ class Hierarchy:
     drifts: np.ndarray
 
     def rows(self, static):
-        """Rows M' (D + 1 S 1')^-1 of the constraints, (m + m', n_exposures, 2 n), for a variance (n_groups, K) of A_0.
+        """Rows M' (D + E B E' + 1 S 1')^-1 of the constraints, (m + m', n_exposures, 2 n).
 
-        Those of the maps that change with time come last.
+        For a variance (n_groups, K) of A_0. Those of the maps that change with time come last.
         """
         moved = self.others @ self.motion @ self.maps.T
         if self.drifts.shape[2]:
             moved = np.concatenate([moved, self.others @ self.drifts], axis=2)
-        weighted = self.weight @ moved
-        for g, variance in enumerate(static):
-            mine = self.group == g
-            if not (variance.any() and mine.any()):
-                continue
-            total, pulled = self.weight[mine].sum(axis=0), weighted[mine].sum(axis=0)
-            known = np.isfinite(variance)
-            root = np.sqrt(np.where(known, variance, 1.0))
-            # (S^-1 + sum W)^-1 without dividing by a variance of zero; one that is infinite has no S^-1
-            inner = np.diag(np.where(known, 1.0, 0.0)) + root[:, None] * total * root
-            weighted[mine] -= self.weight[mine] @ (root[:, None] * np.linalg.solve(inner, root[:, None] * pulled))
+        # D^-1 of what is moved, and of what all have in common, of which a share is left once B is integrated out
+        weighted, common = self.weight @ moved, self.weight.copy()
+        for owners, variances in ((self.night, self.nightly), (self.group, static)):
+            for owner, variance in enumerate(variances):
+                mine = owners == owner
+                if variance.any() and mine.any():
+                    share = common[mine]
+                    taken = share @ _integrated(variance, share.sum(axis=0))
+                    weighted[mine] -= taken @ weighted[mine].sum(axis=0)
+                    common[mine] -= taken @ share.sum(axis=0)
         return (weighted.mT @ self.others).transpose(1, 0, 2)
 
     def convention(self, kind):
@@ -170,9 +177,10 @@ class Hierarchy:
         flat, by_exposure = rows.reshape(len(rows), -1), rows.transpose(1, 0, 2)
         inside = flat @ (self.dynamic @ by_exposure.mT).reshape(flat.shape[1], -1)
         on_modes = (by_exposure @ self.others.mT).transpose(1, 0, 2)
-        for g, variance in enumerate(self.static):
-            common = on_modes[:, self.group == g].sum(axis=1)
-            inside += common * np.where(np.isfinite(variance), variance, 0) @ common.T
+        for owners, variances in ((self.night, self.nightly), (self.group, self.static)):
+            for owner, variance in enumerate(variances):
+                common = on_modes[:, owners == owner].sum(axis=1)
+                inside += common * np.where(np.isfinite(variance), variance, 0) @ common.T
         reach = flat @ (self.motion @ maps).reshape(flat.shape[1], -1)
         if m or rates.shape[2]:
             also = np.concatenate([self.drifts, rates], axis=2).reshape(flat.shape[1], -1)
@@ -199,6 +207,15 @@ class Constraints:
     rows: np.ndarray
     known: np.ndarray
     unknown: tuple
+
+
+def _integrated(variance, total):
+    """``(V^-1 + W)^-1`` for variances (K,), perhaps zero or infinite, and W (K, K)."""
+    known = np.isfinite(variance)
+    root = np.sqrt(np.where(known, variance, 1.0))
+    # without dividing by a variance of zero; one that is infinite has no V^-1
+    inner = np.diag(np.where(known, 1.0, 0.0)) + root[:, None] * total * root
+    return root[:, None] * np.linalg.solve(inner, np.diag(root))
 
 
 def named(maps, gauge, positions):

@@ -1,11 +1,12 @@
 """The most probable stars, distortions and static distortions together, however large these are.
 
-``J = chi2 + sum_i (A_i - S)' Lambda_i^-1 (A_i - S) + (S - m)' V^-1 (S - m)`` is minimised over everything at once by
-damped Gauss-Newton steps (Marquardt 1963), the stars eliminated from each. Nothing but the mean
-similarity of the poses is held, so that no convention stands between the data and their minimum. The scatter Lambda of
-single exposures, by degree, and the size of a static distortion of which nothing is known are those that make the data
-most likely. A single Gaussian scatter would let one odd exposure widen that of all: each has a factor of its own on it,
-as for Student's t distribution (Lange, Little & Taylor 1989).
+``J = chi2 + sum_i (A_i - S - B_n)' Lambda_i^-1 (A_i - S - B_n) + sum_n B_n' Lambda_n^-1 B_n + (S - m)' V^-1 (S - m)``,
+with B_n what the exposures of a night have in common, is minimised over everything at once by damped Gauss-Newton
+steps (Marquardt 1963), the stars eliminated from each. Nothing but the mean similarity of the poses is held, so that
+no convention stands between the data and their minimum. The scatters Lambda of single exposures and of nights, by
+degree, and the size of a static distortion of which nothing is known are those that make the data most likely. A
+single Gaussian scatter would let one odd exposure or night widen that of all: each has a factor of its own on it, as
+for Student's t distribution (Lange, Little & Taylor 1989).
 """
 
 import logging
@@ -59,11 +60,12 @@ class MostProbable:
     ----------
     state : State
     statics : ndarray, shape (n_statics,)
-        S - m in the directions that are not exact, of one detector after the other.
+        S - m in the directions that are not exact, of one detector after the other; then B of one night after the
+        other.
     posterior : Posterior
         Of the coefficients and statics there.
-    oddness : ndarray, shape (n_exposures,)
-        Factors s_i >= 1 on the scatter of single exposures.
+    oddness : ndarray, shape (n_exposures + n_nights,)
+        Factors s_i >= 1 on the scatter of single exposures, and of nights.
     blocks : Blocks
         Of the data alone.
     known : _Known
@@ -85,10 +87,9 @@ class MostProbable:
         mean, centre = given.copy(), np.zeros_like(given)
         mean[:, :, higher] = self.state.coefficients[:, :, higher]
         centre[:, :, higher] = (mean - given)[:, :, higher]
-        static = np.append(self.statics, 0.0)[known.place[known.group]]
-        centre[:, :, :n] = np.einsum("ik,ika->ia", static, known.others).reshape(-1, 2, n)
+        centre[:, :, :n] = np.einsum("ik,ika->ia", known.common(self.statics), known.others).reshape(-1, 2, n)
         by_degree = sizes[np.maximum(np.add(*basis.orders(problem.degree)), 1) - 1]
-        widths = np.broadcast_to(self.oddness[:, None, None] * by_degree, (len(mean), 2, n))
+        widths = np.broadcast_to(self.oddness[: len(mean), None, None] * by_degree, (len(mean), 2, n))
         if problem.prior_sigma is not None:
             given = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
             widths = np.where(given[:, None, None], problem.prior_sigma, widths)
@@ -156,7 +157,7 @@ def most_probable(problem, state, *, loss="linear", sizes=None, max_steps=MAX_ST
     SolveError
         If data and what is known do not determine the unknowns.
     """
-    keep = drawn(np.broadcast_to(problem.group, problem.n_exposures), MOST // (2 * problem.n_modes))
+    keep = drawn(problem.detectors, MOST // (2 * problem.n_modes))
     if sizes is None and len(keep) < problem.n_exposures:
         sizes = most_probable(*part_of(problem, state, keep), loss=loss, max_steps=max_steps).posterior.sizes
     has_closure = sizes is not None and len(sizes) > _Known.of(problem, problem.degree).n_sizes
@@ -200,7 +201,8 @@ class _Search:
             blocks = criterion.linearise(plain, state)
             unit = 1 / np.sqrt(np.median(np.einsum("iaa->ia", blocks.u)))
             self.pointing = constraints.pose_rows(plain, state, blocks), _HELD * unit
-            self.statics, self.oddness = np.zeros(self.known.n_statics), np.ones(problem.n_exposures)
+            self.statics = np.zeros(self.known.n_statics)
+            self.oddness = np.ones(problem.n_exposures + self.known.n_nights)
         else:
             self.pointing, self.statics, self.oddness = near.pointing, near.statics, near.oddness
             self.sizes = np.append(near.sizes, near.unit)
@@ -295,7 +297,7 @@ class _Search:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What is known of the coefficients of exposures: how far they scatter, and about which static distortion.
+    """What is known of the coefficients of exposures: how far they scatter, and about what.
 
     Attributes
     ----------
@@ -309,8 +311,10 @@ class _Known:
     place : ndarray of int, shape (n_groups, K)
         Which of the unknown statics each is; -1 where it is exact.
     static_width : ndarray, shape (n_statics,)
-        Given; infinite where its size is found.
+        Given; infinite where its size is found, NaN that of a night if it is.
     degrees : ndarray of int, shape (K,)
+    night : ndarray of int, shape (n_exposures,), or None
+        See `Problem.nights`.
     """
 
     problem: object
@@ -321,6 +325,7 @@ class _Known:
     place: np.ndarray
     static_width: np.ndarray
     degrees: np.ndarray
+    night: np.ndarray | None
 
     @classmethod
     def of(cls, problem, top):
@@ -332,13 +337,28 @@ class _Known:
             if problem.has_widths(i):
                 width[i] = np.sqrt(row_variances(others[i], problem.prior_sigma[i].ravel()))
         place = np.where(variance > 0, np.cumsum(variance > 0).reshape(variance.shape) - 1, -1)
-        found = np.sqrt(variance[variance > 0])
-        return cls(problem, top, others, group, width, place, found, dynamic_degrees(problem.n_modes))
+        night, static = problem.nights, np.sqrt(variance[variance > 0])
+        if night is not None:
+            sigma = np.nan if problem.night_sigma is None else problem.night_sigma
+            static = np.append(static, np.full((night.max() + 1) * others.shape[1], sigma))
+        return cls(problem, top, others, group, width, place, static, dynamic_degrees(problem.n_modes), night)
 
     @property
     def n_statics(self):
-        """Number of directions of statics that are not exact."""
+        """Number of directions of statics that are not exact, and of what nights have in common."""
         return len(self.static_width)
+
+    @property
+    def n_nights(self):
+        """Number of nights that have something in common."""
+        return 0 if self.night is None else int(self.night.max()) + 1
+
+    def common(self, statics):
+        """S - m + B of every exposure, (n_exposures, K)."""
+        out = np.append(statics, 0.0)[self.place[self.group]]
+        if self.night is not None:
+            out = out + statics[-self.n_nights * len(self.degrees) :].reshape(self.n_nights, -1)[self.night]
+        return out
 
     @cached_property
     def higher(self):
@@ -355,19 +375,24 @@ class _Known:
     @property
     def static_size(self):
         """Number of the size of statics of which nothing is known; None without them."""
-        return int(self.degrees.max()) if np.isinf(self.static_width).any() else None
+        return self.n_scatters if np.isinf(self.static_width).any() else None
+
+    @property
+    def n_scatters(self):
+        """Number of sizes that are scatters, by degree, of exposures and then of nights."""
+        return int(self.degrees.max()) * (1 + bool(np.isnan(self.static_width).any()))
 
     @property
     def n_sizes(self):
-        """Number of sizes that are found: by degree, that of a static distortion, and of what is beyond the degree."""
-        return int(self.degrees.max()) + (self.static_size is not None) + (self.n_higher > 0)
+        """Number of sizes that are found: scatters, that of a static distortion, and of what is beyond the degree."""
+        return self.n_scatters + (self.static_size is not None) + (self.n_higher > 0)
 
     def values(self, state, statics):
-        """Departures A_i - S at a state, what is beyond their degree, and S: one vector."""
+        """Departures A_i - S - B at a state, what is beyond their degree, S, and B: one vector."""
         departure = (state.coefficients - _padded(self.problem.prior_mean, state))[:, :, : basis.n_modes(self.top)]
         modes, detectors = self.higher
         own = departure[:, :, : modes.start].reshape(len(departure), -1)
-        own = np.einsum("ika,ia->ik", self.others, own) - np.append(statics, 0.0)[self.place[self.group]]
+        own = np.einsum("ika,ia->ik", self.others, own) - self.common(statics)
         return np.concatenate([own.ravel(), departure[detectors, :, modes].ravel(), statics])
 
     def factor(self, pointing, width):
@@ -382,6 +407,10 @@ class _Known:
         place = self.place[self.group].ravel()
         on = np.flatnonzero(place >= 0)
         static = sparse.csr_array((-np.ones(len(on)), (on, place[on])), (n * k, self.n_statics))
+        if self.night is not None:
+            first = self.n_statics - self.n_nights * k
+            theirs = (first + k * self.night[:, None] + np.arange(k)).ravel()
+            static = static + sparse.csr_array((-np.ones(n * k), (range(n * k), theirs)), static.shape)
         held = np.zeros((len(pointing), n, m))
         held[:, :, : m - k] = np.einsum("cia,isa->cis", pointing, similar)
         parts = [
@@ -392,11 +421,13 @@ class _Known:
         ]
         counts = [n * k, self.n_higher, self.n_statics, len(held)]
         found = np.concatenate(
-            [np.isnan(self.width).ravel(), np.ones(self.n_higher, bool), np.isinf(self.static_width)]
+            [np.isnan(self.width).ravel(), np.ones(self.n_higher, bool), ~np.isfinite(self.static_width)]
         )
         found = np.append(found, np.zeros(len(held), bool))
         size = [np.tile(self.degrees - 1, n)]
-        size += [np.full(c, k) for c, k in zip(counts[1:], (self.n_sizes - 1, self.degrees.max(), 0), strict=True)]
+        size += [np.full(c, k) for c, k in zip(counts[1:], (self.n_sizes - 1, self.n_scatters, 0), strict=True)]
+        if self.n_nights:
+            size[2][-self.n_nights * k :] = np.tile(self.degrees - 1 + self.degrees.max(), self.n_nights)
         width = [self.width.ravel(), np.ones(self.n_higher), self.static_width, np.full(len(held), width)]
         size = np.where(found, np.concatenate(size), GIVEN)
         rows = sparse.block_array(parts, format="csr")
@@ -404,11 +435,11 @@ class _Known:
 
     def at(self, factor, state, statics, oddness):
         """The factor where the coefficients and statics are."""
-        value, stretch = self.values(state, statics), np.repeat(oddness, self.width.shape[1])
-        pad = len(factor.value) - np.array([len(value), len(stretch)])
-        return replace(
-            factor, value=np.pad(value, (0, pad[0])), stretch=np.pad(stretch, (0, pad[1]), constant_values=1)
-        )
+        value, stretch = self.values(state, statics), np.ones(len(factor.value))
+        (n, k), end = self.width.shape, len(value)
+        stretch[: n * k] = np.repeat(oddness[:n], k)
+        stretch[end - self.n_nights * k : end] = np.repeat(oddness[n:], k)
+        return replace(factor, value=np.pad(value, (0, len(factor.value) - end)), stretch=stretch)
 
     def penalty(self, posterior, state, statics):
         """What is known as part of J, at the sizes of a posterior."""
@@ -416,10 +447,12 @@ class _Known:
         return float(((value / posterior.widths[: len(value)]) ** 2).sum())
 
     def oddness(self, posterior):
-        """Factors s_i on the scatter, as for Student's t distribution, (n_exposures,)."""
+        """Factors (n_exposures + n_nights,) on the scatter of exposures and nights, as for Student's t distribution."""
         n, k, _ = self.others.shape
-        value, variance = (each[: n * k].reshape(n, k) for each in posterior.left)
-        width = (posterior.widths / posterior.factor.stretch)[: n * k].reshape(n, k)
+        end = n * k + self.n_higher + self.n_statics
+        rows = np.concatenate([np.arange(n * k), np.arange(end - self.n_nights * k, end)])
+        width = posterior.widths / posterior.factor.stretch
+        value, variance, width = (each[rows].reshape(-1, k) for each in (*posterior.left, width))
         finite = np.isfinite(width)
         square = np.where(finite, (value**2 + variance) / width**2, 0).sum(axis=1)
         count = finite.sum(axis=1)

@@ -1,7 +1,8 @@
 """Departures of exposures from the static distortion of their detector, and what is known of that, as factors.
 
-``A_i = S_g + d_i`` with ``d_i ~ N(0, Lambda)``, Lambda by degree, and ``S_g ~ N(m_g, V_g)`` for the detector g of
-exposure i. Similarities of single exposures are free.
+``A_i = S_g + B_n + d_i`` with ``d_i ~ N(0, Lambda)``, Lambda by degree, ``B_n ~ N(0, Lambda_n)`` for the night n of
+exposure i, where there are several, and ``S_g ~ N(m_g, V_g)`` for its detector g. Similarities of single exposures are
+free.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +25,7 @@ class ExposureModel:
     """Data on the coefficients of exposures, and the static distortions that these scatter about.
 
     The unknowns are the coefficients of every exposure but its similarity, from where they are, by exposure and in the
-    order of `dynamic_basis`; then those of the statics, from the prior mean.
+    order of `dynamic_basis`; then what those of a night have in common; then those of the statics, from the prior mean.
 
     Attributes
     ----------
@@ -35,12 +36,18 @@ class ExposureModel:
         Number of the static distortion that every exposure departs from.
     degrees : ndarray of int, shape (K,)
         Of every coefficient.
+    night : ndarray of int, shape (n_exposures,), or None
+        See `Problem.nights`.
+    night_sigma : float or None
+        Scatter of nights; None: found.
     """
 
     data: ReducedData
     departure: np.ndarray
     group: np.ndarray
     degrees: np.ndarray
+    night: np.ndarray | None = None
+    night_sigma: float | None = None
 
     @classmethod
     def of(cls, problem, state, motion, group):
@@ -64,28 +71,52 @@ class ExposureModel:
         data = reduced_data(problem, state, rows.reshape(-1, problem.n_exposures * 2 * n), motion)
         departure = (state.coefficients - problem.prior_mean)[:, :, :n].reshape(problem.n_exposures, -1)
         departure = np.stack([mine @ a for mine, a in zip(others, departure, strict=True)])
-        return cls(data, departure, group, dynamic_degrees(n))
+        return cls(data, departure, group, dynamic_degrees(n), problem.nights, problem.night_sigma)
 
     @property
     def n_groups(self):
         """Number of static distortions."""
         return int(self.group.max()) + 1
 
+    @property
+    def n_nights(self):
+        """Number of nights that have something in common."""
+        return 0 if self.night is None else int(self.night.max()) + 1
+
+    @property
+    def n_scatters(self):
+        """Number of sizes that are scatters of exposures and nights."""
+        return int(self.degrees.max(initial=0)) * (1 + (self.n_nights > 0 and self.night_sigma is None))
+
     @cached_property
     def departures(self):
-        """The factor on A_i - S_g, whose sizes are numbered by degree."""
+        """The factor on A_i - S_g - B_n, and that on B_n, whose sizes are numbered by degree."""
         n, k = self.departure.shape
-        own = sparse.eye_array(n * k)
-        static = sparse.kron(sparse.csr_array((-np.ones(n), (range(n), self.group)), (n, self.n_groups)), np.eye(k))
+        parts = [sparse.eye_array(n * k)]
+        for owner, number in ((self.night, self.n_nights), (self.group, self.n_groups)):
+            if number:
+                theirs = sparse.csr_array((-np.ones(n), (range(n), owner)), (n, number))
+                parts.append(sparse.kron(theirs, np.eye(k)))
         size = np.tile(self.degrees - 1, n)
-        rows = sparse.hstack([own, static], format="csr")
-        return Factor("departures of the exposures", rows, self.departure.ravel(), np.ones(n * k), size)
+        rows = sparse.hstack(parts, format="csr")
+        own = Factor("departures of the exposures", rows, self.departure.ravel(), np.ones(n * k), size)
+        return Factor.joined([own, self.nights]) if self.n_nights else own
+
+    @cached_property
+    def nights(self):
+        """The factor on B_n."""
+        n, k = self.departure.shape
+        m = self.n_nights * k
+        rows = sparse.eye_array(m, (n + self.n_nights + self.n_groups) * k, k=n * k, format="csr")
+        found = self.night_sigma is None
+        size = np.tile(self.degrees - 1 + self.degrees.max(), self.n_nights) if found else np.full(m, GIVEN)
+        return Factor("nights", rows, np.zeros(m), np.full(m, 1.0 if found else self.night_sigma), size)
 
     def statics(self, *, size=GIVEN, width=np.nan):
         """The factor on S_g - m_g: of one size that is found, or of given widths (n_groups, K)."""
         n, k = self.departure.shape
         m = self.n_groups * k
-        rows = sparse.hstack([sparse.csr_array((m, n * k)), sparse.eye_array(m)], format="csr")
+        rows = sparse.eye_array(m, (n + self.n_nights + self.n_groups) * k, k=(n + self.n_nights) * k, format="csr")
         widths = np.broadcast_to(width, (self.n_groups, k)).ravel()
         return Factor("static distortion", rows, np.zeros(m), widths, np.full(m, size))
 
@@ -94,14 +125,13 @@ class ExposureModel:
         """That with all sizes found, those of the departures by degree, then that of the statics."""
         factor = Factor.joined([self.departures, self.free_statics])
         unit = 1 / np.sqrt(np.median(np.diag(self.data.curvature)))
-        n = int(self.degrees.max(initial=0)) + 1
         scatter = max(float(np.sqrt(np.mean(self.departure**2))), unit)
-        return most_likely(self.data, factor, np.full(n, scatter), unit * np.array(RANGE))
+        return most_likely(self.data, factor, np.full(self.n_scatters + 1, scatter), unit * np.array(RANGE))
 
     @cached_property
     def free_statics(self):
         """The factor on S_g - m_g of a size that is found."""
-        return self.statics(size=int(self.degrees.max(initial=0)))
+        return self.statics(size=self.n_scatters)
 
 
 def stated(problem):
@@ -114,7 +144,6 @@ def stated(problem):
     sigma = np.zeros(mean.shape) if problem.mean_sigma is None else problem.mean_sigma
     variance = row_variances(others, sigma.reshape(problem.n_exposures, -1))
     given = (others @ mean)[:, :, 0]
-    detector = np.broadcast_to(problem.group, problem.n_exposures)
-    keys = np.column_stack([detector, given, variance])
+    keys = np.column_stack([problem.detectors, given, variance])
     _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     return given[first], variance[first], group.ravel(), first

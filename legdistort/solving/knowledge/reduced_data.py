@@ -123,6 +123,7 @@ def part_of(problem, state, keep):
         prior_sigma=None if problem.prior_sigma is None else problem.prior_sigma[keep],
         mean_sigma=None if problem.mean_sigma is None else problem.mean_sigma[keep],
         group=group,
+        night=problem.night if np.ndim(problem.night) == 0 else problem.night[keep],
         centre=None if problem.centre is None else problem.centre[keep],
         moving=None if problem.moving is None else problem.moving.subset(keep),
     )
