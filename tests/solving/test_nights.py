@@ -144,6 +144,13 @@ def test_a_right_prior_is_right_whatever_nights_add():
     assert states["nights"].value > 1e-3 > states["one"].value
 
 
+@pytest.mark.parametrize(("odd", "named"), [(0.5, ["departure of the night of n4e0"]), (0.0, [])])
+def test_an_odd_night_is_named(odd, named):
+    solution = ld.solve(matches(Nights(5, per=3, odd=odd, roll=0.7, n_stars=100).table))
+    found = [str(row["name"]) for row in solution.factors if str(row["name"]).startswith("departure")]
+    assert found == named
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "low", "high"),

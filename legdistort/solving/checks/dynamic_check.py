@@ -8,7 +8,7 @@ from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...results.check import FALSE_ALARM, Check, FactorTest
 from .limits import MOST_NAMED
 
-#: Exposures of one detector from which the scatter of the others tells whether one is odd.
+#: Exposures, or nights, of one detector from which the scatter of the others tells whether one is odd.
 _FEWEST = 6
 #: Times the scatter of the others that matter to their common map.
 _ODD = 3.0
@@ -50,23 +50,28 @@ def dynamic_check(solution, problem, blocks):
 
 
 def _odd(solution, problem, blocks):
-    """Exposures that depart from the others of their detector more than these among themselves, the farthest first.
+    """Exposures and nights that depart from the others of their detector more than these among themselves.
 
-    Name, how many times as far as these, and the `FactorTest`: squares by degree over those of the others, beyond the
+    The farthest first: name, how many times as far as these, and the `FactorTest`: squares by degree over those of the others, beyond the
     errors of the coefficients. If all scatter alike, by degree, they are distributed as F.
     """
-    found, group = [], problem.detectors
+    found, names = [], np.array(solution.names)
     size, degrees = problem.n_modes, dynamic_degrees(problem.n_modes)
-    for detector in np.unique(group):
-        each = np.flatnonzero(group == detector)
-        if len(each) < _FEWEST:
-            continue
+    for detector in np.unique(problem.detectors):
+        each = np.flatnonzero(problem.detectors == detector)
         rows = dynamic_basis(problem.shapes[each[0]], size)
         a = (solution.coefficients - solution.estimate.prior_mean)[each, :, :size].reshape(len(each), -1) @ rows.T
         noise = np.einsum("ka,iab,kb->ik", rows, np.linalg.inv(blocks.u[each]), rows)
-        for k, ratio, chi2, p in _beyond(a, noise, degrees, len(solution.names)):
-            name = solution.names[each[k]]
-            found.append((name, ratio, FactorTest(f"departure of {name}", _OTHERS, len(rows), chi2, len(rows), p)))
+        owners = [(np.arange(len(each)), "")]
+        if problem.nights is not None:
+            owners.append((np.unique(problem.nights[each], return_inverse=True)[1], "the night of "))
+        for owner, whose in owners:
+            mean = np.eye(owner.max() + 1)[:, owner] / np.bincount(owner)[:, None]
+            if len(mean) < _FEWEST:
+                continue
+            for k, ratio, chi2, p in _beyond(mean @ a, mean**2 @ noise, degrees, len(names)):
+                name = whose + names[each][owner == k][0]
+                found.append((name, ratio, FactorTest(f"departure of {name}", _OTHERS, len(rows), chi2, len(rows), p)))
     return sorted(found, key=lambda each: -each[1])
 
 
