@@ -17,7 +17,7 @@ _SHARED, _BORROWED = 10.0, 0.3
 TAILS, CHANCE = 4.0, 3.0
 #: Nights scatter if the squares of their means exceed what is expected of independent exposures by so many standard
 #: deviations.
-SEEN = 2.0
+SEEN = 3.0
 
 _SMALLEST = 1e-6  # scatter, pixels: where none is seen beyond the errors, Lambda stays invertible
 
