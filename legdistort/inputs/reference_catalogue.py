@@ -25,14 +25,16 @@ from . import column_contract
 from .plain_columns import is_text, numbers, text
 from .table_files import read_table
 
-#: How VizieR calls the columns of Gaia, in small letters.
+#: How VizieR calls the columns of Gaia, and places in the tables of others, in small letters.
 VIZIER = {
     "ra_icrs": "ra", "de_icrs": "dec", "e_ra_icrs": "ra_error", "e_de_icrs": "dec_error", "pmde": "pmdec",
     "e_pmra": "pmra_error", "e_pmde": "pmdec_error", "radecor": "ra_dec_corr", "rapmracor": "ra_pmra_corr",
     "rapmdecor": "ra_pmdec_corr", "depmracor": "dec_pmra_corr", "depmdecor": "dec_pmdec_corr",
     "pmrapmdecor": "pmra_pmdec_corr", "gmag": "phot_g_mean_mag", "plx": "parallax", "e_plx": "parallax_error",
     "raplxcor": "ra_parallax_corr", "deplxcor": "dec_parallax_corr", "plxpmracor": "parallax_pmra_corr",
-    "plxpmdecor": "parallax_pmdec_corr",
+    "plxpmdecor": "parallax_pmdec_corr", "raj2000": "ra", "dej2000": "dec", "radeg": "ra", "dedeg": "dec",
+    "e_raj2000": "ra_error", "e_dej2000": "dec_error", "e_radeg": "ra_error", "e_dedeg": "dec_error",
+    "_raj2000": "ra", "_dej2000": "dec", "_ra": "ra", "_de": "dec",
 }  # fmt: skip
 #: How the tables of the CDS call the parts of sexagesimal positions, in small letters.
 _PARTS = ("rah", "ram", "ras", "ded", "dem", "des", "de-")

@@ -5,6 +5,7 @@ import codecs
 import list_dialects
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.table import Table
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -286,6 +287,21 @@ def test_parts_in_columns_of_their_own(tmp_path):
     (tmp_path / "c.txt").write_text(text)
     sky = [[83 + 47 / 60 + 59.85 / 3600, -(24 / 60 + 0.1 / 3600)], [15 / 3600, 10.5]]
     assert_allclose(read_reference(tmp_path / "c.txt").sky, sky, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("names", "ra", "dec"),
+    [
+        (("RAJ2000", "DEJ2000"), ["17 45 40.04"], ["-29 00 28.1"]),
+        (("_RAJ2000", "_DEJ2000"), [266.41683333], [-29.00780556]),
+        (("RAdeg", "DEdeg"), [266.41683333], [-29.00780556]),
+    ],
+)
+def test_places_as_vizier_names_them(names, ra, dec):
+    table = Table({names[0]: ra, names[1]: dec, "e_RAJ2000": [0.05] * u.arcsec, "e_DEJ2000": [0.06] * u.arcsec})
+    found = read_reference(table)
+    assert_allclose(found.sky, [[266.41683333, -29.00780556]], atol=1e-8)
+    assert_allclose(np.sqrt(np.einsum("jaa->ja", found.covariance)), [[50, 60]])
 
 
 @pytest.mark.parametrize(
