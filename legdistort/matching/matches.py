@@ -387,11 +387,12 @@ class Matches(ShownAsPrinted):
                 raise InputError(f"{name} must be a dict, got {type(given).__name__}")
         if columns:
             table = column_contract.rename(table, columns)
+        former = (getattr(table, "meta", None) or {}).get("camera")  # of a file
         table = column_contract.check(table, column_contract.MATCHED, "the table of matched positions")
         if table["exposure"].dtype.kind != "U":
             table["exposure"] = table["exposure"].astype(str)
         if camera is not None:
-            table, shape = in_focal_plane(table, camera), camera.field
+            table, shape = in_focal_plane(table, camera, former=former), camera.field
         seen, left_out = Observations.of(table), dict(left_out or {})
         check_choice(allow_copies, (True, False), "allow_copies")
         if not allow_copies and (copies := repetitions.reasons(seen.names, seen.exposure, seen.xy)):
@@ -551,11 +552,16 @@ def _inside(seen, shapes):
     return ~out
 
 
-def in_focal_plane(table, camera):
-    """The table with positions in the focal plane of a camera, without those outside of their detector (`_inside`)."""
+def in_focal_plane(table, camera, *, former=None):
+    """The table with positions in the focal plane of a camera, without those outside of their detector (`_inside`).
+
+    Positions in the focal plane of a `former` camera, as in the header of a file, are taken to their detectors first.
+    """
     check_camera(camera)
     if not camera.has_focal_plane:
         return table
+    if "x_detector" in table.colnames and former not in (None, camera.to_meta()):
+        return camera.in_focal_plane(Camera.from_meta(former).on_detectors(table))
     if "x_detector" not in table.colnames:
         detector, part = camera.ids(table), QTable(table, copy=False)
         if "star" not in table.colnames:

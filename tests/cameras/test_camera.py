@@ -599,6 +599,24 @@ class TestFiles:
             assert np.abs(np.array(ours.invert(*here(*xy.T))) - xy.T).max() < 1e-5
         assert "camera  GSAOI, detectors 1, 2, 3, 4" in str(solution)
 
+    @pytest.mark.usefixtures("undrawn")
+    def test_another_camera_has_another_focal_plane(self, table, gsaoi, tmp_path, monkeypatch):
+        """What was matched with a layout is solved with another that is given, as if it had been matched with that."""
+        monkeypatch.chdir(tmp_path)
+        few = table[np.isin(table["exposure"], [f"frame{i:02d}" for i in range(4)])]
+        moved = dict(gsaoi.detectors)
+        moved["1"] = replace(moved["1"], layout=moved["1"].layout + [[0, 0, 3], [0, 0, -2]])
+        other = replace(gsaoi, name="other", detectors=moved)
+        other.write("other.asdf")
+        with_first, with_other = (legdistort.Matches.from_table(few, camera=each) for each in (gsaoi, other))
+        saved = with_first.table.copy()
+        saved.meta |= with_first.to_meta()
+        again = legdistort.Matches.from_table(saved, camera=other)
+        for name in ("x", "y", "x_err", "y_err"):
+            assert np.abs(again.table[name].value - with_other.table[name].value).max() < 1e-9
+        same = legdistort.Matches.from_table(saved, camera=gsaoi)
+        assert np.array_equal(same.table["x"], with_first.table["x"])
+
     def test_a_distortion_is_made_once_for_all_files(self, solution, tmp_path, monkeypatch):
         """Making a series takes longer than all else; the WCSs in memory share nothing."""
         made, series = [], models.legendre_series

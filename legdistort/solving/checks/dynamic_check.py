@@ -52,8 +52,8 @@ def dynamic_check(solution, problem, blocks):
 def _odd(solution, problem, blocks):
     """Exposures and nights that depart from the others of their detector more than these among themselves.
 
-    The farthest first: name, how many times as far as these, and the `FactorTest`: squares by degree over those of the others, beyond the
-    errors of the coefficients. If all scatter alike, by degree, they are distributed as F.
+    The farthest first: name, how many times as far as these, and the `FactorTest`: squares by degree over those of
+    the others, beyond the errors of the coefficients. If all scatter alike, by degree, they are distributed as F.
     """
     found, names = [], np.array(solution.names)
     size, degrees = problem.n_modes, dynamic_degrees(problem.n_modes)
