@@ -24,6 +24,8 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` states the s
     from .measurement.noise_calibration import calibrate_noise as calibrate_noise
     from .measurement.positions import effective_psf as effective_psf
     from .measurement.positions import measure as measure
+    from .photometry.catalogue import Catalogue as Catalogue
+    from .photometry.catalogue import catalogue as catalogue
     from .pipeline import run as run
     from .priors.prior import Prior as Prior
     from .results.solution import Solution as Solution
@@ -40,6 +42,7 @@ __version__: str  # of the package as it is installed, see `__getattr__`
 # and a program that only fits models should not wait for the rest.
 _PLACES = {
     "Camera": "cameras.camera",
+    "Catalogue": "photometry.catalogue",
     "Detector": "cameras.detector",
     "EffectivePSF": "measurement.effective.model",
     "Exposure": "inputs.exposures",
@@ -50,6 +53,7 @@ _PLACES = {
     "Prior": "priors.prior",
     "Solution": "results.solution",
     "calibrate_noise": "measurement.noise_calibration",
+    "catalogue": "photometry.catalogue",
     "coadd": "coaddition.mosaicking",
     "effective_psf": "measurement.positions",
     "match": "matching.matcher",

@@ -241,6 +241,19 @@ def do_coadd(a):
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
 
 
+def do_catalogue(a):
+    """``legdistort catalogue``."""
+    from ..measurement.options import MeasureOptions
+    from ..photometry.catalogue import photometry_path
+
+    outputs.check_file(photometry_path(a.out), overwrite=a.overwrite)
+    cataloguing = given(a, options.CATALOGUING)
+    MeasureOptions(**{name: value for name, value in cataloguing.items() if name != "zero_point"})
+    found = legdistort.catalogue(_open(a), _solution(a), **cataloguing, progress=wants_progress(a))
+    found.write(a.out, overwrite=a.overwrite)
+    _say(a, f"{found}\n{a.out} and {photometry_path(a.out)}", found.stars.meta | {"left_out": dict(found.left_out)})
+
+
 def do_attach(a):
     """``legdistort attach``."""
     from ..wcs.attachment import attach
@@ -411,7 +424,8 @@ def _share(a):
 
 
 def _open(a, **reading):
-    parallel.check_workers(a.workers)
+    if "workers" in a:
+        parallel.check_workers(a.workers)
     return legdistort.open_exposures(**given(a, options.FRAMES, options.FLAGGED), **reading, progress=wants_progress(a))
 
 

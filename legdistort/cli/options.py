@@ -141,6 +141,13 @@ MEASURING = Group(
         ),
     },
 )
+CATALOGUING = {
+    **DETECTOR,
+    "threshold": Option("signal-to-noise ratio of all exposures together (default 5)", type=float),
+    "fwhm": MEASURING["fwhm"],
+    "psf": Option("moffat, effective, or a file or folder with PSFs (default: as the solution's)", path="read"),
+    "zero_point": Option("magnitude of unit flux in a mean exposure (default: no magnitudes)", type=float),
+}
 PSF_FILES = {"write_psf": Option("folder for the effective PSF of every exposure", type=Path, path="folder")}
 INJECTING = {
     "fwhm": Option("of the stars put in, pixels (default: that of the frame's)", type=float, nargs="+"),

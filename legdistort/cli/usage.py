@@ -104,6 +104,15 @@ COMMANDS = {
         options.COADDING,
         options.WORKERS,
     ),
+    "catalogue": _command(
+        "every star measured in all frames at once, by the maps of a solution",
+        "frames/*.fits --solution results/solution.asdf --out catalogue.ecsv",
+        options.FRAMES,
+        options.FLAGGED,
+        options.SOLUTION | options.NAMED_SOLUTION,
+        options.out("table (ECSV) of stars; photometry.ecsv comes beside it", endings=options.TABLE_ENDINGS),
+        options.CATALOGUING,
+    ),
     "attach": _command(
         "the WCS of a solution into its frames",
         "results/solution.asdf frames/*.fits --out calibrated",

@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..exceptions import AssumptionWarning, InputError, reasons_of, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, reasons_of, warn
 from ..geometry.star_hull import support
-from ..inputs.exposure_names import whole_name
 from ..inputs.frames.value_units import value_unit
 from ..inputs.frames.working_units import header_in_working_unit, working_unit
 from ..inputs.sky_wcs import leads_elsewhere, warn_of_another_field
 from ..results.solution import Solution
-from ..results.view import image_view
 from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
 from ..runtime.words import PLANES
@@ -30,6 +27,7 @@ from .mosaic_header import mosaic_header
 from .options import CoaddOptions
 from .preparation import prepare
 from .resampling import engines, noise_gain, pixel_maps
+from .selection import check_order, select_images, warn_of_left_out
 from .weights import make_weights, stellar_widths
 
 if TYPE_CHECKING:
@@ -144,7 +142,7 @@ def coadd(
     >>> ld.coadd(exposures, solution, method="median").exposures
     ('exp00', 'exp01', 'exp02', 'exp03')
     """
-    _check_order(exposures, solution)
+    check_order(exposures, solution, "coadd")
     options = CoaddOptions(
         method=method,
         order=order,
@@ -164,18 +162,9 @@ def coadd(
     return _coadd(exposures, solution, options, share)
 
 
-def _check_order(exposures, solution):
-    """Raise `InputError` for a solution in the place of exposures, and for anything else in the place of a solution."""
-    if isinstance(exposures, Solution):
-        raise InputError("coadd takes the exposures first and then the solution: call coadd(exposures, solution)")
-    if not isinstance(solution, Solution):
-        kind = type(solution).__name__
-        raise InputError(f"coadd takes a Solution after the exposures, as solve gives it, got {kind}")
-
-
 def _coadd(exposures, solution, options, share):
     """The mosaic; `share` is `map_items`, which shares the work among threads or processes."""
-    frames, views, left_out = _select(exposures, solution)
+    frames, views, left_out = select_images(exposures, solution, "co-add", "the mosaic")
     if all(value_unit(f.header).per_area for f in frames):  # light is values times the area of pixels
         options = replace(options, conserve="surface_brightness")
     options.check_names([*(f.name for f in frames), *left_out])
@@ -194,7 +183,7 @@ def _coadd(exposures, solution, options, share):
         unit = _working_unit(solution)
         found = list(share(partial(prepare, folder=folder, unit=unit), frames, description="reading"))
         unfit = {f.name: reason for f, reason in zip(frames, found, strict=True) if isinstance(reason, str)}
-        _warn(unfit)
+        warn_of_left_out(unfit, "the mosaic")
         left_out |= unfit
         prepared = {f.name: one for f, one in zip(frames, found, strict=True) if f.name not in unfit}
         frames = [_in_unit(f, unit) for f in frames if f.name in prepared]
@@ -278,45 +267,6 @@ def _area(exposure_map):
     """Detector pixels per output pixel in the middle of an exposure."""
     area = exposure_map.middle()[4].mean()
     return area if np.isfinite(area) else 1.0
-
-
-def _select(exposures, solution):
-    """Exposures that can be used, their views by name, and the reasons why others cannot."""
-    one = isinstance(exposures, str | Path) or not np.iterable(exposures)
-    exposures = [exposures] if one else list(exposures)
-    if not all(hasattr(e, "read") for e in exposures):
-        raise InputError(
-            "exposures must be images as open_exposures or read_exposures give them, got "
-            f"{type(exposures[0]).__name__}; give open_exposures('frames/*.fits')"
-        )
-    names = [f.name for f in exposures]
-    twice = {n for n in names if names.count(n) > 1}
-    if twice:
-        raise InputError(f"exposures come twice: {', '.join(sorted(twice))}; names must differ")
-    frames, views, left_out = [], {}, {}
-    for frame in exposures:
-        view = image_view(solution, frame)
-        if view is None:
-            whole = solution.left_out.get(whole_name(frame), "it is not in the solution")
-            left_out[frame.name] = solution.left_out.get(frame.name, whole)
-        elif frame.shape != tuple(view.shape):
-            raise InputError(
-                f"exposure {frame.name}: its shape {frame.shape} is not that of the solution, {tuple(view.shape)}; a "
-                "trimmed or binned image needs a solution of its own"
-            )
-        else:
-            frames.append(frame)
-            views[frame.name] = view
-    if not frames:
-        known = f"; the solution has {some_of([v.label for view in solution for v in view.parts], 5)}" * bool(left_out)
-        raise InputError(f"no exposure to co-add: {reasons_of(left_out) or 'the list is empty'}{known}")
-    _warn(left_out)
-    return frames, views, left_out
-
-
-def _warn(left_out):
-    if left_out:
-        warn(f"left out of the mosaic: {reasons_of(left_out)}", AssumptionWarning)
 
 
 def _warn_of_misuse(frames, maps, algorithm, views):

@@ -18,6 +18,7 @@ class Flag(IntFlag):
     #: In a crowd: chi2 of the core above 4.
     DEFORMED = 256
     DEFECT = 512  #: a hot pixel, a bad column or a cosmic ray within one FWHM of the centre was left out of the fit
+    VARIABLE = 1024  #: in a catalogue: its fluxes scatter by more than their errors, and two exposures confirm it
 
 
 #: Flags that make a detection useless as a star position.

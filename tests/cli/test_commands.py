@@ -469,7 +469,9 @@ def test_a_full_standard_error_is_no_reason_to_fail(night, tmp_path):
         assert subprocess.run(command, stderr=full).returncode in (1, 120)  # 120: Python could not empty it
 
 
-@pytest.mark.parametrize("command", ["demo", "run", "measure", "match", "solve", "coadd", "simulate", "show", "report"])
+@pytest.mark.parametrize(
+    "command", ["demo", "run", "measure", "match", "solve", "coadd", "catalogue", "simulate", "show"]
+)
 def test_help_has_an_example(command, capsys):
     with pytest.raises(SystemExit) as end:
         main([command, "--help"])
@@ -490,6 +492,7 @@ def test_help_has_an_example(command, capsys):
         (match, [options.MATCHING]),
         (solve, [options.SOLVING]),
         (coadd, [options.COADDING, options.WORKERS, options.GRID]),
+        (legdistort.catalogue, [options.CATALOGUING]),
         (attach, [options.FRAMES, options.ATTACHING]),
         (predict, [options.PREDICTING]),
         (Prior.from_model, [options.EXPANDING]),

@@ -3,29 +3,27 @@
 from functools import partial
 
 import numpy as np
-from scipy.sparse import csc_array, diags_array
-from scipy.sparse.linalg import splu
-from scipy.spatial import cKDTree
+from scipy.signal import oaconvolve
 
+from ..detection import peaks_above
 from ..filters import gaussian_sums
 from ..profiles.pixel_noise import pixel_variance
+from ..sky.smooth_light import binned, spread
+from .normal_equations import JointFit, normal_matrix, solved
 
 _KIND = np.float32  # of the light of stars: photons bound the ratio of signal to noise of a pixel
 _CHUNK = 200  # stars: their light stays in the processor's cache
 _SEEN = 0.02  # standard deviations of the sky: light of a star below that is left out
-_LONGEST = 0.25  # FWHM, a step of a position
-_SETTLED = 0.05  # standard deviations: a star that moves by less stays
-_DAMPING = 1e-4
-_NEAR = 1.5  # FWHM: what moves within it moves a star
 _SKY = 3.0  # FWHM, standard deviation of the weights of the local sky: as many pixels as a stamp for a sky of its own
 _OUTLIER = 3.0  # standard deviations, of pixels in the sky
 _LEAST = 0.2  # of a change of the sky that stars leave, at least
-_NEIGHBOURS = 10  # of a star, whose errors are part of its own
 _BRIGHT = 20.0  # signal-to-noise ratio of stars that show how good the PSF is
 _CORE = 1.3  # FWHM, radius of a core
+_COVERED = 0.2  # part of a star, by its weight in the detection, on good pixels
+_KERNEL = 1.3  # FWHM, radius of what is looked for
 
 
-class Scene:
+class Scene(JointFit):
     """The stars of a frame, their light and what the frame has beside it.
 
     Parameters
@@ -79,6 +77,11 @@ class Scene:
         return psf.light(np.array([[0.0, 0.0, 1.0]]), self.middle, half).reshape(2 * half + 1, -1)
 
     @property
+    def fwhm(self):
+        """Full width at half maximum of the PSF [pix]."""
+        return self.psf.fwhm
+
+    @property
     def middle(self):
         """The pixel in the middle of the frame, (1, 2)."""
         return np.array([self.frame.signal.shape[::-1]]) // 2
@@ -118,20 +121,36 @@ class Scene:
         """What stars and sky leave, (ny, nx)."""
         return self.frame.signal - self.sky - self.light
 
-    def update_sky(self):
-        """The sky changed by what is left around every pixel, over what a change leaves once the stars follow."""
-        sigma, weights = _SKY * self.psf.fwhm, self.weights
+    def update_sky(self, step=1):
+        """The sky changed by what is left around every pixel, over what a change leaves once the stars follow.
+
+        Parameters
+        ----------
+        step : int
+            Pixels are binned in squares of this side first, and the change interpolated: faster, and exact enough for
+            squares within a star.
+        """
+        sigma, weights = _SKY * self.fwhm, self.weights
         root = np.sqrt(weights)
+
+        def around(image):
+            return gaussian_sums(binned(image.astype(np.float32), step), sigma / step)[0]
+
         left = root * np.clip(root * self.residual, -_OUTLIER, _OUTLIER)  # a blend that has passed for a star is no sky
-        left, norm = (gaussian_sums(image.astype(np.float32), sigma)[0] for image in (left, weights))
+        left, norm = around(left), around(weights)
         norm = np.maximum(norm, 1e-3 * norm.max())
         if len(self.flux):
-            jacobian = self.jacobian(np.arange(len(self.flux)))
-            normal, right = (jacobian.T @ jacobian).tocsc(), jacobian.T @ np.sqrt(weights, dtype=float).ravel()
-            taken = jacobian @ _solved(normal, right, np.sqrt(np.maximum(normal.diagonal(), 1e-30)))
-            taken = (np.sqrt(weights) * taken.reshape(weights.shape)).astype(np.float32)
-            norm = np.maximum(norm - gaussian_sums(taken, sigma)[0], _LEAST * norm)
-        self.sky += left / norm
+            slopes, pixels, centres = self.slopes(np.arange(len(self.flux)))
+            normal, right = (
+                normal_matrix(slopes, centres, self.half),
+                np.einsum("nap,np->na", slopes, root.ravel()[pixels]),
+            )
+            response = solved(normal, right.ravel(), np.sqrt(np.maximum(normal.diagonal(), 1e-30))).reshape(-1, 3)
+            taken = np.zeros(weights.shape)
+            lay(taken, np.einsum("nap,na->np", slopes, response), centres, self.half)
+            norm = np.maximum(norm - around(root * taken), _LEAST * norm)
+        change = left / norm
+        self.sky += change if step == 1 else spread(change, step, weights.shape)
 
     def on_stamps(self, rows):
         """Of some stars `stars`, and the flat indices of the pixels of their stamps and which lie in the image."""
@@ -171,94 +190,68 @@ class Scene:
                 light = self.psf.light(params.astype(_KIND), centres, width * self.half)
                 lay(image, sign * light, centres, width * self.half)
 
-    def fit(self, active, iterations):
-        """Gauss-Newton steps of some stars, all together; the others stay.
+    def equations(self, rows):
+        """Normal matrix (3 m, 3 m) and right side of some stars' x, y and flux, sparse."""
+        slopes, pixels, centres = self.slopes(rows)
+        left = (np.sqrt(self.weights) * self.residual).astype(_KIND).ravel()[pixels]
+        return normal_matrix(slopes, centres, self.half), (slopes @ left[:, :, None]).ravel().astype(float)
 
-        Parameters
-        ----------
-        active : ndarray of bool, shape (n,)
-        iterations : int
+    def slopes(self, rows):
+        """Slopes of the pixels of stamps by some stars' x, y and flux, in units of their noise.
 
         Returns
         -------
-        ndarray of bool, shape (n,)
-            Stars that have not come to rest.
+        slopes : ndarray, shape (m, 3, npix)
+            0 in the corners, which say little.
+        pixels : ndarray of int, shape (m, npix)
+            Flat indices.
+        centres : ndarray of int, shape (m, 2)
         """
-        for _ in range(iterations):
-            rows = np.flatnonzero(active)
-            if not len(rows):
-                break
-            normal, right = self.equations(rows)
-            scale = np.sqrt(np.maximum(normal.diagonal(), 1e-30))
-            step = _solved(normal, right, scale).reshape(-1, 3)
-            moved = np.abs(step * scale.reshape(-1, 3)).max(axis=1)
-            length = np.hypot(*step[:, :2].T)
-            step[:, :2] *= np.minimum(1, _LONGEST * self.psf.fwhm / np.maximum(length, 1e-30))[:, None]
-            flux = self.flux[rows]
-            self.set(rows, self.xy[rows] + step[:, :2], np.maximum(flux + step[:, 2], 0.1 * flux))
-            restless = np.zeros(len(active), dtype=bool)
-            restless[rows] = moved > _SETTLED
-            active = restless if len(rows) < 20 else self.around(restless)
-        return active
-
-    def around(self, stars):
-        """These stars and those near them; masks (n,)."""
-        if not stars.any() or stars.all():
-            return stars
-        return cKDTree(self.xy[stars]).query(self.xy, distance_upper_bound=_NEAR * self.psf.fwhm)[0] < np.inf
-
-    def equations(self, rows):
-        """Normal matrix (3 m, 3 m) and right side of some stars' x, y and flux, sparse."""
-        jacobian, root = self.jacobian(rows), np.sqrt(self.weights, dtype=float).ravel()
-        return (jacobian.T @ jacobian).tocsc(), jacobian.T @ (root * self.residual.ravel())
-
-    def jacobian(self, rows):
-        """Slopes of all pixels by some stars' x, y and flux, in units of their noise; sparse (n pixels, 3 m)."""
-        (ny, nx), grid = self.frame.signal.shape, np.arange(-self.half, self.half + 1)
-        circle = np.flatnonzero(
-            np.hypot(grid, grid[:, None]) <= self.half + 0.5
-        )  # corners say little, and cost a fifth
-        root, size = np.sqrt(self.weights, dtype=float).ravel(), len(circle)
-        values, index = np.empty((len(rows), 3, size)), np.empty((len(rows), 3, size), dtype=np.int32)
+        grid, root = np.arange(-self.half, self.half + 1), np.sqrt(self.weights).ravel()
+        circle = (np.hypot(grid, grid[:, None]) <= self.half + 0.5).ravel()
+        centres = self.stars(rows)[1]
+        pixels, inside = stamp_pixels(centres, self.half, self.light.shape)
+        out = np.empty((len(rows), 3, pixels.shape[1]), dtype=_KIND)
         for i in range(0, len(rows), _CHUNK):
             part = slice(i, i + _CHUNK)
-            params, centres = self.stars(rows[part])
-            pixels, inside = stamp_pixels(centres, self.half, (ny, nx))
-            _, slopes = self.psf.light(params.astype(_KIND), centres, self.half, slopes=True)
-            weights = np.where(inside, root[pixels], 0)[:, None, circle]
-            values[part], index[part] = slopes[..., circle] * weights, pixels[:, None, circle]
-        ends = np.arange(3 * len(rows) + 1) * size
-        return csc_array((values.ravel(), index.ravel(), ends), shape=(ny * nx, 3 * len(rows)))
+            params, middle = self.stars(rows[part])
+            by = self.psf.light(params.astype(_KIND), middle, self.half, slopes=True)[1]
+            out[part] = by * np.where(inside[part] & circle, root[pixels[part]], 0)[:, None]
+        return out, pixels, centres
 
-    def covariance(self):
-        """Covariance of x, y and flux of every star, those of its neighbours unknown too; (n, 3, 3)."""
-        n = len(self.flux)
-        rows = np.arange(n)
-        blocks = self.equations(rows)[0].tobsr((3, 3))
-        k = min(_NEIGHBOURS + 1, n)
-        near = cKDTree(self.xy).query(self.xy, k=np.arange(1, k + 1), distance_upper_bound=2.5 * self.psf.fwhm)[1]
-        near[:, 0] = rows  # of stars that coincide, too
-        real = near < n
-        real[:, 1:] &= near[:, 1:] != rows[:, None]
-        blocks.sort_indices()
-        keys = np.repeat(rows, np.diff(blocks.indptr)) * n + blocks.indices
-        out = np.empty((n, 3, 3))
-        for i in range(0, n, _CHUNK):
-            some, there = near[i : i + _CHUNK], real[i : i + _CHUNK]
-            pairs = np.where(there, some, 0)
-            asked = pairs[:, :, None] * n + pairs[:, None]
-            at = np.minimum(np.searchsorted(keys, asked), len(keys) - 1)
-            found = (keys[at] == asked) & there[:, :, None] & there[:, None]
-            matrix = np.where(found[..., None, None], blocks.data[at], 0.0)
-            matrix = matrix.swapaxes(2, 3).reshape(len(some), 3 * k, 3 * k)
-            diagonal = np.arange(3 * k)
-            matrix[:, diagonal, diagonal] += np.repeat(~there, 3, axis=1)
-            scale = np.sqrt(np.maximum(matrix[:, diagonal, diagonal], 1e-30))
-            matrix /= scale[:, :, None] * scale[:, None]
-            matrix[:, diagonal, diagonal] += 1e-9
-            inverse = np.linalg.inv(matrix)[:, :3, :3]
-            out[i : i + _CHUNK] = inverse / (scale[:, :3, None] * scale[:, None, :3])
-        return out
+    def likelihood(self):
+        """How much likelier what is left is with one more star in the middle of a pixel.
+
+        Returns
+        -------
+        signal, norm : ndarray, shape (ny, nx)
+            The flux of the star is ``signal / norm``, its signal-to-noise ratio ``signal / sqrt(norm)``. The norm is 0
+            where bad pixels cover most of a star.
+        """
+        half = int(np.ceil(_KERNEL * self.fwhm))
+        kernel = self.psf.light(np.array([[0.0, 0.0, 1.0]], dtype=np.float32), self.middle, half)[0]
+        kernel = np.maximum(kernel, 0).reshape(2 * half + 1, -1)[::-1, ::-1].astype(np.float32)
+        signal = oaconvolve(self.weights * self.residual.astype(np.float32), kernel, mode="same")
+        norm = oaconvolve(self.weights, kernel**2, mode="same")
+        seen = norm > _COVERED * (kernel**2).sum() * np.median(self.weights)
+        bright = ~seen & (self.weights > 0)  # under bright stars weights are small, and tell nothing of what is covered
+        if bright.any():
+            good = self.good.astype(np.float32)
+            seen |= oaconvolve(good, kernel**2, mode="same") > _COVERED * (kernel**2).sum()
+        return signal, np.where(seen, np.maximum(norm, 1e-12 * norm.max()), 0)
+
+    def candidates(self, threshold):
+        """Peaks of what is left that look like stars: places (n, 2), of whole pixels, and fluxes (n,)."""
+        signal, norm = self.likelihood()
+        seen = norm > 0
+        ratio = np.where(seen, signal / np.sqrt(np.where(seen, norm, 1)), 0).astype(np.float32)
+        x, y = peaks_above(ratio, threshold, max(1, int(self.fwhm / 2)))
+        return np.column_stack([x, y]).astype(float), (signal / np.maximum(norm, 1e-30))[y, x]
+
+    def contains(self, xy):
+        """Whether places (n, 2) lie in the frame."""
+        ny, nx = self.light.shape
+        return ((xy > -1.5) & (xy < (nx + 0.5, ny + 0.5))).all(axis=1)
 
     def snr(self):
         """Signal-to-noise ratio of the stars where nothing but their flux is unknown, (n,)."""
@@ -299,15 +292,8 @@ class Scene:
     def near(self, params):
         """Pixels of stamps within the core of a star, (n, npix)."""
         dy, dx = np.mgrid[-self.half : self.half + 1, -self.half : self.half + 1].reshape(2, -1)
-        return np.hypot(dx - params[:, :1], dy - params[:, 1:2]) <= _CORE * self.psf.fwhm
-
-
-def _solved(normal, right, scale):
-    """Damped normal equations solved in units of their diagonal."""
-    inverse = diags_array(1 / scale)
-    scaled = (inverse @ normal @ inverse + _DAMPING * diags_array(np.ones(len(scale)))).tocsc()
-    factors = splu(scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return factors.solve(right / scale) / scale
+        x, y = params[:, :1], params[:, 1:2]
+        return (dx - x) ** 2 + (dy - y) ** 2 <= (_CORE * self.fwhm) ** 2
 
 
 def stamp_pixels(centres, half, shape):

@@ -3,10 +3,8 @@
 import logging
 
 import numpy as np
-from scipy.signal import fftconvolve
 from scipy.spatial import cKDTree
 
-from ..detection import peaks_above
 from . import splitting
 
 _PASSES = 8
@@ -17,14 +15,12 @@ _BESIDE = 0.7  # FWHM from a star: a peak there is a matter of splitting it
 SAME = 0.2
 _DISTURBS = 1.5  # FWHM: a change within it is a reason to look at a star anew
 _ALONE = 0.8  # of the threshold, asked of a star where its neighbours are unknown too
-_COVERED = 0.2  # part of a star, by its weight in the detection, on good pixels
-_KERNEL = 1.3  # FWHM, radius of what is looked for
 _STARTING = 3  # passes in which PSF and sky are found anew
 
 log = logging.getLogger(__name__)
 
 
-def search(scene, threshold, retune):
+def search(scene, threshold, retune, pairs=splitting.pairs):
     """Search a scene for more stars, until a pass changes next to nothing.
 
     Parameters
@@ -35,8 +31,10 @@ def search(scene, threshold, retune):
         Signal-to-noise ratio.
     retune : callable, optional
         ``retune(scene)`` gives it the PSF that its stars show; by default it is known.
+    pairs : callable
+        Fits stars of the scene as two each, as `legdistort.measurement.scene.splitting.pairs` does.
     """
-    state = _Search(scene, threshold)
+    state = _Search(scene, threshold, pairs)
     for k in range(_PASSES):
         state.active = scene.fit(state.active, 4)
         if k < _STARTING:
@@ -47,10 +45,8 @@ def search(scene, threshold, retune):
             scene.update_sky()
         scene.update_misfit()
         changed = state.drop()
-        places, flux = candidates(scene, threshold)
-        fresh = _away(places, state.dropped, _AGAIN * scene.psf.fwhm) & _away(
-            places, scene.xy, _BESIDE * scene.psf.fwhm
-        )
+        places, flux = scene.candidates(threshold)
+        fresh = _away(places, state.dropped, _AGAIN * scene.fwhm) & _away(places, scene.xy, _BESIDE * scene.fwhm)
         if k >= _STARTING - 1:
             changed += state.split(places[~fresh])
         changed += state.add(places[fresh], flux[fresh])
@@ -64,8 +60,8 @@ def search(scene, threshold, retune):
 class _Search:
     """A scene with what has been tried: stars to be fitted again, stars that are beyond doubt, places."""
 
-    def __init__(self, scene, threshold):
-        self.scene, self.threshold = scene, threshold
+    def __init__(self, scene, threshold, pairs):
+        self.scene, self.threshold, self.pairs = scene, threshold, pairs
         self.active, self.sure = np.ones(len(scene.flux), dtype=bool), np.zeros(len(scene.flux), dtype=bool)
         self.dropped, self.tried = np.zeros((0, 2)), np.zeros((0, 2))
 
@@ -91,10 +87,10 @@ class _Search:
     def split(self, peaks):
         """Stars replaced by two where that explains more, alone and together with their neighbours; their number."""
         scene = self.scene
-        rows = splitting.doubtful(scene, peaks, scene.snr()) & _away(scene.xy, self.tried, _AGAIN * scene.psf.fwhm)
+        rows = splitting.doubtful(scene, peaks, scene.snr()) & _away(scene.xy, self.tried, _AGAIN * scene.fwhm)
         rows = np.flatnonzero(rows)
         self.tried = np.vstack([self.tried, scene.xy[rows]])
-        params, gain = splitting.pairs(scene, rows)
+        params, gain = self.pairs(scene, rows)
         two = gain > splitting.GAIN
         rows, params = rows[two], params[two]
         if not len(rows):
@@ -115,26 +111,9 @@ class _Search:
 
     def _disturb(self, places):
         """What is near a change is fitted again, and may be tried again."""
-        reach = _DISTURBS * self.scene.psf.fwhm
+        reach = _DISTURBS * self.scene.fwhm
         self.active |= ~_away(self.scene.xy, places, reach)
         self.tried = self.tried[_away(self.tried, places, reach)]
-
-
-def candidates(scene, threshold):
-    """Peaks of what is left that look like stars: places (n, 2), of whole pixels, and fluxes (n,)."""
-    half = int(np.ceil(_KERNEL * scene.psf.fwhm))
-    kernel = scene.psf.light(np.array([[0.0, 0.0, 1.0]], dtype=np.float32), scene.middle, half)[0]
-    kernel = np.maximum(kernel, 0).reshape(2 * half + 1, -1)[::-1, ::-1].astype(np.float32)
-    weights = scene.weights
-    signal = fftconvolve(weights * scene.residual.astype(np.float32), kernel, mode="same")
-    norm = fftconvolve(weights, kernel**2, mode="same")
-    seen = norm > _COVERED * (kernel**2).sum() * np.median(weights)
-    bright = ~seen & (weights > 0)  # under bright stars weights are small, and tell nothing of what is covered
-    if bright.any():
-        seen |= fftconvolve(scene.good.astype(np.float32), kernel**2, mode="same") > _COVERED * (kernel**2).sum()
-    ratio = np.where(seen, signal / np.sqrt(np.maximum(norm, 1e-12 * norm.max())), 0).astype(np.float32)
-    x, y = peaks_above(ratio, threshold, max(1, int(scene.psf.fwhm / 2)))
-    return np.column_stack([x, y]).astype(float), (signal / np.maximum(norm, 1e-30))[y, x]
 
 
 def _away(places, others, distance):
@@ -151,12 +130,11 @@ def _stand(scene, threshold, sure):
     ratio = scene.flux / np.sqrt(np.maximum(scene.covariance()[:, 2, 2], 1e-30))
     doubtful = ~sure & (ratio < _ALONE * threshold)
     # of stars that leave each other undetermined one goes at a time: two lights may have been fitted with three
-    i, j = cKDTree(scene.xy).query_pairs(scene.psf.fwhm, output_type="ndarray").T
+    i, j = cKDTree(scene.xy).query_pairs(scene.fwhm, output_type="ndarray").T
     both = doubtful[i] & doubtful[j]
     doubtful[np.where(ratio[i] < ratio[j], j, i)[both]] = False
     stay = (scene.snr() > threshold) & ~doubtful
-    ny, nx = scene.light.shape
-    stay &= ((scene.xy > -1.5) & (scene.xy < (nx + 0.5, ny + 0.5))).all(axis=1)
-    i, j = cKDTree(scene.xy).query_pairs(SAME * scene.psf.fwhm, output_type="ndarray").T
+    stay &= scene.contains(scene.xy)
+    i, j = cKDTree(scene.xy).query_pairs(SAME * scene.fwhm, output_type="ndarray").T
     stay[np.where(scene.flux[i] < scene.flux[j], i, j)] = False
     return stay

@@ -53,7 +53,7 @@ def doubtful(scene, peaks, snr):
 
     out = (scene.core_chi2() > _CORE_CHI2) & (snr > 10)
     if len(peaks):
-        nearest = cKDTree(scene.xy).query(peaks, distance_upper_bound=scene.psf.fwhm)[1]
+        nearest = cKDTree(scene.xy).query(peaks, distance_upper_bound=scene.fwhm)[1]
         out[nearest[nearest < len(out)]] = True
     return out
 

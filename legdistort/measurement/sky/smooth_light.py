@@ -38,7 +38,7 @@ def smooth_light(signal, good, sigma, *, variance=None):
     if variance is not None:
         faint = total - n * level < _BRIGHT * np.sqrt(n * variance[::step, ::step])
         level, extrapolated = _planes(n * faint, total * faint, sigma / step)
-    return _spread(level, step, signal.shape), extrapolated, step
+    return spread(level, step, signal.shape), extrapolated, step
 
 
 def mean_light(signal, good, sigma):
@@ -54,8 +54,8 @@ def _counted(signal, good, sigma):
     step, whole = max(1, int(sigma / 2)), good.all()
     if whole:
         rows, columns = (np.add.reduceat(np.ones(n, signal.dtype), np.arange(0, n, step)) for n in signal.shape)
-        return step, (np.outer(rows, columns), _binned(signal, step)), whole
-    return step, (_binned(good.astype(signal.dtype), step), _binned(np.where(good, signal, 0), step)), whole
+        return step, (np.outer(rows, columns), binned(signal, step)), whole
+    return step, (binned(good.astype(signal.dtype), step), binned(np.where(good, signal, 0), step)), whole
 
 
 def _moments(n, width, order):
@@ -93,7 +93,7 @@ def _planes(n, total, width, *, whole=False):
     return mean - shift, np.abs(shift)
 
 
-def _binned(image, step):
+def binned(image, step):
     """Sums over squares of pixels, the last ones padded with zeros."""
     ny, nx = image.shape
     if step == 1:
@@ -104,7 +104,7 @@ def _binned(image, step):
     return sum(rows[:, j::step] for j in range(step))
 
 
-def _spread(image, step, shape):
+def spread(image, step, shape):
     """Binned pixels interpolated linearly to all pixels."""
     for n in shape[::-1]:
         padded = np.pad(np.ascontiguousarray(image.T), ((1, 1), (0, 0)), mode="edge")

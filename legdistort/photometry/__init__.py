@@ -1,0 +1,1 @@
+"""Every star measured in all exposures at once: one position and one flux, the exposures' maps known."""

@@ -1,0 +1,203 @@
+"""The stars of a catalogue found, fitted in all exposures at once, and judged by the fluxes of single exposures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import chi2 as chi2_distribution
+
+from ..measurement.flags import Flag
+from ..measurement.profiles.cutouts import Stamps
+from ..measurement.profiles.frame_fit import pixel_flags
+from ..measurement.scene.confusion import confusion
+from ..measurement.scene.search import search
+from ..measurement.scene.shared_psf import moffat_field
+from . import transmissions
+from .blends import pairs
+
+_DEGREE = 2  # of the shape of the stars over a frame
+_CONFIRMED = 3  # exposures from which a star must stand without the strongest
+_LESS = 1.0  # signal-to-noise ratio that it may lose by that
+_SCATTER, _CHANCE = 3.0, 1e-4  # chi2 per degree of freedom of the fluxes, and the chance of it, beyond which they vary
+_FAINT = 30.0  # signal-to-noise ratio: of brighter stars the error of the PSF is larger than that of the fluxes
+_SEEN = 3.0  # signal-to-noise ratio at which an exposure confirms a star
+_CLOSE = 2.0  # FWHM of blended stars
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What the exposures tell of the stars, n of them, one by one (m images) and together.
+
+    Attributes
+    ----------
+    flux, flux_err : ndarray, shape (m, n)
+        By image, in the unit of the flux of the stars; the error is infinite where an image does not see a star.
+    flags : ndarray of int, shape (m, n)
+    zero_err : ndarray, shape (m,)
+        Relative errors of the transmissions.
+    varying : ndarray of bool, shape (n,)
+    rejected : int
+        What was found and is no star: seen by one exposure alone.
+    """
+
+    flux: np.ndarray
+    flux_err: np.ndarray
+    flags: np.ndarray
+    zero_err: np.ndarray
+    varying: np.ndarray
+    rejected: int
+
+    @property
+    def seen(self):
+        """Which image sees which star, (m, n)."""
+        return np.isfinite(self.flux_err)
+
+
+def measure_field(field, xy, left_out, threshold):
+    """Stars of known places fitted, the rest searched for more.
+
+    Parameters
+    ----------
+    field : `~legdistort.photometry.joint_scene.JointScene`
+        Without stars.
+    xy : ndarray, shape (n, 2)
+        Those that are known, in the reference plane.
+    left_out : ndarray of bool, shape (m, n)
+        Images that do not tell where a star is.
+    threshold : float
+        Of the summed likelihood.
+
+    Returns
+    -------
+    Measured
+    """
+    transmissions.start(field, xy, left_out)
+    search(field, threshold, _retune, pairs)
+    rejected = 0
+    while True:
+        errors = transmissions.update(field)
+        field.fit(np.ones(len(field.flux), dtype=bool), 2)
+        flux, error = _by_image(field)
+        lone, varying = judged(flux, error, field.flux, field.snr(), threshold)
+        if not lone.any():
+            break
+        rejected += int(lone.sum())
+        field.remove(lone)
+    return Measured(flux, error, _flags(field), errors, varying, rejected + field.rejected)
+
+
+def _retune(field):
+    """PSFs and transmissions by the stars that there are."""
+    for layer in field.layers:
+        if layer.retuned:
+            layer.scene.use(moffat_field(layer.scene, layer.shape, _DEGREE))
+    field.refresh()
+    transmissions.update(field)
+
+
+def _by_image(field):
+    flux, error = np.zeros((2, len(field.layers), len(field.flux)))
+    for k, layer in enumerate(field.layers):
+        own, its = field.fluxes(layer)
+        flux[k], error[k] = layer.spread(own), layer.spread(its, np.inf)
+    return flux, error
+
+
+def judged(flux, error, mean, snr, threshold):
+    """What is no star, since one exposure alone shows it, and which stars vary; masks (n,).
+
+    A star that three exposures see stands without the strongest of them. Below a signal-to-noise ratio of 30 its
+    fluxes scatter as their errors state, or two exposures confirm it by themselves and it varies.
+
+    Parameters
+    ----------
+    flux, error : ndarray, shape (m, n)
+        By exposure; the error is infinite where it does not see the star.
+    mean, snr : ndarray, shape (n,)
+        Of the star.
+    threshold : float
+    """
+    weight = 1 / error**2
+    ratio = np.where(weight > 0, flux / error, -np.inf)
+    count, stars = (weight > 0).sum(axis=0), np.arange(flux.shape[1])
+    first = ratio.argmax(axis=0)
+    others = weight.copy()
+    others[first, stars] = 0
+    rest = (others * flux).sum(axis=0) / np.sqrt(np.maximum(others.sum(axis=0), 1e-30))
+    lone = (count >= _CONFIRMED) & (rest < threshold - _LESS)
+    chi2, dof = (weight * (flux - mean) ** 2).sum(axis=0), np.maximum(count - 1, 1)
+    limit = np.maximum(_SCATTER * dof, chi2_distribution.isf(_CHANCE, dof))
+    varying = (count >= _CONFIRMED) & (snr < _FAINT) & (chi2 > limit)
+    confirmed = (ratio > _SEEN).sum(axis=0) >= 2
+    return lone | (varying & ~confirmed), varying & confirmed & ~lone
+
+
+def _flags(field):
+    """Flags of the stars by image, (m, n)."""
+    out = np.zeros((len(field.layers), len(field.flux)), dtype=int)
+    for k, layer in enumerate(field.layers):
+        scene = layer.scene
+        if len(layer.stars):
+            params, centres, _, _ = scene.on_stamps(np.arange(len(scene.flux)))
+            stamps = Stamps(scene.frame, centres, scene.half)
+            out[k, layer.stars] = pixel_flags(stamps, params, stamps.good, scene.fwhm)
+    return out
+
+
+def star_flags(field, measured):
+    """Flags of the stars: what is so in every image that sees them, neighbours, and whether they vary; (n,)."""
+    flags = np.where(measured.seen, measured.flags, -1)
+    common = np.bitwise_and.reduce(flags, axis=0) if len(flags) else flags
+    common = np.where(measured.seen.any(axis=0), common, 0)
+    near = cKDTree(field.xy).query(field.xy, k=2)[0][:, 1] < _CLOSE * field.fwhm
+    return common | np.where(near, Flag.BLENDED, 0) | np.where(measured.varying, Flag.VARIABLE, 0)
+
+
+def covariances(field, threshold):
+    """Covariances (n, 3, 3) of x, y and flux, and the mean squared residual of the cores (n,).
+
+    Those of the fit, times the residual where it exceeds the noise; of positions also times one plus the confusion by
+    stars that are not seen (`legdistort.measurement.scene.confusion`).
+    """
+    chi2, snr = field.core_chi2(), field.snr()
+    out = field.covariance() * np.maximum(chi2, 1)[:, None, None]
+    unseen = confusion(
+        field.xy, field.flux, snr, sigma=field.fwhm / 2.3548, threshold=threshold, area=max(field.area, 1)
+    )
+    out[:, :2, :2] *= 1 + unseen[:, None, None]
+    return out, chi2
+
+
+def map_covariances(field):
+    """Covariances (n, 2, 2) of the stars by the maps of the exposures, relative and absolute, by their weights.
+
+    The maps count as independent of each other, but for what is common to all.
+    """
+    weights = np.array([layer.spread(layer.scene.snr()) ** 2 for layer in field.layers])
+    weights /= np.maximum(weights.sum(axis=0), 1e-30)
+    relative, common = np.zeros((2, len(field.flux), 2, 2))
+    for layer, weight in zip(field.layers, weights, strict=True):
+        stars = layer.stars
+        if not len(stars):
+            continue
+        pixels = layer.scene.xy + layer.scene.psf.centre(layer.scene.xy)
+        own, absolute = layer.places.covariance(pixels)
+        relative[stars] += (weight[stars] ** 2)[:, None, None] * own
+        common[stars] += weight[stars, None, None] * (absolute - own)
+    return relative, relative + common
+
+
+def sharpness(field):
+    """What is left in the central pixels over what the PSF has there, weighted by the information; (n,)."""
+    total, norm = np.zeros((2, len(field.flux)))
+    for layer in field.layers:
+        scene = layer.scene
+        if not len(layer.stars):
+            continue
+        params, centres = scene.stars(np.arange(len(scene.flux)))
+        own = scene.psf.light(params, centres, 0)[:, 0]
+        x, y = np.clip(centres, 0, np.array(scene.light.shape[::-1]) - 1).T
+        weight = np.where((x == centres[:, 0]) & (y == centres[:, 1]), scene.weights[y, x], 0)
+        total[layer.stars] += weight * own * scene.residual[y, x]
+        norm[layer.stars] += weight * own**2
+    return total / np.maximum(norm, 1e-30)

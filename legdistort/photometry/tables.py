@@ -1,0 +1,110 @@
+"""The tables of a catalogue."""
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+from scipy.spatial import cKDTree
+
+from ..measurement.crowding import crowding
+from ..results.new_positions import add_sky
+from .measuring import covariances, map_covariances, sharpness, star_flags
+
+_SAME = 0.5  # FWHM from a star of the solution: it is that star
+_MAGNITUDE = 2.5 / np.log(10)
+
+
+def stars_table(field, measured, solution, threshold, zero_point):
+    """One row a star, brightest first; `legdistort.photometry.catalogue.Catalogue` explains the columns."""
+    covariance, chi2 = covariances(field, threshold)
+    relative, absolute = map_covariances(field)
+    both = covariance[:, :2, :2]
+    table = QTable({"star": star_names(field.xy, solution, _SAME * field.fwhm)})
+    table["x"], table["y"] = (c * u.pix for c in field.xy.T)
+    for suffix, each in (("err", both), ("map_err", relative), ("err_abs", both + absolute)):
+        variance = np.maximum(np.einsum("naa->an", each), 0)
+        table[f"x_{suffix}"], table[f"y_{suffix}"] = np.sqrt(variance) * u.pix
+    table["xy_corr"] = both[:, 0, 1] / np.sqrt(both[:, 0, 0] * both[:, 1, 1])
+    if solution.sky is not None:
+        add_sky(table, solution.sky, field.xy, _planes(both + relative), _planes(both + absolute))
+    table["flux"], table["flux_err"] = field.flux, np.sqrt(covariance[:, 2, 2])
+    if zero_point is not None:
+        table["mag"] = zero_point - 2.5 * np.log10(field.flux)
+        table["mag_err"] = _MAGNITUDE * table["flux_err"] / table["flux"]
+    table["flux_scatter"], table["n"] = _scatter(field, measured), measured.seen.sum(axis=0)
+    trusted = np.array([layer.trusted for layer in field.layers])
+    table["n_left_out"] = (measured.seen & ~trusted).sum(axis=0)
+    table["snr"], table["chi2_dof"], table["sharpness"] = field.snr(), chi2, sharpness(field)
+    table["flags"] = star_flags(field, measured)
+    table.add_column(crowding(table, field.fwhm), name="crowding", index=len(table.columns) - 1)
+    table.meta = _meta(field, measured, solution, threshold)
+    return table[np.argsort(-table["flux"], kind="stable")]
+
+
+def star_names(xy, solution, radius):
+    """Those of the stars of the solution that lie at positions (n, 2), one each, and new ones after the highest."""
+    known, positions = np.asarray(solution.estimate.star_names), solution.estimate.positions
+    distance, row = cKDTree(positions).query(xy, distance_upper_bound=radius)
+    nearest = cKDTree(xy).query(positions)[1]
+    same = np.isfinite(distance)
+    same[same] = nearest[row[same]] == np.flatnonzero(same)
+    numbers = [int(name) for name in known.astype(str) if str(name).isdigit()]
+    new = max(numbers, default=-1) + 1 + np.arange(np.count_nonzero(~same))
+    names = np.empty(len(xy), dtype=known.dtype if known.dtype.kind in "iu" else object)
+    names[same], names[~same] = known[row[same]], new if known.dtype.kind in "iu" else new.astype(str)
+    return names if known.dtype.kind in "iu" else names.astype(str)
+
+
+def photometry_table(field, measured, stars, frames):
+    """One row a star and image that sees it.
+
+    Parameters
+    ----------
+    field : `~legdistort.photometry.joint_scene.JointScene`
+    measured : `~legdistort.photometry.measuring.Measured`
+    stars : `~astropy.table.QTable`
+        From `stars_table`.
+    frames : dict
+        Exposures by name.
+    """
+    order = np.argsort(-field.flux, kind="stable")  # as in the table of stars
+    star, image = np.nonzero(measured.seen.T[order])
+    own = [frames[layer.name] for layer in field.layers]
+    table = QTable({"star": stars["star"][star], "exposure": np.array([each.exposure for each in own])[image]})
+    if any(each.detector is not None for each in own):
+        table["detector"] = np.array([str(each.detector) for each in own])[image]
+    for name in ("flux", "flux_err", "flags"):
+        table[name] = getattr(measured, name)[image, order[star]]
+    light = {layer.name: layer.transmission / layer.unit for layer in field.layers}
+    table.meta["zero_points"] = {
+        name: {"magnitude": float(2.5 * np.log10(t)), "error": float(_MAGNITUDE * error)}
+        for (name, t), error in zip(light.items(), measured.zero_err, strict=True)
+    }
+    return table
+
+
+def _planes(covariance):
+    return np.stack([covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]])
+
+
+def _scatter(field, measured):
+    """Standard deviation of the fluxes of single images, weighted; (n,), NaN with a single one."""
+    weight = 1 / measured.flux_err**2
+    total, count = weight.sum(axis=0), measured.seen.sum(axis=0)
+    square = (weight * (measured.flux - field.flux) ** 2).sum(axis=0) / np.maximum(total, 1e-300)
+    return np.where(count > 1, np.sqrt(square * count / np.maximum(count - 1, 1)), np.nan)
+
+
+def _meta(field, measured, solution, threshold):
+    known = set(np.asarray(solution.estimate.star_names).tolist())
+    names = star_names(field.xy, solution, _SAME * field.fwhm).tolist()
+    found = len(known & set(names))
+    return {
+        "threshold": float(threshold),
+        "area": int(field.area),
+        "noise_peaks": field.noise_peaks(threshold),
+        "n_images": len(field.layers),
+        "n_new": len(names) - found,
+        "n_lost": len(known) - found,
+        "n_rejected": measured.rejected,
+        "frame": "reference plane" if solution.sky is None else "ICRS",
+    }

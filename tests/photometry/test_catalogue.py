@@ -1,0 +1,230 @@
+"""Every star measured in all exposures at once, against frames made without the package."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+from deep_frames import compared, deep_frames
+
+import legdistort as ld
+from legdistort.cli import main
+from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.inputs.exposures import Exposure
+from legdistort.measurement.flags import Flag
+from legdistort.measurement.scene.normal_equations import neighbour_covariance
+from legdistort.photometry.measuring import judged
+
+TRANSMISSION = np.array([1.0, 0.8, 1.1, 1.0, 0.9, 1.2, 1.0, 0.7])
+
+
+def exposures_of(truth):
+    return [Exposure(f"f{k:02d}", data, gain=1.0) for k, data in enumerate(truth.frames)]
+
+
+def solved(truth, *, wrong=0.0):
+    """Solution; the brightest star of the third frame measured wrong by some pixels."""
+    exposures = exposures_of(truth)
+    matches = ld.match(ld.measure(exposures, psf="moffat"), exposures=exposures)
+    table = matches.table.copy()
+    rows = np.flatnonzero(table["exposure"] == "f02")
+    table["x"][rows[np.argmax(table["flux"][rows])]] += wrong * table["x"].unit
+    return ld.solve(replace(matches, table=table), degree=3)
+
+
+def beside_truth(truth, solution, stars, **options):
+    start = np.full_like(truth.xy, np.nan)
+    inside = ((truth.pixels[0] > 0) & (truth.pixels[0] < truth.frames[0].shape[0] - 1)).all(axis=1)
+    start[inside] = solution["f00"].correct(truth.pixels[0][inside])
+    return compared(truth, stars, start, **options)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return deep_frames(3, size=320, n_stars=230, n_frames=8, transmission=TRANSMISSION)
+
+
+@pytest.fixture(scope="module")
+def solution(truth):
+    return solved(truth, wrong=3.0)
+
+
+@pytest.fixture(scope="module")
+def found(truth, solution):
+    return ld.catalogue(exposures_of(truth), solution, zero_point=25.0)
+
+
+def test_stars_that_no_frame_shows_are_found(truth, solution, found):
+    c = beside_truth(truth, solution, found.stars)
+    assert len(found.stars) > 1.5 * len(solution.stars)
+    assert c.found(7) >= 0.97
+    assert c.n_false <= 1
+    over_bound, pull = c.ratios(8)
+    assert over_bound < 1.3
+    assert 0.75 < pull < 1.35
+    assert found.stars.meta["noise_peaks"] < 0.1
+
+
+def test_fluxes_of_single_exposures_scatter_as_stated(truth, solution, found):
+    """One flux for all, a flux each: differences are noise; transmissions are those put in."""
+    zero = found.photometry.meta["zero_points"]
+    level = np.array([each["magnitude"] for each in zero.values()])
+    true = 2.5 * np.log10(truth.transmission)
+    error = np.array([each["error"] for each in zero.values()])
+    off = (level - level.mean()) - (true - true.mean())
+    assert np.all(np.abs(off) < 4 * error + 0.005)
+    mean = dict(zip(found.stars["star"], found.stars["flux"], strict=True))
+    rows = found.photometry
+    share = np.sqrt(1 - 1 / len(truth.frames))  # of its noise that differs from the mean
+    pull = (rows["flux"] - [mean[star] for star in rows["star"]]) / rows["flux_err"] / share
+    assert 0.85 < 1.4826 * np.median(np.abs(pull)) < 1.1
+    assert np.any(rows["flux"] < 0)  # what is negative stays
+    faint = found.stars["snr"] < 20
+    expected = found.stars["flux_err"] * np.sqrt(found.stars["n"])
+    assert np.median((found.stars["flux_scatter"] / expected)[faint]) == pytest.approx(1, abs=0.25)
+
+
+def test_stars_of_the_solution_keep_their_numbers(solution, found):
+    known = {name: row for row, name in enumerate(solution.stars["star"])}
+    same = [row for row, name in enumerate(found.stars["star"]) if name in known]
+    assert len(same) >= 0.97 * len(known)
+    assert len(set(found.stars["star"])) == len(found.stars)
+    assert found.stars.meta["n_new"] == len(found.stars) - len(same)
+    theirs = solution.stars[[known[found.stars["star"][row]] for row in same]]
+    off = np.hypot(found.stars["x"][same] - theirs["x"], found.stars["y"][same] - theirs["y"])
+    error = np.hypot(theirs["x_err"], theirs["y_err"])
+    assert np.median(off / error) < 1
+    new = [int(name) for name in found.stars["star"] if name not in known]
+    assert min(new) > max(known)
+    assert list(found.stars["mag"]) == list(25 - 2.5 * np.log10(found.stars["flux"]))
+
+
+def test_an_image_that_the_solution_left_out_does_not_tell_where_a_star_is(solution, found):
+    rows = solution.residuals[~solution.residuals["used"]]
+    assert set(rows["exposure"]) == {"f02"}
+    without = found.stars[found.stars["n_left_out"] > 0]
+    assert len(without) >= 1
+    assert set(without["star"]) <= set(rows["star"])  # some are beyond the stars that determine the map of this frame
+    assert np.all(without["n_left_out"] == 1)
+    assert np.all(without["n"] > 4)  # their fluxes count there
+
+
+def test_an_exposure_that_is_not_in_the_solution_is_left_out_by_name(truth, solution):
+    few = exposures_of(truth)[:3]
+    strange = replace(few[2], name="strange", exposure="strange")
+    with pytest.warns(AssumptionWarning, match="left out of the catalogue: strange: it is not in the solution"):
+        found = ld.catalogue([*few[:2], strange], solution, threshold=7)
+    assert found.stars.meta["n_images"] == 2
+    assert set(found.left_out) == {"strange"}
+
+
+def test_bad_arguments_are_named(truth, solution):
+    exposures = exposures_of(truth)
+    with pytest.raises(InputError, match=r"call catalogue\(exposures, solution\)"):
+        ld.catalogue(solution, exposures)
+    with pytest.raises(InputError, match="threshold must be a number of at least 2"):
+        ld.catalogue(exposures, solution, threshold=1)
+    with pytest.raises(InputError, match="zero_point must be a finite magnitude, got nan"):
+        ld.catalogue(exposures, solution, zero_point=float("nan"))
+    with pytest.raises(InputError, match="no exposure to measure"):
+        ld.catalogue([], solution)
+
+
+def test_what_one_exposure_alone_shows_is_no_star():
+    """Constant, a hit of one exposure, a flare that two confirm, a faint one, one that two exposures see."""
+    rng = np.random.default_rng(1)
+    flux, error = 2 + rng.normal(0, 1, (11, 5)), np.ones((11, 5))
+    flux[:, 1] -= 2
+    flux[4, 1] = 30
+    flux[:, 2] -= 1
+    flux[[2, 3], 2] = 9
+    error[2:, 4], flux[:2, 4] = np.inf, (9, 2)
+    mean = np.array([np.average(f, weights=1 / e**2) for f, e in zip(flux.T, error.T, strict=True)])
+    lone, varying = judged(flux, error, mean, mean * np.sqrt((1 / error**2).sum(axis=0)), 5.0)
+    assert lone.tolist() == [False, True, False, False, False]
+    assert varying.tolist() == [False, False, True, False, False]
+
+
+@pytest.mark.parametrize("k", [1, 3])
+def test_covariances_are_those_of_the_whole_matrix(k):
+    """Where stars have few neighbours, those of the dense inverse."""
+    from scipy.sparse import csc_array
+
+    rng = np.random.default_rng(2)
+    xy = rng.uniform(0, 60, (25, 2))
+    apart = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
+    near = np.exp(-((apart / 3) ** 2)) * (apart < 6)
+    blocks = rng.normal(size=(k, k))
+    normal = np.kron(near + 0.2 * np.eye(25), blocks @ blocks.T + np.eye(k))
+    dense = np.linalg.inv(normal).reshape(25, k, 25, k)[np.arange(25), :, np.arange(25)]
+    np.testing.assert_allclose(neighbour_covariance(csc_array(normal), xy, 6.0), dense, rtol=0.02, atol=1e-6)
+
+
+def test_files_and_command(truth, solution, tmp_path, capsys):
+    paths = []
+    for k, data in enumerate(truth.frames[:4]):
+        paths.append(str(tmp_path / f"f{k:02d}.fits"))
+        fits.PrimaryHDU(data, fits.Header([("GAIN", 1.0)])).writeto(paths[-1])
+    solution.write(tmp_path / "solution.asdf")
+    out = tmp_path / "catalogue.ecsv"
+    call = ["catalogue", *paths, "--solution", str(tmp_path / "solution.asdf"), "--out", str(out), "--threshold", "7"]
+    assert main(call) == 0
+    printed = capsys.readouterr().out
+    assert "peaks of noise are expected" in printed
+    stars, photometry = (QTable.read(tmp_path / name) for name in ("catalogue.ecsv", "photometry.ecsv"))
+    assert len(stars) > 20
+    assert set(photometry["star"]) == set(stars["star"])
+    assert main(call) == 1
+    assert "catalogue.ecsv exists already; give --overwrite" in capsys.readouterr().err
+    out.unlink()
+    assert main(call) == 1
+    assert "photometry.ecsv exists already; give --overwrite" in capsys.readouterr().err
+    assert not out.exists()
+    (tmp_path / "photometry.ecsv").unlink()
+    assert main([*call[:-3], str(tmp_path / "photometry.ecsv")]) == 1
+    assert "give the catalogue another" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_deep_field_with_hits_of_particles():
+    """Eleven frames, most of whose stars none of them shows, 1 % of the pixels hit."""
+    truth = deep_frames(8, size=512, n_stars=600, hit=0.01)
+    solution = solved(truth)
+    found = ld.catalogue(exposures_of(truth), solution)
+    c = beside_truth(truth, solution, found.stars)
+    assert c.found(6) >= 0.93
+    assert c.found(8) >= 0.97
+    assert c.n_false <= 0.01 * c.n_rows
+    over_bound, pull = c.ratios(8)
+    assert over_bound <= 1.3
+    assert 0.8 < pull < 1.2
+    assert np.count_nonzero(found.stars["flags"] & Flag.VARIABLE) <= 0.02 * len(found.stars)
+
+
+@pytest.mark.slow
+def test_detectors_of_a_camera_are_measured_together():
+    """One position on the plane, whichever detectors see a star; refused where nothing ties these to each other."""
+
+    def night(n, seed):
+        made = ld.simulate_exposures(small=True, camera="gsaoi", n_exposures=n, seed=seed)
+        exposures = ld.read_exposures(list(made.hdus.values()), ext="SCI")
+        return made, exposures, ld.match(ld.measure(exposures, psf="moffat"), exposures=exposures)
+
+    made, exposures, matches = night(9, 1)
+    solution = ld.solve(matches)
+    found = ld.catalogue(exposures, solution)
+    assert found.stars.meta["n_images"] == 36
+    assert set(found.photometry["detector"]) == {"1", "2", "3", "4"}
+    known = {name: row for row, name in enumerate(solution.stars["star"])}
+    here, there = np.array([(i, known[name]) for i, name in enumerate(found.stars["star"]) if name in known]).T
+    assert len(here) >= 0.95 * len(known)
+    assert len(found.stars) <= len(made.truth.positions)  # none is there twice
+    off = found.stars["x"][here] - solution.stars["x"][there]
+    pull = off / np.hypot(found.stars["x_err"][here], solution.stars["x_err"][there])
+    assert np.median(np.abs(pull)) < 1
+    _, exposures, matches = night(4, 3)
+    with pytest.warns(AssumptionWarning, match="unknowns of camera GSAOI are not determined"):
+        apart = ld.solve(matches)
+    with pytest.raises(InputError, match="no star ties some detectors of the solution to others"):
+        ld.catalogue(exposures, apart)
