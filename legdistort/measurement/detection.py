@@ -7,10 +7,11 @@ from scipy.ndimage import binary_dilation
 
 from ..inputs.frames.statement import piled_up
 from .filters import gaussian_sums
-from .sidelobes import side_light
 from .sky.amplifiers import amplifier_levels
 from .sky.background import is_steep, sky_and_noise, sky_variance
 from .sky.smooth_light import mean_light, smooth_light
+from .structure.pupil import pupil_structure
+from .structure.sidelobes import side_light
 
 _CLIPPED = 0.986  # standard deviation of a unit normal after clipping at 3 sigma until nothing changes
 _KERNEL = 0.7  # width relative to the stars: costs 6 % of the signal-to-noise ratio, distinguishes closer pairs
@@ -134,8 +135,9 @@ def detect(frame, fwhm, threshold):
     """Peaks of the frame filtered with a Gaussian from which the local light has been taken off.
 
     The kernel has zero sum, so that no halo of a star and no error of the sky passes for stars; the noise is that of
-    the sky and of the photons of the local light. Peaks no brighter than the side lobes of other stars at the same
-    distance from a bright one are left out (`legdistort.measurement.sidelobes`).
+    the sky and of the photons of the local light. What other bright stars have at the same vector offset is taken off
+    (`legdistort.measurement.structure.pupil`). Peaks no brighter than the side lobes of other stars at the same
+    distance from a bright one are left out (`legdistort.measurement.structure.sidelobes`).
 
     Parameters
     ----------
@@ -171,9 +173,16 @@ def detect(frame, fwhm, threshold):
         )  # fmt: skip
         frame = replace(frame, variance=variance)
         variance = variance + np.float32(photon) * np.maximum(light, 0, out=light)
-    x, y, ratio = _peaks(residual, filtered, (norm, variance), frame, (sigma, fwhm, threshold))
+    image, variance = _best(residual, filtered, (norm, variance), frame, sigma)
+    reach = max(1, int(fwhm / 2))
+    x, y = _peaks(image, variance, threshold, reach)
+    bad = frame.saturated if frame.defects is None else frame.saturated | frame.defects
+    spoilt = binary_dilation(bad, iterations=int(np.ceil(2 * sigma))) if bad.any() else None
+    if (structure := pupil_structure(image, variance, x, y, fwhm, threshold, hidden=spoilt)) is not None:
+        image, variance = image - structure[0], variance + structure[1]
+        x, y = _peaks(image, variance, threshold, reach)
+    ratio = image[y, x] / np.sqrt(variance[y, x])
     # of the light of a peak, the part that is neither a side lobe nor an error of the light taken off
-    spoilt = binary_dilation(frame.saturated, iterations=int(np.ceil(2 * sigma))) if frame.saturated.any() else None
     other = side_light(filtered, x, y, fwhm, hidden=spoilt) + _EXTRAPOLATED * extrapolated[y // step, x // step]
     star = ratio * (1 - other / np.maximum(filtered[y, x], np.finfo(np.float32).tiny)) > threshold
     return np.column_stack([x, y])[star][np.argsort(-ratio[star], kind="stable")], frame
@@ -208,32 +217,33 @@ def _norm(sigma):
     return ((kernel - _blur(kernel, _LOCAL * sigma)) ** 2).sum()
 
 
-def _peaks(residual, filtered, noise, frame, settings):
-    """Peaks above the threshold, and their signal-to-noise ratios.
+def _peaks(image, variance, threshold, reach):
+    """Pixels, x and y, that exceed the noise by the threshold and are the highest around them."""
+    y, x = _exceeding(image, threshold * np.sqrt(variance.min()))  # few are left to be compared with their own noise
+    above = image[y, x] > threshold * np.sqrt(variance[y, x])
+    x, y = x[above], y[above]
+    peak = _is_highest(image, x, y, reach)
+    return x[peak], y[peak]
 
-    `noise` is the norm of the kernel and the variance of the image, their product that of the filtered image.
+
+def _best(residual, filtered, noise, frame, sigma):
+    """Height of a star at every pixel, and its variance, infinite where nothing is known.
+
+    Best linear estimate of a Gaussian star in noise that differs from pixel to pixel, sum(g w d) / sum(g^2 w), in units
+    of the filtered image; `noise` is the norm of the kernel and the variance of the image.
     """
-    (norm, variance), (sigma, fwhm, threshold) = noise, settings
-    whole = frame.good.all() and not frame.noise_given  # a smooth map of the variance needs no smoothing
-    image = filtered if whole else _weighted_ratio(residual, norm * variance, frame, sigma)
-    y, x = _above(image, threshold, norm, variance) if whole else _exceeding(image, threshold)
-    peak = _is_highest(image, x, y, max(1, int(fwhm / 2)))
-    x, y = x[peak], y[peak]
-    return x, y, filtered[y, x] / np.sqrt(norm * variance[y, x]) if whole else image[y, x]
-
-
-def _weighted_ratio(residual, variance, frame, sigma):
-    """Signal-to-noise ratio of a star at every pixel.
-
-    Best linear detection of a Gaussian star in noise that differs from pixel to pixel: sum(g w d) / sqrt(sum(g^2 w)).
-    """
-    weight = np.where(frame.good, 1 / variance, 0)
+    norm, variance = noise
+    if frame.good.all() and not frame.noise_given:  # a smooth map of the variance needs no smoothing
+        return filtered, norm * variance
+    weight = np.where(frame.good, 1 / (norm * variance), 0)
     # The square of a Gaussian is a Gaussian narrower by sqrt(2).
     below = _blur(weight, sigma / np.sqrt(2))
-    ratio = _blur(residual * weight, sigma) / np.sqrt(np.maximum(below, 1e-6 * below.max()))
+    below = np.maximum(below, 1e-6 * below.max())
+    image = _blur(residual * weight, sigma) / below
     if not frame.good.all():  # where most of a star would lie on bad pixels the rest determines little
-        ratio[_blur(frame.good.astype(np.float32), sigma / np.sqrt(2)) < _COVERED] = 0
-    return ratio
+        unknown = _blur(frame.good.astype(np.float32), sigma / np.sqrt(2)) < _COVERED
+        image[unknown], below[unknown] = 0, np.float32(1e-30)
+    return image, 1 / below
 
 
 def _blur(image, sigma):

@@ -60,6 +60,8 @@ class FrameStars(NamedTuple):
         Variance per unit of star light, as taken.
     shown : callable
         Without arguments: variance per unit of star light that the stars themselves show.
+    factor_error : float
+        Relative, of the factor from light in the PSF to fluxes, common to all stars.
     """
 
     stamps: object
@@ -68,6 +70,7 @@ class FrameStars(NamedTuple):
     psf: object
     photon: float
     shown: Callable
+    factor_error: float = 0.0
 
 
 def empty_table():

@@ -23,6 +23,7 @@ from .detections import FrameStars, Stars, distinct, empty_table, table_of, with
 from .effective import frame_psf
 from .effective.building import STARS_NEEDED
 from .effective.model import EffectivePSF
+from .effective.total_light import in_total_light
 from .filters import use_compiled_loops
 from .flags import LEAST, UNUSABLE, Flag
 from .injection import calibrate_frame
@@ -123,11 +124,14 @@ def measure(
     -------
     `~astropy.table.QTable`
         One row a detection, brightest first in every exposure: ``exposure``, ``x``, ``y``, ``x_err``, ``y_err`` [pix]
-        (0-based, standard deviations), ``xy_corr``, ``flux``, ``flux_err`` (of the whole profile, in units
-        of the data), ``fwhm`` [pix], ``chi2`` (reduced), ``flags`` (bits of `Flag`; see `UNUSABLE`),
+        (0-based, standard deviations), ``xy_corr``, ``flux``, ``flux_err`` (of the whole profile, in units of the data;
+        with an effective PSF of the exposure's own stars all light within 30 FWHM, and errors relative to its other
+        stars), ``fwhm`` [pix], ``chi2`` (reduced), ``flags`` (bits of `Flag`; see `UNUSABLE`),
         ``crowding`` (how far detected neighbours would pull the position, were their light left in, in standard errors:
         see `legdistort.measurement.crowding`), ``psf`` (what was fitted: "moffat", "effective" or where the PSF came
-        from). An exposure in which nothing is found has no rows.
+        from). An exposure in which nothing is found has no rows. ``meta["flux_factor_error"]``, if there are such PSFs:
+        ``{exposure: relative error common to all its fluxes}``, infinite where the frame does not determine the light
+        of the halos, and fluxes are those in the PSF.
 
     Raises
     ------
@@ -293,7 +297,10 @@ def measure_with_psfs(exposures, options, *, workers=None, progress=False):
         warn_of_psf(verdicts)
     filled = [_of_frame(one.table, e) for e, one in zip(exposures, found, strict=True) if len(one.table)]
     psfs = {name: one.psf for name, one in zip(names, found, strict=True) if one.psf is not None}
-    return vstack(filled) if filled else empty_table(), psfs
+    table = vstack(filled) if filled else empty_table()
+    if errors := {name: float(one.factor_error) for name, one in zip(names, found, strict=True) if one.factor_error}:
+        table.meta["flux_factor_error"] = errors
+    return table, psfs
 
 
 def _of_frame(table, exposure):
@@ -403,6 +410,8 @@ class MeasuredExposure(NamedTuple):
         Of its stars.
     hidden : bool
         Whether its mask hides most bright stars.
+    factor_error : float
+        Relative error common to all fluxes, see `legdistort.measurement.effective.total_light`.
     """
 
     table: QTable
@@ -412,6 +421,7 @@ class MeasuredExposure(NamedTuple):
     noise_ratio: float | None = None
     shape: np.ndarray | None = None
     hidden: bool = False
+    factor_error: float = 0.0
 
     def in_unit(self, unit):
         """The same in a unit of light that is so many times larger."""
@@ -451,20 +461,25 @@ def measure_scaled(exposure, options):
     ratio = camera_gain.contradiction(
         exposure, stamps.frame, stars.flux[clean], stars.chi2[clean] / np.maximum(stars.dof[clean], 1), found.shown
     )
-    return MeasuredExposure(table, None if known else found.photon, psf, found.verdict, ratio, shape, hidden)
+    return MeasuredExposure(
+        table, None if known else found.photon, psf, found.verdict, ratio, shape, hidden, found.factor_error
+    )
 
 
 def _measure_groups(stamps, shape, options, psf):
     """All stars of a frame that is no crowd, in groups of those that touch."""
     fitted = frame_fit.fit_stars(stamps, shape, profile=options.profile, blends=options.blends)
     measured, verdict = frame_psf.measure_frame(stamps, fitted, shape, psf)
+    error = 0.0
+    if measured is not None and isinstance(psf, str):
+        measured, error = in_total_light(measured, stamps, measured.fit.converged & ~measured.astray)
     own_shapes = options.profile == "own"  # other profiles have nothing to compare
     deformed = _is_deformed(stamps, fitted) if own_shapes else np.zeros(len(fitted.flags), dtype=bool)
     stars = _moffat_stars(fitted) if measured is None else _psf_stars(fitted, measured)
     stars = stars._replace(flags=stars.flags | np.where(deformed, Flag.DEFORMED, 0))
     nodes = moffat.quadrature(float(moffat.fwhm(shape)))
     shown = partial(pixel_noise.photon_noise, stamps, fitted.found, fitted.models, nodes)
-    return FrameStars(stamps, stars, verdict, None if measured is None else measured.psf, fitted.photon, shown)
+    return FrameStars(stamps, stars, verdict, None if measured is None else measured.psf, fitted.photon, shown, error)
 
 
 def _stamps(exposure, options):

@@ -408,6 +408,11 @@ class EffectivePSF(ShownAsPrinted):
         except KeyError as error:
             raise InputError(f"{path}: the extension {EXTENSION} is damaged: {error.args[0]}") from None
 
+    def of_flux(self, factor: float) -> EffectivePSF:
+        """The same for fluxes that are larger by a factor: with so much less light for a flux of 1."""
+        residual = None if self.residual is None else self.residual / factor
+        return replace(self, coefficients=self.coefficients / factor, halo=self.halo / factor, residual=residual)
+
     def named(self, **changes: Any) -> EffectivePSF:
         """The same with other attributes."""
         return replace(self, **changes)

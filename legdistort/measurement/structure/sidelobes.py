@@ -46,7 +46,7 @@ def side_light(image, x, y, fwhm, *, hidden=None):
         In units of the image.
     """
     value = np.maximum(image[y, x].astype(float), np.finfo(np.float32).tiny)  # beside bad pixels it may be negative
-    xy, out = _summits(image, x, y), np.zeros(len(x))
+    xy, out = summits(image, x, y), np.zeros(len(x))
     pairs = cKDTree(xy).query_pairs(_REACH * fwhm, output_type="ndarray")
     if not len(pairs):
         return out
@@ -83,7 +83,7 @@ def _without_stars(image, xy, radius):
     return out
 
 
-def _summits(image, x, y):
+def summits(image, x, y):
     """Places of peaks to a fraction of a pixel, by parabolas; (n, 2)."""
     inside = np.clip(x, 1, image.shape[1] - 2), np.clip(y, 1, image.shape[0] - 2)
     if min(image.shape) < 3:

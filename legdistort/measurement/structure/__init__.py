@@ -1,0 +1,1 @@
+"""What stands around bright stars and is no star: side lobes, structure of the pupil."""
