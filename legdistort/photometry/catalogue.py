@@ -57,6 +57,11 @@ class Catalogue(ShownAsPrinted):
     left_out : dict
         Names of images that were not used, with the reason.
 
+    See Also
+    --------
+    legdistort.catalogue : Makes it.
+    legdistort.measure : Stars of single exposures.
+
     Examples
     --------
     >>> import legdistort as ld

@@ -83,7 +83,7 @@ def test_nights_are_a_covariance_of_departures():
     motion = rng.normal(size=(n, k, k))
     nothing = np.zeros((n, k, 0))
     made = hierarchy.Hierarchy(motion, np.broadcast_to(np.eye(k), (n, k, k)), spread, np.linalg.inv(spread), night,
-                               nightly, group, static, np.eye(k), (1, 1), np.eye(2), nothing)  # fmt: skip
+                               nightly, True, group, static, np.eye(k), (1, 1), np.eye(2), nothing)  # fmt: skip
     dense = np.zeros((n, k, n, k))
     for i in range(n):
         dense[i, :, i] = spread[i]

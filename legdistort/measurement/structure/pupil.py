@@ -33,6 +33,7 @@ _WINGS = 3.0  # FWHM^2 that show how bright a star is whose top is not seen
 _COVERED = 0.35  # of the stars, by others at a place near them: what is seen in such a crowd is light of others
 _STANDS = 0.5  # of its light, structure of others under a star that may itself have structure
 _TAPS = np.arange(-2, 4)  # of the interpolation: Lagrange polynomials of degree 5
+_OTHERS = np.stack([np.delete(_TAPS, k) for k in range(len(_TAPS))])
 
 
 def pupil_structure(image, variance, x, y, fwhm, threshold, *, hidden=None):
@@ -136,11 +137,7 @@ def _square(pixel, half):
 
 def _lagrange(part):
     """Weights of the taps at parts of a pixel, (..., 6)."""
-    part = np.asarray(part)[..., None]
-    return np.stack(
-        [np.prod((part - np.delete(_TAPS, k)) / (tap - np.delete(_TAPS, k)), axis=-1) for k, tap in enumerate(_TAPS)],
-        axis=-1,
-    )
+    return np.prod((np.asarray(part)[..., None, None] - _OTHERS) / (_TAPS[:, None] - _OTHERS), axis=-1)
 
 
 def _shifted(image, part):
@@ -189,6 +186,8 @@ class _Shown:
         light, error = self._mean(self.total, self.sums)
         error[few] = np.inf
         self.common = self._shrunk(light, error)
+        reach = int(np.ceil(self.r[self.power > 0].max(initial=0) * fwhm)) + len(_TAPS)
+        self.reach = min(reach, half)  # beyond it there is nothing
 
     def _seen(self, k):
         """The image around a star in units of its top, NaN where others hide it, and its variance."""
@@ -219,12 +218,13 @@ class _Shown:
         return max(float(ratio[order][np.searchsorted(total, total[-1] / 2)]), 0.0)
 
     def around(self, star):
-        """Structure around a star as the others show it, and its variance."""
+        """Structure around a star as the others show it, and its variance; within `reach`."""
         k = np.flatnonzero(self.stars == star)
         light, error = self.common
         if len(k):
             light, error = self._shrunk(*self._mean(self.total - self.weights[k[0]], self.sums - self.values[k[0]]))
-        return light, error
+        near = slice(self.half - self.reach, self.half + self.reach + 1)
+        return light[near, near], error[near, near]
 
     def _mean(self, total, sums):
         known = total > 1e-6 * self.total.max()
@@ -268,9 +268,10 @@ def _cleaned(sky, peaks, shown, threshold):
     """Which peaks stand above the structure of the brighter ones; all structure, and its variance."""
     x, y, xy, tops = peaks
     light, error = np.zeros_like(sky.image), np.zeros_like(sky.image)
-    v, u = np.mgrid[3 - shown.half : shown.half - 2, 3 - shown.half : shown.half - 2]
+    half = shown.reach - 3
+    v, u = np.mgrid[-half : half + 1, -half : half + 1]
     stars = np.zeros(len(x), dtype=bool)
-    strongest = np.abs(shown.common[0]).max() + np.sqrt(shown.common[1].max())
+    strongest = max(np.abs(light[shown.far]).max() + np.sqrt(error[shown.far].max()) for light, error in [shown.common])
     for k in np.argsort(-tops, kind="stable"):
         a, b = x[k] + sky.margin, y[k] + sky.margin
         top, noise = tops[k] - max(light[b, a], 0), sky.variance[b, a]
@@ -283,7 +284,7 @@ def _cleaned(sky, peaks, shown, threshold):
             continue
         mean, variance = shown.around(k)
         base = np.ceil(xy[k]).astype(int)
-        there = _square(base + sky.margin, shown.half - 3)
+        there = _square(base + sky.margin, half)
         part = top * _shifted(mean, base - xy[k])[1:, 1:]
         core = np.hypot(u + base[0] - xy[k, 0], v + base[1] - xy[k, 1]) <= _CORE * shown.fwhm
         light[there] += np.where(core, 0, part)

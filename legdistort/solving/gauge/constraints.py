@@ -67,11 +67,11 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     static = _static_variance(problem, others, group, shared)
     if settled:
         static, dynamic = np.zeros_like(static), np.broadcast_to(np.eye(motion.shape[1]), motion.shape)
-    nightly = np.zeros((0, others.shape[1]))
+    nightly, told = np.zeros((0, others.shape[1])), False
     drifting, drifts, rates = _drifts(problem, motion, others, shared_shears, all_drifts)
     if dynamic is None:
         moved = np.concatenate([others @ motion @ maps.T, others @ drifting @ drifts.T], axis=2)
-        dynamic, nightly = dynamic_covariance(problem, state, error, moved, others, night, group, static)
+        dynamic, nightly, told = dynamic_covariance(problem, state, error, moved, others, night, group, static)
     spread = others @ (dynamic + np.where(held, 0, 1)[:, None, None] * error) @ others.transpose(0, 2, 1)
     weight = np.where(held, 1, influence(error, others))[:, None, None] * np.linalg.inv(spread)
     positions = state.positions.T[used]
@@ -79,7 +79,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     power = values @ values.T / values.shape[1]
     size = tuple(2 * box[1, ::-1])
     hierarchy = Hierarchy(
-        motion, others, dynamic, weight, night, nightly, group, static, maps, size, power, drifting @ drifts.T
+        motion, others, dynamic, weight, night, nightly, told, group, static, maps, size, power, drifting @ drifts.T
     )
     poses = _pose_rows(kind, motion, error, similar, box)
     if len(rates):

@@ -33,7 +33,7 @@ def dynamic_covariance(problem, state, error, moved, others, night, group, stati
     """Lambda of every exposure: from the prior if it has widths, else from the scatter seen beyond the errors.
 
     And the variances (n_nights, K) of what exposures of a night have in common, from the scatter of their means, if
-    that is more than chance.
+    that is more than chance; and whether anything tells these.
 
     A common map of the reference plane is fitted to the departures A_i - A_0 and taken out, so that the result does not
     depend on the gauge of the state; with it what of the static distortion of every detector is not known beforehand.
@@ -59,9 +59,9 @@ def dynamic_covariance(problem, state, error, moved, others, night, group, stati
     own = np.einsum("ika,ia->ik", others, departure)
     variance = (others @ error * others).sum(axis=2)
     counts = variance <= 10 * np.median(variance, axis=0)  # values less certain would add noise and nothing else
-    nightly = np.zeros((0 if night is None else night.max() + 1, own.shape[1]))
+    nightly, told = np.zeros((0 if night is None else night.max() + 1, own.shape[1])), False
     if len(nightly):
-        scatter2, nightly = _of_nights(problem, own, variance, counts, moved, night, group, static)
+        scatter2, nightly, told = _of_nights(problem, own, variance, counts, moved, night, group, static)
     if not nightly.any():
         scatter2, _ = _scatter(own, variance, counts, moved, group, static)
     out = others.transpose(0, 2, 1) * scatter2 @ others
@@ -71,18 +71,18 @@ def dynamic_covariance(problem, state, error, moved, others, night, group, stati
             seen = np.maximum(np.diag(out[i]), _SMALLEST**2)
             given = np.where(np.isfinite(width) & (width > 0), width**2, seen)
             out[i] = others[i].T @ (others[i] * given @ others[i].T) @ others[i]
-    return out, nightly
+    return out, nightly, told
 
 
 def _of_nights(problem, own, variance, counts, moved, night, group, static):
-    """Variance (K,) of exposures about their nights, and that (n_nights, K) of nights, zero if it is chance.
+    """Variance (K,) of exposures about their nights, that (n_nights, K) of nights, zero if it is chance; is it told?
 
     Parameters are those of `_scatter`, of exposures, and `night` and `group` of `dynamic_covariance`.
     """
     free = np.full((night.max() + 1, own.shape[1]), np.inf)
     scatter2, _ = _scatter(own, variance, counts, moved, night, free)
     if problem.night_sigma is not None:
-        return scatter2, np.full(free.shape, problem.night_sigma**2)
+        return scatter2, np.full(free.shape, problem.night_sigma**2), True
     weight = counts / (variance + scatter2 + 1e-300)
     total = _sums(weight, night) + 1e-300
     means, moved = _sums(weight * own, night) / total, _sums(weight[:, :, None] * moved, night) / total[:, :, None]
@@ -90,9 +90,9 @@ def _of_nights(problem, own, variance, counts, moved, night, group, static):
     left, leverage = _fitted(*_common(means, moved, owner, static), counts * total, means)
     dof = np.maximum(counts.sum(axis=0) - leverage, 0.0).sum()
     if dof > 1 and np.sum(counts * total * left**2) < dof + SEEN * np.sqrt(2 * dof):
-        return scatter2, np.zeros(free.shape)
+        return scatter2, np.zeros(free.shape), True
     found, odd = _scatter(means, 1 / total, counts, moved, owner, static, robust=True)
-    return scatter2, odd[:, None] ** 2 * found
+    return scatter2, odd[:, None] ** 2 * found, dof > 1
 
 
 def _common(own, moved, owner, static):

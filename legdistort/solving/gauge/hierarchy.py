@@ -63,6 +63,9 @@ class Hierarchy:
         Night of every exposure, each detector with nights of its own.
     nightly : ndarray, shape (n_nights, K)
         Variance of B by night; none without nights.
+    told : bool
+        Whether anything tells that variance. Else the rows are those of independent exposures: it is no knowledge, but
+        part of the error.
     group : ndarray of int, shape (n_exposures,)
         Detector of every exposure.
     static : ndarray, shape (n_groups, K)
@@ -83,6 +86,7 @@ class Hierarchy:
     weight: np.ndarray
     night: np.ndarray
     nightly: np.ndarray
+    told: bool
     group: np.ndarray
     static: np.ndarray
     maps: np.ndarray
@@ -100,7 +104,7 @@ class Hierarchy:
             moved = np.concatenate([moved, self.others @ self.drifts], axis=2)
         # D^-1 of what is moved, and of what all have in common, of which a share is left once B is integrated out
         weighted, common = self.weight @ moved, self.weight.copy()
-        for owners, variances in ((self.night, self.nightly), (self.group, static)):
+        for owners, variances in ((self.night, self.nightly if self.told else ()), (self.group, static)):
             for owner, variance in enumerate(variances):
                 mine = owners == owner
                 if variance.any() and mine.any():
