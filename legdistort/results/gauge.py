@@ -228,6 +228,8 @@ class Gauge(ShownAsPrinted):
     nights : float or None
         What exposures of a night have in common beside the static distortion, pixels, rms over the nights, the detector
         and axis; None where there is one night.
+    nights_told : bool
+        Whether the exposures tell that, or the caller; else it is as large as the departures themselves.
     """
 
     kind: str = field(metadata=text(*_CONVENTIONS, "shift", "static + shift", "relative polynomial"))
@@ -248,6 +250,7 @@ class Gauge(ShownAsPrinted):
     plane: str | None = None
     drift: Drift | None = None
     nights: float | None = field(default=None, metadata=number(minimum=0, unit="pix"))
+    nights_told: bool = True
 
     @property
     def n_constraints(self) -> int:
@@ -435,6 +438,8 @@ class Gauge(ShownAsPrinted):
             return "\n".join(lines)
         dynamic = np.sqrt(np.sum(self.scatter**2) / 8)
         nights = "" if self.nights is None else f", and those of a night together by {self.nights:.2g} px"
+        if not self.nights_told:
+            nights += " at most, since too few nights tell (night_sigma, --night-sigma, states it)"
         lines.append(
             f"Absolute errors (rms over the field, per axis) come from {_STATIC[self.static][1]}; single exposures "
             f"depart from their mean by {dynamic:.2g} px rms per axis{nights}. "

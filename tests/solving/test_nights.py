@@ -123,6 +123,9 @@ def test_nights_that_nothing_tells_of_may_scatter_as_far_as_they_depart(caplog):
     with caplog.at_level(logging.ERROR):
         unknown, known = (ld.solve(matches(nights.table), night_sigma=sigma) for sigma in (None, 0.02))
     assert unknown.gauge.nights > 0.2
+    assert "at most, since too few nights tell (night_sigma, --night-sigma, states it)" in str(unknown.gauge)
+    assert "too few nights" not in str(known.gauge)
+    assert_allclose(known.stars["x"], unknown.stars["x"], atol=0.1)  # the estimate is that of independent exposures
     assert known.gauge.nights == pytest.approx(0.02 * np.sqrt(16 / 8))
     off = nights.offsets(known.stars)
     stated = np.column_stack([known.stars[c].value for c in ("x_err_abs", "y_err_abs")])

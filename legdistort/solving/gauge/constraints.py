@@ -103,6 +103,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         if problem.terms.n
         else None,
         nights=float(np.sqrt(nightly.mean(axis=0).sum() / 8)) if len(nightly) else None,  # a mode has mean square 1/4
+        nights_told=told or not len(nightly),
     )
     if common is None:
         return made
