@@ -247,13 +247,17 @@ while True:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="folders are exchanged in one step there alone")
 @pytest.mark.parametrize("n_reads", [300, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_readers_beside_a_writer(tmp_path, n_reads):
-    """At 24 commits a second: never files of two runs, and never a folder that is missing."""
-    out, seen, mixed, refused = tmp_path / "out", set(), 0, 0
+    """At 24 commits a second: never files of two runs, and never a folder that is missing.
+
+    More reads than asked for where the machine is so busy that the writer has hardly begun.
+    """
+    out, seen, mixed, refused, reads, end = tmp_path / "out", set(), 0, 0, 0, time.monotonic() + 60
     arguments = [sys.executable, "-c", WRITER, str(out), str(Path(__file__).parent)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE) as process:
         try:
             assert process.stdout.readline() == b"1\n"
-            for _ in range(n_reads):
+            while reads < n_reads or (len(seen) < 3 and time.monotonic() < end):
+                reads += 1
                 try:
                     found = set(read_run(out))
                 except InputError as error:
@@ -264,5 +268,5 @@ def test_readers_beside_a_writer(tmp_path, n_reads):
         finally:
             process.kill()
     assert mixed == 0
-    assert refused < 0.01 * n_reads
+    assert refused < 0.01 * reads
     assert len(seen) > 2
