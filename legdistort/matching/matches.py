@@ -71,6 +71,11 @@ class Observations:
     xy: np.ndarray
     covariance: np.ndarray
 
+    @cached_property
+    def first(self) -> np.ndarray:
+        """First row of every exposure, (n_exposures,)."""
+        return np.unique(self.exposure, return_index=True)[1]
+
     @property
     def key(self) -> np.ndarray:
         """A number (n,) of every pair of exposure and star, which ascends with exposure, then star."""
@@ -208,8 +213,7 @@ class Matches(ShownAsPrinted):
         """
         n = len(self.names)
         if "epoch" in self.table.colnames:
-            first = np.unique(self.observations.exposure, return_index=True)[1]
-            years = column_contract.values(self.table, "epoch", u.yr)[first]
+            years = column_contract.values(self.table, "epoch", u.yr)[self.observations.first]
             days = u.yr.to(u.day) * (years - years.min())
             if np.isfinite(years).all() and (2 * len(np.unique(years)) > n or np.ptp(days) > _NIGHT):
                 return days, "days"
@@ -243,15 +247,14 @@ class Matches(ShownAsPrinted):
             For an exposure with several values in ``block``.
         """
         obs = self.observations
-        first = np.unique(obs.exposure, return_index=True)[1]
         if "block" in self.table.colnames:
             label = np.asarray(self.table["block"])
-            if np.any(several := label != label[first][obs.exposure]):
+            if np.any(several := label != label[obs.first][obs.exposure]):
                 name = self.names[obs.exposure[int(np.argmax(several))]]
                 raise InputError(f"column 'block' has several values for exposure {name}: give one night for each")
-            return np.unique(label[first], return_inverse=True)[1]
+            return np.unique(label[obs.first], return_inverse=True)[1]
         if "epoch" in self.table.colnames:
-            return nights(column_contract.values(self.table, "epoch", u.yr)[first])
+            return nights(column_contract.values(self.table, "epoch", u.yr)[obs.first])
         return np.zeros(len(self.names), dtype=int)
 
     def keep(self, rows: ArrayLike | slice) -> Matches:

@@ -13,8 +13,8 @@ from ..runtime.progress import Bar
 
 _STRIP = 256  # rows of the reference plane that are carried at a time
 _MARGIN = 12  # pixels around what is interpolated: splines have forgotten its edge by then
-_CONFIRMED = 3  # exposures from which a candidate must stand without the strongest
-_LESS = 1.0  # signal-to-noise ratio that it may lose by that
+#: Exposures from which a star must stand without the strongest; signal-to-noise ratio that it may lose by that.
+CONFIRMED, LESS = 3, 1.0
 _UNSEEN = -1e30
 _LEAST = 1e-3  # of the weight of the best seen star of an image: what has less is not seen
 
@@ -219,7 +219,7 @@ class JointScene(JointFit):
         x, y = peaks_above(ratio, threshold, max(1, int(self.fwhm / 2)))
         one, weight, count = (each[y, x] for each in strongest[1:])
         rest = (signal[y, x] - one) / np.sqrt(np.maximum(norm[y, x] - weight, 1e-30))
-        stands = (count < _CONFIRMED) | (rest > threshold - _LESS)
+        stands = (count < CONFIRMED) | (rest > threshold - LESS)
         self.rejected = int(np.count_nonzero(~stands))
         self.area = int(np.count_nonzero(norm))
         x, y = x[stands], y[stands]

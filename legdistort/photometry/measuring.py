@@ -14,10 +14,9 @@ from ..measurement.scene.search import search
 from ..measurement.scene.shared_psf import moffat_field
 from . import transmissions
 from .blends import pairs
+from .joint_scene import CONFIRMED, LESS
 
 _DEGREE = 2  # of the shape of the stars over a frame
-_CONFIRMED = 3  # exposures from which a star must stand without the strongest
-_LESS = 1.0  # signal-to-noise ratio that it may lose by that
 _SCATTER, _CHANCE = 3.0, 1e-4  # chi2 per degree of freedom of the fluxes, and the chance of it, beyond which they vary
 _FAINT = 30.0  # signal-to-noise ratio: of brighter stars the error of the PSF is larger than that of the fluxes
 _SEEN = 3.0  # signal-to-noise ratio at which an exposure confirms a star
@@ -124,10 +123,10 @@ def judged(flux, error, mean, snr, threshold):
     others = weight.copy()
     others[first, stars] = 0
     rest = (others * flux).sum(axis=0) / np.sqrt(np.maximum(others.sum(axis=0), 1e-30))
-    lone = (count >= _CONFIRMED) & (rest < threshold - _LESS)
+    lone = (count >= CONFIRMED) & (rest < threshold - LESS)
     chi2, dof = (weight * (flux - mean) ** 2).sum(axis=0), np.maximum(count - 1, 1)
     limit = np.maximum(_SCATTER * dof, chi2_distribution.isf(_CHANCE, dof))
-    varying = (count >= _CONFIRMED) & (snr < _FAINT) & (chi2 > limit)
+    varying = (count >= CONFIRMED) & (snr < _FAINT) & (chi2 > limit)
     confirmed = (ratio > _SEEN).sum(axis=0) >= 2
     return lone | (varying & ~confirmed), varying & confirmed & ~lone
 

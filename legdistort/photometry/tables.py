@@ -18,7 +18,8 @@ def stars_table(field, measured, solution, threshold, zero_point):
     covariance, chi2 = covariances(field, threshold)
     relative, absolute = map_covariances(field)
     both = covariance[:, :2, :2]
-    table = QTable({"star": star_names(field.xy, solution, _SAME * field.fwhm)})
+    names = star_names(field.xy, solution, _SAME * field.fwhm)
+    table = QTable({"star": names})
     table["x"], table["y"] = (c * u.pix for c in field.xy.T)
     for suffix, each in (("err", both), ("map_err", relative), ("err_abs", both + absolute)):
         variance = np.maximum(np.einsum("naa->an", each), 0)
@@ -36,7 +37,7 @@ def stars_table(field, measured, solution, threshold, zero_point):
     table["snr"], table["chi2_dof"], table["sharpness"] = field.snr(), chi2, sharpness(field)
     table["flags"] = star_flags(field, measured)
     table.add_column(crowding(table, field.fwhm), name="crowding", index=len(table.columns) - 1)
-    table.meta = _meta(field, measured, solution, threshold)
+    table.meta = _meta(field, measured, solution, threshold, names.tolist())
     return table[np.argsort(-table["flux"], kind="stable")]
 
 
@@ -94,9 +95,8 @@ def _scatter(field, measured):
     return np.where(count > 1, np.sqrt(square * count / np.maximum(count - 1, 1)), np.nan)
 
 
-def _meta(field, measured, solution, threshold):
+def _meta(field, measured, solution, threshold, names):
     known = set(np.asarray(solution.estimate.star_names).tolist())
-    names = star_names(field.xy, solution, _SAME * field.fwhm).tolist()
     found = len(known & set(names))
     return {
         "threshold": float(threshold),

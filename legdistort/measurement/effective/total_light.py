@@ -9,6 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from ..sky.smooth_light import binned
+
 #: FWHM. What is on the last one is no part of the flux, and none of the sky.
 _RINGS = np.array([0, 3, 4.5, 6.5, 9, 12.5, 17, 22, 30, 45])
 _CORE = 1.5  # FWHM: nearer to a star, what its PSF leaves is an error of that
@@ -83,7 +85,7 @@ def halo_light(image, good, xy, flux, fwhm):
     xy, flux, highest = xy[bright], flux[bright] / flux.max(), flux.max()
     step = max(2, int(fwhm / _BIN), int(np.ceil(np.sqrt(image.size / _PIXELS))))
     ny, nx = (n // step * step for n in image.shape)
-    count, total = (_binned(part[:ny, :nx], step) for part in (good.astype(float), np.where(good, image, 0)))
+    count, total = (binned(part[:ny, :nx], step) for part in (good.astype(float), np.where(good, image, 0)))
     rings, near = _rings(count.shape, (xy + 0.5) / step - 0.5, flux, fwhm / step)
     y, x = np.indices(count.shape) / np.reshape(count.shape, (2, 1, 1)) - 0.5
     use = (count > step**2 / 2) & ~near
@@ -104,11 +106,6 @@ def halo_light(image, good, xy, flux, fwhm):
         ]
     )
     return whole, np.sqrt((len(parts) - 1) * np.mean((parts - parts.mean()) ** 2))
-
-
-def _binned(image, step):
-    ny, nx = image.shape
-    return image.reshape(ny // step, step, nx // step, step).sum(axis=(1, 3))
 
 
 def _rings(shape, xy, flux, fwhm):

@@ -152,6 +152,11 @@ class Problem:
         several = self.detectors.max() < number.max() < self.n_exposures - 1
         return number if several and self.night_sigma != 0 else None
 
+    @property
+    def n_nights(self):
+        """Number of nights whose exposures may have something in common."""
+        return 0 if self.nights is None else int(self.nights.max()) + 1
+
     @cached_property
     def size(self):
         """Width and height of the detectors, pixels, of every exposure (n_exposures, 2)."""
@@ -383,7 +388,7 @@ def _detectors(matches):
     if "detector" not in matches.table.colnames or matches.camera.has_focal_plane:
         return {}
     detector, exposure = np.asarray(matches.table["detector"]), matches.observations.exposure
-    first = np.unique(exposure, return_index=True)[1]
+    first = matches.observations.first
     if np.any(several := detector != detector[first][exposure]):
         row = int(np.argmax(several))
         raise InputError(

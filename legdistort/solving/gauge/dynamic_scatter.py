@@ -12,8 +12,8 @@ _ROUNDS, _NEWTON = 20, 50  # at most
 #: rolls.
 _SHARED, _BORROWED = 10.0, 0.3
 
-#: Degrees of freedom of Student's t distribution of the departures of nights, which up to so many standard deviations
-#: of the sum of their squares are those of a Gaussian.
+#: Degrees of freedom of Student's t distribution of the departures of exposures and nights, which up to so many
+#: standard deviations of the sum of their squares are those of a Gaussian.
 TAILS, CHANCE = 4.0, 3.0
 #: Nights scatter if the squares of their means exceed what is expected of independent exposures by so many standard
 #: deviations.

@@ -27,13 +27,10 @@ from ..knowledge.factors import GIVEN, Factor
 from ..knowledge.posterior import Posterior, most_likely
 from ..knowledge.reduced_data import drawn, part_of, without_stars
 from . import constraints
+from .dynamic_scatter import CHANCE, TAILS
 
 log = logging.getLogger(__name__)
 
-#: Degrees of freedom of the t distribution of departures.
-TAILS = 4.0
-#: ... which are those of a Gaussian up to so many standard deviations of the sum of their squares.
-CHANCE = 3.0
 #: Steps at most; converged below such parts of every size, and so many standard errors, rms over the unknowns.
 MAX_STEPS, SETTLED = 60, 0.02
 TOLERANCE = {"linear": 0.01, "huber": 0.1, "cauchy": 0.1}
@@ -313,8 +310,6 @@ class _Known:
     static_width : ndarray, shape (n_statics,)
         Given; infinite where its size is found, NaN that of a night if it is.
     degrees : ndarray of int, shape (K,)
-    night : ndarray of int, shape (n_exposures,), or None
-        See `Problem.nights`.
     """
 
     problem: object
@@ -325,7 +320,6 @@ class _Known:
     place: np.ndarray
     static_width: np.ndarray
     degrees: np.ndarray
-    night: np.ndarray | None
 
     @classmethod
     def of(cls, problem, top):
@@ -337,11 +331,9 @@ class _Known:
             if problem.has_widths(i):
                 width[i] = np.sqrt(row_variances(others[i], problem.prior_sigma[i].ravel()))
         place = np.where(variance > 0, np.cumsum(variance > 0).reshape(variance.shape) - 1, -1)
-        night, static = problem.nights, np.sqrt(variance[variance > 0])
-        if night is not None:
-            sigma = np.nan if problem.night_sigma is None else problem.night_sigma
-            static = np.append(static, np.full((night.max() + 1) * others.shape[1], sigma))
-        return cls(problem, top, others, group, width, place, static, dynamic_degrees(problem.n_modes), night)
+        sigma = np.nan if problem.night_sigma is None else problem.night_sigma
+        static = np.append(np.sqrt(variance[variance > 0]), np.full(problem.n_nights * others.shape[1], sigma))
+        return cls(problem, top, others, group, width, place, static, dynamic_degrees(problem.n_modes))
 
     @property
     def n_statics(self):
@@ -351,13 +343,13 @@ class _Known:
     @property
     def n_nights(self):
         """Number of nights that have something in common."""
-        return 0 if self.night is None else int(self.night.max()) + 1
+        return self.problem.n_nights
 
     def common(self, statics):
         """S - m + B of every exposure, (n_exposures, K)."""
         out = np.append(statics, 0.0)[self.place[self.group]]
-        if self.night is not None:
-            out = out + statics[-self.n_nights * len(self.degrees) :].reshape(self.n_nights, -1)[self.night]
+        if self.n_nights:
+            out = out + statics[-self.n_nights * len(self.degrees) :].reshape(self.n_nights, -1)[self.problem.nights]
         return out
 
     @cached_property
@@ -407,9 +399,9 @@ class _Known:
         place = self.place[self.group].ravel()
         on = np.flatnonzero(place >= 0)
         static = sparse.csr_array((-np.ones(len(on)), (on, place[on])), (n * k, self.n_statics))
-        if self.night is not None:
+        if self.n_nights:
             first = self.n_statics - self.n_nights * k
-            theirs = (first + k * self.night[:, None] + np.arange(k)).ravel()
+            theirs = (first + k * self.problem.nights[:, None] + np.arange(k)).ravel()
             static = static + sparse.csr_array((-np.ones(n * k), (range(n * k), theirs)), static.shape)
         held = np.zeros((len(pointing), n, m))
         held[:, :, : m - k] = np.einsum("cia,isa->cis", pointing, similar)
