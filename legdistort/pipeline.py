@@ -42,7 +42,7 @@ from .runtime.progress import Bar
 from .runtime.trees.codec import to_tree
 from .simulation.truth import Truth
 from .solving.estimation import solve
-from .solving.options import CLIP, DEGREE, SolveOptions, check_detectors, check_reference
+from .solving.options import CLIP, DEGREE, SolveOptions, check_detectors, check_reference, prior_as_asked
 from .wcs.storage import write_wcs
 
 if TYPE_CHECKING:
@@ -288,8 +288,11 @@ def _open_frames(paths, min_exposures, stop_at_bad, progress, tied, *, ext, dq_g
 def _known_of(exposures, solving, prior, camera):
     """The options of `solve` with the prior of these exposures; choices about a camera are refused without one."""
     several = camera.has_focal_plane if camera else any(exposure.exposure for exposure in exposures)
-    check_detectors(several, solving.layout, solving.static, solving.dynamic)
-    return replace(solving, prior=_known_prior(prior, exposures, solving.degree))
+    check_detectors(several, solving.layout, solving.static, solving.dynamic, solving.layout_sigma)
+    known = _known_prior(prior, exposures, solving.degree)
+    if camera is None and not several and solving.model is None:
+        prior_as_asked(known, solving.static)  # refuses before anything is measured
+    return replace(solving, prior=known)
 
 
 def _where_to_begin(paths, earlier, measuring, **reading):

@@ -174,7 +174,7 @@ def used_matches(matches, solution):
 def _checked(matches):
     if not isinstance(matches, Matches):
         raise InputError(f"matches must be Matches, got {type(matches).__name__}")
-    return matches
+    return replace(matches, pose_sigma=None)  # poses are taken as they are
 
 
 def _equal(problem):

@@ -20,6 +20,14 @@ def planes(text):
     return () if text == "none" else tuple(text.upper().split(","))
 
 
+def pairs(text):
+    """``{name: number}`` of ``NAME=NUMBER,...``."""
+    try:
+        return {name: float(value) for name, value in (each.split("=") for each in text.split(","))}
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=NUMBER,...") from None
+
+
 def spectrum(text):
     """``degree=rms,...`` as a dict."""
     try:

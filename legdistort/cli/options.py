@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ..runtime import words
-from .arguments import Group, Option, columns, extension, number_or_name, planes, spectrum, word_or
+from .arguments import Group, Option, columns, extension, number_or_name, pairs, planes, spectrum, word_or
 
 # -- options that several commands have
 
@@ -181,12 +181,17 @@ SOLVING = Group(
         ),
         "validate": Option("of the stars, kept out of the fit to test the errors", type=float, metavar="FRACTION"),
         "static": Option(
-            "fit one static distortion for all exposures of a detector; of a camera also hold, prior",
+            "static distortion of a detector: hold what is known, as exact; with its uncertainty (prior); fit one",
             choices=words.CAMERA,
         ),
         "layout": Option(
             "the same for the layout of the detectors of a camera (default: that of headers is fitted)",
             choices=words.CAMERA,
+        ),
+        "layout_sigma": Option(
+            "how well the layout is known: shift [pixels], rotation [degrees], scale of each detector",
+            type=pairs,
+            metavar="shift=S,rotation=R",
         ),
         "dynamic": Option("of a camera: what has a distortion of its own in every exposure", choices=words.DYNAMIC),
         "exposure_degree": Option(
@@ -209,6 +214,11 @@ SOLVING = Group(
             "what exposures of a night have in common, by coefficient; 0: nothing (default: found)",
             type=float,
             metavar="PX",
+        ),
+        "pose_sigma": Option(
+            "errors of the poses, if they are known: shift [pixels], rotation [degrees], scale; 0: exact",
+            type=pairs,
+            metavar="shift=S,rotation=R",
         ),
         "reference": Option(
             "catalogue whose positions are known, such as one of Gaia, or a solution", metavar="TABLE", path="read"

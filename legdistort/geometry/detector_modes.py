@@ -4,7 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from . import basis
+from . import basis, similarity
 
 
 def similarity_basis(shape, n):
@@ -96,3 +96,41 @@ def _poses(ny, nx, n):
         poses[3, 0, 1] = -poses[3, 1, 0]
         poses[2:, :, 2] = -poses[2:, :, :2] @ [(nx - 1) / 2, (ny - 1) / 2]
     return _kept(poses.reshape(len(rows), 6).T @ rows)
+
+
+def pose_departures(poses, given, shapes):
+    """Coefficients (n, 4) of `similarity_basis` that amount to poses (n, 2, 3) beside given ones of the same parity.
+
+    Shifts are those of the middle of every detector, `shapes` a list of (ny, nx); of scale and rotation the logarithm
+    is taken, so that what is turned by much has not shrunk.
+    """
+    apart = similarity.compose(poses, similarity.invert(given))
+    size = np.array(shapes, dtype=float)[:, ::-1]
+    middle = (size - 1) / 2
+    shift = np.einsum("iab,ib->ia", apart[:, :, :2], middle) + apart[:, :, 2] - middle
+    turn = np.log(apart[:, 0, 0] + 1j * apart[:, 1, 0])
+    return np.column_stack([2 * shift, *(np.stack([turn.real, turn.imag]) * _of_turns(size))])
+
+
+def pose_widths(errors, shapes):
+    """Standard deviations (n, 4) of `pose_departures` for errors of shift [px], rotation [deg] and scale."""
+    shift, rotation, scale = errors
+    turns = _of_turns(np.array(shapes, dtype=float))
+    return np.column_stack([np.full((len(turns), 2), 2.0 * shift), scale * turns, np.radians(rotation) * turns])
+
+
+def affine_widths(errors, shape):
+    """Standard deviations (2, 3) of the modes of orders 0 and 1 of a detector (ny, nx) for errors of an affine map.
+
+    Of its shift [px], its rotation [deg], and its scale, one along each axis; rotation and scale count as independent
+    along the axes, so that shears are as large.
+    """
+    shift, rotation, scale = errors
+    across, along = (np.array(shape, dtype=float) / np.sqrt(3)).tolist()
+    turn = np.radians(rotation)
+    return np.array([[2 * shift, scale * along, turn * across], [2 * shift, turn * along, scale * across]])
+
+
+def _of_turns(size):
+    """Coefficients (n,) of a rotation by 1 rad, or of twice the scale, over detectors of some sizes (n, 2)."""
+    return np.hypot(*size.T) / np.sqrt(3)

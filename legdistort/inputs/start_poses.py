@@ -1,12 +1,66 @@
-"""Poses of exposures from matched positions alone."""
+"""Poses of exposures from matched positions alone, and what is known of given ones."""
+
+import contextlib
+from collections.abc import Mapping
 
 import numpy as np
+from astropy import units as u
 
-from ..exceptions import MatchError
+from ..exceptions import InputError, MatchError
 from ..geometry import pair_agreement, similarity
 
 #: Exposures whose stars typically lie farther from their means than this part of their extent are compared in pairs.
 _FAR = 0.01
+#: Errors that poses may have, and their units.
+POSE_ERRORS = {"shift": u.pix, "rotation": u.deg, "scale": u.dimensionless_unscaled}
+
+
+def check_pose_sigma(errors):
+    """Errors of poses, ``{name: number}`` for those of `POSE_ERRORS` that are finite; None if there is none.
+
+    Raises
+    ------
+    InputError
+        As `check_place_errors`, and where that of shifts is missing.
+    """
+    out = check_place_errors(errors, "pose_sigma")
+    if out and "shift" not in out:
+        raise InputError(
+            f"pose_sigma has {' and '.join(out)} without shift, and says nothing of where the reference plane lies: "
+            "state the error of shifts too"
+        )
+    return out
+
+
+def check_place_errors(errors, argument):
+    """Errors of places that are finite, ``{name: number}`` for names of `POSE_ERRORS`; None if there is none.
+
+    Raises
+    ------
+    InputError
+        For another name, unit or type of this `argument`, and for what is no standard deviation.
+    """
+    if errors is None:
+        return None
+    if not isinstance(errors, Mapping) or not set(errors) <= set(POSE_ERRORS):
+        raise InputError(
+            f"{argument} must be a dict of the errors of shift [px], rotation [deg] and scale, got {errors!r}: give, "
+            "for example, {'shift': 0.1, 'rotation': 0.01}"
+        )
+    out = {name: _number(argument, name, value) for name, value in errors.items()}
+    return {name: value for name, value in out.items() if np.isfinite(value)} or None
+
+
+def _number(argument, name, value):
+    """An error of a pose in its unit."""
+    unit = POSE_ERRORS[name]
+    with contextlib.suppress(TypeError, ValueError, u.UnitsError):
+        number = float(u.Quantity(value, getattr(value, "unit", unit)).to_value(unit))
+        if number >= 0 and not isinstance(value, bool):
+            return number
+    raise InputError(
+        f"pose_sigma: the error of {name} must be a number [{unit or 'relative'}], 0 or more, got {value!r}"
+    )
 
 
 def star_means(xy, star, n_stars):

@@ -153,6 +153,9 @@ class Matches(ShownAsPrinted):
     camera : `legdistort.Camera`
         Where it has a focal plane (`Camera.has_focal_plane`), positions are those in that, and those on the detectors
         stand in ``x_detector``, ``y_detector``. That of plain images need not be given.
+    pose_sigma : dict or None
+        Errors of all poses, ``shift`` [pix], ``rotation`` [deg], ``scale``, those that are known; None: poses are where
+        a solution starts.
 
     See Also
     --------
@@ -178,6 +181,7 @@ class Matches(ShownAsPrinted):
     header_distortion: str | None = None
     observations: Observations | None = None
     camera: Camera = field(default=None, metadata={READ: Camera.from_meta})
+    pose_sigma: dict[str, float] | None = None
 
     def __post_init__(self) -> None:
         if self.camera is None:
@@ -341,6 +345,7 @@ class Matches(ShownAsPrinted):
         header_distortion: str | None = None,
         allow_copies: bool = False,
         camera: Camera | None = None,
+        pose_sigma: Mapping[str, float | u.Quantity] | None = None,
     ) -> Matches:
         """Matches from a table of positions whose stars are identified.
 
@@ -371,6 +376,10 @@ class Matches(ShownAsPrinted):
             Where exposures have several detectors, distinguished by the column ``detector``: they become one, the focal
             plane of the camera, whose layout and static distortion count as known. What an exposure adds is then a
             distortion of the focal plane as a whole.
+        pose_sigma : dict, optional
+            Standard errors of the poses given, which are then more than start values: of ``shift``, that of the middle
+            of the detector [pix, both axes], ``rotation`` [deg] about it, and ``scale`` (relative); 0 is exact, and
+            rotation or scale may be left out where they are not known.
 
         Raises
         ------
@@ -409,6 +418,8 @@ class Matches(ShownAsPrinted):
             table = table[inside]
             seen = Observations.of(table)
         seen.check()
+        if (pose_sigma := start_poses.check_pose_sigma(pose_sigma)) and poses is None:
+            raise InputError("pose_sigma states how well poses are known: give these (poses=), or leave pose_sigma out")
         if poses is None:
             found = start_poses.estimate_poses(seen.exposure, seen.star, seen.xy, names=seen.names)
             poses = dict(zip(seen.names, found, strict=True))
@@ -417,7 +428,8 @@ class Matches(ShownAsPrinted):
         if epoch is None and "epoch" in table.colnames:
             epochs = column_contract.values(table, "epoch", u.yr)
             epoch = float(np.nanmean(epochs)) if np.isfinite(epochs).any() else None
-        return cls(table, shapes, poses, sky, left_out, epoch, header_distortion, observations=seen, camera=camera)
+        known = {"observations": seen, "camera": camera, "pose_sigma": pose_sigma}
+        return cls(table, shapes, poses, sky, left_out, epoch, header_distortion, **known)
 
 
 def _beside_the_table():

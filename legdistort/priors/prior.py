@@ -152,6 +152,11 @@ class Prior(ShownAsPrinted):
         """Total degree of the mean; 0 without one."""
         return 0 if self.mean is None else basis.degree_of(self.mean.shape[1])
 
+    @property
+    def states_mean(self) -> bool:
+        """Whether a static distortion is stated, and not its size or the scatter of exposures alone."""
+        return self.mean is not None and self.source != UNSTATED
+
     def static_widths(self, degree: int) -> np.ndarray:
         """Uncertainty (2, n_modes) of the static distortion to a total degree, pixels; zero where it is exact.
 

@@ -23,7 +23,7 @@ from ..geometry import basis
 from ..geometry.detector_modes import similarity_basis
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees.facts import NOT_STORED, array, number, text
-from .errors.catalogue_tie import Tie
+from .errors.catalogue_tie import Tie, errors_by_degree
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -230,6 +230,9 @@ class Gauge(ShownAsPrinted):
         and axis; None where there is one night.
     nights_told : bool
         Whether the exposures tell that, or the caller; else it is as large as the departures themselves.
+    poses_known : bool
+        Whether poses are known with their errors, and so shift, rotation and scale of the common map, which is then
+        complete in `covariance`.
     """
 
     kind: str = field(metadata=text(*_CONVENTIONS, "shift", "static + shift", "relative polynomial"))
@@ -251,6 +254,7 @@ class Gauge(ShownAsPrinted):
     drift: Drift | None = None
     nights: float | None = field(default=None, metadata=number(minimum=0, unit="pix"))
     nights_told: bool = True
+    poses_known: bool = False
 
     @property
     def n_constraints(self) -> int:
@@ -364,10 +368,12 @@ class Gauge(ShownAsPrinted):
         Returns
         -------
         list of (str, int, float)
-            Name, number of modes, error; the similarities first, NaN unless a reference determines them.
+            Name, number of modes, error; the similarities first, NaN unless a reference or poses determine them.
         """
         if self.tie is not None:
             return self.tie.errors(2 * self.box[1, ::-1])
+        if self.poses_known:
+            return errors_by_degree(self.covariance, 2 * self.box[1, ::-1])
         degree = basis.degree_of(self.n_modes)
         variance = np.diag(self.covariance).reshape(2, -1).sum(axis=0) / 8  # b_m has mean square 1/4
         rows = [("shift, rotation, scale" if degree else "shift", 4 if degree else 2, np.nan)]
@@ -399,7 +405,7 @@ class Gauge(ShownAsPrinted):
         error = np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()]))
         tied = f"{self.tie.sentence}; " if self.tie is not None else ""
         after = f" after {_listed(self.unknown_names)}" if self.unknown_names else ""
-        aside = ", apart from the pointing" if self.tie is None else ""
+        aside = ", apart from the pointing" if self.tie is None and not self.poses_known else ""
         known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}"
         if after and error == 0:  # nothing of the common map is known
             known = "absolute positions are not known"
@@ -419,6 +425,9 @@ class Gauge(ShownAsPrinted):
             f"{'modes':24s} {'number':>6s} {'absolute error':>15s}  determined by",
         ]
         measured = {} if self.tie is None else self.tie.words(convention)
+        if self.poses_known:
+            measured = dict.fromkeys((name for name, *_ in self.absolute_errors()), f"{convention} and the known poses")
+            measured["shift, rotation, scale"] = "the poses, which are known"
         for name, n, error in self.absolute_errors():
             size = "not known" if np.isnan(error) else f"{error:.2g} px"
             cause = measured.get(name) or ("the nominal poses, mean over exposures" if np.isnan(error) else convention)

@@ -38,6 +38,10 @@ class Settings:
         Year of the positions, as it was asked for.
     night_sigma : float or None
         What was stated of the scatter of nights, pixels.
+    layout_sigma : dict or None
+        What was stated of the errors of the layout: ``shift`` [px], ``rotation`` [deg], ``scale``.
+    pose_sigma : dict or None
+        Errors of the poses that were known: ``shift`` [px], ``rotation`` [deg], ``scale``.
     max_iterations : int or None
     """
 
@@ -58,5 +62,7 @@ class Settings:
     motion_sigma: float | str | None = field(default=None, metadata=number(minimum=0, unit="pix/yr"))
     motion_epoch: float | None = field(default=None, metadata=YEARS)
     night_sigma: float | None = field(default=None, metadata=_PIXELS)
+    layout_sigma: dict[str, float] | None = None
+    pose_sigma: dict[str, float] | None = None
     max_iterations: int | None = field(default=None, metadata=number(minimum=0))
     validate: float | None = field(default=None, metadata=number(minimum=0, maximum=1))

@@ -156,15 +156,18 @@ class CameraFit:
     Parameters
     ----------
     sought : Sought
+    join : callable, optional
+        ``join(fit)``, a fit with what else is known of where detectors lie to each other.
     """
 
-    def __init__(self, sought):
+    def __init__(self, sought, join=None):
         self.sought, self.step, self._departure = sought, None, np.zeros(sought.free.shape)
+        self.join = join or (lambda fit: fit)
 
     def settle(self, matches, estimate):
         """Matches with the camera with which `estimate`, ``estimate(matches)``, gives a fit that calls for no other."""
         for _ in range(_STEPS):
-            fit = estimate(matches)
+            fit = self.join(estimate(matches))
             self.step = camera_step(fit, self.sought, self._departure)
             self._departure = self._departure + self.step.change
             matches = in_camera(fit.matches, changed(fit.matches.camera, self.step.change))
@@ -296,14 +299,15 @@ def _tell_unknown(matches, step, unknown):
     warn(
         f"{len(unknown)} unknowns of camera {camera.name} are not determined by these exposures and stay where they "
         f"were, above all of detector {', '.join(named)}{apart}: stars that one detector sees in one exposure and "
-        "another in the next determine how these lie; dither over the gaps, or give uncertainties (layout_sigma)",
+        "another in the next determine how these lie; dither over the gaps, or say how well the layout is known "
+        "(layout_sigma)",
         AssumptionWarning,
     )
 
 
 def held(matches, layout, static):
     """Matches whose camera states as exact what is to be held of it ("hold"); all that one exposure is not asked of."""
-    if len(matches.names) == 1:  # no star goes from one detector to another
+    if len(matches.names) == 1 and matches.camera.has_focal_plane:  # no star goes from one detector to another
         layout, static = layout or "hold", static or "hold"
     exact = {"layout_sigma": None, "layout_covariance": None} if layout == "hold" else {}
     exact |= {"static_sigma": None} if static == "hold" else {}
@@ -331,7 +335,7 @@ def camera_step(fit, sought, departure):
     """
     free, prior = sought.free, sought.prior
     problem, blocks, camera = fit.weighted, fit.blocks, fit.matches.camera
-    system = fit.uncertainty.system
+    respond = _response(fit.uncertainty.system, fit.result.gauge)
     patterns = _patterns(fit.matches, camera, problem, free)
     moved = _weighted(problem, patterns)
     k = patterns.shape[2]
@@ -340,7 +344,7 @@ def camera_step(fit, sought, departure):
     alone = np.diag(normal).copy()
     gradients = [_gradient(problem, blocks, patterns[:, :, j], moved[:, :, j]) for j in range(k)]
     for j, (own, stars) in enumerate(gradients):
-        star_response, response = system.settle(own, stars)
+        star_response, response = respond(own, stars)
         stars_follow[:, :, j], follow[:, :, j] = star_response[:2], response
         for m, (other_own, other_stars) in enumerate(gradients):
             normal[m, j] -= np.sum(other_own * response) + np.sum(other_stars * star_response)
@@ -353,6 +357,22 @@ def camera_step(fit, sought, departure):
     change[free] = held @ (departure[free] + covariance @ pull) - departure[free]
     covariance = held @ covariance @ held.T
     return CameraStep(change, covariance, free, stars_follow, follow, float(np.sum(covariance * normal)), weak)
+
+
+def _response(system, gauge):
+    """``settle`` of a reduced system, with the plane that follows too where J determines it."""
+    if not gauge.poses_known:
+        return system.settle
+    moves = system.moves[: gauge.n_constraints]
+    stars, coefficients = (np.stack([of(d) for d in moves]) for of in (system.follow, system.unknowns.spread))
+    covariance = gauge.reach @ gauge.covariance @ gauge.reach.T
+
+    def respond(own, pulls):
+        held = system.settle(own, pulls)
+        values = covariance @ (np.einsum("vkn,kn->v", stars, pulls) + np.einsum("via,ia->v", coefficients, own))
+        return tuple(a + np.tensordot(values, b, 1) for a, b in zip(held, (stars, coefficients), strict=True))
+
+    return respond
 
 
 def _patterns(matches, camera, problem, free):

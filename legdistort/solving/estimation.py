@@ -24,8 +24,9 @@ from .choices import prior_widths
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
 from .equations import effective_modes
+from .gauge import known_poses
 from .motion_choice import resolve as resolve_motion
-from .options import CLIP, DEGREE, SolveOptions, Unasked, check_detectors, check_tie
+from .options import CLIP, DEGREE, SolveOptions, Unasked, check_detectors, check_tie, prior_as_asked, with_stated
 from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
 from .single_detectors import by_detector
@@ -54,6 +55,7 @@ def solve(
     model: Model | None = None,
     static: str | None = None,
     layout: str | None = None,
+    layout_sigma: Mapping[str, float | Quantity] | None = None,
     dynamic: str | None = None,
     exposure_degree: int | None = None,
     gauge: str = "minimal",
@@ -68,6 +70,7 @@ def solve(
     motion_sigma: float | str | None = None,
     motion_epoch: float | Time | None = None,
     night_sigma: float | None = None,
+    pose_sigma: Mapping[str, float | Quantity] | None = None,
     reference: Table | SkyCoord | Solution | StrPath | None = None,
     reference_error: float | Quantity | str | None = None,
     epoch: float | Time | None = None,
@@ -95,17 +98,24 @@ def solve(
         static distortion from which exposures depart. `View.model` then gives it back fitted. A similarity in
         front is replaced by the pose of each exposure. Poses also carry shift, rotation and scale: their part of the
         coefficients c0_0, c1_0 and c0_1 stays as given.
-    static : {None, "fit"}, with a camera also {"hold", "prior"}
-        "fit": one static distortion for all exposures of a detector (column ``detector``, else all of one shape), and
-        for each exposure its pose and the modes up to `exposure_degree` alone: the self-calibration of a camera from
-        its own dithers and rolls (Anderson & King 2003). A prior is its start value and, with ``static_sigma``,
-        constrains it.
-        With a camera: fit the static distortion of every detector, common to all exposures, from what is known of it
-        on ("prior"; the default where uncertainties are given) or from nothing ("fit", up to `degree`); or "hold" it.
+    static : {None, "hold", "prior", "fit"}
+        What is done about the static distortion of a detector. "hold": what is known of it (the prior; with a camera
+        that of its detectors) is exact; "prior": it has the uncertainties that are stated (``static_sigma``); "fit":
+        one for all exposures is found. None: "prior" where uncertainties are stated, else "hold"; where nothing is
+        known of it, it is what the exposures have in common.
+        With a camera "fit" is up to `degree`, from nothing, and exposures keep a distortion of the focal plane. Of
+        single detectors (column ``detector``, else all of one shape) each exposure then has its pose and the modes up
+        to `exposure_degree` alone: the self-calibration of a camera from its own dithers and rolls (Anderson & King
+        2003); a prior is its start value and, with ``static_sigma``, constrains it.
     layout : {None, "hold", "prior", "fit"}
         The same for the layout of the detectors of a camera: as exact, with the uncertainties that are stated of it
         (the default where any are), or without any. That of headers has infinite ones, so that it is fitted by default.
         The result is in ``solution.camera``, with its errors.
+    layout_sigma : dict, optional
+        How well that layout is known, in place of what the camera states: standard errors of the ``shift`` [px, both
+        axes] and the ``rotation`` [deg] of every detector, and of its ``scale`` and shear (relative; by default as
+        large as those of the rotation); infinite for what is left out. Detectors that no star ties have finite errors
+        then.
     dynamic : {None, "focal_plane", "detector"}
         With a camera: what an exposure adds is a distortion of the focal plane as a whole (None does the same), or one
         for every detector by itself, which then is an exposure of its own, ``NAME-DETECTOR``, with a pose of its own;
@@ -148,6 +158,10 @@ def solve(
     night_sigma : float, optional
         What the exposures of a night (`Matches.blocks`) have in common beside the static distortion: standard deviation
         of every normalised coefficient, pixels. None: found from the nights, where there are several; 0: nothing.
+    pose_sigma : dict, optional
+        Errors of the poses of the matches, if these are known and no mere start values, as `Matches.from_table` takes
+        them, in place of what the matches state. Absolute errors then include shift, rotation and scale. Not for poses
+        that `match` found from the positions themselves.
     reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord`, Solution or path, optional
         Positions with errors: what is known beforehand of its stars, and so of shift, rotation and scale, and of maps
         that the exposures do not determine. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error``
@@ -198,30 +212,29 @@ def solve(
     >>> [check.name for check in solution.checks if check.state == "fail"]
     []
     """
-    if not isinstance(matches, Matches):
-        raise InputError(
-            f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
-        )
+    matches = with_stated(matches, pose_sigma, layout, layout_sigma)
     matches, prior, static = _of_detectors(matches, prior, layout, static, dynamic)
     sought, prior = _of_camera(matches, prior, model, degree, layout, static, exposure_degree)
     asked = SolveOptions(
-        degree=degree, prior=prior, model=model, static=static, layout=layout, dynamic=dynamic,
-        exposure_degree=exposure_degree,
+        degree=degree, prior=prior, model=model, static=static, layout=layout, layout_sigma=layout_sigma,
+        dynamic=dynamic, exposure_degree=exposure_degree,
         gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
         max_iterations=max_iterations, validate=validate, motion=motion, motion_sigma=motion_sigma,
-        motion_epoch=motion_epoch, night_sigma=night_sigma,
+        motion_epoch=motion_epoch, night_sigma=night_sigma, pose_sigma=matches.pose_sigma,
     )  # fmt: skip
     tying = {"error": reference_error, "epoch": epoch, "pixel_scale": pixel_scale}
-    catalogue, epoch = check_tie(matches.names, asked, reference, **tying)
+    catalogue, epoch = check_tie(matches, asked, reference, **tying)
     if model is None:
         _warn_of_header(matches, prior)
-    options, form = replace(asked, static=None, layout=None) if matches.camera.has_focal_plane else asked, None
+    is_prior = matches.camera.has_focal_plane or static in ("hold", "prior")  # of the camera, or the prior, by now
+    options, form = replace(asked, static=None, layout=None) if is_prior else asked, None
     if model is not None:
         form = model_forms.read(model, matches, degree=None if isinstance(degree, Unasked) else degree, gauge=gauge)
         options = replace(options, degree=form.degree, model=None, prior=form.prior())
     given, kept_out = (matches, None) if validate is None else hold_out(matches, validate)
     with single_fit.threads(given), minimisers.iterations_shown(progress):
-        fit, options, chosen = _fitted(given, options, sought)
+        join = reference_tie.joined_by(catalogue, epoch=epoch, pixel_scale=pixel_scale)
+        fit, options, chosen = _fitted(given, options, sought, join)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
         diagnostics = replace(_diagnostics(fit, prior, scale), **chosen)
@@ -243,6 +256,10 @@ def solve(
 def _of_detectors(matches, prior, layout, static, dynamic):
     """The matches, of single detectors if they are asked for, what is known of these, and what to do about statics."""
     check_detectors(matches.camera.has_focal_plane, layout, static, dynamic)
+    if dynamic == "detector" and matches.pose_sigma is not None:
+        raise InputError(
+            "pose_sigma is for whole exposures, and with dynamic='detector' every detector has a pose: leave it out"
+        )
     if dynamic != "detector":
         return held(matches, layout, static), prior, static
     if layout is not None:
@@ -269,6 +286,7 @@ def _of_camera(matches, prior, model, degree, layout, static, exposure_degree):
     camera = matches.camera
     if not camera.has_focal_plane:
         prior = _of_detector(camera, prior, model)
+        prior = prior if model is not None else prior_as_asked(prior, static)  # with a model static is refused
         each = prior.values() if isinstance(prior, dict) else [prior]
         if static == "fit" and any(_knows_nothing_of_a_mode(p) for p in each):
             raise InputError("static='fit' needs a finite static_sigma of the prior: make it finite, or leave it out")
@@ -317,13 +335,15 @@ def _knows_nothing_of_a_mode(prior):
     return sigma is not None and not isinstance(sigma, str) and bool(np.isinf(sigma).any())
 
 
-def _fitted(matches, options, sought):
+def _fitted(matches, options, sought, join):
     """The fit, its options, and what was chosen and found for the `Diagnostics`; with the camera that is `sought`."""
-    camera, selection = None if sought is None else CameraFit(sought), None
+    camera, selection = None if sought is None else CameraFit(sought, join), None
     if camera is not None:  # to a layout that is wrong by pixels all observations seem to deviate
         matches = camera.settle(matches, partial(single_fit.estimate, options=_plain(options)))
     if options.chooses_degree:
-        selection = _choose_degree(matches, options)
+        selection = _choose_degree(
+            replace(matches, pose_sigma=None), options
+        )  # stars agree or not wherever the plane is
         options = replace(options, degree=selection.degree)
     options, scatter = resolve_motion(matches, options)
     if camera is not None:
@@ -395,6 +415,8 @@ def _tell(fit, matches):
         if name not in matches.left_out:
             warn(f"exposure {name} is left out: {reason}", AssumptionWarning)
     _tell_lost_stars(fit)
+    if why := known_poses.contradiction(fit.problem, fit.result.state, fit.uncertainty):
+        warn(why, AssumptionWarning)
     if fit.problem.unknowns.shared and (n_weak := fit.result.n_weak):
         warn(
             f"static='fit': {n_weak} of {fit.problem.unknowns.n_common} unknowns of the shared distortion are not "

@@ -22,7 +22,7 @@ from .equations import criterion, elimination, reduced_system
 from .equations.losses import loss_factors
 from .equations.problem import State
 from .equations.reduced_base import Reduced
-from .gauge import constraints
+from .gauge import constraints, known_poses
 from .gauge.hierarchy import determined_by_residuals, is_explained, is_noise
 
 log = logging.getLogger(__name__)
@@ -154,6 +154,8 @@ def solve_joint(
         run = freer
     declared = run.rules.hold or (run.released is None and not problem.terms.is_held)
     convention = run.convention if declared else run.declared()
+    if run.finds_plane:
+        convention = known_poses.determined(run.system, convention, run.violation)
     status = f"converged after {len(run.steps)} iterations"
     if not run.converged:
         status = (
@@ -257,13 +259,31 @@ class _Descent:
         d_star, d_exposure = self.stepping.step(target, accuracy, enough)
         return d_star, d_exposure, _step_size(self.blocks, d_star, d_exposure)
 
+    @property
+    def finds_plane(self):
+        """Whether J has something that determines the plane: known poses, or stars, unless these are held in theirs."""
+        stars = self.problem.terms.catalogue is not None and not self.rules.hold
+        return stars or self.problem.pose_width is not None
+
+    @property
+    def violation(self):
+        """How far the state is from the values of the constraints."""
+        return self.convention.violation(_departure(self.problem, self.state))
+
+    def _target(self):
+        """What is lacking to the values of the constraints, or to those that J and these determine together."""
+        if not self.finds_plane:
+            return -self.violation
+        self.stepping = self.stepping or self.system
+        return known_poses.balanced(self.stepping, self.convention, self.violation)
+
     def descend(self, max_iterations):
         """Iterate until the next step would be below the tolerance."""
         accuracy, size = 1e-3 if self.blocks.coupling.dtype == np.float32 else 1e-5, self.size
         tolerance, enough = self.rules.tolerance, _ENOUGH * self.rules.tolerance
         for count in range(max_iterations):
             _count.get()()
-            target, last = -self.convention.violation(_departure(self.problem, self.state)), size
+            target, last = self._target(), size
             d_star, d_exposure, size = self._step(target, accuracy, enough)
             failed = size >= _MUCH_SMALLER * last and not self.stepping.moves_exactly
             if failed and self.on_trial and self.stepping is not self.made:
@@ -287,7 +307,7 @@ class _Descent:
     def freer(self):
         """The same with further unknown maps left to the residuals; None if these determine none."""
         unknown = any(each.degree > 1 for each in self.convention.unknown_maps)
-        if self.rules.common is not None or self.rules.hold or not unknown:
+        if self.rules.common is not None or self.rules.hold or not unknown or self.finds_plane:
             return None
         if not self.problem.unknowns.shared and is_noise(Reduced(self.weighted, self.blocks, self.convention)):
             return None

@@ -1,6 +1,6 @@
 """Options of `legdistort.solve`, checked before anything is computed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from pathlib import Path
 
@@ -8,9 +8,11 @@ import numpy as np
 
 from ..exceptions import InputError
 from ..geometry import basis, fitter
+from ..geometry.detector_modes import affine_widths
 from ..geometry.epochs import year
 from ..inputs.reference_catalogue import read_reference
-from ..matching.matches import alone
+from ..inputs.start_poses import POSE_ERRORS, check_place_errors, check_pose_sigma
+from ..matching.matches import Matches, alone
 from ..results.settings import Settings
 from ..results.solution import Solution
 from ..runtime.checks import LARGEST, check_choice
@@ -53,6 +55,7 @@ class SolveOptions(Settings):
 
     def __post_init__(self):
         object.__setattr__(self, "motion_epoch", year(self.motion_epoch))
+        object.__setattr__(self, "layout_sigma", check_place_errors(self.layout_sigma, "layout_sigma"))
         self._check_distortion()
         check_choice(self.gauge, GAUGES, "gauge")
         check_error_floor(self.error_floor)
@@ -73,6 +76,8 @@ class SolveOptions(Settings):
             raise InputError("errors='by-brightness' finds the errors, their floor too: leave error_floor out")
         if self.max_iterations is not None and not (isinstance(self.max_iterations, int) and self.max_iterations > 0):
             raise InputError(f"max_iterations must be a positive integer, got {self.max_iterations!r}")
+        if self.pose_sigma is not None and self.method == "alternating":
+            raise InputError("method='alternating' is the published scheme: poses are its start, leave pose_sigma out")
         self._check_motion()
         self._check_nights()
         if self.clip is not None and not (isinstance(self.clip, Real) and 1 < self.clip < LARGEST):
@@ -99,6 +104,7 @@ class SolveOptions(Settings):
                 raise InputError("motion_sigma and motion_epoch belong to motion='proper', 'parallax' or 'auto'")
             return
         for word, excluded in (
+            ("pose_sigma", self.pose_sigma is not None),
             ("method='alternating'", self.method == "alternating"),
             ("errors='correlated'", self.errors == "correlated"),
             ("validate", self.validate is not None),
@@ -115,7 +121,7 @@ class SolveOptions(Settings):
         real = isinstance(self.validate, Real) and not isinstance(self.validate, bool)
         if self.validate is not None and not (real and 0 < self.validate < 0.5):
             raise InputError(f"validate must be a fraction of the stars between 0 and 0.5, got {self.validate!r}")
-        if self.chooses_degree and self.static is not None:
+        if self.chooses_degree and self.static == "fit":
             raise InputError("static='fit' needs a degree in numbers, not 'auto'")
         self._check_static()
         check_prior(self.prior)
@@ -162,16 +168,74 @@ class SolveOptions(Settings):
         return 1 if self.exposure_degree is None else int(self.exposure_degree)
 
 
-def check_detectors(several, layout, static, dynamic):
+def with_stated(matches, pose_sigma, layout, layout_sigma):
+    """Matches with the errors of poses and of the layout of detectors that are given, in place of those they state.
+
+    Raises
+    ------
+    InputError
+        For what are no matches, what is no error of a place, and for a layout that is exact, or missing.
+    """
+    if not isinstance(matches, Matches):
+        raise InputError(
+            f"matches must be Matches (from match(...) or Matches.from_table(...)), got {type(matches).__name__}"
+        )
+    if pose_sigma is not None:
+        matches = replace(matches, pose_sigma=check_pose_sigma(pose_sigma))
+    if layout_sigma is None:
+        return matches
+    check_detectors(matches.camera.has_focal_plane, layout, None, None, layout_sigma)
+    errors = dict.fromkeys(POSE_ERRORS, np.inf) | (check_place_errors(layout_sigma, "layout_sigma") or {})
+    if "scale" not in layout_sigma:
+        errors["scale"] = np.radians(errors["rotation"])
+    detectors = {
+        key: replace(each, layout_sigma=affine_widths(errors.values(), each.shape), layout_covariance=None)
+        for key, each in matches.camera.detectors.items()
+    }
+    return replace(matches, camera=replace(matches.camera, detectors=detectors))
+
+
+def check_detectors(several, layout, static, dynamic, layout_sigma=None):
     """Raise `InputError` for what is no choice, and for choices about a camera without several detectors."""
     given = {"layout": (layout, CAMERA), "static": (static, CAMERA), "dynamic": (dynamic, DYNAMIC)}
     for name, (value, words) in given.items():
         check_choice(value, (None, *words), name)
-        if not several and value is not None and (name, value) != ("static", "fit"):
+        if not several and value is not None and name != "static":
             raise InputError(
                 f"{name}={value!r} is for exposures with several detectors, and these have one each: leave it out, or "
                 "name the camera (camera=, --camera)"
             )
+    if layout_sigma is None:
+        return
+    if not several:
+        raise InputError("layout_sigma is for exposures with several detectors, and these have one each: leave it out")
+    if layout not in (None, "prior"):
+        raise InputError(f"layout_sigma is for layout='prior', got layout={layout!r}: leave one of them out")
+
+
+def prior_as_asked(prior, static):
+    """The prior of plain images with the static distortion as exact ("hold"), or with the widths it has ("prior").
+
+    Raises
+    ------
+    InputError
+        If nothing is known of it, or no uncertainty is stated.
+    """
+    if static not in ("hold", "prior"):
+        return prior
+    named = prior if isinstance(prior, dict) else {None: prior}
+    if any(each is None or (static == "hold" and not each.states_mean) for each in named.values()):
+        raise InputError(
+            f"static={static!r} is for a static distortion that is known: give it (prior, --prior), or leave static out"
+        )
+    if static == "prior" and all(each.static_sigma is None for each in named.values()):
+        raise InputError(
+            "static='prior' needs the uncertainty of the static distortion (static_sigma of the prior, "
+            "--static-sigma): give it, or static='hold'"
+        )
+    if static == "hold":
+        named = {name: replace(each, static_sigma=None) for name, each in named.items()}
+    return named if isinstance(prior, dict) else named[None]
 
 
 def check_reference(reference, *, error=None, epoch=None, pixel_scale=None, method="joint"):
@@ -201,8 +265,8 @@ def check_reference(reference, *, error=None, epoch=None, pixel_scale=None, meth
     return known_stars(solution, f"the reference {name}"), epoch
 
 
-def check_tie(names, asked, reference, **tying):
-    """What `check_reference` gives, for exposures of these names and the `SolveOptions` asked for.
+def check_tie(matches, asked, reference, **tying):
+    """What `check_reference` gives, for these matches and the `SolveOptions` asked for.
 
     Raises
     ------
@@ -217,14 +281,17 @@ def check_tie(names, asked, reference, **tying):
             f"motion={asked.motion!r} with a solution as reference, of whose rates common errors are not kept: "
             "solve all exposures together, or give its table of stars (stars.ecsv)"
         )
-    if len(names) > 1:
+    if catalogue is not None and asked.pose_sigma is not None:
+        raise InputError("pose_sigma and reference both say where the reference plane lies: leave one of them out")
+    if len(matches.names) > 1:
         return catalogue, epoch
-    (name,) = names
+    (name,) = matches.names
     if catalogue is None:
         raise alone(name)
     comparing = {"errors": asked.errors != "stated", "degree": asked.chooses_degree}
-    comparing |= {option: getattr(asked, option) in ("fit", "prior") for option in ("static", "layout")}
-    comparing |= {option: getattr(asked, option) is not None for option in ("validate", "motion")}
+    sought = ("fit", "prior") if matches.camera.has_focal_plane else ("fit",)
+    comparing |= {option: getattr(asked, option) in sought for option in ("static", "layout")}
+    comparing |= {option: getattr(asked, option) is not None for option in ("validate", "motion", "layout_sigma")}
     for option in filter(comparing.get, comparing):
         raise InputError(
             f"{option}={getattr(asked, option)!r} compares exposures with one another, and there is only one ({name}): "

@@ -46,6 +46,9 @@ _LARGE = 2.0
 _ELSEWHERE = 25.0
 #: A map moves the solution to first order; what is left comes from another round.
 _MAP_ROUNDS = 2
+#: Stars of a reference off by so many times the median of those on the same detectors join nothing: of Rayleigh's
+#: distribution that is chance below 1e-19, and maps that the exposures leave open make the median larger.
+_MISMATCH = 8.0
 #: Factor on errors that are to be found.
 _TINY = 1e-6
 #: Modes of maps from which stars are held: of fewer, shear is one that exposures determine by themselves.
@@ -444,14 +447,7 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     if fit.problem.terms.n:  # positions are those of this epoch, whatever the mean of the exposures is
         epoch = fit.problem.terms.epoch
     epoch = matches.epoch if epoch is None else epoch
-    identified = identify(
-        reference.at(epoch, moving=fit.problem.terms.n > 0),
-        matches.stars,
-        np.where(fit.blocks.v[0] > 0, result.state.positions, np.nan).T,
-        flux=_flux(matches),
-        sky=matches.sky,
-        pixel_scale=pixel_scale,
-    )
+    identified = _identified(fit, reference, epoch, pixel_scale)
     log.info("%d of the %d stars of %s are in the exposures", len(identified.rows), len(reference), reference.label)
     of = fit.options
     known = np.all(elimination.inverse_star_blocks(fit.blocks.v)[np.diag(packed(fit.problem.n_star))] > 0, axis=0)
@@ -475,6 +471,53 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     else:  # the map moves the plane alone
         result = replace(result, gauge=replace(result.gauge, tie=replace(result.gauge.tie, freedom=0.0)))
     return replace(fit, matches=replace(matches, sky=identified.sky, epoch=epoch), result=result)
+
+
+def _identified(fit, reference, epoch, pixel_scale):
+    """The stars of a reference at an epoch that a fit has, `legdistort.matching.cross_identification.Identified`."""
+    matches = fit.matches
+    return identify(
+        reference.at(epoch, moving=fit.problem.terms.n > 0),
+        matches.stars,
+        np.where(fit.blocks.v[0] > 0, fit.result.state.positions, np.nan).T,
+        flux=_flux(matches),
+        sky=matches.sky,
+        pixel_scale=pixel_scale,
+    )
+
+
+def joined_by(reference, **tying):
+    """What makes of the `Fit` of a camera one in which the stars of a reference tie detectors that no star ties.
+
+    ``join(fit)``: with these stars as a prior, by which J determines the plane too; None without a reference. Where
+    stars move the fit stays as it is.
+    """
+    return None if reference is None else partial(_joined, reference=reference, **tying)
+
+
+def _joined(fit, *, reference, epoch, pixel_scale):
+    group = np.full(fit.problem.n_stars, -1)
+    group[fit.problem.star[fit.used]] = fit.matches.camera.group_of(fit.matches.table[fit.problem.order][fit.used])
+    if group.max() < 1 or fit.problem.terms.n:
+        return fit
+    found = _identified(fit, reference, fit.matches.epoch if epoch is None else epoch, pixel_scale)
+    positions, agrees = fit.result.state.positions.T, np.ones(len(found.rows), dtype=bool)
+    for g in range(group.max() + 1):  # which are off by as much as this group of detectors
+        mine = np.flatnonzero(group[found.rows] == g)
+        if len(mine) > FEWEST_MODES:
+            source, target = positions[found.rows[mine]], found.xy[mine]
+            off = np.hypot(*(similarity.apply(robust_similarity(source, target), source) - target).T)
+            agrees[mine] = off < _MISMATCH * np.median(off)
+    found = found.subset(agrees)
+    source = positions[found.rows]
+    rough = similarity.fit_similarity(source, found.xy, parity=1) if len(source) > 1 else similarity.identity()
+    catalogue = StarPrior.of(len(positions), found.rows, found.xy, found.covariance[:, :2, :2])
+    problem = replace(fit.problem, moving=replace(fit.problem.terms, catalogue=catalogue))
+    of, weighted = fit.options, problem.scaled(fit.used.astype(float))
+    how = {"gauge": of.gauge, "loss": of.loss, "max_iterations": of.max_iterations}
+    return replace(
+        fit, problem=problem, result=minimisers.solve_joint(weighted, _moved(fit.result.state, rough), **how)
+    )
 
 
 def _held_back(fit, problem):

@@ -827,7 +827,7 @@ def test_options_that_others_leave_without_effect_are_refused(words, message, ni
         ("measure FRAMES --psf moffat --write-psf p --out o.ecsv", "leave write_psf out, or give --psf effective"),
         ("measure FRAMES --profile shared --write-psf p --out o.ecsv", "leave write_psf out, or give --psf effective"),
         ("run FRAMES --layout fit --out o", "--layout fit is for exposures with several detectors"),
-        ("run FRAMES --static hold --out o", "name the camera (--camera)"),
+        ("run FRAMES --static hold --out o", "is for a static distortion that is known"),
         ("run FRAMES --exposure-degree 1 --out o", "belongs to --static fit"),
         ("run FRAMES --motion-sigma 1 --out o", "belong to --motion"),
         ("prior gsaoi-2 --frame tel --out o.asdf", "leave --frame out"),

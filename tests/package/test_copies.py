@@ -72,7 +72,7 @@ def matches():
     sky = TangentPlane(10.0, -70.0, np.array([[-1e-5, 1e-6, 2e-3], [1e-6, 1e-5, -1e-3]]))
     return Matches.from_table(
         table, camera=pair, poses=sim.matches.poses, sky=sky, left_out={"bad": "no stars: 'none'"}, epoch=2020.25,
-        header_distortion="SIP, up to 4.48 px over the detector",
+        header_distortion="SIP, up to 4.48 px over the detector", pose_sigma={"shift": 20.0, "scale": 0.1},
     )  # fmt: skip
 
 

@@ -6,9 +6,10 @@ from dataclasses import replace
 import header_layouts
 import numpy as np
 import pytest
+from astropy.table import Table
 
 import legdistort
-from legdistort.exceptions import AssumptionWarning
+from legdistort.exceptions import AssumptionWarning, InputError
 
 STATES = ("camera", "absolute")
 
@@ -103,6 +104,79 @@ def test_stated_widths_determine_it(apart):
     assert "group" not in solution.stars.colnames
     assert np.isfinite(solution.stars["x_err_abs"]).all()
     assert 0.1 < apart.pulls(solution)[0] < 3
+
+
+def known_stars(night):
+    """Matches of a night whose stars are known, with the camera that headers state; its errors are not."""
+    table = Table(night.table, copy=True)
+    table["star"] = table["true"]
+    shape = header_layouts.SIZE, header_layouts.SIZE
+    places = zip(header_layouts.KEYS, night.stated, strict=True)
+    detectors = {key: legdistort.Detector(shape, layout=place, layout_sigma=np.inf) for key, place in places}
+    return legdistort.Matches.from_table(table, camera=legdistort.Camera("four", detectors))
+
+
+def pull_across(n_sets, **options):
+    """Squared pull of relative positions of stars that nothing but the stated widths ties; finite errors all over."""
+    found = []
+    for seed in range(n_sets):
+        night = header_layouts.Night(seed, off=1.0, turn=0.02, dither=12.0, n=5, n_stars=250)
+        solution = legdistort.solve(known_stars(night), **options)
+        assert "group" not in solution.stars.colnames
+        assert np.isfinite(solution.stars["x_err"]).all()
+        found.append(night.pulls(solution)[0])
+    return np.mean(found)
+
+
+WIDTHS = {"shift": 1.0, "rotation": 0.02, "scale": 1e-6}
+
+
+@pytest.mark.parametrize("n_sets", [4, pytest.param(25, marks=pytest.mark.slow)])
+def test_what_the_caller_knows_of_the_layout(n_sets):
+    assert pull_across(n_sets, layout_sigma=WIDTHS) == pytest.approx(1, abs=0.5 if n_sets < 10 else 0.2)
+
+
+def test_the_caller_s_widths_are_those_of_a_camera(apart):
+    """In pixels of the modes; without an error of the scale that is as large as the rotation's, in radians."""
+    matches, turn = known_stars(apart), np.radians(0.02) * header_layouts.SIZE / np.sqrt(3)
+    stated = {key: replace(each, layout_sigma=[2.0, turn, turn]) for key, each in matches.camera.detectors.items()}
+    by_camera = legdistort.solve(replace(matches, camera=replace(matches.camera, detectors=stated)))
+    by_option = legdistort.solve(matches, layout_sigma={"shift": 1.0, "rotation": 0.02})
+    assert by_option.settings.layout_sigma == {"shift": 1.0, "rotation": 0.02}
+    for column in ("x", "x_err", "x_err_abs"):
+        np.testing.assert_allclose(by_option.stars[column].value, by_camera.stars[column].value, rtol=1e-6)
+    with pytest.raises(InputError, match=r"turn.*: give, for example"):
+        legdistort.solve(matches, layout_sigma={"turn": 0.1})
+
+
+@pytest.mark.parametrize(
+    ("n_sets", "n_known", "error", "n_wrong"),
+    [
+        (4, 80, 0.01, 0),
+        pytest.param(12, 80, 0.05, 0, marks=pytest.mark.slow),
+        pytest.param(12, 40, 0.02, 4, marks=pytest.mark.slow),
+    ],
+)
+def test_a_catalogue_joins_detectors(n_sets, n_known, error, n_wrong):
+    """Absolute errors are true of all stars, those that it does not have too, and hold between detectors."""
+    squares = np.zeros((2, 2))
+    for seed in range(n_sets):
+        night = header_layouts.Night(seed, off=2.5, turn=0.02, dither=12.0, n=5, n_stars=250)
+        matches, rng = known_stars(night), np.random.default_rng(1000 + seed)
+        names = rng.permutation(matches.stars)[:n_known]
+        xy = night.sky[names] + rng.normal(0, error, (n_known, 2))
+        xy[:n_wrong] += rng.normal(0, 5, (n_wrong, 2))
+        catalogue = Table({"star": names, "x": xy[:, 0], "y": xy[:, 1]})
+        catalogue["x_err"] = catalogue["y_err"] = error
+        solution = legdistort.solve(matches, reference=catalogue)
+        assert "group" not in solution.stars.colnames
+        off = solution.estimate.positions - night.sky[solution.estimate.star_names]
+        stated = np.column_stack([solution.stars[name].value for name in ("x_err_abs", "y_err_abs")])
+        known = np.isin(solution.estimate.star_names, names)
+        squares += [[np.sum(each[rows] ** 2) for each in (off, stated)] for rows in (known, ~known)]
+        assert max(solution.camera["2"].place.errors[:2]) < 0.1
+        assert states(solution)["absolute"] == "pass"
+    assert squares[:, 0] / squares[:, 1] == pytest.approx(1, abs=0.25 if n_sets > 10 else 0.4)
 
 
 @pytest.mark.slow

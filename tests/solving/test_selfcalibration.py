@@ -9,7 +9,7 @@ from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
-from legdistort import Matches, Prior, Solution, solve
+from legdistort import Camera, Detector, Matches, Prior, Solution, solve
 from legdistort.exceptions import AssumptionWarning, InputError, SolveError
 from legdistort.geometry import basis
 from legdistort.geometry.detector_modes import similarity_basis
@@ -249,3 +249,50 @@ def test_writes_and_reads(tmp_path):
 def test_refuses_contradictions(settings, words):
     with pytest.raises(InputError, match=words):
         solve(camera(n_stars=30).matches, **settings)
+
+
+def test_three_words_for_one_detector():
+    """As for those of a camera: "hold" and "prior" are the prior as exact and with its widths, however it is given."""
+    sim = camera(n_stars=60, rolls=None)
+    wide, exact = (Prior(sim.truth.static, static_sigma=width) for width in (0.3, None))
+    named = replace(sim.matches, camera=Camera("NIRC2", {"1": Detector(SHAPE, static=wide)}))
+    made = {
+        "hold": [
+            solve(sim.matches, prior=wide, static="hold"),
+            solve(sim.matches, prior=exact),
+            solve(sim.matches, prior=dict.fromkeys(sim.matches.names, wide), static="hold"),
+            solve(named, static="hold"),
+        ],
+        "prior": [
+            solve(sim.matches, prior=wide, static="prior"),
+            solve(sim.matches, prior=wide),
+            solve(named, static="prior"),
+            solve(named),
+        ],
+    }
+    for word, (first, *others) in made.items():
+        assert first.settings.static == word
+        for each in others:
+            for column in ("x", "x_err", "x_err_abs"):
+                assert_allclose(each.stars[column].value, first.stars[column].value, rtol=1e-9)
+    held, known = (np.mean(made[word][0].stars["x_err_abs"].value ** 2) for word in ("hold", "prior"))
+    assert known > 2 * held
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"static": "hold"}, "static='hold' is for a static distortion that is known"),
+        ({"static": "prior"}, "static='prior' is for a static distortion that is known"),
+        ({"static": "hold", "prior": Prior(None, static_sigma=2.0)}, "static='hold' is for a static distortion"),
+        ({"static": "prior", "prior": Prior(np.zeros((2, 10)))}, "static='prior' needs the uncertainty"),
+        (
+            {"static": "hold", "exposure_degree": 1, "prior": Prior(np.zeros((2, 10)))},
+            "exposure_degree belongs to static='fit'",
+        ),
+        ({"static": "free"}, "static must be"),
+    ],
+)
+def test_words_that_make_no_sense(given, message):
+    with pytest.raises(InputError, match=message):
+        solve(camera(n_stars=60).matches, **given)

@@ -122,16 +122,11 @@ class Tie:
 
         NaN for rotation and scale if not determined by the reference. `size` (ny, nx) is that of the box of the modes.
         """
-        similar, *parts = map_parts(size, len(self.covariance) // 2)
-        if self.alone:
-            groups = {"shift": similar[:, :2], "rotation, scale": np.full((len(similar), 2), np.nan)}
-        else:
-            groups = {"shift, rotation, scale": similar}
-        groups |= {f"degree {d}" if d > 1 else "shear": part for d, part in enumerate(parts, start=1)}
-        return [
-            (name, part.shape[1], float(np.sqrt(np.trace(part.T @ self.covariance @ part) / 8)))
-            for name, part in groups.items()
-        ]
+        whole, *others = errors_by_degree(self.covariance, size)
+        if not self.alone:
+            return [whole, *others]
+        shift = np.trace(self.covariance[:: len(self.covariance) // 2, :: len(self.covariance) // 2])
+        return [("shift", 2, float(np.sqrt(shift / 8))), ("rotation, scale", 2, np.nan), *others]
 
     def words(self, convention: str) -> str:
         """What pins the modes of every degree, ``{name as in errors: words}``."""
@@ -153,6 +148,19 @@ class Tie:
 
     def __repr__(self) -> str:
         return f"<Tie: {np.count_nonzero(self.used)} of {len(self.used)} reference stars, {self.rms:.2g} px rms>"
+
+
+def errors_by_degree(covariance, size):
+    """Name, number of modes and error [px, rms over the field and axis] by degree of a map, similarities first, a list.
+
+    `covariance` (2 n, 2 n) is that of its modes, `size` (ny, nx) that of the box of these.
+    """
+    similar, *parts = map_parts(size, len(covariance) // 2)
+    groups = {"shift, rotation, scale": similar}
+    groups |= {f"degree {d}" if d > 1 else "shear": part for d, part in enumerate(parts, start=1)}
+    return [
+        (name, part.shape[1], float(np.sqrt(np.trace(part.T @ covariance @ part) / 8))) for name, part in groups.items()
+    ]
 
 
 def map_parts(size, n):

@@ -11,8 +11,8 @@ _FEWEST = 4
 #: Columns of the detectors, and their values for all stars, up to which they are looked at.
 _MOST_COLUMNS, _MOST_VALUES = 1000, 30_000_000
 _TIE = (
-    "dithers larger than the gaps, which carry stars from one detector to the others, or a camera file with what is "
-    "known of the layout (layout_sigma); --layout hold takes it as exact"
+    "dithers larger than the gaps, which carry stars from one detector to the others, a reference with stars on them "
+    "(--reference), or what is known of the layout (--layout-sigma, a camera file); --layout hold takes it as exact"
 )
 _TELL = "dithers larger than the gaps, which carry stars from one detector to the others, test it"
 

@@ -56,7 +56,7 @@ class Blocks:
     stars : ndarray, shape (2 + k, n_stars)
         Unknowns of the stars at this state.
     held : float
-        Part of J by what is known beforehand of the stars.
+        Part of J by what is known beforehand of the stars and the poses.
     """
 
     chi2: float
@@ -94,6 +94,12 @@ def prior_precision(problem, i):
     others = detector_modes.dynamic_basis(problem.shapes[i], problem.n_modes)
     others = others[np.any((others != 0) & (sigma > 0), axis=1)]
     return out + others.T @ np.linalg.solve(others * sigma**2 @ others.T, others)
+
+
+def pose_precision(problem):
+    """Inverse covariance (n_exposures, 2 n_modes, 2 n_modes) by what is known of poses, distortions aside."""
+    similar = np.stack([detector_modes.similarity_basis(shape, problem.n_modes) for shape in problem.shapes])
+    return similar.mT / problem.pose_width[:, None] ** 2 @ similar
 
 
 def complement(rows):
@@ -159,6 +165,11 @@ def linearise(problem, state):
                 u[i] += _HOLD * np.trace(u_data[i]) / len(departure) * rows.T @ rows
                 g_exposure[i] -= rows.T @ (rows @ g_exposure[i])
     held = problem.terms.hold(state.stars, v, g_star)
+    if problem.pose_width is not None:
+        departure, rows = problem.pose_departure(state)
+        pulled = departure / problem.pose_width**2
+        u, held = u + rows.mT / problem.pose_width[:, None] ** 2 @ rows, held + float((pulled * departure).sum())
+        g_exposure = g_exposure - np.einsum("isa,is->ia", rows, pulled)
     tangents = problem.unknowns.at(state.coefficients)
     return Blocks(
         chi2, penalty, residual, v, g_star, u, u_data, g_exposure, coupling, values, tangents, state.stars, held

@@ -19,10 +19,14 @@ def done_by_prior(problem, uncertainty):
     problem : Problem
     uncertainty : Uncertainty
     """
-    if not problem.has_prior:
+    if not problem.has_prior and problem.pose_width is None:
         return np.zeros(problem.n_exposures)
     blocks = exposure_blocks(uncertainty.coefficients, problem.n_exposures)
-    return np.array([np.sum(criterion.prior_precision(problem, i) * block) for i, block in enumerate(blocks)])
+    out = np.array([np.sum(criterion.prior_precision(problem, i) * block) for i, block in enumerate(blocks)])
+    if problem.pose_width is not None:
+        poses = zip(criterion.pose_precision(problem), blocks, strict=True)
+        out += [np.sum(precision * block) for precision, block in poses]
+    return out
 
 
 def effective_modes(problem, gauge, uncertainty):
@@ -62,7 +66,7 @@ def departure_ratio(problem, gauge, blocks, uncertainty):
     if not held or problem.unknowns.shared:
         return None
     rows = gauge.orthonormal.reshape(gauge.n_constraints, problem.n_exposures, -1)
-    done, number = done_by_prior(problem, uncertainty), 0.0
+    done, number = done_by_prior(replace(problem, pose_width=None), uncertainty), 0.0
     for i in held:
         own = dynamic_basis(problem.shapes[i], problem.n_modes)
         own = own[np.any((own != 0) & (problem.prior_sigma[i].ravel() > 0), axis=1)]

@@ -10,12 +10,16 @@ import numpy as np
 
 from ...exceptions import InputError, SolveError
 from ...geometry import basis
-from ...geometry.detector_modes import dynamic_basis
+from ...geometry.detector_modes import dynamic_basis, pose_departures, pose_widths, similarity_basis
+from ...inputs.start_poses import POSE_ERRORS
 from ...priors.prior import Prior
 from ...runtime.checks import LARGEST
 from .star_terms import StarTerms
-from .unknowns import Unknowns
+from .unknowns import Unknowns, carried
 
+#: Width of what is known exactly of a pose, in errors of what the stars of the exposure say of it; and the largest,
+#: pixels: of rotations and scales of which nothing is known.
+_EXACT, _FREE = 1e-2, 1e3
 #: Number of observations from which compiled loops are used; below, loading numba takes longer than it saves.
 COMPILED_FROM = 20_000
 
@@ -63,6 +67,10 @@ class Problem:
     centre : ndarray, shape (n_exposures, 2, n_all), or None
         What was found of the static distortion beside the prior: about it the widths of coefficients are centred, and
         beyond the degree it is in the mean already. None: nothing.
+    given_poses : ndarray, shape (n_exposures, 2, 3), or None
+        Poses about which those of the exposures scatter.
+    pose_width : ndarray, shape (n_exposures, 4), or None
+        By how much, as coefficients of the similarities of the detector, pixels; None: nothing is known of poses.
     moving : StarTerms or None
         How stars move from exposure to exposure; None: they do not.
     """
@@ -85,6 +93,8 @@ class Problem:
     night: np.ndarray | int = 0
     night_sigma: float | None = None
     centre: np.ndarray | None = None
+    given_poses: np.ndarray | None = None
+    pose_width: np.ndarray | None = None
     moving: StarTerms | None = None
 
     @cached_property
@@ -188,6 +198,18 @@ class Problem:
         """
         out = (coefficients - self.prior_mean)[:, :, : self.n_modes]
         return (out if self.centre is None else out - self.centre[:, :, : self.n_modes]).reshape(len(out), -1)
+
+    def pose_departure(self, state):
+        """How far exposures are from the given poses, in similarities of their detectors: (n_exposures, 4).
+
+        And how a change of their coefficients changes it, (n_exposures, 4, 2 n_modes): by the similarity s that becomes
+        part of the pose, with what this does to the distortion, ``(grad A b) s``.
+        """
+        similar = np.stack([similarity_basis(shape, self.n_modes) for shape in self.shapes])
+        beside = [carried(a, shape, self.degree) for a, shape in zip(state.coefficients, self.shapes, strict=True)]
+        rows = np.linalg.solve(np.eye(4) + similar @ np.stack(beside).mT, similar)
+        own = (state.coefficients - self.prior_mean)[:, :, : self.n_modes].reshape(self.n_exposures, -1, 1)
+        return pose_departures(state.poses, self.given_poses, self.shapes) + (rows @ own)[..., 0], rows
 
     @property
     def n_modes(self):
@@ -349,10 +371,33 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         group=_groups(matches),
         night=matches.blocks,
         night_sigma=night_sigma,
+        **_known_poses(matches, degree, np.bincount(obs.exposure[order], weight[:2].mean(axis=0))),
     )
     if motion is None:
         return problem
     return replace(problem, moving=motion(matches, problem.in_table_order(weight[:2].mean(axis=0))))
+
+
+def _known_poses(matches, degree, weight):
+    """Poses that are known and their widths, as fields of a `Problem`; none where nothing is known of them.
+
+    `weight` (n_exposures,) is the sum of those of an exposure's stars.
+
+    Raises
+    ------
+    InputError
+        At degree 0, at which exposures keep their rotation and scale.
+    """
+    errors = matches.pose_sigma
+    if errors is None:
+        return {}
+    if degree < 1:
+        raise InputError("pose_sigma needs degree 1 at least: raise degree, or leave pose_sigma out")
+    shapes = [matches.shapes[name] for name in matches.names]
+    width = pose_widths([errors.get(name, np.inf) for name in POSE_ERRORS], shapes)
+    poses = np.stack([matches.poses[name] for name in matches.names])
+    exact = _EXACT * 2 / np.sqrt(weight)  # a mode has mean square 1/4
+    return {"given_poses": poses, "pose_width": np.clip(width, exact[:, None], _FREE)}
 
 
 def _weights(covariance, error_floor):

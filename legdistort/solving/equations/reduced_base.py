@@ -80,6 +80,13 @@ class Reduced:
         """How the stars (2 + k, n_stars) follow a change (n,) of the unknowns."""
         return -self._stars(self._couple(d))
 
+    def resistance(self):
+        """`information` and `pull`, with the digits of what is far less than the data tell of anything else."""
+        moves = self.moves[: self.gauge.n_constraints]
+        products = np.stack([self._gradient(self._own(d), self._couple(d)) for d in moves])
+        out = moves @ products.T
+        return (out + out.T) / 2, moves @ self.rhs
+
     @property
     def dof(self):
         """Degrees of freedom under the gauge; widths of a prior not allowed for."""

@@ -49,7 +49,7 @@ class Unknowns:
         """
         if not self.shared:
             return self
-        made = [_carried(a, shape, self.degree) for a, shape in zip(coefficients, self.shapes, strict=True)]
+        made = [carried(a, shape, self.degree) for a, shape in zip(coefficients, self.shapes, strict=True)]
         return replace(self, carried=np.stack(made))
 
     @property
@@ -168,7 +168,7 @@ class Unknowns:
         return spread @ matrix @ spread.T
 
 
-def _carried(coefficients, shape, degree):
+def carried(coefficients, shape, degree):
     """Coefficients (4, 2 n_modes) of ``(grad A b) s`` for the unit similarities s of a detector, A (2, n_all)."""
     n, top = basis.n_modes(degree), basis.degree_of(coefficients.shape[1])
     u, v, w = basis.quadrature(max(top, 1))
@@ -176,8 +176,8 @@ def _carried(coefficients, shape, degree):
     slope = np.stack([coefficients @ by_u * (2 / shape[1]), coefficients @ by_v * (2 / shape[0])])
     similar = detector_modes.similarity_basis(shape, n)
     moved = similar.reshape(len(similar), 2, n) @ values[:n]
-    carried = np.einsum("akp,sap->skp", slope, moved)
-    return (carried @ (values[:n] * w).T).reshape(len(similar), -1)
+    along = np.einsum("akp,sap->skp", slope, moved)
+    return (along @ (values[:n] * w).T).reshape(len(similar), -1)
 
 
 def _inverse(blocks):

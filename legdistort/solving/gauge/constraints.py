@@ -12,7 +12,7 @@ from ...results.gauge import Drift, Gauge
 from ...runtime.checks import check_choice
 from ...runtime.words import GAUGES
 from ..equations import elimination
-from ..equations.criterion import complement
+from ..equations.criterion import complement, pose_precision
 from ..equations.problem import State
 from .dynamic_scatter import conditional_errors, dynamic_covariance, influence
 from .hierarchy import Hierarchy
@@ -62,7 +62,7 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
         _check_mean(motion)
     similar, others = _by_shape(similarity_basis, problem), _by_shape(dynamic_basis, problem)
     held = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
-    error = conditional_errors(blocks.u_data)
+    error = conditional_errors(blocks.u_data + (0 if problem.pose_width is None else pose_precision(problem)))
     maps = _taken_back(problem, motion, box, shared_shears)
     static = _static_variance(problem, others, group, shared)
     if settled:

@@ -117,7 +117,7 @@ def counts(problem, state, shown=1.0):
     plane that a convention holds elsewhere keeps the data from their minimum. It would move stars by more than `shown`
     typical errors.
     """
-    if problem.unknowns.shared or problem.terms.n or problem.fixed is not None:
+    if problem.unknowns.shared or problem.terms.n or problem.fixed is not None or problem.pose_width is not None:
         return False
     if problem.degree < 2 or problem.n_exposures < FEWEST or not reduced_system.is_small(problem):
         return False
