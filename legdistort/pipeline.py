@@ -37,6 +37,7 @@ from .reporting.summary import rounded, summarise
 from .results import accuracy
 from .results.check import Check
 from .runtime import checks, outputs, parallel, provenance
+from .runtime.guards.units import plain_numbers
 from .runtime.notebook import ShownAsPrinted
 from .runtime.progress import Bar
 from .runtime.trees.codec import to_tree
@@ -96,6 +97,7 @@ class Run(ShownAsPrinted):
         return f"<Run: {self.solution!r} in {self.out}>"
 
 
+@plain_numbers
 def run(
     paths: Images | None = None,
     *,
@@ -155,7 +157,7 @@ def run(
     psf : str, EffectivePSF, path, photutils model or dict of those
         What the stars are fitted with, see `legdistort.measure`.
     reference, reference_error, epoch, pixel_scale : optional
-        Catalogue whose positions are known, see `legdistort.solve`.
+        Catalogue whose positions are known, or "gaia", see `legdistort.solve`.
     measuring, matching, solving, coadding : dict, optional
         Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`, all of them checked before a frame is
         read. The stack is ``"clipped"`` here: hot pixels and cosmic rays do not get into it.

@@ -34,7 +34,7 @@ from astropy.table import Table
 import legdistort as ld
 from legdistort.coaddition.grids import read_grid
 from legdistort.exceptions import LegdistortError
-from legdistort.inputs.reference_catalogue import read_reference
+from legdistort.inputs.references.catalogue import read_reference
 from legdistort.inputs.table_files import read_table
 from legdistort.measurement.effective.sources import read_psf
 from legdistort.measurement.noise_curves import NoiseCurves

@@ -25,7 +25,7 @@ from astropy.table import Table
 
 from legdistort.exceptions import AssumptionWarning, LegdistortError
 from legdistort.inputs import column_contract
-from legdistort.inputs.reference_catalogue import read_reference
+from legdistort.inputs.references.catalogue import read_reference
 from legdistort.inputs.table_files import read_table
 
 N = 25

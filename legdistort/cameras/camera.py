@@ -24,6 +24,7 @@ from ..geometry import basis, similarity
 from ..geometry.gsaoi import GSAOI_SIZE, GsaoiMap
 from ..inputs import column_contract
 from ..inputs.file_images import of_files
+from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, keyed
@@ -53,6 +54,7 @@ MARGIN, MARGIN_FITTED = 0.02, 0.1
 _SIDE = 32  # points along a side of a detector that are sought on others
 
 
+@plain_numbers
 @dataclass(frozen=True, eq=False, repr=False)
 class Camera(ShownAsPrinted):
     """Detectors in one focal plane, or the one detector of plain images.
@@ -235,10 +237,12 @@ class Camera(ShownAsPrinted):
             self[key]  # refuses an unknown one
         return detector
 
+    @plain_numbers
     def sees(self, f: ArrayLike) -> np.ndarray:
         """Which positions f (n, 2) of the focal plane fall on each detector, bool (n_detectors, n)."""
         return np.array([each.sees(f) for each in self.detectors.values()])
 
+    @plain_numbers
     def errors_in_focal_plane(self, f: ArrayLike, errors: ArrayLike) -> np.ndarray:
         """Errors (n, 2) at positions f (n, 2), of those measured on the detector there; unchanged off all detectors."""
         out = np.array(errors, dtype=float)
@@ -281,9 +285,9 @@ class Camera(ShownAsPrinted):
         """Lines of a table of where the detectors lie, with the errors of that where it is not exact."""
         places = {key: each.place for key, each in self.detectors.items()}
         known = any(place.errors is not None for place in places.values())
-        errors = f" {'+-':>8s}" * known
+        errors, width = f" {'+-':>8s}" * known, max(10, *map(len, places))
         lines = [
-            f"{'detector':10s} {'size [px]':>13s} {'centre x':>10s}{errors} {'centre y':>10s}{errors} "
+            f"{'detector':{width}s} {'size [px]':>13s} {'centre x':>10s}{errors} {'centre y':>10s}{errors} "
             f"{'rotation':>9s}{errors} {'scale':>9s} {'static':>8s}"
         ]
         for key, place in places.items():
@@ -292,12 +296,13 @@ class Camera(ShownAsPrinted):
                 f" {error:8.2g}" if known else "" for error in (place.errors if place.errors else (0.0, 0.0, 0.0))
             )
             lines.append(
-                f"{key[:10]:10s} {f'{nx} x {ny}':>13s} {place.x:10.2f}{x} {place.y:10.2f}{y} "
+                f"{key:{width}s} {f'{nx} x {ny}':>13s} {place.x:10.2f}{x} {place.y:10.2f}{y} "
                 f"{place.rotation:9.4f}{rotation} {place.scale:9.6f} {self[key].rms:8.3f}"
             )
         return lines
 
     @classmethod
+    @plain_numbers
     def gsaoi(cls, *, size: int = GSAOI_SIZE) -> Camera:
         """The four detectors of GSAOI at Gemini South, "1" to "4", by the polynomials that DRAGONS uses.
 

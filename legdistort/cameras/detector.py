@@ -11,6 +11,7 @@ import numpy as np
 from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.distortion import Distortion
+from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees.facts import SIZE, array
 from .source import check_shape
@@ -58,6 +59,7 @@ class Place:
     errors: tuple[float, ...] | None
 
 
+@plain_numbers
 @dataclass(frozen=True, eq=False, repr=False)
 class Detector(ShownAsPrinted):
     """One detector: its size, where it lies in the focal plane, and its static distortion.
@@ -147,10 +149,12 @@ class Detector(ShownAsPrinted):
         """The static `Distortion`: undistorted -> detector pixels."""
         return Distortion(self.static, self.shape)
 
+    @plain_numbers
     def to_pixels(self, f: ArrayLike) -> np.ndarray:
         """Focal-plane pixels (n, 2) -> detector pixels (n, 2)."""
         return self.distortion(similarity.apply(self.layout, f))
 
+    @plain_numbers
     def to_focal_plane(
         self, xy: ArrayLike, covariance: ArrayLike | None = None
     ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
@@ -167,6 +171,7 @@ class Detector(ShownAsPrinted):
         back = np.linalg.inv(self.slope(f))
         return f, back @ covariance @ back.mT
 
+    @plain_numbers
     def sees(self, f: ArrayLike) -> np.ndarray:
         """Which positions f (n, 2) of the focal plane fall on it."""
         q, size = similarity.apply(self.layout, f), np.array(self.shape[::-1])
@@ -175,6 +180,7 @@ class Detector(ShownAsPrinted):
         near[near] = np.all((xy >= -0.5) & (xy <= size - 0.5), axis=1)
         return near
 
+    @plain_numbers
     def slope(self, f: ArrayLike) -> np.ndarray:
         """Derivative (n, 2, 2) of the detector pixels by the focal-plane pixels f (n, 2)."""
         return self.distortion.jacobian(similarity.apply(self.layout, f)) @ self.layout[:, :2]

@@ -48,6 +48,20 @@ def word_or(number, word):
     return parse
 
 
+def length(text):
+    """A number, of pixels, or one with a unit: ``0.4mas``."""
+    from astropy.units import Quantity
+
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return Quantity(text)
+    except (TypeError, ValueError):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor one with a unit, such as 0.4mas") from None
+
+
 def number_or_name(text):
     """A whole number if it is one, else the text itself."""
     return int(text) if text.isdigit() else text

@@ -18,7 +18,7 @@ from ..exceptions import InputError
 from ..inputs import column_contract
 from ..inputs.exposure_names import detector_name
 from ..inputs.star_lists.formats import stack
-from ..inputs.table_files import read_table, write_stars
+from ..inputs.table_files import named_after, read_table, write_stars
 from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
 from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
@@ -138,6 +138,13 @@ def do_match(a):
 
     contract = column_contract.DETECTED | {name: column_contract.MATCHED[name] for name in ("epoch", "block")}
     read = {Path(path): _read_table(path, a, contract) for path in a.tables}
+    if a.wcs is None:
+        _refuse({"ext": a.ext}, "is for the frames of --wcs")
+        exposures = None
+    else:
+        _refuse({"shape": a.shape}, "comes from the frames of --wcs")
+        exposures = legdistort.open_exposures(a.wcs, ext=a.ext)
+        read = {path: named_after(table, exposures, path) for path, table in read.items()}
     tables = list(read.values())
     if not any(map(len, tables)):
         column_contract.check(tables[0], contract, str(a.tables[0]))
@@ -150,7 +157,9 @@ def do_match(a):
     if camera:
         _refuse({"shape": a.shape}, "comes from the camera of the run")
     known = {"shape": tuple(a.shape) if a.shape else shapes or None, "camera": camera}
-    if (exposures := measured_frames(read)) is not None:
+    if exposures is not None:
+        exposures = camera.of_detectors(exposures) if camera else exposures
+    elif (exposures := measured_frames(read)) is not None:
         _refuse({"shape": a.shape}, "comes from the frames")
     known |= {"exposures": exposures, "progress": wants_progress(a)}
     with timed({}, "match"):
@@ -259,10 +268,10 @@ def do_attach(a):
     from ..wcs.attachment import attach
 
     keywords = given(a, options.FRAMES, options.ATTACHING)
-    tpv, asdf_only = keywords.pop("tpv"), keywords.pop("asdf_only")
+    tpv, head, asdf_only = (keywords.pop(name) for name in ("tpv", "head", "asdf_only"))
     if asdf_only:
         _refuse({"max_error": a.max_error}, "is of the header, which --asdf-only leaves alone")
-    kind = None if asdf_only else "tpv" if tpv else "sip"
+    kind = None if asdf_only else "head" if head else "tpv" if tpv else "sip"
     done = attach(_solution(a), **keywords, kind=kind, progress=wants_progress(a))
     errors = {item.exposure: {"path": str(item.path)} | item.errors for item in done}
     _say(a, "\n".join(repr(item)[1:-1].partition(": ")[2] for item in done), errors)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ..runtime import words
-from .arguments import Group, Option, columns, extension, number_or_name, pairs, planes, spectrum, word_or
+from .arguments import Group, Option, columns, extension, length, number_or_name, pairs, planes, spectrum, word_or
 
 # -- options that several commands have
 
@@ -58,6 +58,10 @@ TABLES = {
     "tables": Option(
         "positions; without a column exposure, one exposure", "tables", nargs="+", metavar="TABLE", path="read"
     )
+}
+WCS_OF_TABLES = {
+    "wcs": Option("frames of the tables: WCS, shape and time", nargs="+", metavar="FRAME", path="read"),
+    "ext": Option("extension of those frames: number, name, or NAME,VERSION", type=extension),
 }
 POSITIONS = {"table": Option("exposure, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
 MATCHED = {"table": Option("exposure, star, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
@@ -221,7 +225,7 @@ SOLVING = Group(
             metavar="shift=S,rotation=R",
         ),
         "reference": Option(
-            "catalogue whose positions are known, such as one of Gaia, or a solution", metavar="TABLE", path="read"
+            "catalogue whose positions are known, a solution, or gaia: from its archive", metavar="TABLE", path="read"
         ),
         "reference_error": Option(
             "of its positions where it states none, mas on the sky, else pixels; found: the size of all its errors",
@@ -277,6 +281,7 @@ ATTACHING = {
     "out": Option("folder for copies", type=Path, path="folder", one_of="where", required=True),
     "in_place": Option("change the frames themselves", action="store_true", one_of="where", required=True),
     "tpv": Option("header for SWarp and SCAMP (default: SIP)", action="store_true", one_of="header"),
+    "head": Option("texts NAME.head for SWarp and SCAMP, no copies of frames", action="store_true", one_of="header"),
     "asdf_only": Option("leave the header alone, add the exact WCS", action="store_true", one_of="header"),
     "max_error": Option("of the header, pixels (default 0.001)", type=float),
     "overwrite": Option("replace copies and ASDF extensions that exist", action="store_true"),
@@ -288,13 +293,16 @@ PREDICTING = {
     "stars": Option(
         "x, y in the reference plane, perhaps x_err, y_err", metavar="TABLE", path="read", one_of="stars", required=True
     ),
-    "sigma": Option("error of one measured position, pixels (default: x_err, y_err)", type=float),
+    "sigma": Option("error of one measured position, pixels (default: x_err, y_err)", type=length, metavar="LENGTH"),
     "degree": Option("total degree to be fitted (default 3)", type=int),
-    "dithers": Option("rms length of the shifts, pixels (default 0)", "--dither", type=float, metavar="RMS"),
+    "dithers": Option("rms length of the shifts, pixels (default 0)", "--dither", type=length, metavar="LENGTH"),
     **KNOWN_STATIC,
-    "dynamic": Option("rms of a coefficient from exposure to exposure, pixels", type=float),
+    "dynamic": Option("rms of a coefficient from exposure to exposure, pixels", type=length, metavar="LENGTH"),
     "spectrum": Option("the same by degree, beyond the fit too", type=spectrum, metavar="DEGREE=RMS,..."),
     "epochs": Option("years of the exposures: motions are fitted too", type=float, nargs="+", metavar="YEAR"),
+    "pixel_scale": Option(
+        "the errors in mas; lengths may then be angles: --sigma 0.4mas", type=float, metavar="ARCSEC"
+    ),
     "gauge": Option("convention for the null space (default minimal)", choices=words.GAUGES),
     "seed": Option("of stars and shifts that are drawn (default 0)", type=int),
 }

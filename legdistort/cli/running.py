@@ -70,6 +70,19 @@ def _as_option(found):
     return f"--{found[1].replace('_', '-')} {found[2] or found[3]}"
 
 
+def _said_once():
+    """A filter of what is logged that lets words of information pass once: those of many files are said for one."""
+    said = set()
+
+    def passes(record):
+        words = record.levelno, record.getMessage()
+        new = record.levelno != logging.INFO or words not in said
+        said.add(words)
+        return new
+
+    return passes
+
+
 @contextmanager
 def _logging(arguments):
     """The log of the package on stderr while a command runs; afterwards as it was, for callers of `main`."""
@@ -77,6 +90,7 @@ def _logging(arguments):
     level = logging.WARNING if arguments.quiet else logging.INFO
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(message)s"))
+    handler.addFilter(_said_once())
     log.handlers[:], log.propagate = [handler], False
     log.setLevel(logging.DEBUG if arguments.debug else level)
     try:

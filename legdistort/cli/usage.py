@@ -74,6 +74,7 @@ COMMANDS = {
         options.TABLES,
         options.out("table (ECSV) of matched positions", endings=options.TABLE_ENDINGS),
         options.TABLE,
+        options.WCS_OF_TABLES,
         options.CAMERA,
         options.MATCHING,
     ),

@@ -15,6 +15,7 @@ from ..inputs.frames.value_units import value_unit
 from ..inputs.frames.working_units import header_in_working_unit, working_unit
 from ..inputs.sky_wcs import leads_elsewhere, warn_of_another_field
 from ..results.solution import Solution
+from ..runtime.guards.units import plain_numbers
 from ..runtime.parallel import map_items
 from ..runtime.scratch import scratch_folder
 from ..runtime.words import PLANES
@@ -42,6 +43,7 @@ _STORED = 5  # bytes a pixel in the scratch folder, about
 _COARSE = 1.5  # pixels of the grid in those of an exposure from which interpolation leaves out too much
 
 
+@plain_numbers
 def coadd(
     exposures: Sequence[Exposure],
     solution: Solution,

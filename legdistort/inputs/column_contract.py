@@ -7,7 +7,7 @@ from astropy import units as u
 from astropy.table import Column, QTable, Table
 
 from ..exceptions import InputError
-from ..geometry.epochs import years
+from ..geometry.epochs import nights, years
 from ..runtime import checks
 from .plain_columns import is_text, numbers, text
 
@@ -193,6 +193,16 @@ def labels(table, column):
     return data
 
 
+def blocks(table, first):
+    """Night, or other block, of exposures whose first rows are given: integers (n_exposures,).
+
+    By the column ``block``, else by gaps of more than half a day in ``epoch``, else one.
+    """
+    if "block" in table.colnames:
+        return np.unique(np.asarray(table["block"])[first], return_inverse=True)[1]
+    return nights(values(table, "epoch", u.yr)[first]) if "epoch" in table.colnames else np.zeros(len(first), dtype=int)
+
+
 def rename(table, columns):
     """Copy of a table with columns renamed to the contract's names.
 
@@ -311,7 +321,7 @@ def check(table, contract, what):
     if len(table) == 0:
         needed = f" the columns {', '.join(missing)} and" if missing else ""
         raise InputError(f"{what} is empty: give one with{needed} a row for each position")
-    out = QTable()
+    table, out = _in_fluxes(table, contract), QTable()
     for name in table.colnames:
         try:
             out.add_column(_kept(table, name, contract), name=name, copy=False)
@@ -321,6 +331,23 @@ def check(table, contract, what):
         out["flux"] = flux_of(out["mag"])
     _check_values(out, what)
     return out
+
+
+def _in_fluxes(table, contract):
+    """The table with fluxes where its column ``flux`` holds magnitudes, by its unit, and their errors likewise."""
+    if "flux" not in contract or "flux" not in table.colnames:
+        return table
+    unit = getattr(table["flux"], "unit", None)
+    if not (unit == u.mag or isinstance(unit, u.MagUnit)):
+        return table
+    table = table.copy(copy_data=False)
+    magnitudes = np.ma.filled(np.ma.asarray(getattr(table["flux"], "value", table["flux"]), dtype=float), np.nan)
+    flux = flux_of(magnitudes)
+    if "flux_err" in table.colnames:
+        error = np.asarray(getattr(table["flux_err"], "value", table["flux_err"]), dtype=float)
+        table["flux_err"] = flux * 0.4 * np.log(10) * error
+    table["flux"] = flux
+    return table
 
 
 def _kept(table, name, contract):

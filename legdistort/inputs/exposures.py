@@ -12,6 +12,7 @@ import numpy as np
 from astropy.io import fits
 
 from ..exceptions import DamagedError, InputError, some_of
+from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from .exposure_names import check_exposure_name, whole_name
 from .frames.undefined_pixels import undefined_pixels
@@ -39,6 +40,7 @@ _OPEN = re.compile(r"open|clear\w*|none|empty|n/?a|", re.IGNORECASE)
 LEAVE_OUT = "; leave this exposure out or mend it"
 
 
+@plain_numbers
 @dataclass(frozen=True, eq=False, repr=False)
 class Exposure(ShownAsPrinted):
     """One image and what is known about it.
@@ -47,7 +49,8 @@ class Exposure(ShownAsPrinted):
     ----------
     name : str
     data : ndarray of float, shape (ny, nx)
-        Integers are converted (float32 up to 16 bits, float64 beyond).
+        Integers are converted (float32 up to 16 bits, float64 beyond). A `~astropy.units.Quantity` gives its unit to
+        the header (``BUNIT``).
     mask : ndarray of bool, shape (ny, nx)
         True = bad; pixels that are not finite are always masked, and so are those that hold no measurement
         (`legdistort.inputs.frames.undefined_pixels`): areas of one number at the border. None = all good.
@@ -108,11 +111,20 @@ class Exposure(ShownAsPrinted):
 
     def __post_init__(self) -> None:
         check_exposure_name(self.name, self.path)
+        unit, header, uncertainty = getattr(self.data, "unit", None), self.header, self.uncertainty
+        if unit is not None:
+            header = header.copy()
+            header["BUNIT"] = unit.to_string()
+        if (own := getattr(uncertainty, "unit", None)) is not None:
+            if unit is None or not own.is_equivalent(unit):
+                raise InputError(
+                    f"{self.name}: the uncertainty is in {own}, the data in {unit or 'no unit'}; give one unit"
+                )
+            uncertainty = uncertainty.to_value(unit)
         data = _as_float(np.asarray(self.data), self.name)
         mask = ~np.isfinite(data)
         if self.mask is not None:
             mask |= self._plane(self.mask, "mask", data.shape).astype(bool)
-        uncertainty = self.uncertainty
         if uncertainty is not None:
             uncertainty = self._plane(uncertainty, "uncertainty", data.shape).astype(data.dtype)
             with np.errstate(invalid="ignore"):
@@ -127,7 +139,7 @@ class Exposure(ShownAsPrinted):
             mask |= undefined
             log.info("%s: %s", self.name, words)
             object.__setattr__(self, "stated", self.stated and self.stated.with_doubt(words))
-        for key, value in {"data": data, "mask": mask, "uncertainty": uncertainty}.items():
+        for key, value in {"data": data, "mask": mask, "uncertainty": uncertainty, "header": header}.items():
             object.__setattr__(self, key, value)
 
     def _plane(self, plane, what, shape):

@@ -76,9 +76,10 @@ def every_id(images, ext):
 
 
 def of_files(exposures, ids):
-    """Exposures whose detectors are in files of their own, with `exposure` and `detector`.
+    """Exposures with `exposure` and `detector`, also those whose detectors are in files of their own.
 
     The detector is that of `ids` which the header names (`KEYWORDS`), the exposure is the name of the file without it.
+    Those of one file keep the detector that they have, unless that is none of `ids` and another keyword names one.
 
     Parameters
     ----------
@@ -92,11 +93,15 @@ def of_files(exposures, ids):
     """
     known, out = {key.lower(): key for key in ids}, []
     for exposure in exposures:
-        if exposure.detector is not None:
+        if exposure.detector in known.values():
             out.append(exposure)
             continue
         values = [str(exposure.header.get(keyword, "")).strip().lower() for keyword in KEYWORDS]
         key = next((known[value] for value in values if value in known), None)
+        if exposure.detector is not None:
+            known_as = {} if key is None else {"name": detector_name(exposure.exposure, key), "detector": key}
+            out.append(replace(exposure, **known_as))
+            continue
         if key is None:
             raise InputError(
                 f"the header of {exposure.name} names none of the detectors {', '.join(known.values())} "

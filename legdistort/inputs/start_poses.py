@@ -1,10 +1,9 @@
 """Poses of exposures from matched positions alone, and what is known of given ones."""
 
-import contextlib
 from collections.abc import Mapping
+from numbers import Real
 
 import numpy as np
-from astropy import units as u
 
 from ..exceptions import InputError, MatchError
 from ..geometry import pair_agreement, similarity
@@ -12,7 +11,7 @@ from ..geometry import pair_agreement, similarity
 #: Exposures whose stars typically lie farther from their means than this part of their extent are compared in pairs.
 _FAR = 0.01
 #: Errors that poses may have, and their units.
-POSE_ERRORS = {"shift": u.pix, "rotation": u.deg, "scale": u.dimensionless_unscaled}
+POSE_ERRORS = {"shift": "px", "rotation": "deg", "scale": "relative"}
 
 
 def check_pose_sigma(errors):
@@ -53,14 +52,11 @@ def check_place_errors(errors, argument):
 
 def _number(argument, name, value):
     """An error of a pose in its unit."""
-    unit = POSE_ERRORS[name]
-    with contextlib.suppress(TypeError, ValueError, u.UnitsError):
-        number = float(u.Quantity(value, getattr(value, "unit", unit)).to_value(unit))
-        if number >= 0 and not isinstance(value, bool):
-            return number
-    raise InputError(
-        f"pose_sigma: the error of {name} must be a number [{unit or 'relative'}], 0 or more, got {value!r}"
-    )
+    if isinstance(value, bool) or not isinstance(value, Real) or not value >= 0:
+        raise InputError(
+            f"{argument}: the error of {name} must be a number [{POSE_ERRORS[name]}], 0 or more, got {value!r}"
+        )
+    return float(value)
 
 
 def star_means(xy, star, n_stars):

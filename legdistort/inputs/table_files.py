@@ -2,6 +2,7 @@
 
 import io
 import logging
+import re
 from numbers import Real
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.table import Column, QTable
 
-from ..exceptions import InputError, without_astropy_warnings
+from ..exceptions import InputError, some_of, without_astropy_warnings
 from ..runtime import outputs, provenance
 from ..runtime.checks import check_is_file
 from . import column_contract, exposure_names
@@ -71,6 +72,37 @@ def read_table(path, *, columns=None, origin=None, error=None):
     inputs = table.meta.get("inputs")
     table.meta["inputs"] = (inputs if isinstance(inputs, dict) else {}) | own
     return table
+
+
+def named_after(table, exposures, path):
+    """A table with its exposures called as frames are: each has the name of one of these, or begins with it.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+    exposures : list of Exposure
+    path : str or path
+        Of the table, for messages.
+
+    Raises
+    ------
+    InputError
+        For an exposure of the table that is none of the frames, or might be several.
+    """
+    known, out = {exposure_names.whole_name(each) for each in exposures}, table.copy(copy_data=False)
+    names = {}
+    for name in np.unique(column_contract.labels(table, "exposure")).tolist():
+        begins = [frame for frame in known if re.match(rf"{re.escape(frame)}(?![A-Za-z0-9])", str(name))]
+        if not begins:
+            some = some_of(sorted(known), 6)
+            raise InputError(
+                f"{path}: exposure {name} is none of the frames ({some}): call the table as its frame, or give it a "
+                "column exposure with the name of that"
+            )
+        names[name] = max(begins, key=len)
+    out["exposure"] = np.array([names[name] for name in column_contract.labels(table, "exposure").tolist()])
+    out["exposure"].description = table["exposure"].description
+    return out
 
 
 def _united(parts, path):

@@ -44,7 +44,7 @@ class Identified:
         Proper motions of the reference, pixels of the reference plane a year, and perhaps parallaxes, pixels; NaN for
         stars without one.
     maps, unknown : ndarray, shape (n, 2, m), or None
-        What its positions have in common, see `legdistort.inputs.reference_catalogue.Reference`; pixels.
+        What its positions have in common, see `legdistort.inputs.references.catalogue.Reference`; pixels.
     """
 
     rows: np.ndarray

@@ -24,6 +24,7 @@ from ..measurement.crowding import LIMIT, is_isolated
 from ..measurement.flags import UNUSABLE, Flag
 from ..priors.from_headers import describe, header_distortions
 from ..runtime import parallel
+from ..runtime.guards.units import plain_numbers
 from . import detector_layout, detector_places
 from .exposure_groups import interlink, link, standing, unite, without
 from .header_poses import HeaderPoses
@@ -51,6 +52,7 @@ _MOST_PLACINGS = 4
 LARGEST_FLAGS = 2.0**32 - 1
 
 
+@plain_numbers
 def match(
     detections: Table,
     *,

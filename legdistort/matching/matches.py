@@ -15,10 +15,11 @@ from scipy.sparse.csgraph import connected_components
 from ..cameras.camera import Camera, check_camera
 from ..exceptions import AssumptionWarning, InputError, MatchError, reasons_of, some_of, warn
 from ..geometry import similarity
-from ..geometry.epochs import exposure_years, nights
+from ..geometry.epochs import exposure_years
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract, exposure_names, repetitions, start_poses
 from ..runtime.checks import check_choice
+from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 
 if TYPE_CHECKING:
@@ -256,11 +257,9 @@ class Matches(ShownAsPrinted):
             if np.any(several := label != label[obs.first][obs.exposure]):
                 name = self.names[obs.exposure[int(np.argmax(several))]]
                 raise InputError(f"column 'block' has several values for exposure {name}: give one night for each")
-            return np.unique(label[obs.first], return_inverse=True)[1]
-        if "epoch" in self.table.colnames:
-            return nights(column_contract.values(self.table, "epoch", u.yr)[obs.first])
-        return np.zeros(len(self.names), dtype=int)
+        return column_contract.blocks(self.table, obs.first)
 
+    @plain_numbers
     def keep(self, rows: ArrayLike | slice) -> Matches:
         """The same matches with some rows of the table; exposures without any go.
 
@@ -332,6 +331,7 @@ class Matches(ShownAsPrinted):
         return f"<Matches: {len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures>"
 
     @classmethod
+    @plain_numbers
     def from_table(
         cls,
         table: Table,

@@ -14,6 +14,7 @@ from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs.exposure_files import listed
 from ..inputs.frames.working_units import in_working_unit, noise_unit
 from ..runtime import checks, parallel
+from ..runtime.guards.units import plain_numbers
 from .injection import calibrate_frame
 from .noise_curves import NoiseCurves
 from .options import MeasureOptions
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from ..inputs.exposures import Exposure
 
 
+@plain_numbers
 def calibrate_noise(
     exposures: Exposure | Sequence[Exposure],
     *,

@@ -16,6 +16,7 @@ from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..inputs.exposure_files import listed
 from ..inputs.frames.working_units import in_working_unit, noise_unit
 from ..runtime import outputs
+from ..runtime.guards.units import plain_numbers
 from ..runtime.parallel import map_items
 from . import across_frames, camera_gain
 from .crowding import SHAPELY, crowding, is_deformed
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
+@plain_numbers
 def measure(
     exposures: Exposure | Sequence[Exposure],
     *,
@@ -193,6 +195,7 @@ def _check_psf_folder(folder, exposures):
                 ) from None
 
 
+@plain_numbers
 def effective_psf(
     exposure: Exposure,
     *,

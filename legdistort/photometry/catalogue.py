@@ -18,6 +18,7 @@ from ..exceptions import InputError, reasons_of
 from ..inputs.table_files import write_table
 from ..measurement.filters import use_compiled_loops
 from ..measurement.options import MeasureOptions
+from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.parallel import map_items
 from .joint_scene import JointScene
@@ -113,6 +114,7 @@ def photometry_path(path):
     return beside
 
 
+@plain_numbers
 def catalogue(
     exposures: Sequence[Exposure],
     solution: Solution,

@@ -13,6 +13,7 @@ import numpy as np
 from ..cameras.source import check_shape
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import basis
+from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees.facts import SIZE, array, number
 
@@ -66,6 +67,7 @@ def _declared(sigma, static_sigma):
     return float(static_sigma)
 
 
+@plain_numbers
 @dataclass(frozen=True, eq=False)
 class Prior(ShownAsPrinted):
     """Static distortion known beforehand, with its uncertainty.
@@ -157,6 +159,7 @@ class Prior(ShownAsPrinted):
         """Whether a static distortion is stated, and not its size or the scatter of exposures alone."""
         return self.mean is not None and self.source != UNSTATED
 
+    @plain_numbers
     def static_widths(self, degree: int) -> np.ndarray:
         """Uncertainty (2, n_modes) of the static distortion to a total degree, pixels; zero where it is exact.
 
@@ -194,6 +197,7 @@ class Prior(ShownAsPrinted):
             )
         return self.sigma
 
+    @plain_numbers
     def with_sigma(self, sigma: ArrayLike | None, *, degree: int = 0) -> Prior:
         """The same prior with another scatter `sigma`, its mean taken as zero from its own degree up to `degree`."""
         degree = max(self.degree, degree)
@@ -221,6 +225,7 @@ class Prior(ShownAsPrinted):
         return np.sqrt((self.mean**2).sum(axis=1)) / 2  # the basis has unit norm on [-1, 1]^2, of area 4
 
     @classmethod
+    @plain_numbers
     def from_model(
         cls,
         model: Any,
@@ -327,6 +332,7 @@ class Prior(ShownAsPrinted):
         return open_prior(where, cls, ext=ext, frame=frame, **options)
 
     @classmethod
+    @plain_numbers
     def from_headers(
         cls,
         exposures: Sequence[Exposure],

@@ -3,10 +3,14 @@
 from dataclasses import asdict
 
 import numpy as np
+from astropy import units as u
 
+from ..geometry import similarity
+from ..inputs import column_contract
 from ..results import accuracy, in_tables
 from ..runtime import provenance
 from ..runtime.trees.codec import to_tree
+from .tables import exposure_rms, sizes
 
 
 def summarise(solution, *, timings=None):
@@ -31,10 +35,90 @@ def summarise(solution, *, timings=None):
         "reference": found.reference and asdict(found.reference),
         "max_inverse_error_px": float(in_tables.largest_inverse_error(solution)),
         "left_out": dict(solution.left_out),
+        "exposures": exposures(solution),
+        "nights": nights(solution),
+        "detectors": detectors(solution.camera),
         "command": provenance.command_line(),
         **found.summary(),
         "timings": rounded(timings or {}),
     }
+
+
+def exposures(solution):
+    """One dict of numbers an exposure, as the schema ``summary-1.0.0.json`` has them; None where one is not known.
+
+    In the units that end their names; `block` is the number of its night.
+    """
+    dx, dy, n = exposure_rms(solution)
+    distortion, dynamic = sizes(solution)
+    block, epoch = _times(solution)
+    out = []
+    for i, view in enumerate(solution):
+        pose = similarity.describe(view.pose)
+        angle, scale = (None, None) if solution.sky is None else view.orientation
+        figures = {
+            "n_stars": n[i], "block": block[i], "epoch_yr": epoch[i],
+            "shift_x_px": pose["dx"], "shift_y_px": pose["dy"], "rotation_deg": pose["rotation"],
+            "scale": pose["scale"], "rms_x_px": dx[i], "rms_y_px": dy[i], "distortion_px": distortion[i],
+            "dynamic_px": dynamic[i], "position_angle_deg": angle, "pixel_scale_arcsec": scale,
+        }  # fmt: skip
+        out.append({"name": view.name, "mirrored": pose["parity"] < 0} | {key: _plain(v) for key, v in figures.items()})
+    return out
+
+
+def nights(solution):
+    """One dict of numbers a night, or other block: its exposures, and the mean of their figures."""
+    found, of = exposures(solution), {}
+    for each in found:
+        of.setdefault(each["block"], []).append(each)
+    return [
+        {
+            "block": block,
+            "exposures": [each["name"] for each in mine],
+            "epoch_yr": _mean(each["epoch_yr"] for each in mine),
+            "rms_px": _rms(each[key] for each in mine for key in ("rms_x_px", "rms_y_px")),
+            "dynamic_px": _rms(each["dynamic_px"] for each in mine),
+        }
+        for block, mine in sorted(of.items())
+    ]
+
+
+def detectors(camera):
+    """One dict of numbers a detector: its place in the focal plane, with errors where it is not exact."""
+    out = []
+    for key, each in camera.detectors.items() if camera.has_focal_plane else ():
+        place = each.place
+        x_err, y_err, rotation_err = map(_plain, place.errors or (None, None, None))
+        out.append(
+            {
+                "name": key, "x_px": place.x, "y_px": place.y, "rotation_deg": place.rotation, "scale": place.scale,
+                "x_err_px": x_err, "y_err_px": y_err, "rotation_err_deg": rotation_err, "static_px": float(each.rms),
+            }
+        )  # fmt: skip
+    return out
+
+
+def _times(solution):
+    """Number of the night and year of every exposure."""
+    table = solution.residuals
+    first = [int(np.argmax(table["exposure"] == name)) for name in solution.names]
+    epoch = column_contract.values(table, "epoch", u.yr)[first] if "epoch" in table.colnames else [np.nan] * len(first)
+    return column_contract.blocks(table, first), epoch
+
+
+def _plain(value):
+    """A number as JSON has it: None for one that is not finite."""
+    return None if value is None or not np.isfinite(value) else value.item() if hasattr(value, "item") else value
+
+
+def _mean(values):
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _rms(values):
+    known = [value**2 for value in values if value is not None]
+    return float(np.sqrt(np.mean(known))) if known else None
 
 
 def rounded(timings):

@@ -174,7 +174,8 @@ def printed(solution):
         f"rms     {both[0]:.4f}, {both[1]:.4f} px in x, y; {np.count_nonzero(used)} of {len(used)} observations used",
         *(line for key, text in solution.diagnostics.in_words().items() for line in _wrapped(key, text)),
         "",
-        f"{'exposure':24s} {'stars':>5s} {'shift x':>9s} {'shift y':>9s} {'rotation':>9s} {'scale':>9s} "
+        f"{'exposure':{_width(solution)}s} {'stars':>5s} {'shift x':>9s} {'shift y':>9s} {'rotation':>9s} "
+        f"{'scale':>9s} "
         f"{'rms x':>7s} {'rms y':>7s} {'distortion':>10s}{'' if solution.sky is None else _SKY_HEADS}",
     ]
     lines += [_row(view) for view in solution]
@@ -182,6 +183,11 @@ def printed(solution):
         lines += ["", *solution.camera.table_lines()]
     lines += [f"left out {name}: {reason}" for name, reason in solution.left_out.items()]
     return "\n".join(lines)
+
+
+def _width(solution):
+    """Letters of the longest name of an exposure, some at least."""
+    return max(16, *map(len, solution.names))
 
 
 _SKY_HEADS = f" {'PA [deg]':>9s} {'arcsec/px':>9s}"
@@ -198,8 +204,8 @@ def _row(view):
         angle, scale = view.orientation
         sky = f" {angle:9.4f} {scale:9.6f}"
     return (
-        f"{view.name[:24]:24s} {len(rows):5d} {d['dx']:9.2f} {d['dy']:9.2f} {d['rotation']:9.4f} {d['scale']:9.6f} "
-        f"{rms[0]:7.4f} {rms[1]:7.4f} {np.sqrt((view.coefficients**2).sum()) / 2:10.3f}{sky}"
+        f"{view.name:{_width(view.solution)}s} {len(rows):5d} {d['dx']:9.2f} {d['dy']:9.2f} {d['rotation']:9.4f} "
+        f"{d['scale']:9.6f} {rms[0]:7.4f} {rms[1]:7.4f} {np.sqrt((view.coefficients**2).sum()) / 2:10.3f}{sky}"
     )
 
 

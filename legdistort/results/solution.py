@@ -14,6 +14,7 @@ from astropy.table import QTable
 from ..cameras.camera import Camera
 from ..geometry.tangent_plane import TangentPlane
 from ..plots import residual_plots
+from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from . import in_tables, new_positions
 from .diagnostics import Diagnostics
@@ -195,6 +196,7 @@ class Solution(ShownAsPrinted):
         """
         return in_tables.stars(self)
 
+    @plain_numbers
     def stars_at(self, epoch: float | Time) -> QTable:
         """The stars where they are at another time, with their errors then, as a table.
 
@@ -228,6 +230,7 @@ class Solution(ShownAsPrinted):
         )
         return np.stack([np.stack([xx, xy]), np.stack([xy, yy])]).transpose(2, 0, 1)
 
+    @plain_numbers
     def correct_table(self, table: Table, *, epoch: float | Time | None = None) -> QTable:
         """Positions measured in any exposures -> the reference plane and the sky, with their errors, as a table.
 

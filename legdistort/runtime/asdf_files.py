@@ -49,8 +49,12 @@ WITH_WCS = (
     "tag:astropy.org:astropy/transform/",
     "tag:astropy.org:astropy/units/",
 )
-#: Tags of files that hold a WCS: those of gwcs, and what the archives of JWST and Roman put around it.
-ARCHIVES = (*WITH_WCS, "tag:stsci.edu:jwst_pipeline/", "tag:stsci.edu:jwst_datamodel/", "asdf://stsci.edu/datamodels/")
+#: Tags of files that hold a WCS: those of gwcs, and what the archives of JWST and Roman put around it (`tweakreg`
+#: leaves a table of its sources).
+ARCHIVES = (
+    *WITH_WCS, "tag:stsci.edu:jwst_pipeline/", "tag:stsci.edu:jwst_datamodel/", "asdf://stsci.edu/datamodels/",
+    "tag:astropy.org:astropy/table/",
+)  # fmt: skip
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _MOST_AXES = 100
 _AT_ONCE = 1 << 20

@@ -19,6 +19,7 @@ from ..geometry import similarity
 from ..inputs.table_files import write_table
 from ..matching.matches import Matches
 from ..runtime import checks, outputs
+from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.progress import Bar
 from . import gsaoi_night, rendering
@@ -85,6 +86,7 @@ class SimulatedExposures(ShownAsPrinted):
         return f"<SimulatedExposures: {len(self.hdus)} images of {ny} x {nx} pixels, {len(self.truth.positions)} stars>"
 
 
+@plain_numbers
 def simulate_matches(
     *,
     n_stars: int = 30,
@@ -206,6 +208,7 @@ def simulate_matches(
     return Simulation(matches_from(truth, observed, sigma, noise_rng, noise=noise, corr=corr, sky=sky), truth)
 
 
+@plain_numbers
 def simulate_exposures(
     *,
     small: bool = False,

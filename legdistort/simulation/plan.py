@@ -17,7 +17,7 @@ from ..geometry import basis, similarity
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from ..priors.prior import Prior
-from ..runtime.checks import check_choice, check_counts
+from ..runtime.checks import check_choice, check_counts, check_positive
 from ..runtime.words import GAUGES
 from ..solving.equations.problem import as_given
 from . import observations, truth
@@ -53,6 +53,7 @@ class Plan:
     epochs: Any = None
     field: SkyCoord | None = None
     camera: Camera | None = None
+    pixel_scale: float | None = None
 
     def __post_init__(self) -> None:
         for name, value in zip(("shape", "prior"), self._field(), strict=True):
@@ -60,6 +61,8 @@ class Plan:
         self._check_epochs()
         check_counts(n_grid=self.n_grid, n_exposures=self.n_exposures)
         object.__setattr__(self, "degree", basis.check_degree(self.degree))
+        if self.pixel_scale is not None:
+            check_positive(self.pixel_scale, "pixel_scale", "number of arcsec")
         check_choice(self.gauge, GAUGES, "gauge")
         if not isinstance(self.prior, Prior | None):
             raise InputError(f"prior must be a Prior, got {as_given(self.prior)}")

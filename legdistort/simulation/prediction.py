@@ -19,6 +19,7 @@ from ..matching.matches import alone
 from ..results import accuracy
 from ..results.errors.absolute_errors import relative_blocks
 from ..results.solution import Solution
+from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..solving import star_motions
 from ..solving.equations.problem import build_problem
@@ -233,6 +234,7 @@ class Prediction(ShownAsPrinted):
         return describe(self)
 
 
+@plain_numbers
 def predict(
     *,
     n_exposures: int,
@@ -253,6 +255,7 @@ def predict(
     min_exposures: int | None = None,
     epochs: ArrayLike | None = None,
     field: SkyCoord | None = None,
+    pixel_scale: float | None = None,
     n_grid: int = 50,
     seed: int = 0,
 ) -> Prediction:
@@ -303,6 +306,9 @@ def predict(
         Years of the exposures: proper motions are fitted too.
     field : `~astropy.coordinates.SkyCoord`, optional
         Where it lies: parallaxes are fitted too.
+    pixel_scale : float, optional
+        Arcsec: lengths may be given as angles then (``0.4 * u.mas``), and the printed errors are angles. Attributes and
+        maps stay in pixels.
     n_grid : int
         Points of the maps along the longer side.
     seed : int
@@ -340,7 +346,7 @@ def predict(
         n_exposures=n_exposures, stars=stars, n_stars=n_stars, density=density, sigma=sigma, degree=degree,
         shape=shape, dithers=dithers, poses=poses, prior=prior, gauge=gauge, dynamic=dynamic, spectrum=spectrum,
         static_spectrum=static_spectrum, min_exposures=min_exposures, n_grid=n_grid, seed=seed,
-        epochs=epochs, field=field, camera=camera,
+        epochs=epochs, field=field, camera=camera, pixel_scale=pixel_scale,
     )  # fmt: skip
     return _predict(plan)
 

@@ -4,12 +4,18 @@ import textwrap
 
 import numpy as np
 
-_MOTIONS = {"motion": "proper motions, relative [px/yr]", "parallax": "parallaxes, relative [px]"}
+_MOTIONS = {"motion": "proper motions, relative [{}/yr]", "parallax": "parallaxes, relative [{}]"}
 
 
-def decimals(prediction):
-    """Decimal places that show three digits of errors like those of a `Prediction`."""
-    return max(4, 3 - int(np.floor(np.log10(prediction.sigma_meas))))
+def decimals(prediction, scale=1.0):
+    """Decimal places that show three digits of errors like those of a `Prediction`, times a scale."""
+    return max(4 if scale == 1 else 0, 3 - int(np.floor(np.log10(scale * prediction.sigma_meas))))
+
+
+def _unit(prediction):
+    """The unit in which errors are shown, and its number in a pixel."""
+    scale = prediction.settings.pixel_scale
+    return ("px", 1.0) if scale is None else ("mas", 1e3 * scale)
 
 
 def finite_rms(values):
@@ -25,13 +31,14 @@ def describe(prediction):
     low, high = prediction.stars_per_exposure.min(), prediction.stars_per_exposure.max()
     thumb_b, thumb_sigma = prediction.thumb
     aliased = np.any(prediction.folded != 0)  # NaN included
-    places = decimals(prediction)
+    unit, scale = _unit(prediction)
+    places = decimals(prediction, scale)
 
     def row(label, noise, aliasing=None, *slopes):
         values = [noise]
         if aliased:
             values += [None, None] if aliasing is None else [aliasing, np.hypot(noise, aliasing)]
-        cells = ["" if v is None else "not known" if np.isnan(v) else f"{v:.{places}f}" for v in values]
+        cells = ["" if v is None else "not known" if np.isnan(v) else f"{scale * v:.{places}f}" for v in values]
         return columns(label, cells + [f"{slope:.3f}" for slope in slopes]).rstrip()
 
     def columns(label, cells):
@@ -42,16 +49,16 @@ def describe(prediction):
         [
             f"Prediction: {prediction.n_exposures} exposures of {ny} x {nx} px, {prediction.n_stars} stars "
             f"({low if low == high else f'{low} to {high}'} on each), degree {prediction.degree}, "
-            f"errors of {prediction.sigma_meas:.4g} px",
+            f"errors of {scale * prediction.sigma_meas:.4g} {unit}",
             columns(
-                "expected, rms per axis [px]",
+                f"expected, rms per axis [{unit}]",
                 ["noise", *(["aliasing", "together"] if aliased else []), "/ sigma", "thumb"],
             ),
             row("b, star positions, relative", *b, prediction.s_b, thumb_b),
             row(_absolute(prediction), prediction.b_abs),
             row("sigma, new positions inside the contour", *sigma, prediction.s_sigma, thumb_sigma),
             row("sigma, new positions over the whole field", prediction.sigma_field, finite_rms(prediction.alias_map)),
-            *(row(_MOTIONS[name], error) for name, error in prediction.motion_errors.items()),
+            *(row(_MOTIONS[name].format(unit), error) for name, error in prediction.motion_errors.items()),
             *textwrap.wrap(f"All but b, absolute, are relative: {_relative(prediction)}", 110),
             f"gauge {solution.gauge.kind}; thumb: s_b = 1/sqrt(n_im), s_sigma = sqrt((1 - 1/n_im)(1 + n_modes/n_star))",
         ]

@@ -17,6 +17,7 @@ from ..matching.matches import Matches
 from ..priors.prior import Prior, has_distortion
 from ..results.diagnostics import Diagnostics
 from ..results.settings import Settings
+from ..runtime.guards.units import plain_numbers
 from . import minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, held, with_errors_times
@@ -47,6 +48,7 @@ log = logging.getLogger(__name__)
 _MOST_NAMED = 6
 
 
+@plain_numbers
 def solve(
     matches: Matches,
     *,
@@ -162,7 +164,7 @@ def solve(
         Errors of the poses of the matches, if these are known and no mere start values, as `Matches.from_table` takes
         them, in place of what the matches state. Absolute errors then include shift, rotation and scale. Not for poses
         that `match` found from the positions themselves.
-    reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord`, Solution or path, optional
+    reference : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord`, Solution, path or "gaia", optional
         Positions with errors: what is known beforehand of its stars, and so of shift, rotation and scale, and of maps
         that the exposures do not determine. Columns ``ra``, ``dec`` [deg, ICRS], ``ra_error``, ``dec_error``
         [mas] and perhaps ``pmra``, ``pmdec``, ``pmra_error``, ``pmdec_error`` [mas/yr], ``parallax``,
@@ -172,6 +174,8 @@ def solve(
         `~astropy.coordinates.SkyCoord` stands for positions, motions and epoch. With `motion` its motions and
         parallaxes are known beforehand too. Errors that prove too small are taken larger, with a warning.
         A `Solution`, its file or folder: the stars of that, found by their positions, and its plane with its errors.
+        "gaia": the stars of Gaia DR3 around the field, from the archive or, if they were asked for before, from a file
+        (`legdistort.inputs.references.gaia`); needs the extra ``gaia``.
     reference_error : float, `~astropy.units.Quantity` or "found", optional
         Error per axis of its positions where it states none: mas on the sky, else pixels. Found: the size of its errors
         is the one at which its stars agree with the exposures, and stated errors count relative to one another alone.

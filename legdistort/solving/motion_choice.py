@@ -20,6 +20,9 @@ from .equations.star_terms import unpacked
 
 log = logging.getLogger(__name__)
 
+#: Days within which nobody asks whether stars moved.
+_LONG = 365.0
+
 
 def resolve(matches, options):
     """Options with motions as they are to be fitted, and the `MotionScatter` that was asked for, or None.
@@ -30,6 +33,7 @@ def resolve(matches, options):
         If the epochs do not determine what was asked for.
     """
     if options.motion is None:
+        _ask(matches)
         return options, None
     star_motions.check_epochs(matches, options.motion)
     if options.motion != "auto" and options.motion_sigma != "evidence":
@@ -46,6 +50,16 @@ def resolve(matches, options):
     if sigma == "evidence":
         sigma = max(found.sigma, 1e-3 * flat_error(flat)) if motion else None
     return replace(options, motion=motion, motion_sigma=sigma), found
+
+
+def _ask(matches):
+    """Say that stars may have moved, where years lie between the exposures."""
+    times, unit = matches.times
+    if unit == "days" and np.ptp(times) > _LONG:
+        log.info(
+            "the exposures span %.1f years, in which stars may have moved: motion='auto' (--motion auto) finds out",
+            np.ptp(times) / 365.25,
+        )
 
 
 def flat_error(fit):

@@ -10,7 +10,8 @@ from ..exceptions import InputError
 from ..geometry import basis, fitter
 from ..geometry.detector_modes import affine_widths
 from ..geometry.epochs import year
-from ..inputs.reference_catalogue import read_reference
+from ..inputs.references.catalogue import read_reference
+from ..inputs.references.gaia import check_gaia, gaia_around, is_gaia
 from ..inputs.start_poses import POSE_ERRORS, check_place_errors, check_pose_sigma
 from ..matching.matches import Matches, alone
 from ..results.settings import Settings
@@ -255,6 +256,9 @@ def check_reference(reference, *, error=None, epoch=None, pixel_scale=None, meth
         return None, epoch
     if method == "alternating":
         raise InputError("method='alternating' is the published scheme: it takes no reference")
+    if is_gaia(reference):  # which is asked once it is known where the field lies
+        check_gaia()
+        return reference, epoch
     is_file = isinstance(reference, (str, Path)) and (Path(reference).is_dir() or Path(reference).suffix == ".asdf")
     solution = Solution.read(reference) if is_file else reference
     if not isinstance(solution, Solution):
@@ -266,7 +270,7 @@ def check_reference(reference, *, error=None, epoch=None, pixel_scale=None, meth
 
 
 def check_tie(matches, asked, reference, **tying):
-    """What `check_reference` gives, for these matches and the `SolveOptions` asked for.
+    """What `check_reference` gives, for these matches and the `SolveOptions` asked for; Gaia is asked here.
 
     Raises
     ------
@@ -275,6 +279,7 @@ def check_tie(matches, asked, reference, **tying):
     InputError
         As there; with one exposure for options that compare exposures with one another.
     """
+    reference = gaia_around(matches) if is_gaia(reference) else reference
     catalogue, epoch = check_reference(reference, method=asked.method, **tying)
     if catalogue is not None and catalogue.maps is not None and asked.motion is not None:
         raise InputError(

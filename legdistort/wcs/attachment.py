@@ -27,10 +27,12 @@ from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read
 from ..runtime.outputs import replacing, replacing_files, replacing_folder
 from ..runtime.progress import Bar
 from .fits_headers import header_error
+from .foreign_trees import has_wcs, refined_tree, table_of
 from .storage import wcs_tree
 
 log = logging.getLogger(__name__)
 
+_ASDF = b"#ASDF"
 #: Names that a message lists.
 _MOST_NAMED = 6
 #: What the header of an image records of a WCS that was written into it; `attach` takes it for its own later.
@@ -51,12 +53,14 @@ class Attachment:
         The file written.
     exposure : str
     header : `~astropy.io.fits.Header` or None
-        The cards that went into the header of the image.
+        The cards that went into the header of the image, or into the file ``.head``.
+    kind : {"sip", "tpv", "head", None}
     """
 
     path: Path
     exposure: str
     header: fits.Header | None
+    kind: str | None = "sip"
 
     @property
     def errors(self):
@@ -65,7 +69,8 @@ class Attachment:
 
     def __repr__(self):
         what = "".join(f"{key[:3]} within {error:.2g} px, " for key, error in self.errors.items() if "MX" in key)
-        return f"<Attachment: {self.exposure} in {self.path}: {what}ASDF>"
+        what = what.removesuffix(", ") if self.kind == "head" else f"{what}ASDF"
+        return f"<Attachment: {self.exposure} in {self.path}: {what}>"
 
 
 def attach(
@@ -84,11 +89,12 @@ def attach(
 
     Two things go in: in the header of the image the keywords of `legdistort.wcs.fits_headers.make_header`, instead of
     those of the former WCS, and an extension ``ASDF`` with the exact gwcs at ``meta.wcs``, which
-    ``stdatamodels.asdf_in_fits.open`` reads. Errors, flags and weights beside the image (``ERR``, ``DQ`` and the like,
-    of its shape and ``EXTVER``) get the keywords as well. Every other HDU, card and byte stays as it is, but for what
-    would be taken for the WCS of the image before that: plates of scans (DSS: ``PLTRAH``, ``AMDX1``, ``XPIXELSZ`` ...),
-    polynomials of IRAF and wcstools. The errors hold for the header as it stands in the file. Nothing is written unless
-    everything can be.
+    ``stdatamodels.asdf_in_fits.open`` reads. Where a pipeline (JWST) keeps its data model there, the gwcs in that is
+    refined (`legdistort.refine`), and every other key and byte of it stays; so it is with ASDF files of Roman. Errors,
+    flags and weights beside the image (``ERR``, ``DQ`` and the like, of its shape and ``EXTVER``) get the keywords as
+    well. Every other HDU, card and byte stays as it is, but for what would be taken for the WCS of the image before
+    that: plates of scans (DSS: ``PLTRAH``, ``AMDX1``, ``XPIXELSZ`` ...), polynomials of IRAF and wcstools. The errors
+    hold for the header as it stands in the file. Nothing is written unless everything can be.
 
     Frames are identified by their names, as `read_exposures` gives them. A frame that was left out of the solution is
     skipped, which is logged.
@@ -103,8 +109,10 @@ def attach(
     in_place : bool
         Change the files themselves, all or none (see the page on files). Exactly one of `out` and `in_place` must be
         given.
-    kind : {"sip", "tpv", None}
-        Form of the header; None leaves it alone and adds the ASDF extension only.
+    kind : {"sip", "tpv", "head", None}
+        Form of the header; None leaves it alone and adds the ASDF extension only. "head" leaves the frames alone, and
+        writes the cards (TPV) of the images of each into a text ``NAME.head``, which SWarp and SCAMP read in the place
+        of its headers: beside the frames, or into the folder `out` without them.
     max_error : float
         Largest error of the header, pixels.
     ext : int, str or (str, int), optional
@@ -130,7 +138,9 @@ def attach(
     if (out is None) is not bool(in_place):
         raise InputError("give either out= (--out), a folder for copies, or in_place=True (--in-place)")
     paths = _files(paths)
-    targets = [path.resolve() for path in paths] if in_place else _targets(paths, Path(out), overwrite)
+    targets = [path.resolve() for path in paths]
+    if kind == "head" or not in_place:
+        targets = _targets(paths, None if in_place else Path(out), overwrite, ".head" if kind == "head" else None)
     plans, images = [], _Images.of(solution)
     for path, target in zip(Bar(paths, desc="attaching", unit="frame", disable=not progress), targets, strict=True):
         plan = _plan(images, path, target, kind=kind, max_error=max_error, ext=ext, overwrite=overwrite)
@@ -142,7 +152,7 @@ def attach(
         for plan in plans:
             with writing(plan.target) as file:
                 plan.write(file)
-    return [Attachment(plan.target, *item) for plan in plans for item in plan.headers.items()]
+    return [Attachment(plan.target, *item, kind) for plan in plans for item in plan.headers.items()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +176,7 @@ class _Images:
 class _Plan:
     """What is to be done to one file: headers ``{exposure: Header or None}`` and edits of its bytes.
 
-    And the names of the exposures that the headers place `elsewhere`.
+    And the names of the exposures that the headers place `elsewhere`. Or, in the place of the edits, the `whole` file.
     """
 
     path: Path
@@ -175,12 +185,13 @@ class _Plan:
     headers: dict
     edits: list
     elsewhere: list
+    whole: bytes | None = None
 
     def write(self, file):
-        raw, pack = read_bytes(self.path)
+        raw, pack = _read(self.path)
         if zlib.crc32(raw) != self.crc:
             raise InputError(f"{self.path} changed while it was worked on; try again")
-        file.write(pack(splice(raw, self.edits)))
+        file.write(pack(splice(raw, self.edits)) if self.whole is None else self.whole)
         shutil.copymode(self.path, file.name)
 
 
@@ -205,9 +216,11 @@ def _copies(out, overwrite):
         yield lambda target: replacing(folder / target.name)
 
 
-def _targets(paths, out, overwrite):
-    """Where the copies go."""
-    targets = [out / path.name for path in paths]
+def _targets(paths, out, overwrite, ending=None):
+    """Where copies go, or files of another ending: into a folder, or beside the frames."""
+    targets = [path.resolve() if out is None else out / path.name for path in paths]
+    if ending is not None:
+        targets = [path.with_name(exposure_names.exposure_name(path) + ending) for path in targets]
     for i, (path, target) in enumerate(zip(paths, targets, strict=True)):
         if target in targets[:i]:
             raise InputError(
@@ -222,9 +235,11 @@ def _targets(paths, out, overwrite):
 
 def _plan(known, path, target, *, kind, max_error, ext, overwrite):
     """The `_Plan` of one file; without headers if it was left out of the solution."""
-    raw, _ = read_bytes(path)
+    raw, _ = _read(path)
+    if raw.startswith(_ASDF):
+        return _plan_of_tree(known, path, target, raw, kind)
     spans = locate(raw, path)
-    headers, edits = {}, []
+    headers, edits, of_images, whole = {}, [], {}, None
     with readable(path), open_bytes(raw) as hdulist:
         images = _images(known, hdulist, path, ext)
         elsewhere = [
@@ -233,16 +248,65 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
         for name, image in images.items():
             headers[name] = None
             if kind is not None:
-                headers[name] = _header(known, name, kind, max_error)
+                headers[name] = _header(known, name, "tpv" if kind == "head" else kind, max_error)
                 planes = file_images.planes_beside(hdulist, hdulist[image])
                 for number in (image, *(_number(hdulist, plane) for plane in planes)):
+                    if kind == "head":
+                        of_images[number] = headers[name]
+                        continue
                     start, data, stop, _ = spans[number]
                     new = exchange_cards(raw[start:data], raw[data:stop], headers[name], WCS_KEYWORDS)
                     _check_written(new, headers[name], known.views[name], path)
                     edits.append((start, data, new))
-        if images:
-            edits += _asdf_edits(known, images, spans, *_tables(hdulist, spans, path, overwrite))
-    return _Plan(path, target, zlib.crc32(raw), headers, edits, elsewhere)
+        if kind == "head":
+            whole = _head(hdulist, of_images)
+        elif images:
+            foreign = _foreign(spans, raw, path) if len(images) == 1 else None
+            if foreign is None:
+                edits += _asdf_edits(known, images, spans, *_tables(hdulist, spans, path, overwrite))
+            else:
+                (name,) = images
+                content = refined_tree(_content(foreign, raw), known.views[name], f"{path}[ASDF]")
+                edits.append((foreign.start, foreign.stop, table_of(foreign.header, content)))
+    return _Plan(path, target, zlib.crc32(raw), headers, edits, elsewhere, whole)
+
+
+def _read(path):
+    """What `read_bytes` gives; of an ASDF file its bytes as they are."""
+    if path.suffix.lower() == ".asdf" and path.is_file() and (raw := path.read_bytes()).startswith(_ASDF):
+        return raw, bytes
+    return read_bytes(path)
+
+
+def _plan_of_tree(known, path, target, raw, kind):
+    """The `_Plan` of an ASDF file of Roman, which holds no headers."""
+    if kind == "head":
+        raise InputError(f"{path} is no FITS file: SWarp and SCAMP do not read it")
+    name = exposure_names.exposure_name(path)
+    if name not in known.views:
+        return _Plan(path, target, zlib.crc32(raw), _nothing(known, path, name), [], [])
+    whole = refined_tree(raw, known.views[name], str(path))
+    return _Plan(path, target, zlib.crc32(raw), {name: None}, [], [], whole)
+
+
+def _foreign(spans, raw, path):
+    """The one extension ASDF of a file, if it is the data model of a pipeline with a gwcs; else None."""
+    tables = [span for span in spans if span.header.get("EXTNAME") == "ASDF"]
+    if len(tables) != 1 or "EXPNAME" in tables[0].header or tables[0].header.get("TFIELDS") != 1:
+        return None
+    return tables[0] if has_wcs(_content(tables[0], raw), f"{path}[ASDF]") else None
+
+
+def _content(span, raw):
+    """The ASDF file in a table of one row."""
+    return raw[span.data : span.data + span.header["NAXIS1"]]
+
+
+def _head(hdulist, of_images):
+    """A file ``.head``, a text: the cards of every image, ``{number: Header}``, none for one without a solution."""
+    blocks = [of_images.get(k, fits.Header()) for k, hdu in enumerate(hdulist) if file_images.is_image(hdu)]
+    lines = [[*block.tostring(sep="\n", endcard=False, padding=False).splitlines(), "END"] for block in blocks]
+    return "".join(f"{line.rstrip()}\n" for block in lines for line in block).encode("ascii")
 
 
 def _is_elsewhere(view, hdulist, hdu):

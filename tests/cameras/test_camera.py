@@ -871,6 +871,22 @@ class TestFrames:
         with pytest.raises(InputError, match="is of detector 1, which its name does not contain"):
             camera.of_detectors([replace(apart[0], name="frame")])
 
+    def test_detectors_under_other_names_are_known_by_their_numbers(self, frames, tmp_path):
+        """The camera counts them, as EXTVER does, and a keyword before that has a name: DETECTOR = 'H2RG-1'."""
+        folder, camera, _ = frames
+        for path in sorted(folder.glob("exp[01].fits")):
+            with fits.open(path) as hdulist:
+                for hdu in hdulist[1:]:
+                    hdu.header["DETECTOR"] = f"H2RG-{hdu.header.pop('CCDCHIP')}"
+                hdulist.writeto(tmp_path / path.name)
+        known = legdistort.read_exposures(sorted(folder.glob("exp[01].fits")), ext="SCI")
+        named = legdistort.read_exposures(sorted(tmp_path.glob("*.fits")), ext="SCI")
+        assert {each.detector for each in named} == {"H2RG-1", "H2RG-2"}
+        understood = camera.of_detectors(named)
+        assert [(e.name, e.exposure, e.detector) for e in understood] == [
+            (e.name, e.exposure, e.detector) for e in known
+        ]
+
     def test_layout_by_headers(self, frames, measured):
         """Without a camera the headers say how the detectors lie; here they know nothing of the distortion."""
         _, camera, _ = frames

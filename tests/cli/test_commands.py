@@ -502,7 +502,7 @@ def test_help_has_an_example(command, capsys):
 )
 def test_options_have_the_names_of_arguments(function, groups):
     """And what is done with those that have not is said in the command."""
-    own = {"prior_sigma", "static_sigma", "tpv", "asdf_only", "where", "ext", "frame", "solution"}
+    own = {"prior_sigma", "static_sigma", "tpv", "head", "asdf_only", "where", "ext", "frame", "solution"}
     known = inspect.signature(function).parameters
     assert {name for group in groups for name in group if name not in known} <= own
 

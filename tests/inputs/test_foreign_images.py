@@ -22,7 +22,7 @@ from legdistort.exceptions import AssumptionWarning, DamagedError, InputError
 from legdistort.geometry.distortion import Distortion
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.frames.pixel_flags import bad_pixels, good_bits
-from legdistort.inputs.reference_catalogue import EXACT, read_reference
+from legdistort.inputs.references.catalogue import EXACT, read_reference
 from legdistort.inputs.sky_wcs import believable_wcs, to_icrs
 from legdistort.matching.header_poses import HeaderPoses
 from legdistort.priors.from_headers import header_distortions

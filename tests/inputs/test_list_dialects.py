@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs import column_contract
-from legdistort.inputs.reference_catalogue import read_reference
+from legdistort.inputs.references.catalogue import read_reference
 from legdistort.inputs.table_files import read_table, write_by_ending
 from legdistort.measurement.flags import Flag
 

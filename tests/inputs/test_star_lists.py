@@ -12,7 +12,7 @@ import legdistort as ld
 from legdistort.cli import parser
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs import column_contract
-from legdistort.inputs.reference_catalogue import read_reference
+from legdistort.inputs.references.catalogue import read_reference
 from legdistort.inputs.table_files import read_table
 from legdistort.matching.matches import Matches
 from legdistort.measurement.flags import Flag
@@ -155,6 +155,39 @@ def test_flystar(tmp_path):
     assert_array_equal(out["mag"], [8.801, 8.805])
     assert_array_equal(out["flux"], [3255625, 3213962])  # its own, not made from the magnitudes
     assert_array_equal(out["epoch"], 2014.944)
+
+
+def _without_names(lines, *left_out):
+    rows = [line.split() for line in lines.splitlines()[1:]]
+    return "".join(" ".join(word for k, word in enumerate(row) if k not in left_out) + "\n" for row in rows)
+
+
+def test_starfinder_without_a_header(tmp_path, caplog):
+    """The same list by the same program, with errors (eleven columns) and without (nine)."""
+    named = read(tmp_path, "A.lis", FLYSTAR)
+    caplog.set_level("INFO", logger="legdistort")
+    bare = read(tmp_path, "B.lis", _without_names(FLYSTAR))
+    assert "columns of FlyStar: x_err = xe, y_err = ye, mag = m, epoch = t" in caplog.text
+    for name in ("x", "y", "x_err", "y_err", "mag", "flux", "epoch"):
+        assert_array_equal(bare[name], named[name])
+    nine = read(tmp_path, "C.lis", _without_names(FLYSTAR, 5, 6), error=0.01)
+    assert "columns of StarFinder: mag = m, epoch = t" in caplog.text
+    for name in ("x", "y", "mag", "flux", "epoch"):
+        assert_array_equal(nine[name], named[name])
+    assert_array_equal(nine["x_err"], 0.01)
+    mine = read(tmp_path, "D.lis", _without_names(FLYSTAR), columns={"x": "col5", "y": "col4"})
+    assert_array_equal(mine["x"], named["y"])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{2: "57000.5"}, {8: "12.0"}, {9: "3.5"}, {3: "abc"}], ids=["MJD", "corr", "frames", "word"]
+)
+def test_eleven_columns_of_others_are_not_starfinder(tmp_path, wrong):
+    rows = [line.split() for line in FLYSTAR.splitlines()[1:]]
+    for k, word in wrong.items():
+        rows[1][k] = word
+    out = read(tmp_path, "a.txt", "".join(" ".join(row) + "\n" for row in rows))
+    assert out.colnames[:3] == ["col1", "col2", "col3"]
 
 
 def test_stetson(tmp_path):

@@ -19,7 +19,7 @@ from legdistort.coaddition.mosaic import Mosaic
 from legdistort.exceptions import InputError
 from legdistort.geometry.tangent_plane import TangentPlane
 from legdistort.inputs.exposures import Exposure
-from legdistort.inputs.reference_catalogue import read_reference
+from legdistort.inputs.references.catalogue import read_reference
 from legdistort.inputs.table_files import read_table, write_stars
 from legdistort.measurement.noise_curves import NoiseCurves
 from legdistort.pipeline import write_summary

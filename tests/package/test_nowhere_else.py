@@ -29,7 +29,7 @@ from gwcs.wcs import WCS as GWCS
 import legdistort as ld
 from legdistort.coaddition.grids import read_grid
 from legdistort.exceptions import InputError, LegdistortError
-from legdistort.inputs.reference_catalogue import read_reference
+from legdistort.inputs.references.catalogue import read_reference
 from legdistort.inputs.sky_wcs import believable_wcs
 from legdistort.inputs.table_files import read_table
 from legdistort.measurement.effective.sources import read_psf

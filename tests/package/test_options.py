@@ -389,6 +389,7 @@ PREDICT = [
     row(degree=2),
     row(camera=lambda _: matches("pair").camera, shape=None),
     row(dithers=10.0),
+    row(pixel_scale=0.02),
     row(poses=lambda _: matches("plain").poses),
     row(prior=Prior(STATIC, sigma=0.1)),
     row(gauge="mean"),

@@ -3,11 +3,14 @@
 import json
 import subprocess
 import sys
+from importlib import resources
 
+import four_detectors
 import numpy as np
 import pytest
+from night_sets import Nights
 
-from legdistort import simulate_matches, solve
+from legdistort import Matches, simulate_matches, solve
 from legdistort.reporting.summary import summarise
 
 
@@ -21,6 +24,46 @@ def test_figures_are_those_of_the_tables():
     assert found["rms_px"] == pytest.approx(np.sqrt(np.mean(left**2)), rel=1e-6)
     assert found["timings"] == {"solve": 0.123}
     assert [check["name"] for check in found["checks"]] == [check.name for check in solution.checks]
+
+
+def _valid(found):
+    """The summary as a file has it, if it keeps the published schema."""
+    jsonschema = pytest.importorskip("jsonschema")
+    read = json.loads(json.dumps(found, allow_nan=False))
+    schema = json.loads((resources.files("legdistort") / "data" / "schemas" / "summary-1.0.0.json").read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.Draft202012Validator(schema).validate(read)
+    return read
+
+
+def test_every_exposure_is_in_figures():
+    table = Nights(2, nights=3, per=2, n_stars=60).table
+    solution = solve(Matches.from_table(table, shape=(1024, 1024)), degree=3)
+    found = _valid(summarise(solution))
+    assert [each["name"] for each in found["exposures"]] == list(solution.names)
+    for each in found["exposures"]:
+        rows = table[table["exposure"] == each["name"]]
+        used = solution.residuals[(solution.residuals["exposure"] == each["name"]) & solution.residuals["used"]]
+        assert each["n_stars"] == len(used)
+        assert each["epoch_yr"] == pytest.approx(rows["epoch"][0])
+        assert each["rms_x_px"] == pytest.approx(np.sqrt(np.mean(used["dx"].value ** 2)), rel=1e-6)
+        matrix = solution.poses[each["name"]]
+        assert each["rotation_deg"] == pytest.approx(np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0])))
+        assert (each["shift_x_px"], each["shift_y_px"]) == tuple(matrix[:, 2])
+        assert each["position_angle_deg"] is None
+    assert [night["exposures"] for night in found["nights"]] == [[f"n{i}e0", f"n{i}e1"] for i in range(3)]
+    assert [night["block"] for night in found["nights"]] == [0, 1, 2]
+    assert found["detectors"] == []
+
+
+def test_every_detector_is_in_figures():
+    solution = solve(four_detectors.matches("layout", 1, n=5, n_stars=120), layout="fit", degree=1)
+    found = _valid(summarise(solution))
+    places = {key: each.place for key, each in solution.camera.detectors.items()}
+    assert {each["name"]: (each["x_px"], each["y_px"]) for each in found["detectors"]} == {
+        key: (place.x, place.y) for key, place in places.items()
+    }
+    assert all(each["x_err_px"] > 0 for each in found["detectors"])
 
 
 def test_a_solution_is_shown_without_what_measures_and_co_adds(tmp_path):

@@ -166,8 +166,8 @@ def test_what_is_wrong_is_said():
     )
     assert matches.pose_sigma == pytest.approx({"shift": 1.0, "rotation": 0.01})
     for wrong, message in (
-        ({"shift": -1}, "error of shift must be a number .pix., 0 or more, got -1"),
-        ({"shift": 1 * u.m}, "error of shift must be"),
+        ({"shift": -1}, "error of shift must be a number .px., 0 or more, got -1"),
+        ({"shift": 1 * u.m}, "shift must be in pix"),
         ({"scale": 0.1}, "scale without shift, and says nothing of where the reference plane lies"),
         ({"turn": 0.1}, "must be a dict of the errors of shift"),
         (0.1, "must be a dict of the errors of shift"),

@@ -20,7 +20,7 @@ from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.geometry.epochs import mean_epoch, year
 from legdistort.geometry.tangent_plane import TangentPlane
-from legdistort.inputs.reference_catalogue import read_reference
+from legdistort.inputs.references.catalogue import read_reference
 from legdistort.matching.matches import Matches
 from legdistort.priors.prior import Prior
 from legdistort.results import accuracy, in_tables

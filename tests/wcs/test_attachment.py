@@ -475,6 +475,47 @@ def test_errors_and_flags_get_the_wcs_of_their_image(geometry, tmp_path):
     assert (tmp_path / "out" / "night.fits").read_bytes()[: last.stop] == before[: last.stop]
 
 
+def _blocks(path):
+    """Headers of a text in which each ends with END, as SWarp reads it."""
+    blocks = path.read_text().split("END\n")
+    assert blocks.pop() == ""
+    return [fits.Header.fromstring(block, sep="\n") for block in blocks]
+
+
+def test_head_files_have_a_block_for_every_image(geometry, tmp_path):
+    """In the order of the file, for errors and flags that of their image, and the frames as they were."""
+    solution = geometry(3, 2.0, shape=SHAPE, names=("night_SCI1", "night_SCI2"))
+    path, zeros = tmp_path / "night.fits", np.zeros(SHAPE, "uint8")
+    beside = [fits.ImageHDU(zeros, header_of(OLD), name=name, ver=k) for k in (1, 2) for name in ("SCI", "DQ")]
+    fits.HDUList([fits.PrimaryHDU(), *beside, fits.ImageHDU(zeros[:9], name="ERR", ver=3)]).writeto(path)
+    before = path.read_bytes()
+    done = attach(solution, path, in_place=True, kind="head")
+    assert path.read_bytes() == before
+    assert {item.path for item in done} == {tmp_path.resolve() / "night.head"}
+    blocks = _blocks(tmp_path / "night.head")
+    assert len(blocks) == 5
+    assert not blocks[4]
+    x, y = np.meshgrid([0.0, 40.0, 89.0], [0.0, 30.0, 59.0])
+    for k, name in enumerate(["night_SCI1", "night_SCI1", "night_SCI2", "night_SCI2"]):
+        sky = WCS(blocks[k]).pixel_to_world(x, y)
+        assert blocks[k]["CTYPE1"] == "RA---TPV"
+        found = np.stack(solution[name].wcs.world_to_pixel(sky))
+        assert_allclose(found, [x, y], rtol=0, atol=1e-3)
+    with pytest.raises(InputError, match=r"night\.head exists already"):
+        attach(solution, path, in_place=True, kind="head")
+    attach(solution, path, out=tmp_path / "heads", kind="head")
+    assert (tmp_path / "heads" / "night.head").read_bytes() == (tmp_path / "night.head").read_bytes()
+    assert [each.name for each in (tmp_path / "heads").iterdir()] == ["night.head"]
+
+
+def test_head_files_of_packed_frames(one, tmp_path):
+    write_frame(tmp_path / "frame.fits")
+    (tmp_path / "frame.fits.gz").write_bytes(gzip.compress((tmp_path / "frame.fits").read_bytes()))
+    (item,) = attach(one, tmp_path / "frame.fits.gz", in_place=True, kind="head")
+    assert item.path.name == "frame.head"
+    assert repr(item).endswith("px>")
+
+
 def test_flags_of_two_images_are_left_alone(geometry, tmp_path):
     solution = geometry(1, 2.0, shape=SHAPE, names=("night_A", "night_B"))
     hdus = [fits.ImageHDU(np.zeros(SHAPE, "uint8"), name=name) for name in ("A", "B", "DQ")]
@@ -707,6 +748,9 @@ def test_command(stored, tmp_path, capsys):
     assert main(["attach", stored, str(frame), "--out", str(out)]) == 1
     assert "--overwrite" in capsys.readouterr().err
     assert main(["attach", stored, str(frame), "--out", str(out), "--asdf-only", "--overwrite"]) == 0
+    capsys.readouterr()
+    assert main(["attach", stored, str(frame), "--in-place", "--head"]) == 0
+    assert re.fullmatch(r"exp00 in .*exp00\.head: TPV within \S+ px", capsys.readouterr().out.strip())
 
 
 def test_command_names_the_best_error(stored, tmp_path, capsys):

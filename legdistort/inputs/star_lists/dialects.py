@@ -73,6 +73,7 @@ def _photutils_flags(table):
 #: charge transfer, u, v and U, V those without distortion; DAOPHOT of Stetson and of IRAF; photutils.
 DIALECTS = (
     Dialect("FlyStar", {"x_err": ("xe",), "y_err": ("ye",), "mag": ("m",), "epoch": ("t",)}, ("x", "y", "xe", "ye")),
+    Dialect("StarFinder", {"mag": ("m",), "epoch": ("t",)}, ("x", "y", "m", "t", "snr", "corr", "N_frames", "flux")),
     Dialect(
         "hst1pass",
         {"x": ("X", "x"), "y": ("Y", "y"), "mag": ("M", "m", "w", "W"), "epoch": ("t",)},
@@ -96,6 +97,34 @@ DIALECTS = (
     Dialect("photutils", {"x": ("xcentroid",), "y": ("ycentroid",)}, ("xcentroid", "ycentroid")),
     Dialect("photutils", {"x": ("x_centroid",), "y": ("y_centroid",)}, ("x_centroid", "y_centroid")),
 )
+
+
+#: Columns of the lists of StarFinder as the Galactic Center Group of UCLA writes them (``.lis``, Keck), which have no
+#: names: with errors and without, as FlyStar reads them (flystar/starlists.py, StarList.from_lis_file).
+_STARFINDER = (
+    ("name", "m", "t", "x", "y", "xe", "ye", "snr", "corr", "N_frames", "flux"),
+    ("name", "m", "t", "x", "y", "snr", "corr", "N_frames", "flux"),
+)
+_YEARS = 1980, 2100
+
+
+def _named(table):
+    """The table with the names of its columns, if it has none and is a list of StarFinder by what stands in them."""
+    names = next((names for names in _STARFINDER if len(names) == len(table.columns)), None)
+    if names is None or table.colnames != [f"col{j + 1}" for j in range(len(names))]:
+        return table
+    try:
+        found = {name: values(table, col) for name, col in zip(names[1:], table.colnames[1:], strict=True)}
+    except InputError:
+        return table
+    year, corr, frames = found["t"], found["corr"], found["N_frames"]
+    if not (np.all((year > _YEARS[0]) & (year < _YEARS[1])) and np.all((corr >= 0) & (corr <= 1.001))):
+        return table
+    if not np.all((frames >= 0) & (frames == np.round(frames))) or np.any(found.get("xe", np.ones(1)) < 0):
+        return table
+    table = table.copy(copy_data=False)
+    table.rename_columns(table.colnames, names)
+    return table
 
 
 def understand(table, columns, *, without_errors=False):
@@ -124,6 +153,8 @@ def understand(table, columns, *, without_errors=False):
         For positions that are not those of the detector, and for those of SExtractor without errors, unless
         `without_errors`.
     """
+    if not any(str(theirs).startswith("col") for theirs in columns.values()):
+        table = _named(table)
     table, source = sextractor.understand(table, columns, without_errors=without_errors)
     source = columns.get("x", source)
     if source is not None and sextractor.is_pixel(source):

@@ -15,6 +15,7 @@ from scipy.interpolate import RectBivariateSpline
 from ...exceptions import InputError
 from ...runtime import outputs
 from ...runtime.fits_bytes import open_fits
+from ...runtime.guards.units import plain_numbers
 from ...runtime.notebook import ShownAsPrinted
 from . import splines
 
@@ -91,6 +92,7 @@ class Grid:
         return f"a grid of {len(self.x)} x {len(self.y)}"
 
 
+@plain_numbers
 @dataclass(frozen=True, eq=False, repr=False)
 class EffectivePSF(ShownAsPrinted):
     """The effective point-spread function of an exposure (Anderson & King 2000, PASP 112, 1360).
@@ -192,6 +194,7 @@ class EffectivePSF(ShownAsPrinted):
         x, y = (splines.basis(d.ravel(), n, self.spacing) for d, n in ((dx, grid.shape[1]), (dy, grid.shape[0])))
         return ((y @ grid) * x).sum(axis=1).reshape(dx.shape)
 
+    @plain_numbers
     def centre(self, xy: ArrayLike) -> np.ndarray:
         """Core-weighted centre, from where the grid has its middle, at some places; (n, 2) [pix]."""
         xy = np.asarray(xy, dtype=float)
@@ -251,6 +254,7 @@ class EffectivePSF(ShownAsPrinted):
         return flux * value, np.stack([flux * by_x, flux * by_y, value], axis=1)
 
     @classmethod
+    @plain_numbers
     def from_array(
         cls, data: ArrayLike, *, oversampling: float, positions: ArrayLike | None = None, source: str = "array"
     ) -> EffectivePSF:
@@ -289,6 +293,7 @@ class EffectivePSF(ShownAsPrinted):
         variation, order = _grid_of(positions, len(data), source)
         return cls(splines.coefficients(data[order]), 1 / oversampling, variation, source=source)
 
+    @plain_numbers
     def images(self, xy: ArrayLike, *, half: float | None = None, oversampling: int = 4) -> np.ndarray:
         """Oversampled images at some places, (n, k, k); the star is in the middle.
 

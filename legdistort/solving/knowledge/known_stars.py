@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import Table
 
 from ...exceptions import InputError
-from ...inputs.reference_catalogue import read_reference
+from ...inputs.references.catalogue import read_reference
 from ...results.errors.absolute_errors import map_directions
 
 _MAS = 3.6e6  # of a degree
@@ -15,7 +15,7 @@ _COMMON = ("_abs", "_known")
 
 
 def known_stars(solution, name):
-    """What a `Solution` knows of its stars, as a `legdistort.inputs.reference_catalogue.Reference` of this name.
+    """What a `Solution` knows of its stars, as a `legdistort.inputs.references.catalogue.Reference` of this name.
 
     Relative errors are those of single stars; the error of the common map is common to all, and maps that the solution
     does not determine are unknown.

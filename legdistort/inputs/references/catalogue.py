@@ -17,13 +17,13 @@ from astropy.coordinates import Angle, SkyCoord
 from astropy.table import Column, Table
 from astropy.time import Time
 
-from ..exceptions import AssumptionWarning, InputError, warn
-from ..geometry.epochs import year
-from ..geometry.tangent_plane import angles, compass, directions
-from ..runtime import checks
-from . import column_contract
-from .plain_columns import is_text, numbers, text
-from .table_files import read_table
+from ...exceptions import AssumptionWarning, InputError, warn
+from ...geometry.epochs import year
+from ...geometry.tangent_plane import angles, compass, directions
+from ...runtime import checks
+from .. import column_contract
+from ..plain_columns import is_text, numbers, text
+from ..table_files import read_table
 
 #: How VizieR calls the columns of Gaia, and places in the tables of others, in small letters.
 VIZIER = {

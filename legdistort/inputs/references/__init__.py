@@ -1,0 +1,1 @@
+"""Catalogues of places that are known beforehand: files, tables, and Gaia by name."""

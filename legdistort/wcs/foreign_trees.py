@@ -1,0 +1,141 @@
+"""Another gwcs in an ASDF file of somebody else's, in which every other key, tag and block stays as it is.
+
+The text of the WCS is exchanged within the YAML of the file; what stands before and after it, and the arrays that
+follow, are not read as objects, which would take the packages that wrote them.
+"""
+
+import io
+import re
+
+import asdf
+import numpy as np
+import yaml
+from astropy.io import fits
+
+from ..exceptions import InputError
+from ..runtime.asdf_files import ARCHIVES, read_tree
+from ..runtime.fits_bytes import BLOCK
+from .refinement import refine
+
+#: Where data models have the WCS of their image: of JWST, and of Roman.
+PLACES = ("meta", "wcs"), ("roman", "meta", "wcs")
+_END = re.compile(rb"\n\.\.\.\r?\n")
+_INDEX = b"#ASDF BLOCK INDEX"
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_HANDLE = "%TAG ! tag:stsci.edu:asdf/"
+#: Names of repeated parts, which asdf counts from one in every file.
+_ANCHOR = re.compile(r"(?<=[\s,\[{])([&*])id(\d+)\b")
+
+
+def refined_tree(content, view, label):
+    """The bytes of an ASDF file in which the WCS of an image is that of a solution, see `legdistort.refine`.
+
+    Parameters
+    ----------
+    content : bytes
+        The whole file.
+    view : View
+    label : str
+        How messages call it.
+
+    Raises
+    ------
+    InputError
+        If no gwcs stands where data models have it (`PLACES`), or it cannot be refined.
+    """
+    try:
+        tree = read_tree(label, content=content, tags=ARCHIVES)
+    except InputError as error:
+        raise InputError(f"{label}: the WCS in it cannot be exchanged: {error}") from None
+    for keys in PLACES:
+        if (wcs := _at(tree, keys)) is not None:
+            return _exchanged(content, keys, refine(wcs, view).stock(), label)
+    raise InputError(f"{label} has no gwcs at {' or '.join('.'.join(keys) for keys in PLACES)}")
+
+
+def has_wcs(content, label):
+    """Whether the bytes of an ASDF file hold a gwcs where data models have it."""
+    try:
+        tree = read_tree(label, content=content, tags=ARCHIVES)
+    except InputError:
+        return False
+    return any(hasattr(_at(tree, keys), "available_frames") for keys in PLACES)
+
+
+def table_of(header, content):
+    """Bytes of the one-row table of FITS that holds an ASDF file, with the header of another one."""
+    header = header.copy()
+    header["NAXIS1"], header["TFORM1"] = len(content), f"{len(content)}B"
+    raw = header.tostring().encode("ascii") + content + bytes(-len(content) % BLOCK)
+    if "CHECKSUM" not in header:
+        return raw
+    file, hdu = io.BytesIO(), fits.BinTableHDU.fromstring(raw)
+    hdu.add_checksum()
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(file)
+    return file.getvalue()[BLOCK:]
+
+
+def _at(tree, keys):
+    for key in keys:
+        tree = tree.get(key) if hasattr(tree, "get") else None
+    return tree
+
+
+def _exchanged(content, keys, wcs, label):
+    end = _END.search(content)
+    text, rest = content[: end.end()].decode("utf-8"), content[end.end() :]
+    standard = re.search(r"#ASDF_STANDARD (\S+)", text)
+    made = io.BytesIO()
+    nested = wcs
+    for key in reversed(keys):
+        nested = {key: nested}
+    asdf.AsdfFile(nested, version=standard[1] if standard else None).write_to(made, all_array_storage="inline")
+    own = made.getvalue().decode("utf-8")
+    if not (_HANDLE in own and _HANDLE in text):
+        raise InputError(f"{label}: the WCS in it cannot be exchanged: its tags are not those of the ASDF standard")
+    first, last = _span(text, keys)
+    new = _ANCHOR.sub(r"\1wcs\2", "".join(own[slice(*_span(own, keys))])).rstrip()
+    old = text[first:last]
+    changed = text[:first] + new + old[len(old.rstrip()) :] + text[last:]
+    if _others(changed, keys) != _others(text, keys):
+        raise InputError(f"{label}: the WCS in it cannot be exchanged: other parts of the file refer to it")
+    out = changed.encode("utf-8")
+    return out + _moved(rest, len(out) - len(content) + len(rest))
+
+
+def _span(text, keys):
+    """Where the value of nested keys begins and ends in a YAML text."""
+    node = yaml.compose(text, Loader=_LOADER)
+    for key in keys:
+        node = next(value for name, value in node.value if name.value == key)
+    starts = np.cumsum([0, *map(len, text.splitlines(keepends=True))])
+    return tuple(int(starts[mark.line]) + mark.column for mark in (node.start_mark, node.end_mark))
+
+
+def _others(text, keys):
+    """What a YAML text holds beside the value of nested keys, tags included."""
+
+    def plain(node, keys):
+        if isinstance(node, yaml.MappingNode):
+            inner = {
+                name.value: plain(value, keys[1:] if keys and name.value == keys[0] else None)
+                for name, value in node.value
+                if keys != (name.value,)
+            }
+            return node.tag, inner
+        if isinstance(node, yaml.SequenceNode):
+            return node.tag, [plain(value, None) for value in node.value]
+        return node.tag, node.value
+
+    try:
+        return plain(yaml.compose(text, Loader=_LOADER), keys)
+    except yaml.YAMLError:
+        return None
+
+
+def _moved(rest, by):
+    """The blocks of a file with the places in their index, if there is one, moved by so many bytes."""
+    place = rest.rfind(_INDEX)
+    if place < 0:
+        return rest
+    return rest[:place] + re.sub(rb"(?m)^- (\d+)", lambda found: b"- %d" % (int(found[1]) + by), rest[place:])
