@@ -20,7 +20,7 @@ from .cameras.camera import Camera, check_camera
 from .coaddition.mosaic_header import is_mosaic
 from .coaddition.mosaicking import coadd
 from .coaddition.options import CoaddOptions
-from .exceptions import InputError
+from .exceptions import AssumptionWarning, InputError, LegdistortError, warn
 from .inputs import exposure_files, table_files
 from .inputs.exposure_names import whole_name
 from .inputs.exposures import observed
@@ -41,6 +41,7 @@ from .runtime.guards.units import plain_numbers
 from .runtime.notebook import ShownAsPrinted
 from .runtime.progress import Bar
 from .runtime.trees.codec import to_tree
+from .runtime.words import CATALOGUES
 from .simulation.truth import Truth
 from .solving.estimation import solve
 from .solving.options import CLIP, DEGREE, SolveOptions, check_detectors, check_reference, prior_as_asked
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from astropy.units import Quantity
 
     from .coaddition.mosaic import Mosaic
+    from .photometry.catalogue import Catalogue
     from .priors.prior import Prior
     from .results.solution import Solution
     from .runtime.annotations import Extension, Images, StrPath
@@ -61,9 +63,11 @@ log = logging.getLogger(__name__)
 
 #: What `write_results` leaves of every solution.
 SOLVED = "solution.asdf", "stars.ecsv", "wcs/*.asdf"
+#: What `run` leaves with ``catalogue="joint"``.
+CATALOGUE = "catalogue.ecsv", "photometry.ecsv"
 #: What `run` and the command ``solve`` leave in their folder, and replace or remove there.
 RESULTS = (
-    *SOLVED, "psf/*.fits", "mosaic.fits", "report.html", "summary.json", "detections.ecsv", "matched.ecsv",
+    *SOLVED, "psf/*.fits", "mosaic.fits", *CATALOGUE, "report.html", "summary.json", "detections.ecsv", "matched.ecsv",
 )  # fmt: skip
 
 _begun: ContextVar[float | None] = ContextVar("_begun", default=None)
@@ -81,12 +85,15 @@ class Run(ShownAsPrinted):
     mosaic : Mosaic
     summary : dict
         Plain numbers and strings, see `legdistort.reporting.summary.summarise`.
+    catalogue : Catalogue or None
+        Of all exposures together, if it was asked for and can be made.
     """
 
     out: Path
     solution: Solution
     mosaic: Mosaic
     summary: dict[str, Any]
+    catalogue: Catalogue | None = None
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -119,6 +126,7 @@ def run(
     matching: Mapping[str, Any] | None = None,
     solving: Mapping[str, Any] | None = None,
     coadding: Mapping[str, Any] | None = None,
+    catalogue: str = "none",
     compare: bool = False,
     truth: Truth | None = None,
     stop_at_bad: bool = False,
@@ -161,6 +169,10 @@ def run(
     measuring, matching, solving, coadding : dict, optional
         Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`, all of them checked before a frame is
         read. The stack is ``"clipped"`` here: hot pixels and cosmic rays do not get into it.
+    catalogue : {'none', 'joint'}
+        'joint': also every star measured in all exposures at once (`legdistort.catalogue`), with what measuring was
+        told of detector and PSF, in ``catalogue.ecsv`` and ``photometry.ecsv``. Where none can be made there is a
+        warning, and all else is there.
     compare : bool
         Also correct by shifts, by the prior's static distortion and shifts, and by a relative polynomial
         (`legdistort.assessment.baselines`), and report the scatter and the sharpness of the stack that each of them
@@ -192,7 +204,7 @@ def run(
 
     See Also
     --------
-    legdistort.measure, legdistort.match, legdistort.solve, legdistort.coadd : Its steps.
+    legdistort.measure, legdistort.match, legdistort.solve, legdistort.coadd, legdistort.catalogue : Its steps.
 
     Examples
     --------
@@ -210,7 +222,7 @@ def run(
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
     tying = _tying(reference, reference_error, epoch, pixel_scale, solving)
-    _check_others(workers, truth)
+    _check_others(workers, truth, catalogue)
     paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
     share, timings = {"workers": workers, "progress": progress}, _of_start()
     with outputs.replacing_folder(out, results=RESULTS, keep=keep) as target:
@@ -229,26 +241,51 @@ def run(
         with timed(timings, "coadd"):
             kept = [exposure for exposure in exposures if whole_name(exposure) in solution.names]
             mosaic = coadd(kept, solution, **vars(coadding), **share)
+        joint = _catalogued(catalogue, kept, solution, measuring, psfs, coadding.scratch, timings, progress)
         with timed(timings, "assess"):
             quality = _if_possible(stack_quality.assess, mosaic, solution, exposures=kept)
-        comparison = stacks = None
-        if compare:
-            with timed(timings, "compare"):
-                comparison, stacks = _compared(matches, solution, solving, quality and mosaic, kept, coadding)
-        summary = summarise(solution, timings=timings) | _assessed(solution, kept, quality, comparison, stacks, truth)
+        comparison, stacks = _compared(compare, matches, solution, solving, quality and mosaic, kept, coadding, timings)
+        summary = summarise(solution, timings=timings) | _counted(joint)
+        summary |= _assessed(solution, kept, quality, comparison, stacks, truth)
         shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
         with parallel.beside(partial(_write_report, target, solution, summary, shown), workers=workers) as report:
             with timed(timings, "write"):
-                write_results(solution, target, psfs=psfs, mosaic=mosaic, progress=progress)
+                write_results(solution, target, psfs=psfs, mosaic=mosaic, joint=joint, progress=progress)
                 write_detections(target / "detections.ecsv", detections, exposures, Path(out), **reading)
                 write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
             summary = _written_summary(target, summary, timings, report)
-    return Run(Path(out), solution, mosaic, summary)
+    return Run(Path(out), solution, mosaic, summary, joint)
+
+
+def _catalogued(kind, exposures, solution, measuring, psfs, scratch, timings, progress):
+    """The catalogue of all exposures; None if its kind is "none", and with a warning where there can be none."""
+    if kind == "none":
+        return None
+    from .photometry.catalogue import catalogue  # it loads numba
+
+    told = {name: getattr(measuring, name) for name in ("fwhm", "gain", "read_noise", "saturation")}
+    psf = {exposure.name: psfs.get(exposure.name, "moffat") for exposure in exposures} if psfs else measuring.psf
+    try:
+        with timed(timings, "catalogue"):
+            return catalogue(exposures, solution, **told, psf=psf, scratch=scratch, progress=progress)
+    except LegdistortError as error:
+        warn(f"no catalogue of all exposures together: {error}", AssumptionWarning)
+        return None
+
+
+def _counted(joint):
+    """The entry of the summary on the catalogue of all exposures, if there is one."""
+    if joint is None:
+        return {}
+    meta = joint.stars.meta
+    counts = {name: meta[name] for name in ("n_new", "n_lost", "n_rejected", "n_images", "noise_peaks", "threshold")}
+    return {"catalogue": {"n_stars": len(joint.stars)} | counts}
 
 
 def _write_report(target, solution, summary, shown):
     """The report of all that `run` leaves, whether it is there yet or written beside it."""
-    files = linked_files(name for name in RESULTS if shown["psfs"] or not name.startswith("psf/"))
+    absent = CATALOGUE * ("catalogue" not in summary) + ("psf/*.fits",) * (not shown["psfs"])
+    files = linked_files(name for name in RESULTS if name not in absent)
     write_report(target / "report.html", solution, summary=summary, **shown, files=files)
 
 
@@ -342,9 +379,10 @@ def _step_options(kind, given, argument, *, defaults=None, **own):
     return checks.options_from(kind, given, argument)
 
 
-def _check_others(workers, truth):
+def _check_others(workers, truth, catalogue):
     """Raise `InputError` for arguments that no step looks at before it begins."""
     parallel.check_workers(workers)
+    checks.check_choice(catalogue, CATALOGUES, "catalogue")
     if truth is not None and not isinstance(truth, Truth):
         raise InputError(
             f"truth must be that of a simulation (simulate_exposures(...).truth), got {type(truth).__name__}"
@@ -372,10 +410,11 @@ def write_matched(path, matches, inputs, *, overwrite=False):
     table_files.write_table(table, path, overwrite=overwrite)
 
 
-def write_results(solution, target, *, psfs=None, mosaic=None, progress=False):
+def write_results(solution, target, *, psfs=None, mosaic=None, joint=None, progress=False):
     """Write ``solution.asdf``, ``stars.ecsv``, ``wcs/NAME.asdf``, ``psf/NAME.fits``, ``mosaic.fits`` into a folder.
 
-    Of a camera the WCSs are those of its detectors, ``wcs/NAME-DETECTOR.asdf``.
+    And ``catalogue.ecsv``, ``photometry.ecsv``, where there is a joint catalogue. Of a camera the WCSs are those of its
+    detectors, ``wcs/NAME-DETECTOR.asdf``.
     """
     solution.write(target / "solution.asdf")
     table_files.write_stars(solution, target / "stars.ecsv")
@@ -386,6 +425,8 @@ def write_results(solution, target, *, psfs=None, mosaic=None, progress=False):
     write_psfs(psfs or {}, target / "psf")
     if mosaic is not None:
         mosaic.write(target / "mosaic.fits")
+    if joint is not None:
+        joint.write(target / CATALOGUE[0])
 
 
 def linked_files(made):
@@ -408,10 +449,15 @@ def write_summary(path, summary):
         file.write(f"{json.dumps(summary, indent=1)}\n".encode())
 
 
-def _compared(matches, solution, solving, mosaic, kept, coadding):
-    """Other corrections, and the stacks that they make where that of the run could be judged."""
-    comparison = baselines.compare(matches, solution, prior=solving.prior)
-    stacks = mosaic and _if_possible(stack_quality.compare_stacks, kept, comparison, mosaic=mosaic, **vars(coadding))
+def _compared(wanted, matches, solution, solving, mosaic, kept, coadding, timings):
+    """Other corrections, and the stacks that they make where that of the run could be judged; None where not wanted."""
+    if not wanted:
+        return None, None
+    with timed(timings, "compare"):
+        comparison = baselines.compare(matches, solution, prior=solving.prior)
+        stacks = mosaic and _if_possible(
+            stack_quality.compare_stacks, kept, comparison, mosaic=mosaic, **vars(coadding)
+        )
     return comparison, stacks
 
 

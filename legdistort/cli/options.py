@@ -145,12 +145,14 @@ MEASURING = Group(
         ),
     },
 )
+SCRATCH = Option("for pixels while work goes on (default: system's)", type=Path, metavar="FOLDER")
 CATALOGUING = {
     **DETECTOR,
     "threshold": Option("signal-to-noise ratio of all exposures together (default 5)", type=float),
     "fwhm": MEASURING["fwhm"],
     "psf": Option("moffat, effective, or a file or folder with PSFs (default: as the solution's)", path="read"),
     "zero_point": Option("magnitude of unit flux in a mean exposure (default: no magnitudes)", type=float),
+    "scratch": SCRATCH,
 }
 PSF_FILES = {"write_psf": Option("folder for the effective PSF of every exposure", type=Path, path="folder")}
 INJECTING = {
@@ -254,11 +256,14 @@ COADDING = Group(
         "planes": Option(
             "beside the image in the file (default all); none: nothing", type=planes, metavar="UNCERT,..."
         ),
-        "scratch": Option("for pixels while work goes on (default: system's)", type=Path, metavar="FOLDER"),
+        "scratch": SCRATCH,
     },
 )
 GRID = {"grid": Option("image or header text whose grid is taken", type=Path, metavar="FILE", path="read")}
 COMPARING = {"compare": Option("also correct by shifts, static map and relative polynomial", action="store_true")}
+LAST_STEP = {
+    "catalogue": Option("joint: every star measured in all exposures at once (default none)", choices=words.CATALOGUES)
+}
 EXPANDING = {
     "where": Option(
         "a file or name, or the two maps of shifts in x and y", "sources", nargs="+", metavar="SOURCE", path="read"

@@ -44,6 +44,7 @@ COMMANDS = {
         options.SOLVING,
         options.COADDING,
         options.WORKERS,
+        options.LAST_STEP,
         options.COMPARING,
     ),
     "measure": _command(

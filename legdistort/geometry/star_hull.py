@@ -48,3 +48,17 @@ def supported(planes, xy):
         if not max(a * p + b * q + c for p, q in box) <= 1e-9:  # else all of the box is inside
             inside &= a * x + b * y + c <= 1e-9  # NaN is not
     return inside
+
+
+def supported_pixels(planes, shape):
+    """Which pixels of an image (ny, nx) lie within the half-planes of `support`, row by row."""
+    (x, y), low, high = (np.arange(n) for n in shape[::-1]), np.full(shape[0], -np.inf), np.full(shape[0], np.inf)
+    for a, b, c in planes:
+        rest = 1e-9 - b * y - c
+        if a == 0:
+            high[rest < 0] = -np.inf
+        elif a > 0:
+            np.minimum(high, rest / a, out=high)
+        else:
+            np.maximum(low, rest / a, out=low)
+    return (x >= low[:, None]) & (x <= high[:, None])

@@ -10,6 +10,7 @@ from functools import lru_cache
 from numbers import Real
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 
 from ..exceptions import InputError
@@ -23,6 +24,11 @@ DEFORMED = 4.0
 #: Signal-to-noise ratio of stars that determine what shape is usual.
 SHAPELY = 20
 
+#: FWHM: two stars nearer than that are one, where neighbours are fitted together.
+SAME = 0.2
+
+_CLOSE = 2.0  # FWHM of stars that touch
+_CROWD, _FEW = 0.05, 10  # of the detections, at least so many, have another one as close as that: a crowd
 _BETA = 3.0
 _REACH = 6.0  # FWHM: neighbours farther away than this pull at nothing but the background
 _QUARTILE = 0.3186  # of the absolute value of a unit normal
@@ -179,3 +185,32 @@ def is_deformed(shapes, covariance, *, xy, peak, snr, chi2, usable):
     noise = np.median(np.einsum("nii->ni", covariance[best]), axis=0)
     deviations = deviation(off, np.linalg.inv(covariance + known + np.diag(np.maximum(spread - noise, 0))))
     return deviations > DEFORMED * shapes.shape[1] * usual(deviations[best])  # the spread is known from few stars
+
+
+def is_crowded(frame, centres, width):
+    """Whether more than 5 % of the detections, and ten, have another one within two FWHM.
+
+    Those beside saturated pixels and defects do not count: trails and tracks break up into many.
+
+    Parameters
+    ----------
+    frame : `~legdistort.measurement.detection.Frame`
+    centres : ndarray of int, shape (n, 2)
+        Detections.
+    width : float
+        Full width at half maximum [pix].
+    """
+    if not _have_neighbours(centres, width):
+        return False
+    bad = frame.saturated if frame.defects is None else frame.saturated | frame.defects
+    if bad.any():
+        bad = binary_dilation(bad, iterations=int(np.ceil(_CLOSE * width)))
+        centres = centres[~bad[centres[:, 1], centres[:, 0]]]
+    return _have_neighbours(centres, width)
+
+
+def _have_neighbours(centres, width):
+    if len(centres) < _FEW:
+        return False
+    nearest = KDTree(centres).query(centres, k=2)[0][:, 1]
+    return np.count_nonzero(nearest < _CLOSE * width) >= max(_FEW, _CROWD * len(centres))

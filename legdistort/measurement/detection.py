@@ -131,6 +131,11 @@ def bright_peaks(frame, fwhm):
     return np.column_stack([x, y])[use][np.argsort(-ratio[use], kind="stable")]
 
 
+def sky_noise(frame, fwhm):
+    """The frame with the variance of the sky alone, as `detect` gives it, without a look for stars."""
+    return _filtered(frame, fwhm)[0]
+
+
 def detect(frame, fwhm, threshold):
     """Peaks of the frame filtered with a Gaussian from which the local light has been taken off.
 
@@ -156,6 +161,25 @@ def detect(frame, fwhm, threshold):
         With the variance of the sky alone, as seen where there are no stars; unchanged if the noise was given.
     """
     sigma = _kernel(fwhm)
+    frame, residual, filtered, noise, (extrapolated, step) = _filtered(frame, fwhm)
+    image, variance = _best(residual, filtered, noise, frame, sigma)
+    reach = max(1, int(fwhm / 2))
+    x, y = _peaks(image, variance, threshold, reach)
+    bad = frame.saturated if frame.defects is None else frame.saturated | frame.defects
+    spoilt = binary_dilation(bad, iterations=int(np.ceil(2 * sigma))) if bad.any() else None
+    if (structure := pupil_structure(image, variance, x, y, fwhm, threshold, hidden=spoilt)) is not None:
+        image, variance = image - structure[0], variance + structure[1]
+        x, y = _peaks(image, variance, threshold, reach)
+    ratio = image[y, x] / np.sqrt(variance[y, x])
+    # of the light of a peak, the part that is neither a side lobe nor an error of the light taken off
+    other = side_light(filtered, x, y, fwhm, hidden=spoilt) + _EXTRAPOLATED * extrapolated[y // step, x // step]
+    star = ratio * (1 - other / np.maximum(filtered[y, x], np.finfo(np.float32).tiny)) > threshold
+    return np.column_stack([x, y])[star][np.argsort(-ratio[star], kind="stable")], frame
+
+
+def _filtered(frame, fwhm):
+    """The frame with its variance; what local light leaves, that filtered, its noise, what is extrapolated."""
+    sigma = _kernel(fwhm)
     seen = frame.good & ~frame.saturated
     # The sky is put back: in crowded fields its map follows the halos, in steps that would pass for stars.
     sky = frame.sky if frame.levels is None else frame.sky - frame.levels
@@ -173,19 +197,7 @@ def detect(frame, fwhm, threshold):
         )  # fmt: skip
         frame = replace(frame, variance=variance)
         variance = variance + np.float32(photon) * np.maximum(light, 0, out=light)
-    image, variance = _best(residual, filtered, (norm, variance), frame, sigma)
-    reach = max(1, int(fwhm / 2))
-    x, y = _peaks(image, variance, threshold, reach)
-    bad = frame.saturated if frame.defects is None else frame.saturated | frame.defects
-    spoilt = binary_dilation(bad, iterations=int(np.ceil(2 * sigma))) if bad.any() else None
-    if (structure := pupil_structure(image, variance, x, y, fwhm, threshold, hidden=spoilt)) is not None:
-        image, variance = image - structure[0], variance + structure[1]
-        x, y = _peaks(image, variance, threshold, reach)
-    ratio = image[y, x] / np.sqrt(variance[y, x])
-    # of the light of a peak, the part that is neither a side lobe nor an error of the light taken off
-    other = side_light(filtered, x, y, fwhm, hidden=spoilt) + _EXTRAPOLATED * extrapolated[y // step, x // step]
-    star = ratio * (1 - other / np.maximum(filtered[y, x], np.finfo(np.float32).tiny)) > threshold
-    return np.column_stack([x, y])[star][np.argsort(-ratio[star], kind="stable")], frame
+    return frame, residual, filtered, (norm, variance), (extrapolated, step)
 
 
 def peaks_above(image, limit, reach):

@@ -19,7 +19,7 @@ from ..runtime import outputs
 from ..runtime.guards.units import plain_numbers
 from ..runtime.parallel import map_items
 from . import across_frames, camera_gain
-from .crowding import SHAPELY, crowding, is_deformed
+from .crowding import SAME, SHAPELY, crowding, is_crowded, is_deformed
 from .detections import FrameStars, Stars, distinct, empty_table, table_of, with_defects
 from .effective import frame_psf
 from .effective.building import STARS_NEEDED
@@ -33,8 +33,6 @@ from .profiles import frame_fit, moffat, pixel_noise
 from .profiles.cutouts import Stamps, box_half
 from .profiles.defects import defect_peaks
 from .profiles.location import locate_stars
-from .scene.measuring import is_crowded, measure_crowd
-from .scene.search import SAME
 
 if TYPE_CHECKING:
     from ..inputs.exposures import Exposure
@@ -442,7 +440,11 @@ def measure_scaled(exposure, options):
     if stamps is None:
         return MeasuredExposure(empty_table(), None, None, frame_psf.Verdict("moffat", 0), hidden=hidden)
     fwhm = float(moffat.fwhm(shape))
-    found = measure_crowd(stamps, shape, options, options.psf_of(name)) if crowd else None
+    found = None
+    if crowd:
+        from .scene.measuring import measure_crowd  # it loads numba
+
+        found = measure_crowd(stamps, shape, options, options.psf_of(name))
     joint = found is not None
     if not joint:
         found = _measure_groups(stamps, shape, options, options.psf_of(name))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ from ..measurement.options import MeasureOptions
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.parallel import map_items
+from ..runtime.scratch import moved, scratch_folder
 from .joint_scene import JointScene
 from .measuring import measure_field
 from .reading import read_layer
@@ -32,6 +34,9 @@ if TYPE_CHECKING:
     from ..runtime.annotations import StrPath
 
 log = logging.getLogger(__name__)
+
+_STORED, _SUMMED = 24, 24  # bytes a pixel of the exposures, at most, and of the reference plane
+_IN_MEMORY = 1 << 30  # bytes of them up to which they need not go to the disk
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,6 +131,7 @@ def catalogue(
     read_noise: float | None = None,
     saturation: float | None = None,
     zero_point: float | None = None,
+    scratch: StrPath | None = None,
     progress: bool = False,
 ) -> Catalogue:
     """Find and measure every star in all exposures at once, by the maps of a solution.
@@ -136,7 +142,8 @@ def catalogue(
     bright stars. What one exposure alone shows, such as the hit of a particle, is no star. Images count where stars
     determined their map (`View.supported`; of a camera those of all detectors), and a core's width beyond.
 
-    All pixels are held in memory, about 35 bytes for each, and 24 for each of the reference plane.
+    In memory are the pixels of one exposure at a time, some 60 bytes for each, where those of all would take more than
+    1 GB; the others are on disk. The catalogue is the same, bit for bit.
 
     Parameters
     ----------
@@ -154,6 +161,9 @@ def catalogue(
         In e-/ADU, e-, ADU; for all exposures instead of their own values.
     zero_point : float, optional
         Magnitude of a star of unit flux in an exposure of mean transmission; without it there are no magnitudes.
+    scratch : str or path, optional
+        Folder for pixels while work goes on, if they do not stay in memory: 24 bytes for each of the exposures, and for
+        each of the reference plane. The default is that of the system (``TMPDIR``), which some systems keep in memory.
     progress : bool
         Show progress bars.
 
@@ -167,6 +177,8 @@ def catalogue(
         For a value out of range, an exposure whose shape is not that of the solution, a solution with motions of stars,
         which this does not fit, one of a camera whose detectors no star ties together, and where no exposure can be
         used.
+    DiskFullError
+        If the disk of `scratch` has less space than will be needed.
 
     Warns
     -----
@@ -195,22 +207,31 @@ def catalogue(
     _check_solution(solution)
     frames, views, left_out = select_images(exposures, solution, "measure", "the catalogue")
     grid = reference_grid(list(views.values()), solution.sky)
-    share = partial(map_items, workers=1, progress=progress)
-    read = share(partial(_read, views=views, grid=grid, options=options), frames, description="reading")
-    layers = []
-    for frame, layer in zip(frames, read, strict=True):
-        if isinstance(layer, str):
-            left_out[frame.name] = layer
-            warn_of_left_out({frame.name: layer}, "the catalogue")
-        else:
-            layers.append(layer)
-    if not layers:
-        raise InputError(f"no exposure can be measured: {reasons_of(left_out)}")
-    use_compiled_loops(sum(layer.scene.light.size for layer in layers))
-    field = JointScene(layers, grid, progress=progress)
+    use_compiled_loops(sum(int(np.prod(frame.shape)) for frame in frames))
+    need = _STORED * sum(int(np.prod(frame.shape)) for frame in frames) + _SUMMED * int(np.prod(grid.shape))
+    what = f"the pixels of {len(frames)} exposures and of the plane they share"
+    with nullcontext() if need <= _IN_MEMORY else scratch_folder(scratch, need, what) as folder:
+        read = partial(_read, views=views, grid=grid, options=options, folder=folder)
+        read = map_items(read, frames, workers=1, progress=progress, description="reading")
+        layers = []
+        for frame, layer in zip(frames, read, strict=True):
+            if isinstance(layer, str):
+                left_out[frame.name] = layer
+                warn_of_left_out({frame.name: layer}, "the catalogue")
+            else:
+                layers.append(layer)
+        if not layers:
+            raise InputError(f"no exposure can be measured: {reasons_of(left_out)}")
+        field = JointScene(layers, grid, folder=folder, progress=progress)
+        return _measured(field, solution, frames, left_out, threshold, zero_point)
+
+
+def _measured(field, solution, frames, left_out, threshold, zero_point):
+    """The catalogue of a scene that has no stars yet."""
     estimate = solution.estimate
-    clipped = np.array([layer.places.left_out(estimate.star_names) for layer in layers])
-    measured = measure_field(field, estimate.positions, clipped, threshold)
+    order = np.argsort(estimate.positions[:, 1], kind="stable")  # stars that are near in the memory are near on images
+    clipped = np.array([layer.places.left_out(np.asarray(estimate.star_names)[order]) for layer in field.layers])
+    measured = measure_field(field, estimate.positions[order], clipped, threshold)
     if not len(field.flux):
         raise InputError(f"no star stands out of all exposures together by {threshold:g} times the noise")
     stars = stars_table(field, measured, solution, threshold, zero_point)
@@ -231,5 +252,9 @@ def _check_solution(solution):
         )
 
 
-def _read(frame, views, grid, options):
-    return read_layer(frame, views[frame.name], grid, options)
+def _read(frame, views, grid, options, folder):
+    """The layer of an image, its pixels on the disk of a folder if there is one."""
+    layer = read_layer(frame, views[frame.name], grid, options)
+    if folder is not None and not isinstance(layer, str):
+        layer.scene.replace_planes(partial(moved, folder=folder))
+    return layer

@@ -3,20 +3,28 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.sparse import bsr_array, csc_array
 
-from ..coaddition.resampling import engines
-from ..coaddition.resampling.engines import Resampling, resample
 from ..measurement.detection import peaks_above
-from ..measurement.scene.normal_equations import JointFit, neighbour_covariance, normal_matrix, solved
+from ..measurement.scene.normal_equations import JointFit, assembled, neighbour_covariance, normal_matrix, solved
 from ..runtime.progress import Bar
+from ..runtime.scratch import forget
+from . import likelihood_sum
 
-_STRIP = 256  # rows of the reference plane that are carried at a time
-_MARGIN = 12  # pixels around what is interpolated: splines have forgotten its edge by then
+_ROWS = 256  # of the reference plane that are looked at together
 #: Exposures from which a star must stand without the strongest; signal-to-noise ratio that it may lose by that.
 CONFIRMED, LESS = 3, 1.0
-_UNSEEN = -1e30
+_NOTHING = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3, 3))  # of no star
 _LEAST = 1e-3  # of the weight of the best seen star of an image: what has less is not seen
+
+
+class Layers(list):
+    """Every `Layer` of a scene; what is on the disk of one leaves the memory before the next has its turn."""
+
+    def __iter__(self):
+        for layer in super().__iter__():
+            yield layer
+            for plane in layer.scene.planes():
+                forget(plane)
 
 
 @dataclass(eq=False)
@@ -83,6 +91,8 @@ class JointScene(JointFit):
     layers : list of Layer
     grid : `~legdistort.coaddition.grids.Grid`
         Of the reference plane, on which the exposures are summed.
+    folder : path, optional
+        On the disk of which the sums are; by default in the memory.
 
     Attributes
     ----------
@@ -94,8 +104,8 @@ class JointScene(JointFit):
         Pixels of the plane that the exposures cover.
     """
 
-    def __init__(self, layers, grid, *, progress=False):
-        self.layers, self.grid, self.rejected, self.area = layers, grid, 0, 0
+    def __init__(self, layers, grid, *, folder=None, progress=False):
+        self.layers, self.grid, self.folder, self.rejected, self.area = Layers(layers), grid, folder, 0, 0
         self.progress = progress
         self.xy, self.flux = np.zeros((0, 2)), np.zeros(0)
         self.fwhm = float(np.median([each.scene.fwhm / _scale(each) for each in layers]))
@@ -149,19 +159,18 @@ class JointScene(JointFit):
 
     def equations(self, rows):
         """Normal matrix (3 m, 3 m) and right side of some stars' x, y and flux, sparse."""
-        normal, right = csc_array((3 * len(rows),) * 2), np.zeros(3 * len(rows))
+        parts, right = [], np.zeros((len(rows), 3))
         for layer in self.layers:
             there = np.flatnonzero(layer.rows[rows] >= 0)
             if len(there):
-                own, side = layer.scene.equations(layer.rows[rows[there]])
-                blocks = np.zeros((len(there), 3, 3))
+                (i, j, blocks), side = layer.scene.blocks(layer.rows[rows[there]])
+                through = np.zeros((len(there), 3, 3))
                 slopes = np.nan_to_num(layer.places.place(self.xy[rows[there]]).slopes)
-                blocks[:, :2, :2] = np.where(layer.trusted[rows[there], None, None], slopes, 0)
-                blocks[:, 2, 2] = layer.transmission
-                through = bsr_array((blocks, there, np.arange(len(there) + 1)), shape=(own.shape[0], len(right)))
-                normal += (through.T @ own @ through).tocsc()
-                right += through.T @ side
-        return normal, right
+                through[:, :2, :2] = np.where(layer.trusted[rows[there], None, None], slopes, 0)
+                through[:, 2, 2] = layer.transmission
+                parts.append((there[i], there[j], through[i].mT @ blocks @ through[j]))
+                right[there] += (side[:, None] @ through)[:, 0]
+        return assembled(parts or [_NOTHING], len(rows)), right.ravel()
 
     def update_sky(self):
         """The sky of every exposure changed by what is left."""
@@ -191,22 +200,21 @@ class JointScene(JointFit):
             total[there] += layer.scene.chi2_around(place.pixel[there])
         return total
 
-    def fluxes(self, layer):
+    def fluxes(self, layer, rows=None):
         """Fluxes of the stars of an image and their errors, positions fixed, neighbours together; (m,) each.
 
-        In the unit of the star's flux. The error is infinite where the image does not see the star.
+        In the unit of the star's flux. The error is infinite where the image does not see the star, and of stars that
+        are not among some rows of its scene.
         """
         scene, m = layer.scene, len(layer.scene.flux)
         if not m:
             return np.zeros(0), np.zeros(0)
-        slopes, pixels, centres = scene.slopes(np.arange(m))
-        slopes = slopes[:, 2:]
+        slopes, right, centres = scene.slopes(np.arange(m), flux_alone=True)
         normal = normal_matrix(slopes, centres, scene.half)
-        left = np.sqrt(scene.weights, dtype=float) * scene.residual
-        right = np.einsum("np,np->n", slopes[:, 0], left.ravel()[pixels])
         diagonal = normal.diagonal()
-        flux = scene.flux + solved(normal, right, np.sqrt(np.maximum(diagonal, 1e-30)))
-        error = np.sqrt(neighbour_covariance(normal, scene.xy, scene.fwhm)[:, 0, 0])
+        flux = scene.flux + solved(normal, right[:, 0], np.sqrt(np.maximum(diagonal, 1e-30)))
+        rows, error = np.arange(m) if rows is None else rows, np.full(m, np.inf)
+        error[rows] = np.sqrt(neighbour_covariance(normal, scene.xy, scene.fwhm, rows)[:, 0, 0])
         seen = scene.snr() ** 2 > _LEAST * scene.flux**2 * diagonal.max()
         return flux / layer.transmission, np.where(seen, error, np.inf) / layer.transmission
 
@@ -214,16 +222,23 @@ class JointScene(JointFit):
 
     def candidates(self, threshold):
         """Peaks of the summed likelihood that stand without their strongest exposure: places (n, 2), fluxes (n,)."""
-        signal, norm, strongest = self.summed_likelihood()
-        ratio = signal / np.sqrt(np.maximum(norm, 1e-30))
-        x, y = peaks_above(ratio, threshold, max(1, int(self.fwhm / 2)))
-        one, weight, count = (each[y, x] for each in strongest[1:])
+        (signal, norm), strongest = self.summed_likelihood()
+        reach, ny, found, self.area = max(1, int(self.fwhm / 2)), self.grid.shape[0], [], 0
+        for start in range(0, ny, _ROWS):
+            low, stop = max(0, start - reach), min(start + _ROWS, ny)
+            rows = slice(low, stop + reach)
+            x, y = peaks_above(signal[rows] / np.sqrt(np.maximum(norm[rows], 1e-30)), threshold, reach)
+            own = (y + low >= start) & (y + low < stop)
+            found.append(np.column_stack([x, y + low])[own])
+            self.area += int(np.count_nonzero(norm[start:stop]))
+        x, y = np.concatenate(found).T
+        one, weight, count = strongest[1:, y, x]
         rest = (signal[y, x] - one) / np.sqrt(np.maximum(norm[y, x] - weight, 1e-30))
         stands = (count < CONFIRMED) | (rest > threshold - LESS)
         self.rejected = int(np.count_nonzero(~stands))
-        self.area = int(np.count_nonzero(norm))
         x, y = x[stands], y[stands]
-        return self.grid.to_reference(np.column_stack([x, y]).astype(float)), (signal / np.maximum(norm, 1e-30))[y, x]
+        flux = signal[y, x] / np.maximum(norm[y, x], 1e-30)
+        return self.grid.to_reference(np.column_stack([x, y]).astype(float)), flux
 
     def noise_peaks(self, threshold):
         """Expected number of peaks of noise above a threshold in the area covered.
@@ -234,33 +249,13 @@ class JointScene(JointFit):
         return float(self.area * t * np.exp(-t * t / 2) / ((2 * np.pi) ** 1.5 * 2 * s * s))
 
     def summed_likelihood(self):
-        """Likelihood of one more star at every pixel of the grid: signal, norm (ny, nx) as those of a scene, and the
-        ratio, signal and norm of the exposure with the greatest ratio and the number of exposures, (4, ny, nx).
+        """Likelihood of one more star at every pixel of the grid: signal and norm as those of a scene, (2, ny, nx), and
+        the ratio, signal and norm of the exposure with the greatest ratio and the number of exposures, (4, ny, nx).
         """
-        ny, nx = self.grid.shape
-        compiled = engines.uses_compiled_splines("interp", 3, ny * nx * len(self.layers))
-        linear, cubic = (Resampling(order=order, compiled=compiled) for order in (1, 3))
-        signal, norm, best = (np.zeros((*k, ny, nx), np.float32) for k in ((), (), (4,)))
-        best[0] = -np.inf
+        sums, best = likelihood_sum.empty_sums(self.grid.shape, self.folder)
         for layer in Bar(self.layers, desc="searching", unit="frame", disable=not self.progress):
-            own, weight = layer.scene.likelihood()
-            weight = np.where(weight > 0, weight, _UNSEEN)
-            for start in range(0, ny, _STRIP):
-                found = layer.grid_map.piece((slice(start, start + _STRIP), slice(0, nx)), margin=_MARGIN)
-                if found is not None:
-                    piece, part = found
-                    n, s = resample([weight[part]], piece, linear)[0], resample([own[part]], piece, cubic)[0]
-                    s, n = layer.transmission * s, layer.transmission**2 * n
-                    there = n > 0  # NaN is not: it lies outside
-                    r = np.where(there, s / np.sqrt(np.where(there, n, 1)), -np.inf)
-                    signal[piece.window] += np.where(there, s, 0)
-                    norm[piece.window] += np.where(there, n, 0)
-                    window = best[:, *piece.window]
-                    higher = r > window[0]
-                    for plane, values in zip(window, (r, s, n), strict=False):
-                        plane[higher] = values[higher]
-                    window[3] += there
-        return signal, norm, best
+            likelihood_sum.add_layer(layer, sums, best)
+        return sums, best
 
 
 def _scale(layer):

@@ -47,12 +47,12 @@ class Places:
 
         Of a detector in a focal plane, the stars of all detectors of the exposure.
         """
-        pixels = np.indices(shape)[::-1].reshape(2, -1)
-        if self.view.chip is not None:
-            pixels = self.view.chip.to_focal_plane(pixels.T.astype(float)).T
         planes = star_hull.support(self.view.common.residuals)
         if len(planes) >= 3:  # fewer stand for no area
             planes = planes - [0, 0, margin]
+        if self.view.chip is None:
+            return star_hull.supported_pixels(planes, shape)
+        pixels = self.view.chip.to_focal_plane(np.indices(shape)[::-1].reshape(2, -1).T.astype(float)).T
         return star_hull.supported(planes, pixels).reshape(shape)
 
     def covariance(self, pixels):

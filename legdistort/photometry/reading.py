@@ -36,8 +36,8 @@ def read_layer(exposure, view, grid, options):
     unit = noise_unit(exposure)
     exposure = in_working_unit(exposure, unit)
     options = replace(options, gain=None, saturation=None)  # the exposure has them
-    frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm)
-    if not len(centres):
+    frame, centres, shape = locate_stars(exposure, threshold=options.threshold, fwhm=options.fwhm, known=True)
+    if centres is not None and not len(centres):
         return "no star is seen in it"
     width = float(moffat.fwhm(shape))
     half = options.box // 2 if options.box else box_half(width)
@@ -45,7 +45,7 @@ def read_layer(exposure, view, grid, options):
     if photon is None:
         photon = frame_fit.photon_noise(Stamps(frame, centres, half), shape)
     places = Places(view)
-    frame = replace(frame, good=frame.good & places.supported(frame.good.shape, _CORE * width))
+    frame = replace(frame, good=frame.good & places.supported(frame.good.shape, _CORE * width), sky=None, levels=None)
     if psf == "effective":
         psf = measure_exposure(exposure, replace(options, psf="effective")).psf
         if psf is None:

@@ -5,6 +5,7 @@ from scipy.ndimage import map_coordinates
 
 _BRIGHT = 50.0  # signal-to-noise ratio of the stars that determine them
 _FEWEST = 5  # stars: with fewer that are bright, the brightest that there are
+_LOOK = 50  # stars, at least, the brightest, of which it is looked which are seen
 _OUTLIER = 5.0  # deviations from the median
 _ROUNDS = 3
 
@@ -44,8 +45,9 @@ def update(field):
     """Transmissions by the fluxes that the stars have in each exposure now; their relative errors by layer."""
     snr, errors = field.snr(), []
     for layer in field.layers:
-        flux, error = field.fluxes(layer)
         stars, t = layer.stars, layer.transmission
+        order = np.argsort(-snr[stars], kind="stable")
+        flux, error = field.fluxes(layer, order[: max(np.count_nonzero(snr[stars] >= _BRIGHT), _LOOK)])
         layer.transmission, error = _ratio(t * flux, t * error, field.flux[stars], snr[stars], t)
         errors.append(error / layer.transmission)
     level = np.exp(np.mean([np.log(layer.transmission / layer.unit) for layer in field.layers]))

@@ -73,6 +73,8 @@ def solution_rows(solution, facts):
         rows["Scatter of corrected positions"] = per_axis(facts["sigma_px"])
     if facts.get("quality"):
         rows["Stars in the mosaic"] = _sharpness(facts["quality"])
+    if joint := facts.get("catalogue"):
+        rows["Catalogue of all exposures"] = "{n_stars} stars, {n_new} of them new".format(**joint)
     error = facts["max_inverse_error_px"]
     rows["Largest error of an inverse"] = error if isinstance(error, str) else f"{error:.1e} px"
     rows["Minimisation"] = solution.status

@@ -73,7 +73,7 @@ def scratch_folder(parent, need, what="the pixels"):
         except OSError as error:
             if isinstance(error, DiskFullError) or not is_full(error, place):
                 raise
-            raise DiskFullError(f"No space left on the disk of {place}: {advice}; no mosaic was made") from None
+            raise DiskFullError(f"No space left on the disk of {place}: {advice}; nothing was made") from None
 
 
 def store(folder, planes):
@@ -130,6 +130,16 @@ def spill(shape, value, dtype, folder):
             file.write(values[: size - start])
         file.flush()
         return np.frombuffer(_Shared(file.fileno(), size * values.itemsize), dtype).reshape(shape)
+
+
+def moved(array, folder):
+    """The array on disk, as those of `spill`; None stays None."""
+    if array is None:
+        return None
+    out = spill(array.shape, 0, array.dtype, folder)
+    out[:] = array
+    forget(out)
+    return out
 
 
 def forget(array):

@@ -25,6 +25,9 @@ CAMERA = ("hold", "prior", "fit")
 #: What of a camera has a distortion of its own in every exposure.
 DYNAMIC = ("focal_plane", "detector")
 
+# -- the catalogue of all exposures, as the last step of a run
+CATALOGUES = ("none", "joint")
+
 # -- co-adding
 COMBINATIONS = ("mean", "median", "clipped")
 ALGORITHMS = ("interp", "adaptive", "exact", "drizzle")

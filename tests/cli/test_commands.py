@@ -40,7 +40,7 @@ from legdistort.simulation.observations import simulate_exposures
 from legdistort.simulation.pupil import PupilPSF
 from legdistort.wcs.attachment import attach
 
-RESULTS = {path.split("/")[0] for path in pipeline.RESULTS} - {"psf"}
+RESULTS = {path.split("/")[0] for path in pipeline.RESULTS} - {"psf", *pipeline.CATALOGUE}
 
 
 @pytest.fixture(scope="module")
@@ -486,7 +486,7 @@ def test_help_has_an_example(command, capsys):
         (write_examples, [options.EXAMPLES]),
         (simulate_exposures, [options.NIGHT]),
         (PupilPSF, [options.OPTICS]),
-        (legdistort.run, [options.RUN_FRAMES, options.WORKERS, options.COMPARING]),
+        (legdistort.run, [options.RUN_FRAMES, options.WORKERS, options.LAST_STEP, options.COMPARING]),
         (measure, [options.MEASURING, options.WORKERS]),
         (calibrate_noise, [options.INJECTING, options.WORKERS]),
         (match, [options.MATCHING]),

@@ -10,13 +10,13 @@ from scipy.spatial import cKDTree
 import legdistort as ld
 from legdistort.exceptions import InputError
 from legdistort.inputs.exposures import Exposure
-from legdistort.measurement import positions
+from legdistort.measurement.crowding import is_crowded
 from legdistort.measurement.detection import Frame
 from legdistort.measurement.flags import UNUSABLE, Flag
 from legdistort.measurement.profiles import moffat
+from legdistort.measurement.scene import measuring
 from legdistort.measurement.scene.confusion import confusion
 from legdistort.measurement.scene.joint_fit import Scene
-from legdistort.measurement.scene.measuring import is_crowded
 from legdistort.measurement.scene.moffat_field import MoffatField
 
 SIZE = 256
@@ -98,7 +98,7 @@ def test_frames_that_are_no_crowd_are_none_of_this(monkeypatch):
     def never(*args):
         raise AssertionError("a sparse frame has been taken for a crowd")
 
-    monkeypatch.setattr(positions, "measure_crowd", never)
+    monkeypatch.setattr(measuring, "measure_crowd", never)
     rng = np.random.default_rng(5)
     xy, flux = rng.uniform(10, 290, (40, 2)), 10 ** rng.uniform(3, 5, 40)
     data = rng.poisson(king.rendered(xy, flux, 300) + king.SKY).astype(np.float32)

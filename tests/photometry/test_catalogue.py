@@ -1,5 +1,7 @@
 """Every star measured in all exposures at once, against frames made without the package."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -184,6 +186,76 @@ def test_files_and_command(truth, solution, tmp_path, capsys):
     (tmp_path / "photometry.ecsv").unlink()
     assert main([*call[:-3], str(tmp_path / "photometry.ecsv")]) == 1
     assert "give the catalogue another" in capsys.readouterr().err
+
+
+def test_pixels_on_the_disk_give_the_same_catalogue(truth, solution, found, tmp_path, monkeypatch):
+    """Bit for bit, looked at a few rows at a time; nothing is left behind."""
+    monkeypatch.setattr(ld.photometry.catalogue, "_IN_MEMORY", 0)
+    monkeypatch.setattr(ld.photometry.joint_scene, "_ROWS", 37)
+    other = ld.catalogue(exposures_of(truth), solution, zero_point=25.0, scratch=tmp_path)
+    for one, same in ((found.stars, other.stars), (found.photometry, other.photometry)):
+        assert one.meta == same.meta
+        for name in one.colnames:
+            np.testing.assert_array_equal(np.asarray(one[name]), np.asarray(same[name]))
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="no scratch folder can be made"):
+        ld.catalogue(exposures_of(truth), solution, scratch=tmp_path / "none")
+
+
+def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
+    """That of the solution which it leaves; without one where there can be none, by a warning."""
+    paths = []
+    for k, data in enumerate(truth.frames[:4]):
+        paths.append(tmp_path / f"f{k:02d}.fits")
+        fits.PrimaryHDU(data, fits.Header([("GAIN", 1.0)])).writeto(paths[-1])
+    with pytest.raises(InputError, match="catalogue must be one of 'none', 'joint', got 'all'"):
+        ld.run(paths, out=tmp_path / "out", catalogue="all")
+    made = ld.run(paths, out=tmp_path / "out", psf="moffat", degree=1, catalogue="joint")
+    expected = ld.catalogue(ld.open_exposures(paths), ld.Solution.read(made.out), psf="moffat")
+    stars, photometry = (QTable.read(made.out / name) for name in ("catalogue.ecsv", "photometry.ecsv"))
+    for found, same in ((stars, expected.stars), (photometry, expected.photometry)):
+        np.testing.assert_allclose(found["flux"], same["flux"], rtol=1e-6)
+    assert made.summary["catalogue"]["n_stars"] == len(made.catalogue.stars) == len(stars)
+    assert {"catalogue.ecsv", "photometry.ecsv"} <= set(made.summary["files"])
+    report = (made.out / "report.html").read_text()
+    assert f"{len(stars)} stars, {stars.meta['n_new']} of them new" in report
+    assert 'href="photometry.ecsv"' in report
+
+    def impossible(_):
+        raise InputError("the solution has motions of stars")
+
+    monkeypatch.setattr(ld.photometry.catalogue, "_check_solution", impossible)
+    options = {"earlier": made.out, "degree": 1, "overwrite": True, "catalogue": "joint"}
+    with pytest.warns(AssumptionWarning, match="no catalogue of all exposures together: the solution has motions"):
+        made = ld.run(paths, out=made.out, **options)
+    assert made.catalogue is None
+    assert "catalogue" not in made.summary
+    names = {path.name for path in made.out.iterdir()}
+    assert {"mosaic.fits", "solution.asdf", "report.html"} <= names
+    assert not names & {"catalogue.ecsv", "photometry.ecsv"}
+    assert "photometry.ecsv" not in (made.out / "report.html").read_text()
+
+
+_PEAK = """
+import sys, legdistort as ld
+from legdistort.photometry import catalogue as verb
+verb._IN_MEMORY = int(sys.argv.pop(1))
+ld.catalogue(ld.open_exposures(sys.argv[2:]), ld.Solution.read(sys.argv[1]), threshold=9)
+print(*(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="its /proc tells the largest memory")
+def test_memory_does_not_grow_with_the_number_of_exposures(tmp_path):
+    truth = deep_frames(4, size=768, n_stars=400, n_frames=10, bounds=False)
+    paths = [str(tmp_path / f"f{k:02d}.fits") for k in range(10)]
+    for path, data in zip(paths, truth.frames, strict=True):
+        fits.PrimaryHDU(data, fits.Header([("GAIN", 1.0)])).writeto(path)
+    solved(truth).write(tmp_path / "solution.asdf")
+    call = [sys.executable, "-W", "ignore", "-c", _PEAK, "0", str(tmp_path / "solution.asdf")]
+    peaks = [int(subprocess.run([*call, *paths[:n]], capture_output=True, check=True).stdout) for n in (3, 10)]
+    assert peaks[1] - peaks[0] < 3 * 24 * 768**2 / 1024  # kB: what three exposures store, of seven more
 
 
 @pytest.mark.slow

@@ -26,8 +26,7 @@ def interpolate(image, xy, order, out):
     out : ndarray of float64, shape (my, mx)
         For the values: NaN outside the pixels; on their outer halves, that at the centre.
     """
-    cubic = order == 3
-    _evaluate(_coefficients(image) if cubic else image, xy, out, cubic)
+    _evaluate(coefficients(image) if order == 3 else image, xy, out, order == 3)
 
 
 @compiled_loop(nogil=True)
@@ -52,8 +51,8 @@ def _mirror(i, n):
 
 
 @compiled_loop(nogil=True)
-def _coefficients(image):
-    """Of the cubic B-splines through the pixels (Unser 1999, IEEE Signal Processing Magazine 16, 22, Box 2)."""
+def coefficients(image):
+    """Those of the cubic B-splines through the pixels (Unser 1999, IEEE Signal Processing Magazine 16, 22, Box 2)."""
     ny, nx = image.shape
     z = _POLE
     c = np.empty((ny, nx))
@@ -83,7 +82,7 @@ def _coefficients(image):
 
 
 @compiled_loop(nogil=True)
-def _place(x, n):
+def place(x, n):
     """Pixel before a coordinate and the fraction behind it; -1 outside."""
     if not -0.5 <= x < n - 0.5:  # NaN neither
         return -1, 0.0
@@ -93,22 +92,23 @@ def _place(x, n):
 
 
 @compiled_loop(nogil=True)
-def _evaluate(image, xy, out, cubic):
+def _evaluate(image, xy, out, is_cubic):
     """Values at coordinates, of the pixels or of the coefficients of cubic B-splines."""
     ny, nx = image.shape
     for r in range(out.shape[0]):
         for k in range(out.shape[1]):
-            (j, u), (i, v) = _place(xy[0, r, k], nx), _place(xy[1, r, k], ny)
+            (j, u), (i, v) = place(xy[0, r, k], nx), place(xy[1, r, k], ny)
             if i < 0 or j < 0:
                 out[r, k] = np.nan
-            elif cubic:
-                out[r, k] = _cubic(image, i, j, u, v)
+            elif is_cubic:
+                out[r, k] = cubic(image, i, j, u, v)
             else:
-                out[r, k] = _linear(image, i, j, u, v)
+                out[r, k] = linear(image, i, j, u, v)
 
 
 @compiled_loop(nogil=True)
-def _linear(image, i, j, u, v):
+def linear(image, i, j, u, v):
+    """Value at the fractions u, v of a pixel behind (i, j), from those of the pixels around."""
     low = (1 - u) * image[i, j] + u * image[i, j + 1]
     return (1 - v) * low + v * ((1 - u) * image[i + 1, j] + u * image[i + 1, j + 1])
 
@@ -121,7 +121,8 @@ def _weights(f):
 
 
 @compiled_loop(nogil=True)
-def _cubic(c, i, j, u, v):
+def cubic(c, i, j, u, v):
+    """Value at the fractions u, v of a pixel behind (i, j), from the `coefficients`."""
     ny, nx = c.shape
     a, b = _mirror(j - 1, nx), _mirror(j + 2, nx)
     low, high = _mirror(i - 1, ny), _mirror(i + 2, ny)

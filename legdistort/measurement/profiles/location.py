@@ -3,7 +3,7 @@
 import numpy as np
 
 from ...exceptions import InputError
-from ..detection import MESH, bright_peaks, detect, prepare
+from ..detection import MESH, bright_peaks, detect, prepare, sky_noise
 from . import moffat
 from .cutouts import Stamps, box_half
 from .defects import are_points, without_defects
@@ -22,7 +22,7 @@ _CROWDED = 0.6  # of the variance at first: what is left of it where much of it 
 WIDEST = 30.0
 
 
-def locate_stars(exposure, *, threshold, fwhm=None):
+def locate_stars(exposure, *, threshold, fwhm=None, known=False):
     """An exposure prepared for fitting, its stars and their shape.
 
     Parameters
@@ -32,13 +32,16 @@ def locate_stars(exposure, *, threshold, fwhm=None):
         Signal-to-noise ratio.
     fwhm : float, optional
         Of the stars [pix], if it is known.
+    known : bool
+        Whether it is known where the stars are: they are not looked for, unless they must tell how many photons a unit
+        of the data is.
 
     Returns
     -------
     frame : `~legdistort.measurement.detection.Frame`
         With the variance of the sky alone, see `legdistort.measurement.detection.detect`.
-    centres : ndarray of int, shape (n, 2)
-        Pixels (x, y), the highest signal-to-noise ratio first.
+    centres : ndarray of int, shape (n, 2), or None
+        Pixels (x, y), the highest signal-to-noise ratio first; None where they were not looked for.
     shape : ndarray, shape (4,)
         Usual one of the bright stars (see `legdistort.measurement.profiles.moffat.shape`).
 
@@ -53,10 +56,16 @@ def locate_stars(exposure, *, threshold, fwhm=None):
         frame = prepare(exposure, mesh=int(8 * moffat.fwhm(shape)), before=frame)
         kernel, shape = _frame_shape(frame, fwhm, exposure.name)
     frame = without_defects(frame, shape)
+
+    def look(frame):
+        if known and frame.photon is not None:
+            return None, sky_noise(frame, kernel)
+        return detect(frame, kernel, threshold)
+
     before = frame
-    centres, frame = detect(before, kernel, threshold)
+    centres, frame = look(before)
     if np.median(frame.variance[::8, ::8]) < _CROWDED * np.median(before.variance[::8, ::8]):
-        centres, frame = detect(frame, kernel, threshold)  # stars have passed for noise, and so for light around others
+        centres, frame = look(frame)  # stars have passed for noise, and so for light around others
     return frame, centres, shape
 
 

@@ -155,6 +155,43 @@ def evaluate(params, half, nodes, *, jacobian=False):
     return model, _derivatives(params) @ terms.swapaxes(0, 1)
 
 
+def evaluate_placed(params, half, nodes):
+    """As `evaluate`, with derivatives by x, y and peak only; these (n, 3, npix)."""
+    x0, y0, peak, log_a, log_b, rho, log_beta = params[:, :7].T[:, :, None]
+    beta = np.exp(log_beta)
+    k = np.exp2(1 / beta) - 1
+    a, b, c = (k * q for q in _form(log_a, log_b, rho))
+    size, kind = 2 * half + 1, params.dtype
+    grid = np.arange(-half, half + 1, dtype=kind)
+    y, x = np.repeat(grid, size), np.tile(grid, size)
+    out = np.zeros((len(params), 3, size**2), dtype=kind)
+    s, t, profile = np.empty((3, len(params), size**2), dtype=kind)
+    for dy, wy in zip(*nodes, strict=True):
+        v = y + kind.type(dy) - y0
+        cv, bv = c * v, b * v
+        square = bv * v + 1
+        for dx, wx in zip(*nodes, strict=True):
+            u = x + kind.type(dx) - x0
+            by_u = a * u + cv
+            np.multiply(by_u + cv, u, out=s)  # 1 + k h
+            s += square
+            np.log(s, out=t)
+            t *= -beta
+            np.exp(t, out=profile)
+            profile *= kind.type(wy * wx)
+            out[:, 2] += profile
+            profile /= s
+            by_u *= profile
+            out[:, 0] += by_u
+            np.multiply(c, u, out=t)
+            t += bv
+            t *= profile
+            out[:, 1] += t
+    model = peak * out[:, 2]
+    out[:, :2] *= (2 * beta * peak)[:, None]
+    return model, out
+
+
 def _form(log_a, log_b, rho):
     """Coefficients of u^2, v^2 and 2uv."""
     return np.exp(log_a), np.exp(log_b), rho * np.exp((log_a + log_b) / 2)

@@ -6,7 +6,8 @@ from . import moffat
 
 #: A subtracted neighbour leaves residuals of this fraction of itself.
 NEIGHBOUR = 0.05
-_LEAST = 0.25  # of the variance of the sky: what is left of it in the darkest places
+#: Of the variance of the sky, what is left of it in the darkest places.
+LEAST_SKY = 0.25
 
 
 def pixel_variance(noise, light):
@@ -24,7 +25,7 @@ def pixel_variance(noise, light):
     ndarray, shape (n, npix)
     """
     sky, photon = noise
-    return np.maximum(sky + photon * light, _LEAST * sky)  # between halos the sky taken off was too high
+    return np.maximum(sky + photon * light, LEAST_SKY * sky)  # between halos the sky taken off was too high
 
 
 def pixel_noise(stamps, fit, models, nodes):

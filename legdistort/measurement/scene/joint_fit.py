@@ -1,15 +1,15 @@
 """All stars of a frame fitted together with one PSF: sparse normal equations of positions and fluxes."""
 
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
-from scipy.signal import oaconvolve
 
 from ..detection import peaks_above
 from ..filters import gaussian_sums
-from ..profiles.pixel_noise import pixel_variance
+from ..profiles.pixel_noise import LEAST_SKY
 from ..sky.smooth_light import binned, spread
-from .normal_equations import JointFit, normal_matrix, solved
+from . import stamps
+from .normal_equations import JointFit, assembled, normal_blocks, normal_matrix, solved
 
 _KIND = np.float32  # of the light of stars: photons bound the ratio of signal to noise of a pixel
 _CHUNK = 200  # stars: their light stays in the processor's cache
@@ -57,9 +57,21 @@ class Scene(JointFit):
         if frame.defects is not None:
             self.good &= ~frame.defects
         self.xy, self.flux = np.zeros((0, 2)), np.zeros(0)
-        self.sky = np.zeros(frame.signal.shape, dtype=np.float32)
+        self.sky, self.light, self.weights = (np.zeros(frame.signal.shape, dtype=_KIND) for _ in range(3))
         self.noise = float(np.sqrt(np.median(frame.variance[::8, ::8])))
         self.use(psf)
+
+    def planes(self):
+        """Images of one value a pixel; some may be None."""
+        frame = self.frame
+        own = self.sky, self.light, self.weights, self.good
+        return *own, frame.signal, frame.variance, frame.good, frame.saturated, frame.defects
+
+    def replace_planes(self, function):
+        """What a function makes of every one of the `planes` in their places."""
+        self.sky, self.light, self.weights, self.good, *rest = map(function, self.planes())
+        names = "signal", "variance", "good", "saturated", "defects"
+        self.frame = replace(self.frame, **dict(zip(names, rest, strict=True)))
 
     def use(self, psf):
         """Another PSF from now on."""
@@ -88,21 +100,21 @@ class Scene(JointFit):
 
     def render(self):
         """The light of all stars made anew."""
-        self.light = self.light_of(np.arange(len(self.flux)))
+        self.light[:] = 0
+        self._add(np.arange(len(self.flux)), 1)
         self.weigh()
 
     def light_of(self, rows):
         """The light of some stars, (ny, nx)."""
-        image = np.zeros(self.frame.signal.shape)
+        image = np.zeros(self.frame.signal.shape, dtype=_KIND)
         self._add(rows, 1, image)
         return image
 
     def weigh(self):
         """Weights made anew, by the light that there is now."""
-        variance = pixel_variance((self.frame.variance, self.photon), (self.light + self.sky).astype(np.float32))
-        if self.misfit:
-            variance = variance + np.square(self.misfit * self.light, dtype=np.float32)
-        self.weights = np.where(self.good, 1 / variance, np.float32(0))
+        planes = self.good, self.frame.variance, self.light, self.sky
+        stamps.inverse_variances(*planes, float(self.photon), LEAST_SKY, float(self.misfit), self.weights)
+        self._snr = None
 
     def update_misfit(self):
         """The misfit that bright stars show, and weights with it."""
@@ -119,7 +131,9 @@ class Scene(JointFit):
     @property
     def residual(self):
         """What stars and sky leave, (ny, nx)."""
-        return self.frame.signal - self.sky - self.light
+        left = self.frame.signal - self.sky
+        left -= self.light
+        return left
 
     def update_sky(self, step=1):
         """The sky changed by what is left around every pixel, over what a change leaves once the stars follow.
@@ -140,14 +154,11 @@ class Scene(JointFit):
         left, norm = around(left), around(weights)
         norm = np.maximum(norm, 1e-3 * norm.max())
         if len(self.flux):
-            slopes, pixels, centres = self.slopes(np.arange(len(self.flux)))
-            normal, right = (
-                normal_matrix(slopes, centres, self.half),
-                np.einsum("nap,np->na", slopes, root.ravel()[pixels]),
-            )
+            slopes, right, centres = self.slopes(np.arange(len(self.flux)), (np.ones_like(weights),))
+            normal = normal_matrix(slopes, centres, self.half)
             response = solved(normal, right.ravel(), np.sqrt(np.maximum(normal.diagonal(), 1e-30))).reshape(-1, 3)
-            taken = np.zeros(weights.shape)
-            lay(taken, np.einsum("nap,na->np", slopes, response), centres, self.half)
+            taken = np.zeros_like(weights)
+            stamps.lay(taken, np.einsum("nap,na->np", slopes, response.astype(_KIND)), centres, self.half, 1)
             norm = np.maximum(norm - around(root * taken), _LEAST * norm)
         change = left / norm
         self.sky += change if step == 1 else spread(change, step, weights.shape)
@@ -155,7 +166,7 @@ class Scene(JointFit):
     def on_stamps(self, rows):
         """Of some stars `stars`, and the flat indices of the pixels of their stamps and which lie in the image."""
         params, centres = self.stars(rows)
-        return params, centres, *stamp_pixels(centres, self.half, self.light.shape)
+        return params, centres, *stamps.stamp_pixels(centres, self.half, self.light.shape)
 
     def add(self, xy, flux):
         """More stars."""
@@ -181,43 +192,64 @@ class Scene(JointFit):
 
     def _add(self, rows, sign, image=None):
         """The light of some stars added to that of all, or to an image, as far as it is seen."""
-        image = self.light if image is None else image
+        if image is None and len(rows):
+            image, self._snr = self.light, None
         reach = (self.flux[rows, None] > self._faint).sum(axis=1)
         for k, width in enumerate((1, 2, 4)):
             some = rows[reach == k]
             for i in range(0, len(some), _CHUNK):
                 params, centres = self.stars(some[i : i + _CHUNK])
                 light = self.psf.light(params.astype(_KIND), centres, width * self.half)
-                lay(image, sign * light, centres, width * self.half)
+                stamps.lay(image, light, centres, width * self.half, sign)
 
     def equations(self, rows):
         """Normal matrix (3 m, 3 m) and right side of some stars' x, y and flux, sparse."""
-        slopes, pixels, centres = self.slopes(rows)
-        left = (np.sqrt(self.weights) * self.residual).astype(_KIND).ravel()[pixels]
-        return normal_matrix(slopes, centres, self.half), (slopes @ left[:, :, None]).ravel().astype(float)
+        blocks, right = self.blocks(rows)
+        return assembled([blocks], len(rows)), right.ravel()
 
-    def slopes(self, rows):
+    def blocks(self, rows):
+        """`normal_blocks` and right side (m, 3) of some stars."""
+        slopes, right, centres = self.slopes(rows)
+        return normal_blocks(slopes, centres, self.half), right
+
+    def residual_at(self, pixels):
+        """What stars and sky leave in some pixels, by their flat indices."""
+        return self.frame.signal.ravel()[pixels] - self.sky.ravel()[pixels] - self.light.ravel()[pixels]
+
+    def slopes(self, rows, left=None, *, flux_alone=False):
         """Slopes of the pixels of stamps by some stars' x, y and flux, in units of their noise.
+
+        Parameters
+        ----------
+        rows : ndarray of int, shape (m,)
+        left : tuple of ndarray, optional
+            Images as of `legdistort.measurement.scene.stamps.weigh`; by default what stars and sky leave.
+        flux_alone : bool
+            Positions are known: slopes by the flux only.
 
         Returns
         -------
-        slopes : ndarray, shape (m, 3, npix)
+        slopes : ndarray, shape (m, 3 or 1, npix)
             0 in the corners, which say little.
-        pixels : ndarray of int, shape (m, npix)
-            Flat indices.
+        right : ndarray, shape (m, 3 or 1)
+            Their products with what is left.
         centres : ndarray of int, shape (m, 2)
         """
-        grid, root = np.arange(-self.half, self.half + 1), np.sqrt(self.weights).ravel()
-        circle = (np.hypot(grid, grid[:, None]) <= self.half + 0.5).ravel()
-        centres = self.stars(rows)[1]
-        pixels, inside = stamp_pixels(centres, self.half, self.light.shape)
-        out = np.empty((len(rows), 3, pixels.shape[1]), dtype=_KIND)
+        left = (self.frame.signal, self.sky, self.light) if left is None else left
+        params, centres = self.stars(rows)
+        if flux_alone:
+            params[:, 2] = 1
+        params, n = params.astype(_KIND), 1 if flux_alone else 3
+        out = np.empty((len(rows), n, (2 * self.half + 1) ** 2), dtype=_KIND)
+        right = np.empty((len(rows), n))
         for i in range(0, len(rows), _CHUNK):
             part = slice(i, i + _CHUNK)
-            params, middle = self.stars(rows[part])
-            by = self.psf.light(params.astype(_KIND), middle, self.half, slopes=True)[1]
-            out[part] = by * np.where(inside[part] & circle, root[pixels[part]], 0)[:, None]
-        return out, pixels, centres
+            if flux_alone:
+                out[part, 0] = self.psf.light(params[part], centres[part], self.half)
+            else:
+                out[part] = self.psf.light(params[part], centres[part], self.half, slopes=True)[1]
+            right[part] = stamps.weigh(out[part], centres[part], self.half, self.weights, left)
+        return out, right, centres
 
     def likelihood(self):
         """How much likelier what is left is with one more star in the middle of a pixel.
@@ -230,14 +262,16 @@ class Scene(JointFit):
         """
         half = int(np.ceil(_KERNEL * self.fwhm))
         kernel = self.psf.light(np.array([[0.0, 0.0, 1.0]], dtype=np.float32), self.middle, half)[0]
-        kernel = np.maximum(kernel, 0).reshape(2 * half + 1, -1)[::-1, ::-1].astype(np.float32)
-        signal = oaconvolve(self.weights * self.residual.astype(np.float32), kernel, mode="same")
-        norm = oaconvolve(self.weights, kernel**2, mode="same")
+        kernel = np.maximum(kernel, 0).reshape(2 * half + 1, -1).astype(np.float32)
+        signal = stamps.correlate(self.weights * self.residual, kernel)
+        norm = stamps.correlate(self.weights, kernel**2)
         seen = norm > _COVERED * (kernel**2).sum() * np.median(self.weights)
         bright = ~seen & (self.weights > 0)  # under bright stars weights are small, and tell nothing of what is covered
         if bright.any():
-            good = self.good.astype(np.float32)
-            seen |= oaconvolve(good, kernel**2, mode="same") > _COVERED * (kernel**2).sum()
+            y, x = np.nonzero(bright)
+            own = np.broadcast_to(kernel.reshape(1, -1), (len(x), kernel.size))
+            there = stamps.squared_ratios(own, np.column_stack([x, y]), half, self.good)
+            seen[y, x] = there > _COVERED * (kernel**2).sum()
         return signal, np.where(seen, np.maximum(norm, 1e-12 * norm.max()), 0)
 
     def candidates(self, threshold):
@@ -255,38 +289,34 @@ class Scene(JointFit):
 
     def snr(self):
         """Signal-to-noise ratio of the stars where nothing but their flux is unknown, (n,)."""
-        return self._over_stamps(lambda own, pixels, near: (self.weights.ravel()[pixels] * own**2).sum(axis=1)) ** 0.5
+        if self._snr is None:
+            half, weights = self.half, self.weights
+            self._snr = self._over_stars(lambda own, _, at: stamps.squared_ratios(own, at, half, weights)) ** 0.5
+        return self._snr
 
     def core_chi2(self, *, lever=False):
         """Mean squared residual in units of the noise, weighted with the PSF, in the core of every star; (n,).
 
         With `lever` also the same mean of the squared signal-to-noise ratio of the pixels.
         """
-        square, weights, good = (self.weights * self.residual**2).ravel(), self.weights.ravel(), self.good.ravel()
-
-        def mean(values, own, pixels, near):
-            core = np.maximum(own, 0) * near * good[pixels]
-            return (core * values(own, pixels)).sum(axis=1) / np.maximum(core.sum(axis=1), 1e-30)
-
-        chi2 = self._over_stamps(partial(mean, lambda own, pixels: square[pixels]))
-        if not lever:
-            return chi2
-        return chi2, self._over_stamps(partial(mean, lambda own, pixels: weights[pixels] * own**2))
+        planes, radius = (self.weights, self.good, self.frame.signal, self.sky, self.light), _CORE * self.fwhm
+        chi2, levers = self._over_stars(lambda *stars: stamps.cores(*stars, self.half, radius, planes), 2).T
+        return (chi2, levers) if lever else chi2
 
     def chi2_around(self, places):
         """Sum of the squared residuals in units of the noise within a core of some places; (n,)."""
         centres = np.round(places).astype(int)
-        pixels, inside = stamp_pixels(centres, self.half, self.light.shape)
-        square = (self.weights * self.residual**2).ravel()[pixels]
+        pixels, inside = stamps.stamp_pixels(centres, self.half, self.light.shape)
+        square = self.weights.ravel()[pixels] * self.residual_at(pixels) ** 2
         return (square * inside * self.near(places - centres)).sum(axis=1)
 
-    def _over_stamps(self, function):
-        out = np.zeros(len(self.flux))
+    def _over_stars(self, function, *shape):
+        """Values of a function of the light of stars on their stamps, and of `stars`; (n, *shape)."""
+        out = np.zeros((len(self.flux), *shape))
         for i in range(0, len(out), _CHUNK):
             params, centres = self.stars(np.arange(i, min(i + _CHUNK, len(out))))
-            pixels, inside = stamp_pixels(centres, self.half, self.frame.signal.shape)
-            own = np.where(inside, self.psf.light(params.astype(_KIND), centres, self.half), 0)
-            out[i : i + _CHUNK] = function(own, pixels, self.near(params))
+            own = self.psf.light(params.astype(_KIND), centres, self.half)
+            out[i : i + _CHUNK] = function(own, params, centres)
         return out
 
     def near(self, params):
@@ -294,21 +324,3 @@ class Scene(JointFit):
         dy, dx = np.mgrid[-self.half : self.half + 1, -self.half : self.half + 1].reshape(2, -1)
         x, y = params[:, :1], params[:, 1:2]
         return (dx - x) ** 2 + (dy - y) ** 2 <= (_CORE * self.fwhm) ** 2
-
-
-def stamp_pixels(centres, half, shape):
-    """Flat indices of the pixels of stamps, and whether they lie in the image; (n, npix)."""
-    dy, dx = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
-    x, y = centres[:, :1] + dx, centres[:, 1:] + dy
-    inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
-    return np.clip(y, 0, shape[0] - 1) * shape[1] + np.clip(x, 0, shape[1] - 1), inside
-
-
-def lay(image, light, centres, half):
-    """Stamps (n, npix) around pixels added to an image."""
-    side = 2 * half + 1
-    for (x, y), one in zip(centres.tolist(), light.reshape(-1, side, side), strict=True):
-        left, low = max(x - half, 0), max(y - half, 0)
-        part = image[low : max(y + half + 1, 0), left : max(x + half + 1, 0)]
-        from_x, from_y = left - x + half, low - y + half
-        part += one[from_y : from_y + part.shape[0], from_x : from_x + part.shape[1]]

@@ -4,8 +4,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.ndimage import binary_dilation
-from scipy.spatial import cKDTree
 
 from ..detections import FrameStars, Stars
 from ..effective.frame_psf import Verdict, judged
@@ -20,41 +18,10 @@ from .moffat_field import MoffatField
 from .search import search
 from .shared_psf import moffat_field, profiles
 
-_CLOSE = 2.0  # FWHM
-_CROWD, _FEWEST = 0.05, 10  # of the detections, at least so many, have another one as close as that
 _DIRTY = 0.1  # of the detections, hot pixels and hits of particles: in crowds of stars they are some per cent
 _SHARP = 0.6  # of the width of stars: what is narrower is none
 _DEFORMED = 4.0  # chi2 of a core that is no single star's
 _DEGREE = {"own": 2, "linear": 1, "shared": 0}
-
-
-def is_crowded(frame, centres, width):
-    """Whether more than 5 % of the detections, and ten, have another one within two FWHM.
-
-    Those beside saturated pixels and defects do not count: trails and tracks break up into many.
-
-    Parameters
-    ----------
-    frame : `~legdistort.measurement.detection.Frame`
-    centres : ndarray of int, shape (n, 2)
-        Detections.
-    width : float
-        Full width at half maximum [pix].
-    """
-    if not _have_neighbours(centres, width):
-        return False
-    bad = frame.saturated if frame.defects is None else frame.saturated | frame.defects
-    if bad.any():
-        bad = binary_dilation(bad, iterations=int(np.ceil(_CLOSE * width)))
-        centres = centres[~bad[centres[:, 1], centres[:, 0]]]
-    return _have_neighbours(centres, width)
-
-
-def _have_neighbours(centres, width):
-    if len(centres) < _FEWEST:
-        return False
-    nearest = cKDTree(centres).query(centres, k=2)[0][:, 1]
-    return np.count_nonzero(nearest < _CLOSE * width) >= max(_FEWEST, _CROWD * len(centres))
 
 
 def measure_crowd(stamps, shape, options, psf):

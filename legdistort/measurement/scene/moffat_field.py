@@ -9,7 +9,6 @@ from ..profiles import moffat
 from ..profiles.shape_field import shape_field
 
 _PLACES = 9  # along x and along y at which the shape is kept: it is a polynomial of degree 2 at most
-_SLOPED = (0, 1, 2)  # of the derivatives, those by x, y and height
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +93,7 @@ class MoffatField:
         profile, unit = profile.astype(params.dtype), unit.astype(params.dtype)
         if not slopes:
             return moffat.evaluate(profile, half, self._nodes if half < 4 * self.fwhm else moffat.CENTRES)
-        light, by = moffat.evaluate(profile, half, self._nodes, jacobian=True)
-        by = by[:, _SLOPED]
+        light, by = moffat.evaluate_placed(profile, half, self._nodes)
         by[:, 2] *= unit[:, None]
         return light, by
 

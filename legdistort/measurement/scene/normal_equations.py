@@ -1,9 +1,11 @@
 """Stars fitted together by Gauss-Newton steps: of one frame, or of all exposures at once."""
 
 import numpy as np
-from scipy.sparse import coo_array, diags_array
+from scipy.sparse import bsr_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
+
+from .stamps import products
 
 _CHUNK = 200  # stars: their matrices stay in the processor's cache
 _LONGEST = 0.25  # FWHM, a step of a position
@@ -61,7 +63,7 @@ class JointFit:
         return neighbour_covariance(self.equations(np.arange(len(self.flux)))[0], self.xy, self.fwhm)
 
 
-def neighbour_covariance(normal, xy, fwhm):
+def neighbour_covariance(normal, xy, fwhm, rows=None):
     """Covariance of the parameters of every star, those of its neighbours unknown too.
 
     Parameters
@@ -71,23 +73,25 @@ def neighbour_covariance(normal, xy, fwhm):
     xy : ndarray, shape (n, 2)
     fwhm : float
         Of the PSF [pix].
+    rows : ndarray of int, shape (m,), optional
+        Of these stars alone.
 
     Returns
     -------
-    ndarray, shape (n, k, k)
+    ndarray, shape (n, k, k) or (m, k, k)
     """
     n = len(xy)
-    p, rows = normal.shape[0] // max(n, 1), np.arange(n)
+    p, rows = normal.shape[0] // max(n, 1), np.arange(n) if rows is None else rows
     blocks = normal.tobsr((p, p))
     k = min(_NEIGHBOURS + 1, n)
-    near = cKDTree(xy).query(xy, k=np.arange(1, k + 1), distance_upper_bound=2.5 * fwhm)[1]
+    near = cKDTree(xy).query(xy[rows], k=np.arange(1, k + 1), distance_upper_bound=2.5 * fwhm)[1]
     near[:, 0] = rows  # of stars that coincide, too
     real = near < n
     real[:, 1:] &= near[:, 1:] != rows[:, None]
     blocks.sort_indices()
-    keys = np.repeat(rows, np.diff(blocks.indptr)) * n + blocks.indices
-    out = np.empty((n, p, p))
-    for i in range(0, n, _CHUNK):
+    keys = np.repeat(np.arange(n), np.diff(blocks.indptr)) * n + blocks.indices
+    out = np.empty((len(rows), p, p))
+    for i in range(0, len(rows), _CHUNK):
         some, there = near[i : i + _CHUNK], real[i : i + _CHUNK]
         pairs = np.where(there, some, 0)
         asked = pairs[:, :, None] * n + pairs[:, None]
@@ -106,7 +110,12 @@ def neighbour_covariance(normal, xy, fwhm):
 
 
 def normal_matrix(slopes, centres, half):
-    """Normal matrix of stars whose stamps overlap.
+    """Normal matrix of stars whose stamps overlap, from `normal_blocks`; csc_array, shape (k n, k n)."""
+    return assembled([normal_blocks(slopes, centres, half)], len(slopes))
+
+
+def normal_blocks(slopes, centres, half):
+    """The blocks that are not 0 of the normal matrix of stars whose stamps overlap.
 
     Parameters
     ----------
@@ -119,30 +128,27 @@ def normal_matrix(slopes, centres, half):
 
     Returns
     -------
-    csc_array, shape (k n, k n)
+    rows, columns : ndarray of int, shape (m,)
+        Stars.
+    blocks : ndarray, shape (m, k, k)
     """
-    n, k, _ = slopes.shape
-    side = 2 * half + 1
-    i, j = (
-        cKDTree(centres).query_pairs(side - 0.5, p=np.inf, output_type="ndarray").T if n > 1 else np.zeros((2, 0), int)
-    )
-    y, x = np.divmod(np.arange(side * side), side)
-    blocks = np.empty((len(i), k, k))
-    for start in range(0, len(i), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        dx, dy = (centres[i[part]] - centres[j[part]]).T
-        there = (x + dx[:, None], y + dy[:, None])  # where the pixels of the first star lie on the stamp of the other
-        common = np.logical_and(*((t >= 0) & (t < side) for t in there))
-        index = np.where(common, there[1] * side + there[0], 0)
-        other = np.take_along_axis(slopes[j[part]], index[:, None], axis=2) * common[:, None]
-        blocks[part] = slopes[i[part]] @ other.mT
-    own = np.arange(n)
-    rows, columns = np.concatenate([own, i, j]), np.concatenate([own, j, i])
+    i, j = np.zeros((2, 0), int)
+    if len(slopes):
+        i, j = cKDTree(centres).query_pairs(2 * half + 0.5, p=np.inf, output_type="ndarray").T
+    own, blocks = np.arange(len(slopes)), products(slopes, centres, half, i, j)
     values = np.concatenate([slopes @ slopes.mT, blocks, blocks.mT])
-    at = np.broadcast_arrays(
-        k * rows[:, None, None] + np.arange(k)[:, None], k * columns[:, None, None] + np.arange(k), values
-    )
-    return coo_array((at[2].ravel(), (at[0].ravel(), at[1].ravel())), shape=(k * n, k * n)).tocsc().astype(float)
+    return np.concatenate([own, i, j]), np.concatenate([own, j, i]), values
+
+
+def assembled(parts, n):
+    """The sum of some `normal_blocks` of n stars; csc_array, shape (k n, k n)."""
+    rows, columns, blocks = (np.concatenate(each) for each in zip(*parts, strict=True))
+    keys, place = np.unique(columns * n + rows, return_inverse=True)
+    k = blocks.shape[1]
+    # of the transpose, whose rows are the columns
+    total = np.stack([np.bincount(place, b, len(keys)) for b in blocks.mT.reshape(len(blocks), -1).T], axis=1)
+    starts = np.searchsorted(keys, np.arange(n + 1) * n)
+    return bsr_array((total.reshape(-1, k, k), keys % max(n, 1), starts), shape=(k * n, k * n)).tocsr().T
 
 
 def solved(normal, right, scale):

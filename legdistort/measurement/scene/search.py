@@ -5,14 +5,13 @@ import logging
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..crowding import SAME
 from . import splitting
 
 _PASSES = 8
 _CHANGED = 0.002  # of the stars: a pass that changes less is the last
 _AGAIN = 0.5  # FWHM from what was dropped: it is not tried again
 _BESIDE = 0.7  # FWHM from a star: a peak there is a matter of splitting it
-#: FWHM: two stars nearer than that are one.
-SAME = 0.2
 _DISTURBS = 1.5  # FWHM: a change within it is a reason to look at a star anew
 _ALONE = 0.8  # of the threshold, asked of a star where its neighbours are unknown too
 _STARTING = 3  # passes in which PSF and sky are found anew

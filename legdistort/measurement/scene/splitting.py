@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..profiles.levenberg_marquardt import Limits, minimise
-from .joint_fit import stamp_pixels
+from .stamps import stamp_pixels
 
 #: Chi2 that a second star must take away.
 GAIN = 30.0
@@ -79,7 +79,7 @@ def pairs(scene, rows):
         part = slice(i, i + 100)
         own, centres = scene.stars(rows[part])
         pixels, inside = stamp_pixels(centres, half, scene.light.shape)
-        left = scene.residual.ravel()[pixels]
+        left = scene.residual_at(pixels)
         data = left + scene.psf.light(own, centres, half)
         weights = np.where(inside, scene.weights.ravel()[pixels], 0)
         problem = _Stamps(scene.psf, centres, data, weights, half)
