@@ -82,7 +82,7 @@ class Run(ShownAsPrinted):
     out : Path
         Folder with ``solution.asdf``, ``stars.ecsv``, ``wcs/NAME.asdf``, ``mosaic.fits``, ``report.html``.
     solution : Solution
-    mosaic : Mosaic
+    mosaic : Mosaic or None
     summary : dict
         Plain numbers and strings, see `legdistort.reporting.summary.summarise`.
     catalogue : Catalogue or None
@@ -91,7 +91,7 @@ class Run(ShownAsPrinted):
 
     out: Path
     solution: Solution
-    mosaic: Mosaic
+    mosaic: Mosaic | None
     summary: dict[str, Any]
     catalogue: Catalogue | None = None
 
@@ -126,6 +126,7 @@ def run(
     matching: Mapping[str, Any] | None = None,
     solving: Mapping[str, Any] | None = None,
     coadding: Mapping[str, Any] | None = None,
+    mosaic: bool = True,
     catalogue: str = "none",
     compare: bool = False,
     truth: Truth | None = None,
@@ -169,6 +170,8 @@ def run(
     measuring, matching, solving, coadding : dict, optional
         Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`, all of them checked before a frame is
         read. The stack is ``"clipped"`` here: hot pixels and cosmic rays do not get into it.
+    mosaic : bool
+        Co-add the frames; without it there is no ``mosaic.fits``, and nothing is said of the sharpness of a stack.
     catalogue : {'none', 'joint'}
         'joint': also every star measured in all exposures at once (`legdistort.catalogue`), with what measuring was
         told of detector and PSF, in ``catalogue.ecsv`` and ``photometry.ecsv``. Where none can be made there is a
@@ -220,7 +223,7 @@ def run(
     measuring = _step_options(MeasureOptions, measuring, "measuring", psf=psf)
     matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures, progress=progress)
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
-    coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"})
+    coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"}, wanted=mosaic)
     tying = _tying(reference, reference_error, epoch, pixel_scale, solving)
     _check_others(workers, truth, catalogue)
     paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
@@ -238,23 +241,28 @@ def run(
         with timed(timings, "solve"):
             solution = solve(matches, **vars(solving), **tying, progress=progress)
             solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
-        with timed(timings, "coadd"):
-            kept = [exposure for exposure in exposures if whole_name(exposure) in solution.names]
-            mosaic = coadd(kept, solution, **vars(coadding), **share)
+        kept = [exposure for exposure in exposures if whole_name(exposure) in solution.names]
+        stack, quality = _coadded(kept, solution, coadding, share, timings) if mosaic else (None, None)
         joint = _catalogued(catalogue, kept, solution, measuring, psfs, coadding.scratch, timings, progress)
-        with timed(timings, "assess"):
-            quality = _if_possible(stack_quality.assess, mosaic, solution, exposures=kept)
-        comparison, stacks = _compared(compare, matches, solution, solving, quality and mosaic, kept, coadding, timings)
+        comparison, stacks = _compared(compare, matches, solution, solving, quality and stack, kept, coadding, timings)
         summary = summarise(solution, timings=timings) | _counted(joint)
-        summary |= _assessed(solution, kept, quality, comparison, stacks, truth)
-        shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
+        summary |= _assessed(solution, kept, stack, quality, comparison, stacks, truth)
+        shown = {"mosaic": stack, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
         with parallel.beside(partial(_write_report, target, solution, summary, shown), workers=workers) as report:
             with timed(timings, "write"):
-                write_results(solution, target, psfs=psfs, mosaic=mosaic, joint=joint, progress=progress)
+                write_results(solution, target, psfs=psfs, mosaic=stack, joint=joint, progress=progress)
                 write_detections(target / "detections.ecsv", detections, exposures, Path(out), **reading)
                 write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
             summary = _written_summary(target, summary, timings, report)
-    return Run(Path(out), solution, mosaic, summary, joint)
+    return Run(Path(out), solution, stack, summary, joint)
+
+
+def _coadded(exposures, solution, coadding, share, timings):
+    """The stack, and how sharp it is, if that can be judged."""
+    with timed(timings, "coadd"):
+        stack = coadd(exposures, solution, **vars(coadding), **share)
+    with timed(timings, "assess"):
+        return stack, _if_possible(stack_quality.assess, stack, solution, exposures=exposures)
 
 
 def _catalogued(kind, exposures, solution, measuring, psfs, scratch, timings, progress):
@@ -285,6 +293,7 @@ def _counted(joint):
 def _write_report(target, solution, summary, shown):
     """The report of all that `run` leaves, whether it is there yet or written beside it."""
     absent = CATALOGUE * ("catalogue" not in summary) + ("psf/*.fits",) * (not shown["psfs"])
+    absent += ("mosaic.fits",) * (shown["mosaic"] is None)
     files = linked_files(name for name in RESULTS if name not in absent)
     write_report(target / "report.html", solution, summary=summary, **shown, files=files)
 
@@ -368,11 +377,13 @@ def _known_prior(prior, exposures=None, degree=3):
     return prior.stand_in if exposures is None else prior.read(exposures, degree)
 
 
-def _step_options(kind, given, argument, *, defaults=None, **own):
+def _step_options(kind, given, argument, *, defaults=None, wanted=True, **own):
     """The frozen options of a step: from its dict, from what `run` takes itself, and from the defaults of `run`."""
     kind(**own)  # errors of these are raised without a mention of the dict
     given = {} if given is None else given
     if isinstance(given, dict):
+        if not wanted and (idle := sorted(given.keys() - {"scratch"})):  # where the catalogue keeps its pixels too
+            raise InputError(f"without a mosaic (mosaic=False, --no-mosaic) nothing is co-added: leave {idle[0]} out")
         for name in own.keys() & given:
             raise InputError(f"{argument} has the option {name!r}: give it as the argument {name} of run itself")
         given = (defaults or {}) | own | given
@@ -389,9 +400,9 @@ def _check_others(workers, truth, catalogue):
         )
 
 
-def _assessed(solution, exposures, quality, comparison, stacks, truth):
+def _assessed(solution, exposures, stack, quality, comparison, stacks, truth):
     """The entries of the summary on images, mosaic and other corrections, as far as known, with all checks."""
-    checked = solution.checks + run_checks.check_run(solution, quality)
+    checked = solution.checks + run_checks.check_run(solution, quality, stacked=stack is not None)
     figures = {"checks": [to_tree(check) for check in checked], "fwhm_ratio": quality and quality.fwhm_ratio}
     figures |= {"observed": observed(exposures), "stated": stated_rows(exposures)}
     if quality:

@@ -27,7 +27,7 @@ _NAMED = 6  # exposures in a sentence
 _FEWEST = 4  # exposures, to determine how much they usually differ
 
 
-def check_run(solution, quality=None):
+def check_run(solution, quality=None, *, stacked=True):
     """Checks of the images and of the stack.
 
     Parameters
@@ -35,19 +35,21 @@ def check_run(solution, quality=None):
     solution : Solution
     quality : `~legdistort.assessment.stack_quality.Quality`, optional
         Of the stack, with the widths in single exposures.
+    stacked : bool
+        Whether there is a stack.
 
     Returns
     -------
     tuple of Check
     """
     return (
-        image_check(quality, model_misfits(solution.residuals)),
-        stack_check(quality, moving=solution.estimate.motions is not None),
+        image_check(quality, model_misfits(solution.residuals), stacked=stacked),
+        stack_check(quality, moving=solution.estimate.motions is not None, stacked=stacked),
         inverse_check(solution),
     )
 
 
-def image_check(quality, misfits=None):
+def image_check(quality, misfits=None, *, stacked=True):
     """Are the stars of the solution those of the frames, are those of all exposures alike, and as their model has them?
 
     Parameters
@@ -55,13 +57,15 @@ def image_check(quality, misfits=None):
     quality : `~legdistort.assessment.stack_quality.Quality` or None
     misfits : dict, optional
         ``{exposure: Misfit}``, see `~legdistort.assessment.model_misfits.model_misfits`.
+    stacked : bool
+        Whether there is a stack, for which the shapes of stars are measured.
 
     Returns
     -------
     Check
     """
     light = quality.light if quality else None
-    made = [*_light_checks(light), *_misfit_checks(misfits or {}), _shapes_check(quality)]
+    made = [*_light_checks(light), *_misfit_checks(misfits or {}), _shapes_check(quality, stacked)]
     return max(made, key=lambda check: STATES.index(check.state))
 
 
@@ -114,8 +118,10 @@ def _misfit_checks(misfits):
                     )  # fmt: skip
 
 
-def _shapes_check(quality):
+def _shapes_check(quality, stacked):
     """Are the stars of all exposures alike?"""
+    if not stacked:
+        return Check("images", "unknown", None, None, "no mosaic was made, for which shapes of stars are compared", "")
     found = quality.exposures if quality else {}
     if len(found) < _FEWEST:
         frames = f"{len(found)} exposure{'s' * (len(found) != 1)}"
@@ -157,8 +163,10 @@ def _odd_one(values):
     return best
 
 
-def stack_check(quality, *, moving=False):
-    """Is the stack as sharp as its frames? It cannot be where stars are `moving` between them."""
+def stack_check(quality, *, moving=False, stacked=True):
+    """Is the stack, if there is one, as sharp as its frames? It cannot be where stars are `moving` between them."""
+    if not stacked:
+        return Check("sharpness", "unknown", None, BLURRED, "no mosaic was made", "")
     ratio = quality.fwhm_ratio if quality else np.nan
     if not np.isfinite(ratio):
         return Check("sharpness", "unknown", None, BLURRED, "no star could be measured in stack and frames alike", "")

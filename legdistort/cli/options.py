@@ -262,7 +262,8 @@ COADDING = Group(
 GRID = {"grid": Option("image or header text whose grid is taken", type=Path, metavar="FILE", path="read")}
 COMPARING = {"compare": Option("also correct by shifts, static map and relative polynomial", action="store_true")}
 LAST_STEP = {
-    "catalogue": Option("joint: every star measured in all exposures at once (default none)", choices=words.CATALOGUES)
+    "mosaic": Option("co-add nothing", "--no-mosaic", action="store_false"),
+    "catalogue": Option("joint: every star measured in all exposures at once (default none)", choices=words.CATALOGUES),
 }
 EXPANDING = {
     "where": Option(

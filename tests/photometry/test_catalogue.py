@@ -234,6 +234,15 @@ def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
     assert {"mosaic.fits", "solution.asdf", "report.html"} <= names
     assert not names & {"catalogue.ecsv", "photometry.ecsv"}
     assert "photometry.ecsv" not in (made.out / "report.html").read_text()
+    made = ld.run(paths, out=made.out, earlier=made.out, degree=1, overwrite=True, mosaic=False)
+    assert made.mosaic is None
+    assert not (made.out / "mosaic.fits").exists()
+    assert "mosaic.fits" not in (made.out / "report.html").read_text()
+    states = {check.name: (check.state, check.sentence) for check in made.checks}
+    assert states["sharpness"] == ("unknown", "no mosaic was made")
+    assert states["images"][0] == "unknown"
+    with pytest.raises(InputError, match=r"without a mosaic \(mosaic=False, --no-mosaic\) .*: leave order out"):
+        ld.run(paths, out=tmp_path / "none", mosaic=False, coadding={"order": 3})
 
 
 _PEAK = """
