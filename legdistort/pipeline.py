@@ -382,7 +382,9 @@ def _step_options(kind, given, argument, *, defaults=None, wanted=True, **own):
     kind(**own)  # errors of these are raised without a mention of the dict
     given = {} if given is None else given
     if isinstance(given, dict):
-        if not wanted and (idle := sorted(given.keys() - {"scratch"})):  # where the catalogue keeps its pixels too
+        usual = vars(kind()) | (defaults or {}) | {"scratch": given.get("scratch")}  # which the catalogue uses too
+        idle = [name for name, value in given.items() if name in usual and not value == usual[name]]
+        if idle and not wanted:
             raise InputError(f"without a mosaic (mosaic=False, --no-mosaic) nothing is co-added: leave {idle[0]} out")
         for name in own.keys() & given:
             raise InputError(f"{argument} has the option {name!r}: give it as the argument {name} of run itself")

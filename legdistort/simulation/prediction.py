@@ -217,7 +217,7 @@ class Prediction(ShownAsPrinted):
             except LegdistortError as error:
                 failed["{} {}".format(*next(iter(change.items())))] = str(error)
         table = Table(rows)
-        table.meta["failed"] = failed
+        table.meta |= {"failed": failed, "pixel_scale": settings.pixel_scale}
         for name in table.colnames:
             if table[name].dtype.kind == "f":
                 slope = name.startswith(("s_", "thumb_"))

@@ -80,6 +80,14 @@ def _relative(prediction):
 def describe_plans(plans):
     """The table of `Prediction.alternatives` as text: criteria (aliasing if any is known), slopes, rules of thumb."""
     criteria = [c for c in ("b", "b_alias", "b_abs", "sigma", "sigma_alias") if np.nansum(plans[c]) > 0]
+    if (scale := plans.meta["pixel_scale"]) is not None:
+        plans = plans.copy()
+        for name in criteria:
+            places = max(0, int(plans[name].info.format[1:-1]) - int(np.round(np.log10(1e3 * scale))))
+            plans[name] = 1e3 * scale * np.asarray(plans[name])
+            plans[name].info.format = f".{places}f"
+            plans.rename_column(name, f"{name} [mas]")
+        criteria = [f"{name} [mas]" for name in criteria]
     columns = ["n_exposures", "degree", "n_stars", *criteria, "s_b", "thumb_b", "s_sigma", "thumb_sigma"]
     lines = plans[columns].pformat(max_lines=-1, max_width=-1)
     return "\n".join(lines + [f"{change}: {reason}" for change, reason in plans.meta["failed"].items()])

@@ -242,7 +242,7 @@ def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
     assert states["sharpness"] == ("unknown", "no mosaic was made")
     assert states["images"][0] == "unknown"
     with pytest.raises(InputError, match=r"without a mosaic \(mosaic=False, --no-mosaic\) .*: leave order out"):
-        ld.run(paths, out=tmp_path / "none", mosaic=False, coadding={"order": 3})
+        ld.run(paths, out=tmp_path / "none", mosaic=False, coadding={"order": 1})
 
 
 _PEAK = """
