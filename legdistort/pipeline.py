@@ -383,7 +383,7 @@ def _step_options(kind, given, argument, *, defaults=None, wanted=True, **own):
     given = {} if given is None else given
     if isinstance(given, dict):
         usual = vars(kind()) | (defaults or {}) | {"scratch": given.get("scratch")}  # which the catalogue uses too
-        idle = [name for name, value in given.items() if name in usual and not value == usual[name]]
+        idle = [name for name, value in given.items() if name in usual and value != usual[name]]
         if idle and not wanted:
             raise InputError(f"without a mosaic (mosaic=False, --no-mosaic) nothing is co-added: leave {idle[0]} out")
         for name in own.keys() & given:
