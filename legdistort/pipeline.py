@@ -434,7 +434,10 @@ def write_results(solution, target, *, psfs=None, mosaic=None, joint=None, progr
     (target / "wcs").mkdir()
     for view in Bar(list(solution), desc="writing", unit="WCS", disable=not progress):
         for part in view.parts:
-            write_wcs(part, target / "wcs" / f"{part.label}.asdf")
+            if part.fold:
+                warn(f"no WCS of {part.label}: {part.fold}", AssumptionWarning)
+            else:
+                write_wcs(part, target / "wcs" / f"{part.label}.asdf")
     write_psfs(psfs or {}, target / "psf")
     if mosaic is not None:
         mosaic.write(target / "mosaic.fits")

@@ -12,13 +12,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from ..exceptions import InputError, LegdistortError, SolveError
+from ..exceptions import FoldError, InputError, LegdistortError, SolveError
 from ..geometry import similarity
 from ..geometry.distortion import Distortion
 from ..matching.matches import Matches
 from ..priors.prior import means
 from ..results.diagnostics import Diagnostics
-from ..results.in_tables import largest_inverse_error
+from ..results.in_tables import folds
 from ..results.settings import Settings
 from ..solving import assembly, minimisers
 from ..solving.equations import criterion
@@ -147,7 +147,8 @@ def compare(matches, solution, *, prior=None):
     for name, call in calls.items():
         try:
             made = call()
-            largest_inverse_error(made)
+            for reason in folds(made).values():
+                raise FoldError(reason)
             out[name] = made
         except LegdistortError as error:
             log.warning("%s is left out of the comparison: %s", name, error)

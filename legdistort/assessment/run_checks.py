@@ -3,9 +3,9 @@
 import numpy as np
 from scipy import special
 
-from ..exceptions import FoldError, some_of
+from ..exceptions import some_of
 from ..results.check import CERTAIN, FALSE_ALARM, STATES, Check
-from ..results.in_tables import largest_inverse_error
+from ..results.in_tables import folds, largest_inverse_error
 from .model_misfits import model_misfits
 
 #: A stack whose stars are this much wider than those of single exposures has lost sharpness that can be seen.
@@ -181,8 +181,8 @@ def stack_check(quality, *, moving=False, stacked=True):
 
 def inverse_check(solution):
     """Do the WCSs invert?"""
-    try:
-        error = largest_inverse_error(solution)
-    except FoldError as fold:
-        return Check("inverse", "fail", None, None, str(fold), "lower --degree, or give a prior")
+    if folded := folds(solution):
+        words = f"{some_of(list(folded), _NAMED)} cannot be inverted: {next(iter(folded.values()))}"
+        return Check("inverse", "fail", float(len(folded)), 0.0, words, "lower --degree, or give a prior")
+    error = largest_inverse_error(solution)
     return Check("inverse", "pass", error, None, f"every WCS inverts to {error:.1e} px")

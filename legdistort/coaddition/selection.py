@@ -43,6 +43,8 @@ def select_images(exposures, solution, verb, product):
                 f"exposure {frame.name}: its shape {frame.shape} is not that of the solution, {tuple(view.shape)}; a "
                 "trimmed or binned image needs a solution of its own"
             )
+        elif view.fold:
+            left_out[frame.name] = view.fold
         else:
             frames.append(frame)
             views[frame.name] = view

@@ -3,7 +3,6 @@
 import numpy as np
 from markupsafe import Markup, escape
 
-from ..exceptions import FoldError
 from ..results import in_tables
 from ..runtime.trees.codec import to_tree
 from .tables import count
@@ -35,10 +34,7 @@ def facts_of(solution, summary):
         "observed": {},
     } | summary
     if "max_inverse_error_px" not in facts:
-        try:
-            facts["max_inverse_error_px"] = in_tables.largest_inverse_error(solution)
-        except FoldError as error:
-            facts["max_inverse_error_px"] = str(error)
+        facts["max_inverse_error_px"] = in_tables.largest_inverse_error(solution)
     return facts
 
 
@@ -75,8 +71,8 @@ def solution_rows(solution, facts):
         rows["Stars in the mosaic"] = _sharpness(facts["quality"])
     if joint := facts.get("catalogue"):
         rows["Catalogue of all exposures"] = "{n_stars} stars, {n_new} of them new".format(**joint)
-    error = facts["max_inverse_error_px"]
-    rows["Largest error of an inverse"] = error if isinstance(error, str) else f"{error:.1e} px"
+    error, folded = facts["max_inverse_error_px"], "; ".join(in_tables.folds(solution).values())
+    rows["Largest error of an inverse"] = folded or f"{error:.1e} px"
     rows["Minimisation"] = solution.status
     if camera := in_tables.camera_sentence(solution):
         rows["Camera"] = camera

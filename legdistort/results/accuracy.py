@@ -246,11 +246,14 @@ def scatter(corrected):
 def corrected_positions(solution):
     """Corrected positions (n_exposures, n_stars, 2) of the fitted stars (section 3.3), NaN where not used.
 
-    Those of stars whose motions were fitted are carried to the epoch of the solution.
+    And for an exposure whose map cannot be inverted. Those of stars whose motions were fitted are carried to the epoch
+    of the solution.
     """
     table = solution.residuals
     out = np.full((len(solution.names), len(solution.estimate.star_names), 2), np.nan)
     for i, name in enumerate(solution.names):
+        if solution[name].fold:
+            continue
         rows = table[(table["exposure"] == name) & table["used"]]
         xy = np.column_stack([rows["x"].value, rows["y"].value])
         out[i, np.searchsorted(solution.estimate.star_names, rows["star"])] = solution[name].to_reference(xy)

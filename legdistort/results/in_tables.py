@@ -120,9 +120,15 @@ def rms(solution):
     return np.array([np.sqrt(np.mean(solution.residuals[d][used].to_value(u.pix) ** 2)) for d in ("dx", "dy")])
 
 
+def folds(solution):
+    """Images whose map cannot be inverted, ``{label of the view: reason}``."""
+    return {part.label: part.fold for view in solution for part in view.parts if part.fold}
+
+
 def largest_inverse_error(solution):
-    """Largest certified round-trip error over all exposures, pixels."""
-    return max(view.distortion.inverse.error for view in solution)
+    """Largest certified round-trip error over all exposures that can be inverted, pixels; NaN without one."""
+    inverted = [view for view in solution if not all(part.fold for part in view.parts)]
+    return max((view.distortion.inverse.error for view in inverted), default=np.nan)
 
 
 def sky_sentence(solution):

@@ -12,7 +12,7 @@ import numpy as np
 from astropy import units as u
 from astropy.wcs import WCS
 
-from ..exceptions import InputError, some_of
+from ..exceptions import FoldError, InputError, some_of
 from ..geometry import similarity, star_hull
 from ..geometry.distortion import Distortion
 from ..geometry.models import exposure_model, like, outside, to_pixels
@@ -117,6 +117,16 @@ class View(ShownAsPrinted):
         """The `Detector`, if this view is of one in a focal plane; else None."""
         camera = self.solution.camera
         return camera[self.detector] if camera.has_focal_plane and self.detector is not None else None
+
+    @cached_property
+    def fold(self) -> str:
+        """Why its map cannot be inverted, which a WCS needs; empty if it can."""
+        try:
+            for each in (self.common, *(() if self.chip is None else (self.chip,))):
+                float(each.distortion.inverse.error)
+        except FoldError as error:
+            return str(error) if self.chip is None else f"{self.label}: {error}"
+        return ""
 
     def check_pixels(self) -> None:
         """Raise `InputError` if its pixels are those of a focal plane, and of no image."""

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import resources
 
 import four_detectors
@@ -10,7 +11,10 @@ import numpy as np
 import pytest
 from night_sets import Nights
 
-from legdistort import Matches, simulate_matches, solve
+from legdistort import Matches, coadd, match, measure, read_exposures, simulate_exposures, simulate_matches, solve
+from legdistort.assessment.run_checks import check_run
+from legdistort.exceptions import AssumptionWarning
+from legdistort.pipeline import write_results
 from legdistort.reporting.summary import summarise
 
 
@@ -64,6 +68,29 @@ def test_every_detector_is_in_figures():
         key: (place.x, place.y) for key, place in places.items()
     }
     assert all(each["x_err_px"] > 0 for each in found["detectors"])
+
+
+def test_a_map_that_folds_costs_its_image_alone(tmp_path):
+    """Named in summary and check; the others have their WCS, and are co-added."""
+    night = simulate_exposures(small=True, n_exposures=4, seed=1)
+    exposures = read_exposures(list(night.hdus.values()))
+    solution = solve(match(measure(exposures, psf="moffat"), exposures=exposures), degree=2, clip=None)
+    coefficients = solution.coefficients.copy()
+    coefficients[2, 0, 3] += 300  # a parabola over the whole detector
+    bent = replace(solution, coefficients=coefficients)
+    found = _valid(summarise(bent))
+    assert list(found["folded"]) == ["exp02"]
+    assert "exposure exp02 folds" in found["folded"]["exp02"]
+    assert 0 < found["max_inverse_error_px"] < 1e-3
+    with pytest.warns(AssumptionWarning, match="no WCS of exp02: the distortion of exposure exp02 folds"):
+        write_results(bent, tmp_path)
+    assert sorted(path.stem for path in (tmp_path / "wcs").iterdir()) == ["exp00", "exp01", "exp03"]
+    with pytest.warns(AssumptionWarning, match="left out of the mosaic: exp02: the distortion of exposure exp02 folds"):
+        mosaic = coadd(exposures, bent)
+    assert mosaic.exposures == ("exp00", "exp01", "exp03")
+    check = next(check for check in check_run(bent) if check.name == "inverse")
+    assert (check.state, check.value) == ("fail", 1.0)
+    assert check.sentence.startswith("exp02 cannot be inverted: ")
 
 
 def test_a_solution_is_shown_without_what_measures_and_co_adds(tmp_path):
