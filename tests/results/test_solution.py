@@ -241,6 +241,17 @@ def test_copies(what, remake):
     assert str(again) == str(solution)
 
 
+def test_names_are_printed_whole():
+    matches = simulate_matches(n_stars=20, n_exposures=3, degree=1, seed=1).matches
+    names = {old: f"{old}_of_a_night_with_a_name_of_forty_letters" for old in matches.names}
+    table = matches.table.copy()
+    table["exposure"] = [names[old] for old in table["exposure"]]
+    printed = str(solve(Matches.from_table(table, shape=(2048, 2048)), degree=1))
+    rows = [line for line in printed.splitlines() if line.startswith("exp0")]
+    assert [row.split()[0] for row in rows] == list(names.values())
+    assert len({len(row) for row in rows}) == 1
+
+
 def test_size_of_a_pickle():
     """Of 24,000 positions in 60 exposures; equations stay behind, and what was made from the solution."""
     matches = simulate_matches(n_exposures=60, n_stars=400, degree=3, seed=1).matches

@@ -62,6 +62,14 @@ def test_the_dense_oracle_agrees(kind, epochs):
     assert solution.dof == 2 * len(sim.matches.table) - n_free
 
 
+@pytest.mark.parametrize(("last", "asked"), [(2015.9, False), (2018.4, True)])
+def test_years_between_exposures_are_asked_about(last, asked, caplog):
+    caplog.set_level("INFO", logger="legdistort")
+    sim = field(3, degree=1, n_exposures=4, epochs=np.linspace(2015.3, last, 4))
+    solve(sim.matches, degree=1)
+    assert ("the exposures span 3.1 years, in which stars may have moved: motion='auto'" in caplog.text) is asked
+
+
 def test_rows_of_zero_motion_change_nothing():
     """Stars held at zero motion by what is known of them are stars without motions."""
     sim = field(60, motion=0.0)

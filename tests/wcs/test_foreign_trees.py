@@ -173,6 +173,7 @@ def test_catalogues_with_the_wcs_of_their_images(night, tmp_path, capsys):
     lists = [str(tmp_path / f"{path.stem}_cat.ecsv") for path in paths]
     words = ["--error", "0.02", "--wcs", *map(str, paths), "--out", str(tmp_path / "matched.ecsv")]
     assert main(["match", *lists, *words]) == 0
+    assert capsys.readouterr().err.count("columns of photutils: x = xcentroid, y = ycentroid") == 1  # of six lists
     assert main(["solve", str(tmp_path / "matched.ecsv"), "--degree", "2", "--out", str(tmp_path / "solved")]) == 0
     found = ld.Solution.read(tmp_path / "solved")
     assert found.names == solution.names
