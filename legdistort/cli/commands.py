@@ -258,7 +258,7 @@ def do_catalogue(a):
 
     outputs.check_file(photometry_path(a.out), overwrite=a.overwrite)
     cataloguing = given(a, options.CATALOGUING)
-    MeasureOptions(**{name: value for name, value in cataloguing.items() if name not in ("zero_point", "scratch")})
+    MeasureOptions(**{name: value for name, value in cataloguing.items() if name in options.MEASURING})
     found = legdistort.catalogue(_open(a), _solution(a), **cataloguing, progress=wants_progress(a))
     found.write(a.out, overwrite=a.overwrite)
     _say(a, f"{found}\n{a.out} and {photometry_path(a.out)}", found.stars.meta | {"left_out": dict(found.left_out)})

@@ -152,6 +152,7 @@ CATALOGUING = {
     "fwhm": MEASURING["fwhm"],
     "psf": Option("moffat, effective, or a file or folder with PSFs (default: as the solution's)", path="read"),
     "zero_point": Option("magnitude of unit flux in a mean exposure (default: no magnitudes)", type=float),
+    "positions": Option("given stars, x, y or ra, dec: their fluxes and upper limits", path="read", metavar="TABLE"),
     "scratch": SCRATCH,
 }
 PSF_FILES = {"write_psf": Option("folder for the effective PSF of every exposure", type=Path, path="folder")}

@@ -23,12 +23,15 @@ from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.parallel import map_items
 from ..runtime.scratch import moved, scratch_folder
+from .forced import at_places, forced_table, given_places
 from .joint_scene import JointScene
 from .measuring import measure_field
 from .reading import read_layer
 from .tables import photometry_table, stars_table
 
 if TYPE_CHECKING:
+    from astropy.table import Table
+
     from ..inputs.exposures import Exposure
     from ..results.solution import Solution
     from ..runtime.annotations import StrPath
@@ -85,6 +88,8 @@ class Catalogue(ShownAsPrinted):
 
     def __repr__(self) -> str:
         n_images = self.stars.meta["n_images"]
+        if self.stars.meta.get("forced"):
+            return f"<Catalogue: {len(self.stars)} given positions in {n_images} images>"
         return f"<Catalogue: {len(self.stars)} stars in {n_images} images, {self.stars.meta['n_new']} of them new>"
 
     def __str__(self) -> str:
@@ -131,6 +136,7 @@ def catalogue(
     read_noise: float | None = None,
     saturation: float | None = None,
     zero_point: float | None = None,
+    positions: Table | StrPath | None = None,
     scratch: StrPath | None = None,
     progress: bool = False,
 ) -> Catalogue:
@@ -161,6 +167,10 @@ def catalogue(
         In e-/ADU, e-, ADU; for all exposures instead of their own values.
     zero_point : float, optional
         Magnitude of a star of unit flux in an exposure of mean transmission; without it there are no magnitudes.
+    positions : `~astropy.table.Table` or path, optional
+        Given stars instead: ``x``, ``y`` in the reference plane [pix] or, where the solution has a sky, ``ra``, ``dec``
+        [deg], perhaps ``star``. All stars are found as always, and the fluxes at these places are fitted beside those
+        of the others: negative ones are kept, and ``flux_limit`` is three standard deviations above what is there.
     scratch : str or path, optional
         Folder for pixels while work goes on, if they do not stay in memory: 24 bytes for each of the exposures, and for
         each of the reference plane. The default is that of the system (``TMPDIR``), which some systems keep in memory.
@@ -174,9 +184,9 @@ def catalogue(
     Raises
     ------
     InputError
-        For a value out of range, an exposure whose shape is not that of the solution, a solution with motions of stars,
-        which this does not fit, one of a camera whose detectors no star ties together, and where no exposure can be
-        used.
+        For a value out of range, positions that are not finite or on no exposure, an exposure whose shape is not that
+        of the solution, a solution with motions of stars, which this does not fit, one of a camera whose detectors no
+        star ties together, and where no exposure can be used.
     DiskFullError
         If the disk of `scratch` has less space than will be needed.
 
@@ -205,6 +215,7 @@ def catalogue(
     if zero_point is not None and not np.isfinite(zero_point):
         raise InputError(f"zero_point must be a finite magnitude, got {zero_point!r}")
     _check_solution(solution)
+    places = None if positions is None else given_places(positions, solution)
     frames, views, left_out = select_images(exposures, solution, "measure", "the catalogue")
     grid = reference_grid(list(views.values()), solution.sky)
     use_compiled_loops(sum(int(np.prod(frame.shape)) for frame in frames))
@@ -223,20 +234,25 @@ def catalogue(
         if not layers:
             raise InputError(f"no exposure can be measured: {reasons_of(left_out)}")
         field = JointScene(layers, grid, folder=folder, progress=progress)
-        return _measured(field, solution, frames, left_out, threshold, zero_point)
+        return _measured(field, solution, frames, left_out, threshold, zero_point, places)
 
 
-def _measured(field, solution, frames, left_out, threshold, zero_point):
+def _measured(field, solution, frames, left_out, threshold, zero_point, places):
     """The catalogue of a scene that has no stars yet."""
     estimate = solution.estimate
     order = np.argsort(estimate.positions[:, 1], kind="stable")  # stars that are near in the memory are near on images
     clipped = np.array([layer.places.left_out(np.asarray(estimate.star_names)[order]) for layer in field.layers])
     measured = measure_field(field, estimate.positions[order], clipped, threshold)
-    if not len(field.flux):
+    if places is not None:
+        measured, names, rows = at_places(field, measured, *places)
+        stars = forced_table(field, measured, names, rows, solution, threshold, zero_point)
+    elif not len(field.flux):
         raise InputError(f"no star stands out of all exposures together by {threshold:g} times the noise")
-    stars = stars_table(field, measured, solution, threshold, zero_point)
+    else:
+        stars = stars_table(field, measured, solution, threshold, zero_point)
+        names, rows = stars["star"], np.argsort(-field.flux, kind="stable")
     frames = {frame.name: frame for frame in frames}
-    return Catalogue(stars, photometry_table(field, measured, stars, frames), left_out)
+    return Catalogue(stars, photometry_table(field, measured, names, rows, frames), left_out)
 
 
 def _check_solution(solution):

@@ -76,13 +76,13 @@ def measure_field(field, xy, left_out, threshold):
     while True:
         errors = transmissions.update(field)
         field.fit(np.ones(len(field.flux), dtype=bool), 2)
-        flux, error = _by_image(field)
+        flux, error = by_image(field)
         lone, varying = judged(flux, error, field.flux, field.snr(), threshold)
         if not lone.any():
             break
         rejected += int(lone.sum())
         field.remove(lone)
-    return Measured(flux, error, _flags(field), errors, varying, rejected + field.rejected)
+    return Measured(flux, error, image_flags(field), errors, varying, rejected + field.rejected)
 
 
 def _retune(field):
@@ -94,7 +94,8 @@ def _retune(field):
     transmissions.update(field)
 
 
-def _by_image(field):
+def by_image(field):
+    """Fluxes of the stars by image and their errors, positions fixed, (m, n) each; infinite where one is not seen."""
     flux, error = np.zeros((2, len(field.layers), len(field.flux)))
     for k, layer in enumerate(field.layers):
         own, its = field.fluxes(layer)
@@ -131,7 +132,7 @@ def judged(flux, error, mean, snr, threshold):
     return lone | (varying & ~confirmed), varying & confirmed & ~lone
 
 
-def _flags(field):
+def image_flags(field):
     """Flags of the stars by image, (m, n)."""
     out = np.zeros((len(field.layers), len(field.flux)), dtype=int)
     for k, layer in enumerate(field.layers):

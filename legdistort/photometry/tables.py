@@ -9,7 +9,7 @@ from ..measurement.crowding import crowding
 from ..results.new_positions import add_sky
 from .measuring import covariances, map_covariances, sharpness, star_flags
 
-_SAME = 0.5  # FWHM from a star of the solution: it is that star
+SAME = 0.5  # FWHM from a star of the solution: it is that star
 _MAGNITUDE = 2.5 / np.log(10)
 
 
@@ -18,7 +18,7 @@ def stars_table(field, measured, solution, threshold, zero_point):
     covariance, chi2 = covariances(field, threshold)
     relative, absolute = map_covariances(field)
     both = covariance[:, :2, :2]
-    names = star_names(field.xy, solution, _SAME * field.fwhm)
+    names = star_names(field.xy, solution, SAME * field.fwhm)
     table = QTable({"star": names})
     table["x"], table["y"] = (c * u.pix for c in field.xy.T)
     for suffix, each in (("err", both), ("map_err", relative), ("err_abs", both + absolute)):
@@ -29,15 +29,14 @@ def stars_table(field, measured, solution, threshold, zero_point):
         add_sky(table, solution.sky, field.xy, _planes(both + relative), _planes(both + absolute))
     table["flux"], table["flux_err"] = field.flux, np.sqrt(covariance[:, 2, 2])
     if zero_point is not None:
-        table["mag"] = zero_point - 2.5 * np.log10(field.flux)
-        table["mag_err"] = _MAGNITUDE * table["flux_err"] / table["flux"]
-    table["flux_scatter"], table["n"] = _scatter(field, measured), measured.seen.sum(axis=0)
+        table["mag"], table["mag_err"] = magnitudes(table["flux"], table["flux_err"], zero_point)
+    table["flux_scatter"], table["n"] = flux_scatter(field, measured), measured.seen.sum(axis=0)
     trusted = np.array([layer.trusted for layer in field.layers])
     table["n_left_out"] = (measured.seen & ~trusted).sum(axis=0)
     table["snr"], table["chi2_dof"], table["sharpness"] = field.snr(), chi2, sharpness(field)
     table["flags"] = star_flags(field, measured)
     table.add_column(crowding(table, field.fwhm), name="crowding", index=len(table.columns) - 1)
-    table.meta = _meta(field, measured, solution, threshold, names.tolist())
+    table.meta = summary(field, measured, solution, threshold, names.tolist())
     return table[np.argsort(-table["flux"], kind="stable")]
 
 
@@ -55,26 +54,32 @@ def star_names(xy, solution, radius):
     return names if known.dtype.kind in "iu" else names.astype(str)
 
 
-def photometry_table(field, measured, stars, frames):
+def magnitudes(flux, error, zero_point):
+    """Magnitudes of fluxes (n,) and their errors; NaN where there is no light."""
+    light = np.where(flux > 0, flux, np.nan)
+    return zero_point - 2.5 * np.log10(light), _MAGNITUDE * error / light
+
+
+def photometry_table(field, measured, names, rows, frames):
     """One row a star and image that sees it.
 
     Parameters
     ----------
     field : `~legdistort.photometry.joint_scene.JointScene`
     measured : `~legdistort.photometry.measuring.Measured`
-    stars : `~astropy.table.QTable`
-        From `stars_table`.
+    names : ndarray, shape (n,)
+    rows : ndarray of int, shape (n,)
+        Which stars these are.
     frames : dict
         Exposures by name.
     """
-    order = np.argsort(-field.flux, kind="stable")  # as in the table of stars
-    star, image = np.nonzero(measured.seen.T[order])
+    star, image = np.nonzero(measured.seen.T[rows])
     own = [frames[layer.name] for layer in field.layers]
-    table = QTable({"star": stars["star"][star], "exposure": np.array([each.exposure for each in own])[image]})
+    table = QTable({"star": names[star], "exposure": np.array([each.exposure for each in own])[image]})
     if any(each.detector is not None for each in own):
         table["detector"] = np.array([str(each.detector) for each in own])[image]
     for name in ("flux", "flux_err", "flags"):
-        table[name] = getattr(measured, name)[image, order[star]]
+        table[name] = getattr(measured, name)[image, rows[star]]
     light = {layer.name: layer.transmission / layer.unit for layer in field.layers}
     table.meta["zero_points"] = {
         name: {"magnitude": float(2.5 * np.log10(t)), "error": float(_MAGNITUDE * error)}
@@ -87,7 +92,7 @@ def _planes(covariance):
     return np.stack([covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]])
 
 
-def _scatter(field, measured):
+def flux_scatter(field, measured):
     """Standard deviation of the fluxes of single images, weighted; (n,), NaN with a single one."""
     weight = 1 / measured.flux_err**2
     total, count = weight.sum(axis=0), measured.seen.sum(axis=0)
@@ -95,7 +100,8 @@ def _scatter(field, measured):
     return np.where(count > 1, np.sqrt(square * count / np.maximum(count - 1, 1)), np.nan)
 
 
-def _meta(field, measured, solution, threshold, names):
+def summary(field, measured, solution, threshold, names):
+    """What the table of stars says of itself, in plain numbers."""
     known = set(np.asarray(solution.estimate.star_names).tolist())
     found = len(known & set(names))
     return {

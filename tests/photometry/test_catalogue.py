@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import QTable
+from astropy.table import QTable, Table
 from deep_frames import compared, deep_frames
 
 import legdistort as ld
@@ -200,6 +200,56 @@ def test_pixels_on_the_disk_give_the_same_catalogue(truth, solution, found, tmp_
     assert not list(tmp_path.iterdir())
     with pytest.raises(InputError, match="no scratch folder can be made"):
         ld.catalogue(exposures_of(truth), solution, scratch=tmp_path / "none")
+
+
+def test_fluxes_at_given_places(truth, solution, found):
+    """Of stars too faint to be found and of empty sky as their errors state; of bright ones as they are."""
+    rng, pixels = np.random.default_rng(5), truth.pixels[0]
+    apart = np.hypot(*(pixels[:, None] - pixels).T) + 99 * np.eye(len(pixels))
+    alone = np.flatnonzero(((pixels > 8) & (pixels < 312)).all(axis=1) & (apart.min(axis=0) > 6))
+    faint, bright = alone[truth.snr[alone] < 4], alone[truth.snr[alone] > 40][:8]
+    empty = rng.uniform(20, 300, (400, 2))
+    empty = empty[np.hypot(*(pixels[:, None] - empty).T).T.min(axis=0) > 6][:40]
+    xy = solution["f00"].correct(np.vstack([truth.pixels[0][bright], truth.pixels[0][faint], empty]))
+    names = [f"s{k}" for k in range(len(xy))]
+    given = Table({"star": names, "x": xy[:, 0], "y": xy[:, 1]})
+    out = ld.catalogue(exposures_of(truth), solution, zero_point=25.0, positions=given)
+    assert out.stars["star"].tolist() == names
+    np.testing.assert_allclose(out.stars["x"].value, xy[:, 0])
+    b, n = len(bright), len(bright) + len(faint)
+    ratio = np.asarray(out.stars["flux"][:b]) / truth.flux[bright]
+    level = np.median(ratio)
+    assert np.std(ratio / level) < 0.03
+    true = level * np.concatenate([truth.flux[faint], np.zeros(len(empty))])
+    pull = (np.asarray(out.stars["flux"][b:]) - true) / np.asarray(out.stars["flux_err"][b:])
+    assert 0.75 < np.sqrt(np.mean(pull[: len(faint)] ** 2)) < 1.35
+    assert 0.7 < np.sqrt(np.mean(pull[len(faint) :] ** 2)) < 1.35
+    assert abs(np.mean(pull[len(faint) :])) < 0.6
+    assert np.any(out.stars["flux"][n:] < 0)
+    assert np.mean(out.stars["flux_limit"][b:] > true) > 0.97
+    assert np.isnan(out.stars["mag"][n:][out.stars["flux"][n:] < 0]).all()
+    one = out.photometry[out.photometry["star"] == names[0]]
+    mean = np.sum(one["flux"] / one["flux_err"] ** 2) / np.sum(one["flux_err"] ** -2.0)
+    assert mean == pytest.approx(out.stars["flux"][0], rel=1e-3)
+    assert repr(out) == f"<Catalogue: {len(xy)} given positions in 8 images>"
+
+
+def test_places_that_cannot_be_measured_are_named(truth, solution, tmp_path):
+    exposures = exposures_of(truth)[:3]
+    for table, words in (
+        (Table({"x": [10.0, np.nan], "y": [5.0, 6.0]}), r"position of star 1 \(row 1\) is not finite"),
+        (Table({"star": ["a", "a"], "x": [10.0, 20], "y": [5.0, 6]}), "a name in column star stands twice"),
+        (Table({"ra": [10.0], "dec": [5.0]}), r"no columns x, y \(the solution does not know the sky"),
+        (Table({"x": [9e5], "y": [9e5]}), r"no position lies on an exposure \(star 0\)"),
+    ):
+        with pytest.raises(InputError, match=words):
+            ld.catalogue(exposures, solution, positions=table)
+    place = np.array([[150.0, 150.0], [1e4, 1e4]])
+    Table({"star": [7, 9], "x": place[:, 0], "y": place[:, 1]}).write(tmp_path / "given.csv")
+    with pytest.warns(AssumptionWarning, match="no exposure shows the place of star 9: left out"):
+        out = ld.catalogue(exposures, solution, positions=tmp_path / "given.csv")
+    assert out.stars["star"].tolist() == [7]
+    assert out.stars["n"][0] == 3
 
 
 def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
