@@ -74,20 +74,20 @@ def at_places(field, measured, names, xy):
     Raises
     ------
     InputError
-        If no place lies on an image.
+        If no image sees one of the places.
     """
-    inside = field.contains(xy)
-    if not inside.all():
-        off = some_of([str(name) for name in names[~inside]], _NAMED)
-        if not inside.any():
-            raise InputError(f"no position lies on an exposure (star {off}): are they of this field?")
-        warn(f"no exposure shows the place of star {off}: left out", AssumptionWarning)
-    names, xy = names[inside], xy[inside]
     if len(field.xy):
         field.remove(cKDTree(xy).query(field.xy)[0] < SAME * field.fwhm)
-    begin = _BEGIN * np.median(field.flux) if len(field.flux) else 1.0
-    rows = len(field.flux) + np.arange(len(xy))
+    first, begin = len(field.flux), _BEGIN * np.median(field.flux) if len(field.flux) else 1.0
     field.add(xy, np.full(len(xy), begin))
+    seen = field.snr()[first:] > 0
+    if not seen.all():
+        off = some_of([str(name) for name in names[~seen]], _NAMED)
+        if not seen.any():
+            raise InputError(f"no exposure shows one of the positions (star {off}): are they of this field?")
+        warn(f"no exposure shows the place of star {off}, where stars determined its map: left out", AssumptionWarning)
+        field.remove(np.append(np.zeros(first, dtype=bool), ~seen))
+    names, rows = names[seen], first + np.arange(np.count_nonzero(seen))
     for _ in range(_ROUNDS):
         flux, error = by_image(field)
         weight = 1 / error**2
@@ -102,9 +102,7 @@ def forced_table(field, measured, names, rows, solution, threshold, zero_point):
     """One row a given place, in their order; `legdistort.photometry.catalogue.Catalogue` explains the columns."""
     xy, flux = field.xy[rows], field.flux[rows]
     weight = (1 / measured.flux_err[:, rows] ** 2).sum(axis=0)
-    chi2 = field.core_chi2()[rows]
-    with np.errstate(divide="ignore"):
-        error = np.sqrt(np.maximum(chi2, 1) / weight)
+    error = np.sqrt(np.maximum(field.core_chi2()[rows], 1) / weight)
     table = QTable({"star": names})
     table["x"], table["y"] = (c * u.pix for c in xy.T)
     if solution.sky is not None:
@@ -117,7 +115,6 @@ def forced_table(field, measured, names, rows, solution, threshold, zero_point):
         table["mag_limit"] = magnitudes(table["flux_limit"], error, zero_point)[0]
     table["flux_scatter"] = flux_scatter(field, measured)[rows]
     table["n"], table["snr"] = measured.seen[:, rows].sum(axis=0), flux / error
-    table["chi2_dof"] = chi2
     table["flags"] = star_flags(field, measured)[rows]
     table.meta = summary(field, measured, solution, threshold, np.asarray(names).tolist()) | {"forced": True}
     return table

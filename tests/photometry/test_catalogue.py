@@ -207,8 +207,10 @@ def test_fluxes_at_given_places(truth, solution, found):
     rng, pixels = np.random.default_rng(5), truth.pixels[0]
     apart = np.hypot(*(pixels[:, None] - pixels).T) + 99 * np.eye(len(pixels))
     alone = np.flatnonzero(((pixels > 8) & (pixels < 312)).all(axis=1) & (apart.min(axis=0) > 6))
-    faint, bright = alone[truth.snr[alone] < 4], alone[truth.snr[alone] > 40][:8]
+    supported = solution["f00"].supported(pixels)
+    faint, bright = alone[(truth.snr[alone] < 4) & supported[alone]], alone[truth.snr[alone] > 40][:8]
     empty = rng.uniform(20, 300, (400, 2))
+    empty = empty[solution["f00"].supported(empty)]
     empty = empty[np.hypot(*(pixels[:, None] - empty).T).T.min(axis=0) > 6][:40]
     xy = solution["f00"].correct(np.vstack([truth.pixels[0][bright], truth.pixels[0][faint], empty]))
     names = [f"s{k}" for k in range(len(xy))]
@@ -240,13 +242,15 @@ def test_places_that_cannot_be_measured_are_named(truth, solution, tmp_path):
         (Table({"x": [10.0, np.nan], "y": [5.0, 6.0]}), r"position of star 1 \(row 1\) is not finite"),
         (Table({"star": ["a", "a"], "x": [10.0, 20], "y": [5.0, 6]}), "a name in column star stands twice"),
         (Table({"ra": [10.0], "dec": [5.0]}), r"no columns x, y \(the solution does not know the sky"),
-        (Table({"x": [9e5], "y": [9e5]}), r"no position lies on an exposure \(star 0\)"),
+        (Table({"x": [9e5], "y": [9e5]}), r"no exposure shows one of the positions \(star 0\)"),
     ):
         with pytest.raises(InputError, match=words):
             ld.catalogue(exposures, solution, positions=table)
     place = np.array([[150.0, 150.0], [1e4, 1e4]])
     Table({"star": [7, 9], "x": place[:, 0], "y": place[:, 1]}).write(tmp_path / "given.csv")
-    with pytest.warns(AssumptionWarning, match="no exposure shows the place of star 9: left out"):
+    with pytest.warns(
+        AssumptionWarning, match="no exposure shows the place of star 9, where stars determined its map: left out"
+    ):
         out = ld.catalogue(exposures, solution, positions=tmp_path / "given.csv")
     assert out.stars["star"].tolist() == [7]
     assert out.stars["n"][0] == 3
