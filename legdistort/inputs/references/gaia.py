@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import numpy as np
@@ -134,9 +135,17 @@ def _kept(folder, places):
 def _asked(query):
     """The table that an archive answers with."""
     import pyvo
+    from pyvo.utils.http import create_session
 
     try:
-        return pyvo.dal.TAPService(_archive()).run_async(query).to_table()
+        with ExitStack() as opened:  # pyvo leaves connections open where it does not read an answer to its end
+            session = opened.enter_context(closing(create_session()))
+
+            def close_later(response, *_, **__):
+                opened.callback(response.close)
+
+            session.hooks["response"].append(close_later)
+            return pyvo.dal.TAPService(_archive(), session=session).run_async(query).to_table()
     except Exception as error:  # requests, pyvo and the server raise what they like
         raise InputError(
             f"the archive of Gaia ({_archive()}) gives no stars: {first_line(error)}; {_INSTEAD}"
