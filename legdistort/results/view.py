@@ -120,7 +120,14 @@ class View(ShownAsPrinted):
 
     @cached_property
     def fold(self) -> str:
-        """Why its map cannot be inverted, which a WCS needs; empty if it can."""
+        """Why its map cannot be inverted, which a WCS needs; empty if it can.
+
+        Examples
+        --------
+        >>> import legdistort as ld
+        >>> ld.solve(ld.simulate_matches(seed=1).matches)["exp00"].fold
+        ''
+        """
         try:
             for each in (self.common, *(() if self.chip is None else (self.chip,))):
                 float(each.distortion.inverse.error)

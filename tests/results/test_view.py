@@ -540,6 +540,27 @@ def test_a_mosaic_weighted_by_the_error_maps_of_detectors(several):
     assert np.median(ratios) > 0.1
 
 
+def test_a_fold_is_said_for_the_exposure_and_the_detector(several):
+    """Of the distortion of an exposure, which all its detectors share, and of that of one detector alone."""
+    plain = ld.solve(ld.simulate_matches(n_stars=30, n_exposures=3, degree=2, seed=1).matches, degree=2)
+    assert [view.fold for view in plain] == ["", "", ""]
+    coefficients = plain.coefficients.copy()
+    coefficients[1, 0, 3] += 1000
+    bent = replace(plain, coefficients=coefficients)
+    assert [bool(view.fold) for view in bent] == [False, True, False]
+    assert bent["exp01"].fold.startswith("the distortion of exposure exp01 folds")
+    several, _ = several
+    first, *others = several.camera.detectors
+    static = np.zeros((2, 6))
+    static[0, 3] = 1000
+    detectors = dict(several.camera.detectors)
+    detectors[first] = replace(detectors[first], static=static, static_sigma=None)
+    bent = replace(several, camera=replace(several.camera, detectors=detectors))
+    name = bent.names[0]
+    assert bent[name, first].fold.startswith(f"{bent[name, first].label}: ")
+    assert not any(bent[name, other].fold for other in others)
+
+
 def test_all_of_a_view_is_tested_here():
     source = Path(__file__).read_text(encoding="utf-8")
     public = [name for name in vars(View) if not name.startswith("_")]
