@@ -98,6 +98,11 @@ def _poses(ny, nx, n):
     return _kept(poses.reshape(len(rows), 6).T @ rows)
 
 
+def detector_corners(shapes):
+    """Corners (n, 4, 2) of detectors (ny, nx), a list of n, pixels."""
+    return np.array(shapes)[:, None, ::-1] * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 0.5
+
+
 def pose_departures(poses, given, shapes):
     """Coefficients (n, 4) of `similarity_basis` that amount to poses (n, 2, 3) beside given ones of the same parity.
 

@@ -87,7 +87,7 @@ def named_after(table, exposures, path):
     Raises
     ------
     InputError
-        For an exposure of the table that is none of the frames, or might be several.
+        For an exposure of the table that is none of the frames.
     """
     known, out = {exposure_names.whole_name(each) for each in exposures}, table.copy(copy_data=False)
     names = {}

@@ -36,8 +36,8 @@ def summarise(solution, *, timings=None):
         "max_inverse_error_px": _plain(in_tables.largest_inverse_error(solution)),
         "folded": in_tables.folds(solution),
         "left_out": dict(solution.left_out),
-        "exposures": exposures(solution),
-        "nights": nights(solution),
+        "exposures": (each := exposures(solution)),
+        "nights": nights(each),
         "detectors": detectors(solution.camera),
         "command": provenance.command_line(),
         **found.summary(),
@@ -67,9 +67,9 @@ def exposures(solution):
     return out
 
 
-def nights(solution):
-    """One dict of numbers a night, or other block: its exposures, and the mean of their figures."""
-    found, of = exposures(solution), {}
+def nights(found):
+    """One dict of numbers a night, or other block, of what `exposures` gives: these, and the mean of their figures."""
+    of = {}
     for each in found:
         of.setdefault(each["block"], []).append(each)
     return [
@@ -102,7 +102,8 @@ def detectors(camera):
 def _times(solution):
     """Number of the night and year of every exposure."""
     table = solution.residuals
-    first = [int(np.argmax(table["exposure"] == name)) for name in solution.names]
+    names, rows = np.unique(column_contract.labels(table, "exposure"), return_index=True)
+    first = rows[np.searchsorted(names, solution.names)]
     epoch = column_contract.values(table, "epoch", u.yr)[first] if "epoch" in table.colnames else [np.nan] * len(first)
     return column_contract.blocks(table, first), epoch
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..exceptions import FoldError, SolveError
 from ..geometry import similarity
+from ..geometry.detector_modes import detector_corners
 from ..geometry.distortion import Distortion
 from .equations.elimination import inverse_star_blocks
 from .equations.problem import State
@@ -138,7 +139,7 @@ def _common_similarity(problem, nominal, refined, weights, astray):
     variance = 1 / np.add.reduceat(weights, problem.start[:-1])
     weight = 1 / (variance + 10 * np.median(variance))
     weight[astray] = 0
-    corners = np.array(problem.shapes)[:, None, ::-1] * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 0.5
+    corners = detector_corners(problem.shapes)
     old, new = (similarity.apply_inverses(poses, corners).reshape(-1, 2) for poses in (nominal, refined))
     return similarity.fit_similarity(old, new, weights=np.repeat(weight, 4), parity=1)
 

@@ -27,7 +27,7 @@ from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read
 from ..runtime.outputs import replacing, replacing_files, replacing_folder
 from ..runtime.progress import Bar
 from .fits_headers import header_error
-from .foreign_trees import has_wcs, refined_tree, table_of
+from .foreign_trees import PLACES, model_wcs, refined_tree, table_of
 from .storage import wcs_tree
 
 log = logging.getLogger(__name__)
@@ -261,13 +261,9 @@ def _plan(known, path, target, *, kind, max_error, ext, overwrite):
         if kind == "head":
             whole = _head(hdulist, of_images)
         elif images:
-            foreign = _foreign(spans, raw, path) if len(images) == 1 else None
-            if foreign is None:
-                edits += _asdf_edits(known, images, spans, *_tables(hdulist, spans, path, overwrite))
-            else:
-                (name,) = images
-                content = refined_tree(_content(foreign, raw), known.views[name], f"{path}[ASDF]")
-                edits.append((foreign.start, foreign.stop, table_of(foreign.header, content)))
+            edits += _foreign_edits(known, images, spans, raw, path) or _asdf_edits(
+                known, images, spans, *_tables(hdulist, spans, path, overwrite)
+            )
     return _Plan(path, target, zlib.crc32(raw), headers, edits, elsewhere, whole)
 
 
@@ -285,21 +281,24 @@ def _plan_of_tree(known, path, target, raw, kind):
     name = exposure_names.exposure_name(path)
     if name not in known.views:
         return _Plan(path, target, zlib.crc32(raw), _nothing(known, path, name), [], [])
-    whole = refined_tree(raw, known.views[name], str(path))
+    if (found := model_wcs(raw, str(path))) is None:
+        raise InputError(f"{path} has no gwcs at {' or '.join('.'.join(keys) for keys in PLACES)}")
+    whole = refined_tree(raw, found, known.views[name], str(path))
     return _Plan(path, target, zlib.crc32(raw), {name: None}, [], [], whole)
 
 
-def _foreign(spans, raw, path):
-    """The one extension ASDF of a file, if it is the data model of a pipeline with a gwcs; else None."""
+def _foreign_edits(known, images, spans, raw, path):
+    """The edit of the only extension ASDF of a file, if it is a data model of a pipeline with a gwcs; else none."""
     tables = [span for span in spans if span.header.get("EXTNAME") == "ASDF"]
-    if len(tables) != 1 or "EXPNAME" in tables[0].header or tables[0].header.get("TFIELDS") != 1:
-        return None
-    return tables[0] if has_wcs(_content(tables[0], raw), f"{path}[ASDF]") else None
-
-
-def _content(span, raw):
-    """The ASDF file in a table of one row."""
-    return raw[span.data : span.data + span.header["NAXIS1"]]
+    if len(images) != 1 or len(tables) != 1 or "EXPNAME" in tables[0].header or tables[0].header.get("TFIELDS") != 1:
+        return []
+    (name,), (span,), label = images, tables, f"{path}[ASDF]"
+    content, found = raw[span.data : span.data + span.header["NAXIS1"]], None
+    with contextlib.suppress(InputError):  # of another program, which may hold anything
+        found = model_wcs(content, label)
+    if found is None:
+        return []
+    return [(span.start, span.stop, table_of(span.header, refined_tree(content, found, known.views[name], label)))]
 
 
 def _head(hdulist, of_images):

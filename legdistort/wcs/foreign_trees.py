@@ -27,13 +27,30 @@ _HANDLE = "%TAG ! tag:stsci.edu:asdf/"
 _ANCHOR = re.compile(r"(?<=[\s,\[{])([&*])id(\d+)\b")
 
 
-def refined_tree(content, view, label):
+def model_wcs(content, label):
+    """Keys and gwcs of the data model in the bytes of an ASDF file; None if none is where models have it (`PLACES`).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read; `label` is how the message calls it.
+    """
+    try:
+        tree = read_tree(label, content=content, tags=ARCHIVES)
+    except InputError as error:
+        raise InputError(f"{label}: the WCS in it cannot be exchanged: {error}") from None
+    return next(((keys, wcs) for keys in PLACES if hasattr(wcs := _at(tree, keys), "available_frames")), None)
+
+
+def refined_tree(content, found, view, label):
     """The bytes of an ASDF file in which the WCS of an image is that of a solution, see `legdistort.refine`.
 
     Parameters
     ----------
     content : bytes
         The whole file.
+    found : tuple
+        Its keys and gwcs, from `model_wcs`.
     view : View
     label : str
         How messages call it.
@@ -41,25 +58,10 @@ def refined_tree(content, view, label):
     Raises
     ------
     InputError
-        If no gwcs stands where data models have it (`PLACES`), or it cannot be refined.
+        If it cannot be refined.
     """
-    try:
-        tree = read_tree(label, content=content, tags=ARCHIVES)
-    except InputError as error:
-        raise InputError(f"{label}: the WCS in it cannot be exchanged: {error}") from None
-    for keys in PLACES:
-        if (wcs := _at(tree, keys)) is not None:
-            return _exchanged(content, keys, refine(wcs, view).stock(), label)
-    raise InputError(f"{label} has no gwcs at {' or '.join('.'.join(keys) for keys in PLACES)}")
-
-
-def has_wcs(content, label):
-    """Whether the bytes of an ASDF file hold a gwcs where data models have it."""
-    try:
-        tree = read_tree(label, content=content, tags=ARCHIVES)
-    except InputError:
-        return False
-    return any(hasattr(_at(tree, keys), "available_frames") for keys in PLACES)
+    keys, wcs = found
+    return _exchanged(content, keys, refine(wcs, view).stock(), label)
 
 
 def table_of(header, content):

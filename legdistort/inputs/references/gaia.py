@@ -11,6 +11,7 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord, UnitSphericalRepresentation
 
 from ...exceptions import InputError
+from ...geometry.detector_modes import detector_corners
 from ...geometry.similarity import apply_inverses
 from ...runtime.checks import first_line
 from ..table_files import write_table
@@ -94,8 +95,7 @@ def gaia_around(matches):
 
 def _corners(matches):
     """The corners of all exposures on the sky."""
-    shapes = np.array([matches.shapes[name] for name in matches.names])
-    corners = shapes[:, None, ::-1] * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 0.5
+    corners = detector_corners([matches.shapes[name] for name in matches.names])
     poses = np.stack([matches.poses[name] for name in matches.names])
     return matches.sky.to_sky(apply_inverses(poses, corners).reshape(-1, 2))
 
