@@ -232,4 +232,4 @@ def drawn_set(
     use = np.bincount(star, minlength=n_stars)[star] > 1
     used, star = np.unique(star[use], return_inverse=True)
     data = {"xy": xy[use], "err": err[use], "star": star, "exposure": exposure[use], "poses": poses, "n": size}
-    return data | {"degree": degree}, {"stars": stars[used], "static": given, "dynamic": own}
+    return data | {"degree": degree}, {"stars": stars[used], "static": given, "dynamic": own, "beyond": beyond}

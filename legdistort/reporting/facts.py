@@ -61,7 +61,7 @@ def solution_rows(solution, facts):
         "Stars": stars if lost else facts["n_stars"],
         "Positions used": Markup("{} <small>({} not used)</small>").format(facts["n_observations"], not_used),
         "χ² / degrees of freedom": Markup(
-            "{:.1f} / {} = {} <small>(1 where the stated errors are right)</small>"
+            "{:.1f} / {:.0f} = {} <small>(1 where the stated errors are right)</small>"
         ).format(facts["chi2"], facts["dof"], _ratio(facts)),
         "Residuals, rms": per_axis(facts["rms_px"]),
     }
@@ -120,7 +120,7 @@ def methods(solution, facts, *, stacked):
         f"{solution.degree} in each axis{static}, and all its coefficients and the positions of all stars minimise the "
         f"weighted squares of the residuals. {count(facts['n_observations'], 'position')} of "
         f"{count(facts['n_stars'], 'star')} were used{f', {not_used} were not' if not_used else ''}. "
-        f"The residuals are {per_axis(facts['rms_px'])} rms, with chi2 = {facts['chi2']:.1f} for {facts['dof']} "
+        f"The residuals are {per_axis(facts['rms_px'])} rms, with chi2 = {facts['chi2']:.1f} for {facts['dof']:.0f} "
         "degrees of freedom.",
     ]
     if facts.get("sigma_px") is not None:

@@ -25,7 +25,7 @@ def summarise(solution, *, timings=None):
         "n_stars": int(np.count_nonzero(np.isfinite(solution.estimate.positions[:, 0]))),
         "n_observations": int(np.count_nonzero(solution.residuals["used"])),
         "chi2": float(solution.chi2),
-        "dof": int(solution.dof),
+        "dof": float(solution.dof),
         "rms_px": float(np.sqrt(np.mean(in_tables.rms(solution) ** 2))),
         "sigma_px": float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else None,
         "checks": [to_tree(check) for check in solution.checks],

@@ -132,6 +132,6 @@ def _responses(view):
     of_camera = np.zeros((len(q), 2, 0))
     if errors is not None:
         of_camera = moved @ errors.coefficients[view.index]
-        of_camera = of_camera - slope @ errors.in_focal_plane(solution.camera, f, view.detector)
+        of_camera = of_camera - slope @ errors.of_measured(view, q)
     modes = weights * basis.values(degree, x, y)
     return tuple(np.einsum("mn,nak->amk", modes, each).reshape(2 * len(modes), -1) for each in (moved, of_camera))

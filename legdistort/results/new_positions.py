@@ -255,14 +255,14 @@ def relative_errors(view, q):
 
 
 def by_camera(view, q, by_modes, back):
-    """Covariance (n, 2, 2) of corrected positions by the errors of a camera that was fitted: its own, and what the
-    coefficients make of them. Zero without.
+    """Covariance (n, 2, 2) of corrected positions by the errors of what exposures have in common, such as a camera.
+
+    Its own, and what the coefficients make of them. Zero without.
     """
-    solution = view.solution
-    errors = solution.estimate.uncertainty.camera
+    errors = view.solution.estimate.uncertainty.camera
     if errors is None:
         return np.zeros((len(q), 2, 2))
-    seen = errors.in_focal_plane(solution.camera, view.common.distortion(q), view.detector)
+    seen = errors.of_measured(view, q)
     through = back @ seen - by_modes @ errors.coefficients[view.index]
     return through @ through.mT
 

@@ -57,8 +57,9 @@ class Solution(ShownAsPrinted):
         detector position, and ``used`` added.
     chi2 : float
         Weighted sum of squares of the used residuals.
-    dof : int
-        Its degrees of freedom; the directions fixed by the gauge (the null space) are counted.
+    dof : float
+        Its degrees of freedom: coordinates less what the data determine of the unknowns; the directions fixed by the
+        gauge (the null space) are counted.
     status : str
         How the minimisation ended.
     gauge : Gauge
@@ -108,7 +109,7 @@ class Solution(ShownAsPrinted):
     coefficients: np.ndarray
     residuals: QTable
     chi2: float
-    dof: int
+    dof: float
     status: str
     gauge: Gauge
     settings: Settings
@@ -287,7 +288,7 @@ class Solution(ShownAsPrinted):
         exposures = f"{len(self.names)} exposure{'s' * (len(self.names) != 1)}"
         return (
             f"<Solution: {exposures}, {stars}, degree {self.degree}, "
-            f"chi2 {self.chi2:.1f} for {self.dof} degrees of freedom>"
+            f"chi2 {self.chi2:.1f} for {self.dof:.0f} degrees of freedom>"
         )
 
     def __str__(self) -> str:

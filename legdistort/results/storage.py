@@ -49,7 +49,7 @@ class StoredFit:
 
     degree: int = dataclasses.field(metadata=number(minimum=0, maximum=30))
     chi2: float = dataclasses.field(metadata=number(minimum=0))
-    dof: int
+    dof: float
     status: str
     columns: tuple[str, ...]
     left_out: dict[str, str]
@@ -87,7 +87,7 @@ def write_solution(solution, path, *, overwrite=False):
         "status": solution.status,
         "degree": solution.degree,
         "chi2": float(solution.chi2),
-        "dof": int(solution.dof),
+        "dof": float(solution.dof),
         "exposures": [to_tree(_stored_exposure(view)) for view in solution],
         "stars": to_tree(StoredStars(np.asarray(estimate.star_names), estimate.positions)),
         "columns": table.colnames,  # their order: that of a mapping is lost in files

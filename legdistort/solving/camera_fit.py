@@ -21,6 +21,7 @@ from ..results.errors.camera_errors import CameraErrors, Departure, moved_by
 from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
+from .equations.common_parts import followed
 
 #: Part of what the data would determine of a direction alone below which it is not determined beside all else: what
 #: detectors and exposures can exchange is so to first order, and by the gradient of one times the other beyond.
@@ -334,29 +335,17 @@ def camera_step(fit, sought, departure):
         Of the camera from where it was beforehand.
     """
     free, prior = sought.free, sought.prior
-    problem, blocks, camera = fit.weighted, fit.blocks, fit.matches.camera
-    respond = _response(fit.uncertainty.system, fit.result.gauge)
-    patterns = _patterns(fit.matches, camera, problem, free)
-    moved = _weighted(problem, patterns)
-    k = patterns.shape[2]
-    stars_follow, normal = np.empty((2, problem.n_stars, k)), np.einsum("ank,anl->kl", patterns, moved)
-    follow = np.empty((*blocks.g_exposure.shape, k))
-    alone = np.diag(normal).copy()
-    gradients = [_gradient(problem, blocks, patterns[:, :, j], moved[:, :, j]) for j in range(k)]
-    for j, (own, stars) in enumerate(gradients):
-        star_response, response = respond(own, stars)
-        stars_follow[:, :, j], follow[:, :, j] = star_response[:2], response
-        for m, (other_own, other_stars) in enumerate(gradients):
-            normal[m, j] -= np.sum(other_own * response) + np.sum(other_stars * star_response)
-    normal = (normal + normal.T) / 2
+    patterns = _patterns(fit.matches, fit.matches.camera, fit.weighted, free)
+    follow = followed(_response(fit.uncertainty.system, fit.result.gauge), fit.weighted, fit.blocks, patterns)
     precision = 1 / prior[free] ** 2
-    pull = -np.einsum("ank,an->k", moved, blocks.residual) - precision * departure[free]
-    covariance, weak = _inverse(normal, precision, alone)
+    pull = follow.pull - precision * departure[free]
+    covariance, weak = _inverse(follow.normal, precision, follow.alone)
     held = _held(weak, np.nonzero(free)[2])
     change = np.zeros(free.shape)
     change[free] = held @ (departure[free] + covariance @ pull) - departure[free]
     covariance = held @ covariance @ held.T
-    return CameraStep(change, covariance, free, stars_follow, follow, float(np.sum(covariance * normal)), weak)
+    freedom = float(np.sum(covariance * follow.normal))
+    return CameraStep(change, covariance, free, follow.stars, follow.coefficients, freedom, weak)
 
 
 def _response(system, gauge):
@@ -386,24 +375,6 @@ def _patterns(matches, camera, problem, free):
         moved = moved_by(chip, chip.distortion.invert(xy[rows]), units[:, :, free[c].ravel()])
         out[np.ix_([True, True], rows, of_detector == c)] = moved.transpose(1, 0, 2)
     return out
-
-
-def _weighted(problem, patterns):
-    """W p."""
-    w = problem.weight[:, :, None]
-    return np.stack([w[0] * patterns[0] + w[2] * patterns[1], w[2] * patterns[0] + w[1] * patterns[1]])
-
-
-def _gradient(problem, blocks, pattern, weighted):
-    """Gradients of exposures and stars, were the displacements (2, n) the residuals."""
-    own, stars = np.zeros_like(blocks.g_exposure), np.zeros_like(blocks.g_star)
-    for i in range(problem.n_exposures):
-        part = problem.part(i)
-        f = blocks.coupling[:, :, part]
-        pulled = problem.terms.pull(i, f[:, 0] * pattern[0, part] + f[:, 1] * pattern[1, part])
-        stars[:, problem.star[part]] += pulled
-        own[i] = (weighted[:, part] @ blocks.values[:, part].T).ravel()
-    return own, stars
 
 
 def _inverse(normal, precision, alone):

@@ -491,7 +491,7 @@ def _settings(asked, options, form):
 
 def _solution(fit, scale, settings, diagnostics, form=None):
     uncertainty, matches = (fit.uncertainty if scale == 1 else fit.uncertainty_at(scale)), fit.matches
-    if scale != 1 and uncertainty.camera is not None:
+    if scale != 1 and matches.camera.has_focal_plane and uncertainty.camera is not None:
         matches = replace(matches, camera=with_errors_times(matches.camera, uncertainty.camera.free, scale))
     return assemble(
         matches,

@@ -73,6 +73,8 @@ class Result:
         Unknowns of a distortion common to all exposures that these do not determine.
     system : Direct, OnStars, Iterative or None
         The reduced system there, if it was made with that gauge.
+    higher : ndarray, shape (k, k), or None
+        Covariance of what exposures have in common beyond the degree, as `MostProbable.higher_covariance` has it.
     """
 
     state: State
@@ -84,6 +86,7 @@ class Result:
     robust: np.ndarray
     n_weak: int = 0
     system: reduced_system.Reduced | None = None
+    higher: np.ndarray | None = None
 
 
 @contextlib.contextmanager

@@ -18,6 +18,7 @@ from .equations import criterion, effective_modes, elimination
 from .equations.covariances import Uncertainty
 from .equations.problem import Problem, build_problem, uses_compiled_loops
 from .gauge import known_maps, most_probable
+from .gauge.higher_static import higher_errors
 
 log = logging.getLogger(__name__)
 
@@ -59,9 +60,9 @@ class Fit:
     shared_errors : ndarray, shape (3, n_stars), or None
         See `Uncertainty`.
     camera_errors : `legdistort.results.errors.camera_errors.CameraErrors` or None
-        Those of a camera that was fitted.
+        Those of a camera that was fitted, or of the static distortion beyond the degree.
     shared_unknowns : float
-        Number of unknowns of a camera that were fitted and that the data determine.
+        Number of unknowns of these that the data determine.
     """
 
     matches: Matches
@@ -93,6 +94,13 @@ class Fit:
     def uncertainty(self):
         """Covariances at the stated errors."""
         return self.uncertainty_at(1.0)
+
+    def with_higher_errors(self):
+        """The fit with the errors of what exposures have in common beyond the degree, if they show any."""
+        if self.result.higher is None:
+            return self
+        errors, n = higher_errors(self.weighted, self.result, self.uncertainty, self.result.higher)
+        return replace(self, camera_errors=errors, shared_unknowns=n)
 
     def uncertainty_at(self, scale):
         """Covariances at the stated errors times a factor."""
@@ -126,7 +134,7 @@ class Fit:
             priors = problem, replace(problem, static_sigma=None)
             by_prior, by_widths = (effective_modes.done_by_prior(p, self.uncertainty).sum() for p in priors)
             n_free += problem.unknowns.n_common - self.result.n_weak - (by_prior - by_widths)
-        return round(2 * np.count_nonzero(self.used) - n_free)
+        return round(float(2 * np.count_nonzero(self.used) - n_free), 6)
 
 
 def estimate(matches, options, **how):
@@ -207,7 +215,7 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
             common |= {"tolerance": TRIAL, "settled": near_by and near.chi2 < EXPLAINED * problem.xy.size}
         result = minimisers.solve_joint(problem, start, **common)
         problem, result, _ = _unbent(matches, problem, start, result, common)
-        return Fit(matches, problem, result, everything, options)
+        return Fit(matches, problem, result, everything, options).with_higher_errors()
     if start_values.far_off(problem, typical).any() and (astray := agreement.astray(problem)):
         return minimise(matches.without(astray), options, judged=judged)
     as_near = trial and near_by and (near.options.degree, near.options.clip) == (options.degree, None)
@@ -215,7 +223,7 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
     given = problem
     problem, plain, near, explained = _first(matches, given, start, plain, common, options.clip)
     if explained:
-        return Fit(matches, problem, plain, everything, options)
+        return Fit(matches, problem, plain, everything, options).with_higher_errors()
     if near is None:
         near, typical = start_values.start(problem, nominal, robust=True)
         if lost := _misplaced(problem, typical):
@@ -232,7 +240,7 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
         kept = given.scaled(used)
         problem, result, _ = _unbent(matches, kept, near, result, common, or_else=problem, clip=options.clip)
         problem = replace(problem, weight=given.weight)
-    fit = Fit(matches, problem, result, used, options)
+    fit = Fit(matches, problem, result, used, options).with_higher_errors()
     if plain is not None and plain.converged and not used.all() and fit.dof < 1:  # nothing tells what is wrong then
         return Fit(matches, problem, plain, everything, options)
     if result is plain and not plain.converged:
@@ -282,7 +290,9 @@ def _unbent(matches, problem, start, result, common, *, loss="linear", or_else=N
         again = minimisers.solve_joint(problem, _padded(result.state, problem), **common)
         if clipping.is_explained(problem, again, clip=clip):
             return problem, again, start
-    shown = SHOWN if loss == "linear" and not begun else SHOWN_BY_MISFIT
+    plain = loss == "linear" and not begun
+    misfit = plain and clipping.is_misfit(problem, result) and not most_probable.counts(problem, result.state, SHOWN)
+    shown = SHOWN if plain and not misfit else SHOWN_BY_MISFIT
     # the detectors of a camera have statics of theirs
     possible = common["gauge"] != "mean" and not matches.camera.has_focal_plane
     if not possible or not most_probable.counts(problem, result.state, shown):
@@ -299,11 +309,12 @@ def _unbent(matches, problem, start, result, common, *, loss="linear", or_else=N
         else:
             was = criterion.linearise(whole, _padded(result.state, whole))
             better = held.converged and held.blocks.cost < was.cost
+            better &= found.is_explained or not misfit  # else the misfit has another cause
         if better and held is not None:
             positions = held.state.positions.T[elimination.typical_stars(held.blocks.v)]
             gauge = known_maps.as_in_posterior(held.gauge, found.blocks.unknowns, positions, *found.covariances())
             widths = any(problem.has_widths(i) for i in range(problem.n_exposures))  # those that were given
-            held = replace(held, gauge=replace(gauge, prior=widths))
+            held = replace(held, gauge=replace(gauge, prior=widths), higher=found.higher_covariance)
         if better:
             return whole, held, found.state
     return before, result, start

@@ -195,7 +195,7 @@ def test_what_is_not_there_gets_no_width():
     assert solution.diagnostics.widths == (0, 0, 0)
     lowest = solve(sim.matches, degree=0, prior=Prior(sim.truth.static))
     assert_allclose(solution.estimate.positions, lowest.estimate.positions, atol=1e-3)
-    assert solution.dof == lowest.dof
+    assert solution.dof == pytest.approx(lowest.dof, abs=0.01)
 
 
 def test_degree_0_has_nothing_that_scatters():

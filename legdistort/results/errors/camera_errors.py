@@ -1,4 +1,6 @@
-"""What the errors of a camera that was fitted do to stars, coefficients and new positions.
+"""What the errors of what exposures have in common do to stars, coefficients and new positions.
+
+That is a camera that was fitted, or the static distortion beyond the degree.
 
 Layouts and statics have a covariance of their own, and stars and coefficients follow them. All of it is written as the
 responses to independent errors of unit size: covariances are sums over these, and what two things have in common is in
@@ -17,6 +19,7 @@ from ...runtime.trees.facts import array, number
 
 if TYPE_CHECKING:
     from ...cameras.camera import Camera
+    from ..view import View
 
 
 @dataclass(frozen=True)
@@ -57,9 +60,12 @@ class CameraErrors:
         How stars move with directions of the camera that nothing determines, of unit rms.
     departure : Departure or None
         None where nothing was stated.
+    owner : ndarray of int, shape (n_exposures,), or None
+        Detector of every exposure, where each is of one alone and the modes are those of the exposure; None for those
+        of the detectors of a camera.
     """
 
-    free: np.ndarray = field(metadata=array("n_detectors", 2, "modes", holds="booleans"))
+    free: np.ndarray = field(metadata=array("n_parts", 2, "modes", holds="booleans"))
     changes: np.ndarray = field(metadata=array("k", "r", unit="pix"))
     stars: np.ndarray = field(metadata=array("n_stars", 2, "r", unit="pix"))
     coefficients: np.ndarray = field(metadata=array("n_exposures", "2 n_modes", "r", unit="pix"))
@@ -67,6 +73,7 @@ class CameraErrors:
         default_factory=lambda: np.zeros((0, 2, 0)), metadata=array("n_stars", 2, "m", blocks=(0, 2, 0))
     )
     departure: Departure | None = None
+    owner: np.ndarray | None = field(default=None, metadata=array("n_exposures", holds="integers"))
 
     def scaled(self, factor: float) -> CameraErrors:
         """The same with all errors times a factor."""
@@ -91,20 +98,20 @@ class CameraErrors:
                 out |= chip.sees(f) if detector is None else key == detector
         return out
 
-    def in_focal_plane(self, camera: Camera, f: np.ndarray, detector: str | None = None) -> np.ndarray:
-        """Responses (n, 2, r) of positions measured at f (n, 2) in the focal plane, pixels.
+    def of_measured(self, view: View, q: np.ndarray) -> np.ndarray:
+        """Responses (n, 2, r) of what was measured in an exposure at undistorted pixels q (n, 2), pixels.
 
-        Parameters
-        ----------
-        camera : Camera
-        f : ndarray, shape (n, 2)
-        detector : str, optional
-            To which they belong; by default that on which each falls. Zero off all detectors.
+        In the focal plane, where there is one, on the detector of the view or else on that on which each falls; zero
+        off all detectors.
         """
-        out, changes = np.zeros((len(f), 2, self.changes.shape[1])), np.zeros((*self.free.shape, self.changes.shape[1]))
+        changes = np.zeros((*self.free.shape, self.changes.shape[1]))
         changes[self.free] = self.changes
-        for c, (key, chip) in enumerate(camera.detectors.items()):
-            here = chip.sees(f) if detector is None else np.full(len(f), key == detector)
+        if self.owner is not None:
+            values = basis.values(basis.degree_of(changes.shape[2]), *basis.normalize(q, view.common.shape))
+            return -np.einsum("amk,mn->nak", changes[self.owner[view.index]], values)
+        f, out = view.common.distortion(q), np.zeros((len(q), 2, self.changes.shape[1]))
+        for c, (key, chip) in enumerate(view.solution.camera.detectors.items()):
+            here = chip.sees(f) if view.detector is None else np.full(len(f), key == view.detector)
             out[here] = moved_by(chip, similarity.apply(chip.layout, f[here]), changes[c])
         return out
 

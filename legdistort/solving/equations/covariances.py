@@ -261,7 +261,7 @@ class Uncertainty:
         """
         if self._gauge.plane is not None or not (self._is_dense or self._given is not None or self._on_stars):
             return None
-        weights = self._weights
+        weights = self.star_weights
         unknown = max((each.degree for each in self._gauge.unknown_maps), default=0)
         n = modes_for(self._gauge.n_modes, np.count_nonzero(weights[:, 0, 0]), unknown)
         maps = plain_maps(self._gauge, self._blocks.stars[:2].T, n)
@@ -273,7 +273,7 @@ class Uncertainty:
         return CommonFit(*map(np.ascontiguousarray, parts))
 
     @cached_property
-    def _weights(self):
+    def star_weights(self) -> np.ndarray:
         """W_j (n_stars, 2 + k, 2 + k): what observations say of position, of motion and of parallax of every star."""
         v, catalogue = self._blocks.v, self._problem.terms.catalogue
         inverse = unpacked(elimination.inverse_star_blocks(v if catalogue is None else v - catalogue.precision))

@@ -104,10 +104,22 @@ class MostProbable:
         return whole.covariance[:n, :n], replace(whole, sizes=sizes).covariance[:n, :n]
 
     @property
+    def higher_covariance(self):
+        """Of what exposures have in common beyond the degree, by detector, along x first (k, k); None without."""
+        unknowns, covariance = self.blocks.unknowns, self.posterior.covariance
+        higher = slice(unknowns.size - unknowns.n_common, unknowns.size)
+        return covariance[higher, higher] if unknowns.n_common else None
+
+    @property
     def dof(self):
         """Degrees of freedom: of the data, less the unknowns that these determine beyond what is known of them."""
         data, n = self.posterior.data, len(self.posterior.data.pull)
         return data.n_data - float((self.posterior.covariance[:n, :n] * data.curvature).sum())
+
+    @property
+    def is_explained(self):
+        """Whether the errors explain the residuals, to five standard deviations of chi2."""
+        return self.blocks.chi2 < self.dof + 5 * np.sqrt(2 * self.dof)
 
 
 def counts(problem, state, shown=1.0):

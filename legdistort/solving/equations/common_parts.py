@@ -1,0 +1,75 @@
+"""How stars and exposures follow what all exposures have in common and the fit took as known, such as a camera."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """What a fit makes of changes of k numbers that it took as known.
+
+    Attributes
+    ----------
+    stars : ndarray, shape (2, n_stars, k)
+        How positions follow a unit of each.
+    coefficients : ndarray, shape (n_exposures, 2 n_modes, k)
+        How the fitted coefficients follow.
+    normal : ndarray, shape (k, k)
+        Normal matrix of these numbers with stars and coefficients eliminated.
+    alone : ndarray, shape (k,)
+        Its diagonal if stars and coefficients were known.
+    pull : ndarray, shape (k,)
+        Minus half the slope of chi2.
+    """
+
+    stars: np.ndarray
+    coefficients: np.ndarray
+    normal: np.ndarray
+    alone: np.ndarray
+    pull: np.ndarray
+
+
+def followed(respond, problem, blocks, patterns):
+    """The `Followed` of displacements (2, n, k) of what was measured by a unit of each number.
+
+    Parameters
+    ----------
+    respond : callable
+        ``respond(own, stars)``, the step of stars and coefficients by their gradients: ``settle`` of a reduced system.
+    problem : Problem
+    blocks : Blocks
+        At the solution.
+    patterns : ndarray, shape (2, n, k)
+    """
+    moved, k = _weighted(problem, patterns), patterns.shape[2]
+    normal = np.einsum("ank,anl->kl", patterns, moved)
+    alone = np.diag(normal).copy()
+    stars = np.empty((2, problem.n_stars, k))
+    coefficients = np.empty((*blocks.g_exposure.shape, k))
+    gradients = [_gradient(problem, blocks, patterns[:, :, j], moved[:, :, j]) for j in range(k)]
+    for j, (own, of_stars) in enumerate(gradients):
+        star_response, response = respond(own, of_stars)
+        stars[:, :, j], coefficients[:, :, j] = star_response[:2], response
+        for m, (other_own, other_stars) in enumerate(gradients):
+            normal[m, j] -= np.sum(other_own * response) + np.sum(other_stars * star_response)
+    pull = -np.einsum("ank,an->k", moved, blocks.residual)
+    return Followed(stars, coefficients, (normal + normal.T) / 2, alone, pull)
+
+
+def _weighted(problem, patterns):
+    """W p."""
+    w = problem.weight[:, :, None]
+    return np.stack([w[0] * patterns[0] + w[2] * patterns[1], w[2] * patterns[0] + w[1] * patterns[1]])
+
+
+def _gradient(problem, blocks, pattern, weighted):
+    """Gradients of exposures and stars, were the displacements (2, n) the residuals."""
+    own, stars = np.zeros_like(blocks.g_exposure), np.zeros_like(blocks.g_star)
+    for i in range(problem.n_exposures):
+        part = problem.part(i)
+        f = blocks.coupling[:, :, part]
+        pulled = problem.terms.pull(i, f[:, 0] * pattern[0, part] + f[:, 1] * pattern[1, part])
+        stars[:, problem.star[part]] += pulled
+        own[i] = (weighted[:, part] @ blocks.values[:, part].T).ravel()
+    return own, stars
