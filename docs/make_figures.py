@@ -17,6 +17,7 @@ import numpy as np
 from PIL import Image
 
 import legdistort as ld
+from legdistort import paper
 from legdistort.assessment import baselines, stack_quality
 from legdistort.demo import run_demo
 from legdistort.plots import solution_plots, stack_plots
@@ -54,7 +55,7 @@ def sweeps(n_sweeps=300, n_seeds=10):
         problem = build_problem(sim.matches, 3, prior=ld.Prior(sim.truth.static))
         start, _ = start_values.start(problem, np.stack([sim.matches.poses[name] for name in sim.matches.names]))
         for name, solver, n in (
-            ("alternating", minimisers.solve_alternating, n_sweeps),
+            ("alternating", paper.alternate, n_sweeps),
             ("joint", minimisers.solve_joint, 4),
         ):
             state, curve = start, []

@@ -363,7 +363,7 @@ def _where_to_begin(paths, earlier, measuring, **reading):
 
 def _tying(reference, error, epoch, pixel_scale, solving):
     """What ties the solution to the sky, as arguments of `solve`."""
-    how = {"error": error, "epoch": epoch, "pixel_scale": pixel_scale, "method": solving.method}
+    how = {"error": error, "epoch": epoch, "pixel_scale": pixel_scale}
     reference, epoch = check_reference(reference, **how)
     return {"reference": reference, "epoch": epoch, "pixel_scale": pixel_scale}
 

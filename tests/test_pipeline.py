@@ -9,7 +9,7 @@ from legdistort.exceptions import InputError
 KINDS = {
     "measuring": ({"threshold": 1}, "threshold must be a number of at least 2"),
     "matching": ({"tolerance": -1}, "tolerance must be a positive number of pixels"),
-    "solving": ({"gauge": "maximal"}, "gauge must be one of 'minimal', 'mean', got 'maximal'"),
+    "solving": ({"gauge": "maximal"}, "gauge must be one of 'minimal', got 'maximal'"),
     "coadding": ({"order": 9}, "order must be an integer from 0 to 5"),
 }
 
@@ -53,7 +53,7 @@ def test_what_run_takes_itself_does_not_stand_in_a_dict(argument, name, tmp_path
         ({"epoch": "soon"}, "epoch"),
         (
             {"clip": 5.0, "solving": {"method": "alternating"}},
-            "^solving: method='alternating' .* takes neither loss nor clip",
+            "^solving: method='alternating' is that of the published method",
         ),
         ({"solving": {"static": "fit"}, "degree": 1}, "^solving: static='fit' shares the modes"),
     ],

@@ -26,6 +26,7 @@ import numpy as np
 import simulations
 
 import legdistort as ld
+from legdistort import paper
 from legdistort.assessment import baselines
 from legdistort.assessment.stack_quality import assess
 from legdistort.exceptions import LegdistortWarning
@@ -71,7 +72,7 @@ def model(plan):
     plan.save(figures.first_modes(), "leg")
     plan.save(figures.application(ld.simulate_matches(n_exposures=3, seed=3)), "distoschem")
     sim = ld.simulate_matches(n_exposures=30, seed=1)
-    solution = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static), gauge=simulations.GAUGE)
+    solution = paper.solve(sim.matches, prior=ld.Prior(sim.truth.static))
     plan.save(figures.one_star(sim, solution), "schema")
     corrected = accuracy.corrected_positions(solution)
     apart = np.abs(np.nanmean(corrected, axis=0) - solution.estimate.positions).max()

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import legdistort as ld
+from legdistort import paper
 from legdistort.geometry import basis, similarity
 from legdistort.results import accuracy
 from legdistort.simulation.observations import matches_from
@@ -17,15 +18,13 @@ from legdistort.simulation.observations import matches_from
 LEVELS = (0.03, 0.07, 0.14, 0.28)
 N_OUTCOMES = 100
 N_GRID = 150
-#: Dynamic parts that sum to zero: what a start at the static distortion implies for undithered exposures.
-GAUGE = "mean"
 FRACTION_INSIDE = 0.9
 
 
 def simulation_1(seed=0, *, n_grid=N_GRID):
     """One data set and the map of its error: simulation, solution, grid (n, 2), sigma_j' (n,), contour."""
     sim = ld.simulate_matches(seed=seed)
-    solution = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static), gauge=GAUGE, clip=None)
+    solution = paper.solve(sim.matches, prior=ld.Prior(sim.truth.static))
     grid = sim.truth.grid(sim.truth.names[0], n_grid)
     sigma = accuracy.new_scatter(solution, sim.truth.distort, grid, 0.14, rng=np.random.default_rng(seed))
     return sim, solution, grid, sigma, accuracy.contour(sim.truth.positions, fraction=FRACTION_INSIDE)
@@ -54,9 +53,7 @@ class Outcome:
             seed=self.seed,
         )
         truth = sim.truth
-        solution = ld.solve(
-            sim.matches, prior=ld.Prior(truth.static) if self.static_known else None, gauge=GAUGE, clip=None
-        )
+        solution = paper.solve(sim.matches, prior=ld.Prior(truth.static) if self.static_known else None)
         b = [accuracy.bias(solution.estimate.positions, truth.positions, removed=removed) for removed in (None, 3)]
         if not self.n_grid:
             return (*b, np.nan, np.nan)
@@ -138,7 +135,7 @@ def simulation_5(kind, *, amplitude=1.0, n_stars=1000, n_exposures=10, seed=0):
     observed = np.ones((n_exposures, n_stars), dtype=bool)
     errors = np.full((n_exposures, n_stars, 2), 0.14)
     matches = matches_from(truth, observed, errors, np.random.default_rng(0), noise=0)
-    solution = ld.solve(matches, prior=ld.Prior(sim.truth.static), gauge=GAUGE, clip=None)
+    solution = paper.solve(matches, prior=ld.Prior(sim.truth.static))
     found = np.stack([whole_coefficients(solution, name) for name in solution.names])
     return found - sim.truth.coefficients, accuracy.bias(solution.estimate.positions, truth.positions)
 

@@ -204,8 +204,6 @@ SOLVING = Group(
         "exposure_degree": Option(
             "with --static fit: degree of what every exposure has for itself (default 1)", type=int
         ),
-        "gauge": Option("convention for the null space (default minimal)", choices=words.GAUGES),
-        "method": Option("(default joint)", choices=words.METHODS),
         "loss": Option("(default linear)", choices=words.LOSSES),
         "clip": Option("leave out what deviates by more sigma; 0: nothing (default 5)", type=float, none=0),
         "errors": Option("(default stated)", choices=words.ERRORS),
@@ -310,6 +308,5 @@ PREDICTING = {
     "pixel_scale": Option(
         "the errors in mas; lengths may then be angles: --sigma 0.4mas", type=float, metavar="ARCSEC"
     ),
-    "gauge": Option("convention for the null space (default minimal)", choices=words.GAUGES),
     "seed": Option("of stars and shifts that are drawn (default 0)", type=int),
 }

@@ -17,7 +17,7 @@ from ..solving.gauge.hierarchy import named
 _LARGE = 100.0
 
 
-def noiseless_solution(matches, problem, layout, kind, scatter):
+def noiseless_solution(matches, problem, layout, scatter):
     """What `legdistort.solve` would give for exact positions, their errors being as stated.
 
     Parameters
@@ -28,8 +28,6 @@ def noiseless_solution(matches, problem, layout, kind, scatter):
         Made of them.
     layout : Layout
         They come from.
-    kind : {"minimal", "mean"}
-        Of the gauge.
     scatter : ndarray, shape (2, n_modes), or None
         Of the coefficients from exposure to exposure, pixels, if anything is assumed of it.
 
@@ -44,11 +42,11 @@ def noiseless_solution(matches, problem, layout, kind, scatter):
     stars = np.concatenate([positions.T, np.zeros((problem.terms.n, len(positions)))])
     state = State(stars, problem.prior_mean.copy(), np.stack(list(layout.poses.values())))
     blocks = criterion.linearise(problem, state)
-    gauge = _gauge(kind, problem, state, blocks, scatter, layout.sigma)
+    gauge = _gauge(problem, state, blocks, scatter, layout.sigma)
     uncertainty = held = Uncertainty(problem, blocks, gauge)
     if gauge.static in ("none", "fitted", "uncertain"):
         plain = replace(problem, mean_sigma=None)
-        held = Uncertainty(problem, blocks, _gauge(kind, plain, state, blocks, scatter, layout.sigma))
+        held = Uncertainty(problem, blocks, _gauge(plain, state, blocks, scatter, layout.sigma))
     exact = replace(blocks, residual=np.zeros_like(blocks.residual), chi2=0.0)
     solution = assemble(
         matches,
@@ -57,26 +55,26 @@ def noiseless_solution(matches, problem, layout, kind, scatter):
         exact,
         gauge,
         uncertainty,
-        settings=Settings(problem.degree, method="predicted", gauge=kind),
+        settings=Settings(problem.degree, method="predicted"),
         status="predicted: nothing was measured",
         dof=0,
     )
     return solution, state, held
 
 
-def _gauge(kind, problem, state, blocks, scatter, sigma):
+def _gauge(problem, state, blocks, scatter, sigma):
     """The gauge, its weights from the scatter assumed, since there are no data to show it.
 
     Where nothing was assumed it counts as large beside the errors, and all of a common map is unknown.
     """
     if any(problem.has_widths(i) for i in range(problem.n_exposures)):
-        return constraints.make(kind, problem, state, blocks)
+        return constraints.make("minimal", problem, state, blocks)
     others = dynamic_basis(problem.shapes[0], problem.n_modes)
     assumed = np.full(2 * problem.n_modes, _LARGE * sigma) if scatter is None else scatter.ravel()
     dynamic = np.stack([others.T @ (others * assumed**2 @ others.T) @ others] * problem.n_exposures)
     if scatter is not None:
-        return constraints.make(kind, problem, state, blocks, dynamic=dynamic)
-    gauge = constraints.make(kind, replace(problem, mean_sigma=None), state, blocks, dynamic=dynamic)
+        return constraints.make("minimal", problem, state, blocks, dynamic=dynamic)
+    gauge = constraints.make("minimal", replace(problem, mean_sigma=None), state, blocks, dynamic=dynamic)
     unknown = named(10 * dynamic_basis(2 * gauge.box[1, ::-1], gauge.n_modes).T, gauge, state.positions.T)  # any size
     nothing = {"dynamic": np.zeros_like(dynamic), "covariance": np.zeros_like(gauge.covariance)}
     return replace(gauge, **nothing, unknown_maps=unknown, static="open")

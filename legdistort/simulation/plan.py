@@ -17,8 +17,7 @@ from ..geometry import basis, similarity
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract
 from ..priors.prior import Prior
-from ..runtime.checks import check_choice, check_counts, check_positive
-from ..runtime.words import GAUGES
+from ..runtime.checks import check_counts, check_positive
 from ..solving.equations.problem import as_given
 from . import observations, truth
 
@@ -43,7 +42,6 @@ class Plan:
     dithers: Any
     poses: dict[str, np.ndarray] | None
     prior: Prior | None
-    gauge: str
     dynamic: Any
     spectrum: Any
     static_spectrum: Any
@@ -63,7 +61,6 @@ class Plan:
         object.__setattr__(self, "degree", basis.check_degree(self.degree))
         if self.pixel_scale is not None:
             check_positive(self.pixel_scale, "pixel_scale", "number of arcsec")
-        check_choice(self.gauge, GAUGES, "gauge")
         if not isinstance(self.prior, Prior | None):
             raise InputError(f"prior must be a Prior, got {as_given(self.prior)}")
         if np.shape(self.shape) != (2,):
@@ -131,7 +128,7 @@ class Plan:
         return min(4, self.n_exposures) if self.min_exposures is None else self.min_exposures
 
     def __repr__(self) -> str:
-        return f"<Plan: {self.n_exposures} exposures, degree {self.degree}, gauge {self.gauge}>"
+        return f"<Plan: {self.n_exposures} exposures, degree {self.degree}>"
 
 
 @dataclass(frozen=True, eq=False)

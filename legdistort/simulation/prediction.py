@@ -248,7 +248,6 @@ def predict(
     dithers: ArrayLike = 0.0,
     poses: Mapping[str, ArrayLike] | None = None,
     prior: Prior | None = None,
-    gauge: str = "minimal",
     dynamic: ArrayLike | None = None,
     spectrum: Mapping[int, float] | ArrayLike | None = None,
     static_spectrum: Mapping[int, float] | ArrayLike | None = None,
@@ -289,8 +288,6 @@ def predict(
         Instead of dithers, ``{exposure: (2, 3)}``, reference plane -> undistorted pixels, as for rolls.
     prior : Prior, optional
         Static distortion; with widths the exposures may have fewer stars than modes.
-    gauge : {"minimal", "mean"}
-        As for `solve`.
     dynamic : float or array_like, optional
         Scatter of the fitted coefficients from exposure to exposure, pixels: one, per mode (n_modes,) or
         (2, n_modes). It gives the absolute error. Not with a prior that has widths, which mean the same.
@@ -344,7 +341,7 @@ def predict(
     """
     plan = Plan(
         n_exposures=n_exposures, stars=stars, n_stars=n_stars, density=density, sigma=sigma, degree=degree,
-        shape=shape, dithers=dithers, poses=poses, prior=prior, gauge=gauge, dynamic=dynamic, spectrum=spectrum,
+        shape=shape, dithers=dithers, poses=poses, prior=prior, dynamic=dynamic, spectrum=spectrum,
         static_spectrum=static_spectrum, min_exposures=min_exposures, n_grid=n_grid, seed=seed,
         epochs=epochs, field=field, camera=camera, pixel_scale=pixel_scale,
     )  # fmt: skip
@@ -364,7 +361,7 @@ def _predict(plan):
     problem = build_problem(matches, plan.degree, prior=plan.prior, motion=motion)
     fitted = independent[:, : problem.n_modes]
     known = bool(np.isfinite(fitted).all())
-    solution, state, held = noiseless_solution(matches, problem, layout, plan.gauge, fitted if known else None)
+    solution, state, held = noiseless_solution(matches, problem, layout, fitted if known else None)
     x, y = layout.axes(plan.n_grid)
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     noise = accuracy.expected_scatter(solution, grid, layout.sigma)

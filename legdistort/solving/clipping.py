@@ -102,7 +102,7 @@ def start_from(problem, result):
     return State(np.where(result.blocks.v[0] > 0, positions, state.positions), state.coefficients, state.poses)
 
 
-def solve_clipped(problem, start, *, clip, plain=None, gauge="minimal", loss="linear", max_iterations=None, hold=False):
+def solve_clipped(problem, start, *, clip, plain=None, loss="linear", max_iterations=None, hold=False):
     """Joint solution without the observations that deviate by more than `clip` standard errors.
 
     A solution with the Cauchy loss, which gross errors hardly move, identifies observations that deviate. They
@@ -118,7 +118,7 @@ def solve_clipped(problem, start, *, clip, plain=None, gauge="minimal", loss="li
     clip : float
     plain : Result, optional
         Of all observations, with the loss asked for: the result if none deviates.
-    gauge, loss, max_iterations, hold
+    loss, max_iterations, hold
         As for `legdistort.solving.minimisers.solve_joint`.
 
     Returns
@@ -129,8 +129,7 @@ def solve_clipped(problem, start, *, clip, plain=None, gauge="minimal", loss="li
     dict
         ``{exposure: reason}`` of exposures that the fit cannot follow.
     """
-    how = {"gauge": gauge, "hold": hold}
-    result = _robust(problem, start, plain, how)
+    result = _robust(problem, start, plain, hold)
     full = plain.blocks if plain is not None and plain.converged and np.all(plain.robust == 1) else None
     good = used = np.ones(problem.xy.shape[1], dtype=bool)
     for count in itertools.count():
@@ -152,15 +151,15 @@ def solve_clipped(problem, start, *, clip, plain=None, gauge="minimal", loss="li
         if agreement.starved(problem, used):
             break
         kept = problem.scaled(used.astype(float))
-        result = minimisers.solve_joint(kept, result.state, loss=loss, max_iterations=max_iterations, **how)
+        result = minimisers.solve_joint(kept, result.state, loss=loss, max_iterations=max_iterations, hold=hold)
     return result, used, {}
 
 
-def _robust(problem, start, plain, how):
+def _robust(problem, start, plain, hold):
     """The fit with the Cauchy loss; the plain one, if there is one, where it has no answer."""
     with warnings.catch_warnings(), contextlib.suppress(*[SolveError] * (plain is not None)):
         warnings.simplefilter("ignore", ConvergenceWarning)  # a start, good to a fraction of the errors, is enough
-        return minimisers.solve_joint(problem, start, loss="cauchy", max_iterations=20, tolerance=ENOUGH, **how)
+        return minimisers.solve_joint(problem, start, loss="cauchy", max_iterations=20, tolerance=ENOUGH, hold=hold)
     return plain
 
 

@@ -124,10 +124,11 @@ def solve(
         the result is a solution without a camera, and `layout` has no meaning.
     exposure_degree : int, optional
         With ``static="fit"``: 0 leaves an exposure shift, rotation and scale, 1 (default) an affine map, and so on.
-    gauge : {"minimal", "mean"}
-        Convention (datum) for what the data do not determine (their null space), see `legdistort.results.gauge`.
-    method : {"joint", "alternating"}
-        Gauss-Newton on all unknowns, or the scheme of the paper.
+    gauge : {"minimal"}
+        Convention (datum) for what the data do not determine (their null space), see `legdistort.results.gauge`. That
+        of the paper, and its scheme of minimisation, are in `legdistort.paper`.
+    method : {"joint"}
+        Gauss-Newton on all unknowns.
     loss : {"linear", "huber", "cauchy"}
         Robust losses give deviant observations less weight. Against many gross mismatches "huber" is too mild: use
         `clip`, or "cauchy".
@@ -135,7 +136,7 @@ def solve(
         Leave out observations whose residual exceeds this many standard errors (at the observed scale, if
         that is larger than the stated errors), where chance does not explain what a plain fit leaves; they are listed
         in ``residuals["used"]``. Stars and exposures that contradict the others are left out as a whole, with a
-        warning. None keeps all. Not with ``method="alternating"``.
+        warning. None keeps all.
     error_floor : float
         Pixels, added in quadrature to every stated error.
     errors : {"stated", "scale", "floor", "by-brightness", "correlated"}
@@ -233,7 +234,7 @@ def solve(
     is_prior = matches.camera.has_focal_plane or static in ("hold", "prior")  # of the camera, or the prior, by now
     options, form = replace(asked, static=None, layout=None) if is_prior else asked, None
     if model is not None:
-        form = model_forms.read(model, matches, degree=None if isinstance(degree, Unasked) else degree, gauge=gauge)
+        form = model_forms.read(model, matches, degree=None if isinstance(degree, Unasked) else degree)
         options = replace(options, degree=form.degree, model=None, prior=form.prior())
     given, kept_out = (matches, None) if validate is None else hold_out(matches, validate)
     with single_fit.threads(given), minimisers.iterations_shown(progress):
@@ -255,6 +256,13 @@ def solve(
     if sought is not None:
         kept_out = solution.camera.in_focal_plane(matches.camera.on_detectors(kept_out))
     return replace(solution, diagnostics=replace(found, validation=validation(solution, kept_out, validate)))
+
+
+def solution_of(fit, asked, **settings):
+    """The `Solution` of a `Fit` to matches that were given, with some `SolveOptions`; words in its `Settings`."""
+    diagnostics = replace(_diagnostics(fit, asked.prior, 1.0), epoch=fit.matches.epoch)
+    found = replace(diagnostics, sky=None if fit.matches.sky is None else "exposures")
+    return _solution(fit, 1.0, replace(_settings(asked, asked, None), **settings), found)
 
 
 def _of_detectors(matches, prior, layout, static, dynamic):

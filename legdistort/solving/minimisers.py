@@ -1,6 +1,6 @@
-"""Two ways to minimise the criterion: jointly (Gauss-Newton) and, as published, alternately.
+"""Minimising the criterion on all unknowns at once (Gauss-Newton).
 
-The joint solver eliminates the stars (Schur complement), solves for the coefficients under the constraints of
+The solver eliminates the stars (Schur complement), solves for the coefficients under the constraints of
 the gauge and substitutes back: the structure of bundle adjustment (Triggs et al. 2000), with exposures for
 cameras and stars for points.
 """
@@ -27,8 +27,8 @@ from .gauge.hierarchy import determined_by_residuals, is_explained, is_noise
 
 log = logging.getLogger(__name__)
 
-#: Iterations of the joint solver and sweeps of the alternating one at most, unless another number is given.
-MAX_ITERATIONS, MAX_SWEEPS = 50, 1000
+#: Iterations at most, unless another number is given.
+MAX_ITERATIONS = 50
 #: A minimisation has converged when the next step would be below so many standard errors, rms over the unknowns.
 TOLERANCE = 5e-5
 #: The constraints follow the state for so many iterations; then they are held. Those of a state that is not yet the
@@ -66,7 +66,7 @@ class Result:
     status : str
         What happened, in a sentence.
     n_iterations : int
-        Steps of the joint solver, sweeps of the alternating one.
+        Steps, or sweeps of the published scheme (`legdistort.paper`).
     robust : ndarray, shape (n,)
         Factors on the weights from the loss (ones for a linear one).
     n_weak : int
@@ -379,63 +379,3 @@ def _advance(problem, state, cost, d_star, d_exposure):
         "the minimisation diverges: no step, however short, keeps the residuals in bounds; the start is too far off "
         "(wrong poses or many mismatched stars?)"
     )
-
-
-def solve_alternating(problem, state, *, gauge="minimal", max_iterations=None, tolerance=1e-5):
-    """The paper's scheme (section 3.2): stars given A, coefficients given X, until both change by less than 1e-5.
-
-    The norms in its two stopping rules are taken as Euclidean over all unknowns. Where it ends along the directions
-    that the data do not determine depends on the start and the number of sweeps, so compare with `solve_joint` only
-    what is left after a common map of the fitted degree.
-
-    Parameters
-    ----------
-    problem : Problem
-    state : State
-        The static distortion as starting point, see `legdistort.solving.start_values.start`.
-    gauge : {"minimal", "mean"}
-        Convention in which errors are reported.
-    max_iterations : int, optional
-        Cap on the sweeps, 1000 if not given.
-    tolerance : float
-
-    Returns
-    -------
-    Result
-    """
-    max_iterations = MAX_SWEEPS if max_iterations is None else max_iterations
-    n_modes = problem.n_modes
-    blocks = criterion.linearise(problem, state)
-    for sweep in range(1, max_iterations + 1):
-        _count.get()()
-        before = state
-        for _ in range(3):  # stars given A: a few Newton steps, each star by itself
-            step = elimination.symmetric_times(elimination.inverse_star_blocks(blocks.v), blocks.g_star)
-            state = State(state.stars + step, state.coefficients, state.poses)
-            blocks = criterion.linearise(problem, state)
-            if np.abs(step).max() < 1e-9:
-                break
-        coefficients = state.coefficients.copy()  # coefficients given X: linear, each exposure by itself
-        change = np.linalg.solve(blocks.u, blocks.g_exposure[..., None])[..., 0]
-        coefficients[:, :, :n_modes] += change.reshape(-1, 2, n_modes)
-        state = State(state.stars, coefficients, state.poses)
-        blocks = criterion.linearise(problem, state)
-        c_a = _relative_change(before.coefficients, state.coefficients)
-        c_x = _relative_change(before.positions, state.positions)
-        status = f"converged after {sweep} sweeps (|dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e})"
-        if converged := c_a <= tolerance and c_x <= tolerance:
-            break
-    if not converged:
-        status = (
-            f"stopped after {max_iterations} sweeps with |dA|/|A| = {c_a:.1e}, |dX|/|X| = {c_x:.1e}: the coefficients "
-            "drift along directions that the data do not determine; method='joint' fixes these"
-        )
-        warn(status, ConvergenceWarning)
-    state = constraints.absorb_similarities(problem, state)
-    blocks = criterion.linearise(problem, state)
-    convention = constraints.make(gauge, problem, state, blocks)
-    return Result(state, blocks, convention, converged, status, sweep, np.ones(problem.xy.shape[1]))
-
-
-def _relative_change(old, new):
-    return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))

@@ -83,11 +83,6 @@ class Form:
     def __repr__(self):
         return f"<Form: degree {self.degree}, {self.n_free} free coefficients>"
 
-    @property
-    def is_whole(self):
-        """Whether all modes up to the degree are free, constants aside (poses carry these)."""
-        return all(expansion.free[:, 1:].all() for expansion in self._expansions.values())
-
     def describe(self):
         """The form in plain numbers and strings, as files of solutions keep it."""
         model = next(iter(self._expansions.values())).model
@@ -130,7 +125,7 @@ class Form:
         return out
 
 
-def read(model, matches, *, degree, gauge):
+def read(model, matches, *, degree):
     """The `Form` that `solve` was given, once its other arguments are seen to go with it.
 
     Raises
@@ -143,8 +138,6 @@ def read(model, matches, *, degree, gauge):
         raise InputError(
             f"the model has free coefficients up to total degree {form.degree}: leave degree={degree!r} out"
         )
-    if gauge == "mean" and not form.is_whole:
-        raise InputError("gauge='mean' balances all modes, which fixed coefficients forbid: use gauge='minimal'")
     return form
 
 

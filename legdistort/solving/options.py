@@ -58,13 +58,8 @@ class SolveOptions(Settings):
         object.__setattr__(self, "motion_epoch", year(self.motion_epoch))
         object.__setattr__(self, "layout_sigma", check_place_errors(self.layout_sigma, "layout_sigma"))
         self._check_distortion()
-        check_choice(self.gauge, GAUGES, "gauge")
+        self._check_published()
         check_error_floor(self.error_floor)
-        check_choice(self.method, METHODS, "method")
-        if self.method == "alternating" and isinstance(self.clip, Unasked):
-            object.__setattr__(self, "clip", None)
-        if self.method == "alternating" and (self.loss != "linear" or self.clip is not None):
-            raise InputError("method='alternating' is the published scheme: it takes neither loss nor clip")
         check_choice(self.loss, LOSSES, "loss")
         check_choice(self.errors, ERRORS, "errors")
         if self.errors != "stated" and self.loss != "linear":
@@ -77,14 +72,22 @@ class SolveOptions(Settings):
             raise InputError("errors='by-brightness' finds the errors, their floor too: leave error_floor out")
         if self.max_iterations is not None and not (isinstance(self.max_iterations, int) and self.max_iterations > 0):
             raise InputError(f"max_iterations must be a positive integer, got {self.max_iterations!r}")
-        if self.pose_sigma is not None and self.method == "alternating":
-            raise InputError("method='alternating' is the published scheme: poses are its start, leave pose_sigma out")
         self._check_motion()
         self._check_nights()
         if self.clip is not None and not (isinstance(self.clip, Real) and 1 < self.clip < LARGEST):
             raise InputError(
                 f"clip must be a number of standard errors above 1, got {self.clip!r}; clip=None (--clip 0) keeps all"
             )
+
+    def _check_published(self):
+        """Refuse what is the paper's alone."""
+        for name, words in (("gauge", GAUGES), ("method", METHODS)):
+            value = getattr(self, name)
+            if isinstance(value, str) and value in words[1:]:
+                raise InputError(
+                    f"{name}={value!r} is that of the published method, which legdistort.paper.solve has; leave it out"
+                )
+            check_choice(value, words[:1], name)
 
     def _check_nights(self):
         sigma = self.night_sigma
@@ -106,7 +109,6 @@ class SolveOptions(Settings):
             return
         for word, excluded in (
             ("pose_sigma", self.pose_sigma is not None),
-            ("method='alternating'", self.method == "alternating"),
             ("errors='correlated'", self.errors == "correlated"),
             ("validate", self.validate is not None),
         ):
@@ -146,8 +148,6 @@ class SolveOptions(Settings):
                     "too, or leave exposure_degree out"
                 )
             return
-        if self.method != "joint":
-            raise InputError("static='fit' needs method='joint'")
         if self.exposure_degree is not None:
             basis.check_degree(self.exposure_degree, "exposure_degree")
         if self.own_degree >= self.degree or self.degree < 2:
@@ -239,7 +239,7 @@ def prior_as_asked(prior, static):
     return named if isinstance(prior, dict) else named[None]
 
 
-def check_reference(reference, *, error=None, epoch=None, pixel_scale=None, method="joint"):
+def check_reference(reference, *, error=None, epoch=None, pixel_scale=None):
     """The arguments of `solve` that concern a reference catalogue, checked: the catalogue read, and the epoch in years.
 
     Raises
@@ -254,8 +254,6 @@ def check_reference(reference, *, error=None, epoch=None, pixel_scale=None, meth
         if error is not None:
             raise InputError("reference_error is for the catalogue of reference: leave it out, or give that")
         return None, epoch
-    if method == "alternating":
-        raise InputError("method='alternating' is the published scheme: it takes no reference")
     if is_gaia(reference):  # which is asked once it is known where the field lies
         check_gaia()
         return reference, epoch
@@ -280,7 +278,7 @@ def check_tie(matches, asked, reference, **tying):
         As there; with one exposure for options that compare exposures with one another.
     """
     reference = gaia_around(matches) if is_gaia(reference) else reference
-    catalogue, epoch = check_reference(reference, method=asked.method, **tying)
+    catalogue, epoch = check_reference(reference, **tying)
     if catalogue is not None and catalogue.maps is not None and asked.motion is not None:
         raise InputError(
             f"motion={asked.motion!r} with a solution as reference, of whose rates common errors are not kept: "

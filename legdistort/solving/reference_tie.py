@@ -459,7 +459,7 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         reference.label,
         matches.stars,
         scale=scale,
-        solve=partial(minimisers.solve_joint, gauge=of.gauge, loss=of.loss, max_iterations=of.max_iterations),
+        solve=partial(minimisers.solve_joint, loss=of.loss, max_iterations=of.max_iterations),
         common={"shared_errors": fit.shared_errors, "camera": fit.camera_errors},
         finds_errors=reference.finds_errors,
     )
@@ -514,7 +514,7 @@ def _joined(fit, *, reference, epoch, pixel_scale):
     catalogue = StarPrior.of(len(positions), found.rows, found.xy, found.covariance[:, :2, :2])
     problem = replace(fit.problem, moving=replace(fit.problem.terms, catalogue=catalogue))
     of, weighted = fit.options, problem.scaled(fit.used.astype(float))
-    how = {"gauge": of.gauge, "loss": of.loss, "max_iterations": of.max_iterations}
+    how = {"loss": of.loss, "max_iterations": of.max_iterations}
     return replace(
         fit, problem=problem, result=minimisers.solve_joint(weighted, _moved(fit.result.state, rough), **how)
     )

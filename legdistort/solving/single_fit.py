@@ -204,10 +204,7 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
     else:
         start, typical = start_values.start(problem, nominal, robust=options.loss != "linear")
     everything = np.ones(problem.xy.shape[1], dtype=bool)
-    common = {"gauge": options.gauge, "max_iterations": options.max_iterations}
-    if options.method == "alternating":
-        return Fit(matches, problem, minimisers.solve_alternating(problem, start, **common), everything, options)
-    common["loss"] = options.loss
+    common = {"loss": options.loss, "max_iterations": options.max_iterations}
     if options.clip is None:
         if options.loss != "linear" and (lost := _misplaced(problem, typical)):
             return minimise(matches.without(lost), options, judged=judged)
@@ -294,8 +291,7 @@ def _unbent(matches, problem, start, result, common, *, loss="linear", or_else=N
     misfit = plain and clipping.is_misfit(problem, result) and not most_probable.counts(problem, result.state, SHOWN)
     shown = SHOWN if plain and not misfit else SHOWN_BY_MISFIT
     # the detectors of a camera have statics of theirs
-    possible = common["gauge"] != "mean" and not matches.camera.has_focal_plane
-    if not possible or not most_probable.counts(problem, result.state, shown):
+    if matches.camera.has_focal_plane or not most_probable.counts(problem, result.state, shown):
         return before, result, start
     with warnings.catch_warnings(action="ignore", category=ConvergenceWarning), contextlib.suppress(SolveError):
         # the fit with its plane elsewhere is nearer, unless gross errors moved it

@@ -23,9 +23,8 @@ def measure(name, solver, n_exposures, n_stars):
     import rivals
     import sets
 
-    from legdistort import Matches, solve
+    from legdistort import Matches, paper, solve
     from legdistort.results import accuracy
-    from legdistort.solving import minimisers
     from legdistort.solving.equations import compiled
 
     assert compiled
@@ -45,7 +44,7 @@ def measure(name, solver, n_exposures, n_stars):
             if solver == "scipy":
                 state, chi2 = rivals.solve_scipy(problem, start)
             else:
-                result = minimisers.solve_alternating(problem, start, max_iterations=300)
+                result = paper.alternate(problem, start, max_iterations=300)
                 state, chi2, sweeps = result.state, result.blocks.chi2, result.n_iterations
             positions = state.positions.T
         times.append(time.perf_counter() - begin)

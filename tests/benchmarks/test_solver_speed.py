@@ -4,8 +4,7 @@ import pytest
 import rivals
 import sets
 
-from legdistort import Matches, solve
-from legdistort.solving import minimisers
+from legdistort import Matches, paper, solve
 
 
 @pytest.fixture(scope="module", params=["simulation 1", "gsaoi-like", "large"])
@@ -45,7 +44,5 @@ def test_rivals(benchmark, posed, rival):
     if rival == "scipy":
         assert benchmark.pedantic(rivals.solve_scipy, args=(problem, start), rounds=1)[1] > 0
     else:
-        result = benchmark.pedantic(
-            minimisers.solve_alternating, args=(problem, start), kwargs={"max_iterations": 300}, rounds=1
-        )
+        result = benchmark.pedantic(paper.alternate, args=(problem, start), kwargs={"max_iterations": 300}, rounds=1)
         assert result.blocks.chi2 > 0

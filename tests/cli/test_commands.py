@@ -916,7 +916,7 @@ def test_outputs_are_tried_and_not_only_permitted(night, tmp_path, capsys, monke
         ("call match(table) (legdistort match) first", "call legdistort match first"),
         ("lower it, measuring={'threshold': 3} (--threshold 3)", "lower it, --threshold 3"),
         ("columns={'star': ...} or --columns star=...", "--columns star=..."),
-        ("must be one of 'joint', 'alternating', got 'x'", "must be one of joint, alternating, got x"),
+        ("must be one of 'linear', 'huber', got 'x'", "must be one of linear, huber, got x"),
         ("it's the star's own", "it's the star's own"),
     ],
 )

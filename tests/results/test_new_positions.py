@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from oracle import DenseOracle
 
 import legdistort as ld
+from legdistort import paper
 from legdistort.assessment.baselines import solve_shifts
 from legdistort.cli.parser import main
 from legdistort.exceptions import AssumptionWarning, InputError
@@ -201,8 +202,8 @@ def test_halving_all_errors_of_the_stars_quarters_the_relative_part(sim, solutio
     for column in ("x_err", "y_err"):
         table[column] = table[column] / 2
     matches = ld.Matches.from_table(table, shape=sim.matches.shapes, poses=sim.matches.poses)
-    finer = ld.solve(matches, prior=ld.Prior(sim.truth.static), gauge="mean")
-    same = ld.solve(sim.matches, prior=ld.Prior(sim.truth.static), gauge="mean")
+    finer = paper.solve(matches, prior=ld.Prior(sim.truth.static))
+    same = paper.solve(sim.matches, prior=ld.Prior(sim.truth.static))
     for name in sim.matches.names:
         ratio = finer[name].sigma_map(n=4, support=False)[2] / same[name].sigma_map(n=4, support=False)[2]
         assert_allclose(ratio, 0.5, rtol=1e-3)

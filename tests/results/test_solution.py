@@ -13,7 +13,7 @@ from astropy import units as u
 from astropy.modeling import models
 from astropy.table import QTable, Table
 
-from legdistort import Matches, Prior, Solution, solve
+from legdistort import Matches, Prior, Solution, paper, solve
 from legdistort.assessment import baselines
 from legdistort.exceptions import LegdistortWarning
 from legdistort.geometry import basis
@@ -92,12 +92,12 @@ PRODUCERS = {
     "degree chosen": lambda: solve(FEW.matches, degree="auto", prior=Prior(FEW.truth.static)),
     "model": lambda: solve(simulate_matches(n_stars=40, n_exposures=5, seed=5).matches, model=model()),
     "validated": lambda: solve(NIGHT.matches, degree=2, validate=0.2, clip=5),
-    "alternating": lambda: solve(FEW.matches, degree=1, method="alternating"),
+    "published scheme": lambda: paper.solve(FEW.matches, degree=1, method="alternating"),
     "floor found": lambda: solve(NIGHT.matches, degree=1, errors="floor"),
     "errors scaled": lambda: solve(NIGHT.matches, degree=1, errors="scale"),
     "clipped": lambda: solve(mismatched(simulate_matches(n_stars=60, n_exposures=6, seed=4)), degree=2, clip=5),
     "robust": lambda: solve(mismatched(simulate_matches(n_stars=60, n_exposures=6, seed=4)), degree=2, loss="cauchy"),
-    "mean gauge": lambda: solve(FEW.matches, degree=2, gauge="mean", error_floor=0.01, max_iterations=30),
+    "published": lambda: paper.solve(FEW.matches, degree=2, max_iterations=30),
     "shifts": lambda: baselines.solve_shifts(FEW.matches),
     "static and shifts": lambda: baselines.solve_shifts(NIGHT.matches, prior=Prior(NIGHT.truth.static), weighted=True),
     "relative to one exposure": lambda: baselines.solve_relative(FEW.matches, degree=2),

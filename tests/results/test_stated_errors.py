@@ -8,6 +8,7 @@ from astropy import units as u
 from caller_warnings import warns_here
 from numpy.testing import assert_allclose
 
+from legdistort import paper
 from legdistort.exceptions import AssumptionWarning
 from legdistort.geometry import similarity
 from legdistort.geometry.distortion import Distortion
@@ -121,13 +122,6 @@ def test_what_residuals_determine_is_left_to_them(monkeypatch, method):
     # maps of the gauge are cubics of cubics here, so a common map of higher degree is taken out
     b, bound = accuracy.bias(solution.estimate.positions, true, removed=6), accuracy.expected_bias(solution, removed=6)
     assert b == pytest.approx(bound, rel=0.25)
-
-
-def test_the_literal_mean_gauge_is_kept_to_the_letter():
-    solution = solve(precise(1).matches, gauge="mean", prior=Prior(np.zeros((2, 10))), clip=None)
-    assert solution.gauge.released is None
-    assert np.abs(solution.coefficients.sum(axis=0)[:, 1:]).max() < 1e-3
-    assert solution.chi2 > 3 * solution.dof
 
 
 def test_understated_errors_do_not_contradict_the_convention():
@@ -339,7 +333,7 @@ def test_gauge_states_what_determines_what():
                   "smallest dynamic part", "uncertainty of the static distortion"):  # fmt: skip
         assert words in text
     assert "prior widths" in str(solve(sim.matches, prior=Prior(sim.truth.static, sigma=0.9)).gauge)
-    assert "sum to zero" in str(solve(sim.matches, prior=prior, gauge="mean").gauge)
+    assert "sum to zero" in str(paper.solve(sim.matches, prior=prior).gauge)
 
 
 def test_static_uncertainty_does_not_average_down():

@@ -332,19 +332,11 @@ def test_prior_widths_serve_sparse_fields():
         predict(n_exposures=5, n_stars=6, sigma=0.02, prior=prior, dynamic=0.9)
 
 
-def test_a_distorting_prior_and_the_mean_gauge():
+def test_a_distorting_prior():
     static = Prior(np.random.default_rng(0).normal(0, 3, (2, 21)))
     plain, curved = (predict(n_exposures=5, n_stars=60, sigma=0.1, prior=prior) for prior in (None, static))
     assert curved.b == pytest.approx(plain.b, rel=0.05)
     assert curved.b != plain.b
-    mean = predict(n_exposures=5, n_stars=60, sigma=0.1, gauge="mean")
-    assert mean.b == pytest.approx(plain.b, rel=1e-3)
-    assert mean.solution.gauge.kind == "mean"
-    rolls = {f"e{k}": np.column_stack([m, [0, 2047]]) for k, m in enumerate(([[1, 0], [0, 1]], [[-1, 0], [0, -1]]))}
-    rolls["e0"][:, 2] = 0
-    rolls["e1"][:, 2] = 2047
-    with pytest.raises(SolveError, match="gauge='mean' leaves a common map of the reference plane free"):
-        predict(n_exposures=2, n_stars=60, sigma=0.1, gauge="mean", poses=rolls)
 
 
 def test_many_coefficients_are_approximated_and_it_is_said(monkeypatch):
@@ -384,7 +376,6 @@ GOOD = {"n_exposures": 4, "n_stars": 40, "sigma": 0.1}
         ({"poses": {"a": np.eye(2, 3)}}, InputError, "poses has 1 exposures, n_exposures is 4"),
         ({"poses": {}, "dithers": 5.0}, InputError, "poses and dithers both state where the exposures lie"),
         ({"poses": dict.fromkeys("abcd", np.ones((2, 3)))}, InputError, "pose of exposure 'a' is not a similarity"),
-        ({"gauge": "none"}, InputError, "gauge must be one of 'minimal', 'mean', got 'none'"),
         ({"min_exposures": 5}, InputError, "min_exposures must be from 1 to the 4 exposures, got 5"),
         ({"prior": 3}, InputError, "prior must be a Prior, got int"),
         ({"dynamic": -1}, InputError, "dynamic holds standard deviations in pixels, finite and not negative, got -1"),
@@ -437,7 +428,7 @@ def test_what_was_asked_for_stays_as_it_was():
     settings = predict(**GOOD).settings
     assert (settings.n_exposures, settings.n_stars, settings.sigma) == (GOOD["n_exposures"], None, GOOD["sigma"])
     assert np.shape(settings.stars) == (GOOD["n_stars"], 2)  # those that were drawn
-    assert repr(settings) == f"<Plan: {GOOD['n_exposures']} exposures, degree 3, gauge minimal>"
+    assert repr(settings) == f"<Plan: {GOOD['n_exposures']} exposures, degree 3>"
     with pytest.raises(FrozenInstanceError):
         settings.degree = 2
 

@@ -179,7 +179,6 @@ def test_what_is_wrong_is_said():
     catalogue = Table({"star": [1, 2], "x": [1.0, 2], "y": [1.0, 2], "x_err": [1.0, 1], "y_err": [1.0, 1]})
     for options, message in (
         ({"degree": 0}, "needs degree 1 at least"),
-        ({"method": "alternating"}, "poses are its start"),
         ({"reference": catalogue}, "both say where the reference plane lies"),
         ({"motion": "proper"}, "does not go with pose_sigma"),
     ):
@@ -191,7 +190,6 @@ def test_what_is_wrong_is_said():
     "options",
     [
         {"degree": "auto"},
-        {"gauge": "mean"},
         {"loss": "huber"},
         {"validate": 0.2},
         {"errors": "floor"},

@@ -303,7 +303,6 @@ def test_the_form_itself_explains_itself():
         ),
         (form(), {"degree": 5}, "free coefficients up to total degree 3: leave degree=5 out"),
         (form(2), {"degree": 3}, "free coefficients up to total degree 2: leave degree=3 out"),
-        (PARTLY, {"gauge": "mean"}, "gauge='mean' balances all modes"),
         (form(), {"prior": {}}, "leave prior out"),
         (np.sin, {}, "must be one astropy model"),
     ],

@@ -13,7 +13,7 @@ from caller_warnings import warns_here
 
 from legdistort import Matches, Prior, match, simulate_exposures, simulate_matches, solve
 from legdistort.cli.parser import main
-from legdistort.exceptions import AssumptionWarning, ConvergenceWarning, InputError, MatchError, SolveError
+from legdistort.exceptions import AssumptionWarning, MatchError, SolveError
 from legdistort.geometry import pair_agreement, similarity
 from legdistort.inputs import repetitions
 from legdistort.inputs.exposure_files import open_exposures
@@ -237,15 +237,6 @@ def test_no_more_is_left_out_than_leaves_something_to_judge_by():
     assert solution.residuals["used"].all()
     assert solution.dof == 4
     assert {check.name: check.state for check in solution.checks}["chi2"] == "fail"
-
-
-def test_it_yields_to_the_published_scheme():
-    sim = precise(5, n_stars=20)
-    with warns_here(ConvergenceWarning, match="stopped after 3 sweeps"):
-        solution = solve(sim.matches, method="alternating", max_iterations=3)
-    assert solution.settings.clip is None
-    with pytest.raises(InputError, match="takes neither loss nor clip"):
-        solve(sim.matches, method="alternating", clip=5.0)
 
 
 @pytest.mark.slow

@@ -243,7 +243,6 @@ def test_writes_and_reads(tmp_path):
         ({"static": "fit", "exposure_degree": 3}, "there are none"),
         ({"static": "fit", "exposure_degree": -1}, "exposure_degree"),
         ({"static": "fit", "degree": 1}, "there are none"),
-        ({"static": "fit", "method": "alternating"}, "needs method='joint'"),
     ],
 )
 def test_refuses_contradictions(settings, words):

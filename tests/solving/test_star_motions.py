@@ -310,7 +310,6 @@ def test_parallaxes_are_found():
             r"not determined by exposures at 2 epochs \(condition number [\d.e+]+\)",
         ),
         (np.repeat([2015.5, 2016.5, 2018.5], 4), {"motion": "proper", "motion_sigma": -1}, "motion_sigma must be"),
-        (THREE, {"motion": "proper", "method": "alternating"}, "does not go with method='alternating'"),
         (THREE, {"motion": "proper", "validate": 0.1}, "does not go with validate, for which stars stay"),
         (THREE, {"motion": "proper", "errors": "correlated"}, "does not go with errors='correlated'"),
         (THREE, {"motion": "quick"}, "motion must be"),

@@ -294,8 +294,9 @@ def _check_mean(motion):
     ratio = np.linalg.eigvals(np.linalg.solve(power, mean.T @ mean)).real.min()
     if ratio < _MEAN_LIMIT:
         raise SolveError(
-            "gauge='mean' leaves a common map of the reference plane free: the orientations of these exposures cancel "
-            f"in the mean (ratio {max(ratio, 0):.1e}), as for rolls of 0, 90, 180 and 270 degrees; use gauge='minimal'"
+            "the published convention leaves a common map of the reference plane free: the orientations of these "
+            f"exposures cancel in the mean (ratio {max(ratio, 0):.1e}), as for rolls of 0, 90, 180 and 270 degrees; "
+            "use legdistort.solve"
         )
 
 
