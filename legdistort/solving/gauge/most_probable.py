@@ -27,7 +27,7 @@ from ..knowledge.factors import GIVEN, Factor
 from ..knowledge.posterior import Posterior, most_likely
 from ..knowledge.reduced_data import drawn, part_of, without_stars
 from . import constraints
-from .dynamic_scatter import CHANCE, TAILS
+from .dynamic_scatter import CHANCE, TAILS, conditional_errors
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +46,7 @@ RANGE = 1e-2, 1e6
 _DAMPING = 1e-10, 1e6  # of the diagonal: at first, and where a step is given up
 _ROUNDING = 1e-9  # of J
 _NOTHING = 1e3  # what is known, in sizes
+_SEEN = 5.0  # standard deviations of the squares of departures by their errors
 _HELD = 1e-2  # what counts as exact, in errors of a coefficient
 
 
@@ -137,10 +138,18 @@ def counts(problem, state, shown=1.0):
     if 2 * np.count_nonzero(problem.weight[0]) - n_free < LEFT:
         return False
     known = _Known.of(problem, problem.degree)
-    departures = known.values(state, np.zeros(known.n_statics))
-    square = np.sum(departures**2) / problem.n_exposures / 4  # b_m has mean square 1/4
+    departures = known.values(state, np.zeros(known.n_statics))[: known.width.size].reshape(problem.n_exposures, -1)
     gradient = 2 * problem.degree / problem.size.mean()
-    return bool(square * gradient > shown / np.sqrt(np.median(problem.weight[0][problem.weight[0] > 0])))
+    limit = (
+        4 * shown / np.sqrt(np.median(problem.weight[0][problem.weight[0] > 0])) / gradient
+    )  # b_m^2 is 1/4 on average
+    squares = np.sum(departures**2, axis=1)
+    if np.mean(squares) <= limit:
+        return False
+    error = known.others @ conditional_errors(criterion.linearise(problem, state).u_data) @ known.others.mT
+    noise, chance = np.einsum("ikk->i", error), np.sqrt(2 * np.einsum("ikl,ikl->i", error, error))
+    seen = squares > noise + _SEEN * chance  # an exposure that is worth little departs far for nothing
+    return bool(np.sum((squares - noise)[seen]) > limit * problem.n_exposures)
 
 
 def most_probable(problem, state, *, loss="linear", sizes=None, max_steps=MAX_STEPS):
