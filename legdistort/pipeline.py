@@ -246,7 +246,7 @@ def run(
         joint = _catalogued(catalogue, kept, solution, measuring, psfs, coadding.scratch, timings, progress)
         comparison, stacks = _compared(compare, matches, solution, solving, quality and stack, kept, coadding, timings)
         summary = summarise(solution, timings=timings) | _counted(joint)
-        summary |= _assessed(solution, kept, stack, quality, comparison, stacks, truth)
+        summary |= _assessed(solution, kept, stack, quality, comparison, stacks, truth, joint)
         shown = {"mosaic": stack, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
         with parallel.beside(partial(_write_report, target, solution, summary, shown), workers=workers) as report:
             with timed(timings, "write"):
@@ -402,9 +402,9 @@ def _check_others(workers, truth, catalogue):
         )
 
 
-def _assessed(solution, exposures, stack, quality, comparison, stacks, truth):
+def _assessed(solution, exposures, stack, quality, comparison, stacks, truth, joint):
     """The entries of the summary on images, mosaic and other corrections, as far as known, with all checks."""
-    checked = solution.checks + run_checks.check_run(solution, quality, stacked=stack is not None)
+    checked = solution.checks + run_checks.check_run(solution, quality, stacked=stack is not None, joint=joint)
     figures = {"checks": [to_tree(check) for check in checked], "fwhm_ratio": quality and quality.fwhm_ratio}
     figures |= {"observed": observed(exposures), "stated": stated_rows(exposures)}
     if quality:

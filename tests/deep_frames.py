@@ -48,13 +48,13 @@ def mapped(rng, xy, size, shift=15.0, bend=0.25):
     return xy + d + (c @ terms).T, np.eye(2) + np.einsum("ak,bkn->nab", c, by)
 
 
-def deep_frames(seed, *, size=640, n_stars=900, n_frames=11, transmission=None, hit=0.0, bounds=True):
-    """The trial: stars of S/N 0.8 to 200 a frame, most of them faint; a part `hit` of the pixels with cosmic rays.
+def deep_frames(seed, *, size=640, n_stars=900, n_frames=11, transmission=None, hit=0.0, faintest=0.8, bounds=True):
+    """The trial: stars of S/N `faintest` to 200 a frame, most of them faint; a part `hit` of the pixels with hits.
 
     Without `bounds` there are none, which large sets have no memory for.
     """
     rng = np.random.default_rng(seed)
-    a, b, g = 0.8, 200.0, -0.7
+    a, b, g = faintest, 200.0, -0.7
     flux = (rng.uniform(size=n_stars) * (b**g - a**g) + a**g) ** (1 / g) * SKY * np.sqrt(4 * np.pi) * SIGMA
     xy = rng.uniform(-MARGIN, size + MARGIN, (n_stars, 2))
     t = np.ones(n_frames) if transmission is None else np.asarray(transmission)
@@ -131,14 +131,17 @@ class Compared:
 
     Attributes
     ----------
-    snr, row : ndarray, shape (n,)
-        Of the true stars there, the brightest first, and the row that is theirs, -1 where there is none.
+    star, snr, row : ndarray, shape (n,)
+        The true stars there, the brightest first, their ratios and the rows that are theirs, -1 where there is none.
     off, bound, error : ndarray, shape (n, 2)
         Of the positions; the error is that of pixels and maps together.
     n_rows, n_false : int
         Rows there, and those within a FWHM of no true star with a ratio above 3.
+    shift : ndarray, shape (2,)
+        Of the plane of the catalogue.
     """
 
+    star: np.ndarray
     snr: np.ndarray
     row: np.ndarray
     off: np.ndarray
@@ -146,6 +149,7 @@ class Compared:
     error: np.ndarray
     n_rows: int
     n_false: int
+    shift: np.ndarray
 
     def found(self, low, high=np.inf):
         """Part of the stars of some ratio that have a row."""
@@ -196,4 +200,27 @@ def compared(truth, stars, start, *, edge=40):
     away = cKDTree(place[truth.snr > 3]).query(xy)[0] > fwhm
     off = xy[row] - place[order]
     counts = int(within.sum()), int((away & within).sum())
-    return Compared(truth.snr[order], row, off, truth.bound[order, :2], error[row], *counts)
+    return Compared(order, truth.snr[order], row, off, truth.bound[order, :2], error[row], *counts, shift)
+
+
+def artificial_inside(truth, compared, made, *, edge=40):
+    """Which artificial stars of a table lie where `compared` looks; (n,)."""
+    there = np.column_stack([made["x"].value, made["y"].value]) - compared.shift
+    return ((there > edge) & (there < truth.frames[0].shape[0] - 1 - edge)).all(axis=1)
+
+
+def flux_level(truth, compared, stars):
+    """Fluxes of a catalogue over true ones, by bright stars."""
+    use = (compared.snr > 40) & (compared.row >= 0)
+    return np.median(np.asarray(stars["flux"])[compared.row[use]] / truth.flux[compared.star[use]])
+
+
+def excess(truth, compared, stars):
+    """Ratios of signal to noise of rows that are true stars, by what their fluxes are too large, over the errors, and
+    what ``flux_bias`` states of that; (3, n).
+    """
+    use = compared.row >= 0
+    rows = stars[compared.row[use]]
+    off = np.asarray(rows["flux"]) - flux_level(truth, compared, stars) * truth.flux[compared.star[use]]
+    stated = rows["flux_bias"] if "flux_bias" in stars.colnames else np.full(len(rows), np.nan)
+    return np.array([rows["snr"], off / rows["flux_err"], stated / rows["flux_err"]])

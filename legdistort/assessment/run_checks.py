@@ -1,4 +1,4 @@
-"""The checks that a run adds to those of its solution: images and stack."""
+"""The checks that a run adds to those of its solution: images, stack and catalogue."""
 
 import numpy as np
 from scipy import special
@@ -27,8 +27,8 @@ _NAMED = 6  # exposures in a sentence
 _FEWEST = 4  # exposures, to determine how much they usually differ
 
 
-def check_run(solution, quality=None, *, stacked=True):
-    """Checks of the images and of the stack.
+def check_run(solution, quality=None, *, stacked=True, joint=None):
+    """Checks of the images, of the stack and of the catalogue of all exposures.
 
     Parameters
     ----------
@@ -37,16 +37,19 @@ def check_run(solution, quality=None, *, stacked=True):
         Of the stack, with the widths in single exposures.
     stacked : bool
         Whether there is a stack.
+    joint : `~legdistort.photometry.catalogue.Catalogue`, optional
+        Checked if there is one.
 
     Returns
     -------
     tuple of Check
     """
-    return (
+    checked = (
         image_check(quality, model_misfits(solution.residuals), stacked=stacked),
         stack_check(quality, moving=solution.estimate.motions is not None, stacked=stacked),
         inverse_check(solution),
     )
+    return checked if joint is None else (*checked, joint.check)
 
 
 def image_check(quality, misfits=None, *, stacked=True):

@@ -253,15 +253,33 @@ def do_coadd(a):
 
 def do_catalogue(a):
     """``legdistort catalogue``."""
-    from ..measurement.options import MeasureOptions
     from ..photometry.catalogue import photometry_path
 
     outputs.check_file(photometry_path(a.out), overwrite=a.overwrite)
-    cataloguing = given(a, options.CATALOGUING)
-    MeasureOptions(**{name: value for name, value in cataloguing.items() if name in options.MEASURING})
-    found = legdistort.catalogue(_open(a), _solution(a), **cataloguing, progress=wants_progress(a))
+    if a.artificial is None:
+        _refuse({"seed": a.seed}, "is for the stars of --artificial")
+    found = _catalogue(a, options.CATALOGUING, options.ARTIFICIAL)
     found.write(a.out, overwrite=a.overwrite)
     _say(a, f"{found}\n{a.out} and {photometry_path(a.out)}", found.stars.meta | {"left_out": dict(found.left_out)})
+
+
+def do_completeness(a):
+    """``legdistort completeness``."""
+    from ..photometry.artificial_stars import table_paths
+
+    for path in table_paths(a.out):
+        outputs.check_file(path, overwrite=a.overwrite)
+    found = _catalogue(a, options.COMPLETENESS).completeness
+    found.write(a.out, overwrite=a.overwrite)
+    _say(a, f"{found}\n{' and '.join(map(str, table_paths(a.out)))}", found.by_flux.meta)
+
+
+def _catalogue(a, *groups):
+    from ..measurement.options import MeasureOptions
+
+    cataloguing = given(a, *groups)
+    MeasureOptions(**{name: value for name, value in cataloguing.items() if name in options.MEASURING})
+    return legdistort.catalogue(_open(a), _solution(a), **cataloguing, progress=wants_progress(a))
 
 
 def do_attach(a):

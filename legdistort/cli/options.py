@@ -155,6 +155,14 @@ CATALOGUING = {
     "positions": Option("given stars, x, y or ra, dec: their fluxes and upper limits", path="read", metavar="TABLE"),
     "scratch": SCRATCH,
 }
+ARTIFICIAL = {
+    "artificial": Option("so many artificial stars, which tell the bias of faint fluxes", type=int, metavar="N"),
+    "seed": Option("of the random numbers (default 0)", type=int),
+}
+COMPLETENESS = {name: option for name, option in CATALOGUING.items() if name != "positions"} | {
+    "artificial": Option("stars put in (default 1000)", "--stars", default=1000, type=int, metavar="N"),
+    "seed": ARTIFICIAL["seed"],
+}
 PSF_FILES = {"write_psf": Option("folder for the effective PSF of every exposure", type=Path, path="folder")}
 INJECTING = {
     "fwhm": Option("of the stars put in, pixels (default: that of the frame's)", type=float, nargs="+"),

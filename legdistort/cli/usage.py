@@ -114,6 +114,18 @@ COMMANDS = {
         options.SOLUTION | options.NAMED_SOLUTION,
         options.out("table (ECSV) of stars; photometry.ecsv comes beside it", endings=options.TABLE_ENDINGS),
         options.CATALOGUING,
+        options.ARTIFICIAL,
+    ),
+    "completeness": _command(
+        "artificial stars in all frames, found again as the catalogue finds stars",
+        "frames/*.fits --solution results/solution.asdf --out completeness.ecsv",
+        options.FRAMES,
+        options.FLAGGED,
+        options.SOLUTION | options.NAMED_SOLUTION,
+        options.out(
+            "table (ECSV) by flux; tables by place and of the stars come beside it", endings=options.TABLE_ENDINGS
+        ),
+        options.COMPLETENESS,
     ),
     "attach": _command(
         "the WCS of a solution into its frames",

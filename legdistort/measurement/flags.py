@@ -19,6 +19,7 @@ class Flag(IntFlag):
     DEFORMED = 256
     DEFECT = 512  #: a hot pixel, a bad column or a cosmic ray within one FWHM of the centre was left out of the fit
     VARIABLE = 1024  #: in a catalogue: its fluxes scatter by more than their errors, and two exposures confirm it
+    DISPLACED = 2048  #: in a catalogue: more than five errors from where the solution has it
 
 
 #: Flags that make a detection useless as a star position.

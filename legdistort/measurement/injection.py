@@ -81,7 +81,9 @@ def calibrate_frame(exposure, remeasure, *, psf=None, threshold=5.0, widths=None
         off = _offsets(exposure, centres, each, profile, photon=photon, again=again, rng=rng)
         log.info("%s: FWHM %.2f px, %d stars put in at %d fluxes", name, width, len(each), len(levels))
         known = {"exposure": name, "fwhm": width * u.pix}
-        rows += [known | {"flux": flux} | _statistics(off[each == flux]) for flux in levels]
+        for flux in levels:
+            made = off[each == flux]
+            rows.append(known | {"flux": flux} | statistics(made[:, :2], made[:, 2:], {"x": u.pix, "y": u.pix}))
     return NoiseCurves(QTable(rows, meta={"fwhm": {name: own and own.fwhm}, "photon": {name: float(photon)}}))
 
 
@@ -173,12 +175,25 @@ def _offsets(exposure, centres, flux, profile, *, photon, again, rng):
     return out
 
 
-def _statistics(off):
-    """Columns of `NoiseCurves` for stars of one flux."""
-    found = off[np.isfinite(off[:, 0])]
-    out = {"n": len(off), "found": len(found) / len(off)}
-    for k, axis in enumerate("xy"):
-        d, err = found[:, k], found[:, 2 + k]
+def statistics(off, error, units):
+    """How the stars of a group were found, as columns of `NoiseCurves`.
+
+    Parameters
+    ----------
+    off, error : ndarray, shape (n, k)
+        Measured less true values, and errors stated; NaN for stars not found.
+    units : dict
+        Of the k values, by name.
+
+    Returns
+    -------
+    dict
+        Their number ``n``, the part ``found``, and of every value the ``_rms``, ``_sigma`` (robust), ``_bias`` (median)
+        of the deviations, ``_err``, the median error stated, and ``_ratio``, stated over true errors (robust).
+    """
+    there = np.isfinite(off[:, 0])
+    out = {"n": len(off), "found": there.sum() / max(len(off), 1)}
+    for name, unit, d, err in zip(units, units.values(), off[there].T, error[there].T, strict=True):
         sigma, pull = (biweight_scale(v, M=np.zeros(1)) if len(d) > 2 else np.nan for v in (d, d / err))
         figures = {
             "rms": np.sqrt(np.mean(d**2)) if len(d) else np.nan,
@@ -186,7 +201,7 @@ def _statistics(off):
             "bias": np.median(d) if len(d) else np.nan,
             "err": np.median(err) if len(d) else np.nan,
         }
-        out |= {f"{axis}_{key}": value * u.pix for key, value in figures.items()} | {f"{axis}_ratio": 1 / pull}
+        out |= {f"{name}_{key}": value * unit for key, value in figures.items()} | {f"{name}_ratio": 1 / pull}
     return out
 
 
@@ -230,14 +245,19 @@ def free_positions(exposure, taken, fwhm, *, n, rng):
         xy = xy[cKDTree(taken).query(xy)[0] > AWAY * fwhm]
     if not len(xy):
         return xy
+    return xy[distant(xy, APART * fwhm, n)]
+
+
+def distant(xy, distance, n):
+    """The first n of some places (m, 2) that lie so far from one another; their rows, at most n."""
     tree, keep, near = cKDTree(xy), [], np.zeros(len(xy), dtype=bool)
     for i, place in enumerate(xy):  # who came first stays
         if not near[i]:
             keep.append(i)
             if len(keep) == n:
                 break
-            near[tree.query_ball_point(place, APART * fwhm)] = True
-    return xy[keep]
+            near[tree.query_ball_point(place, distance)] = True
+    return keep
 
 
 def inject(exposure, xy, flux, profile, *, photon, rng):
@@ -262,10 +282,16 @@ def inject(exposure, xy, flux, profile, *, photon, rng):
     """
     light = _light(exposure.shape, xy, flux, profile)
     seen = np.maximum(light, 0)  # an effective PSF may dip below the sky
-    added = light if not photon else light - seen + photon * rng.poisson(seen / photon)
+    added = with_photons(light, photon, rng)
     before = exposure.uncertainty
     uncertainty = None if before is None else np.sqrt(before**2 + photon * seen)
     return replace(exposure, data=exposure.data + added, uncertainty=uncertainty)
+
+
+def with_photons(light, photon, rng):
+    """Light with the noise of its photons, whose variance is `photon` times the light."""
+    seen = np.maximum(light, 0)
+    return light if not photon else light - seen + photon * rng.poisson(seen / photon)
 
 
 def _light(image_shape, xy, flux, profile):

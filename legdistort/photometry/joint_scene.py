@@ -1,5 +1,6 @@
 """The stars of all exposures together: positions on the reference plane, and one flux each."""
 
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from ..measurement.detection import peaks_above
 from ..measurement.scene.normal_equations import JointFit, assembled, neighbour_covariance, normal_matrix, solved
 from ..runtime.progress import Bar
-from ..runtime.scratch import forget
+from ..runtime.scratch import forget, moved
 from . import likelihood_sum
 
 _ROWS = 256  # of the reference plane that are looked at together
@@ -148,6 +149,24 @@ class JointScene(JointFit):
             layer.scene.xy[known] = pixel[known]
             layer.scene.flux = layer.transmission * self.flux[layer.stars]
             layer.scene.render()
+
+    @contextmanager
+    def restored(self):
+        """Stars may come and go, and the sky change: they are as before afterwards."""
+        own, before = (self.xy, self.flux), []
+        for each in self.layers:
+            scene = each.scene
+            before.append((each.rows, each.trusted, scene.xy, scene.flux, scene.sky))
+            each.rows, each.trusted, scene.xy, scene.flux = (values.copy() for values in before[-1][:-1])
+            scene.sky = scene.sky.copy() if self.folder is None else moved(scene.sky, self.folder)
+        self.xy, self.flux = (values.copy() for values in own)
+        try:
+            yield
+        finally:
+            self.xy, self.flux = own
+            for each, values in zip(self.layers, before, strict=True):
+                each.rows, each.trusted, each.scene.xy, each.scene.flux, each.scene.sky = values
+                each.scene.render()
 
     def contains(self, xy):
         """Whether places (n, 2) lie in any image."""

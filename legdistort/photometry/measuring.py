@@ -72,17 +72,40 @@ def measure_field(field, xy, left_out, threshold):
     """
     transmissions.start(field, xy, left_out)
     search(field, threshold, _retune, pairs)
-    rejected = 0
+    rejected = lone = 0
     while True:
+        rejected += lone
         errors = transmissions.update(field)
         field.fit(np.ones(len(field.flux), dtype=bool), 2)
-        flux, error = by_image(field)
-        lone, varying = judged(flux, error, field.flux, field.snr(), threshold)
-        if not lone.any():
-            break
-        rejected += int(lone.sum())
-        field.remove(lone)
-    return Measured(flux, error, image_flags(field), errors, varying, rejected + field.rejected)
+        flux, error, varying, lone = _without_lone(field, threshold)
+        if not lone:
+            return Measured(flux, error, image_flags(field), errors, varying, rejected + field.rejected)
+
+
+def measure_again(field, threshold, around=None):
+    """A field that was measured searched for more after a change of its pixels.
+
+    PSFs and transmissions stay, which a few stars do not change.
+
+    Parameters
+    ----------
+    field : `~legdistort.photometry.joint_scene.JointScene`
+    threshold : float
+        Of the summed likelihood.
+    around : ndarray, shape (m, 2), optional
+        Places near which alone it is searched.
+    """
+    search(field, threshold, None, pairs, settled=True, around=around)
+    while _without_lone(field, threshold)[-1]:
+        pass
+
+
+def _without_lone(field, threshold):
+    """Fluxes by image, errors and which stars vary, before what one image alone shows is taken off; and its number."""
+    flux, error = by_image(field)
+    lone, varying = judged(flux, error, field.flux, field.snr(), threshold)
+    field.remove(lone)
+    return flux, error, varying, int(lone.sum())
 
 
 def _retune(field):

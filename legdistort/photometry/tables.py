@@ -6,7 +6,9 @@ from astropy.table import QTable
 from scipy.spatial import cKDTree
 
 from ..measurement.crowding import crowding
+from ..measurement.flags import Flag
 from ..results.new_positions import add_sky
+from .agreement import BEYOND, displacements
 from .measuring import covariances, map_covariances, sharpness, star_flags
 
 SAME = 0.5  # FWHM from a star of the solution: it is that star
@@ -34,9 +36,12 @@ def stars_table(field, measured, solution, threshold, zero_point):
     trusted = np.array([layer.trusted for layer in field.layers])
     table["n_left_out"] = (measured.seen & ~trusted).sum(axis=0)
     table["snr"], table["chi2_dof"], table["sharpness"] = field.snr(), chi2, sharpness(field)
-    table["flags"] = star_flags(field, measured)
+    away = displacements(names, field.xy, np.einsum("naa->na", both), solution)
+    displaced = away > BEYOND
+    table["flags"] = star_flags(field, measured) | np.where(displaced, Flag.DISPLACED, 0)
     table.add_column(crowding(table, field.fwhm), name="crowding", index=len(table.columns) - 1)
     table.meta = summary(field, measured, solution, threshold, names.tolist())
+    table.meta |= {"n_known": int(np.isfinite(away).sum()), "displaced": names[displaced].tolist()}
     return table[np.argsort(-table["flux"], kind="stable")]
 
 

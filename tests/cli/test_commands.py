@@ -470,7 +470,7 @@ def test_a_full_standard_error_is_no_reason_to_fail(night, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "command", ["demo", "run", "measure", "match", "solve", "coadd", "catalogue", "simulate", "show"]
+    "command", ["demo", "run", "measure", "match", "solve", "coadd", "catalogue", "completeness", "simulate", "show"]
 )
 def test_help_has_an_example(command, capsys):
     with pytest.raises(SystemExit) as end:
@@ -492,7 +492,7 @@ def test_help_has_an_example(command, capsys):
         (match, [options.MATCHING]),
         (solve, [options.SOLVING]),
         (coadd, [options.COADDING, options.WORKERS, options.GRID]),
-        (legdistort.catalogue, [options.CATALOGUING]),
+        (legdistort.catalogue, [options.CATALOGUING, options.ARTIFICIAL, options.COMPLETENESS]),
         (attach, [options.FRAMES, options.ATTACHING]),
         (predict, [options.PREDICTING]),
         (Prior.from_model, [options.EXPANDING]),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table
-from deep_frames import compared, deep_frames
+from deep_frames import artificial_inside, compared, deep_frames
 
 import legdistort as ld
 from legdistort.cli import main
@@ -16,6 +16,8 @@ from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
 from legdistort.measurement.flags import Flag
 from legdistort.measurement.scene.normal_equations import neighbour_covariance
+from legdistort.photometry.agreement import catalogue_check
+from legdistort.photometry.artificial_stars import flux_bias, matched
 from legdistort.photometry.measuring import judged
 
 TRANSMISSION = np.array([1.0, 0.8, 1.1, 1.0, 0.9, 1.2, 1.0, 0.7])
@@ -102,6 +104,36 @@ def test_stars_of_the_solution_keep_their_numbers(solution, found):
     assert list(found.stars["mag"]) == list(25 - 2.5 * np.log10(found.stars["flux"]))
 
 
+def test_stars_that_the_solution_has_elsewhere_are_flagged(truth, solution, found):
+    """Those of three frames, one of which the solution has beside its place; the others are where they were."""
+    assert found.check.state == "pass"
+    assert found.stars.meta["n_known"] > 0.9 * len(solution.stars)
+    before = found.stars.meta["displaced"]
+    assert len(before) <= 1  # a blend that no single exposure shows
+    estimate = solution.estimate
+    bright = next(
+        k for k, name in enumerate(estimate.star_names) if name in found.stars["star"][:20] and name not in before
+    )
+    moved = estimate.positions.copy()
+    moved[bright] += [0.3, -0.3]
+    wrong = replace(solution, estimate=replace(estimate, positions=moved))
+    other = ld.catalogue(exposures_of(truth)[:3], wrong, threshold=9)
+    rows = (other.stars["flags"] & Flag.DISPLACED) > 0
+    displaced = other.stars.meta["displaced"]
+    assert set(other.stars["star"][rows]) == set(displaced)
+    assert estimate.star_names[bright] in displaced
+    assert len(displaced) <= 2
+    assert f"{len(displaced)} of {other.stars.meta['n_known']} stars lie more than 5 errors" in str(other)
+
+
+@pytest.mark.parametrize(("displaced", "state"), [(0, "pass"), (3, "pass"), (9, "warn"), (30, "fail")])
+def test_too_many_of_them_are_no_chance(displaced, state):
+    stars = Table(meta={"n_known": 100, "displaced": list(range(displaced))})
+    check = catalogue_check(stars)
+    assert (check.name, check.state, check.value) == ("catalogue", state, displaced / 100)
+    assert catalogue_check(Table()).state == "unknown"
+
+
 def test_an_image_that_the_solution_left_out_does_not_tell_where_a_star_is(solution, found):
     rows = solution.residuals[~solution.residuals["used"]]
     assert set(rows["exposure"]) == {"f02"}
@@ -131,6 +163,12 @@ def test_bad_arguments_are_named(truth, solution):
         ld.catalogue(exposures, solution, zero_point=float("nan"))
     with pytest.raises(InputError, match="no exposure to measure"):
         ld.catalogue([], solution)
+    with pytest.raises(InputError, match="artificial must be a positive integer, got 0"):
+        ld.catalogue(exposures, solution, artificial=0)
+    with pytest.raises(InputError, match="seed must be an integer, 0 or above, got -1"):
+        ld.catalogue(exposures, solution, artificial=5, seed=-1)
+    with pytest.raises(InputError, match="leave artificial or positions out"):
+        ld.catalogue(exposures, solution, artificial=5, positions=Table({"x": [9.0], "y": [9.0]}))
 
 
 def test_what_one_exposure_alone_shows_is_no_star():
@@ -256,6 +294,88 @@ def test_places_that_cannot_be_measured_are_named(truth, solution, tmp_path):
     assert out.stars["n"][0] == 3
 
 
+def test_artificial_stars_are_found_as_stars_are(truth, solution, found, monkeypatch):
+    """Faint ones are missed, bright ones not, errors are those stated; the catalogue and its pixels stay."""
+    measure, left = ld.photometry.catalogue.measure_completeness, []
+
+    def watched(field, *args, **options):
+        def planes():
+            scenes = [each.scene for each in field.layers]
+            images = [(each.frame.signal.copy(), each.light.copy(), each.sky.copy()) for each in scenes]
+            return np.array(images), field.xy.copy(), field.flux.copy(), [each.rows.copy() for each in field.layers]
+
+        left.append(planes())
+        out = measure(field, *args, **options)
+        left.append(planes())
+        return out
+
+    monkeypatch.setattr(ld.photometry.catalogue, "measure_completeness", watched)
+    other = ld.catalogue(exposures_of(truth), solution, zero_point=25.0, artificial=24, seed=2)
+    for name in found.stars.colnames:
+        np.testing.assert_array_equal(np.asarray(found.stars[name]), np.asarray(other.stars[name]))
+    assert set(other.stars.colnames) - set(found.stars.colnames) == {"flux_bias"}
+    (images, *stars), (after, *same) = left
+    np.testing.assert_allclose(images, after, atol=1e-3)  # of a noise of 10
+    for each, its in zip(stars, same, strict=True):
+        np.testing.assert_array_equal(each, its)
+    made, table = other.completeness.stars, other.completeness.by_flux
+    assert len(made) == table["n"].sum() == other.completeness.by_place["n"].sum() == 24
+    assert np.mean(made["found"][made["snr"] > 8]) > 0.85
+    assert np.mean(made["found"][made["snr"] < 3.5]) < 0.2
+    seen = made[made["found"]]
+    pull = np.concatenate([np.asarray(seen[f"{name}_off"] / seen[f"{name}_err"]) for name in ("x", "y", "flux")])
+    assert 0.6 < 1.4826 * np.median(np.abs(pull)) < 1.5
+    np.testing.assert_allclose(table["mag_low"], 25 - 2.5 * np.log10(table["flux_high"]))
+    np.testing.assert_allclose(np.diff(table["mag_low"]), -0.5)
+    assert table.meta["n_rows"] == len(found.stars)
+    assert table.meta["n_false"] <= 2
+    assert repr(other.completeness) == f"<Completeness: 24 artificial stars, {len(seen)} of them found>"
+    assert "rows are false, by negative light" in str(other.completeness)
+
+
+def test_the_brightest_star_chooses_its_row_first():
+    xy, flux = np.array([[0.0, 0], [1.0, 0], [9.0, 0], [30.0, 0]]), np.array([1.0, 5.0, 2.0, 9.0])
+    rows = np.array([[0.6, 0], [9.5, 0], [8.8, 0], [-0.9, 0]])
+    assert matched(xy, flux, rows, 1.0).tolist() == [3, 0, 2, -1]
+    assert matched(xy, flux, rows[:0], 1.0).tolist() == [-1] * 4
+
+
+def test_the_bias_of_faint_fluxes_is_that_of_their_selection():
+    """Unit noise, a threshold of 5, fluxes that follow a power law: the bias as computed from the definition."""
+    rng = np.random.default_rng(3)
+    flux = 2 * rng.uniform(size=400_000) ** (-1 / 0.7)
+    measured = flux + rng.normal(size=len(flux))
+    stars = QTable({"found": measured > 5, "snr_found": measured, "flux_off": measured - flux})
+    stars["flux_err"] = 1.0
+    snr = np.array([5.5, 7.0])
+    true = [np.median((measured - flux)[np.abs(measured - s) < 0.1]) for s in snr]
+    np.testing.assert_allclose(flux_bias(stars, snr, np.array([2.0, 3.0])), [2 * true[0], 3 * true[1]], atol=0.1)
+    assert np.isnan(flux_bias(stars[:3], snr, np.ones(2))).all()
+    assert np.isnan(flux_bias(stars[:0], snr, np.ones(2))).all()
+
+
+def test_artificial_stars_of_the_command(truth, solution, tmp_path, capsys):
+    """Tables of two calls with one seed are the same; what stands there is not replaced."""
+    paths = []
+    for k, data in enumerate(truth.frames[:3]):
+        paths.append(str(tmp_path / f"f{k:02d}.fits"))
+        fits.PrimaryHDU(data, fits.Header([("GAIN", 1.0)])).writeto(paths[-1])
+    solution.write(tmp_path / "solution.asdf")
+    call = ["completeness", *paths, "--solution", str(tmp_path / "solution.asdf"), "--stars", "3", "--threshold", "9"]
+    for name in ("one", "two"):
+        assert main([*call, "--out", str(tmp_path / f"{name}.ecsv"), "--seed", "4"]) == 0
+    assert "Completeness: 3 artificial stars" in capsys.readouterr().out
+    for what in ("", "_places", "_stars"):
+        one, two = (QTable.read(tmp_path / f"{name}{what}.ecsv") for name in ("one", "two"))
+        for name in one.colnames:
+            np.testing.assert_array_equal(np.asarray(one[name]), np.asarray(two[name]))
+    (tmp_path / "one.ecsv").unlink()
+    assert main([*call, "--out", str(tmp_path / "one.ecsv")]) == 1
+    assert "one_places.ecsv exists already; give --overwrite" in capsys.readouterr().err
+    assert main(["catalogue", *call[1:6], "--out", str(tmp_path / "c.ecsv"), "--seed", "1"]) == 1
+    assert "--seed is for the stars of --artificial" in capsys.readouterr().err
+
+
 def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
     """That of the solution which it leaves; without one where there can be none, by a warning."""
     paths = []
@@ -269,6 +389,7 @@ def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
     stars, photometry = (QTable.read(made.out / name) for name in ("catalogue.ecsv", "photometry.ecsv"))
     for found, same in ((stars, expected.stars), (photometry, expected.photometry)):
         np.testing.assert_allclose(found["flux"], same["flux"], rtol=1e-6)
+    assert str(made.checks[-1]) == str(made.catalogue.check)
     assert made.summary["catalogue"]["n_stars"] == len(made.catalogue.stars) == len(stars)
     assert {"catalogue.ecsv", "photometry.ecsv"} <= set(made.summary["files"])
     report = (made.out / "report.html").read_text()
@@ -292,6 +413,7 @@ def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
     assert made.mosaic is None
     assert not (made.out / "mosaic.fits").exists()
     assert "mosaic.fits" not in (made.out / "report.html").read_text()
+    assert "catalogue" not in {check.name for check in made.checks}
     states = {check.name: (check.state, check.sentence) for check in made.checks}
     assert states["sharpness"] == ("unknown", "no mosaic was made")
     assert states["images"][0] == "unknown"
@@ -335,6 +457,42 @@ def test_a_deep_field_with_hits_of_particles():
     assert over_bound <= 1.3
     assert 0.8 < pull < 1.2
     assert np.count_nonzero(found.stars["flags"] & Flag.VARIABLE) <= 0.02 * len(found.stars)
+
+
+@pytest.mark.slow
+def test_artificial_stars_tell_the_truth():
+    """The part found of them is that found of true stars, field by field more of these."""
+    true, artificial = [], []
+    for seed in range(1, 6):
+        truth = deep_frames(seed, size=320, n_stars=230, n_frames=6)
+        solution = solved(truth)
+        found = ld.catalogue(exposures_of(truth), solution, artificial=40 if seed < 3 else None)
+        c = beside_truth(truth, solution, found.stars, edge=20)
+        true.append((c.snr, c.row >= 0))
+        if found.completeness:
+            made = found.completeness.stars
+            made = made[artificial_inside(truth, c, made, edge=20)]
+            artificial.append((np.asarray(made["snr"]), np.asarray(made["found"])))
+    sets = [np.concatenate(each, axis=1) for each in (true, artificial)]
+    for low, high in ((2, 4.5), (4.5, 8), (8, 50)):
+        hits = [hit[(snr >= low) & (snr < high)] for snr, hit in sets]
+        n, both = [len(hit) for hit in hits], (sum(hit.sum() for hit in hits) + 0.5) / (sum(map(len, hits)) + 1)
+        error = np.sqrt(both * (1 - both) * (1 / n[0] + 1 / n[1]))
+        assert abs(hits[0].mean() - hits[1].mean()) < 0.03 + 2.5 * error, (low, high)
+
+
+@pytest.mark.slow
+def test_negative_light_tells_how_many_rows_are_false():
+    """At a threshold of 3.5, in sets of bright stars alone: whatever else is found is false."""
+    false, stated = 0, 0
+    for seed in (1, 2, 3):
+        truth = deep_frames(seed, size=320, n_stars=60, n_frames=8, faintest=4.0)
+        solution = solved(truth)
+        found = ld.catalogue(exposures_of(truth), solution, threshold=3.5, artificial=1)
+        false += beside_truth(truth, solution, found.stars, edge=-100).n_false
+        stated += found.completeness.by_flux.meta["n_false"]
+    assert false >= 10
+    assert false / 1.5 <= stated <= 1.5 * false
 
 
 @pytest.mark.slow

@@ -18,6 +18,30 @@ _SLOPE = (0.2, 1.8)  # of the number of stars over their flux, minus its power
 _SEPARATIONS = np.linspace(0, 6, 121)[1:]  # standard deviations of the PSF
 
 
+def flux_law(flux, snr, threshold):
+    """The law that fluxes of stars follow: their number above a flux goes with its power -p.
+
+    Parameters
+    ----------
+    flux, snr : ndarray, shape (n,)
+        Signal-to-noise ratios at known positions.
+    threshold : float
+        Signal-to-noise ratio from which a star alone is found.
+
+    Returns
+    -------
+    tuple of float or None
+        The flux above which all stars are seen, and p by these; None where too few tell.
+    """
+    faint = snr < 2 * _COMPLETE * threshold
+    if np.count_nonzero(faint) < _FEWEST:
+        return None
+    least = float(_COMPLETE * threshold * np.median(flux[faint] / snr[faint]))
+    seen = flux > least
+    n = np.count_nonzero(seen)
+    return None if n < _FEWEST else (least, float(np.clip(n / np.log(flux[seen] / least).sum(), *_SLOPE)))
+
+
 def confusion(xy, flux, snr, *, sigma, threshold, area):
     """Variance that stars not seen add to a position, in units of that of its fit.
 
@@ -39,15 +63,12 @@ def confusion(xy, flux, snr, *, sigma, threshold, area):
     ndarray, shape (n,)
         0 where too few stars tell.
     """
-    faint = snr < 2 * _COMPLETE * threshold
-    if np.count_nonzero(faint) < _FEWEST:
+    law = flux_law(flux, snr, threshold)
+    if law is None:
         return np.zeros(len(flux))
-    least = _COMPLETE * threshold * np.median(flux[faint] / snr[faint])
+    least, power = law
     seen = flux > least
     n = np.count_nonzero(seen)
-    if n < _FEWEST:
-        return np.zeros(len(flux))
-    power = np.clip(n / np.log(flux[seen] / least).sum(), *_SLOPE)
     distance = cKDTree(xy[seen]).query(xy, k=min(_AROUND, n))[0][:, -1]
     density = _AROUND / np.minimum(np.pi * np.maximum(distance, sigma) ** 2, area)
     # stars per px^2 of more than u times the noise of this star: number * u ** -power

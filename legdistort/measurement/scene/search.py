@@ -15,11 +15,12 @@ _BESIDE = 0.7  # FWHM from a star: a peak there is a matter of splitting it
 _DISTURBS = 1.5  # FWHM: a change within it is a reason to look at a star anew
 _ALONE = 0.8  # of the threshold, asked of a star where its neighbours are unknown too
 _STARTING = 3  # passes in which PSF and sky are found anew
+_AROUND = 3.0  # FWHM from places: a scene is searched within
 
 log = logging.getLogger(__name__)
 
 
-def search(scene, threshold, retune, pairs=splitting.pairs):
+def search(scene, threshold, retune, pairs=splitting.pairs, *, settled=False, around=None):
     """Search a scene for more stars, until a pass changes next to nothing.
 
     Parameters
@@ -32,37 +33,53 @@ def search(scene, threshold, retune, pairs=splitting.pairs):
         ``retune(scene)`` gives it the PSF that its stars show; by default it is known.
     pairs : callable
         Fits stars of the scene as two each, as `legdistort.measurement.scene.splitting.pairs` does.
+    settled : bool
+        The scene has been searched before: its misfit stays, and its stars are beyond doubt.
+    around : ndarray, shape (m, 2), optional
+        Places near which alone it is searched, and stars are fitted.
     """
-    state = _Search(scene, threshold, pairs)
+    state = _Search(scene, threshold, pairs, settled, around)
     for k in range(_PASSES):
         state.active = scene.fit(state.active, 4)
         if k < _STARTING:
             scene.update_sky()
             if retune is not None:
                 retune(scene)
-            state.active = scene.fit(np.ones_like(state.active), 2)
+            state.active = scene.fit(state.near(scene.xy), 2)
             scene.update_sky()
-        scene.update_misfit()
+        if not settled:
+            scene.update_misfit()
         changed = state.drop()
-        places, flux = scene.candidates(threshold)
+        places, flux = state.candidates()
         fresh = _away(places, state.dropped, _AGAIN * scene.fwhm) & _away(places, scene.xy, _BESIDE * scene.fwhm)
         if k >= _STARTING - 1:
             changed += state.split(places[~fresh])
         changed += state.add(places[fresh], flux[fresh])
         log.debug("pass %d: %d stars, %d changes", k + 1, len(scene.flux), changed)
-        if k >= _STARTING and changed < _CHANGED * len(scene.flux):
+        if k >= _STARTING and changed < max(1, 0 if settled else _CHANGED * len(scene.flux)):
             break
-    scene.fit(np.ones(len(scene.flux), dtype=bool), 3)
+    scene.fit(state.near(scene.xy), 3)
     state.drop()
 
 
 class _Search:
     """A scene with what has been tried: stars to be fitted again, stars that are beyond doubt, places."""
 
-    def __init__(self, scene, threshold, pairs):
-        self.scene, self.threshold, self.pairs = scene, threshold, pairs
-        self.active, self.sure = np.ones(len(scene.flux), dtype=bool), np.zeros(len(scene.flux), dtype=bool)
-        self.dropped, self.tried = np.zeros((0, 2)), np.zeros((0, 2))
+    def __init__(self, scene, threshold, pairs, settled, around):
+        self.scene, self.threshold, self.pairs, self.around = scene, threshold, pairs, around
+        self.active, self.sure = self.near(scene.xy), np.full(len(scene.flux), settled)
+        self.dropped, self.tried = np.zeros((0, 2)), scene.xy[~self.active]
+
+    def near(self, places):
+        """Which places (n, 2) are where the scene is searched; (n,)."""
+        reach = _AROUND * self.scene.fwhm
+        return np.ones(len(places), dtype=bool) if self.around is None else ~_away(places, self.around, reach)
+
+    def candidates(self):
+        """What may be stars where the scene is searched: places (n, 2) and fluxes (n,)."""
+        places, flux = self.scene.candidates(self.threshold)
+        near = self.near(places)
+        return places[near], flux[near]
 
     def drop(self):
         """Stars that are none taken off; their number."""
