@@ -59,6 +59,6 @@ def catalogue_check(stars):
     if part <= DISPLACED or p >= FALSE_ALARM:
         return Check("catalogue", "pass", part, DISPLACED, words)
     state = "fail" if part > 5 * DISPLACED and p < CERTAIN else "warn"
-    return Check("catalogue", state, part, DISPLACED, f"{words}: {some_of(list(map(str, displaced)), _NAMED)}",
-                 "look at them (flag DISPLACED): a blend may be taken apart in one of the two alone, or the PSF is not theirs"
-                 )  # fmt: skip
+    named = f"{words}: {some_of(list(map(str, displaced)), _NAMED)}"
+    cure = "look at them (flag DISPLACED): a blend is perhaps taken apart in one of the two alone, or the PSF is not theirs"
+    return Check("catalogue", state, part, DISPLACED, named, cure)
