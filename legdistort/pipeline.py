@@ -70,7 +70,8 @@ RESULTS = (
     *SOLVED, "psf/*.fits", "mosaic.fits", *CATALOGUE, "report.html", "summary.json", "detections.ecsv", "matched.ecsv",
 )  # fmt: skip
 
-_begun: ContextVar[float | None] = ContextVar("_begun", default=None)
+#: When the command began that calls, and its options for another run; None and nothing without one.
+_command: ContextVar[tuple[float | None, dict[str, Any]]] = ContextVar("_command", default=(None, {}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +147,8 @@ def run(
         Folder for the results; made if it does not exist. Nothing is left there if the run fails.
     earlier : str or path, optional
         Folder of an earlier run, whose measured positions are taken instead of measuring anew. All options but those of
-        reading and measuring may differ. Its frames, or those of them that are given, must be unchanged.
+        reading and measuring may differ, and are those of this call (the command ``run --from`` repeats those of the
+        earlier one). Its frames, or those of them that are given, must be unchanged.
     ext : int, str or (str, int), optional
         Extension to read from every file.
     dq_good : int, str or sequence of int, optional
@@ -227,6 +229,7 @@ def run(
     tying = _tying(reference, reference_error, epoch, pixel_scale, solving)
     _check_others(workers, truth, catalogue)
     paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
+    measuring = before.measuring if before else measuring
     share, timings = {"workers": workers, "progress": progress}, _of_start()
     with outputs.replacing_folder(out, results=RESULTS, keep=keep) as target:
         check_results(out, overwrite)  # again: nobody else writes there any more
@@ -251,7 +254,9 @@ def run(
         with parallel.beside(partial(_write_report, target, solution, summary, shown), workers=workers) as report:
             with timed(timings, "write"):
                 write_results(solution, target, psfs=psfs, mosaic=stack, joint=joint, progress=progress)
-                write_detections(target / "detections.ecsv", detections, exposures, Path(out), **reading)
+                write_detections(
+                    target / "detections.ecsv", detections, exposures, Path(out), measuring=measuring, **reading
+                )
                 write_matched(target / "matched.ecsv", matches, solution.provenance["inputs"])
             summary = _written_summary(target, summary, timings, report)
     return Run(Path(out), solution, stack, summary, joint)
@@ -302,24 +307,29 @@ def _written_summary(target, summary, timings, report):
     """The summary with all times, once the report is there, and what there is to check the files by; writes it."""
     with timed(timings, "report"):
         report()
-    summary = summary | {"timings": rounded(timings)} | listed_files(target)
+    begun, asked = _command.get()
+    summary = summary | {"timings": rounded(timings)} | ({} if begun is None else {"options": asked})
+    summary |= listed_files(target)
     write_summary(target / "summary.json", summary)
     return summary
 
 
 @contextmanager
-def counted_from(begun):
-    """Context in which `run` counts the time of a command since it began (`time.perf_counter`) as the step "start"."""
-    token = _begun.set(begun)
+def called_by(begun, options):
+    """Context in which `run` counts the time of a command since it began (`time.perf_counter`) as the step "start".
+
+    And leaves its options, ``{flag: text or None}``, in the summary, for a run that goes on from there.
+    """
+    token = _command.set((begun, options))
     try:
         yield
     finally:
-        _begun.reset(token)
+        _command.reset(token)
 
 
 def _of_start():
     """Seconds by step, to begin with: what the command took that calls, if it is one."""
-    since = _begun.get()
+    since, _ = _command.get()
     return {} if since is None else {"start": time.perf_counter() - since}
 
 

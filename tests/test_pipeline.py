@@ -77,7 +77,7 @@ def test_a_folder_for_the_results_is_needed(out):
         ("run --error-floor -1", "solving: error_floor must"),
         ("run --pixfrac 2 --algorithm drizzle", "coadding: pixfrac must"),
         ("run --degree 99", "degree must be"),
-        ("run --no-mosaic --order 1", "without a mosaic (--no-mosaic) nothing is co-added: leave order out"),
+        ("run --no-mosaic --order 1", "--order is for a mosaic, and --no-mosaic wants none: leave it out"),
         ("run --min-exposures 1", "min_exposures must be"),
         ("run --pixel-scale -1", "--pixel-scale is for the catalogue of --reference"),
         ("run --workers 0", "workers must be"),

@@ -23,7 +23,7 @@ from ..exceptions import InputError
 from ..geometry import basis, similarity
 from ..geometry.gsaoi import GSAOI_SIZE, GsaoiMap
 from ..inputs import column_contract
-from ..inputs.file_images import of_files
+from ..inputs.detector_files import of_files
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees import codec
@@ -49,8 +49,8 @@ IMAGE = "image"
 GSAOI_DEGREE = 6
 #: Size of a pixel of the focal plane of GSAOI [arcsec], about that of its detectors.
 GSAOI_SCALE = 0.0197
-#: They may stick out of the field by this part of it, of small ones too where headers have them wrong by pixels.
-MARGIN, MARGIN_FITTED = 0.02, 0.1
+#: They may stick out of the field by this part of it: layouts are wrong by pixels, and are moved where they are fitted.
+MARGIN = 0.1
 _SIDE = 32  # points along a side of a detector that are sought on others
 
 
@@ -458,7 +458,7 @@ def _shifted(detector, first):
 
 def _within(detector, field):
     size, outline = np.array(field[::-1]), detector.outline
-    margin = (MARGIN if detector.layout_sigma is None else MARGIN_FITTED) * size
+    margin = MARGIN * size
     return bool(np.all(outline >= -margin - 0.5) and np.all(outline <= size + margin - 0.5))
 
 

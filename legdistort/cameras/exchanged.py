@@ -15,7 +15,7 @@ from ..inputs.start_poses import estimate_poses
 
 #: Positions of a star on two detectors agree within so many pixels, or this part of the distance between stars.
 _NEAR, _PART = 20.0, 0.25
-#: Fewest stars on two detectors by their numbers that prove the places, if half of them agree.
+#: Fewest stars on two detectors by their numbers that prove the places of both, if half of them agree.
 _FEWEST = 10
 #: Standard errors of the difference of two counts beyond which places are taken as exchanged.
 _SURE = 4.0
@@ -36,32 +36,40 @@ def check_places(matches):
         return
     keys, detector = np.unique(camera.ids(matches.table), return_inverse=True)
     xy = np.stack([matches.table[f"{axis}_detector"].value for axis in "xy"], axis=1)
-    if _proved(matches, detector):
+    proved = _proved(matches, detector)
+    if np.all(proved[~np.eye(len(keys), dtype=bool)]):
         return
     focal = {(a, b): camera[b].to_focal_plane(xy[detector == k]) for k, a in enumerate(keys) for b in keys}
     given = _crossing(matches, detector, [focal[key, key] for key in keys])
-    for a, b in combinations(keys, 2):
-        if camera[a].shape != camera[b].shape:
+    for (i, a), (j, b) in combinations(enumerate(keys), 2):
+        if camera[a].shape != camera[b].shape or proved[i, j]:
             continue
-        exchanged = _crossing(matches, detector, [focal[key, {a: b, b: a}.get(key, key)] for key in keys])
-        if exchanged - given > _SURE * np.sqrt(exchanged + given):
+        other = _crossing(matches, detector, [focal[key, {a: b, b: a}.get(key, key)] for key in keys])
+        exchanged, kept = (sum(n for pair, n in each.items() if {i, j} & {*pair}) for each in (other, given))
+        if exchanged - kept > _SURE * np.sqrt(exchanged + kept):
             raise InputError(
-                f"detectors {a} and {b} of camera {camera.name} seem to be exchanged: {exchanged} stars are on two "
-                f"detectors with the places of these two exchanged, {given} as they are; exchange them in the camera, "
-                "or in what names the detectors in the headers"
+                f"detectors {a} and {b} of camera {camera.name} seem to be exchanged: with the places of these two "
+                f"exchanged {exchanged} stars are on one of them and another detector, {kept} as they are; exchange "
+                "them in the camera, or in what names the detectors in the headers"
             )
 
 
 def _proved(matches, detector):
-    """Whether most stars that are on two detectors by their numbers are so by their positions."""
+    """Of which pairs of detectors most stars that are on others too are so by numbers and positions: bool (n, n)."""
     observations, poses = matches.observations, [matches.poses[name] for name in matches.names]
-    seen = np.bincount(np.unique(np.stack([observations.star, detector]), axis=1)[0])
-    number = np.sum(seen[seen > 1] - 1)
-    return number >= _FEWEST and _agreeing(observations, detector, observations.xy, poses) > number / 2
+    n_detectors, star = detector.max() + 1, observations.star
+    seen = np.zeros((n_detectors, star.max() + 1), dtype=int)
+    seen[detector, star] = 1
+    by_number, by_place = seen @ seen.T, np.zeros((n_detectors, n_detectors), dtype=int)
+    np.fill_diagonal(by_number, 0)
+    for (i, j), number in _agreeing(observations, detector, observations.xy, poses).items():
+        by_place[i, j] = by_place[j, i] = number
+    number, agreeing = (each.sum(axis=0) + each.sum(axis=0)[:, None] - each for each in (by_number, by_place))
+    return (number >= _FEWEST) & (agreeing > number / 2)
 
 
 def _crossing(matches, detector, focal):
-    """Number of stars on two detectors, by positions in the focal plane, one array for each detector.
+    """Numbers of stars on each pair of detectors, by positions in the focal plane, one array for each detector.
 
     What a detector sees of a star counts as a star of its own, so that poses rest on each detector by itself.
     """
@@ -74,12 +82,13 @@ def _crossing(matches, detector, focal):
 
 
 def _agreeing(observations, detector, f, poses):
-    """Number of pairs of stars on different detectors that agree, by positions f (n, 2) in the focal plane."""
+    """Of each pair of detectors the number of pairs of stars that agree, by positions f (n, 2) in the focal plane."""
     f = similarity.apply_inverses(np.asarray(poses)[observations.exposure], f[:, None])[:, 0]
     first = np.unique(np.stack([observations.star, detector]), axis=1, return_index=True)[1]
     at = [f[first[detector[first] == k]] for k in range(detector.max() + 1)]
     trees, near = [cKDTree(each) for each in at], _nearness(at)
-    return sum(one.count_neighbors(other, near) for one, other in combinations(trees, 2))
+    pairs = combinations(range(len(trees)), 2)
+    return {(i, j): trees[i].count_neighbors(trees[j], near) for i, j in pairs}
 
 
 def _nearness(at):

@@ -7,6 +7,11 @@ from pathlib import Path
 # -- values from their text
 
 
+def names(text):
+    """``NAME,...`` as a list, each without dashes before it."""
+    return [name.lstrip("-").replace("_", "-") for name in text.split(",") if name]
+
+
 def columns(text):
     """``ours=theirs,...`` as pairs."""
     pairs = [item.split("=") for item in text.split(",") if item]
@@ -110,7 +115,8 @@ class Group(dict):
         self.title = title
 
 
-def _flagged(groups):
+def flagged(groups):
+    """Name, flag, name among the parsed arguments, and `Option` of every option of some groups."""
     for group in groups:
         for name, option in group.items():
             flag = option.flag or f"--{name.replace('_', '-')}"
@@ -122,7 +128,7 @@ def add_options(parser, groups):
     exclusive = {}
     for group in groups:
         titled = parser.add_argument_group(group.title) if isinstance(group, Group) else parser
-        for _, flag, _, option in _flagged([group]):
+        for _, flag, _, option in flagged([group]):
             place, settings = titled, dict(option.settings)
             if option.one_of is not None:
                 required = settings.pop("required", False)
@@ -134,7 +140,7 @@ def add_options(parser, groups):
 
 def given(arguments, *groups):
     """Those options of some groups that were given, or have a default here, as keyword arguments of a function."""
-    found = {name: (getattr(arguments, dest), option.none) for name, _, dest, option in _flagged(groups)}
+    found = {name: (getattr(arguments, dest), option.none) for name, _, dest, option in flagged(groups)}
     return {name: None if value == none else value for name, (value, none) in found.items() if value is not None}
 
 
@@ -144,7 +150,7 @@ def check_paths(arguments, groups):
     from ..runtime.outputs import check_ending, check_file, check_folder, check_not_read, try_to_write
 
     named = {"read": [], "file": [], "folder": [], "results": []}
-    for _, _, dest, option in _flagged(groups):
+    for _, _, dest, option in flagged(groups):
         value = getattr(arguments, dest)
         if option.path is not None and value not in (None, option.none):
             named[option.path].append(value)
@@ -160,7 +166,7 @@ def check_paths(arguments, groups):
         check_file(path, overwrite=arguments.overwrite)
     for folder in named["folder"] + named["results"]:
         check_folder(folder)
-    for _, _, dest, option in _flagged(groups):
+    for _, _, dest, option in flagged(groups):
         if option.endings is not None and getattr(arguments, dest) is not None:
             check_ending(getattr(arguments, dest), option.endings)
     for path in named["file"] + named["folder"] + named["results"]:

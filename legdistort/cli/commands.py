@@ -24,8 +24,10 @@ from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
 from ..runtime.trees.codec import from_tree
 from ..solving.choices.degree_choice import AUTO, HIGHEST
+from ..solving.options import DEGREE
 from . import options
-from .arguments import given, wants_progress
+from .arguments import flagged, given, wants_progress
+from .repeating import repeatable
 
 #: Size of frames from which further processes are worth their start, a second or two each.
 _MANY_BYTES = 1 << 25
@@ -69,7 +71,7 @@ def do_run(a):
         _solving(a, with_headers=True),
     )
     own = ("psf", "degree", "prior", "clip", "reference", "reference_error", "epoch", "pixel_scale", "min_exposures")
-    with pipeline.counted_from(a.begun):
+    with pipeline.called_by(a.begun, repeatable(a)):
         result = legdistort.run(
             **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING),
             out=a.out,
@@ -101,14 +103,14 @@ def do_measure(a):
     from ..measurement.options import MeasureOptions
 
     measuring = given(a, options.MEASURING)
-    MeasureOptions(**measuring)  # which refuses them before a frame is read
+    asked = MeasureOptions(**measuring)  # which refuses them before a frame is read
     bad = {}
     exposures = _open(a, left_out=bad, stop_at_bad=a.stop_at_bad)
     table = legdistort.measure(exposures, **measuring, **given(a, options.PSF_FILES), **_share(a))
     shapes = {e.name: list(e.shape) for e in exposures}
     table.meta["left_out"] = bad
     reading = given(a, {"ext": options.FRAMES["ext"]}, options.FLAGGED)
-    write_detections(a.out, table, exposures, a.out.parent, **reading, overwrite=a.overwrite)
+    write_detections(a.out, table, exposures, a.out.parent, measuring=asked, **reading, overwrite=a.overwrite)
     _say(
         a,
         f"{len(table)} detections in {len(exposures)} exposures",
@@ -134,6 +136,7 @@ def do_match(a):
     """``legdistort match``."""
     if a.camera:
         _refuse({"shape": a.shape}, "comes from --camera")
+    from ..inputs.wcs_files import open_wcs
     from ..measurement.earlier import measured_frames
     from ..pipeline import timed, write_matched
 
@@ -143,13 +146,12 @@ def do_match(a):
         _refuse({"ext": a.ext}, "is for the frames of --wcs")
         exposures = None
     else:
-        _refuse({"shape": a.shape}, "comes from the frames of --wcs")
-        exposures = legdistort.open_exposures(a.wcs, ext=a.ext)
+        exposures = open_wcs(a.wcs, ext=a.ext, shape=a.shape and tuple(a.shape))
         read = {path: named_after(table, exposures, path) for path, table in read.items()}
     tables = list(read.values())
     if not any(map(len, tables)):
         column_contract.check(tables[0], contract, str(a.tables[0]))
-    names = [name for table in tables for name in dict.fromkeys(table["exposure"])]
+    names = [name for table in tables for name in _parts(table)]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
@@ -157,7 +159,7 @@ def do_match(a):
     camera = _camera(a.camera) or _measured_with(tables)
     if camera:
         _refuse({"shape": a.shape}, "comes from the camera of the run")
-    known = {"shape": tuple(a.shape) if a.shape else shapes or None, "camera": camera}
+    known = {"shape": tuple(a.shape) if a.shape and a.wcs is None else shapes or None, "camera": camera}
     if exposures is not None:
         exposures = camera.of_detectors(exposures) if camera else exposures
     elif (exposures := measured_frames(read)) is not None:
@@ -165,8 +167,7 @@ def do_match(a):
     known |= {"exposures": exposures, "progress": wants_progress(a)}
     with timed({}, "match"):
         matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
-    several = [table for table in tables if "detector" in table.colnames]
-    seen = {*names, *(detector_name(*pair) for t in several for pair in zip(t["exposure"], t["detector"], strict=True))}
+    seen = {*names, *(name for table in tables for name in table["exposure"])}
     empty = {name: "no star was detected in it" for name in shapes if name not in seen}
     bad = {name: reason for each in tables for name, reason in (each.meta.get("left_out") or {}).items()}
     bad = {name: reason for name, reason in bad.items() if name not in seen}
@@ -243,7 +244,7 @@ def do_coadd(a):
     check_ending(a.out)
     _refuse_drops(a)
     solution = _solution(a)
-    coadding = given(a, options.COADDING) | {"grid": _grid(a.grid, solution)}
+    coadding = {"method": "clipped"} | given(a, options.COADDING) | {"grid": _grid(a.grid, solution)}
     CoaddOptions(**coadding)  # which refuses them before a frame is read
     mosaic = legdistort.coadd(_open(a), solution, **coadding, **_share(a))
     mosaic.write(a.out, overwrite=a.overwrite)
@@ -417,6 +418,9 @@ def _refuse_ignored(a):
         _refuse(tying, "is for the catalogue of --reference")
     if a.command == "run":
         _refuse_drops(a)
+        if not a.no_mosaic:
+            coadding = {dest: getattr(a, dest) for _, _, dest, _ in flagged([options.COADDING]) if dest != "scratch"}
+            _refuse(coadding | {"no_match_background": None}, "is for a mosaic, and --no-mosaic wants none")
 
 
 def _refuse_drops(a):
@@ -466,7 +470,7 @@ def _solving(a, shape=None, *, with_headers=False):
         return keywords | {"prior": HeaderPrior(sigma, static_sigma)}
     prior = _prior(a.prior, shape, static_sigma)
     if sigma is not None:
-        degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else a.degree
+        degree = 0 if sigma == EVIDENCE else HIGHEST if a.degree == AUTO else keywords.get("degree", DEGREE)
         prior = (prior or legdistort.Prior([[0.0], [0.0]], source=UNSTATED)).with_sigma(sigma, degree=degree)
     return keywords | {"prior": prior}
 
@@ -491,6 +495,13 @@ def _read_table(path, a, contract=None):
 def _camera(given):
     """The camera of ``--camera``; None without one."""
     return legdistort.Camera.gsaoi() if given == "gsaoi" else given and legdistort.Camera.read(given)
+
+
+def _parts(table):
+    """Names of the exposures in a table, or of the parts of them that single detectors took."""
+    if "detector" not in table.colnames:
+        return list(dict.fromkeys(table["exposure"]))
+    return list(dict.fromkeys(detector_name(*pair) for pair in zip(table["exposure"], table["detector"], strict=True)))
 
 
 def _measured_with(tables):

@@ -3,7 +3,19 @@
 from pathlib import Path
 
 from ..runtime import words
-from .arguments import Group, Option, columns, extension, length, number_or_name, pairs, planes, spectrum, word_or
+from .arguments import (
+    Group,
+    Option,
+    columns,
+    extension,
+    length,
+    names,
+    number_or_name,
+    pairs,
+    planes,
+    spectrum,
+    word_or,
+)
 
 # -- options that several commands have
 
@@ -29,8 +41,15 @@ RUN_FRAMES = {
     ),
     "ext": FRAMES["ext"],
     "earlier": Option(
-        "results of an earlier run: its positions are taken, not measured again", "--from", metavar="FOLDER"
+        "results of an earlier run: positions are its own, not measured again; its options hold but for those given",
+        "--from",
+        metavar="FOLDER",
     ),
+}
+FORGETTING = {
+    "forget": Option(
+        "options of the earlier run that do not hold; all: none does", type=names, default=[], metavar="NAME,..."
+    )
 }
 FLAGGED = {"dq_good": Option("flags that leave a pixel good: a sum, or 64,32", metavar="BITS")}
 STOPPING = {"stop_at_bad": Option("refuse blank and damaged frames, do not leave them out", action="store_true")}
@@ -187,7 +206,7 @@ MATCHING = Group(
 SOLVING = Group(
     "solving",
     {
-        "degree": Option("total degree, or auto (default 3)", type=word_or(int, "auto"), default=3),
+        "degree": Option("total degree, or auto (default 3)", type=word_or(int, "auto")),
         **KNOWN_STATIC,
         "prior_sigma": Option(
             "scatter of exposures around it; evidence: found from them",
@@ -248,7 +267,7 @@ SOLVING = Group(
 COADDING = Group(
     "co-adding",
     {
-        "method": Option("(default clipped)", "--combine", choices=words.COMBINATIONS, default="clipped"),
+        "method": Option("(default clipped)", "--combine", choices=words.COMBINATIONS),
         "order": Option("of the spline (default 3)", type=number_or_name, choices=(*range(6), *words.ORDERS)),
         "algorithm": Option("of resampling (default interp)", choices=words.ALGORITHMS),
         "pixfrac": Option("with drizzle: side of the drops (default 1)", type=float),

@@ -6,6 +6,7 @@ Nothing here loads the package, so that help and wrong usage are answered at onc
 import argparse
 import difflib
 import re
+import sys
 import time
 from importlib.metadata import version
 
@@ -27,7 +28,7 @@ def main(argv=None):
         with offline():  # while modules are imported, too: astropy would fetch leap seconds where the clock is ahead
             from .running import run_command
 
-            arguments.begun = begun
+            arguments.begun, arguments.argv = begun, sys.argv[1:] if argv is None else list(argv)
             return run_command(arguments)
 
 

@@ -13,6 +13,7 @@ from ..runtime.progress import Bar
 from . import commands
 from .arguments import check_paths, wants_progress
 from .process import INTERRUPTED, stoppable, tell
+from .repeating import how_to_forget, with_earlier
 
 log = logging.getLogger("legdistort")
 
@@ -27,6 +28,7 @@ def run_command(arguments):
             warnings.simplefilter("ignore")  # of other packages
             warnings.simplefilter("default", LegdistortWarning)
             warnings.showwarning = lambda message, *_, **__: log.warning("%s", in_shell_words(str(message)))
+            arguments = with_earlier(arguments)
             with logging_redirect_tqdm([log], Bar) if wants_progress(arguments) else nullcontext():  # bars stay whole
                 check_paths(arguments, arguments.groups)
                 status = getattr(commands, f"do_{arguments.command}")(arguments)
@@ -36,7 +38,7 @@ def run_command(arguments):
     except (LegdistortError, OSError, MemoryError) as error:
         if arguments.debug:
             raise
-        tell(_in_words(error))
+        tell(_in_words(error, arguments))
         return 1
     except KeyboardInterrupt:
         tell("interrupted")
@@ -44,9 +46,10 @@ def run_command(arguments):
     return status or 0
 
 
-def _in_words(error):
+def _in_words(error, arguments):
     if isinstance(error, LegdistortError):
-        return in_shell_words(str(error))
+        words = in_shell_words(str(error))
+        return words + how_to_forget(words, arguments)
     return f"not enough memory ({error})" if isinstance(error, MemoryError) else str(error)
 
 

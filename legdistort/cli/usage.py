@@ -34,6 +34,7 @@ COMMANDS = {
         "frames to WCS, mosaic and report",
         "frames/*.fits --out results --degree 3",
         options.RUN_FRAMES,
+        options.FORGETTING,
         options.FLAGGED,
         options.STOPPING,
         options.STRICT,

@@ -33,6 +33,7 @@ from ..runtime.notebook import ShownAsPrinted
 from ..runtime.progress import Bar
 from ..runtime.provenance import checksum, unchanged
 from . import repetitions
+from .detector_files import with_detectors
 from .exposure_names import detector_name, exposure_name
 from .exposures import LEAVE_OUT, Exposure
 from .file_images import find_image, images_of_detectors, is_image, of_detector
@@ -299,7 +300,7 @@ def _read_each(paths, read, ext, progress, bad=None, copies=None):
             origins[exposure.name] = origin
             exposures.append(exposure)
     _warn_of_doubts(exposures)
-    return exposures
+    return with_detectors(exposures)
 
 
 def _warn_of_doubts(exposures):

@@ -75,51 +75,6 @@ def every_id(images, ext):
     return [part for part in values if part[1]]
 
 
-def of_files(exposures, ids):
-    """Exposures with `exposure` and `detector`, also those whose detectors are in files of their own.
-
-    The detector is that of `ids` which the header names (`KEYWORDS`), the exposure is the name of the file without it.
-    Those of one file keep the detector that they have, unless that is none of `ids` and another keyword names one.
-
-    Parameters
-    ----------
-    exposures : list of Exposure
-    ids : iterable of str
-
-    Raises
-    ------
-    InputError
-        For a header that names none of the detectors, or a file name that does not have it.
-    """
-    known, out = {key.lower(): key for key in ids}, []
-    for exposure in exposures:
-        if exposure.detector in known.values():
-            out.append(exposure)
-            continue
-        values = [str(exposure.header.get(keyword, "")).strip().lower() for keyword in KEYWORDS]
-        key = next((known[value] for value in values if value in known), None)
-        if exposure.detector is not None:
-            known_as = {} if key is None else {"name": detector_name(exposure.exposure, key), "detector": key}
-            out.append(replace(exposure, **known_as))
-            continue
-        if key is None:
-            raise InputError(
-                f"the header of {exposure.name} names none of the detectors {', '.join(known.values())} "
-                f"({', '.join(KEYWORDS)}): read all extensions of a file by their name (ext='SCI', --ext SCI), or "
-                "correct the ids of the camera"
-            )
-        whole = re.sub(
-            rf"[-_.]?(?<![A-Za-z0-9]){re.escape(key)}(?![A-Za-z0-9])", "", exposure.name, flags=re.IGNORECASE
-        )
-        if whole in ("", exposure.name):
-            raise InputError(
-                f"{exposure.name} is of detector {key}, which its name does not contain: files of one exposure are "
-                f"those with one name but for the detector, such as {exposure.name}_{key}; rename them"
-            )
-        out.append(replace(exposure, exposure=whole, detector=key))
-    return out
-
-
 def of_detector(exposure, ext, key):
     """An exposure that was read from one of several images of a file, named after its detector."""
     whole = exposure.name.removesuffix(f"_{''.join(map(str, ext))}")

@@ -48,16 +48,17 @@ def from_hdulist(hdulist, ext, label, path, good=None):
         _refuse_other_shapes(hdulist, hdu, label)
         planes = planes_of(hdulist, hdu, good)
     name, shape = exposure_name(label, ext), plane_shape(hdu)
-    wcs = None if lacking else header_wcs(header, hdulist, shape, name)
-    known, origin = {}, None
+    known, wcs, origin = {}, None, None
     tables = [other for other in hdulist if other.name == "ASDF"]
     if len(tables) == 1:
         owner = tables[0].header.get("EXPNAME")
         if path is not None:
             known["has_gwcs"] = owner is None or named_images(hdulist, path).get(owner) is hdu
         if owner is None and header.get("TELESCOP") == "JWST":
-            gwcs = _gwcs_of(tables[0], name, shape)
-            wcs, origin = (wcs, None) if gwcs is None else (gwcs, Stated("gwcs", "extension ASDF"))
+            wcs = _gwcs_of(tables[0], name, shape)
+            origin = None if wcs is None else Stated("gwcs", "extension ASDF")
+    if wcs is None and not lacking:
+        wcs = header_wcs(header, hdulist, shape, name)
     stated = read_statement(
         header, planes["data"], integer=integer, own=None if hdu is hdulist[0] else own, wcs=wcs,
         seen=origin or _wcs_in_words(wcs, header, own), mask=_masks_in_words(hdulist, hdu, good),

@@ -124,7 +124,7 @@ def read_roman(file, label, path, good=None):
         ) from None
     if "data" not in planes:
         raise DamagedError(f"{label}: no image of Roman (no entry roman.data)")
-    header = _roman_header(meta)
+    header = header_of_meta({"telescope": "ROMAN"} | meta)
     name, data = exposure_name(label), planes["data"]
     mask = bad_pixels(planes["dq"], good, do_not_use=True) if "dq" in planes else None
     wcs = meta.get("wcs")
@@ -140,17 +140,26 @@ def _plain(node):
     return {key: _plain(value) if hasattr(value, "items") else value for key, value in node.items()}
 
 
-def _roman_header(meta):
-    """What a FITS header would contain for a Roman image."""
+def header_of_meta(meta):
+    """What a FITS header would contain for an image of Roman or JWST, by the ``meta`` of its data model."""
     exposure, instrument = meta.get("exposure") or {}, meta.get("instrument") or {}
-    header = fits.Header([("TELESCOP", "ROMAN"), ("INSTRUME", str(instrument.get("name", "WFI")))])
-    for key, value in (("DETECTOR", instrument.get("detector")), ("FILTER", instrument.get("optical_element"))):
+    header = fits.Header()
+    telescope = meta.get("telescope")
+    named = {
+        "TELESCOP": telescope,
+        "INSTRUME": instrument.get("name") or ("WFI" if telescope == "ROMAN" else None),
+        "DETECTOR": instrument.get("detector"),
+        "FILTER": instrument.get("optical_element"),
+    }
+    for key, value in named.items():
         if value is not None:
             header[key] = str(value)
     times = [exposure.get(key) for key in ("exposure_time", "effective_exposure_time")]
     header["EXPTIME"] = next((float(t) for t in times if isinstance(t, (int, float)) and t > 0), 0.0)
     start = exposure.get("start_time")
-    if start is not None:
+    if isinstance(start, (int, float)):  # of JWST
+        header["MJD-OBS"] = start
+    elif start is not None:
         try:
             header["DATE-OBS"] = Time(start).utc.isot
         except ValueError:

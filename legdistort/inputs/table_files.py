@@ -75,11 +75,13 @@ def read_table(path, *, columns=None, origin=None, error=None):
 
 
 def named_after(table, exposures, path):
-    """A table with its exposures called as frames are: each has the name of one of these, or begins with it.
+    """A table with its exposures called as frames are: each has the name of one of these, begins with it, or ends else.
+
+    Of frames that one detector took each it gets a column ``detector``, too.
 
     Parameters
     ----------
-    table : `~astropy.table.Table`
+    table : `~astropy.table.QTable`
     exposures : list of Exposure
     path : str or path
         Of the table, for messages.
@@ -89,20 +91,30 @@ def named_after(table, exposures, path):
     InputError
         For an exposure of the table that is none of the frames.
     """
-    known, out = {exposure_names.whole_name(each) for each in exposures}, table.copy(copy_data=False)
-    names = {}
-    for name in np.unique(column_contract.labels(table, "exposure")).tolist():
-        begins = [frame for frame in known if re.match(rf"{re.escape(frame)}(?![A-Za-z0-9])", str(name))]
-        if not begins:
+    known = {whole: (whole, None) for whole in map(exposure_names.whole_name, exposures)}
+    known |= {each.name: (exposure_names.whole_name(each), each.detector) for each in exposures}
+    labels, found = column_contract.labels(table, "exposure"), {}
+    for name in np.unique(labels).tolist():
+        if (frame := _frame_of(name, known)) is None:
             some = some_of(sorted(known), 6)
             raise InputError(
                 f"{path}: exposure {name} is none of the frames ({some}): call the table as its frame, or give it a "
                 "column exposure with the name of that"
             )
-        names[name] = max(begins, key=len)
-    out["exposure"] = np.array([names[name] for name in column_contract.labels(table, "exposure").tolist()])
+        found[name] = known[frame]
+    out = table.copy(copy_data=False)
+    out["exposure"] = np.array([found[name][0] for name in labels.tolist()])
     out["exposure"].description = table["exposure"].description
+    if "detector" not in table.colnames and None not in (detectors := [found[name][1] for name in labels.tolist()]):
+        out["detector"] = np.array(detectors, dtype=str)
     return out
+
+
+def _frame_of(name, frames):
+    """The longest name of a frame that a name begins with, or the only one that differs by its last word; or None."""
+    begins = [frame for frame in frames if re.match(rf"{re.escape(frame)}(?![A-Za-z0-9])", str(name))]
+    alike = [frame for frame in frames if "_" in frame and frame.rpartition("_")[0] == str(name).rpartition("_")[0]]
+    return max(begins, key=len, default=alike[0] if len(alike) == 1 else None)
 
 
 def _united(parts, path):
@@ -151,7 +163,8 @@ def _fill_errors(table, error):
         bad = ~(np.isfinite(stated) & (stated > 0))
         table[name] = np.where(bad, error, stated) * u.pix
         filled |= bad
-    log.info("%d of %d positions come without an error; it is taken as %g pixels", filled.sum(), len(table), error)
+    number = "all" if filled.all() else f"{filled.sum()} of {len(table)}"  # the same words of every list are said once
+    log.info("%s positions come without an error; it is taken as %g pixels", number, error)
 
 
 def write_stars(solution, path, *, epoch=None, overwrite=False):

@@ -47,6 +47,15 @@ def n_tied(star):
     return len(found) - len(np.unique(found))
 
 
+def farthest(moves, detector):
+    """The detector that is moved most against the others, and by how much [pix], by moves (n, 2) of what was seen."""
+    seen = np.unique(detector)
+    middles = np.array([np.median(moves[detector == c], axis=0) for c in seen])
+    others = [np.median(np.delete(middles, k, axis=0), axis=0) for k in range(len(seen))]
+    far = np.hypot(*(middles - others).T)
+    return seen[np.argmax(far)], far.max()
+
+
 def nearer(camera, xy, exposure, detector, star):
     """Positions in the focal plane with the detectors where their stars put them.
 

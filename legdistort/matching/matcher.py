@@ -48,6 +48,8 @@ FEWEST = 5
 FEW_HOT = 0.05
 #: How often detectors are placed by the stars that were found with the placing before.
 _MOST_PLACINGS = 4
+#: Detections that a layout must gain in which detectors lie elsewhere than in an exact one.
+_FEWEST_GAINED = 10
 #: Larger numbers are no flags: the bits of 32.
 LARGEST_FLAGS = 2.0**32 - 1
 
@@ -167,7 +169,7 @@ def match(
     headers = HeaderPoses.from_wcs({n: e.wcs for n, e in (named or {}).items() if e.wcs is not None}, shapes)
 
     with parallel.one_blas_thread():  # matrices are small
-        label = _label_over_gaps if camera is not None and detector_places.is_free(camera) else _label
+        label = _label_over_gaps if camera is not None and len(camera.detectors) > 1 and len(names) > 1 else _label
         star, left_out = label(table, names, shapes, headers, options, camera)
     isolated = is_isolated(table, isolation)
     if not isolated.all():
@@ -201,28 +203,45 @@ def _label(table, names, shapes, headers, options, camera=None):
 
 
 def _label_over_gaps(table, names, shapes, headers, options, camera):
-    """The same where the layout of the camera is not exact: labels in that which the stars call for.
+    """The same in the layout which the stars call for: labels, with a warning where that of the camera is exact.
 
-    It is sought anew with the stars that were found, as long as more detections become the same star.
+    It is sought anew with the stars that were found, as long as more detections become the same star; of an exact one
+    by more than chance.
     """
-    keys = {key: c for c, key in enumerate(camera.detectors)}
-    detector = np.array([keys[key] for key in camera.ids(table)])
+    keys, free = list(camera.detectors), detector_places.is_free(camera)
+    detector = np.array([keys.index(key) for key in camera.ids(table)])
     exposure, moved = np.unique(table["exposure"], return_inverse=True)[1], table.copy()
-    found = _label(table, names, shapes, headers, options)
+    found, given = _label(table, names, shapes, headers, options), _positions(table)
     for _ in range(_MOST_PLACINGS):
-        xy = np.stack([moved["x"].to_value(u.pix), moved["y"].to_value(u.pix)], axis=1)
-        xy = detector_places.nearer(camera, xy, exposure, detector, found[0])
+        xy = detector_places.nearer(camera, _positions(moved), exposure, detector, found[0])
         if xy is None:
+            break
+        c, far = detector_places.farthest(xy - given, detector)
+        if not free and far < detector_places.WIDTH:
             break
         moved["x"], moved["y"] = xy.T * u.pix
         try:
             again = _label(moved, names, shapes, headers, options)
         except MatchError:
             break
-        if detector_places.n_tied(again[0]) <= detector_places.n_tied(found[0]):
+        gained = detector_places.n_tied(again[0]) - detector_places.n_tied(found[0])
+        if gained <= (0 if free else _FEWEST_GAINED):
             break
         found = again
+        if not free:
+            warn(
+                f"stars that move over the gaps do not fit the layout of camera {camera.name}: detector {keys[c]} "
+                f"seems to lie {far:.0f} px from where it has it; they are matched nevertheless, and layout='fit' "
+                "(--layout fit) of solve and run finds the layout",
+                AssumptionWarning,
+            )
+            break
     return found
+
+
+def _positions(table):
+    """Positions (n, 2) of a table, pixels."""
+    return np.column_stack([table["x"].to_value(u.pix), table["y"].to_value(u.pix)])
 
 
 def _check_detectors(camera, table, star, shapes):

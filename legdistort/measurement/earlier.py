@@ -14,8 +14,10 @@ from ..inputs.exposure_files import ExposureFile, file_checksums, open_exposures
 from ..inputs.exposure_names import whole_name
 from ..inputs.table_files import read_table, write_table
 from ..runtime import provenance
+from ..runtime.checks import options_from
 from ..runtime.locks import way_back
 from .effective.model import EffectivePSF
+from .options import MeasureOptions
 
 #: Files of a run that have what it measured.
 DETECTIONS, PSFS = "detections.ecsv", "psf"
@@ -76,6 +78,11 @@ class EarlierRun:
         return {"ext": tuple(ext) if isinstance(ext, list) else ext, "dq_good": self.table.meta.get("dq_good")}
 
     @property
+    def measuring(self):
+        """The `MeasureOptions`, as far as they are numbers and words."""
+        return options_from(MeasureOptions, self.table.meta.get("measuring"), f"{self.folder / DETECTIONS}: measuring")
+
+    @property
     def camera(self):
         """The camera that was given; None if none was."""
         meta = self.table.meta.get("camera")
@@ -116,6 +123,13 @@ class EarlierRun:
         return table, {exposure.name: self.psfs[exposure.name] for exposure in exposures if exposure.name in self.psfs}
 
 
+def _plain_options(measuring):
+    """Those of `MeasureOptions` that are numbers or words, and no defaults."""
+    usual = vars(MeasureOptions())
+    kept = {name: value for name, value in vars(measuring).items() if isinstance(value, str | int | float)}
+    return {name: value for name, value in kept.items() if value != usual[name]}
+
+
 def measured_frames(tables):
     """The frames of tables of positions, whose headers may know the sky.
 
@@ -145,7 +159,9 @@ def measured_frames(tables):
     return exposures
 
 
-def write_detections(path, detections, exposures, out, *, ext=None, dq_good=None, camera=None, overwrite=False):
+def write_detections(
+    path, detections, exposures, out, *, measuring, ext=None, dq_good=None, camera=None, overwrite=False
+):
     """Write what was measured, for `EarlierRun` and for the command ``match``.
 
     Parameters
@@ -156,6 +172,8 @@ def write_detections(path, detections, exposures, out, *, ext=None, dq_good=None
         Those that are not in files cannot be gone on from.
     out : Path
         Where the file will be found: paths of frames are relative to it.
+    measuring : MeasureOptions
+        How it was measured.
     ext, dq_good, camera
         As given to `legdistort.run`.
     overwrite : bool
@@ -170,5 +188,6 @@ def write_detections(path, detections, exposures, out, *, ext=None, dq_good=None
         "ext": list(ext) if isinstance(ext, tuple) else ext,
         "dq_good": dq_good,
         "camera": camera and camera.to_meta(),
+        "measuring": _plain_options(measuring),
     }
     write_table(table, path, overwrite=overwrite)

@@ -60,5 +60,5 @@ def catalogue_check(stars):
         return Check("catalogue", "pass", part, DISPLACED, words)
     state = "fail" if part > 5 * DISPLACED and p < CERTAIN else "warn"
     named = f"{words}: {some_of(list(map(str, displaced)), _NAMED)}"
-    cure = "look at them (flag DISPLACED): a blend is perhaps taken apart in one of the two alone, or the PSF is not theirs"
+    cure = "look at them (flag DISPLACED): a blend is perhaps taken apart in one alone, or the PSF is not theirs"
     return Check("catalogue", state, part, DISPLACED, named, cure)

@@ -174,6 +174,7 @@ def printed(solution):
         f"status  {solution.status}",
         *_wrapped("camera", camera_sentence(solution)),
         *_static_in_words(solution),
+        *_wrapped("odd", next((c.sentence for c in solution.checks if c.name == "dynamic part" and c.tests), "")),
         *_wrapped("gauge", solution.gauge.sentence),
         f"sky     {sky_sentence(solution)}",
         *(_wrapped("stars", motions.sentence) if motions is not None else []),

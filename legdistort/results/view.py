@@ -16,6 +16,7 @@ from ..exceptions import FoldError, InputError, some_of
 from ..geometry import similarity, star_hull
 from ..geometry.distortion import Distortion
 from ..geometry.models import exposure_model, like, outside, to_pixels
+from ..inputs.detector_files import label_of
 from ..inputs.exposure_names import detector_name
 from ..plots import solution_plots
 from ..runtime.checks import check_counts
@@ -742,10 +743,12 @@ def check_key(solution, key):
 
 def image_view(solution, image):
     """The view of an image, an Exposure or ExposureFile, by its exposure and detector or by its name; None without."""
-    key = (image.exposure, image.detector) if solution.camera.has_focal_plane else image.name
+    of_camera = solution.camera.has_focal_plane
+    key = (image.exposure, image.detector) if of_camera else image.name
     if key in solution:
         return solution[key]
-    return None
+    parts = {part.label: part for view in solution for part in view.parts}
+    return parts.get(label_of(image.name, image.header, parts, exact=not of_camera))
 
 
 def error_map(view, *, n=64, support=True, absolute=False):

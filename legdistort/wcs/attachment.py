@@ -17,9 +17,10 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from ..exceptions import ExportError, InputError, some_of, without_astropy_warnings
-from ..inputs import exposure_files, exposure_names, file_images
+from ..inputs import detector_files, exposure_files, exposure_names, file_images
 from ..inputs.frames import wcs_cards
 from ..inputs.sky_wcs import header_wcs, leads_elsewhere, warn_of_another_field
+from ..inputs.wcs_files import PLACES
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD
 from ..runtime.checks import first_line
@@ -27,7 +28,7 @@ from ..runtime.fits_bytes import BLOCK, exchange_cards, locate, open_bytes, read
 from ..runtime.outputs import replacing, replacing_files, replacing_folder
 from ..runtime.progress import Bar
 from .fits_headers import header_error
-from .foreign_trees import PLACES, model_wcs, refined_tree, table_of
+from .foreign_trees import model_wcs, refined_tree, table_of
 from .storage import wcs_tree
 
 log = logging.getLogger(__name__)
@@ -162,6 +163,12 @@ class _Images:
     views: dict
     left_out: dict
     checksum: str | None
+    of_camera: bool
+
+    def of_file(self, name, header):
+        """Name of the exposure, or of the part of one, in a file of one detector; None if it is of another."""
+        labels = {*self.views, *self.left_out}
+        return detector_files.label_of(name, header, labels, exact=not self.of_camera)
 
     @classmethod
     def of(cls, solution):
@@ -169,7 +176,8 @@ class _Images:
         if solution.camera.has_focal_plane:
             ids = solution.camera.detectors
             left_out = {exposure_names.detector_name(name, k): why for name, why in left_out.items() for k in ids}
-        return cls({part.label: part for view in solution for part in view.parts}, left_out, solution.checksum)
+        views = {part.label: part for view in solution for part in view.parts}
+        return cls(views, left_out, solution.checksum, solution.camera.has_focal_plane)
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,10 +287,11 @@ def _plan_of_tree(known, path, target, raw, kind):
     if kind == "head":
         raise InputError(f"{path} is no FITS file: SWarp and SCAMP do not read it")
     name = exposure_names.exposure_name(path)
-    if name not in known.views:
-        return _Plan(path, target, zlib.crc32(raw), _nothing(known, path, name), [], [])
     if (found := model_wcs(raw, str(path))) is None:
         raise InputError(f"{path} has no gwcs at {' or '.join('.'.join(keys) for keys in PLACES)}")
+    name = name if name in known.views else known.of_file(name, found[2]) or name
+    if name not in known.views:
+        return _Plan(path, target, zlib.crc32(raw), _nothing(known, path, name), [], [])
     whole = refined_tree(raw, found, known.views[name], str(path))
     return _Plan(path, target, zlib.crc32(raw), {name: None}, [], [], whole)
 
@@ -407,7 +416,9 @@ def _images(known, hdulist, path, ext):
     candidates = {exposure_names.exposure_name(path, ext): ext}
     if ext is None:
         candidates = file_images.extension_names(hdulist, path)
-    candidates |= file_images.detector_names(hdulist, path, ext)
+    candidates |= file_images.detector_names(hdulist, path, ext) | _in_a_file_of_its_own(
+        known, candidates, hdulist, path
+    )
     found = {name: form for name, form in candidates.items() if name in known.views}
     if not found:
         return _nothing(known, path, next((n for n in candidates if n in known.left_out), next(iter(candidates))))
@@ -424,6 +435,18 @@ def _images(known, hdulist, path, ext):
     if len(set(images.values())) < len(images):
         raise InputError(f"{path}: exposures {', '.join(images)} are the same image; choose one with ext= (--ext)")
     return images
+
+
+def _in_a_file_of_its_own(known, candidates, hdulist, path):
+    """The part of an exposure, ``{name: extension}``, that is in a file of one detector; empty for other files."""
+    found = {}
+    for name, ext in candidates.items() if any(map(file_images.is_image, hdulist)) else ():
+        with contextlib.suppress(InputError):  # an extension that is no image
+            image = file_images.find_image(hdulist, ext, str(path), of_several=True)
+            header = wcs_cards.header_of_image(hdulist[0].header, image.header)
+            found.setdefault(known.of_file(name, header), ext)
+    found.pop(None, None)
+    return found
 
 
 def _nothing(known, path, name):

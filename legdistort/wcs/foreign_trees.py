@@ -13,12 +13,11 @@ import yaml
 from astropy.io import fits
 
 from ..exceptions import InputError
+from ..inputs.wcs_files import wcs_in
 from ..runtime.asdf_files import ARCHIVES, read_tree
 from ..runtime.fits_bytes import BLOCK
 from .refinement import refine
 
-#: Where data models have the WCS of their image: of JWST, and of Roman.
-PLACES = ("meta", "wcs"), ("roman", "meta", "wcs")
 _END = re.compile(rb"\n\.\.\.\r?\n")
 _INDEX = b"#ASDF BLOCK INDEX"
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -28,7 +27,7 @@ _ANCHOR = re.compile(r"(?<=[\s,\[{])([&*])id(\d+)\b")
 
 
 def model_wcs(content, label):
-    """Keys and gwcs of the data model in the bytes of an ASDF file; None if none is where models have it (`PLACES`).
+    """What `legdistort.inputs.wcs_files.wcs_in` gives for the bytes of an ASDF file.
 
     Raises
     ------
@@ -39,7 +38,7 @@ def model_wcs(content, label):
         tree = read_tree(label, content=content, tags=ARCHIVES)
     except InputError as error:
         raise InputError(f"{label}: the WCS in it cannot be exchanged: {error}") from None
-    return next(((keys, wcs) for keys in PLACES if hasattr(wcs := _at(tree, keys), "available_frames")), None)
+    return wcs_in(tree)
 
 
 def refined_tree(content, found, view, label):
@@ -50,7 +49,7 @@ def refined_tree(content, found, view, label):
     content : bytes
         The whole file.
     found : tuple
-        Its keys and gwcs, from `model_wcs`.
+        What `model_wcs` gives.
     view : View
     label : str
         How messages call it.
@@ -60,7 +59,7 @@ def refined_tree(content, found, view, label):
     InputError
         If it cannot be refined.
     """
-    keys, wcs = found
+    keys, wcs, _ = found
     return _exchanged(content, keys, refine(wcs, view).stock(), label)
 
 
@@ -75,12 +74,6 @@ def table_of(header, content):
     hdu.add_checksum()
     fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(file)
     return file.getvalue()[BLOCK:]
-
-
-def _at(tree, keys):
-    for key in keys:
-        tree = tree.get(key) if hasattr(tree, "get") else None
-    return tree
 
 
 def _exchanged(content, keys, wcs, label):

@@ -866,6 +866,9 @@ class TestFrames:
         assert set(parted["exposure"]) == {"exp0_cal", "exp1_cal"}
         for name in ("detector", "x", "y", "x_err"):
             assert np.array_equal(np.sort(parted[name]), np.sort(together[name]))
+        assert [(each.exposure, each.detector) for each in apart][:2] == [("exp0_cal", "1"), ("exp1_cal", "1")]
+        apart = [replace(each, exposure=None, detector=None) for each in apart]
+        assert [each.exposure for each in camera.of_detectors(apart)] == ["exp0_cal", "exp1_cal", "exp1_cal"]
         with pytest.raises(InputError, match="names none of the detectors A, B"):
             legdistort.Camera("c", dict(zip("AB", camera.detectors.values(), strict=True))).of_detectors(apart)
         with pytest.raises(InputError, match="is of detector 1, which its name does not contain"):
@@ -978,10 +981,10 @@ class TestExchanged:
             legdistort.solve(matches)
 
     def test_matching(self):
-        """Of detectors alike: all exposures match, and nothing else would tell."""
+        """Of detectors alike: all exposures match, and nothing else would tell; others are rightly tied, c and d."""
         rng, size = np.random.default_rng(1), 1000
-        places = {"a": 0.0, "b": 1020.0, "c": 2040.0}
-        sky, rows = rng.uniform([-200, -200], [3240, 1200], (500, 2)), []
+        places = {"a": 0.0, "b": 1020.0, "c": 2040.0, "d": 3060.0}
+        sky, rows = rng.uniform([-200, -200], [4260, 1200], (1600, 2)), []
         for i in range(6):
             f = sky + rng.uniform(-200, 200, 2)
             for key, first in places.items():

@@ -527,9 +527,9 @@ def test_help_loads_nothing(words):
 
 def test_what_stands_for_none():
     arguments = parser._parser().parse_args(["coadd", "a.fits", "--solution", "s", "--out", "m", "--scale", "none"])
-    assert given(arguments, options.COADDING) == {"method": "clipped", "match_background": True, "scale": None}
+    assert given(arguments, options.COADDING) == {"match_background": True, "scale": None}
     arguments = parser._parser().parse_args(["run", "a.fits", "--out", "o", "--clip", "0", "--errors", "floor"])
-    assert given(arguments, options.SOLVING) == {"degree": 3, "clip": None, "errors": "floor"}
+    assert given(arguments, options.SOLVING) == {"clip": None, "errors": "floor"}
     assert given(arguments, options.MEASURING) == {}
 
 

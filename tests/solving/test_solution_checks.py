@@ -592,7 +592,9 @@ def departures(seed, *, prior=True, **setting):
     prior = ld.Prior(truth["static"]) if prior else None
     solution = ld.solve(drawn_sets.as_matches(data), degree=3, prior=prior, clip=None)
     sentence = next(check.sentence for check in solution.checks if check.name == "dynamic part")
-    return [t["name"] for t in solution.factors if t["name"].startswith("departure")], sentence
+    found = [t["name"] for t in solution.factors if t["name"].startswith("departure")]
+    assert ("\nodd     exposures depart" in str(solution)) is bool(found)
+    return found, sentence
 
 
 @pytest.mark.parametrize("prior", [True, False])
