@@ -39,7 +39,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 import legdistort as ld
-from legdistort.cli.arguments import _flagged
+from legdistort.cli.arguments import flagged
 from legdistort.cli.parser import main
 from legdistort.cli.usage import COMMANDS
 from legdistort.exceptions import LegdistortError
@@ -377,7 +377,7 @@ def use_words(rng, folder):
         os.link(frame, folder / frame.name)
     command = pick(rng, sorted(set(COMMANDS) - {"demo"}))
     groups = COMMANDS[pick(rng, sorted(COMMANDS)) if rng.random() < 0.1 else command].groups
-    options = list(_flagged(groups))
+    options = list(flagged(groups))
     words = [command]
     paths = [
         *(frame.name for frame in frames),

@@ -365,7 +365,8 @@ class Camera(ShownAsPrinted):
         if exposure.shape != self[key].shape:
             raise InputError(
                 f"{exposure.name} has shape {exposure.shape}, detector {key} of camera {self.name} {self[key].shape} "
-                "(ny, nx): is it a camera of another instrument?"
+                "(ny, nx): is it a camera of another instrument? Else leave the camera "
+                "out, which takes the layout of the headers"
             )
 
     @classmethod

@@ -311,7 +311,12 @@ EXPANDING = {
 }
 ATTACHING = {
     "out": Option("folder for copies", type=Path, path="folder", one_of="where", required=True),
-    "in_place": Option("change the frames themselves", action="store_true", one_of="where", required=True),
+    "in_place": Option(
+        "change the frames themselves; with --head put texts beside them",
+        action="store_true",
+        one_of="where",
+        required=True,
+    ),
     "tpv": Option("header for SWarp and SCAMP (default: SIP)", action="store_true", one_of="header"),
     "head": Option("texts NAME.head for SWarp and SCAMP, no copies of frames", action="store_true", one_of="header"),
     "asdf_only": Option("leave the header alone, add the exact WCS", action="store_true", one_of="header"),

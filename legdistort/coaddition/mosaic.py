@@ -190,7 +190,10 @@ class Mosaic(ShownAsPrinted):
         ``IMCMB001``, ``IMCMB002``, ...
         """
         header = self.header.copy()
-        header.update(self.wcs.to_header(relax=True))
+        cards = self.wcs.to_header(relax=True)
+        for key in [key for key in cards if key.startswith(("DATE-", "MJD-"))]:  # of the file that gave the grid
+            del cards[key]
+        header.update(cards)
         if self.offset is not None:  # IRAF's logical = LTM physical + LTV, 1-based: physical is the reference plane
             for axis, shift in enumerate(self.offset, start=1):
                 header[f"LTM{axis}_{axis}"] = (1.0, "reference-plane pixels are mosaic pixels")

@@ -83,6 +83,11 @@ def _wcs_in_words(wcs, header, own):
     return Stated(projection, "CTYPE1" if "CTYPE1" in own else "CTYPE1 of the primary header, by INHERIT = T")
 
 
+def _has_do_not_use(hdulist, hdu):
+    """Whether one bit of the flags beside an image states that a pixel is not to be used."""
+    return hdu.header.get("TELESCOP", hdulist[0].header.get("TELESCOP", "")) in ("JWST", "ROMAN")
+
+
 def _masks_in_words(hdulist, hdu, good):
     """The planes of flags beside an image, as `Stated`."""
     beside = [other for other in _alike(hdulist, hdu) if other.name in MASK_NAMES]
@@ -90,6 +95,7 @@ def _masks_in_words(hdulist, hdu, good):
         return Stated(None, "no plane of flags")
     names = descriptive_flags(beside[-1].header)
     words = f"without {', '.join(f'{name} ({bit})' for name, bit in names.items())}" if names else "of all flags"
+    words = "of the flag DO_NOT_USE" if not names and _has_do_not_use(hdulist, hdu) else words
     words = f"without flags {good}" if good is not None and not names else words
     return Stated(words, f"plane {beside[-1].name}")
 
@@ -119,13 +125,12 @@ def planes_of(hdulist, hdu, good=None):
     data = data.reshape(plane_shape(hdu))
     if isinstance(blank, int) and (blanks := data == blank).any():  # of a frame that was made of an integer one
         data = np.where(blanks, data.dtype.type(np.nan), data)
-    telescope = hdu.header.get("TELESCOP", hdulist[0].header.get("TELESCOP", ""))
     planes = {"data": data}
     for other in _alike(hdulist, hdu):
         if other.name in MASK_NAMES:
             flags, described = other.data.reshape(data.shape), sum(descriptive_flags(other.header).values())
             kept = (good or 0) | described if described or good is not None else None
-            planes["mask"] = bad_pixels(flags, kept, do_not_use=telescope in ("JWST", "ROMAN"))
+            planes["mask"] = bad_pixels(flags, kept, do_not_use=_has_do_not_use(hdulist, hdu))
         elif other.name in UNCERTAINTY_NAMES:
             kind = str(other.header.get("UTYPE", UNCERTAINTY_NAMES[other.name]))  # CCDData writes its class as UTYPE
             with np.errstate(invalid="ignore", divide="ignore"):

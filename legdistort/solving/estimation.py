@@ -422,7 +422,7 @@ def _choose_degree(matches, options):
 
 def _tell(fit, matches):
     """Log how the fit ended and what it left out, and warn of what these exposures cannot determine."""
-    log.info("%s; chi2 %.1f for %d degrees of freedom", fit.result.status, fit.chi2, fit.dof)
+    log.info("%s; chi2 %.1f for %.0f degrees of freedom", fit.result.status, fit.chi2, fit.dof)
     for name, reason in fit.matches.left_out.items():
         if name not in matches.left_out:
             warn(f"exposure {name} is left out: {reason}", AssumptionWarning)

@@ -153,7 +153,7 @@ class SolveOptions(Settings):
         if self.own_degree >= self.degree or self.degree < 2:
             raise InputError(
                 f"static='fit' shares the modes above exposure_degree={self.own_degree} up to degree={self.degree}: "
-                "there are none; raise degree (at least 2) or lower exposure_degree"
+                f"there are none; raise degree to {max(self.own_degree + 1, 2)} or more, or lower exposure_degree"
             )
 
     @property

@@ -157,6 +157,14 @@ class TestSky:
         again = coadd(exposures, solution, grid=header)
         np.testing.assert_allclose(again.data, mosaic.data, rtol=1e-4, atol=0.01)
 
+    def test_dates_are_those_of_the_exposures_not_of_the_grid(self):
+        solution, _, _, exposures, mosaic = plain()
+        header = mosaic.to_hdulist()["SCI"].header
+        header["DATE-OBS"], header["MJD-OBS"] = "2001-01-01T00:00:00", 51910.0
+        again = coadd(exposures, solution, grid=header).to_hdulist()["SCI"].header
+        assert again.get("DATE-OBS") == mosaic.header.get("DATE-OBS")
+        assert "MJD-OBS" not in again
+
     def test_without_sky_the_world_is_the_reference_plane(self):
         solution, stars, *_ = plain()
         blind = StandIn(solution.poses, solution.distortions)

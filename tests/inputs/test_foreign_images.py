@@ -201,6 +201,7 @@ def test_jwst_cal(jwst, data):
     (exposure,) = ld.read_exposures(jwst)
     assert_array_equal(exposure.data, data)
     assert np.argwhere(exposure.mask).tolist() == [[1, 2]]
+    assert exposure.stated.mask.value == "of the flag DO_NOT_USE"
     assert_allclose(exposure.uncertainty, 3)
     assert exposure.exposure_time == 21.5
     xy = np.array([[3.0, 4.0], [70.0, 90.0]])

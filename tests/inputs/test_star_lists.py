@@ -167,7 +167,7 @@ def test_starfinder_without_a_header(tmp_path, caplog):
     named = read(tmp_path, "A.lis", FLYSTAR)
     caplog.set_level("INFO", logger="legdistort")
     bare = read(tmp_path, "B.lis", _without_names(FLYSTAR))
-    assert "columns of FlyStar: x_err = xe, y_err = ye, mag = m, epoch = t" in caplog.text
+    assert "columns of StarFinder, FlyStar: x_err = xe, y_err = ye, mag = m, epoch = t" in caplog.text
     for name in ("x", "y", "x_err", "y_err", "mag", "flux", "epoch"):
         assert_array_equal(bare[name], named[name])
     nine = read(tmp_path, "C.lis", _without_names(FLYSTAR, 5, 6), error=0.01)

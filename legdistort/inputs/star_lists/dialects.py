@@ -72,7 +72,11 @@ def _photutils_flags(table):
 #: FlyStar and StarFinder; hst1pass (Anderson 2022, WFC3 ISR 2022-05), whose X, Y are x, y after the correction for
 #: charge transfer, u, v and U, V those without distortion; DAOPHOT of Stetson and of IRAF; photutils.
 DIALECTS = (
-    Dialect("FlyStar", {"x_err": ("xe",), "y_err": ("ye",), "mag": ("m",), "epoch": ("t",)}, ("x", "y", "xe", "ye")),
+    Dialect(
+        "StarFinder, FlyStar",
+        {"x_err": ("xe",), "y_err": ("ye",), "mag": ("m",), "epoch": ("t",)},
+        ("x", "y", "xe", "ye"),
+    ),
     Dialect("StarFinder", {"mag": ("m",), "epoch": ("t",)}, ("x", "y", "m", "t", "snr", "corr", "N_frames", "flux")),
     Dialect(
         "hst1pass",

@@ -117,6 +117,6 @@ def _stated(solution, departure):
     found = f"detectors depart from {given} by {ratio:.2g} times its uncertainty"
     if state in WRONG:
         return Check("camera", state, ratio, None, f"{found}, above all {departure.detector}",
-                     "look at the camera file (layout_sigma, static_sigma), or --layout fit, --static fit",
+                     "look at what states it, the headers or the camera file, or --layout fit, --static fit",
                      factors)  # fmt: skip
     return Check("camera", "pass", ratio, None, found, tests=factors)
