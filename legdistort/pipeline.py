@@ -347,6 +347,11 @@ def _known_of(exposures, solving, prior, camera):
     """The options of `solve` with the prior of these exposures; choices about a camera are refused without one."""
     several = camera.has_focal_plane if camera else any(exposure.exposure for exposure in exposures)
     check_detectors(several, solving.layout, solving.static, solving.dynamic, solving.layout_sigma)
+    if several and isinstance(prior, str | HeaderPrior):
+        raise InputError(
+            "prior='header' (--prior header) is for frames of one detector: static='fit' (--static fit) finds the "
+            "distortions of several, or a camera (--camera) states them"
+        )
     known = _known_prior(prior, exposures, solving.degree)
     if camera is None and not several and solving.model is None:
         prior_as_asked(known, solving.static)  # refuses before anything is measured

@@ -292,10 +292,24 @@ def test_run_takes_the_prior_of_the_headers(tmp_path, night, sip_night, monkeypa
         ld.run(frames, out=tmp_path / "out", prior="headers")
 
 
+def test_the_prior_of_headers_is_for_one_detector(tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline, "measure_with_psfs", lambda *_, **__: pytest.fail("measured"))
+    for k in range(4):
+        parts = [
+            fits.ImageHDU(np.random.default_rng((k, ver)).normal(size=(64, 64)).astype("f4"), name="SCI", ver=ver)
+            for ver in (1, 2)
+        ]
+        for ver, part in enumerate(parts, start=1):
+            part.header["CCDCHIP"] = ver
+        fits.HDUList([fits.PrimaryHDU(), *parts]).writeto(tmp_path / f"f{k}.fits")
+    with pytest.raises(InputError, match=r"is for frames of one detector: static='fit' \(--static fit\) finds"):
+        ld.run(f"{tmp_path}/*.fits", ext="SCI", out=tmp_path / "out", prior="header")
+
+
 def test_the_prior_of_headers_needs_frames(capsys):
     line = ["predict", "--n-exposures", "4", "--n-stars", "50", "--sigma", "0.02", "--prior", "header", "--quiet"]
     assert main(line) == 1
     assert (
-        "--prior header takes the distortion from the headers of frames, which only run reads"
+        "only run reads frames: write the distortion of one, legdistort prior FRAME --out FILE"
         in capsys.readouterr().err
     )
