@@ -17,7 +17,7 @@ import numpy as np
 from ..cameras.detector import Detector, affine_of
 from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, warn
 from ..geometry import basis, similarity
-from ..results.errors.camera_errors import CameraErrors, Departure, moved_by
+from ..results.errors.camera_errors import CameraErrors, Departure, moved_by, unit_errors
 from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
@@ -28,8 +28,6 @@ from .equations.common_parts import followed
 _WEAK = 1e-5
 #: Part of the variance stated that exposures must take away for a direction to count as tested by them.
 _TOLD = 0.1
-#: Variances below this part of the largest are rounding.
-_ROUNDING = 1e-13
 #: Weights of a change of a layout, its shift and the rest, beside that of a static distortion, where a map can be put
 #: into either: shifts are the least known.
 _SHIFT_WEIGHT, _LAYOUT_WEIGHT = 0.003, 0.03
@@ -221,9 +219,7 @@ def _errors(fit, step, unknown):
     """The `CameraErrors` of a step; `unknown` (m, k) are the directions of the camera that nothing determines."""
     good, gauge = fit.blocks.v[0] > 0, fit.result.gauge
     plain = gauge.modes_at(fit.result.state.positions.T[good], gauge.n_modes).T
-    values, vectors = np.linalg.eigh(step.covariance)
-    rank = values > _ROUNDING * values.max(initial=0)
-    changes = vectors[:, rank] * np.sqrt(values[rank])
+    changes = unit_errors(step.covariance)
     stars, unknown_stars = np.zeros((len(good), 2, changes.shape[1])), np.zeros((len(good), 2, len(unknown)))
     spread = step.spread[:, good] @ changes
     common = np.linalg.pinv(plain) @ spread

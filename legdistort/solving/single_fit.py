@@ -18,6 +18,7 @@ from .equations import criterion, effective_modes, elimination
 from .equations.covariances import Uncertainty
 from .equations.problem import Problem, build_problem, uses_compiled_loops
 from .gauge import known_maps, most_probable
+from .gauge.hierarchy import is_noise
 from .gauge.higher_static import higher_errors
 
 log = logging.getLogger(__name__)
@@ -305,7 +306,7 @@ def _unbent(matches, problem, start, result, common, *, loss="linear", or_else=N
         else:
             was = criterion.linearise(whole, _padded(result.state, whole))
             better = held.converged and held.blocks.cost < was.cost
-            better &= found.is_explained or not misfit  # else the misfit has another cause
+            better &= not misfit or is_noise(found)  # else the misfit has another cause
         if better and held is not None:
             positions = held.state.positions.T[elimination.typical_stars(held.blocks.v)]
             gauge = known_maps.as_in_posterior(held.gauge, found.blocks.unknowns, positions, *found.covariances())

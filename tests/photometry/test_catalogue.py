@@ -201,12 +201,18 @@ def test_covariances_are_those_of_the_whole_matrix(k):
     np.testing.assert_allclose(neighbour_covariance(csc_array(normal), xy, 6.0), dense, rtol=0.02, atol=1e-6)
 
 
-def test_files_and_command(truth, solution, tmp_path, capsys):
+def written(frames, solution, folder):
+    """Paths of frames that are written to a folder, beside ``solution.asdf``."""
     paths = []
-    for k, data in enumerate(truth.frames[:4]):
-        paths.append(str(tmp_path / f"f{k:02d}.fits"))
+    for k, data in enumerate(frames):
+        paths.append(str(folder / f"f{k:02d}.fits"))
         fits.PrimaryHDU(data, fits.Header([("GAIN", 1.0)])).writeto(paths[-1])
-    solution.write(tmp_path / "solution.asdf")
+    solution.write(folder / "solution.asdf")
+    return paths
+
+
+def test_files_and_command(truth, solution, tmp_path, capsys):
+    paths = written(truth.frames[:4], solution, tmp_path)
     out = tmp_path / "catalogue.ecsv"
     call = ["catalogue", *paths, "--solution", str(tmp_path / "solution.asdf"), "--out", str(out), "--threshold", "7"]
     assert main(call) == 0
@@ -356,11 +362,7 @@ def test_the_bias_of_faint_fluxes_is_that_of_their_selection():
 
 def test_artificial_stars_of_the_command(truth, solution, tmp_path, capsys):
     """Tables of two calls with one seed are the same; what stands there is not replaced."""
-    paths = []
-    for k, data in enumerate(truth.frames[:3]):
-        paths.append(str(tmp_path / f"f{k:02d}.fits"))
-        fits.PrimaryHDU(data, fits.Header([("GAIN", 1.0)])).writeto(paths[-1])
-    solution.write(tmp_path / "solution.asdf")
+    paths = written(truth.frames[:3], solution, tmp_path)
     call = ["completeness", *paths, "--solution", str(tmp_path / "solution.asdf"), "--stars", "3", "--threshold", "9"]
     for name in ("one", "two"):
         assert main([*call, "--out", str(tmp_path / f"{name}.ecsv"), "--seed", "4"]) == 0

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from ...cameras.camera import Camera
     from ..view import View
 
+#: Variances below this part of the largest are rounding.
+_ROUNDING = 1e-13
+
 
 @dataclass(frozen=True)
 class Departure:
@@ -114,6 +117,13 @@ class CameraErrors:
             here = chip.sees(f) if view.detector is None else np.full(len(f), key == view.detector)
             out[here] = moved_by(chip, similarity.apply(chip.layout, f[here]), changes[c])
         return out
+
+
+def unit_errors(covariance):
+    """Independent errors of unit size, (k, r), whose sum has a covariance (k, k)."""
+    sizes, vectors = np.linalg.eigh(covariance)
+    kept = sizes > _ROUNDING * sizes.max(initial=0)
+    return vectors[:, kept] * np.sqrt(sizes[kept])
 
 
 def moved_by(detector, q, changes):

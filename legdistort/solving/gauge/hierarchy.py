@@ -311,7 +311,7 @@ def determined_by_residuals(system, gauge):
 
 
 def is_noise(system):
-    """Whether the errors explain the residuals."""
+    """Whether the errors explain the residuals of a reduced system, or of `MostProbable`."""
     return system.dof <= 0 or system.blocks.chi2 < system.dof + 5 * np.sqrt(2 * system.dof)
 
 

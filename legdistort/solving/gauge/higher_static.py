@@ -7,14 +7,11 @@ errors of these terms, add up.
 
 import numpy as np
 
-from ...results.errors.camera_errors import CameraErrors
+from ...results.errors.camera_errors import CameraErrors, unit_errors
 from ...results.errors.common_maps import fitted, plain_maps
 from ...results.new_positions import widened_all
 from ..equations import criterion
 from ..equations.common_parts import followed
-
-#: Variances below this part of the largest are rounding.
-_ROUNDING = 1e-13
 
 
 def higher_errors(problem, result, uncertainty, covariance):
@@ -38,9 +35,7 @@ def higher_errors(problem, result, uncertainty, covariance):
     of = np.where(owner[problem.exposure][:, None] == detector, -values[mode].T, 0.0)
     patterns[axis, :, np.arange(len(covariance))] = of.T
     follow = followed(uncertainty.system.settle, problem, blocks, patterns)
-    sizes, vectors = np.linalg.eigh(covariance)
-    kept = sizes > _ROUNDING * sizes.max()
-    changes = vectors[:, kept] * np.sqrt(sizes[kept])
+    changes = unit_errors(covariance)
     free = np.zeros((owner.max() + 1, 2, n_all), dtype=bool)
     free[:, :, n:] = True
     stars = (follow.stars @ changes).transpose(1, 0, 2)

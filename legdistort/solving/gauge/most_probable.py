@@ -117,11 +117,6 @@ class MostProbable:
         data, n = self.posterior.data, len(self.posterior.data.pull)
         return data.n_data - float((self.posterior.covariance[:n, :n] * data.curvature).sum())
 
-    @property
-    def is_explained(self):
-        """Whether the errors explain the residuals, to five standard deviations of chi2."""
-        return self.blocks.chi2 < self.dof + 5 * np.sqrt(2 * self.dof)
-
 
 def counts(problem, state, shown=1.0):
     """Whether a bend of the plane by as much as exposures depart from their prior would show in their residuals.
@@ -140,14 +135,13 @@ def counts(problem, state, shown=1.0):
     known = _Known.of(problem, problem.degree)
     departures = known.values(state, np.zeros(known.n_statics))[: known.width.size].reshape(problem.n_exposures, -1)
     gradient = 2 * problem.degree / problem.size.mean()
-    limit = (
-        4 * shown / np.sqrt(np.median(problem.weight[0][problem.weight[0] > 0])) / gradient
-    )  # b_m^2 is 1/4 on average
+    error = 1 / np.sqrt(np.median(problem.weight[0][problem.weight[0] > 0]))
+    limit = 4 * shown * error / gradient  # b_m has mean square 1/4
     squares = np.sum(departures**2, axis=1)
     if np.mean(squares) <= limit:
         return False
-    error = known.others @ conditional_errors(criterion.linearise(problem, state).u_data) @ known.others.mT
-    noise, chance = np.einsum("ikk->i", error), np.sqrt(2 * np.einsum("ikl,ikl->i", error, error))
+    own = known.others @ conditional_errors(criterion.linearise(problem, state).u_data) @ known.others.mT
+    noise, chance = np.einsum("ikk->i", own), np.sqrt(2 * np.einsum("ikl,ikl->i", own, own))
     seen = squares > noise + _SEEN * chance  # an exposure that is worth little departs far for nothing
     return bool(np.sum((squares - noise)[seen]) > limit * problem.n_exposures)
 
