@@ -65,7 +65,7 @@ def solve(
     Raises
     ------
     InputError
-        For bad options, and for a camera of several detectors.
+        For bad options, a camera of several detectors, and several fields.
     SolveError
         If an exposure has fewer stars than modes, the orientations of the exposures cancel in the mean (rolls of 0,
         90, 180 and 270 degrees), or the minimisation diverges.
@@ -91,6 +91,8 @@ def solve(
         raise InputError(f"the published method has a degree in numbers, got {degree!r}")
     if prior_widths.sought(prior):
         raise InputError("the published method finds no scatter of exposures: give a prior without sigma='evidence'")
+    if matches.fields.any():
+        raise InputError("the published method is for exposures of one field: use legdistort.solve")
     if matches.camera.has_focal_plane:
         raise InputError(
             f"the published method is for exposures of one detector, and camera {matches.camera.name} has several: use "

@@ -195,18 +195,20 @@ class Model:
 
 def drawn_set(
     seed, *, n_stars=110, n=11, static=1.0, dynamic=0.4, degree=3, size=2048, dither=150.0, rolls=0.0,
-    errors=(0.005, 0.08), higher=0.0, odd=None, shifts=None,
+    errors=(0.005, 0.08), higher=0.0, odd=None, shifts=None, given=None, angles=None,
 ):  # fmt: skip
     """What `Model` takes, and the truth: stars, static (2, m), departures; px/mode, errors log-uniform by star.
 
-    Departures of the last exposure are `odd` px/mode; `shifts` (n, 2) are in the place of random dithers.
+    Departures of the last exposure are `odd` px/mode; `shifts` (n, 2) are in the place of random dithers, `given`
+    (2, m) of a static that is drawn, and `angles` [deg] of equal rolls.
     """
     rng = np.random.default_rng(seed)
     m, other = len(orders(degree)), rows(degree)[1]
     middle, half = (size - 1) / 2, size / 2 + 1.5 * dither
     reach = half if shifts is None else size / 2 + np.abs(shifts).max()
     stars = rng.uniform(middle - reach, middle + reach, (n_stars, 2))
-    given = (static * rng.normal(size=len(other)) @ other).reshape(2, m)
+    drawn = (static * rng.normal(size=len(other)) @ other).reshape(2, m)
+    given = drawn if given is None else given
     n = n if shifts is None else len(shifts)
     own = (dynamic * rng.normal(size=(n, len(other))) @ other).reshape(n, 2, m)
     if odd is not None:
@@ -217,7 +219,8 @@ def drawn_set(
     shift[0] = 0
     if shifts is not None:
         shift = -shifts
-    angle, sigma = np.deg2rad(rolls * np.arange(n)), np.exp(rng.uniform(*np.log(errors), n_stars))
+    angles = rolls * np.arange(n) if angles is None else angles
+    angle, sigma = np.deg2rad(angles), np.exp(rng.uniform(*np.log(errors), n_stars))
     turn = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], 1).reshape(n, 2, 2)
     poses = np.concatenate([turn, (middle + shift - turn.sum(axis=2) * middle)[:, :, None]], axis=2)
     seen = []

@@ -18,7 +18,7 @@ from ..exceptions import InputError
 from ..inputs import column_contract
 from ..inputs.exposure_names import detector_name
 from ..inputs.star_lists.formats import stack
-from ..inputs.table_files import named_after, read_table, write_stars
+from ..inputs.table_files import named_after, write_stars
 from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
 from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
@@ -27,6 +27,7 @@ from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
 from . import options
 from .arguments import flagged, given, wants_progress
+from .given_files import given_camera, read_given, read_matches, refuse
 from .repeating import repeatable
 
 #: Size of frames from which further processes are worth their start, a second or two each.
@@ -40,7 +41,7 @@ def do_demo(a):
 
     night = given(a, options.NIGHT)
     if kind := given(a, options.EXAMPLES):
-        _refuse({"small": a.small, "camera": a.camera}, "goes with a night that is solved, not with --as")
+        refuse({"small": a.small, "camera": a.camera}, "goes with a night that is solved, not with --as")
         written = write_examples(**kind, out=a.out, seed=a.seed or 0, overwrite=a.overwrite)
         _say(a, "\n".join(map(str, written)), {"files": [str(path) for path in written]})
         return
@@ -79,7 +80,7 @@ def do_run(a):
             measuring=measuring,
             matching=matching,
             solving=solving,
-            camera=_camera(a.camera),
+            camera=given_camera(a.camera),
             coadding=given(a, options.COADDING),
             **given(a, options.LAST_STEP),
             compare=a.compare,
@@ -135,15 +136,15 @@ def do_noise(a):
 def do_match(a):
     """``legdistort match``."""
     if a.camera:
-        _refuse({"shape": a.shape}, "comes from --camera")
+        refuse({"shape": a.shape}, "comes from --camera")
     from ..inputs.wcs_files import open_wcs
     from ..measurement.earlier import measured_frames
     from ..pipeline import timed, write_matched
 
     contract = column_contract.DETECTED | {name: column_contract.MATCHED[name] for name in ("epoch", "block")}
-    read = {Path(path): _read_table(path, a, contract) for path in a.tables}
+    read = {Path(path): read_given(path, a, contract) for path in a.tables}
     if a.wcs is None:
-        _refuse({"ext": a.ext}, "is for the frames of --wcs")
+        refuse({"ext": a.ext}, "is for the frames of --wcs")
         exposures = None
     else:
         exposures = open_wcs(a.wcs, ext=a.ext, shape=a.shape and tuple(a.shape))
@@ -156,14 +157,14 @@ def do_match(a):
     if twice is not None:
         raise InputError(f"exposure {twice} comes from two tables; rename a file, or give a column exposure")
     shapes = {name: shape for each in tables for name, shape in each.meta.get("shapes", {}).items()}
-    camera = _camera(a.camera) or _measured_with(tables)
+    camera = given_camera(a.camera) or _measured_with(tables)
     if camera:
-        _refuse({"shape": a.shape}, "comes from the camera of the run")
+        refuse({"shape": a.shape}, "comes from the camera of the run")
     known = {"shape": tuple(a.shape) if a.shape and a.wcs is None else shapes or None, "camera": camera}
     if exposures is not None:
         exposures = camera.of_detectors(exposures) if camera else exposures
     elif (exposures := measured_frames(read)) is not None:
-        _refuse({"shape": a.shape}, "comes from the frames")
+        refuse({"shape": a.shape}, "comes from the frames")
     known |= {"exposures": exposures, "progress": wants_progress(a)}
     with timed({}, "match"):
         matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
@@ -198,20 +199,10 @@ def do_solve(a):
     # a mosaic there does not belong to this solution
     with outputs.replacing_folder(a.out, results=RESULTS, keep=a.keep) as target:
         check_results(a.out, a.overwrite)  # again: nobody else writes there any more
-        table = _read_table(a.table, a, column_contract.MATCHED)
-        known = legdistort.Matches.read_meta(table.meta)
-        known |= {"shape": tuple(a.shape)} if a.shape else {}
-        known |= {"camera": _camera(a.camera)} if a.camera else {}
-        if known["camera"]:
-            _refuse({"shape": a.shape}, "comes from the camera")
-        else:
-            _refuse({"layout": a.layout}, "is for the detectors of a camera")
-            if known["shape"] is None:
-                raise InputError(f"{a.table} does not state the size of the detectors: give --shape NY NX")
-        matches = legdistort.Matches.from_table(table, **known)
+        matches, inputs = read_matches(a)
         with timed({}, "solve"):
             solution = legdistort.solve(matches, **_solving(a, a.shape), progress=wants_progress(a))
-        solution = provenance.with_inputs(solution, table.meta["inputs"])
+        solution = provenance.with_inputs(solution, inputs)
         with timed({}, "assess"):
             summary = summarise(solution)
         with timed({}, "write"):
@@ -258,7 +249,7 @@ def do_catalogue(a):
 
     outputs.check_file(photometry_path(a.out), overwrite=a.overwrite)
     if a.artificial is None:
-        _refuse({"seed": a.seed}, "is for the stars of --artificial")
+        refuse({"seed": a.seed}, "is for the stars of --artificial")
     found = _catalogue(a, options.CATALOGUING, options.ARTIFICIAL)
     found.write(a.out, overwrite=a.overwrite)
     _say(a, f"{found}\n{a.out} and {photometry_path(a.out)}", found.stars.meta | {"left_out": dict(found.left_out)})
@@ -290,7 +281,7 @@ def do_attach(a):
     keywords = given(a, options.FRAMES, options.ATTACHING)
     tpv, head, asdf_only = (keywords.pop(name) for name in ("tpv", "head", "asdf_only"))
     if asdf_only:
-        _refuse({"max_error": a.max_error}, "is of the header, which --asdf-only leaves alone")
+        refuse({"max_error": a.max_error}, "is of the header, which --asdf-only leaves alone")
     kind = None if asdf_only else "head" if head else "tpv" if tpv else "sip"
     done = attach(_solution(a), **keywords, kind=kind, progress=wants_progress(a))
     errors = {item.exposure: {"path": str(item.path)} | item.errors for item in done}
@@ -304,14 +295,14 @@ def do_predict(a):
     keywords = given(a, options.PREDICTING) | {"prior": _prior(a.prior, a.shape, a.static_sigma)}
     keywords.pop("static_sigma", None)
     if a.stars is not None:
-        keywords["stars"] = _read_table(a.stars, a)
+        keywords["stars"] = read_given(a.stars, a)
     else:
-        _refuse({"columns": a.columns or None, "origin": a.origin, "error": a.error}, "is for the table of --stars")
+        refuse({"columns": a.columns or None, "origin": a.origin, "error": a.error}, "is for the table of --stars")
     if a.camera:
-        _refuse({"shape": a.shape}, "comes from --camera")
+        refuse({"shape": a.shape}, "comes from --camera")
     if a.shape is not None:
         keywords["shape"] = tuple(a.shape)
-    keywords["camera"] = _camera(a.camera)
+    keywords["camera"] = given_camera(a.camera)
     prediction = legdistort.predict(**keywords)
     _draw(prediction, a)
     plans = prediction.alternatives()
@@ -343,12 +334,12 @@ def do_show(a):
     from ..runtime.fits_bytes import looks_like_fits
 
     if looks_like_fits(a.solution):
-        _refuse({"max_bytes": a.max_bytes, "strict": a.strict}, "is for a solution")
+        refuse({"max_bytes": a.max_bytes, "strict": a.strict}, "is for a solution")
         exposures = read_exposures(str(a.solution), **given(a, {"ext": options.FRAMES["ext"]}, options.FLAGGED))
         stated = {exposure.name: exposure.stated for exposure in exposures}
         _say(a, "\n\n".join(map(str, stated.values())), {name: each.to_dict() for name, each in stated.items()})
         return 0
-    _refuse({"ext": a.ext, "dq_good": a.dq_good}, "is for a frame")
+    refuse({"ext": a.ext, "dq_good": a.dq_good}, "is for a frame")
     solution = _solution(a)
     summary = summarise(solution)
     _report(a, solution, summary)
@@ -370,7 +361,7 @@ def do_correct(a):
     """``legdistort correct``."""
     from ..inputs.table_files import write_by_ending
 
-    table = _solution(a).correct_table(_read_table(a.table, a), epoch=a.epoch)
+    table = _solution(a).correct_table(read_given(a.table, a), epoch=a.epoch)
     write_by_ending(table, a.out, overwrite=a.overwrite)
     _say(a, f"{len(table)} positions in {a.out}", {"n_positions": len(table), "out": str(a.out)})
 
@@ -404,31 +395,24 @@ def _checks(summary):
     return from_tree(tuple[Check, ...], summary["checks"], "checks")
 
 
-def _refuse(given, reason):
-    """Raise `InputError` for the first of ``{name: value}`` that was given: it would be ignored."""
-    for name, value in given.items():
-        if value not in (None, False):
-            raise InputError(f"--{name.replace('_', '-')} {reason}: leave it out")
-
-
 def _refuse_ignored(a):
     """Options of `run` and `solve` that others leave without effect."""
     if a.reference is None:
         tying = {"reference_error": a.reference_error, "epoch": a.epoch, "pixel_scale": a.pixel_scale}
-        _refuse(tying, "is for the catalogue of --reference")
+        refuse(tying, "is for the catalogue of --reference")
     if a.command == "run":
         _refuse_drops(a)
         if not a.no_mosaic:
             coadding = {dest: getattr(a, dest) for _, _, dest, _ in flagged([options.COADDING]) if dest != "scratch"}
-            _refuse(coadding | {"no_match_background": None}, "is for a mosaic, and --no-mosaic wants none")
+            refuse(coadding | {"no_match_background": None}, "is for a mosaic, and --no-mosaic wants none")
 
 
 def _refuse_drops(a):
     """Options of one way of resampling with another."""
     if a.algorithm != "drizzle":
-        _refuse({"pixfrac": a.pixfrac, "kernel": a.kernel}, "is for --algorithm drizzle")
+        refuse({"pixfrac": a.pixfrac, "kernel": a.kernel}, "is for --algorithm drizzle")
     if a.algorithm not in (None, "interp"):
-        _refuse({"order": a.order}, "is for --algorithm interp")
+        refuse({"order": a.order}, "is for --algorithm interp")
 
 
 def _status(a, summary):
@@ -482,19 +466,6 @@ def _prior(text, shape, static_sigma):
     if text is None:
         return None if static_sigma is None else legdistort.Prior(None, static_sigma=static_sigma)
     return legdistort.Prior.from_file(text, shape=shape, static_sigma=static_sigma)
-
-
-def _read_table(path, a, contract=None):
-    """The table in a file; where it does not keep a contract, the message names the file."""
-    table = read_table(path, columns=dict(a.columns), origin=a.origin, error=a.error)
-    if contract is not None and len(table):
-        column_contract.check(table, contract, str(path))
-    return table
-
-
-def _camera(given):
-    """The camera of ``--camera``; None without one."""
-    return legdistort.Camera.gsaoi() if given == "gsaoi" else given and legdistort.Camera.read(given)
 
 
 def _parts(table):

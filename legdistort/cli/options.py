@@ -83,7 +83,15 @@ WCS_OF_TABLES = {
     "ext": Option("extension of those frames: number, name, or NAME,VERSION", type=extension),
 }
 POSITIONS = {"table": Option("exposure, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
-MATCHED = {"table": Option("exposure, star, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
+MATCHED = {
+    "tables": Option(
+        "exposure, star, x, y, x_err, y_err; several: fields of one camera without a common star, solved together",
+        "tables",
+        nargs="+",
+        metavar="TABLE",
+        path="read",
+    )
+}
 WORKERS = {"workers": Option("cores to use (default: all, where frames are not few and small)", type=int, metavar="N")}
 
 

@@ -35,10 +35,7 @@ def main(argv=None):
 def _parsed(argv):
     arguments, unknown = _parser().parse_known_args(argv)
     if unknown:
-        hint = ""
-        if arguments.command == "solve" and not unknown[0].startswith("-"):
-            hint = ": solve takes one table of matched positions, and lists of exposures go to legdistort match first"
-        arguments.parser.error(f"no option or place for {' '.join(unknown)}{hint}")
+        arguments.parser.error(f"no option or place for {' '.join(unknown)}")
     return arguments
 
 

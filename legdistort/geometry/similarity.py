@@ -41,6 +41,11 @@ def apply_inverses(poses, xy):
     return (xy - poses[:, None, :, 2]) @ np.linalg.inv(poses[:, :, :2]).mT
 
 
+def apply_each(poses, xy):
+    """Positions (n, 2), each through a pose of its own (n, 2, 3)."""
+    return np.einsum("nab,nb->na", poses[:, :, :2], xy) + poses[:, :, 2]
+
+
 def compose(second, first):
     """The pose ``x -> second(first(x))``, or those for poses `second` (..., 2, 3)."""
     out = second[..., :2] @ first

@@ -59,6 +59,7 @@ STARS = {
     "y_err_known": ("stat.error;pos.cartesian.y", "y_err_abs after the unknown directions are taken off"),
     "xy_corr": ("stat.correlation;pos.cartesian", "correlation of x_err and y_err"),
     "n": ("meta.number;obs", "observations used"),
+    "field": ("meta.code", "number of the field, from 1, of exposures that have common stars"),
     "group": ("meta.code", "which detectors saw it, of those that nothing ties to others; errors hold within"),
     "reference_used": ("meta.code", "whether the position in the reference catalogue counts among what is known of it"),
     "flux": ("phot.flux;stat.mean", "mean over the exposures"),

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..exceptions import InputError, MatchError
 from ..geometry import pair_agreement, similarity
+from ..geometry.detector_modes import detector_corners
 
 #: Exposures whose stars typically lie farther from their means than this part of their extent are compared in pairs.
 _FAR = 0.01
@@ -65,6 +66,30 @@ def star_means(xy, star, n_stars):
     sums = np.column_stack([np.bincount(star, xy[:, k], n_stars) for k in (0, 1)])
     with np.errstate(invalid="ignore"):
         return sums / total[:, None]
+
+
+def moves_apart(poses, shapes, fields):
+    """By how much to move every field along x for none to overlap on the reference plane, (n_fields, 2), pixels.
+
+    Zero, if they do not. The first stays, and lengths are whole thousands.
+
+    Parameters
+    ----------
+    poses : list of ndarray, each (2, 3)
+    shapes : list of (ny, nx)
+    fields : ndarray of int, shape (n_exposures,)
+        Number of the field of every exposure.
+    """
+    corners = similarity.apply_inverses(np.array(poses), detector_corners(shapes))
+    ends = [corners[fields == field].reshape(-1, 2) for field in range(fields.max() + 1)]
+    low, high = (np.array([getattr(each, name)(axis=0) for each in ends]) for name in ("min", "max"))
+    overlap = np.all((low[:, None] < high) & (low < high[:, None]), axis=2)
+    moves, end = np.zeros(low.shape), high[0, 0]
+    if np.count_nonzero(overlap) > len(ends):
+        for field in range(1, len(ends)):
+            moves[field, 0] = 1000 * np.ceil((end - low[field, 0]) / 1000 + 0.5)
+            end = high[field, 0] + moves[field, 0]
+    return moves
 
 
 def estimate_poses(exposure, star, xy, *, names=None):

@@ -1,6 +1,7 @@
-"""Poses of exposures by the WCSs in their headers: tried first in matching, and always verified."""
+"""Poses of exposures by their headers, a WCS or else a shift: tried first in matching, and always verified."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from astropy import units as u
@@ -32,11 +33,28 @@ class HeaderPoses:
         ``{exposure: (ny, nx)}``.
     sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
         Where the plane of these poses lies.
+    shifts : dict
+        ``{exposure: (2,)}``, pixels by which stars are shifted, of exposures that state that and have no WCS.
     """
 
     poses: dict
     shapes: dict
     sky: TangentPlane | None
+    shifts: dict = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, exposures, shapes):
+        """Those of some exposures.
+
+        Parameters
+        ----------
+        exposures : list of `legdistort.Exposure`
+        shapes : dict
+            ``{exposure: (ny, nx)}``.
+        """
+        stated = {e.name: [e.header.get(key) for key in ("XSHIFT", "YSHIFT")] for e in exposures if e.wcs is None}
+        shifts = {name: np.array(each, float) for name, each in stated.items() if all(map(_is_number, each))}
+        return replace(cls.from_wcs({e.name: e.wcs for e in exposures if e.wcs is not None}, shapes), shifts=shifts)
 
     @classmethod
     def from_wcs(cls, wcss, shapes):
@@ -70,6 +88,8 @@ class HeaderPoses:
 
     def step(self, source, target):
         """Nominal pose from one exposure's pixels to another's, or None."""
+        if {source, target} <= self.shifts.keys():
+            return np.column_stack([np.eye(2), self.shifts[target] - self.shifts[source]])
         if not {source, target} <= self.poses.keys():
             return None
         return similarity.compose(self.poses[target], similarity.invert(self.poses[source]))
@@ -148,6 +168,10 @@ class HeaderPoses:
                 "the headers",
                 AssumptionWarning,
             )
+
+
+def _is_number(value):
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _grid(shape, n):

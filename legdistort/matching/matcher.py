@@ -166,7 +166,7 @@ def match(
     table = _without_repetitions(_without_flagged(table, int(reject_flags)))
     copies = _copies(table)
     table, names = table[~np.isin(table["exposure"], list(copies))], [name for name in names if name not in copies]
-    headers = HeaderPoses.from_wcs({n: e.wcs for n, e in (named or {}).items() if e.wcs is not None}, shapes)
+    headers = HeaderPoses.of((named or {}).values(), shapes)
 
     with parallel.one_blas_thread():  # matrices are small
         label = _label_over_gaps if camera is not None and len(camera.detectors) > 1 and len(names) > 1 else _label
@@ -368,7 +368,8 @@ def _check_groups(groups, lists, names, left_out):
     if len(large) > 1:
         listed = "; ".join(some_of(group, 6) for group in large[:6])
         raise MatchError(
-            f"the exposures form {len(large)} groups with no star in common: {listed}; match each group by itself",
+            f"the exposures form {len(large)} groups with no star in common: {listed}; match each group by itself; "
+            "fields of one camera can be solved together then",
             groups=large,
         )
     if not large:

@@ -21,6 +21,7 @@ from ..inputs import column_contract, exposure_names, repetitions, start_poses
 from ..runtime.checks import check_choice
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
+from .fields import estimated, joined, side_by_side
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -88,19 +89,48 @@ class Observations:
         key = self.key
         return bool(np.all(key[1:] > key[:-1]))
 
-    def check(self) -> None:
+    @cached_property
+    def fields(self) -> np.ndarray:
+        """Number of the group of every exposure that has common stars, directly or through others, (n_exposures,)."""
+        n = len(self.names)
+        for rows in _some_then_all(self):
+            # tie every exposure to the first one of each of its stars: the same groups as all pairs, in a small graph
+            star, exposure, first = self.star[rows], self.exposure[rows], np.full(len(self.stars), n)
+            np.minimum.at(first, star, exposure)
+            tied = np.zeros((n, n), dtype=bool)
+            tied[exposure, first[star]] = True
+            if tied[:, 0].all():  # as nearly always
+                return np.zeros(n, dtype=int)
+        return connected_components(tied, directed=False)[1]
+
+    def check(self, *, n_fields: float = 1) -> None:
         """Raise what `Matches.from_table` does where these do not determine distortions.
+
+        Parameters
+        ----------
+        n_fields : int
+            Groups of exposures without a common star that there may be.
 
         Raises
         ------
         InputError
             For a star that stands twice in an exposure, or positions that all lie on one line.
         MatchError
-            For exposures in groups without a common star.
+            For exposures in more groups.
         """
         _check_duplicates(self)
-        _check_connected(self)
+        if (count := int(self.fields.max()) + 1) > n_fields:
+            raise MatchError(
+                f"the exposures form {count} groups with no star in common: {self.groups_in_words}; solve each group "
+                "by itself"
+            )
         _check_spread(self)
+
+    @property
+    def groups_in_words(self) -> str:
+        """The exposures of every group that has common stars."""
+        groups = [[str(self.names[i]) for i in np.flatnonzero(self.fields == g)] for g in range(self.fields.max() + 1)]
+        return "; ".join(some_of(group, 6) for group in groups)
 
     @classmethod
     def of(cls, table: Table) -> Observations:
@@ -259,6 +289,14 @@ class Matches(ShownAsPrinted):
                 raise InputError(f"column 'block' has several values for exposure {name}: give one night for each")
         return column_contract.blocks(self.table, obs.first)
 
+    @property
+    def fields(self) -> np.ndarray:
+        """Number of the field of every exposure (n_exposures,): groups of exposures without a common star.
+
+        They lie side by side on the reference plane, and are solved together for what they have in common.
+        """
+        return self.observations.fields
+
     @plain_numbers
     def keep(self, rows: ArrayLike | slice) -> Matches:
         """The same matches with some rows of the table; exposures without any go.
@@ -282,7 +320,8 @@ class Matches(ShownAsPrinted):
         if len(table) == 0:
             raise MatchError("no position is left: keep those of an exposure at least")
         seen = Observations.of(table)
-        seen.check()
+        kept = np.isin(self.names, seen.names)
+        seen.check(n_fields=len(np.unique(self.fields[kept])))
         return replace(self, table=table, observations=seen, **self._by_exposure(seen.names))
 
     def without(self, reasons: Mapping[str, str]) -> Matches:
@@ -328,7 +367,32 @@ class Matches(ShownAsPrinted):
         return {"shape": found.pop("shapes"), **found}
 
     def __repr__(self) -> str:
-        return f"<Matches: {len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures>"
+        n_fields = int(self.fields.max(initial=0)) + 1
+        of_fields = f" of {n_fields} fields" if n_fields > 1 else ""
+        counts = f"{len(self.table)} observations of {len(self.stars)} stars in {len(self.names)} exposures"
+        return f"<Matches: {counts}{of_fields}>"
+
+    @classmethod
+    def of_fields(cls, fields: Mapping[str, Matches]) -> Matches:
+        """Matches of several fields that one camera has taken, to solve them together for what they have in common.
+
+        Fields lie side by side on the reference plane. The sky is known where all have the same tangent plane.
+
+        Parameters
+        ----------
+        fields : dict
+            ``{name: Matches}``; the name stands in front of those of exposures, or of stars, if some stand in several
+            fields.
+
+        Raises
+        ------
+        InputError
+            For anything else, fewer than two, or fields of different cameras or errors of poses.
+        """
+        if not isinstance(fields, Mapping) or len(fields) < 2 or not all(isinstance(p, cls) for p in fields.values()):
+            raise InputError(f"fields must be a dict of Matches, two at least, got {fields!r}")
+        table, known = joined({str(label): part for label, part in fields.items()})
+        return cls.from_table(table, **known, allow_copies=True)
 
     @classmethod
     @plain_numbers
@@ -386,7 +450,8 @@ class Matches(ShownAsPrinted):
         InputError
             For missing columns, bad values, duplicate (exposure, star) rows, a missing shape or pose.
         MatchError
-            For exposures in groups without a common star.
+            For exposures that overlap on the `sky` and have no common star. Other groups without a common star lie side
+            by side on the reference plane (`Matches.fields`).
 
         Warns
         -----
@@ -417,14 +482,12 @@ class Matches(ShownAsPrinted):
         if not inside.all():
             table = table[inside]
             seen = Observations.of(table)
-        seen.check()
+        seen.check(n_fields=np.inf)
         if (pose_sigma := start_poses.check_pose_sigma(pose_sigma)) and poses is None:
             raise InputError("pose_sigma states how well poses are known: give these (poses=), or leave pose_sigma out")
-        if poses is None:
-            found = start_poses.estimate_poses(seen.exposure, seen.star, seen.xy, names=seen.names)
-            poses = dict(zip(seen.names, found, strict=True))
-        else:
-            poses = _check_poses(poses, seen.names)
+        poses = estimated(seen) if poses is None else _check_poses(poses, seen.names)
+        if seen.fields.any():
+            poses = side_by_side(seen, poses, shapes, sky)
         if epoch is None and "epoch" in table.colnames:
             epochs = column_contract.values(table, "epoch", u.yr)
             epoch = float(np.nanmean(epochs)) if np.isfinite(epochs).any() else None
@@ -593,22 +656,3 @@ def alone(name, more=""):
         f"only one exposure ({name}): the distortion is found from the differences between exposures, or from a "
         f"catalogue; give two of the same field at least, or reference= (--reference){more}"
     )
-
-
-def _check_connected(seen):
-    n = len(seen.names)
-    for rows in _some_then_all(seen):
-        # tie every exposure to the first one of each of its stars: the same groups as all pairs, in a small graph
-        star, exposure, first = seen.star[rows], seen.exposure[rows], np.full(len(seen.stars), n)
-        np.minimum.at(first, star, exposure)
-        tied = np.zeros((n, n), dtype=bool)
-        tied[exposure, first[star]] = True
-        if tied[:, 0].all():  # as nearly always
-            return
-    count, group = connected_components(tied, directed=False)
-    if count > 1:
-        groups = [[name for name, g in zip(seen.names, group, strict=True) if g == label] for label in range(count)]
-        listed = "; ".join(some_of(g, 6) for g in groups)
-        raise MatchError(
-            f"the exposures form {len(groups)} groups with no star in common: {listed}; solve each group by itself"
-        )

@@ -89,7 +89,9 @@ def known_offsets(solution, xy):
     """
     xy, unknown = np.asarray(xy, dtype=float), solution.gauge.unknown
     good = _compared(solution, xy)
-    similar = _columns(xy[good], "similarity") if solution.gauge.tie is None else np.zeros((2 * good.sum(), 0))
+    similar = np.zeros((2 * good.sum(), 0))
+    if solution.gauge.tie is None:
+        similar = _of_fields(solution.gauge.plane_modes().fields_of(solution.estimate.positions[good]), xy[good])
     stars = np.stack([each.stars for each in unknown], axis=2) if unknown else np.zeros((*xy.shape, 0))
     moves = [each.coefficients for each in unknown]
     return _without_directions(solution, xy, similar, stars, moves, "unknown_at")
@@ -108,9 +110,19 @@ def relative_offsets(solution, xy):
     ndarray, shape (n_stars, 2)
     """
     xy, gauge = np.asarray(xy, dtype=float), solution.gauge
-    moves = -gauge.motion.reshape(len(gauge.motion), 2, gauge.n_modes, -1)
+    moves = -gauge.motion.reshape(len(gauge.motion), 2, gauge.n_own, -1)
     similar = np.zeros((2 * _compared(solution, xy).sum(), 0))
     return _without_directions(solution, xy, similar, gauge.directions, np.moveaxis(moves, -1, 0), "directions_at")
+
+
+def _of_fields(field, xy):
+    """Orthonormal displacement fields (2 n, 4 n_fields) of similarities at positions (n, 2) of some fields (n,)."""
+    out = []
+    for number in np.unique(field):
+        mine = np.tile(field == number, 2)
+        out.append(np.zeros((len(mine), 4)))
+        out[-1][mine] = _columns(xy[field == number], "similarity")
+    return np.hstack(out)
 
 
 def _compared(solution, xy):

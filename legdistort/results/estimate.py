@@ -71,14 +71,14 @@ class StoredUncertainty:
         )
     )
     stars: np.ndarray = field(metadata=array(3, "n_stars", unit="pix2", packed=True, nan=True))
-    directions: np.ndarray = field(metadata=array("n_stars", 2, "2 n_map_modes", nan=True))
+    directions: np.ndarray = field(metadata=array("n_stars", 2, "2 n_plane_modes", nan=True))
     weak: tuple[UnknownDirection, ...]
     common: CommonFit | None = None
     star_unknowns: np.ndarray | None = field(
         default=None, metadata=array("n_star_pairs", "n_stars", packed=True, nan=True)
     )
     drift_directions: np.ndarray | None = field(
-        default=None, metadata=array("n_stars", "2 + n_terms", "2 n_map_modes + n_drift", nan=True)
+        default=None, metadata=array("n_stars", "2 + n_terms", "2 n_plane_modes + n_drift", nan=True)
     )
     camera: CameraErrors | None = None
 

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from ..geometry import basis
-from ..geometry.detector_modes import similarity_basis
+from ..geometry.plane_modes import PlaneModes
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees.facts import NOT_STORED, array, number, text
 from .errors.catalogue_tie import Tie, errors_by_degree
@@ -59,7 +59,7 @@ class UnknownMap:
 
     name: str
     degree: int = field(metadata=number(minimum=0, maximum=30))
-    map: np.ndarray = field(metadata=array("2 n_map_modes", unit="pix"))
+    map: np.ndarray = field(metadata=array("2 n_plane_modes", unit="pix"))
 
     def __repr__(self) -> str:
         return f"<UnknownMap: {self.name}>"
@@ -111,6 +111,8 @@ class Drift:
         Whether the parallaxes of these stars tie the mean parallax.
     joint : ndarray, shape (2 n_modes + q, 2 n_modes + q), or None
         Covariance of the common map and these, where a reference determined them together.
+    n_fields : int
+        Fields that have such maps each.
     """
 
     names: tuple[str, ...] = field(metadata=text("vx", "vy", "parallax", length="n_terms"))
@@ -122,8 +124,9 @@ class Drift:
     n_tied: int = field(default=0, metadata=number(minimum=0))
     parallax_tied: bool = False
     joint: np.ndarray | None = field(
-        default=None, metadata=array("2 n_map_modes + n_drift", "2 n_map_modes + n_drift", covariance=True)
+        default=None, metadata=array("2 n_plane_modes + n_drift", "2 n_plane_modes + n_drift", covariance=True)
     )
+    n_fields: int = field(default=1, metadata=number(minimum=1))
 
     @property
     def n_constraints(self) -> int:
@@ -182,9 +185,11 @@ class Drift:
 
     def errors(self) -> dict[str, float]:
         """Rms over the field [pix/yr per axis, pix] of what the maps add to motions and parallaxes, by name."""
-        n = self.motion.shape[1] // 2
+        n = self.motion.shape[1] // 2 * self.n_fields
         free = self.names[len(self.names) - self.motion.shape[2] // n :]
-        power = np.diag(self.covariance).reshape(len(free), n).sum(axis=1) / 4  # b_m has mean square 1/4
+        power = (
+            np.diag(self.covariance).reshape(len(free), n).sum(axis=1) / 4 / self.n_fields
+        )  # b_m has mean square 1/4
         return {name: float(np.sqrt(each)) for name, each in zip(free, power, strict=True)}
 
 
@@ -196,11 +201,11 @@ class Gauge(ShownAsPrinted):
     ----------
     kind : {"minimal", "mean"} or str
         Convention. Or the name of a simpler correction, which comes with a `plane`.
-    constraint : ndarray, shape (n_constraints, n_exposures, 2 n_modes)
+    constraint : ndarray, shape (n_constraints, n_exposures, 2 n)
         Rows of the constraints; they act on A_i - A_0, x modes first.
-    motion : ndarray, shape (n_exposures, 2 n_modes, 2 n_modes)
-        N_i: displacement modes of the reference plane -> coefficients of exposure i.
-    dynamic : ndarray, same shape
+    motion : ndarray, shape (n_exposures, 2 n, 2 n_modes)
+        N_i: displacement modes of the reference plane -> coefficients of exposure i, n of them per axis.
+    dynamic : ndarray, shape (n_exposures, 2 n, 2 n)
         Lambda, covariance of a single exposure's departure from the static distortion, px^2; nothing along its
         similarities.
     box : ndarray, shape (2, 2)
@@ -233,21 +238,23 @@ class Gauge(ShownAsPrinted):
     poses_known : bool
         Whether poses are known with their errors, and so shift, rotation and scale of the common map, which is then
         complete in `covariance`.
+    more_boxes : ndarray, shape (n_fields - 1, 2, 2), or None
+        `box` of every further field, where exposures are in groups without a common star.
     """
 
     kind: str = field(metadata=text(*_CONVENTIONS, "shift", "static + shift", "relative polynomial"))
     constraint: np.ndarray = field(metadata=_ROWS)
-    motion: np.ndarray = field(metadata=array("n_exposures", "2 n_map_modes", "2 n_map_modes"))
+    motion: np.ndarray = field(metadata=array("n_exposures", "2 n_map_modes", "2 n_plane_modes"))
     dynamic: np.ndarray = field(
         metadata=array("n_exposures", "2 n_map_modes", "2 n_map_modes", unit="pix2", covariance=True)
     )
     box: np.ndarray = field(metadata=array(2, 2, unit="pix"))
-    covariance: np.ndarray = field(metadata=array("2 n_map_modes", "2 n_map_modes", unit="pix2", covariance=True))
+    covariance: np.ndarray = field(metadata=array("2 n_plane_modes", "2 n_plane_modes", unit="pix2", covariance=True))
     unknown_maps: tuple[UnknownMap, ...] = ()
     static: str = field(default="exact", metadata=text(*_STATIC))
     prior: bool = False
     values: np.ndarray | None = field(default=None, metadata=array("n_constraints", unit="pix"))
-    released: np.ndarray | None = field(default=None, metadata=array("2 n_map_modes", "released"))
+    released: np.ndarray | None = field(default=None, metadata=array("2 n_plane_modes", "released"))
     tie: Tie | None = None
     responses: Any = field(default=None, repr=False, compare=False, metadata=NOT_STORED)
     plane: str | None = None
@@ -255,6 +262,21 @@ class Gauge(ShownAsPrinted):
     nights: float | None = field(default=None, metadata=number(minimum=0, unit="pix"))
     nights_told: bool = True
     poses_known: bool = False
+    more_boxes: np.ndarray | None = field(default=None, metadata=array("further_fields", 2, 2, unit="pix"))
+
+    @property
+    def boxes(self) -> np.ndarray:
+        """Centre and half size of the box of every field, (n_fields, 2, 2), pixels."""
+        return self.box[None] if self.more_boxes is None else np.concatenate([self.box[None], self.more_boxes])
+
+    @property
+    def n_fields(self) -> int:
+        """Number of fields: groups of exposures without a common star."""
+        return 1 if self.more_boxes is None else 1 + len(self.more_boxes)
+
+    def plane_modes(self, n_modes: int | None = None) -> PlaneModes:
+        """The modes of the reference plane, by default those of the gauge, as `PlaneModes`."""
+        return PlaneModes(self.boxes, (self.n_modes if n_modes is None else n_modes) // self.n_fields)
 
     @property
     def n_constraints(self) -> int:
@@ -281,12 +303,17 @@ class Gauge(ShownAsPrinted):
 
     @property
     def n_modes(self) -> int:
-        """Modes of the reference plane per axis."""
+        """Modes of the reference plane per axis, those of all fields."""
+        return self.motion.shape[2] // 2
+
+    @property
+    def n_own(self) -> int:
+        """Modes per axis of an exposure that can compensate such maps."""
         return self.motion.shape[1] // 2
 
     @property
     def scatter(self) -> np.ndarray:
-        """Dynamic scatter of single exposures per axis and mode (2, n_modes), pixels, mean over the exposures."""
+        """Dynamic scatter of single exposures per axis and mode (2, n), pixels, mean over the exposures."""
         return np.sqrt(np.einsum("iaa->a", self.dynamic) / len(self.dynamic)).reshape(2, -1)
 
     @cached_property
@@ -312,13 +339,11 @@ class Gauge(ShownAsPrinted):
 
     def modes_at(self, xy: ArrayLike, n_modes: int | None = None) -> np.ndarray:
         """Values (n_modes, n) of the reference-plane modes, by default of the gauge, at reference positions (n, 2)."""
-        degree = basis.degree_of(self.n_modes if n_modes is None else n_modes)
-        u, v = ((np.asarray(xy) - self.box[0]) / self.box[1]).T
-        return basis.values(degree, u, v)
+        return self.plane_modes(n_modes).at(xy)
 
     def common_map(self, departure: np.ndarray) -> np.ndarray:
         """The map (2 n_modes,) of the reference plane, similarities aside, to which departures A_i - A_0 amount."""
-        similar = similarity_basis(2 * self.box[1, ::-1], self.n_modes)
+        similar = self.plane_modes().similar
         reach = self.reach if self.drift is None else self.orthonormal @ self.all_motion.reshape(departure.size, -1)
         out = -np.linalg.pinv(reach)[: 2 * self.n_modes] @ self.orthonormal @ departure.ravel()
         return out - similar.T @ (similar @ out)
@@ -338,7 +363,7 @@ class Gauge(ShownAsPrinted):
 
         Posterior standard deviation above 1 px, rms over the stars, where no size of the static distortion is stated.
         """
-        shape = (len(self.motion), 2, self.n_modes)
+        shape = (len(self.motion), 2, self.n_own)
         mapped = tuple(
             UnknownDirection(each.name, self.directions @ each.map, -(self.motion @ each.map).reshape(shape))
             for each in self.unknown_maps
@@ -371,15 +396,16 @@ class Gauge(ShownAsPrinted):
             Name, number of modes, error; the similarities first, NaN unless a reference or poses determine them.
         """
         if self.tie is not None:
-            return self.tie.errors(2 * self.box[1, ::-1])
+            return self.tie.errors(self.plane_modes(len(self.tie.covariance) // 2))
         if self.poses_known:
-            return errors_by_degree(self.covariance, 2 * self.box[1, ::-1])
-        degree = basis.degree_of(self.n_modes)
+            return errors_by_degree(self.covariance, self.plane_modes())
+        of_degree = self.plane_modes().degrees
         variance = np.diag(self.covariance).reshape(2, -1).sum(axis=0) / 8  # b_m has mean square 1/4
-        rows = [("shift, rotation, scale" if degree else "shift", 4 if degree else 2, np.nan)]
+        variance, degree = np.bincount(of_degree, variance) / self.n_fields, of_degree.max()
+        rows = [("shift, rotation, scale" if degree else "shift", (4 if degree else 2) * self.n_fields, np.nan)]
         for d in range(1, degree + 1):
-            part = slice(basis.n_modes(d - 1), basis.n_modes(d))
-            rows.append((f"degree {d}" if d > 1 else "shear", 2 * (d + 1) if d > 1 else 2, variance[part].sum() ** 0.5))
+            n = (2 * (d + 1) if d > 1 else 2) * self.n_fields
+            rows.append((f"degree {d}" if d > 1 else "shear", n, variance[d] ** 0.5))
         return rows
 
     @property
@@ -418,7 +444,7 @@ class Gauge(ShownAsPrinted):
         if self.plane is not None:
             return self.sentence
         convention = f"the constraint ({_CONVENTIONS[self.kind]})" + (" and the prior widths" if self.prior else "")
-        degree = basis.degree_of(self.n_modes)
+        degree = basis.degree_of(self.n_own)
         lines = [
             f"Gauge {self.kind!r}. A map of the reference plane of degree {degree} that every exposure compensates "
             f"changes no residual (null space): {self.n_maps} modes, {min(6, self.n_maps)} of them exactly.",

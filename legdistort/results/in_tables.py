@@ -28,6 +28,9 @@ def stars(solution):
     table["n"] = np.bincount(index, minlength=len(table))
     if (tie := solution.gauge.tie) is not None and tie.known is not None:
         table["reference_used"] = np.isin(estimate.star_names, tie.stars[tie.used])
+    if solution.gauge.n_fields > 1:
+        known = np.isfinite(estimate.positions[:, 0])
+        table["field"] = np.where(known, 1 + solution.gauge.plane_modes().fields_of(estimate.positions), 0)
     if solution.camera.has_focal_plane and _are_apart(solution, used):
         table["group"] = np.full(len(table), -1)
         table["group"][index] = solution.camera.group_of(used)
@@ -173,6 +176,7 @@ def printed(solution):
         *in_lines(solution.checks),
         f"status  {solution.status}",
         *_wrapped("camera", camera_sentence(solution)),
+        *_wrapped("fields", _fields_in_words(solution)),
         *_static_in_words(solution),
         *_wrapped("odd", next((c.sentence for c in solution.checks if c.name == "dynamic part" and c.tests), "")),
         *_wrapped("gauge", solution.gauge.sentence),
@@ -214,6 +218,11 @@ def _row(view):
         f"{view.name:{_width(view.solution)}s} {len(rows):5d} {d['dx']:9.2f} {d['dy']:9.2f} {d['rotation']:9.4f} "
         f"{d['scale']:9.6f} {rms[0]:7.4f} {rms[1]:7.4f} {np.sqrt((view.coefficients**2).sum()) / 2:10.3f}{sky}"
     )
+
+
+def _fields_in_words(solution):
+    n = solution.gauge.n_fields
+    return f"{n} without a common star, each with a plane of its own; they lie side by side" if n > 1 else ""
 
 
 def _static_in_words(solution):

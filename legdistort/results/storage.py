@@ -198,9 +198,12 @@ def _check_consistent(solution):
     gauge, camera = solution.gauge, estimate.uncertainty.camera
     if (gauge.drift is None) != (estimate.motions is None):
         raise ValueError("motions of stars and the maps common to them come together")
-    basis.degree_of(gauge.n_modes)  # refuses a number that is none of modes
-    if not np.all(gauge.box[1] > 0):
-        raise ValueError(f"entry {ROOT}.gauge.box: half sizes should be positive, got {gauge.box[1].tolist()}")
+    basis.degree_of(gauge.n_own)  # refuses a number that is none of modes
+    if gauge.n_modes != gauge.n_own * gauge.n_fields:
+        raise ValueError(f"{gauge.n_own} modes of {gauge.n_fields} fields do not make {gauge.n_modes} of the plane")
+    for _, half in gauge.boxes:
+        if not np.all(half > 0):
+            raise ValueError(f"entry {ROOT}.gauge.box: half sizes should be positive, got {half.tolist()}")
     if gauge.n_maps > 2 * gauge.n_modes:
         raise ValueError(f"the gauge cannot have {gauge.n_constraints} constraints on {2 * gauge.n_modes} modes")
     if camera and np.count_nonzero(camera.free) != len(camera.changes):

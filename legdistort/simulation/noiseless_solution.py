@@ -75,6 +75,6 @@ def _gauge(problem, state, blocks, scatter, sigma):
     if scatter is not None:
         return constraints.make("minimal", problem, state, blocks, dynamic=dynamic)
     gauge = constraints.make("minimal", replace(problem, mean_sigma=None), state, blocks, dynamic=dynamic)
-    unknown = named(10 * dynamic_basis(2 * gauge.box[1, ::-1], gauge.n_modes).T, gauge, state.positions.T)  # any size
+    unknown = named(10 * gauge.plane_modes().others.T, gauge, state.positions.T)  # any size
     nothing = {"dynamic": np.zeros_like(dynamic), "covariance": np.zeros_like(gauge.covariance)}
     return replace(gauge, **nothing, unknown_maps=unknown, static="open")

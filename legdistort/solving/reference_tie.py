@@ -19,7 +19,6 @@ from scipy.linalg import block_diag
 
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import similarity
-from ..geometry.detector_modes import similarity_basis
 from ..geometry.similarity import robust_similarity
 from ..inputs import column_contract
 from ..matching.cross_identification import identify
@@ -32,6 +31,7 @@ from .equations.problem import State
 from .equations.star_terms import StarPrior, packed, unpacked
 from .gauge import catalogue_map, catalogue_motions, hierarchy
 from .gauge.catalogue_agreement import agreement
+from .gauge.moved_fields import moved_by, poses_of, similarities
 
 log = logging.getLogger(__name__)
 
@@ -102,9 +102,9 @@ class ReferenceTie:
         InputError
             If most of the reference stars lie elsewhere, or, where stars move, those of a reference without motions.
         """
-        status, first = result.status, self._rough(result.state)
+        status, first = result.status, self._rough(problem, result.state)
         if first is not None:
-            result = self.solve(problem, _moved(result.state, first))
+            result = self.solve(problem, moved_by(problem, result.state, first))
         prior, made, rest = None, None, ""
         for count in range(_ROUNDS):
             if count < 2:  # afterwards the plane moves too little for another
@@ -116,11 +116,11 @@ class ReferenceTie:
             moved, error = self._move(directions, step, made)
             if count and moved < max(_SETTLED * error, 1e-8):
                 break
-            similar = similarity_basis(prior.size, prior.n_modes)
+            similar = prior.modes.similar
             shift = similar.T @ (similar @ step)
             step = step - shift
             prior = replace(prior, centre=prior.centre - step)
-            state = _moved(result.state, _pose(result.gauge, shift))
+            state = moved_by(problem, result.state, poses_of(result.gauge, shift))
             common = _common(problem, result, step)
             if common is None:
                 result = replace(result, state=state, blocks=criterion.linearise(problem.scaled(result.robust), state))
@@ -313,18 +313,13 @@ class ReferenceTie:
                 AssumptionWarning,
             )
 
-    def _rough(self, state):
-        """Shift, rotation and scale from the solution to the reference, gross errors left aside; None if tiny."""
-        source, target = state.positions.T[self.identified.rows], self.identified.xy
-        if len(source) == 1:
-            pose = np.column_stack([np.eye(2), (target - source)[0]])
-        elif len(source) == 2:
-            pose = similarity.fit_similarity(source, target, parity=1)
-        else:
-            pose = robust_similarity(source, target)
-        move = np.abs(similarity.apply(pose, state.positions.T) - state.positions.T)
-        log.debug("first similarity of the tie: %.3g px", move.max())
-        return pose if move.max() > 1e-3 else None
+    def _rough(self, problem, state):
+        """Similarities (n_fields, 2, 3) of the fields to the reference, gross errors left aside; None if tiny."""
+        rows = self.identified.rows
+        poses = similarities(problem, rows, state.positions.T[rows], self.identified.xy, self.label)
+        move = np.abs(similarity.apply_each(poses[problem.field_of_stars], state.positions.T) - state.positions.T).max()
+        log.debug("first similarity of the tie: %.3g px", move)
+        return poses if move > 1e-3 else None
 
     def _errors(self, problem, result):
         weighted = problem.scaled(result.robust)
@@ -357,7 +352,7 @@ class ReferenceTie:
         common, unknown = self._of_reference(gauge, k, result.state.positions.T)
         covariance = covariance.reshape(2 * k, -1) + common @ common.T
         maps = np.hstack([maps.reshape(2 * k, -1), unknown])
-        return catalogue_map.map_prior(covariance, maps, directions, tuple(2 * gauge.box[1, ::-1]))
+        return catalogue_map.map_prior(covariance, maps, directions, gauge.plane_modes(k))
 
     def _equations(self, result, directions, errors, prior):
         positions = result.state.positions.T
@@ -398,24 +393,6 @@ def _drifted(problem, result, step):
         mean = np.zeros((terms.n, problem.n_stars)) + terms.mean
         problem = replace(problem, moving=replace(terms, mean=mean + moved[2:]))
     return problem, State(state.stars + moved, coefficients, state.poses)
-
-
-def _pose(gauge, shift):
-    """The similarity X -> X + phi(X) g of modes g (2 k,) without anything else, as a pose."""
-    corners = gauge.box[0] + gauge.box[1] * np.array([[0.0, 0], [1, 0], [0, 1]])
-    move = (shift.reshape(2, -1) @ gauge.modes_at(corners, len(shift) // 2)).T
-    linear = np.eye(2) + (move[1:] - move[0]).T / gauge.box[1]
-    return np.column_stack([linear, corners[0] + move[0] - linear @ corners[0]])
-
-
-def _moved(state, pose):
-    """The same solution in a plane moved by a pose: exactly as good."""
-    stars = state.stars.copy()
-    stars[:2] = similarity.apply(pose, state.positions.T).T
-    if len(stars) > 2:
-        stars[2:4] = pose[:, :2] @ state.stars[2:4]  # motions turn with the plane
-        stars[4:] *= np.sqrt(np.linalg.det(pose[:, :2]))
-    return State(stars, state.coefficients, similarity.compose(state.poses, similarity.invert(pose)))
 
 
 def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
@@ -509,14 +486,13 @@ def _joined(fit, *, reference, epoch, pixel_scale):
             off = np.hypot(*(similarity.apply(robust_similarity(source, target), source) - target).T)
             agrees[mine] = off < _MISMATCH * np.median(off)
     found = found.subset(agrees)
-    source = positions[found.rows]
-    rough = similarity.fit_similarity(source, found.xy, parity=1) if len(source) > 1 else similarity.identity()
+    rough = similarities(fit.problem, found.rows, positions[found.rows], found.xy, reference.label)
     catalogue = StarPrior.of(len(positions), found.rows, found.xy, found.covariance[:, :2, :2])
     problem = replace(fit.problem, moving=replace(fit.problem.terms, catalogue=catalogue))
     of, weighted = fit.options, problem.scaled(fit.used.astype(float))
     how = {"loss": of.loss, "max_iterations": of.max_iterations}
     return replace(
-        fit, problem=problem, result=minimisers.solve_joint(weighted, _moved(fit.result.state, rough), **how)
+        fit, problem=problem, result=minimisers.solve_joint(weighted, moved_by(problem, fit.result.state, rough), **how)
     )
 
 

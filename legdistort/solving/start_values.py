@@ -53,12 +53,16 @@ def start(problem, nominal, *, robust=False):
         current = refine(problem, current, q, positions, weight)
     distance2 = distances(problem, current, q, positions)
     typical = np.sqrt([similarity.median(_some(distance2[problem.part(i)])) for i in range(problem.n_exposures)])
-    common = _common_similarity(problem, nominal, current, full, misplaced(problem, typical))
-    current = similarity.compose(current, common)
+    back = [
+        _common_similarity(problem, nominal, current, full, misplaced(problem, typical), field)
+        for field in range(problem.n_fields)
+    ]
+    common = np.stack(back)
+    current = similarity.compose(current, common[problem.fields])
     if problem.terms.n:
         stars = moving_stars(problem, current, q, weight)
     else:
-        stars = similarity.apply(similarity.invert(common), positions.T).T
+        stars = similarity.apply_each(similarity.invert(common)[problem.field_of_stars], positions.T).T
     return State(stars, problem.prior_mean.copy(), current), typical
 
 
@@ -130,15 +134,15 @@ def moments(problem, q, weight, positions):
     return means[0].T, means[1].T, np.moveaxis(cross, 2, 0)
 
 
-def _common_similarity(problem, nominal, refined, weights, astray):
-    """The similarity of the reference plane that brings refined poses back, in the mean, to the nominal ones.
+def _common_similarity(problem, nominal, refined, weights, astray, field):
+    """The similarity of a field of the plane that brings refined poses back, in the mean, to the nominal ones.
 
     Exposures of like quality, by the weights (n,) of their observations, count equally, bad ones less, misplaced ones
     not at all.
     """
     variance = 1 / np.add.reduceat(weights, problem.start[:-1])
     weight = 1 / (variance + 10 * np.median(variance))
-    weight[astray] = 0
+    weight[astray | (problem.fields != field)] = 0
     corners = detector_corners(problem.shapes)
     old, new = (similarity.apply_inverses(poses, corners).reshape(-1, 2) for poses in (nominal, refined))
     return similarity.fit_similarity(old, new, weights=np.repeat(weight, 4), parity=1)

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 
 from legdistort.exceptions import SolveError
 from legdistort.geometry.detector_modes import dynamic_basis, dynamic_degrees
+from legdistort.geometry.plane_modes import PlaneModes
 from legdistort.matching.matches import Matches
 from legdistort.results.gauge import UnknownMap
 from legdistort.simulation.observations import simulate_matches
@@ -167,26 +168,29 @@ def test_residuals_determine_maps_however_they_are_turned():
 # --- names of unknown maps, and constraints ----------------------------------------------------------------------
 
 
+BOX = np.array([[[500.0, 500], [500, 500]]])
+
+
 @pytest.mark.parametrize(("share", "name"), [(0.87, "degree 2"), (0.93, "z^2")])
 def test_a_map_has_the_name_of_what_it_mostly_is(share, name):
-    size, power = (1000, 1000), np.eye(6) / 4
-    pointed = hierarchy._pointing_off(power, size)
+    modes, power = PlaneModes(BOX, 6), np.eye(6) / 4
+    pointed = hierarchy._pointing_off(power, modes.similar.T)
     metric = hierarchy._metric(power, pointed)
-    patterns = {each: pattern for each, _, pattern in hierarchy._patterns(6, size)}
+    patterns = {each: pattern for each, _, pattern in hierarchy._patterns(modes)}
     u, v = np.meshgrid(*[(np.arange(200) + 0.5) / 100 - 1] * 2)
     square = np.real((u + 1j * v) ** 2)  # by its definition
-    modes = [np.sqrt(5) / 2 * (3 * each**2 - 1) / np.sqrt(4) for each in (u, v)]
+    squares = [np.sqrt(5) / 2 * (3 * each**2 - 1) / np.sqrt(4) for each in (u, v)]
     along = patterns["z^2"] / np.sqrt(patterns["z^2"] @ metric @ patterns["z^2"])
-    assert along[3] / along[5] == pytest.approx(np.mean(square * modes[0]) / np.mean(square * modes[1]))
+    assert along[3] / along[5] == pytest.approx(np.mean(square * squares[0]) / np.mean(square * squares[1]))
     across = np.where(np.isin(np.arange(12), [3, 5]), 1.0, 0.0)  # x^2 + y^2 in x alone, which turns no angle right
     across -= along * (along @ metric @ across)
     across /= np.sqrt(across @ metric @ across)
     maps = (np.sqrt(share) * along + np.sqrt(1 - share) * across)[:, None]
-    assert [each.name for each in hierarchy._named(maps, pointed, metric, size)] == [name]
+    assert [each.name for each in hierarchy._named(maps, pointed, metric, modes)] == [name]
 
 
 def test_patterns_have_the_degree_of_their_name():
-    told = [(name, degree) for name, degree, _ in hierarchy._patterns(10, (1000, 1000))]
+    told = [(name, degree) for name, degree, _ in hierarchy._patterns(PlaneModes(BOX, 10))]
     assert told == [("shear", 1)] * 2 + [("z^2", 2), ("i z^2", 2), ("z^3", 3), ("i z^3", 3)]
 
 
@@ -221,7 +225,7 @@ def test_a_map_of_which_a_percent_is_not_taken_back_is_left_to_the_data(seen, ta
     motion = np.stack([np.eye(12)] * 3)
     motion[:, 4, 4] = seen
     problem = SimpleNamespace(n_modes=6, n_exposures=3, fixed=[np.eye(12)[4:5]] * 3)
-    maps = constraints._taken_back(problem, motion, np.array([[500.0, 500], [500, 500]]), False)
+    maps = constraints._taken_back(problem, motion, PlaneModes(BOX, 6), False)
     assert len(maps) == taken_back
     assert (np.abs(maps[:, 4]).max() > 0.1) == (taken_back == 8)
 
@@ -230,8 +234,8 @@ def test_a_map_of_which_a_percent_is_not_taken_back_is_left_to_the_data(seen, ta
 def test_an_exposure_of_twice_the_scale_is_no_part_of_the_plane(scale, counts):
     poses = np.stack([np.eye(2, 3)] * 4)
     poses[-1, :, :2] /= scale
-    problem = SimpleNamespace(shapes=[(1000, 1000)] * 4, n_modes=6)
-    _, half = constraints.reference_box(problem, SimpleNamespace(poses=poses))
+    problem = SimpleNamespace(shapes=[(1000, 1000)] * 4, n_modes=6, n_fields=1, fields=np.zeros(4))
+    ((_, half),) = constraints.reference_modes(problem, SimpleNamespace(poses=poses)).boxes
     assert_allclose(half * 2, 1000 * (scale if counts else 1), rtol=1e-3)
 
 
@@ -245,7 +249,7 @@ def offsets(pulls):
     values = np.column_stack([np.ones(n), xy])
     directions = np.kron(np.eye(2), values).reshape(2, n, 6).transpose(1, 0, 2)
     made = catalogue_map.Offsets(np.arange(n), np.column_stack([pulls, np.zeros(n)]), np.stack([np.eye(2)] * n))
-    prior = catalogue_map.MapPrior(np.zeros((6, 6)), np.zeros(6), (2, 2))
+    prior = catalogue_map.MapPrior(np.zeros((6, 6)), np.zeros(6), PlaneModes(np.array([[[0.0, 0], [1, 1]]]), 3))
     return catalogue_map.MapEquations(made, directions, 1e-6 * np.eye(2 * n), prior)
 
 

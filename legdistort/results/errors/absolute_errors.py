@@ -119,10 +119,10 @@ def coefficient_variance(gauge, block, i, response=None):
     NaN for what an unknown direction of unit rms changes by more than the rest of the error. Or of what follows these
     coefficients by a `response` (k, 2 n_modes), with its covariance in the place of theirs.
     """
-    n = gauge.n_modes
+    n, own = gauge.n_modes, gauge.n_own
     size = len(block) // 2 if response is None else response.shape[1] // 2
     moved = np.zeros((2, size, 2 * n))
-    moved[:, :n] = gauge.motion[i].reshape(2, n, -1)
+    moved[:, :own] = gauge.motion[i].reshape(2, own, -1)
     moved = moved.reshape(2 * size, -1)
     follow = np.eye(2 * size) if response is None else response
     moved = follow @ moved

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...geometry import basis
-from ...geometry.detector_modes import dynamic_basis, dynamic_degrees, similarity_basis
 from ...runtime.trees.facts import array, number
 
 if TYPE_CHECKING:
-    from ...runtime.annotations import Shape
+    from ...geometry.plane_modes import PlaneModes
 
 
 @dataclass(frozen=True)
@@ -117,12 +115,12 @@ class Tie:
         """Whether a single star determines the shift, and nothing else."""
         return self.measured[0] < 1
 
-    def errors(self, size: Shape) -> list[tuple[str, int, float]]:
+    def errors(self, modes: PlaneModes) -> list[tuple[str, int, float]]:
         """Name, number of modes and error [px, rms over the field and axis] by degree, as a list.
 
-        NaN for rotation and scale if not determined by the reference. `size` (ny, nx) is that of the box of the modes.
+        NaN for rotation and scale if not determined by the reference. `modes` are those of the covariance.
         """
-        whole, *others = errors_by_degree(self.covariance, size)
+        whole, *others = errors_by_degree(self.covariance, modes)
         if not self.alone:
             return [whole, *others]
         shift = np.trace(self.covariance[:: len(self.covariance) // 2, :: len(self.covariance) // 2])
@@ -150,25 +148,25 @@ class Tie:
         return f"<Tie: {np.count_nonzero(self.used)} of {len(self.used)} reference stars, {self.rms:.2g} px rms>"
 
 
-def errors_by_degree(covariance, size):
+def errors_by_degree(covariance, modes):
     """Name, number of modes and error [px, rms over the field and axis] by degree of a map, similarities first, a list.
 
-    `covariance` (2 n, 2 n) is that of its modes, `size` (ny, nx) that of the box of these.
+    `covariance` is that of the modes of a plane, `PlaneModes`.
     """
-    similar, *parts = map_parts(size, len(covariance) // 2)
+    similar, *parts = map_parts(modes)
     groups = {"shift, rotation, scale": similar}
     groups |= {f"degree {d}" if d > 1 else "shear": part for d, part in enumerate(parts, start=1)}
     return [
-        (name, part.shape[1], float(np.sqrt(np.trace(part.T @ covariance @ part) / 8))) for name, part in groups.items()
+        (name, part.shape[1], float(np.sqrt(np.trace(part.T @ covariance @ part) / 8 / modes.n_fields)))
+        for name, part in groups.items()
     ]
 
 
-def map_parts(size, n):
+def map_parts(modes):
     """Orthonormal columns (2 n, ...) of a map: similarities, the two shears, then those of each further degree.
 
-    `size` (ny, nx) is that of the box of the modes, pixels.
+    Of the `modes` of the plane, `PlaneModes`.
     """
-    columns = dynamic_basis(size, n).T
-    orders = dynamic_degrees(n)
-    degrees = range(1, basis.degree_of(n) + 1)
-    return [similarity_basis(size, n).T, *(columns[:, orders == d] for d in degrees)]
+    columns, orders = modes.others.T, modes.degrees_of_others
+    degrees = range(1, modes.degrees.max() + 1)
+    return [modes.similar.T, *(columns[:, orders == d] for d in degrees)]

@@ -58,7 +58,7 @@ class CommonFit:
 
         The plane is bent back by the maps then, which the exposures follow by `Gauge.all_motion`.
         """
-        moved = gauge.all_motion[i].reshape(2, gauge.n_modes, -1, gauge.n_modes)[..., : self.n_modes(gauge)]
+        moved = gauge.all_motion[i].reshape(2, gauge.n_own, -1, gauge.n_modes)[..., : self.n_modes(gauge)]
         moved = basis.change_degree(moved.transpose(0, 2, 3, 1), basis.degree_of(len(block) // 2))
         moved = moved.transpose(0, 3, 1, 2).reshape(len(block), -1)
         shared = self.coefficients[i] @ moved.T
@@ -69,10 +69,14 @@ class CommonFit:
         return len(self.covariance) // (gauge.all_motion.shape[2] // gauge.n_modes)
 
 
-def modes_for(n_modes, n_stars, unknown=0):
-    """How many of the modes of a gauge, unknown up to a degree, the map that is taken off so many stars has."""
-    degrees = [d for d in range(basis.degree_of(n_modes) + 1) if PER_MODE * basis.n_modes(d) <= n_stars]
-    return basis.n_modes(max(*degrees, 0, unknown))
+def modes_for(modes, positions, unknown=0):
+    """How many modes of a plane, unknown up to a degree, the map has that is taken off stars at positions (n, 2).
+
+    Of several fields, that of the fewest stars decides.
+    """
+    fewest = np.bincount(modes.fields_of(positions), minlength=modes.n_fields).min()
+    degrees = [d for d in range(modes.degrees.max() + 1) if PER_MODE * basis.n_modes(d) <= fewest]
+    return basis.n_modes(max(*degrees, 0, unknown)) * modes.n_fields
 
 
 def plain_maps(gauge, xy, n):

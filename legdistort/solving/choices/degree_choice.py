@@ -260,17 +260,18 @@ def _of_their_own(fit, high):
     problem, gauge, system, n = fit.problem, fit.result.gauge, fit.uncertainty.system, fit.problem.n_exposures
     departure = (fit.result.state.coefficients - problem.prior_mean)[:, :, high]
     modes = np.arange(2 * problem.n_modes).reshape(2, -1)[:, high].ravel()
-    maps = np.arange(2 * gauge.n_modes).reshape(2, -1)
+    own_modes, maps = (np.arange(2 * k).reshape(2, -1) for k in (gauge.n_own, gauge.n_modes))
+    n_fields = problem.n_fields
     # shears in the place of linear modes: similarities are in the poses
     of_degree = dynamic_degrees(problem.n_modes) == basis.degree_of(high.stop)
     turn = np.stack([dynamic_basis(shape, problem.n_modes) for shape in problem.shapes])[:, of_degree]
 
     def seen(motion, causes):
         """What common maps do to the departures, (n_exposures K, m)."""
-        out = turn[:, :, modes] @ motion[:, maps[:, high].reshape(-1, 1), causes.ravel()]
+        out = turn[:, :, modes] @ motion[:, own_modes[:, high].reshape(-1, 1), causes.ravel()]
         return out.reshape(-1, out.shape[2])
 
-    columns, size, _ = np.linalg.svd(seen(gauge.motion, maps[:, high.start :]), full_matrices=False)
+    columns, size, _ = np.linalg.svd(seen(gauge.motion, maps[:, n_fields * high.start :]), full_matrices=False)
     common, still = columns[:, size > _SETTLED * size.max()], np.zeros_like(fit.blocks.g_star)
 
     def own(each):
@@ -285,7 +286,9 @@ def _of_their_own(fit, high):
     known = turn @ elimination.inverse_exposure_blocks(fit.blocks.u) @ turn.mT  # if the stars were
 
     def excess(effects=None):
-        beside = np.zeros((given.size, 1)) if effects is None else own(seen(effects, maps[:, basis.n_modes(1) :]))
+        beside = (
+            np.zeros((given.size, 1)) if effects is None else own(seen(effects, maps[:, n_fields * basis.n_modes(1) :]))
+        )
         lifted = np.linalg.solve(known, beside.reshape(n, turn.shape[1], -1)).reshape(beside.shape)
         lifted = lifted @ np.linalg.inv(np.linalg.cholesky(np.eye(beside.shape[1]) + beside.T @ lifted)).T  # Woodbury
 
@@ -310,8 +313,9 @@ def _second_order(fit, carried):
     problem, state, gauge = fit.problem, fit.result.state, fit.result.gauge
     coefficients = problem.prior_mean.copy()
     coefficients[:, :, :carried] = state.coefficients[:, :, :carried]
-    whole = constraints.motion_with_distortion(problem, state.poses, coefficients, gauge.box)
-    return (whole - gauge.motion) * np.minimum(problem.mean_sigma.max(axis=0), _UNKNOWN).ravel()
+    whole = constraints.motion_with_distortion(problem, state.poses, coefficients, gauge.plane_modes())
+    sigma = np.minimum(problem.mean_sigma.max(axis=0), _UNKNOWN)
+    return (whole - gauge.motion) * np.repeat(sigma, problem.n_fields, axis=1).ravel()
 
 
 def _folds_at_stars(fit, low, high):

@@ -263,8 +263,9 @@ class Uncertainty:
             return None
         weights = self.star_weights
         unknown = max((each.degree for each in self._gauge.unknown_maps), default=0)
-        n = modes_for(self._gauge.n_modes, np.count_nonzero(weights[:, 0, 0]), unknown)
-        maps = plain_maps(self._gauge, self._blocks.stars[:2].T, n)
+        positions = self._blocks.stars[:2].T
+        n = modes_for(self._gauge.plane_modes(), positions[weights[:, 0, 0] != 0], unknown)
+        maps = plain_maps(self._gauge, positions, n)
         weighted = weights @ maps
         stars, coefficients = self._follow(weighted)
         fit = of_normal(maps, weights)

@@ -71,6 +71,8 @@ class Problem:
         Poses about which those of the exposures scatter.
     pose_width : ndarray, shape (n_exposures, 4), or None
         By how much, as coefficients of the similarities of the detector, pixels; None: nothing is known of poses.
+    field : ndarray of int, shape (n_exposures,)
+        Group of exposures with common stars that every exposure is in, directly or through others.
     moving : StarTerms or None
         How stars move from exposure to exposure; None: they do not.
     """
@@ -95,6 +97,7 @@ class Problem:
     centre: np.ndarray | None = None
     given_poses: np.ndarray | None = None
     pose_width: np.ndarray | None = None
+    field: np.ndarray | int = 0
     moving: StarTerms | None = None
 
     @cached_property
@@ -149,6 +152,24 @@ class Problem:
     def detectors(self):
         """Number of the detector of every exposure, (n_exposures,)."""
         return np.broadcast_to(self.group, self.n_exposures)
+
+    @property
+    def fields(self):
+        """Number of the field of every exposure, (n_exposures,)."""
+        return np.broadcast_to(self.field, self.n_exposures)
+
+    @property
+    def n_fields(self):
+        """Number of groups of exposures without a common star, each with a null space of its own."""
+        return int(np.max(self.field)) + 1
+
+    @cached_property
+    def field_of_stars(self):
+        """Number of the field of every star, (n_stars,)."""
+        out = np.zeros(self.n_stars, dtype=int)
+        if self.n_fields > 1:
+            out[self.star] = self.fields[self.exposure]
+        return out
 
     @cached_property
     def nights(self):
@@ -370,6 +391,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
         own_degree=own_degree,
         group=_groups(matches),
         night=matches.blocks,
+        field=matches.fields,
         night_sigma=night_sigma,
         **_known_poses(matches, degree, np.bincount(obs.exposure[order], weight[:2].mean(axis=0))),
     )

@@ -31,7 +31,7 @@ class Reduced:
     def _on_unknowns(self, gauge):
         """The constraints as rows on the unknowns; those of the gauge act on the modes up to its own degree."""
         n, size = len(gauge.motion), self.problem.n_modes
-        if gauge.n_modes == size and not self.problem.unknowns.shared:
+        if gauge.n_own == size and not self.problem.unknowns.shared:
             return gauge.orthonormal
         rows = gauge.orthonormal.reshape(gauge.n_constraints, n, 2, -1)
         rows = np.pad(rows, ((0, 0), (0, 0), (0, 0), (0, size - rows.shape[3]))).reshape(-1, n, 2 * size)

@@ -5,7 +5,7 @@ from scipy import special
 from scipy.linalg import cholesky, solve_triangular
 
 from ...results.check import CERTAIN
-from ...results.errors.catalogue_tie import Agreement, map_parts
+from ...results.errors.catalogue_tie import Agreement
 from ..checks.limits import addition_that_shows
 from ..equations.criterion import complement
 from .hierarchy import LIMIT
@@ -54,7 +54,7 @@ def agreement(equations, stated, used, motions=None):
 def _bends(equations):
     """Maps (2 k, m) without shift, rotation and scale over the stars, orthonormal over these."""
     root = cholesky(equations.metric)
-    similar = np.linalg.qr(root @ map_parts(equations.prior.size, equations.prior.n_modes)[0])[0]
+    similar = np.linalg.qr(root @ equations.prior.modes.similar.T)[0]
     return solve_triangular(root, complement(similar.T).T)
 
 

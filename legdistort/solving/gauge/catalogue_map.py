@@ -63,13 +63,12 @@ class MapPrior:
         Inverse of its covariance, px^-2; nothing along similarities and what is unknown.
     centre : ndarray, shape (2 k,)
         Its most probable value, in modes.
-    size : tuple
-        ``(ny, nx)`` of the box of the modes, pixels.
+    modes : `legdistort.geometry.plane_modes.PlaneModes`
     """
 
     information: np.ndarray
     centre: np.ndarray
-    size: tuple
+    modes: object
 
     @property
     def n_modes(self):
@@ -77,16 +76,16 @@ class MapPrior:
         return len(self.centre) // 2
 
 
-def map_prior(covariance, unknown, directions, size):
+def map_prior(covariance, unknown, directions, modes):
     """The `MapPrior` of a covariance (2 k, 2 k) that leaves out similarities and `unknown` maps (2 k, m)."""
     metric = _metric(directions)
-    similar = map_parts(size, len(covariance) // 2)[0]
+    similar = modes.similar.T
     root = np.linalg.cholesky(metric).T
     free = np.linalg.qr(root @ np.hstack([similar, unknown]))[0]
     known = root.T @ complement(free.T).T  # what of a map is in its known part, in orthonormal coordinates
     inner = known.T @ covariance @ known
     inner += max(_EXACT, 1e-9 * np.trace(inner)) * np.eye(len(inner))
-    return MapPrior(known @ np.linalg.solve(inner, known.T), np.zeros(len(covariance)), size)
+    return MapPrior(known @ np.linalg.solve(inner, known.T), np.zeros(len(covariance)), modes)
 
 
 def _metric(directions):
@@ -179,7 +178,7 @@ class MapEquations:
         """
         information = self.prior.information + self.gain(used, weights)[0]
         curvature, maps = eigh((information + information.T) / 2, self.metric)
-        similar = map_parts(self.prior.size, self.prior.n_modes)[0]
+        similar = self.prior.modes.similar.T
         inside = similar @ np.linalg.solve(similar.T @ self.metric @ similar, similar.T @ self.metric @ maps)
         pointing = np.einsum("am,ab,bm->m", inside, self.metric, inside) > 0.5
         known = (curvature * LIMIT**2 > 1) | (pointing & (curvature > 1e-9 * curvature[-1]))
@@ -384,7 +383,7 @@ def estimate(equations, used, names):
     left = equations.left(value)
     information, weighted = equations.gain(used)
     share = covariance @ information
-    parts = map_parts(equations.prior.size, equations.prior.n_modes)[1:]
+    parts = map_parts(equations.prior.modes)[1:]
     pointing = 1.0 if np.count_nonzero(used) > 1 else 0.5  # a single star determines the shift alone
     measured = [pointing, *(np.trace(part.T @ share @ part) / part.shape[1] for part in parts)]
     dof = 2 * np.count_nonzero(used) - np.trace(share)

@@ -8,6 +8,7 @@ import numpy as np
 from ...exceptions import SolveError
 from ...geometry import basis, similarity
 from ...geometry.detector_modes import dynamic_basis, row_variances, similarity_basis, similarity_poses
+from ...geometry.plane_modes import PlaneModes
 from ...results.gauge import Drift, Gauge
 from ...runtime.checks import check_choice
 from ...runtime.words import GAUGES
@@ -56,52 +57,54 @@ def make(kind, problem, state, blocks, *, released=None, common=None, dynamic=No
     shared, shared_shears = problem.unknowns.shared, problem.own_degree == 0
     group, night = problem.detectors, problem.nights
     problem, state, blocks = own_part(problem, state, blocks)
-    box = reference_box(problem, state)
-    motion = _motion(problem, state.poses, box)
+    modes = reference_modes(problem, state)
+    motion = _motion(problem, state.poses, modes)
     if kind == "mean":
         _check_mean(motion)
     similar, others = _by_shape(similarity_basis, problem), _by_shape(dynamic_basis, problem)
     held = np.array([problem.has_widths(i) for i in range(problem.n_exposures)])
     error = conditional_errors(blocks.u_data + (0 if problem.pose_width is None else pose_precision(problem)))
-    maps = _taken_back(problem, motion, box, shared_shears)
+    maps = _taken_back(problem, motion, modes, shared_shears)
     static = _static_variance(problem, others, group, shared)
     if settled:
-        static, dynamic = np.zeros_like(static), np.broadcast_to(np.eye(motion.shape[1]), motion.shape)
+        static, dynamic = np.zeros_like(static), np.broadcast_to(np.eye(motion.shape[1]), error.shape)
     nightly, told = np.zeros((0, others.shape[1])), False
     drifting, drifts, rates = _drifts(problem, motion, others, shared_shears, all_drifts)
     if dynamic is None:
         moved = np.concatenate([others @ motion @ maps.T, others @ drifting @ drifts.T], axis=2)
         dynamic, nightly, told = dynamic_covariance(problem, state, error, moved, others, night, group, static)
-    spread = others @ (dynamic + np.where(held, 0, 1)[:, None, None] * error) @ others.transpose(0, 2, 1)
-    weight = np.where(held, 1, influence(error, others))[:, None, None] * np.linalg.inv(spread)
+    # about a static distortion that was found widths tell nothing of the plane, which exposures that show it hold
+    told_by_widths = held & ~(all_drifts and problem.centre is not None)
+    spread = others @ (dynamic + np.where(told_by_widths, 0, 1)[:, None, None] * error) @ others.transpose(0, 2, 1)
+    weight = np.where(told_by_widths, 1, influence(error, others))[:, None, None] * np.linalg.inv(spread)
     positions = state.positions.T[used]
-    values = basis.values(problem.degree, *((positions - box[0]) / box[1]).T)
+    values = modes.at(positions)
     power = values @ values.T / values.shape[1]
-    size = tuple(2 * box[1, ::-1])
     hierarchy = Hierarchy(
-        motion, others, dynamic, weight, night, nightly, told, group, static, maps, size, power, drifting @ drifts.T
+        motion, others, dynamic, weight, night, nightly, told, group, static, maps, modes, power, drifting @ drifts.T
     )
-    poses = _pose_rows(kind, motion, error, similar, box)
+    poses = _pose_rows(kind, motion, error, similar, modes)
     if len(rates):
         carried = influence(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
         poses = np.concatenate([poses, (rates @ drifting.transpose(0, 2, 1) @ carried).transpose(1, 0, 2)])
     known = hierarchy.solve(kind, released)
     rows = np.concatenate([known.rows, poses])
     covariance, drift_covariance = hierarchy.covariance(known, poses, drifting @ rates.T)
-    pointed = _without_rates(hierarchy.pointed, values, drifting.shape[2]) @ drifts.T
+    pointed = _without_rates(hierarchy.pointed, values, drifting.shape[2], modes.n_fields) @ drifts.T
+    drift = (problem.terms.names, drifting, pointed @ drift_covariance @ pointed.T, drifts, rates)
+    drift = Drift(*drift, n_fields=modes.n_fields) if problem.terms.n else None
     made = Gauge(
         kind,
         constraint=rows,
         motion=motion,
         dynamic=dynamic,
-        box=box,
+        box=modes.boxes[0],
+        more_boxes=modes.boxes[1:] if modes.n_fields > 1 else None,
         covariance=covariance,
         unknown_maps=known.unknown,
         static=_in_a_word(static, shared),
         prior=bool(held.any()),
-        drift=Drift(problem.terms.names, drifting, pointed @ drift_covariance @ pointed.T, drifts, rates)
-        if problem.terms.n
-        else None,
+        drift=drift,
         nights=float(np.sqrt(nightly.mean(axis=0).sum() / 8)) if len(nightly) else None,  # a mode has mean square 1/4
         nights_told=told or not len(nightly),
     )
@@ -126,12 +129,12 @@ def _drifts(problem, motion, others, shared_shears, all_drifts):
     rates : ndarray, shape (c, q)
         Those that the poses carry: a common shift, rotation and expansion with time, the mean parallax.
     """
-    terms, n = problem.terms, problem.n_modes
+    terms, n, m = problem.terms, problem.n_modes, motion.shape[2] // 2
     free = np.flatnonzero(all_drifts | ~np.any(terms.precision, axis=1))
     if not len(free):
         return np.zeros((problem.n_exposures, 2 * n, 0)), np.zeros((0, 0)), np.zeros((0, 0))
-    lift = terms.lift(n)[:, :, 2 * n :].reshape(problem.n_exposures, 2 * n, terms.n, n)
-    drifting = motion @ lift[:, :, free].reshape(problem.n_exposures, 2 * n, -1)
+    lift = terms.lift(m)[:, :, 2 * m :].reshape(problem.n_exposures, 2 * m, terms.n, m)
+    drifting = motion @ lift[:, :, free].reshape(problem.n_exposures, 2 * m, -1)
     possible = np.eye(drifting.shape[2])
     if problem.fixed is not None:
         moved = np.concatenate([rows @ each for rows, each in zip(problem.fixed, drifting, strict=True)])
@@ -143,7 +146,7 @@ def _drifts(problem, motion, others, shared_shears, all_drifts):
     return drifting, inside, carried
 
 
-def _without_rates(pointed, values, q):
+def _without_rates(pointed, values, q, n_fields):
     """Takes off modes (q,) of maps that change with time the rates and mean parallax that they do to the stars, (q, q).
 
     `pointed` (2 n, 2 n) does so for a common map; `values` (n, n_stars) are the modes at the stars.
@@ -151,8 +154,8 @@ def _without_rates(pointed, values, q):
     n = len(values)
     out, first = np.eye(q), 2 * n if q >= 2 * n else 0
     out[:first, :first] = pointed[:first, :first]
-    if q > first:
-        out[first, first:] -= values.mean(axis=1) / values[0].mean()
+    for k in range(n_fields if q > first else 0):
+        out[first + k, first + k :: n_fields] -= values[k::n_fields].mean(axis=1) / values[k].mean()
     return out
 
 
@@ -163,9 +166,9 @@ def _null_space(matrix, tolerance):
     return rows[size <= tolerance * size.max(initial=1e-300)]
 
 
-def _taken_back(problem, motion, box, shared_shears):
+def _taken_back(problem, motion, modes, shared_shears):
     """Orthonormal rows (m, 2 n): maps of the reference plane, similarities aside, in the null space."""
-    similar = similarity_basis(2 * box[1, ::-1], problem.n_modes)
+    similar = modes.similar
     if shared_shears:
         return np.zeros((0, len(similar.T)))
     if problem.fixed is None:
@@ -204,18 +207,18 @@ def _in_a_word(static, shared):
 
 
 def pose_rows(problem, state, blocks):
-    """Orthonormal rows (4, n_exposures, 2 n_modes) on coefficients that hold the plane by the poses; see `make`."""
-    box = reference_box(problem, state)
-    motion, error = _motion(problem, state.poses, box), conditional_errors(blocks.u_data)
-    rows = _pose_rows("minimal", motion, error, _by_shape(similarity_basis, problem), box)
+    """Orthonormal rows (4 n_fields, n_exposures, 2 n_modes) on coefficients that hold the plane by the poses."""
+    modes = reference_modes(problem, state)
+    motion, error = _motion(problem, state.poses, modes), conditional_errors(blocks.u_data)
+    rows = _pose_rows("minimal", motion, error, _by_shape(similarity_basis, problem), modes)
     return np.linalg.qr(rows.reshape(len(rows), -1).T)[0].T.reshape(rows.shape)
 
 
-def _pose_rows(kind, motion, error, similar, box):
-    """Rows (4, n_exposures, 2 n) that hold the plane by the poses, mean over the exposures."""
+def _pose_rows(kind, motion, error, similar, modes):
+    """Rows (4 n_fields, n_exposures, 2 n) that hold the plane by the poses, mean over the exposures."""
     if kind == "mean":
         return similar.transpose(1, 0, 2)
-    common = similarity_basis(2 * box[1, ::-1], motion.shape[1] // 2)
+    common = modes.similar
     weight = influence(error, similar)[:, None, None] * (similar.transpose(0, 2, 1) @ similar)
     return (common @ motion.transpose(0, 2, 1) @ weight).transpose(1, 0, 2)
 
@@ -242,15 +245,17 @@ def own_part(problem, state, blocks):
     return own, State(state.stars, state.coefficients[:, :, :n], state.poses), inner
 
 
-def reference_box(problem, state):
-    """Centre and half size (2, 2) of the box of the reference plane that all detectors cover."""
+def reference_modes(problem, state):
+    """`PlaneModes` of the boxes of the reference plane that the detectors of every field cover."""
     scale = np.sqrt(np.abs(np.linalg.det(state.poses[:, :, :2])))
     usual = np.abs(np.log(scale / np.median(scale))) < np.log(2)  # a mismatched exposure may have any scale
-    ends = _by_shape(_corners, problem)[usual]
-    pose_list = state.poses[usual]
-    corners = similarity.apply_inverses(pose_list, ends).reshape(-1, 2)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    return np.stack([(low + high) / 2, (high - low) / 2])
+    corners, boxes = similarity.apply_inverses(state.poses, _by_shape(_corners, problem)), []
+    for field in range(problem.n_fields):
+        mine = problem.fields == field
+        seen = corners[mine & usual if np.any(mine & usual) else mine].reshape(-1, 2)
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        boxes.append(np.stack([(low + high) / 2, (high - low) / 2]))
+    return PlaneModes(np.stack(boxes), problem.n_modes)
 
 
 def _by_shape(function, problem, n=None):
@@ -262,19 +267,31 @@ def _by_shape(function, problem, n=None):
     return np.stack(made)[[shapes.index(shape) for shape in problem.shapes]]
 
 
-def _motion(problem, pose_list, box):
+def _motion(problem, pose_list, modes):
     """N_i, to first order in the distortion: a displacement g of the reference plane moves q by R g(T^-1 q)."""
-    degree, size = problem.degree, problem.n_modes
+    degree, size, box = problem.degree, problem.n_modes, modes.boxes[problem.fields]
     linear = pose_list[:, :, :2]
     back = similarity.apply_inverses(pose_list, _by_shape(_nodes, problem, degree))
-    reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0))
+    reference = basis.values(degree, *np.moveaxis((back - box[:, None, 0]) / box[:, None, 1], -1, 0))
     mixing = _projection(degree).T @ reference.transpose(1, 2, 0)
-    return np.einsum("iab,imn->iambn", linear, mixing).reshape(-1, 2 * size, 2 * size)
+    return _of_fields(problem, np.einsum("iab,imn->iambn", linear, mixing)).reshape(-1, 2 * size, 2 * modes.size)
 
 
-def motion_with_distortion(problem, pose_list, coefficients, box):
+def _of_fields(problem, motion):
+    """Maps (n_exposures, 2, m, 2, n) from the modes of the field of every exposure, on those of all fields."""
+    if problem.n_fields == 1:
+        return motion
+    out = np.zeros((*motion.shape, problem.n_fields))
+    for field in range(problem.n_fields):
+        mine = problem.fields == field
+        out[mine, ..., field] = motion[mine]
+    return out
+
+
+def motion_with_distortion(problem, pose_list, coefficients, modes):
     """N_i where a distortion d, A_i (n_exposures, 2, n_all), carries q to a place that moves by (I + grad d) R g."""
     degree, n, top = problem.degree, problem.n_modes, basis.degree_of(coefficients.shape[2])
+    box = modes.boxes[problem.fields]
     exact = degree + top // 2  # for products of a mode, a map and a slope
     u, v, w = basis.quadrature(exact)
     by_u, by_v = basis.gradients(top, u, v)[1:]
@@ -282,9 +299,9 @@ def motion_with_distortion(problem, pose_list, coefficients, box):
     moved = np.eye(2)[:, :, None] + slope * (2 / problem.size)[:, None, :, None]
     moved = np.einsum("iack,icb->iabk", moved, pose_list[:, :, :2])
     back = similarity.apply_inverses(pose_list, _by_shape(_nodes, problem, exact))
-    reference = basis.values(degree, *np.moveaxis((back - box[0]) / box[1], -1, 0)).transpose(1, 2, 0)
+    reference = basis.values(degree, *np.moveaxis((back - box[:, None, 0]) / box[:, None, 1], -1, 0)).transpose(1, 2, 0)
     out = (basis.values(degree, u, v) * w * moved[:, :, :, None]) @ reference[:, None, None]
-    return out.swapaxes(2, 3).reshape(-1, 2 * n, 2 * n)
+    return _of_fields(problem, out.swapaxes(2, 3)).reshape(-1, 2 * n, 2 * modes.size)
 
 
 def _check_mean(motion):

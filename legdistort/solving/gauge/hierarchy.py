@@ -32,7 +32,6 @@ import numpy as np
 from scipy.linalg import eigh
 
 from ...geometry import basis
-from ...geometry.detector_modes import similarity_basis
 from ...results.gauge import UnknownMap
 from ..equations.criterion import complement
 
@@ -51,11 +50,11 @@ class Hierarchy:
 
     Attributes
     ----------
-    motion : ndarray, shape (n_exposures, 2 n, 2 n)
-        N_i.
-    others : ndarray, shape (n_exposures, K, 2 n)
-        Orthonormal rows of all modes but the similarities, which the poses carry.
-    dynamic : ndarray, shape (n_exposures, 2 n, 2 n)
+    motion : ndarray, shape (n_exposures, 2 n', 2 n)
+        N_i, to the modes of exposures from those of the reference plane.
+    others : ndarray, shape (n_exposures, K, 2 n')
+        Orthonormal rows of all modes of an exposure but the similarities, which the poses carry.
+    dynamic : ndarray, shape (n_exposures, 2 n', 2 n')
         Lambda_i.
     weight : ndarray, shape (n_exposures, K, K)
         Inverse of Lambda_i + C_i on these rows.
@@ -72,11 +71,11 @@ class Hierarchy:
         Variance of A_0 by detector: infinite where it is not known, zero where it is exact.
     maps : ndarray, shape (m, 2 n)
         Orthonormal rows: the maps that every exposure can compensate (null space), similarities aside.
-    size : tuple
-        ``(ny, nx)`` of the box of the reference plane on which the modes are defined, pixels.
+    modes : `legdistort.geometry.plane_modes.PlaneModes`
+        Of the reference plane.
     power : ndarray, shape (n, n)
         Mean products of the modes of the reference plane, over the stars.
-    drifts : ndarray, shape (n_exposures, 2 n, m')
+    drifts : ndarray, shape (n_exposures, 2 n', m')
         How the m' common maps that change with time, motions and parallaxes of all stars, change the coefficients.
     """
 
@@ -90,12 +89,12 @@ class Hierarchy:
     group: np.ndarray
     static: np.ndarray
     maps: np.ndarray
-    size: tuple
+    modes: object
     power: np.ndarray
     drifts: np.ndarray
 
     def rows(self, static):
-        """Rows M' (D + E B E' + 1 S 1')^-1 of the constraints, (m + m', n_exposures, 2 n).
+        """Rows M' (D + E B E' + 1 S 1')^-1 of the constraints, (m + m', n_exposures, 2 n').
 
         For a variance (n_groups, K) of A_0. Those of the maps that change with time come last.
         """
@@ -115,7 +114,7 @@ class Hierarchy:
         return (weighted.mT @ self.others).transpose(1, 0, 2)
 
     def convention(self, kind):
-        """Rows (m + m', n_exposures, 2 n) of a convention by itself: A_0 at the prior mean."""
+        """Rows (m + m', n_exposures, 2 n') of a convention by itself: A_0 at the prior mean."""
         smallest = self.rows(np.zeros_like(self.static))
         if kind == "mean":
             mean = np.einsum("bc,ikc,ika->bia", self.maps, self.others, self.others, optimize=True)
@@ -125,7 +124,7 @@ class Hierarchy:
     @cached_property
     def pointed(self):
         """Takes off modes of a map the similarity that they do to the stars, (2 n, 2 n)."""
-        return _pointing_off(self.power, self.size)
+        return _pointing_off(self.power, self.modes.similar.T)
 
     @cached_property
     def metric(self):
@@ -161,7 +160,7 @@ class Hierarchy:
             unknown = unknown @ complement(inside.T).T
         rows = np.concatenate([np.tensordot(known.T, rows[:n], 1), np.tensordot(unknown.T, held[:n], 1), rows[n:]])
         return Constraints(
-            rows, self.maps.T @ known, _named(self.maps.T @ unknown, self.pointed, self.metric, self.size)
+            rows, self.maps.T @ known, _named(self.maps.T @ unknown, self.pointed, self.metric, self.modes)
         )
 
     def covariance(self, known, poses, rates):
@@ -175,7 +174,7 @@ class Hierarchy:
         rates : ndarray, shape (n_exposures, 2 n, c)
             How the latter changes the coefficients.
         """
-        rows, similar = np.concatenate([known.rows, poses]), similarity_basis(self.size, len(self.power)).T
+        rows, similar = np.concatenate([known.rows, poses]), self.modes.similar.T
         maps = np.hstack([known.known, *(each.map[:, None] for each in known.unknown), similar])
         n, m = known.known.shape[1], self.drifts.shape[2]
         flat, by_exposure = rows.reshape(len(rows), -1), rows.transpose(1, 0, 2)
@@ -229,7 +228,7 @@ def named(maps, gauge, positions):
     pointed, metric = plane_metric(gauge, positions[np.isfinite(positions[:, 0])])
     moved, vectors = np.linalg.eigh(maps.T @ metric @ maps)
     kept = moved > 0.5
-    return _named(maps @ vectors[:, kept] / np.sqrt(moved[kept]), pointed, metric, tuple(2 * gauge.box[1, ::-1]))
+    return _named(maps @ vectors[:, kept] / np.sqrt(moved[kept]), pointed, metric, gauge.plane_modes())
 
 
 def of_maps(metric, maps):
@@ -242,16 +241,15 @@ def plane_metric(gauge, positions):
     """`Hierarchy.pointed` and `Hierarchy.metric` of a gauge and positions (n, 2)."""
     values = gauge.modes_at(positions)
     power = values @ values.T / values.shape[1]
-    pointed = _pointing_off(power, tuple(2 * gauge.box[1, ::-1]))
+    pointed = _pointing_off(power, gauge.plane_modes().similar.T)
     return pointed, _metric(power, pointed)
 
 
-def _pointing_off(power, size):
+def _pointing_off(power, similar):
     """Takes off modes (2 n,) of a map the similarity that they do to the stars, (2 n, 2 n).
 
-    `power` (n, n) are the mean products of the modes, over the stars.
+    `power` (n, n) are the mean products of the modes, over the stars, `similar` (2 n, 4) the similarities.
     """
-    similar = similarity_basis(size, len(power)).T
     pulled = _times_power(similar.T, power)
     return np.eye(len(similar)) - similar @ np.linalg.pinv(pulled @ similar, rcond=1e-12, hermitian=True) @ pulled
 
@@ -266,16 +264,16 @@ def _times_power(rows, power):
     return (rows.reshape(-1, 2, len(power)) @ power).reshape(rows.shape)
 
 
-def _named(maps, pointed, metric, size):
+def _named(maps, pointed, metric, modes):
     """Unknown maps (2 n, m) with names: turned, as far as they allow, into those that have one."""
-    found, left, n = [], np.eye(maps.shape[1]), len(maps) // 2
-    for name, degree, pattern in _patterns(n, size):
+    found, left = [], np.eye(maps.shape[1])
+    for name, degree, pattern in _patterns(modes):
         inside = left @ (left.T @ (maps.T @ metric @ pattern))
         if inside @ inside > _ALIKE * (pattern @ metric @ pattern):
             inside /= np.linalg.norm(inside)
             found.append(UnknownMap(name, degree, pointed @ maps @ inside))
             left = left @ complement((left.T @ inside)[None]).T
-    degrees = np.tile(np.add(*basis.orders(basis.degree_of(n))), 2)
+    degrees = np.tile(modes.degrees, 2)
     for rest in (pointed @ maps @ left).T:
         power = np.bincount(degrees, rest**2)
         degree = int(power[1:].argmax()) + 1
@@ -324,14 +322,26 @@ def is_explained(chi2, system):
     return chi2 <= max(2.0 * system.dof, 0.1 * system.blocks.chi2)
 
 
-def _patterns(n, size):
-    """Maps with a name: the shears, and by degree those that keep angles, z^d of the complex plane z = x + iy."""
-    top = basis.degree_of(n)
+def _patterns(modes):
+    """Maps with a name: the shears, and by degree those that keep angles, z^d of the complex plane z = x + iy.
+
+    Those of several fields first in all of them alike, then in each.
+    """
+    top = basis.degree_of(modes.n)
     u, v, w = basis.quadrature(top)
-    z = (u * size[1] + 1j * v * size[0]) / max(size)
     project = (basis.values(top, u, v) * w).T
-    fields = [("shear", 1, np.conj(z)), ("shear", 1, 1j * np.conj(z))] if top else []
+    names = [("shear", 1, 1.0), ("shear", 1, 1j)] if top else []
     for d in range(2, top + 1):
-        fields += [(f"z^{d}", d, z**d), (f"i z^{d}", d, 1j * z**d)]
-    for name, degree, field in fields:
-        yield name, degree, np.concatenate([field.real @ project, field.imag @ project])
+        names += [(f"z^{d}", d, 1.0), (f"i z^{d}", d, 1j)]
+    made = []
+    for number, size in enumerate(modes.shapes):
+        z = (u * size[1] + 1j * v * size[0]) / np.max(modes.shapes)
+        fields = [turn * (z**d if d > 1 else np.conj(z)) for _, d, turn in names]
+        rows = np.stack([np.concatenate([f.real @ project, f.imag @ project]) for f in fields]) if fields else []
+        made.append(modes.of_field(rows, number) if fields else [])
+    for (name, degree, _), *each in zip(names, *made, strict=True):
+        yield name, degree, sum(each)
+    if modes.n_fields > 1:
+        for number, rows in enumerate(made, start=1):
+            for (name, degree, _), row in zip(names, rows, strict=True):
+                yield f"{name} of field {number}", degree, row

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import eigh
 
-from ...geometry.detector_modes import similarity_basis
 from ..equations.criterion import complement
 from .hierarchy import LIMIT, named, of_maps, plane_metric
 
@@ -26,9 +25,9 @@ def as_in_posterior(gauge, unknowns, positions, covariance, wide):
         The same as if nothing told the size of a static distortion of which nothing is stated. A direction is unknown
         if it has an error beyond `LIMIT` pixels there. None: all statics are stated.
     """
-    size, n = 2 * gauge.box[1, ::-1], gauge.n_modes
+    n = gauge.n_own
     pointed, metric = plane_metric(gauge, positions)
-    similar = similarity_basis(size, n).T
+    similar = gauge.plane_modes().similar.T
     maps = complement(similar.T).T
     rows = gauge.orthonormal.T.reshape(len(gauge.motion), 2, n, -1)
     rows = np.pad(rows, ((0, 0), (0, 0), (0, unknowns.n_modes - n), (0, 0)))

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...geometry.detector_modes import similarity_basis
 from ..equations import effective_modes
 from ..equations.criterion import complement
 
@@ -49,7 +48,7 @@ def _of_scatter(gauge):
 
     Nothing of shift, rotation and scale, and of maps that are unknown without J.
     """
-    similar = similarity_basis(tuple(2 * gauge.box[1, ::-1]), gauge.n_modes).T
+    similar = gauge.plane_modes().similar.T
     free = gauge.reach @ np.column_stack([similar, *(each.map for each in gauge.unknown_maps)])
     known = complement(np.linalg.qr(free)[0].T)
     spread = known @ gauge.reach

@@ -129,7 +129,9 @@ def counts(problem, state, shown=1.0):
         return False
     if problem.degree < 2 or problem.n_exposures < FEWEST or not reduced_system.is_small(problem):
         return False
-    n_free = problem.n_star * problem.n_stars + problem.unknowns.size - 2 * problem.n_modes
+    if problem.prior_sigma is not None and problem.mean_sigma is not None and problem.mean_sigma.any():
+        return True  # widths draw exposures to the mean of the prior, and not to the static distortion that they show
+    n_free = problem.n_star * problem.n_stars + problem.unknowns.size - 2 * problem.n_modes * problem.n_fields
     if 2 * np.count_nonzero(problem.weight[0]) - n_free < LEFT:
         return False
     known = _Known.of(problem, problem.degree)
@@ -405,8 +407,8 @@ class _Known:
     def factor(self, pointing, width):
         """All that is known, as one factor on the unknowns and then the statics; its values are those of `at`.
 
-        `pointing` (4, n_exposures, 2 n_modes) are rows on the coefficients that are held, as good as exactly, by a
-        width: the data say nothing of them.
+        `pointing` (4 n_fields, n_exposures, 2 n_modes) are rows on the coefficients that are held, as good as exactly,
+        by a width: the data say nothing of them.
         """
         n, k, m = self.others.shape
         similar = np.stack([similarity_basis(shape, m // 2) for shape in self.problem.shapes])

@@ -89,7 +89,7 @@ def reduced_data(problem, state, rows, motion):
         curvature=(curvature + curvature.T) / 2,
         pull=rows @ pull - across @ solved[:, -1],
         chi2=float(data.chi2 - others @ pull @ solved[:, -1]),
-        n_data=data.n_data - len(others) + 4,
+        n_data=data.n_data - len(others) + 4 * problem.n_fields,
     )
 
 
@@ -110,6 +110,7 @@ def part_of(problem, state, keep):
     rows = np.concatenate([np.arange(*problem.start[i : i + 2]) for i in keep])
     stars, star = np.unique(problem.star[rows], return_inverse=True)
     group = problem.group if problem.group is None else np.unique(problem.group[keep], return_inverse=True)[1]
+    field = np.unique(problem.fields[keep], return_inverse=True)[1]
     part = replace(
         problem,
         names=tuple(problem.names[i] for i in keep),
@@ -123,6 +124,7 @@ def part_of(problem, state, keep):
         prior_sigma=None if problem.prior_sigma is None else problem.prior_sigma[keep],
         mean_sigma=None if problem.mean_sigma is None else problem.mean_sigma[keep],
         group=group,
+        field=field,
         night=problem.night if np.ndim(problem.night) == 0 else problem.night[keep],
         centre=None if problem.centre is None else problem.centre[keep],
         moving=None if problem.moving is None else problem.moving.subset(keep),

@@ -1,0 +1,61 @@
+"""Files that are given on the command line: tables, cameras, matched positions of one field or several."""
+
+from pathlib import Path
+
+import legdistort
+
+from ..exceptions import InputError
+from ..inputs import column_contract
+from ..inputs.table_files import read_table
+
+
+def refuse(given, reason):
+    """Raise `InputError` for the first of ``{name: value}`` that was given: it would be ignored."""
+    for name, value in given.items():
+        if value not in (None, False):
+            raise InputError(f"--{name.replace('_', '-')} {reason}: leave it out")
+
+
+def read_given(path, a, contract=None):
+    """The table in a file; where it does not keep a contract, the message names the file."""
+    table = read_table(path, columns=dict(a.columns), origin=a.origin, error=a.error)
+    if contract is not None and len(table):
+        column_contract.check(table, contract, str(path))
+    return table
+
+
+def given_camera(given):
+    """The camera of ``--camera``; None without one."""
+    return legdistort.Camera.gsaoi() if given == "gsaoi" else given and legdistort.Camera.read(given)
+
+
+def read_matches(a):
+    """The `Matches` in the tables of a command line, those of several fields joined, and their inputs."""
+    paths = [Path(path) for path in a.tables]
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise InputError("a table stands twice on the command line: every field has one of its own")
+    read = {path: _read(path, a) for path in paths}
+    inputs = {name: checksum for _, files in read.values() for name, checksum in files.items()}
+    if len(read) == 1:
+        return read[paths[0]][0], inputs
+    stems = [path.stem for path in read]
+    labels = stems if len(set(stems)) == len(stems) else [path.resolve().parent.name for path in read]
+    if len(set(labels)) < len(labels):
+        raise InputError(f"tables of fields must differ in their names, or those of their folders: {', '.join(stems)}")
+    fields = {label: matches for label, (matches, _) in zip(labels, read.values(), strict=True)}
+    return legdistort.Matches.of_fields(fields), inputs
+
+
+def _read(path, a):
+    """The `Matches` in a table, and its inputs."""
+    table = read_given(path, a, column_contract.MATCHED)
+    known = legdistort.Matches.read_meta(table.meta)
+    known |= {"shape": tuple(a.shape)} if a.shape else {}
+    known |= {"camera": given_camera(a.camera)} if a.camera else {}
+    if known["camera"]:
+        refuse({"shape": a.shape}, "comes from the camera")
+    else:
+        refuse({"layout": a.layout}, "is for the detectors of a camera")
+        if known["shape"] is None:
+            raise InputError(f"{path} does not state the size of the detectors: give --shape NY NX")
+    return legdistort.Matches.from_table(table, **known), table.meta["inputs"]

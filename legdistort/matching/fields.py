@@ -1,0 +1,82 @@
+"""Fields: groups of exposures without a common star, which lie side by side on the reference plane."""
+
+from collections import Counter
+
+import numpy as np
+from astropy.table import vstack
+
+from ..exceptions import InputError, MatchError
+from ..geometry import similarity
+from ..inputs import exposure_names, start_poses
+
+_BY_NAME = {"shape": "shapes", "poses": "poses", "left_out": "left_out"}
+
+
+def estimated(seen):
+    """Poses by the positions of `Observations` alone, those of every field by itself, ``{exposure: (2, 3)}``."""
+    poses = {}
+    for number in range(seen.fields.max() + 1):
+        mine = seen.fields == number
+        rows, names = mine[seen.exposure], np.array(seen.names)[mine].tolist()
+        exposure, star = (np.unique(each[rows], return_inverse=True)[1] for each in (seen.exposure, seen.star))
+        found = start_poses.estimate_poses(exposure, star, seen.xy[rows], names=names)
+        poses |= dict(zip(names, found, strict=True))
+    return {name: poses[name] for name in seen.names}
+
+
+def side_by_side(seen, poses, shapes, sky):
+    """Poses with fields that overlap on the reference plane moved apart.
+
+    Raises
+    ------
+    MatchError
+        Where the plane is one of the sky.
+    """
+    names = list(seen.names)
+    moves = start_poses.moves_apart([poses[name] for name in names], [shapes[name] for name in names], seen.fields)
+    if not moves.any():
+        return poses
+    if sky is not None:
+        raise MatchError(
+            f"exposures overlap on the sky and have no star in common: {seen.groups_in_words}; match them anew, or "
+            "solve each group by itself"
+        )
+    shifts = [np.column_stack([np.eye(2), -move]) for move in moves[seen.fields]]
+    return {name: similarity.compose(poses[name], shift) for name, shift in zip(names, shifts, strict=True)}
+
+
+def joined(parts):
+    """The table of several `Matches`, ``{name of the field: Matches}``, and the other words of `Matches.from_table`.
+
+    The name of the field stands in front of names of exposures, or of stars, if several fields have some of them.
+
+    Raises
+    ------
+    InputError
+        For different cameras or errors of poses.
+    """
+    for label in parts:
+        exposure_names.check_exposure_name(label)
+    metas = [part.to_meta() for part in parts.values()]
+    same = {key: all(meta[key] == metas[0][key] for meta in metas) for key in ("camera", "pose_sigma", "sky")}
+    for key, cure in (("camera", "match them with the same one"), ("pose_sigma", "state the same, or none")):
+        if not same[key]:
+            raise InputError(f"fields {', '.join(parts)} differ in {key}: {cure}")
+    names = Counter(name for part in parts.values() for name in (*part.names, *part.left_out))
+    stars = Counter(str(star) for part in parts.values() for star in part.stars)
+    again = max(names.values()) > 1, max(stars.values()) > 1 or len({p.stars.dtype.kind for p in parts.values()}) > 1
+    tables, known = [], {key: {} for key in _BY_NAME}
+    for label, part in parts.items():
+        new = {name: f"{label}_{name}" if again[0] else name for name in (*part.names, *part.left_out)}
+        table = part.table.copy(copy_data=False)
+        table["exposure"] = [new[name] for name in table["exposure"]]
+        if again[1]:
+            table["star"] = [f"{label}_{star}" for star in table["star"]]
+        tables.append(table)
+        for key, attribute in _BY_NAME.items():
+            known[key] |= {new[name]: value for name, value in getattr(part, attribute).items()}
+    first = next(iter(parts.values()))
+    known |= {"pose_sigma": first.pose_sigma, "sky": first.sky if same["sky"] else None}
+    known |= {"camera": first.camera if first.camera.is_known else None}
+    known["header_distortion"] = next((p.header_distortion for p in parts.values() if p.header_distortion), None)
+    return vstack(tables, join_type="inner", metadata_conflicts="silent"), known
