@@ -80,6 +80,7 @@ def scatter(fit):
     good = np.isfinite(covariance).all(axis=(1, 2))
     gauge, state = fit.result.gauge, fit.result.state
     values = gauge.modes_at(state.positions.T[good])
+    values = values[np.any(values, axis=1)]  # those of fields with such stars
     n, m = int(np.count_nonzero(good)), 2 * len(values)
     if 2 * n <= m:
         raise SolveError(

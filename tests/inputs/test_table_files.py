@@ -268,7 +268,11 @@ SKY = ["ra", "dec", "ra_error", "dec_error", "ra_dec_corr", "ra_error_abs", "dec
 
 def test_stars_follow_the_virtual_observatory(solution):
     stars = solution.stars
-    names = column_contract.STARS.keys() - {"reference_used", "group", "field"}  # no reference was given, one detector, one field
+    names = column_contract.STARS.keys() - {
+        "reference_used",
+        "group",
+        "field",
+    }  # no reference was given, one detector, one field
     assert set(stars.colnames) == {*names, "sky"}
     for name in names:
         assert check_ucd(stars[name].info.meta["ucd"], check_controlled_vocabulary=True), name

@@ -201,6 +201,30 @@ def test_a_reference_ties_every_field():
         solved(data, prior=UNCERTAIN, reference=of_first)
 
 
+@pytest.mark.parametrize("motion", ["proper", "auto"])
+def test_a_field_of_one_date_beside_one_in_which_stars_move(motion):
+    data, truth = field_sets.drawn_fields(11, dynamic=0.1)
+    rng, first = np.random.default_rng(11), truth["exposure_field"] == 0
+    years = np.where(first, 2010.0 + 0.7 * np.arange(len(first)), 2013.5)
+    own = np.where((truth["field"] == 0)[:, None], 0.1, 0.0) * rng.normal(size=(len(truth["field"]), 2))
+    moved = own[data["star"]] * (years[data["exposure"]] - years[first].mean())[:, None]
+    turned = np.einsum("nab,nb->na", data["poses"][data["exposure"], :, :2], moved)
+    data |= {"xy": data["xy"] + turned, "epoch": years[data["exposure"]]}
+    solution = solved(data, prior=ld.Prior(truth["static"]), motion=motion, motion_epoch=years[first].mean())
+    assert abs(solution.chi2 / solution.dof - 1) < 0.15
+    weight = np.bincount(data["star"], data["err"][:, 0] ** -2.0)
+    xy, stated = columns_of(solution, "x", "y"), columns_of(solution, "x_err", "y_err")
+    for number in (0, 1):
+        mine = truth["field"] == number
+        left = without_map(xy[mine] - truth["stars"][mine], truth["stars"][mine], weight[mine])
+        assert 0.5 < np.sum(left**2) / np.sum(stated[mine] ** 2) < 1.6
+    mine = truth["field"] == 0
+    rates = columns_of(solution, "vx", "vy")
+    left = without_map(rates[mine] - own[mine], truth["stars"][mine], weight[mine])
+    assert 0.5 < np.sum(left**2) / np.sum(columns_of(solution, "vx_err", "vy_err")[mine] ** 2) < 1.6
+    assert not np.isfinite(rates[~mine]).any()
+
+
 def test_the_layout_of_a_camera_is_found_from_all_fields():
     parts, truth = {}, {}
     for k, label in enumerate("ab"):

@@ -10,6 +10,8 @@ from moving_stars import positions_at
 from legdistort.exceptions import AssumptionWarning
 from legdistort.inputs.table_files import read_table
 from legdistort.matching.matcher import match
+from legdistort.matching.matches import Matches
+from legdistort.priors.prior import Prior
 from legdistort.solving import estimation
 
 MAS = 9.95 * np.array([-1, 1])  # a pixel, x to the west
@@ -122,3 +124,27 @@ def test_positions_beyond_the_shape_are_left_out_by_name(shared_data):
     assert matches.table["x"][inside].value.max() < 1129
     solution = solve(matches.without(dict.fromkeys(matches.names[:4], "")), degree=2, motion="proper")
     assert "19apr17" in solution.names
+
+
+def test_beside_a_field_of_one_date(shared_data, epochs):
+    """Four lists of Orion BN/KL of one date by the same camera: known exactly, it tells nothing of OB150029 anew."""
+    lists = []
+    for path in sorted((shared_data / "keck_nirc2_onc_bn").glob("*.lis")):
+        table = read_table(path)
+        table["exposure"], table.meta = [path.stem] * len(table), {}
+        table["x_err"], table["y_err"] = (np.hypot(table[name], 0.02) for name in ("x_err", "y_err"))
+        lists.append(table)
+    orion = match(vstack(lists), shape=(1024, 1024), min_exposures=3)
+    known = {"prior": Prior(np.zeros((2, 6)), sigma=0.5), "degree": 2, "motion": "proper"}
+    alone, both = solve(epochs, **known), solve(Matches.of_fields({"ob": epochs, "orion": orion}), **known)
+    assert "seen at a single epoch" in str(both)
+    stars = {str(name): k for k, name in enumerate(both.stars["star"])}
+    rows = [stars[f"ob_{name}"] for name in alone.stars["star"]]
+    assert set(both.stars["field"][rows]) <= {0, 1}
+    good = np.isfinite(alone.stars["x"]) & np.isfinite(both.stars["x"][rows])
+    assert np.count_nonzero(good) > 0.97 * len(good)
+    for name, error in (("vx", "vx_err"), ("vy", "vy_err")):  # rates of shift, rotation and scale are not known
+        off = (both.stars[name][rows] - alone.stars[name]).value[good]
+        xy = np.stack([alone.stars["x"].value, alone.stars["y"].value, np.ones(len(good))], axis=1)[good]
+        off -= xy @ np.linalg.lstsq(xy, off, rcond=None)[0]
+        assert np.median(np.abs(off) / alone.stars[error].value[good]) < 0.1

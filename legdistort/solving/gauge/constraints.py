@@ -135,15 +135,23 @@ def _drifts(problem, motion, others, shared_shears, all_drifts):
         return np.zeros((problem.n_exposures, 2 * n, 0)), np.zeros((0, 0)), np.zeros((0, 0))
     lift = terms.lift(m)[:, :, 2 * m :].reshape(problem.n_exposures, 2 * m, terms.n, m)
     drifting = motion @ lift[:, :, free].reshape(problem.n_exposures, 2 * m, -1)
-    possible = np.eye(drifting.shape[2])
+    possible = np.eye(drifting.shape[2])[_changing(problem, free, m)]
     if problem.fixed is not None:
         moved = np.concatenate([rows @ each for rows, each in zip(problem.fixed, drifting, strict=True)])
-        possible = _null_space(moved, _SETTLED)
+        possible = _null_space(moved @ possible.T, _SETTLED) @ possible
     carried = _null_space((others @ drifting @ possible.T).reshape(-1, len(possible)), 1e-6) @ possible
     if shared_shears:
         return drifting, np.zeros((0, drifting.shape[2])), carried
     inside = complement(carried @ possible.T) @ possible
     return drifting, inside, carried
+
+
+def _changing(problem, free, m):
+    """Which maps (k m,) of k terms change from exposure to exposure: not those of a field of one date."""
+    field, columns = problem.fields, problem.terms.columns[:, :, free]
+    spread = [np.ptp(columns[field == number], axis=0).max(axis=0) for number in range(problem.n_fields)]
+    changes = np.stack(spread, axis=1) > _NOTHING
+    return np.repeat(changes[:, None], m // problem.n_fields, axis=1).ravel()
 
 
 def _without_rates(pointed, values, q, n_fields):
