@@ -1,6 +1,6 @@
 """Poses of exposures by the WCSs in their headers: tried first in matching, and always verified."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy import units as u
@@ -148,6 +148,32 @@ class HeaderPoses:
                 "the headers",
                 AssumptionWarning,
             )
+
+
+def sky_by_layout(matches, camera, poses):
+    """Where the reference plane lies on the sky, with detectors where they were found.
+
+    The plane is put on the sky by headers, which have the detectors elsewhere: those that agree on where count, one
+    that contradicts them does not.
+
+    Parameters
+    ----------
+    matches : Matches
+        With a sky, by headers.
+    camera : Camera
+        As it was found.
+    poses : ndarray, shape (n_exposures, 2, 3)
+
+    Returns
+    -------
+    `~legdistort.geometry.tangent_plane.TangentPlane`
+    """
+    before, after = matches.camera.headers, camera.headers
+    if before is None or after is None:
+        return matches.sky
+    back = similarity.compose(before.similarity, similarity.invert(after.similarity))
+    moves = [similarity.compose(similarity.invert(pose), similarity.compose(back, pose)) for pose in poses]
+    return replace(matches.sky, matrix=similarity.compose(matches.sky.matrix, np.mean(moves, axis=0)))
 
 
 def _grid(shape, n):

@@ -86,14 +86,18 @@ def nights(found):
 
 def detectors(camera):
     """One dict of numbers a detector: its place in the focal plane, with errors where it is not exact."""
-    out = []
+    out, headers, off = [], camera.headers, {}
+    if headers is not None:
+        off = dict(zip(headers.names, np.column_stack([headers.shifts, headers.rotations]).tolist(), strict=True))
     for key, each in camera.detectors.items() if camera.has_focal_plane else ():
         place = each.place
+        x_off, y_off, turned = off.get(key, (None, None, None))
         x_err, y_err, rotation_err = map(_plain, place.errors or (None, None, None))
         out.append(
             {
                 "name": key, "x_px": place.x, "y_px": place.y, "rotation_deg": place.rotation, "scale": place.scale,
                 "x_err_px": x_err, "y_err_px": y_err, "rotation_err_deg": rotation_err, "static_px": float(each.rms),
+                "header_x_off_px": x_off, "header_y_off_px": y_off, "header_turned_deg": turned,
             }
         )  # fmt: skip
     return out
