@@ -463,8 +463,9 @@ def _tell_lost_stars(fit):
     more = f" and {len(lost) - len(named)} more" * (len(lost) > len(named))
     warn(
         f"{len(lost)} star{'s have' if len(lost) > 1 else ' has'} no position, the observations contradict one another "
-        f"and there is no majority: {', '.join(named)}{more}; look whether they are matched rightly, or leave "
-        "them out; bright ones may have errors that are too small: errors='floor' (--errors floor)",
+        f"and there is no majority: {', '.join(named)}{more}; if a check names what displaces stars (motions, static "
+        "distortions, a layout), see to that first; else look whether they are matched rightly, or leave them out; "
+        "bright ones may have errors that are too small: errors='floor' (--errors floor)",
         AssumptionWarning,
     )
 

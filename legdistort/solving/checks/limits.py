@@ -13,6 +13,8 @@ NEGLIGIBLE = 0.05
 GROSS_ERRORS = 0.05
 #: Errors of a star: a pattern, or a bend, of so much must show, else the question is open.
 SEEN = 3.0
+#: What is said of exposures left out that agree with others of their night.
+ALIKE = "has another distortion"
 #: Names in a sentence.
 MOST_NAMED = 6
 _SURELY = special.ndtri(0.95)

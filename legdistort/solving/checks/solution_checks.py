@@ -16,10 +16,10 @@ from ...exceptions import some_of
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from .camera_check import camera_check, contradicted_layout, undetermined
-from .cures import with_cures
+from .cures import with_cures, without_static
 from .dynamic_check import dynamic_check, significance
 from .known_effects import Observed
-from .limits import GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
+from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
 from .reference_check import reference_check
 from .residual_tests import Residuals
@@ -397,6 +397,11 @@ def rejection_check(solution):
     if lost:
         number = f"{len(lost)} exposures were" if len(lost) > 1 else "one exposure was"
         words += f"; {number} left out: " + "; ".join(f"{k} ({v})" for k, v in list(lost.items())[:3])
+        words += f"; and {len(lost) - 3} more" * (len(lost) > 3)
+    if any(ALIKE in why for why in lost.values()):
+        own = "one distortion is not that of all nights: "
+        cure = f"{own}{without_static(solution)}" if solution.settings.static == "fit" else f"{own}raise --degree"
+        return Check("rejection", "warn", share, GROSS_ERRORS, words, cure)
     if p < FALSE_ALARM:
         return Check("rejection", "fail" if share > 0.3 else "warn", share, GROSS_ERRORS, words,
                      "mismatches or blends: look at the exposures with most of them, or match with a smaller radius"
