@@ -26,17 +26,22 @@ class Night:
         Standard deviations of what headers have wrong of the place [pix] and of the rotation [degrees] of detectors.
     dither : float
         Largest dither along an axis [pix].
+    odd : tuple of float
+        What the headers of detector 3 have wrong beside that: x, y [pix] and rotation [degrees].
     rolls : sequence of float
         Position angles of the exposures one after the other, degrees.
     sigma : float
         Of the positions [pix].
     """
 
-    def __init__(self, seed, *, off=2.5, turn=0.0, dither=80.0, n=9, n_stars=450, rolls=(0.0,), sigma=0.01, size=0.3):
+    def __init__(self, seed, *, off=2.5, turn=0.0, dither=80.0, n=9, n_stars=450, rolls=(0.0,), sigma=0.01, size=0.3,
+                 odd=(0.0, 0.0, 0.0)):  # fmt: skip
         rng = np.random.default_rng(seed)
         self.sky = rng.uniform(-60, 2 * MIDDLE + 60, (n_stars, 2))
         flux = 10 ** rng.uniform(3.5, 5.5, n_stars)
         self.wrong = rng.normal(0, off, (4, 2)), rng.normal(0, turn, 4)
+        self.wrong[0][2] += odd[:2]
+        self.wrong[1][2] += odd[2]
         self.places = np.array([_place(corner, np.zeros(2), 0.0) for corner in CORNERS])
         self.stated = np.array([_place(c, *w) for c, *w in zip(CORNERS, *self.wrong, strict=True)])
         rows, self.exposures, self.focal, self.flux = [], [], [], flux

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as stored
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,8 @@ from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, keyed
 from . import storage
 from .detector import Detector
-from .from_wcs import camera_of
+from .from_wcs import camera_of, layouts_of
+from .header_layout import HeaderLayout, compare_headers
 from .source import check_shape
 
 if TYPE_CHECKING:
@@ -378,10 +380,27 @@ class Camera(ShownAsPrinted):
         exposures : list of Exposure
             Of the same camera, with `exposure` and `detector`.
         """
-        parts = {}
-        for exposure in exposures:
-            parts.setdefault(exposure.exposure, []).append(exposure)
-        return cls.from_exposures(max(parts.values(), key=len))
+        return cls.from_exposures(_fullest(exposures))
+
+    def with_headers(self, exposures: Sequence[Exposure]) -> Camera:
+        """The camera with the `header_layout` of its detectors by that of several exposures which has most of them.
+
+        Parameters
+        ----------
+        exposures : list of Exposure
+            Of detectors of this camera, with `exposure` and `detector`. Those without a WCS state nothing.
+        """
+        named = {each.detector: each for each in _fullest([each for each in exposures if each.wcs is not None])}
+        stated = layouts_of(named) if len(named) > 1 and self.has_focal_plane else {}
+        layouts = {key: stated[key][1] if key in stated else None for key in self.detectors}
+        return replace(
+            self, detectors={k: replace(each, header_layout=layouts[k]) for k, each in self.detectors.items()}
+        )
+
+    @cached_property
+    def headers(self) -> HeaderLayout | None:
+        """Whether headers have the detectors where they lie (`legdistort.cameras.header_layout`); None without any."""
+        return compare_headers(self) if self.has_focal_plane else None
 
     @classmethod
     def from_exposures(
@@ -436,6 +455,14 @@ class Camera(ShownAsPrinted):
             Naming the file: if it is no camera, or damaged.
         """
         return storage.read_camera(path, cls)
+
+
+def _fullest(exposures):
+    """The detectors of the exposure that has most, of a list of `Exposure`; empty of none."""
+    parts = {}
+    for exposure in exposures:
+        parts.setdefault(exposure.exposure, []).append(exposure)
+    return max(parts.values(), key=len, default=[])
 
 
 def _common(sigma):

@@ -82,6 +82,9 @@ class Detector(ShownAsPrinted):
     layout_covariance : array_like, shape (6, 6), optional
         Covariance of the modes of `layout_sigma`, those of x first, instead of it, px^2. It is for the errors of
         `place`: as a prior they count as independent.
+    header_layout : array_like, shape (2, 3), optional
+        The layout as headers have it, in a plane of theirs that is the same for all detectors: it is compared with the
+        layout, and what solves leaves it alone.
 
     Raises
     ------
@@ -112,12 +115,11 @@ class Detector(ShownAsPrinted):
     layout_covariance: np.ndarray | None = field(
         default=None, metadata=array(6, 6, unit="pix2", covariance=True, infinite=True)
     )
+    header_layout: np.ndarray | None = field(default=None, metadata=array(2, 3, unit="pix", invertible=True))
 
     def __post_init__(self) -> None:
         shape = check_shape(self.shape)
-        layout = np.array(self.layout, dtype=float)
-        if layout.shape != (2, 3) or not np.isfinite(layout).all() or np.linalg.det(layout[:, :2]) == 0:
-            raise InputError(f"layout must be a finite (2, 3) array [M | t] with an area, got {self.layout!r}")
+        layout = _affine(self.layout, "layout")
         static, sigma = self.static, self.static_sigma
         if hasattr(static, "static_sigma"):
             if static.shape not in (None, shape):
@@ -127,6 +129,7 @@ class Detector(ShownAsPrinted):
         if not np.array_equal(layout, np.eye(2, 3)):
             static, layout = _split(static, shape, layout)
         given = {"shape": shape, "layout": layout, "static": static}
+        given["header_layout"] = None if self.header_layout is None else _affine(self.header_layout, "header_layout")
         covariance = _covariance(self.layout_covariance)
         widths = self.layout_sigma if covariance is None else np.sqrt(np.diag(covariance)).reshape(2, 3)
         given["layout_sigma"], given["layout_covariance"] = _widths(widths, 3, "layout_sigma"), covariance
@@ -218,6 +221,14 @@ class Detector(ShownAsPrinted):
 
     def __repr__(self) -> str:
         return f"<Detector: {self.shape[1]} x {self.shape[0]} px, static distortion {self.rms:.3g} px rms>"
+
+
+def _affine(value, name):
+    """An affine map (2, 3)."""
+    out = np.array(value, dtype=float)
+    if out.shape != (2, 3) or not np.isfinite(out).all() or np.linalg.det(out[:, :2]) == 0:
+        raise InputError(f"{name} must be a finite (2, 3) array [M | t] with an area, got {value!r}")
+    return out
 
 
 def _covariance(value):

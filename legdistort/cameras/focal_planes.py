@@ -64,10 +64,14 @@ def focal_planes(camera, exposures):
 
 
 def _wcs(camera, parts):
-    """The linear WCS of the focal plane that fits those of its detectors best, or None if they have none."""
-    places, sky = [], []
-    for part in parts:
-        if part.wcs is not None:
+    """The linear WCS of the focal plane that fits those of its detectors best, or None if they have none.
+
+    A detector whose header contradicts those of the others has no part in it.
+    """
+    places, sky, odd = [], [], () if camera.headers is None else camera.headers.odd
+    known = [part for part in parts if part.wcs is not None]
+    for part in known:
+        if part.detector not in odd or all(each.detector in odd for each in known):
             xy = basis.denormalize(*(a.ravel() for a in np.meshgrid(_GRID, _GRID)), part.shape)
             places.append(camera[part.detector].to_focal_plane(xy))
             sky.append(to_icrs(part.wcs, xy))

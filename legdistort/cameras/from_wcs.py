@@ -29,17 +29,23 @@ def camera_of(kind, exposures, name=None):
         if exposure.wcs is None:
             raise InputError(f"{exposure.name} (detector {key}) has no celestial WCS, or none that is plausible")
     first = next(iter(named.values()))
+    sigma = np.inf if len(named) > 1 else None  # headers are rarely better than a pixel
+    detectors = {}
+    for key, (static, layout) in layouts_of(named).items():
+        stated = layout if len(named) > 1 else None
+        known = {"static": static, "layout_sigma": sigma, "header_layout": stated}
+        detectors[key] = Detector(named[key].shape, layout=layout, **known)
+    return kind(name or str(first.header.get("INSTRUME", "camera")).strip() or "camera", detectors)
+
+
+def layouts_of(named):
+    """Static distortion and layout, in one focal plane, of ``{detector: exposure}`` of one exposure, by their WCSs."""
     middles = [to_icrs(each.wcs, basis.denormalize(*np.zeros((2, 1)), each.shape))[:, 0] for each in named.values()]
     lon, lat = np.radians(middles).T
     centre = np.degrees(tangent_plane.angles(tangent_plane.directions(lon, lat).mean(axis=0)))
     found = {key: _expanded(each, centre) for key, each in named.items()}
     plane = _focal_plane([pose for _, pose in found.values()])
-    sigma = np.inf if len(found) > 1 else None  # headers are rarely better than a pixel
-    detectors = {
-        key: Detector(named[key].shape, layout=similarity.compose(pose, plane), static=static, layout_sigma=sigma)
-        for key, (static, pose) in found.items()
-    }
-    return kind(name or str(first.header.get("INSTRUME", "camera")).strip() or "camera", detectors)
+    return {key: (static, similarity.compose(pose, plane)) for key, (static, pose) in found.items()}
 
 
 def _by_detector(exposures):

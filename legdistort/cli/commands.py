@@ -16,6 +16,7 @@ from ..coaddition.mosaic import check_ending
 from ..coaddition.options import CoaddOptions
 from ..exceptions import InputError
 from ..inputs import column_contract
+from ..inputs.detector_files import warn_of_detectors
 from ..inputs.exposure_names import detector_name
 from ..inputs.star_lists.formats import stack
 from ..inputs.table_files import named_after, write_stars
@@ -165,6 +166,8 @@ def do_match(a):
         exposures = camera.of_detectors(exposures) if camera else exposures
     elif (exposures := measured_frames(read)) is not None:
         refuse({"shape": a.shape}, "comes from the frames")
+    elif camera is None:
+        warn_of_detectors(names)
     known |= {"exposures": exposures, "progress": wants_progress(a)}
     with timed({}, "match"):
         matches = legdistort.match(stack(tables), **known, **given(a, options.MATCHING))
@@ -350,11 +353,8 @@ def do_stars(a):
     """``legdistort stars``."""
     solution = _solution(a)
     write_stars(solution, a.out, epoch=a.epoch, overwrite=a.overwrite)
-    _say(
-        a,
-        f"{len(solution.estimate.star_names)} stars in {a.out}",
-        {"n_stars": len(solution.estimate.star_names), "out": str(a.out)},
-    )
+    n_stars = len(solution.estimate.star_names)
+    _say(a, f"{n_stars} stars in {a.out}", {"n_stars": n_stars, "out": str(a.out)})
 
 
 def do_correct(a):

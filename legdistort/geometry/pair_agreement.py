@@ -95,8 +95,21 @@ def _pairs(exposure, star, order):
 
 def _n_near(source, target):
     """Number of `target` positions (n, 2) near where a robust affine map carries the `source`."""
+    reach = REACH * np.median(np.hypot(*(target - np.median(target, axis=0)).T))
+    return int(np.count_nonzero(affine_distances(source, target, least=1e-3 * reach) <= reach))
+
+
+def affine_distances(source, target, least=0.0):
+    """Distances (n,) of `target` positions (n, 2) from where a robust affine map carries the `source`.
+
+    Parameters
+    ----------
+    source, target : ndarray, shape (n, 2)
+        Pixels.
+    least : float
+        Median distance that is small enough.
+    """
     middle = np.median(target, axis=0)
-    reach = REACH * np.median(np.hypot(*(target - middle).T))
     size = np.ptp(source, axis=0).max() or 1.0
     columns = np.column_stack([np.ones(len(source)), (source - source.mean(axis=0)) / size])
     weight = np.ones(len(source))
@@ -105,10 +118,10 @@ def _n_near(source, target):
         found = np.linalg.lstsq(root * columns, root * (target - middle), rcond=None)[0]
         off2 = ((columns @ found - (target - middle)) ** 2).sum(axis=1)
         scale2 = np.median(off2)
-        if scale2 < 1e-6 * reach**2:
+        if scale2 <= least**2:
             break
         weight = 1 / (1 + off2 / scale2)
-    return int(np.count_nonzero(off2 <= reach**2))
+    return np.sqrt(off2)
 
 
 def _verdict(agree, contradict):

@@ -9,7 +9,7 @@ import logging
 import re
 from dataclasses import replace
 
-from ..exceptions import InputError
+from ..exceptions import AssumptionWarning, InputError, some_of, warn
 from ..geometry import epochs
 from .exposure_names import detector_name
 from .file_images import KEYWORDS
@@ -18,6 +18,10 @@ log = logging.getLogger(__name__)
 
 #: Keywords of the detector of a file, in order of preference; extensions of single files all have one ``EXTVER``.
 _OF_FILES = ("CCDCHIP", "DETECTOR", "CHIP", "CCDNUM", "DET-ID")
+#: Detectors as names of files have them: NIRCam, NIRSpec, Roman, and those that count chips.
+_IN_NAME = re.compile(
+    r"(?<![A-Za-z0-9])(nrc[ab](?:[1-4]|long)|nrs[12]|wfi\d\d|(?:chip|ccd|det|sca)\d{1,3})(?![A-Za-z0-9])", re.IGNORECASE
+)
 #: Years between the beginnings of what counts as one exposure: 2 s by name, a minute by the time alone.
 _APART, _SAME_TIME = 60 / 3.156e7, 2 / 3.156e7
 
@@ -92,6 +96,38 @@ def without_id(name, key):
     """Name of a file without the id of a detector in it; None where it does not have it, or nothing else."""
     whole = re.sub(rf"[-_.]?(?<![A-Za-z0-9]){re.escape(key)}(?![A-Za-z0-9])", "", name, flags=re.IGNORECASE)
     return None if whole in ("", name) else whole
+
+
+def named_detectors(names):
+    """Detectors that names of files have in them, and the names without these, of several of the same exposures.
+
+    Parameters
+    ----------
+    names : list of str
+
+    Returns
+    -------
+    keys, whole : list of str
+        Sorted, each once; empty unless every name has one, and two at least are the same without it.
+    """
+    found = [_IN_NAME.search(name) for name in names]
+    if not all(found):
+        return [], []
+    keys = {match[1].lower() for match in found}
+    whole = {without_id(name, match[1]) for name, match in zip(names, found, strict=True)} - {None}
+    return (sorted(keys), sorted(whole)) if len(keys) > 1 and len(whole) < len(names) else ([], [])
+
+
+def warn_of_detectors(names):
+    """Warn where names of exposures are of several detectors of the same (`named_detectors`), and nothing else is."""
+    keys, whole = named_detectors(names)
+    if keys:
+        warn(
+            f"by their names these are {len(keys)} detectors ({some_of(keys, 6)}) of {len(whole)} exposures, and they "
+            f"are taken for {len(names)} exposures of one detector: give the frames that they were measured in, --wcs "
+            "FRAMES, whose headers tell detectors apart",
+            AssumptionWarning,
+        )
 
 
 def label_of(name, header, labels, *, exact):

@@ -49,6 +49,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: Ending of a frame before which its weight map has `.weight`.
+_WEIGHT_MAP = re.compile(r"(?<!\.weight)\.(fits?|fts)$", re.IGNORECASE)
+
 _FILTERS = threading.Lock()  # warning filters belong to the process, not to the thread that changes them
 _NO_FRAME = "tables of positions go to match(table) (legdistort match)"
 
@@ -359,7 +362,20 @@ def expand_paths(paths):
             sources.append(source)
     if not sources:
         raise InputError("no exposures to read: paths is empty")
+    _tell_weight_maps(sources)
     return sources
+
+
+def _tell_weight_maps(sources):
+    """Say of weight maps beside frames, as SWarp and SExtractor have them, that they are not read."""
+    beside = [_WEIGHT_MAP.sub(r".weight.\1", str(path)) for path in sources if isinstance(path, (str, Path))]
+    found = [path for path in beside if ".weight." in path and Path(path).exists()]
+    if found:
+        log.warning(
+            "weight maps are not read (%s): pixels without weight count as good ones; set them to NaN in the frames, "
+            "or give these an extension DQ",
+            some_of([Path(path).name for path in found], 3),
+        )
 
 
 def _parts(sources, ext):

@@ -174,6 +174,32 @@ def _is_number(value):
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def sky_by_layout(matches, camera, poses):
+    """Where the reference plane lies on the sky, with detectors where they were found.
+
+    The plane is put on the sky by headers, which have the detectors elsewhere: those that agree on where count, one
+    that contradicts them does not.
+
+    Parameters
+    ----------
+    matches : Matches
+        With a sky, by headers.
+    camera : Camera
+        As it was found.
+    poses : ndarray, shape (n_exposures, 2, 3)
+
+    Returns
+    -------
+    `~legdistort.geometry.tangent_plane.TangentPlane`
+    """
+    before, after = matches.camera.headers, camera.headers
+    if before is None or after is None:
+        return matches.sky
+    back = similarity.compose(before.similarity, similarity.invert(after.similarity))
+    moves = [similarity.compose(similarity.invert(pose), similarity.compose(back, pose)) for pose in poses]
+    return replace(matches.sky, matrix=similarity.compose(matches.sky.matrix, np.mean(moves, axis=0)))
+
+
 def _grid(shape, n):
     """Pixels of an n x n grid from edge to edge (the centre for n = 1), shape (n*n, 2)."""
     x, y = (np.linspace(0, size - 1, n) if n > 1 else np.array([(size - 1) / 2]) for size in shape[::-1])

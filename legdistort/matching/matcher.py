@@ -155,6 +155,8 @@ def match(
         if any(exposure.detector is not None for exposure in exposures or ()):
             camera = Camera.of_frames(exposures)
             log.info("layout of the detectors by the headers: %s", camera)
+    elif any(exposure.detector is not None for exposure in exposures or ()):
+        camera = camera.with_headers(exposures)
     if camera is not None:
         table = in_focal_plane(table, camera)
         shape = camera.field

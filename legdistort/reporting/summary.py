@@ -10,7 +10,7 @@ from ..inputs import column_contract
 from ..results import accuracy, in_tables
 from ..runtime import provenance
 from ..runtime.trees.codec import to_tree
-from .tables import exposure_rms, sizes
+from .tables import departures, exposure_rms, rms_length, sizes
 
 
 def summarise(solution, *, timings=None):
@@ -37,7 +37,7 @@ def summarise(solution, *, timings=None):
         "folded": in_tables.folds(solution),
         "left_out": dict(solution.left_out),
         "exposures": (each := exposures(solution)),
-        "nights": nights(each),
+        "nights": nights(solution, each),
         "detectors": detectors(solution.camera),
         "command": provenance.command_line(),
         **found.summary(),
@@ -67,9 +67,13 @@ def exposures(solution):
     return out
 
 
-def nights(found):
-    """One dict of numbers a night, or other block, of what `exposures` gives: these, and the mean of their figures."""
-    of = {}
+def nights(solution, found):
+    """One dict of numbers a night, or other block, of what `exposures` gives: these, and the mean of their figures.
+
+    `common_px` is the size of their mean departure from the static distortion, `common_err_px` that of its standard
+    error, by how they scatter about it; None of one exposure.
+    """
+    of, departing = {}, departures(solution)
     for each in found:
         of.setdefault(each["block"], []).append(each)
     return [
@@ -79,21 +83,33 @@ def nights(found):
             "epoch_yr": _mean(each["epoch_yr"] for each in mine),
             "rms_px": _rms(each[key] for each in mine for key in ("rms_x_px", "rms_y_px")),
             "dynamic_px": _rms(each["dynamic_px"] for each in mine),
+            **_in_common(departing[[each["block"] == block for each in found]]),
         }
         for block, mine in sorted(of.items())
     ]
 
 
+def _in_common(departing):
+    """Size of the mean of departures (n, 2, n_modes), and of its standard error."""
+    n = len(departing)
+    error = rms_length(departing.std(axis=0, ddof=1)) / np.sqrt(n) if n > 1 else None
+    return {"common_px": float(rms_length(departing.mean(axis=0))), "common_err_px": _plain(error)}
+
+
 def detectors(camera):
     """One dict of numbers a detector: its place in the focal plane, with errors where it is not exact."""
-    out = []
+    out, headers, off = [], camera.headers, {}
+    if headers is not None:
+        off = dict(zip(headers.names, np.column_stack([headers.shifts, headers.rotations]).tolist(), strict=True))
     for key, each in camera.detectors.items() if camera.has_focal_plane else ():
         place = each.place
+        x_off, y_off, turned = off.get(key, (None, None, None))
         x_err, y_err, rotation_err = map(_plain, place.errors or (None, None, None))
         out.append(
             {
                 "name": key, "x_px": place.x, "y_px": place.y, "rotation_deg": place.rotation, "scale": place.scale,
                 "x_err_px": x_err, "y_err_px": y_err, "rotation_err_deg": rotation_err, "static_px": float(each.rms),
+                "header_x_off_px": x_off, "header_y_off_px": y_off, "header_turned_deg": turned,
             }
         )  # fmt: skip
     return out

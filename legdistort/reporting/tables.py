@@ -98,7 +98,7 @@ def exposures_table(solution, shapes=None):
             cells += [_number(fwhm, 2), _number(ratio, 2), _number(angle, 0)]
             high += (len(cells) - 2,) if ratio > TRAILED else ()
         rows.append(Row(cells, high, exposure=i))
-    reference = "static distortion" if np.any(solution.estimate.prior_mean) else "mean of the exposures"
+    reference = "static distortion" if np.any(solution.estimate.prior_mean) else "median of the exposures"
     return Table(
         head,
         rows,
@@ -172,11 +172,21 @@ def sizes(solution):
 
     The basis is orthonormal on a square of area 4: the mean square is the sum of squared coefficients over 4.
     """
+    return [rms_length(part) for part in (solution.coefficients, departures(solution))]
+
+
+def departures(solution):
+    """Dynamic parts (n_exposures, 2, n_modes): from the static distortion, without one from the median exposure.
+
+    The median: one night that is odd is not in what all others depart from.
+    """
     static = solution.estimate.prior_mean
-    if not np.any(static):
-        static = np.mean(solution.coefficients, axis=0)
-    parts = solution.coefficients, solution.coefficients - static
-    return [np.sqrt(np.sum(part[:, :, 1:] ** 2, axis=(1, 2))) / 2 for part in parts]
+    return solution.coefficients - (static if np.any(static) else np.median(solution.coefficients, axis=0))
+
+
+def rms_length(coefficients):
+    """Rms length (...) over the detector of displacements (..., 2, n_modes) without the constant mode, pixels."""
+    return np.sqrt(np.sum(coefficients[..., 1:] ** 2, axis=(-2, -1))) / 2
 
 
 def _with_error(value, digits, error):

@@ -141,6 +141,8 @@ def sky_sentence(solution):
         return "not known: no WCS in the headers that proved right, no reference catalogue with ra, dec"
     source = {"exposures": "from the headers", "reference": "from the reference"}.get(solution.diagnostics.sky, "")
     tied = ", tied to the reference" if source and solution.gauge.tie is not None and "head" in source else ""
+    if "head" in source and not tied and solution.camera.headers is not None and (odd := solution.camera.headers.odd):
+        source += f" of all detectors but {', '.join(odd)}"
     words = f"tangent point {sky.lon:.6f} {sky.lat:+.6f} deg, {sky.pixel_scale:.5g} arcsec/px"
     return f"{words}{', ' * bool(source)}{source}{tied}"
 

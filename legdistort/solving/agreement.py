@@ -9,9 +9,13 @@ import numpy as np
 from ..exceptions import SolveError, some_of
 from ..geometry import pair_agreement
 from . import start_values
+from .checks.limits import ALIKE
 
 #: Exposures that must agree before others are left out for their sake.
 FEWEST = 3
+#: Exposures of a night agree that lie by less than this part as far from one another as from the others; of these so
+#: many are looked at, and pairs that share so many stars.
+_NEARER, _PARTNERS, _FEWEST_SHARED = 1 / 3, 8, 10
 
 
 def astray(problem):
@@ -44,10 +48,40 @@ def unfollowed(problem, good):
         n = problem.start[i + 1] - problem.start[i]
         n_off = n - np.count_nonzero(good[problem.part(i)])
         if n_off == n or pair_agreement.beyond_chance(n_off, n):
-            out[name] = (
-                f"{n_off} of its {n} stars deviate from the solution of the others (mismatched, or not this field?)"
+            out[name] = f"{n_off} of its {n} stars deviate from the solution of the others"
+    alike = _alike(problem, [problem.names.index(name) for name in out]) if len(out) > 1 else {}
+    return {name: f"{why} {alike.get(name, '(mismatched, or not this field?)')}" for name, why in out.items()}
+
+
+def _alike(problem, odd):
+    """What is to be said of exposures that agree with others of their night, and not with all the rest, by name.
+
+    Parameters
+    ----------
+    problem : Problem
+    odd : list of int
+        Exposures that the fit cannot follow.
+    """
+    night, rest, out = np.broadcast_to(problem.night, problem.n_exposures), range(problem.n_exposures), {}
+    rest = [k for k in rest if k not in odd]
+    for i in odd:
+        own = [_distance(problem, i, k) for k in odd if k != i and night[k] == night[i]]
+        others = [_distance(problem, i, k) for k in rest[:: len(rest) // _PARTNERS + 1]]
+        if own and np.median(own) < _NEARER * np.median(others):
+            out[problem.names[i]] = (
+                f"in the same way as those of {len(own)} more of its night, with which it agrees to "
+                f"{np.median(own):.2g} px: this night {ALIKE}"
             )
     return out
+
+
+def _distance(problem, i, k):
+    """Median distance [pix] of the stars that two exposures share once one is laid on the other; infinite for few."""
+    a, b = problem.part(i), problem.part(k)
+    _, mine, other = np.intersect1d(problem.star[a], problem.star[b], return_indices=True)
+    if len(mine) < _FEWEST_SHARED:
+        return np.inf
+    return float(np.median(pair_agreement.affine_distances(problem.xy.T[a][mine], problem.xy.T[b][other])))
 
 
 def starved(problem, used):

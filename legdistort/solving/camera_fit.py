@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..cameras.detector import Detector, affine_of
-from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, warn
+from ..cameras.detector import affine_of
+from ..exceptions import AssumptionWarning, ConvergenceWarning, InputError, LegdistortError, SolveError, warn
 from ..geometry import basis, similarity
 from ..results.errors.camera_errors import CameraErrors, Departure, moved_by, unit_errors
 from ..results.new_positions import widened_all
@@ -163,16 +163,47 @@ class CameraFit:
         self.sought, self.step, self._departure = sought, None, np.zeros(sought.free.shape)
         self.join = join or (lambda fit: fit)
 
-    def settle(self, matches, estimate):
-        """Matches with the camera with which `estimate`, ``estimate(matches)``, gives a fit that calls for no other."""
+    def settle(self, matches, estimate, *, layout_alone=False):
+        """Matches with the camera with which `estimate`, ``estimate(matches)``, gives a fit that calls for no other.
+
+        With its `layout_alone`, of which nothing is known, for a beginning: where that is wrong by tens of pixels,
+        static distortions, and maps that only widths determine, would take up what is of it, and lead astray.
+        """
+        sought = self.sought
+        if layout_alone:
+            free = sought.free & (np.arange(sought.free.shape[2]) < 3)
+            if not free.any() or (np.array_equal(free, sought.free) and np.isinf(sought.prior[free]).all()):
+                return matches
+            sought = Sought(free, np.full(free.shape, np.inf))
         for _ in range(_STEPS):
             fit = self.join(estimate(matches))
-            self.step = camera_step(fit, self.sought, self._departure)
+            self.step = camera_step(fit, sought, self._departure)
             self._departure = self._departure + self.step.change
-            matches = in_camera(fit.matches, changed(fit.matches.camera, self.step.change))
+            try:
+                matches = in_camera(fit.matches, changed(fit.matches.camera, self.step.change))
+            except LegdistortError as error:  # it folds, or detectors leave the focal plane
+                raise SolveError(self._astray(matches, estimate, sought, error)) from None
             if self.step.length < _SMALL:
                 break
         return matches
+
+    def _astray(self, matches, estimate, sought, error):
+        """What is wrong, and what to do, where the camera that was found is none."""
+        camera = matches.camera
+        why = str(error).partition(";")[0]
+        words = f"no static distortions of the detectors of camera {camera.name} agree with the stars ({why})"
+        if sought.free[:, :, :3].any() or len(camera.detectors) < 2:
+            return f"{words}; lower the degree, or give a camera that is nearer to the right one (camera=, --camera)"
+        free = np.broadcast_to(np.arange(sought.free.shape[2]) < 3, sought.free.shape)
+        found = CameraFit(Sought(free, np.full(free.shape, np.inf)), self.join).settle(matches, estimate).camera
+        beside = {k: replace(each, header_layout=camera[k].layout) for k, each in found.detectors.items()}
+        layout = replace(found, detectors=beside).headers
+        odd = [f"{layout.names[k]} lies {np.hypot(*layout.shifts[k]):.0f} px" for k in np.flatnonzero(~layout.agree)]
+        odd = f"detector {', '.join(odd)}" if odd else f"detectors lie up to {layout.scatter:.2g} px"
+        return (
+            f"{words}: the layout was taken as exact, and the stars contradict it: {odd} from where it has it; give "
+            "layout='fit' (--layout fit), which finds it"
+        )
 
     def finished(self, fit):
         """The fit with the settled camera, with the errors of that: in the camera, and in those of the stars.
@@ -410,9 +441,8 @@ def changed(camera, change):
         low = affine_of(change[k, :, :3], each.shape)
         static = basis.change_degree(each.static, top) + basis.change_degree(change[k], top)
         static[:, :3] = 0.0  # the layout, which moves the static distortion along
-        known = {"layout_sigma": each.layout_sigma, "layout_covariance": each.layout_covariance}
         layout = similarity.compose(low, each.layout)
-        detectors[key] = Detector(each.shape, layout=layout, static=static, static_sigma=_widened(each, top), **known)
+        detectors[key] = replace(each, layout=layout, static=static, static_sigma=_widened(each, top))
     return replace(camera, detectors=detectors)
 
 
@@ -444,8 +474,7 @@ def with_errors(camera, step, unknown):
         top = max(basis.degree_of(free.shape[2]), basis.degree_of(each.static.shape[1]))
         widths = basis.change_degree(np.where(np.arange(free.shape[2]) < 3, 0.0, errors[k]), top)
         static = basis.change_degree(each.static, top)
-        known = {"layout_covariance": covariance, "static": static, "static_sigma": widths}
-        detectors[key] = Detector(each.shape, layout=each.layout, **known)
+        detectors[key] = replace(each, layout_covariance=covariance, static=static, static_sigma=widths)
     return replace(camera, detectors=detectors)
 
 

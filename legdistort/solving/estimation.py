@@ -13,6 +13,7 @@ import numpy as np
 
 from ..cameras.exchanged import check_places
 from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, MatchError, some_of, warn
+from ..matching.header_poses import sky_by_layout
 from ..matching.matches import Matches
 from ..priors.prior import Prior, has_distortion
 from ..results.diagnostics import Diagnostics
@@ -246,6 +247,7 @@ def solve(
         diagnostics = replace(_diagnostics(fit, prior, scale), **chosen)
         if catalogue is not None:
             fit = reference_tie.tie_to(fit, catalogue, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
+        fit = fit if sought is None or catalogue is not None else _on_headers(fit, given)
     epoch = given.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
@@ -366,7 +368,8 @@ def _fitted(matches, options, sought, join):
     """The fit, its options, and what was chosen and found for the `Diagnostics`; with the camera that is `sought`."""
     camera, selection = None if sought is None else CameraFit(sought, join), None
     if camera is not None:  # to a layout that is wrong by pixels all observations seem to deviate
-        matches = camera.settle(matches, partial(single_fit.estimate, options=_plain(options)))
+        plain = partial(single_fit.estimate, options=_plain(options))
+        matches = camera.settle(camera.settle(matches, plain, layout_alone=True), plain)
     if options.chooses_degree:
         selection = _choose_degree(
             replace(matches, pose_sigma=None), options
@@ -378,6 +381,14 @@ def _fitted(matches, options, sought, join):
     fit, errors_found = _estimate(matches, options)
     fit = fit if camera is None else camera.finished(fit)
     return fit, options, {"selection": selection, "motion_scatter": scatter, **errors_found}
+
+
+def _on_headers(fit, matches):
+    """The fit of a camera with the sky of the headers that have its detectors where they were found."""
+    if matches.sky is None:
+        return fit
+    sky = sky_by_layout(matches, fit.matches.camera, fit.result.state.poses)
+    return replace(fit, matches=replace(fit.matches, sky=sky))
 
 
 def _plain(options):
@@ -467,8 +478,9 @@ def _tell_lost_stars(fit):
     more = f" and {len(lost) - len(named)} more" * (len(lost) > len(named))
     warn(
         f"{len(lost)} star{'s have' if len(lost) > 1 else ' has'} no position, the observations contradict one another "
-        f"and there is no majority: {', '.join(named)}{more}; look whether they are matched rightly, or leave "
-        "them out; bright ones may have errors that are too small: errors='floor' (--errors floor)",
+        f"and there is no majority: {', '.join(named)}{more}; if a check names what displaces stars (motions, static "
+        "distortions, a layout), see to that first; else look whether they are matched rightly, or leave them out; "
+        "bright ones may have errors that are too small: errors='floor' (--errors floor)",
         AssumptionWarning,
     )
 

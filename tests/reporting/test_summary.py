@@ -1,6 +1,7 @@
 """The figures of a solution, against its tables."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -58,6 +59,21 @@ def test_every_exposure_is_in_figures():
     assert [night["exposures"] for night in found["nights"]] == [[f"n{i}e0", f"n{i}e1"] for i in range(3)]
     assert [night["block"] for night in found["nights"]] == [0, 1, 2]
     assert found["detectors"] == []
+
+
+def test_a_night_has_what_its_exposures_have_in_common():
+    """One night is 3 px off a mode: that is its figure, and none of the others have a part of it."""
+    table = Nights(2, nights=7, per=3, n_stars=120, odd=3.0, roll=0.0).table
+    solution = solve(Matches.from_table(table, shape=(1024, 1024)), degree=3)
+    nights = _valid(summarise(solution))["nights"]
+    common = np.array([night["common_px"] for night in nights])
+    odd = int(np.argmax(common))
+    assert common[odd] > 1
+    assert np.delete(common, odd).max() < 0.15
+    assert all(0 < night["common_err_px"] < 0.1 for night in nights)
+    sentence = next(check.sentence for check in solution.checks if check.name == "dynamic part")
+    told = re.search(rf"the night of {nights[odd]['exposures'][0]} .* others, by ([\d.]+) px rms: look at", sentence)
+    assert float(told[1]) == pytest.approx(common[odd], rel=0.1)
 
 
 def test_every_detector_is_in_figures():

@@ -1,23 +1,37 @@
 """The check of a camera: do its detectors lie, and distort, as was stated of them, and would that have shown?"""
 
+from dataclasses import replace
+from itertools import combinations
+
 import numpy as np
 
+from ...cameras.header_layout import FAR, LEAST
 from ...results.check import WRONG, Check, FactorTest, state_of
 from .known_effects import DEPARTURES, LAYOUT, STATICS
 from .limits import SEEN, addition_that_shows, as_one
 
 #: Stars that cross, from which on it tells something that they are left out.
 _FEWEST = 4
+#: Layouts that agree so well [pix] are the same.
+_SAME = 1e-6
 #: Columns of the detectors, and their values for all stars, up to which they are looked at.
 _MOST_COLUMNS, _MOST_VALUES = 1000, 30_000_000
 _TIE = (
     "dithers larger than the gaps, which carry stars from one detector to the others, a reference with stars on them "
     "(--reference), or what is known of the layout (--layout-sigma, a camera file); --layout hold takes it as exact"
 )
+_ODD = (
+    "this solution does not count on that header: nothing is to be done for it; other programs need a better one, "
+    "which legdistort attach writes"
+)
+_UNDECIDED = (
+    "the positions of the stars do not count on these headers, the sky does, by so much: tie it to a catalogue "
+    "(--reference); legdistort attach then writes better headers"
+)
 _TELL = "dithers larger than the gaps, which carry stars from one detector to the others, test it"
 
 
-def camera_check(solution, residuals, observed, *, camera, error, judged):
+def camera_check(solution, residuals, observed, *, camera, contradicted, error, judged):
     """Do exposures agree with what was stated of the detectors of a camera? None for a single one.
 
     Parameters
@@ -27,6 +41,8 @@ def camera_check(solution, residuals, observed, *, camera, error, judged):
     observed : Observed
     camera : `legdistort.results.errors.camera_errors.CameraErrors` or None
         Of what was fitted.
+    contradicted : Check or None
+        See `contradicted_layout`; the residuals are those of that then, and tell nothing else.
     error : float
         Typical error of a star, pixels.
     judged : callable
@@ -34,33 +50,87 @@ def camera_check(solution, residuals, observed, *, camera, error, judged):
     """
     if observed.detector is None or residuals.dof < 1:
         return None
-    free = np.zeros(1, dtype=bool) if camera is None else camera.free.any(axis=(0, 1))
+    free = np.zeros(4, dtype=bool) if camera is None else camera.free.any(axis=(0, 1))
     held = {LAYOUT: not free[:3].any(), STATICS: not free[3:].any()}
     held = [effect for effect, is_held in held.items() if is_held]
     stated, apart = _stated(solution, camera and camera.departure), undetermined(solution)
     apart = Check("camera", "unknown", None, None, *apart) if apart else None
-    lost = _lost(solution) if LAYOUT in held else None
-    return as_one([_held(held, solution.camera.name, residuals, observed, error, judged), stated, apart, lost])
+    headers = None if apart else _headers(solution, free[:3].any())
+    given = _held(held, solution.camera.name, residuals, observed, error, judged)
+    if contradicted is not None:
+        given = contradicted if given is None else replace(contradicted, tests=given.tests)
+    return as_one([given, stated, apart, headers])
 
 
-def _lost(solution):
-    """The check of a layout that is held by the stars that cross from detector to detector and are left out for it."""
-    residuals, used = solution.residuals, solution.residuals["used"]
-    crossing, agree = (_crossing(rows["star"], rows["detector"]) for rows in (residuals, residuals[used]))
-    if len(crossing) < _FEWEST or len(agree) > len(crossing) / 2:
+def _headers(solution, found):
+    """The check of the layout of headers, against the one that was `found`, or else given; None where there is none."""
+    headers, camera = solution.camera.headers, solution.camera
+    if headers is None or (not found and headers.scatter < _SAME and not headers.odd):  # by headers, and held
         return None
+    there = "the stars put it" if found else f"camera {camera.name} has it, which was given"
+    if headers.is_undecided:
+        there = "the stars have them" if found else f"camera {camera.name} has them, which was given"
+        return Check("camera", "warn", headers.scatter, FAR, headers.sentence(there), _UNDECIDED)
+    if words := headers.sentence(there):
+        far = max(np.hypot(*shift) for shift, agrees in zip(headers.shifts, headers.agree, strict=True) if not agrees)
+        cure = _ODD if found else f"--layout fit tells which of the two is right; {_ODD}"
+        return Check("camera", "warn", far, LEAST, words, cure)
+    words = f"the headers have the detectors where they lie, to {headers.scatter:.2g} px"
+    return Check("camera", "pass", headers.scatter, FAR, words)
+
+
+def contradicted_layout(solution, camera):
+    """The check of a layout that is held by the stars that cross from detector to detector and are left out for it.
+
+    Parameters
+    ----------
+    solution : Solution
+    camera : `legdistort.results.errors.camera_errors.CameraErrors` or None
+        Of what was fitted.
+
+    Returns
+    -------
+    Check or None
+        None where the layout was fitted, there is no other detector, or most of these stars agree with it.
+    """
+    if len(solution.camera.detectors) < 2 or (camera is not None and camera.free[:, :, :3].any()):
+        return None
+    residuals, used = solution.residuals, np.asarray(solution.residuals["used"])
+    names, detector = np.unique(np.asarray(residuals["detector"]).astype(str), return_inverse=True)
+    stars, star = np.unique(np.asarray(residuals["star"]), return_inverse=True)
+    seen, agree = np.zeros((2, len(stars), len(names)), dtype=bool)
+    seen[star, detector] = True
+    agree[star[used], detector[used]] = True
+    crossing = seen.sum(axis=1) > 1
+    number = np.count_nonzero(crossing & (agree.sum(axis=1) < 2))
+    if np.count_nonzero(crossing) < _FEWEST or number < np.count_nonzero(crossing) / 2:
+        return None
+    far, worst = _farthest(residuals, star, detector)
+    names = names[worst] if len(names) > 2 else " against ".join(names)
     found = (
-        f"{len(crossing) - len(agree)} of {len(crossing)} stars that cross to another detector are left out on one "
-        "of them: they do not agree with the layout that was given"
+        f"the layout was taken as exact, and the stars contradict it: detector {names} lies {far:.0f} px from where it "
+        f"has it ({number} of {np.count_nonzero(crossing)} stars that cross to another detector are left out on one of "
+        "them)"
     )
-    return Check("camera", "fail", len(agree), len(crossing) / 2, found, LAYOUT.cure)
+    instead = " instead of --layout hold" * (solution.settings.layout == "hold")
+    return Check("camera", "fail", far, None, found, f"{LAYOUT.cure}{instead}")
 
 
-def _crossing(star, detector):
-    """Stars that several detectors see."""
-    pairs = set(zip(np.asarray(star).tolist(), np.asarray(detector).tolist(), strict=True))
-    stars, count = np.unique([star for star, _ in pairs], return_counts=True)
-    return stars[count > 1]
+def _farthest(residuals, star, detector):
+    """By how many pixels a detector lies elsewhere than the others, by the stars (n,) that both see, and its number."""
+    node, index = np.unique(star * (detector.max() + 1) + detector, return_inverse=True)
+    off = np.stack([residuals[name].value for name in ("dx", "dy")], axis=1)
+    off = np.array([np.median(off[index == k], axis=0) for k in range(len(node))])
+    star, detector, apart = *np.divmod(node, detector.max() + 1), {}
+    for a, b in combinations(np.unique(detector), 2):
+        common, mine, other = np.intersect1d(star[detector == a], star[detector == b], return_indices=True)
+        if len(common):
+            difference = np.median(off[detector == a][mine] - off[detector == b][other], axis=0)
+            apart.setdefault(a, []).append(difference)
+            apart.setdefault(b, []).append(-difference)
+    far = {key: np.hypot(*np.median(each, axis=0)) for key, each in apart.items()}
+    worst = max(far, key=far.get)
+    return far[worst], worst
 
 
 def undetermined(solution):
@@ -86,7 +156,8 @@ def _held(effects, name, residuals, observed, error, judged):
     if not tests:
         return None
     words = {LAYOUT: "the layout", STATICS: "the static distortions"}
-    given = f"{' and '.join(words[effect] for effect in tests)} that were given of the detectors"
+    were = "was" if [*tests] == [LAYOUT] else "were"
+    given = f"{' and '.join(words[effect] for effect in tests)} that {were} given of the detectors"
     factors = tuple(FactorTest(effect.name, name, round(score.nu), score.t, score.nu, score.p)
                     for effect, (score, _) in tests.items())  # fmt: skip
     states = [(score.p, *judged(score)) for score, _ in tests.values()]

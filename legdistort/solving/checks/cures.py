@@ -76,7 +76,15 @@ def with_cures(checks, solution, residuals, observed, judged):
     if ends and judged(after)["chi2"].state not in WRONG:  # then it is the degree and no more
         return checks, explained
     fields = smooth_fields(left)
-    return checks | {name: _with_fields(checks[name], fields) for name in wrong if name in _BY_FIELDS}, explained
+    own = without_static(solution) if solution.settings.static == "fit" and observed.detector is None else ""
+    return checks | {name: _with_fields(checks[name], fields, own) for name in wrong if name in _BY_FIELDS}, explained
+
+
+def without_static(solution):
+    """The cure where exposures have distortions of their own, and one was fitted to all."""
+    degree = solution.settings.exposure_degree + 1
+    higher = f", or let exposures have more of their own: --exposure-degree {degree}" * (degree < solution.degree)
+    return f"leave --static fit out, which fits one distortion to all exposures{higher}"
 
 
 def _named(checks, effects, judged):
@@ -111,12 +119,12 @@ def _is_better(after, before):
     return STATES.index(after.state) < STATES.index(before.state)
 
 
-def _with_fields(check, fields):
-    """A check that names smooth fields, if they are a reason for what it found."""
+def _with_fields(check, fields, cure):
+    """A check that names smooth fields, if they are a reason for what it found, with a cure if there is one."""
     if not fields.are_there or (check.name == "chi2" and fields.share * check.value < SHARE * (check.value - 1)):
         return check
     words = "neighbouring stars of an exposure are displaced alike, in every exposure in another way (turbulence), by "
-    return replace(check, sentence=f"{check.sentence}; {words}{fields.rms:.2g} px rms")
+    return replace(check, sentence=f"{check.sentence}; {words}{fields.rms:.2g} px rms", cure=cure or check.cure)
 
 
 def _higher_degree(residuals):

@@ -44,16 +44,20 @@ def dynamic_check(solution, problem, blocks):
     odd = _odd(solution, problem, blocks)
     found = f"exposures depart from {static} beyond noise"
     if odd:
-        named = [f"{name} {ratio:.2g} times as far as the others" for name, ratio, _ in odd]
-        found += f", {some_of(named, MOST_NAMED)}"
+        named = [f"{name} {ratio:.2g} times as far as the others, by {rms:.2g} px rms" for name, ratio, rms, _ in odd]
+        found += (
+            f", {some_of(named, MOST_NAMED)}: look at what was different then; its distortions are its own, and do "
+        )
+        found += "no harm, but absolute positions are surer without"
     return Check("dynamic part", "pass", p, FALSE_ALARM, found, tests=tuple(test for *_, test in odd))
 
 
 def _odd(solution, problem, blocks):
     """Exposures and nights that depart from the others of their detector more than these among themselves.
 
-    The farthest first: name, how many times as far as these, and the `FactorTest`: squares by degree over those of
-    the others, beyond the errors of the coefficients. If all scatter alike, by degree, they are distributed as F.
+    The farthest first: name, how many times as far as these, by how many pixels rms, and the `FactorTest`: squares by
+    degree over those of the others, beyond the errors of the coefficients. If all scatter alike, by degree, they are
+    distributed as F.
     """
     found, names = [], np.array(solution.names)
     size, degrees = problem.n_modes, dynamic_degrees(problem.n_modes)
@@ -69,9 +73,12 @@ def _odd(solution, problem, blocks):
             mean = np.eye(owner.max() + 1)[:, owner] / np.bincount(owner)[:, None]
             if len(mean) < _FEWEST:
                 continue
-            for k, ratio, chi2, p in _beyond(mean @ a, mean**2 @ noise, degrees, len(names)):
+            departing = mean @ a
+            for k, ratio, chi2, p in _beyond(departing, mean**2 @ noise, degrees, len(names)):
                 name = whose + names[each][owner == k][0]
-                found.append((name, ratio, FactorTest(f"departure of {name}", _OTHERS, len(rows), chi2, len(rows), p)))
+                test = FactorTest(f"departure of {name}", _OTHERS, len(rows), chi2, len(rows), p)
+                rms = np.linalg.norm(departing[k] - np.delete(departing, k, axis=0).mean(axis=0)) / 2  # as `rms_length`
+                found.append((name, ratio, rms, test))
     return sorted(found, key=lambda each: -each[1])
 
 

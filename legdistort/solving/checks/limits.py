@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
-from ...results.check import FALSE_ALARM, STATES
+from ...results.check import FALSE_ALARM, STATES, WRONG
 
 #: Errors right to this fraction pass, however many observations prove the rest.
 NEGLIGIBLE = 0.05
@@ -13,6 +13,8 @@ NEGLIGIBLE = 0.05
 GROSS_ERRORS = 0.05
 #: Errors of a star: a pattern, or a bend, of so much must show, else the question is open.
 SEEN = 3.0
+#: What is said of exposures left out that agree with others of their night.
+ALIKE = "has another distortion"
 #: Names in a sentence.
 MOST_NAMED = 6
 _SURELY = special.ndtri(0.95)
@@ -34,12 +36,12 @@ def of_chi2(dof):
 
 
 def as_one(checks):
-    """One check of several of the same name: those in the worst state, their sentences joined; None of none."""
+    """One check of several of the same name: what is wrong, or else in the worst state, joined; None of none."""
     checks = [check for check in checks if check is not None]
     if not checks:
         return None
-    worst = max((check.state for check in checks), key=STATES.index)
-    told = [check for check in checks if check.state == worst]
+    checks.sort(key=lambda check: -STATES.index(check.state))
+    told = [check for check in checks if check.state in (checks[0].state, *WRONG)]
     return replace(
         told[0],
         sentence="; ".join(check.sentence for check in told),

@@ -15,11 +15,11 @@ from scipy import special
 from ...exceptions import some_of
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
-from .camera_check import camera_check, undetermined
-from .cures import with_cures
+from .camera_check import camera_check, contradicted_layout, undetermined
+from .cures import with_cures, without_static
 from .dynamic_check import dynamic_check, significance
 from .known_effects import Observed
-from .limits import GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
+from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
 from .reference_check import reference_check
 from .residual_tests import Residuals
@@ -68,7 +68,8 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     made, explained = judged(residuals), ()
     observed = Observed(problem, state, solution.residuals[problem.order], times[0])
     several = problem.n_exposures > 1  # errors are not found from one
-    if several and residuals.dof >= 1 and any(check.state in WRONG for check in made.values()):
+    contradicted = None if observed.detector is None else contradicted_layout(solution, uncertainty.camera)
+    if contradicted is None and several and residuals.dof >= 1 and any(c.state in WRONG for c in made.values()):
         made, explained = with_cures(made, solution, residuals, observed, judged)
     others = (
         dynamic_check(solution, problem, blocks),
@@ -79,6 +80,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
             residuals,
             observed,
             camera=uncertainty.camera,
+            contradicted=contradicted,
             error=_star_error(residuals),
             judged=partial(_pattern_state, residuals=residuals),
         ),
@@ -94,6 +96,9 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     made = [made[name] for name in _ORDER if made.get(name) is not None]
     if residuals.dof < 1:
         made = [_unjudged(check) if check.name in _BY_RESIDUALS else check for check in made]
+    if contradicted is not None:  # of residuals that it makes nothing else is told
+        wrong = {check.name for check in made if check.state in WRONG} - {"camera"}
+        return tuple(replace(c, cure="see camera first, which is the cause") if c.name in wrong else c for c in made)
     return _causes_first(made, explained)
 
 
@@ -392,6 +397,11 @@ def rejection_check(solution):
     if lost:
         number = f"{len(lost)} exposures were" if len(lost) > 1 else "one exposure was"
         words += f"; {number} left out: " + "; ".join(f"{k} ({v})" for k, v in list(lost.items())[:3])
+        words += f"; and {len(lost) - 3} more" * (len(lost) > 3)
+    if any(ALIKE in why for why in lost.values()):
+        own = "one distortion is not that of all nights: "
+        cure = f"{own}{without_static(solution)}" if solution.settings.static == "fit" else f"{own}raise --degree"
+        return Check("rejection", "warn", share, GROSS_ERRORS, words, cure)
     if p < FALSE_ALARM:
         return Check("rejection", "fail" if share > 0.3 else "warn", share, GROSS_ERRORS, words,
                      "mismatches or blends: look at the exposures with most of them, or match with a smaller radius"

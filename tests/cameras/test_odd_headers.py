@@ -1,0 +1,176 @@
+"""Headers that have one detector of a camera elsewhere than it lies: it is named, and has no part in the sky."""
+
+import json
+import warnings
+from dataclasses import replace
+
+import header_layouts
+import numpy as np
+import pytest
+
+import legdistort as ld
+from legdistort.exceptions import FoldError, LegdistortWarning, SolveError
+from legdistort.reporting.summary import summarise
+from legdistort.solving import camera_fit
+
+SIZE, STEP = 640, 680
+ODD = 35.0, -28.0, 0.8
+
+
+def turned(degrees, scale=1.0):
+    angle = np.radians(degrees)
+    return scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def place(middle, degrees):
+    """Plane -> pixels of a detector whose middle lies there, and which is turned."""
+    return np.column_stack([turned(degrees), np.full(2, (SIZE - 1) / 2) - turned(degrees) @ middle])
+
+
+def camera(n_x, n_y, wrong, *, plane=None, known=True):
+    """Detectors in a grid; headers have them `wrong` (n, 3) by x, y [pix] and degrees, in a plane that is `plane`."""
+    middles = [np.array([i, j]) * STEP for i in range(n_x) for j in range(n_y)]
+    plane = np.eye(2, 3) if plane is None else plane  # focal plane -> plane of the headers
+    back = np.linalg.inv(plane[:, :2])
+    detectors = {}
+    for k, (middle, (dx, dy, angle)) in enumerate(zip(middles, wrong, strict=True)):
+        stated = place(middle + [dx, dy], angle)
+        linear = stated[:, :2] @ back
+        stated = np.column_stack([linear, stated[:, 2] - linear @ plane[:, 2]])
+        sigma = None if known else np.inf
+        detectors[f"{k}"] = ld.Detector(
+            (SIZE, SIZE), layout=place(middle, 0.0), header_layout=stated, layout_sigma=sigma
+        )
+    return ld.Camera("grid", detectors)
+
+
+@pytest.mark.parametrize("parity", [1, -1])
+def test_the_odd_one_is_found_and_measured_by_the_others(parity):
+    wrong = np.zeros((4, 3))
+    wrong[2] = ODD
+    plane = np.column_stack([turned(31.0, 2e-4) @ np.diag([1, parity]), [3.0, -2.0]])
+    headers = camera(2, 2, wrong, plane=plane).headers
+    assert headers.odd == ("2",)
+    np.testing.assert_allclose(headers.shifts, wrong[:, :2], atol=1e-6)
+    np.testing.assert_allclose(headers.rotations, wrong[:, 2], atol=1e-6)
+    assert "detector 2 45 px (+35 in x, -28 in y, turned by 0.80 deg)" in headers.sentence("the stars put it")
+
+
+def test_two_odd_ones_of_nine():
+    wrong = np.random.default_rng(1).normal(0, [1, 1, 0.1], (9, 3))
+    wrong[[3, 7], 0] += 40.0
+    assert camera(3, 3, wrong).headers.odd == ("3", "7")
+
+
+def test_of_two_nobody_can_say_which_is_wrong():
+    headers = camera(2, 1, [(0, 0, 0), (45, 0, 0)]).headers
+    assert headers.odd == ()
+    assert headers.is_undecided
+    assert headers.scatter == pytest.approx(45, abs=1e-6)
+    assert "headers of detectors 0 and 1 have these 45 px otherwise" in headers.sentence("the stars have them")
+    assert not camera(2, 1, [(0, 0, 0), (10, 0, 0)]).headers.is_undecided
+
+
+def test_a_layout_that_is_not_known_contradicts_nothing():
+    assert camera(2, 2, [(0, 0, 0), (0, 0, 0), ODD, (0, 0, 0)], known=False).headers.odd == ()
+    assert ld.Camera.gsaoi().headers is None
+
+
+@pytest.mark.parametrize(("n_x", "n_y"), [(3, 1), (2, 2), (3, 3)])
+@pytest.mark.parametrize("n_sets", [15, pytest.param(400, marks=pytest.mark.slow)])
+def test_headers_that_are_all_alike_wrong_have_no_odd_one(n_x, n_y, n_sets):
+    rng = np.random.default_rng(2)
+    odd = [camera(n_x, n_y, rng.normal(0, [5, 5, 0], (n_x * n_y, 3))).headers.odd for _ in range(n_sets)]
+    assert sum(map(bool, odd)) <= 0.04 * n_sets + 1
+
+
+@pytest.fixture(scope="module")
+def night():
+    return header_layouts.Night(3, off=1.0, n=7, n_stars=250, odd=ODD)
+
+
+@pytest.fixture(scope="module")
+def matches(night):
+    return ld.match(night.table, exposures=night.exposures)
+
+
+def sky_error(night, solution):
+    """Mean distance [pix] of the stars on the sky from where right headers have them, those of exposures averaged."""
+    xi, eta = (night.sky[night.true_stars(solution)] - header_layouts.MIDDLE).T * header_layouts.ARCSEC / 3600
+    off_x = (solution.stars["ra"].value - 150.0) * np.cos(np.radians(-20.0)) + xi
+    off_y = solution.stars["dec"].value + 20.0 - eta
+    return np.hypot(np.mean(off_x), np.mean(off_y)) * 3600 / header_layouts.ARCSEC
+
+
+OPTIONS = {}, {"static": "fit"}, {"layout_sigma": {"shift": 2.0, "rotation": 0.2}}
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_it_has_no_vote_on_the_sky_whatever_is_fitted(night, matches, options):
+    """A quarter of 45 px otherwise; the headers of seven exposures are 3 px off, each."""
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        solution = ld.solve(matches, **options)
+        assert sky_error(night, solution) < 4.0
+        check = next(check for check in solution.checks if check.name == "camera")
+        assert check.state in ("warn", "fail")
+        assert "the headers have detector 3 " in check.sentence
+        assert check.value == pytest.approx(45, abs=6) or check.state == "fail"
+        printed = str(solution)
+        figures = {each["name"]: each for each in json.loads(json.dumps(summarise(solution)))["detectors"]}
+    assert "from the headers of all detectors but 3" in printed
+    assert figures["3"]["header_x_off_px"] == pytest.approx(ODD[0], abs=8)
+    assert figures["3"]["header_turned_deg"] == pytest.approx(ODD[2], abs=0.3)
+    assert np.hypot(figures["1"]["header_x_off_px"], figures["1"]["header_y_off_px"]) < 8
+
+
+def test_it_has_none_where_the_camera_is_given(night, tmp_path):
+    """As exact: the headers of the frames are compared with it, and stay with the solution through its file."""
+    places = zip(header_layouts.KEYS, night.places, strict=True)
+    shape = header_layouts.SIZE, header_layouts.SIZE
+    exact = ld.Camera("four", {key: ld.Detector(shape, layout=layout) for key, layout in places})
+    solution = ld.solve(ld.match(night.table, exposures=night.exposures, camera=exact))
+    assert sky_error(night, solution) < 4.0
+    check = next(check for check in solution.checks if check.name == "camera")
+    assert check.state == "warn"
+    assert "from where camera four has it, which was given" in check.sentence
+    again = ld.Solution.read(solution.write(tmp_path / "solution.asdf"))
+    assert again.camera.headers.odd == ("3",)
+
+
+def test_right_headers_pass():
+    night = header_layouts.Night(3, off=1.0, n=7, n_stars=250)
+    solution = ld.solve(ld.match(night.table, exposures=night.exposures))
+    check = next(check for check in solution.checks if check.name == "camera")
+    assert check.state == "pass"
+    assert solution.camera.headers.odd == ()
+    assert replace(solution.camera["3"], header_layout=None).header_layout is None
+
+
+def test_a_layout_that_is_held_and_wrong_is_the_cause(matches):
+    """The detector and by how much; with the option that finds it, and no other cure anywhere."""
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        solution = ld.solve(matches, layout="hold")
+    checks = {check.name: check for check in solution.checks}
+    assert checks["camera"].state == "fail"
+    assert "stars contradict it: detector 3 lies" in checks["camera"].sentence
+    assert checks["camera"].value == pytest.approx(np.hypot(*ODD[:2]), abs=5)
+    assert checks["camera"].cure == "--layout fit instead of --layout hold"
+    wrong = [check for check in solution.checks if check.state in ("warn", "fail") and check.name != "camera"]
+    assert wrong
+    assert {check.cure for check in wrong} == {"see camera first, which is the cause"}
+
+
+def test_static_distortions_cannot_make_up_for_it(matches, monkeypatch):
+    """Where they fold in the attempt, it is said what they could not make up for."""
+    in_camera, calls = camera_fit.in_camera, []
+
+    def folds_at_first(*given):
+        calls.append(given)
+        if len(calls) == 1:
+            raise FoldError("the distortion cannot be inverted; too few stars there?")
+        return in_camera(*given)
+
+    monkeypatch.setattr(camera_fit, "in_camera", folds_at_first)
+    words = r"cannot be inverted\): .*detector 3 lies 4\d px from where it has it; give layout='fit' \(--layout fit\)"
+    with pytest.raises(SolveError, match=words):
+        ld.solve(matches, layout="hold", static="fit")
