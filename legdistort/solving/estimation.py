@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..cameras.exchanged import check_places
-from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, MatchError, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, some_of, warn
 from ..matching.header_poses import sky_by_layout
 from ..matching.matches import Matches
 from ..priors.prior import Prior, has_distortion
@@ -229,7 +229,6 @@ def solve(
         motion_epoch=motion_epoch, night_sigma=night_sigma, pose_sigma=matches.pose_sigma,
     )  # fmt: skip
     tying = {"error": reference_error, "epoch": epoch, "pixel_scale": pixel_scale}
-    _check_fields(matches, asked, reference)
     catalogue, epoch = check_tie(matches, asked, reference, **tying)
     if model is None:
         _warn_of_header(matches, prior)
@@ -266,20 +265,6 @@ def solution_of(fit, asked, **settings):
     diagnostics = replace(_diagnostics(fit, asked.prior, 1.0), epoch=fit.matches.epoch)
     found = replace(diagnostics, sky=None if fit.matches.sky is None else "exposures")
     return _solution(fit, 1.0, replace(_settings(asked, asked, None), **settings), found)
-
-
-def _check_fields(matches, options, reference):
-    """Raise `MatchError` for groups of exposures without a common star that share nothing sought or known."""
-    if not matches.fields.any():
-        return
-    prior = options.prior.values() if isinstance(options.prior, dict) else [options.prior]
-    known = matches.camera.has_focal_plane or reference is not None or any(each is not None for each in prior)
-    if not known and options.static != "fit":
-        raise MatchError(
-            f"the exposures form {matches.fields.max() + 1} groups with no star in common: "
-            f"{matches.observations.groups_in_words}; solve each group by itself, or all together for the distortion "
-            "of their detector: static='fit' (--static fit), or a prior"
-        )
 
 
 def _of_detectors(matches, prior, layout, static, dynamic):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..exceptions import InputError
+from ..exceptions import InputError, MatchError
 from ..geometry import basis, fitter
 from ..geometry.detector_modes import affine_widths
 from ..geometry.epochs import year
@@ -267,16 +267,31 @@ def check_reference(reference, *, error=None, epoch=None, pixel_scale=None):
     return known_stars(solution, f"the reference {name}"), epoch
 
 
+def _check_fields(matches, options, reference):
+    """Raise `MatchError` for groups of exposures without a common star that share nothing sought or known."""
+    if not matches.fields.any():
+        return
+    prior = options.prior.values() if isinstance(options.prior, dict) else [options.prior]
+    known = matches.camera.has_focal_plane or reference is not None or any(each is not None for each in prior)
+    if not known and options.static != "fit":
+        raise MatchError(
+            f"the exposures form {matches.fields.max() + 1} groups with no star in common: "
+            f"{matches.observations.groups_in_words}; solve each group by itself, or all together for the distortion "
+            "of their detector: static='fit' (--static fit), or a prior"
+        )
+
+
 def check_tie(matches, asked, reference, **tying):
     """What `check_reference` gives, for these matches and the `SolveOptions` asked for; Gaia is asked here.
 
     Raises
     ------
     MatchError
-        For one exposure without a reference.
+        For one exposure without a reference, and groups of exposures that share nothing.
     InputError
         As there; with one exposure for options that compare exposures with one another.
     """
+    _check_fields(matches, asked, reference)
     reference = gaia_around(matches) if is_gaia(reference) else reference
     catalogue, epoch = check_reference(reference, **tying)
     if catalogue is not None and catalogue.maps is not None and asked.motion is not None:
