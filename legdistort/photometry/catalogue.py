@@ -191,8 +191,8 @@ def catalogue(
     artificial : int, optional
         Put so many artificial stars into all exposures, a few at a time, and find them again: `Catalogue.completeness`
         states what the catalogue misses and how many rows are false, and the column ``flux_bias`` by how much fluxes
-        near the threshold are too large. As many as 3 % of the rows come at a time, for a third of the time that the
-        catalogue takes.
+        near the threshold are too large. As many as 3 % of the rows come at a time, for about a tenth of the time
+        that the catalogue takes.
     seed : int
         Of the random numbers of artificial stars.
     scratch : str or path, optional
