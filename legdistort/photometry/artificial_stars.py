@@ -28,6 +28,7 @@ _FAINTEST = 0.4  # of the threshold, the ratio of signal to noise of the faintes
 _STEP, _BINS = 10**0.2, 9  # of fluxes: half a magnitude
 _POWER = 0.7  # of the number of stars over their flux, where too few tell
 _TRIES = 10  # places drawn for each one wanted
+_LOOK = 200  # places whose median tells how faint a star may be
 _WIDE = 4  # times the stamps on which stars are fitted: as far as the light of any star is subtracted
 _BLENDED = 2.0  # FWHM of an artificial star: stars that no single exposure showed are found anew
 _BESIDE = 4.0  # FWHM: rows of other stars might be taken for its own
@@ -128,14 +129,14 @@ def measure_completeness(field, known, threshold, n, *, seed, zero_point):
     -------
     Completeness
     """
-    rng, norm = np.random.default_rng(seed), field.summed_likelihood()[0][1]
+    rng = np.random.default_rng(seed)
     law = flux_law(field.flux, field.snr(), threshold)
-    faintest = _FAINTEST * threshold / np.sqrt(np.median(norm[norm > 0]))
+    faintest = _FAINTEST * threshold / np.median(_places(field, _LOOK, rng, apart=0)[1])
     edges, power = faintest * _STEP ** np.arange(_BINS + 1), law[1] if law else _POWER
     most, rows = max(1, int(_SHARE * len(field.flux))), []
     with Bar(total=n, desc="artificial stars", unit="star", disable=not field.progress) as bar:
         while (left := n - sum(map(len, rows))) > 0:
-            xy, unit = _places(field, norm, min(most, left), rng)
+            xy, unit = _places(field, min(most, left), rng)
             low, high = edges[[0, -1]] ** -power
             flux = (low - rng.uniform(size=len(xy)) * (low - high)) ** (-1 / power)
             rows.append(np.column_stack([xy, flux, unit * flux, _found_again(field, known, xy, flux, threshold, rng)]))
@@ -171,13 +172,12 @@ def flux_bias(stars, snr, error):
     return np.interp(snr, middle, bias) * error
 
 
-def _places(field, norm, n, rng):
-    """Random places (at most n, 2) that any exposure sees, far from one another, and the ratio for unit flux."""
-    pixels = rng.uniform(-0.5, np.array(norm.shape[::-1]) - 0.5, (_TRIES * n, 2))
-    x, y = np.round(pixels).astype(int).T
-    pixels, unit = pixels[norm[y, x] > 0], np.sqrt(norm[y, x][norm[y, x] > 0])
-    xy = field.grid.to_reference(pixels)
-    keep = distant(xy, APART * field.fwhm, n)
+def _places(field, n, rng, apart=APART):
+    """Random places (at most n, 2) that any exposure sees, so many FWHM apart, and the ratio for unit flux."""
+    xy = field.grid.to_reference(rng.uniform(-0.5, np.array(field.grid.shape[::-1]) - 0.5, (_TRIES * n, 2)))
+    unit = field.unit_snr(xy)
+    xy, unit = xy[unit > 0], unit[unit > 0]
+    keep = distant(xy, apart * field.fwhm, n)
     return xy[keep], unit[keep]
 
 
@@ -192,9 +192,9 @@ def _found_again(field, known, xy, flux, threshold, rng):
         measure_again(field, threshold, xy)
         row = matched(places, light, field.xy, field.fwhm)[: len(xy)]
         there, row = row >= 0, row[row >= 0]
-        errors = np.sqrt(np.einsum("naa->na", covariances(field, threshold)[0])[row])
+        errors = np.sqrt(np.einsum("naa->na", covariances(field, threshold, row)[0]))
         off = np.column_stack([field.xy[row] - xy[there], field.flux[row] - flux[there]])
-        out[there] = np.column_stack([off, errors, field.snr()[row]])
+        out[there] = np.column_stack([off, errors, field.snr(row)])
     return out
 
 

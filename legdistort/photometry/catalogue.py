@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_STORED, _SUMMED = 24, 24  # bytes a pixel of the exposures, at most, and of the reference plane
+_STORED = 24  # bytes a pixel of the exposures, at most
 _IN_MEMORY = 1 << 30  # bytes of them up to which they need not go to the disk
 
 
@@ -191,13 +191,13 @@ def catalogue(
     artificial : int, optional
         Put so many artificial stars into all exposures, a few at a time, and find them again: `Catalogue.completeness`
         states what the catalogue misses and how many rows are false, and the column ``flux_bias`` by how much fluxes
-        near the threshold are too large. As many as 3 % of the rows come at a time, for a third of the time that the
-        catalogue takes.
+        near the threshold are too large. As many as 3 % of the rows come at a time, for about a tenth of the time
+        that the catalogue takes.
     seed : int
         Of the random numbers of artificial stars.
     scratch : str or path, optional
-        Folder for pixels while work goes on, if they do not stay in memory: 24 bytes for each of the exposures, and for
-        each of the reference plane. The default is that of the system (``TMPDIR``), which some systems keep in memory.
+        Folder for pixels while work goes on, if they do not stay in memory: 24 bytes for each. The default is that of
+        the system (``TMPDIR``), which some systems keep in memory.
     progress : bool
         Show progress bars.
 
@@ -244,8 +244,8 @@ def catalogue(
     frames, views, left_out = select_images(exposures, solution, "measure", "the catalogue")
     grid = reference_grid(list(views.values()), solution.sky)
     use_compiled_loops(sum(int(np.prod(frame.shape)) for frame in frames))
-    need = _STORED * sum(int(np.prod(frame.shape)) for frame in frames) + _SUMMED * int(np.prod(grid.shape))
-    what = f"the pixels of {len(frames)} exposures and of the plane they share"
+    need = _STORED * sum(int(np.prod(frame.shape)) for frame in frames)
+    what = f"the pixels of {len(frames)} exposures"
     with nullcontext() if need <= _IN_MEMORY else scratch_folder(scratch, need, what) as folder:
         read = partial(_read, views=views, grid=grid, options=options, folder=folder)
         read = map_items(read, frames, workers=1, progress=progress, description="reading")
@@ -258,7 +258,7 @@ def catalogue(
                 layers.append(layer)
         if not layers:
             raise InputError(f"no exposure can be measured: {reasons_of(left_out)}")
-        field = JointScene(layers, grid, folder=folder, progress=progress)
+        field = JointScene(layers, grid, progress=progress)
         return _measured(field, solution, frames, left_out, threshold, zero_point, places, artificial, seed)
 
 

@@ -6,16 +6,25 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..measurement.detection import peaks_above
-from ..measurement.scene.normal_equations import JointFit, assembled, neighbour_covariance, normal_matrix, solved
+from ..measurement.scene.normal_equations import (
+    JointFit,
+    assembled,
+    neighbour_covariance,
+    normal_matrix,
+    solved,
+    with_neighbours,
+)
 from ..runtime.progress import Bar
-from ..runtime.scratch import forget, moved
+from ..runtime.scratch import forget
 from . import likelihood_sum
 
-_ROWS = 256  # of the reference plane that are looked at together
+_BLOCK = 256  # rows and columns of the reference plane that are looked at together
+_SMALL, _WORTH = 128, 2  # of blocks, where little has changed; as many of the others take as long as these do
+_AROUND = 3.5  # FWHM, to either side, that are looked at around a place
 #: Exposures from which a star must stand without the strongest; signal-to-noise ratio that it may lose by that.
 CONFIRMED, LESS = 3, 1.0
 _NOTHING = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3, 3))  # of no star
-_LEAST = 1e-3  # of the weight of the best seen star of an image: what has less is not seen
+_LEAST = 1e-3  # of the information that an image has on a faint star anywhere: of what it has less, it does not see
 
 
 class Layers(list):
@@ -77,6 +86,11 @@ class Layer:
         """The stars that it sees, in the order of its scene; (m,)."""
         return np.flatnonzero(self.rows >= 0)
 
+    def own(self, rows):
+        """Which of some stars it sees, and their rows in its scene; (m,) each."""
+        own = self.rows[rows]
+        return np.flatnonzero(own >= 0), own[own >= 0]
+
     def spread(self, values, empty=0.0):
         """Values (m,) of the stars of the scene for all stars, (n,)."""
         out = np.full(len(self.rows), empty)
@@ -92,8 +106,6 @@ class JointScene(JointFit):
     layers : list of Layer
     grid : `~legdistort.coaddition.grids.Grid`
         Of the reference plane, on which the exposures are summed.
-    folder : path, optional
-        On the disk of which the sums are; by default in the memory.
 
     Attributes
     ----------
@@ -105,8 +117,10 @@ class JointScene(JointFit):
         Pixels of the plane that the exposures cover.
     """
 
-    def __init__(self, layers, grid, *, folder=None, progress=False):
-        self.layers, self.grid, self.folder, self.rejected, self.area = Layers(layers), grid, folder, 0, 0
+    starting, by_places = 2, True  # the search begins with the stars of a solution
+
+    def __init__(self, layers, grid, *, progress=False):
+        self.layers, self.grid, self.rejected, self.area = Layers(layers), grid, 0, 0
         self.progress = progress
         self.xy, self.flux = np.zeros((0, 2)), np.zeros(0)
         self.fwhm = float(np.median([each.scene.fwhm / _scale(each) for each in layers]))
@@ -152,20 +166,19 @@ class JointScene(JointFit):
 
     @contextmanager
     def restored(self):
-        """Stars may come and go, and the sky change: they are as before afterwards."""
+        """Stars may come and go: they are as before afterwards."""
         own, before = (self.xy, self.flux), []
         for each in self.layers:
             scene = each.scene
-            before.append((each.rows, each.trusted, scene.xy, scene.flux, scene.sky))
-            each.rows, each.trusted, scene.xy, scene.flux = (values.copy() for values in before[-1][:-1])
-            scene.sky = scene.sky.copy() if self.folder is None else moved(scene.sky, self.folder)
+            before.append((each.rows, each.trusted, scene.xy, scene.flux))
+            each.rows, each.trusted, scene.xy, scene.flux = (values.copy() for values in before[-1])
         self.xy, self.flux = (values.copy() for values in own)
         try:
             yield
         finally:
             self.xy, self.flux = own
             for each, values in zip(self.layers, before, strict=True):
-                each.rows, each.trusted, each.scene.xy, each.scene.flux, each.scene.sky = values
+                each.rows, each.trusted, each.scene.xy, each.scene.flux = values
                 each.scene.render()
 
     def contains(self, xy):
@@ -180,9 +193,9 @@ class JointScene(JointFit):
         """Normal matrix (3 m, 3 m) and right side of some stars' x, y and flux, sparse."""
         parts, right = [], np.zeros((len(rows), 3))
         for layer in self.layers:
-            there = np.flatnonzero(layer.rows[rows] >= 0)
+            there, own = layer.own(rows)
             if len(there):
-                (i, j, blocks), side = layer.scene.blocks(layer.rows[rows[there]])
+                (i, j, blocks), side = layer.scene.blocks(own)
                 through = np.zeros((len(there), 3, 3))
                 slopes = np.nan_to_num(layer.places.place(self.xy[rows[there]]).slopes)
                 through[:, :2, :2] = np.where(layer.trusted[rows[there], None, None], slopes, 0)
@@ -201,15 +214,36 @@ class JointScene(JointFit):
         for layer in self.layers:
             layer.scene.update_misfit()
 
-    def snr(self):
-        """Signal-to-noise ratio of the stars where nothing but their flux is unknown, (n,)."""
-        return np.sqrt(np.sum([layer.spread(layer.scene.snr()) ** 2 for layer in self.layers], axis=0))
+    def weigh(self, rows):
+        """Weights of all exposures made anew around some stars."""
+        for layer in self.layers:
+            layer.scene.weigh(layer.own(rows)[1])
 
-    def core_chi2(self):
-        """Mean squared residual in units of the noise in the cores, weighted with the information; (n,)."""
-        weights = np.array([layer.spread(layer.scene.snr()) ** 2 for layer in self.layers])
-        chi2 = np.array([layer.spread(layer.scene.core_chi2()) for layer in self.layers])
+    def snr(self, rows=None):
+        """Signal-to-noise ratio of the stars, or some, where nothing but their flux is unknown, (n,)."""
+        return np.sqrt(self._by_layer(lambda scene, own: scene.snr(own) ** 2, rows).sum(axis=0))
+
+    def unit_snr(self, xy):
+        """Ratios of signal to noise that stars of unit flux at some places would have by what is there now; (n,)."""
+        total = np.zeros(len(xy))
+        for layer in self.layers:
+            place, there = layer.local(xy)
+            total[there] += (layer.transmission * layer.scene.unit_snr(place.pixel[there])) ** 2
+        return np.sqrt(total)
+
+    def core_chi2(self, rows=None):
+        """Mean squared residual in units of the noise in cores, of all or some, weighted with the information; (n,)."""
+        weights = self._by_layer(lambda scene, own: scene.snr(own) ** 2, rows)
+        chi2 = self._by_layer(lambda scene, own: scene.core_chi2(own), rows)
         return (weights * chi2).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-30)
+
+    def _by_layer(self, function, rows):
+        """Values of ``function(scene, rows of the scene)`` for stars, all or some, by layer, (m, n)."""
+        out = np.zeros((len(self.layers), len(self.flux) if rows is None else len(rows)))
+        for values, layer in zip(out, self.layers, strict=True):
+            there, own = layer.own(np.arange(len(self.flux)) if rows is None else rows)
+            values[there] = function(layer.scene, None if rows is None else own)
+        return out
 
     def chi2_around(self, places):
         """Sum of the squared residuals within a core of some places of the plane, in units of the noise; (n,)."""
@@ -220,44 +254,81 @@ class JointScene(JointFit):
         return total
 
     def fluxes(self, layer, rows=None):
-        """Fluxes of the stars of an image and their errors, positions fixed, neighbours together; (m,) each.
+        """Fluxes of stars of an image and their errors, positions fixed, neighbours together; (m,) each.
 
-        In the unit of the star's flux. The error is infinite where the image does not see the star, and of stars that
-        are not among some rows of its scene.
+        Of some rows of its scene, in order, in the unit of the star's flux. The error is infinite where the image does
+        not see the star.
         """
-        scene, m = layer.scene, len(layer.scene.flux)
-        if not m:
+        scene = layer.scene
+        rows = np.arange(len(scene.flux)) if rows is None else rows
+        some = with_neighbours(scene.xy, rows, scene.fwhm)
+        if not len(some):
             return np.zeros(0), np.zeros(0)
-        slopes, right, centres = scene.slopes(np.arange(m), flux_alone=True)
-        normal = normal_matrix(slopes, centres, scene.half)
+        slopes, right, centres = scene.slopes(some, flux_alone=True)
+        normal, own = normal_matrix(slopes, centres, scene.half), np.searchsorted(some, rows)
         diagonal = normal.diagonal()
-        flux = scene.flux + solved(normal, right[:, 0], np.sqrt(np.maximum(diagonal, 1e-30)))
-        rows, error = np.arange(m) if rows is None else rows, np.full(m, np.inf)
-        error[rows] = np.sqrt(neighbour_covariance(normal, scene.xy, scene.fwhm, rows)[:, 0, 0])
-        seen = scene.snr() ** 2 > _LEAST * scene.flux**2 * diagonal.max()
+        flux = scene.flux[rows] + solved(normal, right[:, 0], np.sqrt(np.maximum(diagonal, 1e-30)))[own]
+        error = np.sqrt(neighbour_covariance(normal, scene.xy[some], scene.fwhm, own)[:, 0, 0])
+        seen = diagonal[own] > _LEAST * scene.usual_information
         return flux / layer.transmission, np.where(seen, error, np.inf) / layer.transmission
 
     # -- the search
 
-    def candidates(self, threshold):
-        """Peaks of the summed likelihood that stand without their strongest exposure: places (n, 2), fluxes (n,)."""
-        (signal, norm), strongest = self.summed_likelihood()
-        reach, ny, found, self.area = max(1, int(self.fwhm / 2)), self.grid.shape[0], [], 0
-        for start in range(0, ny, _ROWS):
-            low, stop = max(0, start - reach), min(start + _ROWS, ny)
-            rows = slice(low, stop + reach)
-            x, y = peaks_above(signal[rows] / np.sqrt(np.maximum(norm[rows], 1e-30)), threshold, reach)
-            own = (y + low >= start) & (y + low < stop)
-            found.append(np.column_stack([x, y + low])[own])
-            self.area += int(np.count_nonzero(norm[start:stop]))
-        x, y = np.concatenate(found).T
-        one, weight, count = strongest[1:, y, x]
-        rest = (signal[y, x] - one) / np.sqrt(np.maximum(norm[y, x] - weight, 1e-30))
+    def candidates(self, threshold, around=None):
+        """Peaks of the summed likelihood that stand without their strongest exposure: places (n, 2), fluxes (n,).
+
+        Everywhere, or around some places (m, 2) of the reference plane.
+        """
+        parts, found = self._parts(around), []
+        if around is None:
+            self.area = 0
+        for part in Bar(parts, desc="searching", unit="block", disable=not self.progress):
+            pixels, values, area = self._peaks(part, threshold)
+            found.append(np.vstack([pixels, values]))
+            self.area += area if around is None else 0
+        columns = np.hstack([np.zeros((6, 0)), *found])  # parts around places may overlap
+        x, y, signal, norm, rest, count = columns[:, np.unique(columns[:2], axis=1, return_index=True)[1]]
         stands = (count < CONFIRMED) | (rest > threshold - LESS)
-        self.rejected = int(np.count_nonzero(~stands))
-        x, y = x[stands], y[stands]
-        flux = signal[y, x] / np.maximum(norm[y, x], 1e-30)
-        return self.grid.to_reference(np.column_stack([x, y]).astype(float)), flux
+        if around is None:
+            self.rejected = int(np.count_nonzero(~stands))
+        return self.grid.to_reference(np.column_stack([x, y])[stands]), (signal / np.maximum(norm, 1e-30))[stands]
+
+    def _parts(self, around):
+        """Rows and columns of the plane that are looked at together: blocks of all of it, or what is around places."""
+        shape = np.array(self.grid.shape)
+        everything = _blocks(np.ones(-(-shape // _BLOCK), dtype=bool), _BLOCK, shape)
+        if around is None:
+            return everything
+        reach = int(np.ceil(_AROUND * self.fwhm))
+        middle = np.round(self.grid.from_reference(around))[:, ::-1].astype(int)
+        middle = np.unique(middle[((middle > -reach) & (middle < shape + reach)).all(axis=1)], axis=0)
+        ends = np.stack([np.maximum(middle - reach, 0), np.minimum(middle + reach + 1, shape)], axis=1)
+        touched = np.zeros(-(-shape // _SMALL), dtype=bool)
+        for low, high in ends.tolist():
+            touched[tuple(slice(i // _SMALL, -(-k // _SMALL)) for i, k in zip(low, high, strict=True))] = True
+        some = [tuple(map(slice, low, high)) for low, high in ends.tolist()]
+        if touched.sum() < len(some):
+            some = _blocks(touched, _SMALL, shape)
+        return some if len(some) < _WORTH * len(everything) else everything
+
+    def _peaks(self, part, threshold):
+        """Peaks of a part of the plane: x, y, then signal, norm, ratio without the strongest, number of exposures; and
+        the pixels that any exposure sees.
+        """
+        reach = max(1, int(self.fwhm / 2))
+        ends = zip(part, self.grid.shape, strict=True)
+        wide = tuple(slice(max(s.start - reach, 0), min(s.stop + reach, n)) for s, n in ends)
+        sums, best = likelihood_sum.empty_sums([s.stop - s.start for s in wide])
+        for layer in self.layers:
+            likelihood_sum.add_layer(layer, wide, sums, best)
+        x, y = peaks_above(sums[0] / np.sqrt(np.maximum(sums[1], 1e-30)), threshold, reach)
+        pixels = np.array([x + wide[1].start, y + wide[0].start])
+        low, high = (np.array([[getattr(s, end)] for s in part[::-1]]) for end in ("start", "stop"))
+        own = ((pixels >= low) & (pixels < high)).all(axis=0)
+        (signal, norm), (one, weight, count) = sums[:, y, x][:, own], best[1:, y, x][:, own]
+        rest = (signal - one) / np.sqrt(np.maximum(norm - weight, 1e-30))
+        inner = tuple(slice(p.start - w.start, p.stop - w.start) for p, w in zip(part, wide, strict=True))
+        return pixels[:, own], np.array([signal, norm, rest, count]), int(np.count_nonzero(sums[1][inner]))
 
     def noise_peaks(self, threshold):
         """Expected number of peaks of noise above a threshold in the area covered.
@@ -267,17 +338,16 @@ class JointScene(JointFit):
         s, t = self.fwhm / 2.3548, threshold
         return float(self.area * t * np.exp(-t * t / 2) / ((2 * np.pi) ** 1.5 * 2 * s * s))
 
-    def summed_likelihood(self):
-        """Likelihood of one more star at every pixel of the grid: signal and norm as those of a scene, (2, ny, nx), and
-        the ratio, signal and norm of the exposure with the greatest ratio and the number of exposures, (4, ny, nx).
-        """
-        sums, best = likelihood_sum.empty_sums(self.grid.shape, self.folder)
-        for layer in Bar(self.layers, desc="searching", unit="frame", disable=not self.progress):
-            likelihood_sum.add_layer(layer, sums, best)
-        return sums, best
-
 
 def _scale(layer):
     """Pixels of an image in one of the reference plane."""
     area = layer.grid_map.middle()[4].mean()
     return np.sqrt(area) if np.isfinite(area) and area > 0 else 1.0
+
+
+def _blocks(wanted, side, shape):
+    """Rows and columns of those square blocks of an image that are wanted."""
+    return [
+        tuple(slice(i * side, min((i + 1) * side, n)) for i, n in zip(each, shape, strict=True))
+        for each in np.argwhere(wanted).tolist()
+    ]

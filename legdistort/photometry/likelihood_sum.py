@@ -1,23 +1,17 @@
 """Likelihood images of exposures on the reference plane, summed by compiled loops."""
 
-from functools import partial
-
 import numpy as np
 
 from ..coaddition.resampling.compiled_splines import coefficients, cubic, linear, place
 from ..runtime.compiling import compiled_loop
-from ..runtime.scratch import forget, spill
 
 _UNSEEN = np.float32(-1e30)
+_MARGIN = 8  # pixels around a piece of an image: a sample is to a coefficient so far away 3e-5 of what it is to its own
 
 
-def empty_sums(shape, folder=None):
-    """Signal and norm (2, ny, nx) of no exposure; ratio, signal, norm of the strongest, and number, (4, ny, nx).
-
-    In the memory, or on the disk of a folder.
-    """
-    zeros = np.full if folder is None else partial(spill, folder=folder)
-    sums, best = (zeros((n, *shape), 0, np.float32) for n in (2, 4))
+def empty_sums(shape):
+    """Signal and norm (2, ny, nx) of no exposure; ratio, signal, norm of the strongest, and number, (4, ny, nx)."""
+    sums, best = (np.zeros((n, *shape), np.float32) for n in (2, 4))
     best[0] = -np.inf
     return sums, best
 
@@ -59,19 +53,15 @@ def add(signal, norm, xy, inside, transmission, sums, best):
                 best[0, r, k], best[1, r, k], best[2, r, k] = ratio, s, n
 
 
-def add_layer(layer, sums, best, rows=256):
-    """The likelihood image of a `~legdistort.photometry.joint_scene.Layer` added, so many rows at a time."""
-    signal, norm = layer.scene.likelihood()
+def add_layer(layer, part, sums, best):
+    """The likelihood image of a `~legdistort.photometry.joint_scene.Layer` added, on some rows and columns."""
+    found = layer.grid_map.piece(part, margin=_MARGIN)
+    if found is None:
+        return
+    piece, pixels = found
+    signal, norm = layer.scene.likelihood(pixels)
+    if min(signal.shape) < 2:
+        return
     norm[norm <= 0] = _UNSEEN
-    signal = coefficients(signal)
-    ny, nx = sums.shape[1:]
-    for start in range(0, ny, rows):
-        found = layer.grid_map.piece((slice(start, start + rows), slice(0, nx)), margin=0)
-        if found is not None:
-            piece, part = found
-            piece.xy[0] += part[1].start
-            piece.xy[1] += part[0].start
-            window = np.s_[:, *piece.window]
-            add(signal, norm, piece.xy, piece.inside, layer.transmission, sums[window], best[window])
-            for planes in (sums, best):
-                forget(planes)
+    window = np.s_[:, *(slice(w.start - p.start, w.stop - p.start) for w, p in zip(piece.window, part, strict=True))]
+    add(coefficients(signal), norm, piece.xy, piece.inside, layer.transmission, sums[window], best[window])

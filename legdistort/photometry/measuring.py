@@ -21,6 +21,7 @@ _SCATTER, _CHANCE = 3.0, 1e-4  # chi2 per degree of freedom of the fluxes, and t
 _FAINT = 30.0  # signal-to-noise ratio: of brighter stars the error of the PSF is larger than that of the fluxes
 _SEEN = 3.0  # signal-to-noise ratio at which an exposure confirms a star
 _CLOSE = 2.0  # FWHM of blended stars
+_SEARCHED = 3.0  # FWHM from a place around which it was searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,33 +97,41 @@ def measure_again(field, threshold, around=None):
         Places near which alone it is searched.
     """
     search(field, threshold, None, pairs, settled=True, around=around)
-    while _without_lone(field, threshold)[-1]:
-        pass
+    reach = _SEARCHED * field.fwhm
+    while True:
+        near = np.ones(len(field.flux), dtype=bool) if around is None else cKDTree(around).query(field.xy)[0] < reach
+        if not _without_lone(field, threshold, np.flatnonzero(near))[-1]:
+            return
 
 
-def _without_lone(field, threshold):
-    """Fluxes by image, errors and which stars vary, before what one image alone shows is taken off; and its number."""
-    flux, error = by_image(field)
-    lone, varying = judged(flux, error, field.flux, field.snr(), threshold)
-    field.remove(lone)
-    return flux, error, varying, int(lone.sum())
+def _without_lone(field, threshold, rows=None):
+    """Fluxes by image, errors and which stars vary, before what one image alone shows is taken off; and its number.
+
+    Of all stars, or of some rows.
+    """
+    flux, error = by_image(field, rows)
+    rows, gone = np.arange(len(field.flux)) if rows is None else rows, np.zeros(len(field.flux), dtype=bool)
+    gone[rows], varying = judged(flux, error, field.flux[rows], field.snr(rows), threshold)
+    field.remove(gone)
+    return flux, error, varying, int(gone.sum())
 
 
 def _retune(field):
     """PSFs and transmissions by the stars that there are."""
     for layer in field.layers:
         if layer.retuned:
-            layer.scene.use(moffat_field(layer.scene, layer.shape, _DEGREE))
+            layer.scene.use(moffat_field(layer.scene, layer.shape, _DEGREE), render=False)
     field.refresh()
     transmissions.update(field)
 
 
-def by_image(field):
-    """Fluxes of the stars by image and their errors, positions fixed, (m, n) each; infinite where one is not seen."""
-    flux, error = np.zeros((2, len(field.layers), len(field.flux)))
+def by_image(field, rows=None):
+    """Fluxes of the stars, or some, by image and their errors, positions fixed, (m, n) each; infinite if not seen."""
+    rows = np.arange(len(field.flux)) if rows is None else rows
+    flux, error = np.zeros((len(field.layers), len(rows))), np.full((len(field.layers), len(rows)), np.inf)
     for k, layer in enumerate(field.layers):
-        own, its = field.fluxes(layer)
-        flux[k], error[k] = layer.spread(own), layer.spread(its, np.inf)
+        there, own = layer.own(rows)
+        flux[k, there], error[k, there] = field.fluxes(layer, own)
     return flux, error
 
 
@@ -176,18 +185,17 @@ def star_flags(field, measured):
     return common | np.where(near, Flag.BLENDED, 0) | np.where(measured.varying, Flag.VARIABLE, 0)
 
 
-def covariances(field, threshold):
-    """Covariances (n, 3, 3) of x, y and flux, and the mean squared residual of the cores (n,).
+def covariances(field, threshold, rows=None):
+    """Covariances (n, 3, 3) of x, y and flux of stars, all or some, and mean squared residuals of their cores (n,).
 
     Those of the fit, times the residual where it exceeds the noise; of positions also times one plus the confusion by
     stars that are not seen (`legdistort.measurement.scene.confusion`).
     """
-    chi2, snr = field.core_chi2(), field.snr()
-    out = field.covariance() * np.maximum(chi2, 1)[:, None, None]
-    unseen = confusion(
-        field.xy, field.flux, snr, sigma=field.fwhm / 2.3548, threshold=threshold, area=max(field.area, 1)
-    )
-    out[:, :2, :2] *= 1 + unseen[:, None, None]
+    chi2 = field.core_chi2(rows)
+    out = field.covariance(rows) * np.maximum(chi2, 1)[:, None, None]
+    known = {"sigma": field.fwhm / 2.3548, "threshold": threshold, "area": max(field.area, 1)}
+    unseen = confusion(field.xy, field.flux, field.snr(), **known)
+    out[:, :2, :2] *= 1 + (unseen if rows is None else unseen[rows])[:, None, None]
     return out, chi2
 
 

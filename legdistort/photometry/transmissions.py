@@ -47,8 +47,9 @@ def update(field):
     for layer in field.layers:
         stars, t = layer.stars, layer.transmission
         order = np.argsort(-snr[stars], kind="stable")
-        flux, error = field.fluxes(layer, order[: max(np.count_nonzero(snr[stars] >= _BRIGHT), _LOOK)])
-        layer.transmission, error = _ratio(t * flux, t * error, field.flux[stars], snr[stars], t)
+        order = order[: max(np.count_nonzero(snr[stars] >= _BRIGHT), _LOOK)]
+        flux, error = field.fluxes(layer, order)
+        layer.transmission, error = _ratio(t * flux, t * error, field.flux[stars[order]], snr[stars[order]], t)
         errors.append(error / layer.transmission)
     level = np.exp(np.mean([np.log(layer.transmission / layer.unit) for layer in field.layers]))
     for layer in field.layers:

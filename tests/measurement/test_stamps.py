@@ -73,7 +73,11 @@ def test_weights_are_inverse_variances(stars):
     good, sky = variance > 0.8, sky - 3
     expected = good / (np.maximum(variance + 0.5 * (light + sky), 0.25 * variance) + (0.1 * light) ** 2)
     assert np.any(variance + 0.5 * (light + sky) < 0.25 * variance)
-    stamps.inverse_variances(good, variance, light, sky, 0.5, 0.25, 0.1, out)
+    (ny, nx), before = out.shape, out.copy()
+    stamps.inverse_variances(good, variance, light, sky, 0.5, 0.25, 0.1, out, np.array([[2, 3, 7, 9]]))
+    before[2:7, 3:9] = expected[2:7, 3:9]
+    np.testing.assert_allclose(out, before, rtol=1e-5)
+    stamps.inverse_variances(good, variance, light, sky, 0.5, 0.25, 0.1, out, np.array([[0, 0, ny, nx]]))
     np.testing.assert_allclose(out, expected, rtol=1e-5)
 
 

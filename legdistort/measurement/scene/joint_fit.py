@@ -21,6 +21,7 @@ _BRIGHT = 20.0  # signal-to-noise ratio of stars that show how good the PSF is
 _CORE = 1.3  # FWHM, radius of a core
 _COVERED = 0.2  # part of a star, by its weight in the detection, on good pixels
 _KERNEL = 1.3  # FWHM, radius of what is looked for
+_SPARSE = 4  # of so many rows and columns one tells the median weight
 
 
 class Scene(JointFit):
@@ -73,8 +74,8 @@ class Scene(JointFit):
         names = "signal", "variance", "good", "saturated", "defects"
         self.frame = replace(self.frame, **dict(zip(names, rest, strict=True)))
 
-    def use(self, psf):
-        """Another PSF from now on."""
+    def use(self, psf, *, render=True):
+        """Another PSF from now on; without `render` the light of stars is as before, until it is made anew."""
         unit = self.unit(psf, 2 * self.half)
         if len(self.flux):  # the same centres and heights
             self.xy = self.xy + self.psf.centre(self.xy) - psf.centre(self.xy)
@@ -82,7 +83,8 @@ class Scene(JointFit):
         self.psf = psf
         edges = [np.abs(unit[row]).max() for row in (self.half, 0)]  # of stamps, and of ones twice as wide
         self._faint = _SEEN * self.noise / np.maximum(edges, 1e-30)
-        self.render()
+        if render:
+            self.render()
 
     def unit(self, psf, half):
         """A star of unit flux in the middle of the frame, (2 half + 1, 2 half + 1)."""
@@ -92,6 +94,19 @@ class Scene(JointFit):
     def fwhm(self):
         """Full width at half maximum of the PSF [pix]."""
         return self.psf.fwhm
+
+    @property
+    def usual_weight(self):
+        """Median weight of the good pixels."""
+        if self._usual is None:
+            weights = self.weights[::_SPARSE, ::_SPARSE]
+            self._usual = float(np.median(weights[weights > 0])) if (weights > 0).any() else 0.0
+        return self._usual
+
+    @property
+    def usual_information(self):
+        """Inverse variance of the flux of a faint star on good pixels."""
+        return self.usual_weight * float((self.unit(self.psf, self.half) ** 2).sum())
 
     @property
     def middle(self):
@@ -110,10 +125,17 @@ class Scene(JointFit):
         self._add(rows, 1, image)
         return image
 
-    def weigh(self):
-        """Weights made anew, by the light that there is now."""
-        planes = self.good, self.frame.variance, self.light, self.sky
-        stamps.inverse_variances(*planes, float(self.photon), LEAST_SKY, float(self.misfit), self.weights)
+    def weigh(self, rows=None):
+        """Weights made anew, by the light that there is now; everywhere, or on the stamps of some stars."""
+        planes, limits = (self.good, self.frame.variance, self.light, self.sky), np.array(self.light.shape)
+        low, high = np.zeros((1, 2), dtype=int), limits[None]
+        if rows is None:
+            self._usual = None
+        else:
+            centres = np.round(self.xy[rows, ::-1]).astype(int)
+            low, high = (np.clip(centres + side, 0, limits) for side in (-self.half, self.half + 1))
+        boxes = np.hstack([low, high])
+        stamps.inverse_variances(*planes, float(self.photon), LEAST_SKY, float(self.misfit), self.weights, boxes)
         self._snr = None
 
     def update_misfit(self):
@@ -131,8 +153,12 @@ class Scene(JointFit):
     @property
     def residual(self):
         """What stars and sky leave, (ny, nx)."""
-        left = self.frame.signal - self.sky
-        left -= self.light
+        return self.residual_in(np.s_[:, :])
+
+    def residual_in(self, part):
+        """What stars and sky leave in some rows and columns."""
+        left = self.frame.signal[part] - self.sky[part]
+        left -= self.light[part]
         return left
 
     def update_sky(self, step=1):
@@ -181,7 +207,10 @@ class Scene(JointFit):
 
     def set(self, rows, xy, flux):
         """Other positions and fluxes of some stars."""
-        self._add(rows, -1)
+        if len(rows) == len(self.flux):  # half the work
+            self.light[:] = 0
+        else:
+            self._add(rows, -1)
         self.xy[rows], self.flux[rows] = xy, flux
         self._add(rows, 1)
 
@@ -251,8 +280,13 @@ class Scene(JointFit):
             right[part] = stamps.weigh(out[part], centres[part], self.half, self.weights, left)
         return out, right, centres
 
-    def likelihood(self):
+    def likelihood(self, part=np.s_[:, :]):
         """How much likelier what is left is with one more star in the middle of a pixel.
+
+        Parameters
+        ----------
+        part : tuple of slice
+            Rows and columns of the frame that are asked for.
 
         Returns
         -------
@@ -263,16 +297,21 @@ class Scene(JointFit):
         half = int(np.ceil(_KERNEL * self.fwhm))
         kernel = self.psf.light(np.array([[0.0, 0.0, 1.0]], dtype=np.float32), self.middle, half)[0]
         kernel = np.maximum(kernel, 0).reshape(2 * half + 1, -1).astype(np.float32)
-        signal = stamps.correlate(self.weights * self.residual, kernel)
-        norm = stamps.correlate(self.weights, kernel**2)
-        seen = norm > _COVERED * (kernel**2).sum() * np.median(self.weights)
-        bright = ~seen & (self.weights > 0)  # under bright stars weights are small, and tell nothing of what is covered
+        ends = [each.indices(n)[:2] for each, n in zip(part, self.light.shape, strict=True)]
+        wide = tuple(slice(max(a - half, 0), b + half) for a, b in ends)  # what the kernel meets
+        inner = tuple(slice(a - own.start, b - own.start) for (a, b), own in zip(ends, wide, strict=True))
+        weights = self.weights[wide]
+        signal = stamps.correlate(weights * self.residual_in(wide), kernel)[inner]
+        norm = stamps.correlate(weights, kernel**2)[inner]
+        seen = norm > _COVERED * (kernel**2).sum() * self.usual_weight
+        # under bright stars weights are small, and tell nothing of what is covered
+        bright = ~seen & (weights[inner] > 0)
         if bright.any():
             y, x = np.nonzero(bright)
             own = np.broadcast_to(kernel.reshape(1, -1), (len(x), kernel.size))
-            there = stamps.squared_ratios(own, np.column_stack([x, y]), half, self.good)
+            there = stamps.squared_ratios(own, np.column_stack([x, y]) + [ends[1][0], ends[0][0]], half, self.good)
             seen[y, x] = there > _COVERED * (kernel**2).sum()
-        return signal, np.where(seen, np.maximum(norm, 1e-12 * norm.max()), 0)
+        return signal, np.where(seen, np.maximum(norm, 1e-12 * norm.max(initial=0)), 0)
 
     def candidates(self, threshold):
         """Peaks of what is left that look like stars: places (n, 2), of whole pixels, and fluxes (n,)."""
@@ -287,20 +326,33 @@ class Scene(JointFit):
         ny, nx = self.light.shape
         return ((xy > -1.5) & (xy < (nx + 0.5, ny + 0.5))).all(axis=1)
 
-    def snr(self):
-        """Signal-to-noise ratio of the stars where nothing but their flux is unknown, (n,)."""
-        if self._snr is None:
-            half, weights = self.half, self.weights
-            self._snr = self._over_stars(lambda own, _, at: stamps.squared_ratios(own, at, half, weights)) ** 0.5
-        return self._snr
+    def snr(self, rows=None):
+        """Signal-to-noise ratio of the stars, or some, where nothing but their flux is unknown, (n,)."""
+        if self._snr is not None:
+            return self._snr if rows is None else self._snr[rows]
+        half, weights = self.half, self.weights
+        out = self._over_stars(rows, lambda own, _, at: stamps.squared_ratios(own, at, half, weights)) ** 0.5
+        if rows is None:
+            self._snr = out
+        return out
 
-    def core_chi2(self, *, lever=False):
-        """Mean squared residual in units of the noise, weighted with the PSF, in the core of every star; (n,).
+    def unit_snr(self, xy):
+        """Ratios of signal to noise of stars of unit flux at some places, nothing but the flux unknown; (n,)."""
+        out = np.zeros(len(xy))
+        for i in range(0, len(xy), _CHUNK):
+            centres = np.round(xy[i : i + _CHUNK]).astype(int)
+            params = np.column_stack([xy[i : i + _CHUNK] - centres, np.ones(len(centres))]).astype(_KIND)
+            own = self.psf.light(params, centres, self.half)
+            out[i : i + _CHUNK] = stamps.squared_ratios(own, centres, self.half, self.weights) ** 0.5
+        return out
+
+    def core_chi2(self, rows=None, *, lever=False):
+        """Mean squared residual in units of the noise, weighted with the PSF, in the core of stars, or some; (n,).
 
         With `lever` also the same mean of the squared signal-to-noise ratio of the pixels.
         """
         planes, radius = (self.weights, self.good, self.frame.signal, self.sky, self.light), _CORE * self.fwhm
-        chi2, levers = self._over_stars(lambda *stars: stamps.cores(*stars, self.half, radius, planes), 2).T
+        chi2, levers = self._over_stars(rows, lambda *stars: stamps.cores(*stars, self.half, radius, planes), 2).T
         return (chi2, levers) if lever else chi2
 
     def chi2_around(self, places):
@@ -310,11 +362,12 @@ class Scene(JointFit):
         square = self.weights.ravel()[pixels] * self.residual_at(pixels) ** 2
         return (square * inside * self.near(places - centres)).sum(axis=1)
 
-    def _over_stars(self, function, *shape):
-        """Values of a function of the light of stars on their stamps, and of `stars`; (n, *shape)."""
-        out = np.zeros((len(self.flux), *shape))
+    def _over_stars(self, rows, function, *shape):
+        """Values of a function of the light of stars, all or some, on their stamps, and of `stars`; (n, *shape)."""
+        rows = np.arange(len(self.flux)) if rows is None else rows
+        out = np.zeros((len(rows), *shape))
         for i in range(0, len(out), _CHUNK):
-            params, centres = self.stars(np.arange(i, min(i + _CHUNK, len(out))))
+            params, centres = self.stars(rows[i : i + _CHUNK])
             own = self.psf.light(params.astype(_KIND), centres, self.half)
             out[i : i + _CHUNK] = function(own, params, centres)
         return out

@@ -12,7 +12,7 @@ _LONGEST = 0.25  # FWHM, a step of a position
 _SETTLED = 0.05  # standard deviations: a star that moves by less stays
 _DAMPING = 1e-4
 _NEAR = 1.5  # FWHM: what moves within it moves a star
-_NEIGHBOURS = 10  # of a star, whose errors are part of its own
+_NEIGHBOURS, _REACH = 10, 2.5  # of a star, whose errors are part of its own; FWHM within which they are
 
 
 class JointFit:
@@ -20,7 +20,16 @@ class JointFit:
 
     Who inherits has `xy` (n, 2), `flux` (n,) and `fwhm` [pix], ``equations(rows)``, the normal matrix (3 m, 3 m) and
     right side of some stars' x, y and flux, and ``set(rows, xy, flux)``.
+
+    Attributes
+    ----------
+    starting : int
+        Passes of a search in which the PSF is found anew.
+    by_places : bool
+        Whether a search afterwards looks only where something has changed.
     """
+
+    starting, by_places = 3, False
 
     def fit(self, active, iterations):
         """Gauss-Newton steps of some stars, all together; the others stay.
@@ -58,9 +67,22 @@ class JointFit:
             return stars
         return cKDTree(self.xy[stars]).query(self.xy, distance_upper_bound=_NEAR * self.fwhm)[0] < np.inf
 
-    def covariance(self):
-        """Covariance of x, y and flux of every star, those of its neighbours unknown too; (n, 3, 3)."""
-        return neighbour_covariance(self.equations(np.arange(len(self.flux)))[0], self.xy, self.fwhm)
+    def covariance(self, rows=None):
+        """Covariance of x, y and flux of the stars, or some, those of their neighbours unknown too; (n, 3, 3)."""
+        if rows is None:
+            return neighbour_covariance(self.equations(np.arange(len(self.flux)))[0], self.xy, self.fwhm)
+        if not len(rows):
+            return np.zeros((0, 3, 3))
+        some = with_neighbours(self.xy, rows, self.fwhm)
+        own = np.searchsorted(some, rows)
+        return neighbour_covariance(self.equations(some)[0], self.xy[some], self.fwhm, own)
+
+
+def with_neighbours(xy, rows, fwhm):
+    """Some stars and those whose errors are part of theirs: rows in order, (m,)."""
+    if not len(rows):
+        return np.zeros(0, dtype=int)
+    return np.flatnonzero(cKDTree(xy[rows]).query(xy, distance_upper_bound=_REACH * fwhm)[0] < np.inf)
 
 
 def neighbour_covariance(normal, xy, fwhm, rows=None):
@@ -84,7 +106,7 @@ def neighbour_covariance(normal, xy, fwhm, rows=None):
     p, rows = normal.shape[0] // max(n, 1), np.arange(n) if rows is None else rows
     blocks = normal.tobsr((p, p))
     k = min(_NEIGHBOURS + 1, n)
-    near = cKDTree(xy).query(xy[rows], k=np.arange(1, k + 1), distance_upper_bound=2.5 * fwhm)[1]
+    near = cKDTree(xy).query(xy[rows], k=np.arange(1, k + 1), distance_upper_bound=_REACH * fwhm)[1]
     near[:, 0] = rows  # of stars that coincide, too
     real = near < n
     real[:, 1:] &= near[:, 1:] != rows[:, None]

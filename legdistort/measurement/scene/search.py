@@ -14,7 +14,7 @@ _AGAIN = 0.5  # FWHM from what was dropped: it is not tried again
 _BESIDE = 0.7  # FWHM from a star: a peak there is a matter of splitting it
 _DISTURBS = 1.5  # FWHM: a change within it is a reason to look at a star anew
 _ALONE = 0.8  # of the threshold, asked of a star where its neighbours are unknown too
-_STARTING = 3  # passes in which PSF and sky are found anew
+_WHOLE = 3  # passes that look at all of a scene; in the last of them stars are split for the first time
 _AROUND = 3.0  # FWHM from places: a scene is searched within
 
 log = logging.getLogger(__name__)
@@ -40,25 +40,31 @@ def search(scene, threshold, retune, pairs=splitting.pairs, *, settled=False, ar
     """
     state = _Search(scene, threshold, pairs, settled, around)
     for k in range(_PASSES):
-        state.active = scene.fit(state.active, 4)
-        if k < _STARTING:
+        state.fit(4)
+        if not settled and k < _WHOLE:
             scene.update_sky()
+        if not settled and k < scene.starting:
             if retune is not None:
                 retune(scene)
             state.active = scene.fit(state.near(scene.xy), 2)
             scene.update_sky()
-        if not settled:
+        state.local = settled or (scene.by_places and k >= _WHOLE)
+        if state.local:
+            scene.weigh(state.near_changes(_AROUND))
+        else:
             scene.update_misfit()
         changed = state.drop()
+        rows = state.near_changes(_AROUND)
         places, flux = state.candidates()
         fresh = _away(places, state.dropped, _AGAIN * scene.fwhm) & _away(places, scene.xy, _BESIDE * scene.fwhm)
-        if k >= _STARTING - 1:
-            changed += state.split(places[~fresh])
+        if settled or k >= _WHOLE - 1:
+            changed += state.split(rows, places[~fresh])
         changed += state.add(places[fresh], flux[fresh])
         log.debug("pass %d: %d stars, %d changes", k + 1, len(scene.flux), changed)
-        if k >= _STARTING and changed < max(1, 0 if settled else _CHANGED * len(scene.flux)):
+        if k >= (1 if settled else _WHOLE) and changed < max(1, 0 if settled else _CHANGED * len(scene.flux)):
             break
     scene.fit(state.near(scene.xy), 3)
+    state.local = settled
     state.drop()
 
 
@@ -69,22 +75,37 @@ class _Search:
         self.scene, self.threshold, self.pairs, self.around = scene, threshold, pairs, around
         self.active, self.sure = self.near(scene.xy), np.full(len(scene.flux), settled)
         self.dropped, self.tried = np.zeros((0, 2)), scene.xy[~self.active]
+        self.local, self.changes = settled, np.zeros((0, 2)) if around is None else around
 
     def near(self, places):
         """Which places (n, 2) are where the scene is searched; (n,)."""
         reach = _AROUND * self.scene.fwhm
         return np.ones(len(places), dtype=bool) if self.around is None else ~_away(places, self.around, reach)
 
+    def near_changes(self, reach):
+        """Stars within so many FWHM of what has changed since the last look; all unless only these are; rows (m,)."""
+        if not self.local:
+            return np.arange(len(self.scene.flux))
+        return np.flatnonzero(~_away(self.scene.xy, self.changes, reach * self.scene.fwhm))
+
+    def fit(self, iterations):
+        """Stars that have not come to rest fitted."""
+        self.changes = np.vstack([self.changes, self.scene.xy[self.active]])
+        self.active = self.scene.fit(self.active, iterations)
+
     def candidates(self):
         """What may be stars where the scene is searched: places (n, 2) and fluxes (n,)."""
-        places, flux = self.scene.candidates(self.threshold)
+        where = {"around": self.changes} if self.local else {}
+        places, flux = self.scene.candidates(self.threshold, **where)
+        self.changes = np.zeros((0, 2))
         near = self.near(places)
         return places[near], flux[near]
 
     def drop(self):
         """Stars that are none taken off; their number."""
         scene = self.scene
-        lost = ~_stand(scene, self.threshold, self.sure)
+        rows, lost = self.near_changes(_AROUND), np.zeros(len(scene.flux), dtype=bool)
+        lost[rows] = ~_stand(scene, self.threshold, self.sure[rows], rows)
         gone = scene.xy[lost]
         scene.remove(lost)
         self.active, self.sure = self.active[~lost], self.sure[~lost]
@@ -100,11 +121,11 @@ class _Search:
         self._disturb(places)
         return len(flux)
 
-    def split(self, peaks):
-        """Stars replaced by two where that explains more, alone and together with their neighbours; their number."""
+    def split(self, rows, peaks):
+        """Stars among some replaced by two where that explains more, alone and with their neighbours; their number."""
         scene = self.scene
-        rows = splitting.doubtful(scene, peaks, scene.snr()) & _away(scene.xy, self.tried, _AGAIN * scene.fwhm)
-        rows = np.flatnonzero(rows)
+        rows = rows[_away(scene.xy[rows], self.tried, _AGAIN * scene.fwhm)]
+        rows = rows[splitting.doubtful(scene, peaks, rows)]
         self.tried = np.vstack([self.tried, scene.xy[rows]])
         params, gain = self.pairs(scene, rows)
         two = gain > splitting.GAIN
@@ -127,7 +148,7 @@ class _Search:
 
     def _disturb(self, places):
         """What is near a change is fitted again, and may be tried again."""
-        reach = _DISTURBS * self.scene.fwhm
+        reach, self.changes = _DISTURBS * self.scene.fwhm, np.vstack([self.changes, places])
         self.active |= ~_away(self.scene.xy, places, reach)
         self.tried = self.tried[_away(self.tried, places, reach)]
 
@@ -139,18 +160,19 @@ def _away(places, others, distance):
     return np.isinf(cKDTree(others).query(places, distance_upper_bound=distance)[0])
 
 
-def _stand(scene, threshold, sure):
-    """Stars that stay: significant by themselves and beside their neighbours, and no two in one place; (n,)."""
-    if not len(scene.flux):
+def _stand(scene, threshold, sure, rows):
+    """Stars among some that stay: significant by themselves and beside their neighbours, no two in one place; (n,)."""
+    if not len(rows):
         return np.ones(0, dtype=bool)
-    ratio = scene.flux / np.sqrt(np.maximum(scene.covariance()[:, 2, 2], 1e-30))
+    xy, flux = scene.xy[rows], scene.flux[rows]
+    ratio = flux / np.sqrt(np.maximum(scene.covariance(rows)[:, 2, 2], 1e-30))
     doubtful = ~sure & (ratio < _ALONE * threshold)
     # of stars that leave each other undetermined one goes at a time: two lights may have been fitted with three
-    i, j = cKDTree(scene.xy).query_pairs(scene.fwhm, output_type="ndarray").T
+    i, j = cKDTree(xy).query_pairs(scene.fwhm, output_type="ndarray").T
     both = doubtful[i] & doubtful[j]
     doubtful[np.where(ratio[i] < ratio[j], j, i)[both]] = False
-    stay = (scene.snr() > threshold) & ~doubtful
-    stay &= scene.contains(scene.xy)
-    i, j = cKDTree(scene.xy).query_pairs(SAME * scene.fwhm, output_type="ndarray").T
-    stay[np.where(scene.flux[i] < scene.flux[j], i, j)] = False
+    stay = (scene.snr(rows) > threshold) & ~doubtful
+    stay &= scene.contains(xy)
+    i, j = cKDTree(xy).query_pairs(SAME * scene.fwhm, output_type="ndarray").T
+    stay[np.where(flux[i] < flux[j], i, j)] = False
     return stay

@@ -1,6 +1,7 @@
 """Stars that may be two: both fitted, and kept where that explains more than noise."""
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..profiles.levenberg_marquardt import Limits, minimise
 from .stamps import stamp_pixels
@@ -39,22 +40,19 @@ class _Stamps:
         return (left**2).sum(axis=1), (slopes @ left[:, :, None])[:, :, 0], slopes @ slopes.swapaxes(1, 2)
 
 
-def doubtful(scene, peaks, snr):
-    """Stars that may be two: what is left of their core exceeds the noise, or has a peak; a mask (n,).
+def doubtful(scene, peaks, rows):
+    """Stars among some that may be two: what is left of their core exceeds the noise, or has a peak; a mask (n,).
 
     Parameters
     ----------
     scene : `~legdistort.measurement.scene.joint_fit.Scene`
     peaks : ndarray, shape (m, 2)
         Of what is left.
-    snr : ndarray, shape (n,)
+    rows : ndarray of int, shape (n,)
     """
-    from scipy.spatial import cKDTree
-
-    out = (scene.core_chi2() > _CORE_CHI2) & (snr > 10)
+    out = (scene.core_chi2(rows) > _CORE_CHI2) & (scene.snr(rows) > 10)
     if len(peaks):
-        nearest = cKDTree(scene.xy).query(peaks, distance_upper_bound=scene.fwhm)[1]
-        out[nearest[nearest < len(out)]] = True
+        out |= np.isin(rows, cKDTree(scene.xy).query(peaks, distance_upper_bound=scene.fwhm)[1])
     return out
 
 

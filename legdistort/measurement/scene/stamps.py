@@ -155,7 +155,7 @@ def products(slopes, centres, half, i, j):
 
 
 @compiled_loop(nogil=True)
-def inverse_variances(good, variance, light, sky, photon, least, misfit, out):
+def inverse_variances(good, variance, light, sky, photon, least, misfit, out, boxes):
     """Inverse variances of pixels (`legdistort.measurement.profiles.pixel_noise.pixel_variance`), 0 for bad ones.
 
     Parameters
@@ -167,11 +167,14 @@ def inverse_variances(good, variance, light, sky, photon, least, misfit, out):
     misfit : float
         Error of the light, relative.
     out : ndarray, shape (ny, nx)
+    boxes : ndarray of int, shape (n, 4)
+        First row and column, and those behind the last, of the parts that are wanted.
     """
-    for i in range(out.shape[0]):
-        for k in range(out.shape[1]):
-            one = max(variance[i, k] + photon * (light[i, k] + sky[i, k]), least * variance[i, k])
-            out[i, k] = good[i, k] / (one + (misfit * light[i, k]) ** 2)
+    for top, left, bottom, right in boxes:
+        for i in range(top, bottom):
+            for k in range(left, right):
+                one = max(variance[i, k] + photon * (light[i, k] + sky[i, k]), least * variance[i, k])
+                out[i, k] = good[i, k] / (one + (misfit * light[i, k]) ** 2)
 
 
 @compiled_loop(nogil=True)
