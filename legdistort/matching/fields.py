@@ -1,6 +1,7 @@
 """Fields: groups of exposures without a common star, which lie side by side on the reference plane."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 from astropy.table import vstack
@@ -57,6 +58,8 @@ def joined(parts):
     """
     for label in parts:
         exposure_names.check_exposure_name(label)
+    # headers of every field may have the detectors a little elsewhere
+    parts = {label: replace(part, camera=part.camera.with_headers([])) for label, part in parts.items()}
     metas = [part.to_meta() for part in parts.values()]
     same = {key: all(meta[key] == metas[0][key] for meta in metas) for key in ("camera", "pose_sigma", "sky")}
     for key, cure in (("camera", "match them with the same one"), ("pose_sigma", "state the same, or none")):

@@ -229,7 +229,11 @@ def test_the_layout_of_a_camera_is_found_from_all_fields():
     parts, truth = {}, {}
     for k, label in enumerate("ab"):
         columns, poses, stars, layout = field_sets.misplaced_field(k, label)
-        camera = ld.Camera("four", {key: ld.Detector((1024, 1024), layout=place) for key, place in layout.items()})
+        of_header = {key: place + [[0, 0, 7.0 * k], [0, 0, 0]] for key, place in layout.items()}  # other in each field
+        detectors = {
+            key: ld.Detector((1024, 1024), layout=place, header_layout=of_header[key]) for key, place in layout.items()
+        }
+        camera = ld.Camera("four", detectors)
         parts[label] = ld.Matches.from_table(Table(columns), camera=camera, poses=poses)
         truth |= {f"{label}_{j}": place for j, place in enumerate(stars)}
     with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
