@@ -50,6 +50,7 @@ def detector(x, seed):
     return Detector(
         SHAPE, layout=np.array([[1.0, 0.01, -x], [-0.01, 1.0, -8.0]]), static=static,
         static_sigma=np.full((2, 10), 0.03), layout_covariance=factor @ factor.T + 0.01 * np.eye(6),
+        header_layout=[[0.9, 0.1, 40.0], [-0.1, 0.9, -7.0]],
     )  # fmt: skip
 
 
