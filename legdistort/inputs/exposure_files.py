@@ -6,6 +6,7 @@ import contextlib
 import glob
 import hashlib
 import logging
+import os
 import re
 import threading
 from collections.abc import Sequence
@@ -369,7 +370,8 @@ def expand_paths(paths):
 def _tell_weight_maps(sources):
     """Say of weight maps beside frames, as SWarp and SExtractor have them, that they are not read."""
     beside = [_WEIGHT_MAP.sub(r".weight.\1", str(path)) for path in sources if isinstance(path, (str, Path))]
-    found = [path for path in beside if ".weight." in path and Path(path).exists()]
+    # a name so much longer may be one that no file can have
+    found = [path for path in beside if ".weight." in path and os.path.exists(path)]
     if found:
         log.warning(
             "weight maps are not read (%s): pixels without weight count as good ones; set them to NaN in the frames, "
