@@ -430,6 +430,7 @@ class TestFittedCamera:
         assert apart(solution.camera, gsaoi).max() < 0.1
         assert solution.gauge.unknown_names == ("shear",)
 
+    @pytest.mark.slow
     def test_what_was_known_helps(self, gsaoi):
         """Uncertainties of layout and static are used without being asked for, and get smaller."""
         night = gsaoi_images.Night(n_exposures=6, n_stars=400, dither=6.0)
@@ -746,6 +747,7 @@ class TestSimulation:
         assert len(away) > 60
         assert np.abs(away - away.mean(axis=0)).max() < 1e-5
 
+    @pytest.mark.slow
     def test_demo(self, tmp_path, capsys):
         """The demonstration with a camera: at the bound, in one mosaic as sharp as the frames."""
         out = tmp_path / "demo"

@@ -16,7 +16,7 @@ SIGMA = 0.01
 
 @pytest.fixture(scope="module")
 def night():
-    return gsaoi_images.Night(n_exposures=5, n_stars=400, dither=9.0, dynamic=0.2)
+    return gsaoi_images.Night(n_exposures=5, n_stars=250, dither=9.0, dynamic=0.2)
 
 
 def detections(night, keys="1234"):
@@ -79,6 +79,7 @@ def test_shapes(night):
         legdistort.match(table, shape={"1": (2048, 2048), 2: (2048, 2048)})
 
 
+@pytest.mark.slow
 def test_images_without_wcs(night, matches):
     """Exposures whose headers have no WCS give shapes, names and times, no more."""
     table, _ = detections(night)

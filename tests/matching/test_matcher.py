@@ -68,8 +68,8 @@ def test_field(cell, flips, headers):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cell", CELLS, ids=str)
-def test_twelve_fields(cell):
-    for seed in range(12):
+def test_other_fields(cell):
+    for seed in range(4):
         assert_field(cell, seed=seed)
     assert_field(cell, seed=0, flips=FLIPS)
     assert_field(cell, seed=1, flips=FLIPS, headers=True)

@@ -80,7 +80,7 @@ def crowded(seed, *, spacing=8.0, size=500):
 
 @pytest.fixture(scope="module")
 def crowd():
-    tables, pulls = zip(*(crowded(seed) for seed in range(8)), strict=True)
+    tables, pulls = zip(*(crowded(seed) for seed in range(5)), strict=True)
     isolated = np.concatenate([is_isolated(table) for table in tables])
     return isolated, np.concatenate(pulls), np.concatenate([table["crowding"] for table in tables])
 

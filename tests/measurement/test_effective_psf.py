@@ -275,6 +275,7 @@ def test_errors_grow_where_the_psf_is_wrong(made):
     assert np.median(table["x_err"][bright]) > 1.5 * np.median(made["effective"]["x_err"][bright])
 
 
+@pytest.mark.slow
 def test_what_all_bright_stars_leave_is_no_noise_of_theirs():
     """Elongation that no quadratic PSF follows raises chi2 of bright stars, and moves none: errors are the bound.
 

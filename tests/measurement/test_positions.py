@@ -170,6 +170,7 @@ def test_shape_that_varies_over_the_field():
     assert chi2["shared"] > 2
 
 
+@pytest.mark.slow
 def test_blends_fitted_together_are_better():
     rng = np.random.default_rng(13)
     fwhm, n, out = 3.5, 225, {}

@@ -229,10 +229,9 @@ print(json.dumps(out))
 """
 
 
-#: What ``pip install gwcs`` gave: today, early in 2025, and before ASDF 4.
+#: What ``pip install gwcs`` gave: today, and before ASDF 4.
 STACKS = {
     "today": ["gwcs"],
-    "February 2025": ["gwcs==0.24.0", "astropy==7.0.0", "asdf==4.1.0", "asdf-astropy==0.8.0", "numpy==2.2.3"],
     "December 2024": ["gwcs==0.22.1", "astropy==7.0.0", "asdf==4.1.0", "asdf-astropy==0.7.0", "numpy==2.2.0"],
 }
 

@@ -511,6 +511,7 @@ def test_errors_of_the_coefficients_of_a_detector(several, name, key):
     assert np.sum(scatter) / np.sum(own) == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_mosaic_weighted_by_the_error_maps_of_detectors(several):
     """Values of flat images come out as the errors of the correction at their pixels have them."""
     solution, _ = several
