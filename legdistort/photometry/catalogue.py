@@ -266,6 +266,7 @@ def _measured(field, solution, frames, left_out, threshold, zero_point, places, 
     """The catalogue of a scene that has no stars yet."""
     estimate, completeness = solution.estimate, None
     order = np.argsort(estimate.positions[:, 1], kind="stable")  # stars that are near in the memory are near on images
+    order = order[np.isfinite(estimate.positions[order, 1])]
     clipped = np.array([layer.places.left_out(np.asarray(estimate.star_names)[order]) for layer in field.layers])
     measured = measure_field(field, estimate.positions[order], clipped, threshold)
     if places is not None:
@@ -280,7 +281,7 @@ def _measured(field, solution, frames, left_out, threshold, zero_point, places, 
     photometry = photometry_table(field, measured, names, rows, frames)
     if artificial is not None:
         completeness = measure_completeness(
-            field, estimate.positions, threshold, int(artificial), seed=int(seed), zero_point=zero_point
+            field, estimate.positions[order], threshold, int(artificial), seed=int(seed), zero_point=zero_point
         )
         bias = flux_bias(completeness.stars, stars["snr"], stars["flux_err"])
         stars.add_column(bias, name="flux_bias", index=stars.colnames.index("flux_err") + 1)

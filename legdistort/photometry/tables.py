@@ -13,6 +13,7 @@ from .measuring import covariances, map_covariances, sharpness, star_flags
 
 SAME = 0.5  # FWHM from a star of the solution: it is that star
 _MAGNITUDE = 2.5 / np.log(10)
+_NOWHERE = 1e9  # pixels: where stars without a position are
 
 
 def stars_table(field, measured, solution, threshold, zero_point):
@@ -48,6 +49,7 @@ def stars_table(field, measured, solution, threshold, zero_point):
 def star_names(xy, solution, radius):
     """Those of the stars of the solution that lie at positions (n, 2), one each, and new ones after the highest."""
     known, positions = np.asarray(solution.estimate.star_names), solution.estimate.positions
+    positions = np.where(np.isfinite(positions), positions, _NOWHERE)
     distance, row = cKDTree(positions).query(xy, distance_upper_bound=radius)
     nearest = cKDTree(xy).query(positions)[1]
     same = np.isfinite(distance)

@@ -104,6 +104,19 @@ def test_stars_of_the_solution_keep_their_numbers(solution, found):
     assert list(found.stars["mag"]) == list(25 - 2.5 * np.log10(found.stars["flux"]))
 
 
+def test_a_star_without_a_position_in_the_solution_is_a_new_one(truth, solution, found):
+    """All its observations were left out, say."""
+    positions = solution.estimate.positions.copy()
+    positions[3] = np.nan
+    lost = replace(solution, estimate=replace(solution.estimate, positions=positions))
+    again = ld.catalogue(exposures_of(truth), lost, zero_point=25)
+    name = solution.estimate.star_names[3]
+    assert name not in again.stars["star"]
+    assert again.stars.meta["n_new"] == found.stars.meta["n_new"] + 1
+    there = found.stars[found.stars["star"] == name]
+    assert np.hypot(again.stars["x"] - there["x"], again.stars["y"] - there["y"]).min() < 0.5 * there["x_err"][0]
+
+
 def test_stars_that_the_solution_has_elsewhere_are_flagged(truth, solution, found):
     """Those of three frames, one of which the solution has beside its place; the others are where they were."""
     assert found.check.state == "pass"
