@@ -25,6 +25,7 @@ from .inputs import exposure_files, table_files
 from .inputs.exposure_names import whole_name
 from .inputs.exposures import observed
 from .inputs.frames.statement import stated_rows
+from .inputs.references.gaia import is_gaia
 from .matching.matcher import match
 from .matching.matches import alone
 from .matching.options import MatchOptions, check_enough
@@ -121,6 +122,7 @@ def run(
     psf: Any = "auto",
     reference: Table | SkyCoord | Solution | StrPath | None = None,
     reference_error: float | Quantity | str | None = None,
+    reference_degree: int | None = None,
     epoch: float | Time | None = None,
     pixel_scale: float | None = None,
     measuring: Mapping[str, Any] | None = None,
@@ -167,7 +169,7 @@ def run(
         Leave out observations beyond this many standard errors, see `legdistort.solve`.
     psf : str, EffectivePSF, path, photutils model or dict of those
         What the stars are fitted with, see `legdistort.measure`.
-    reference, reference_error, epoch, pixel_scale : optional
+    reference, reference_error, reference_degree, epoch, pixel_scale : optional
         Catalogue whose positions are known, or "gaia", see `legdistort.solve`.
     measuring, matching, solving, coadding : dict, optional
         Further arguments of `legdistort.measure`, `match`, `solve` and `coadd`, all of them checked before a frame is
@@ -226,7 +228,7 @@ def run(
     matching = _step_options(MatchOptions, matching, "matching", min_exposures=min_exposures, progress=progress)
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"}, wanted=mosaic)
-    tying = _tying(reference, reference_error, epoch, pixel_scale, solving)
+    tying = _tying(reference, reference_error, reference_degree, epoch, pixel_scale)
     _check_others(workers, truth, catalogue)
     paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
     measuring = before.measuring if before else measuring
@@ -376,11 +378,11 @@ def _where_to_begin(paths, earlier, measuring, **reading):
     return before.frames if paths is None else paths, before.reading | {"camera": before.camera}, before
 
 
-def _tying(reference, error, epoch, pixel_scale, solving):
-    """What ties the solution to the sky, as arguments of `solve`."""
-    how = {"error": error, "epoch": epoch, "pixel_scale": pixel_scale}
-    reference, epoch = check_reference(reference, **how)
-    return {"reference": reference, "epoch": epoch, "pixel_scale": pixel_scale}
+def _tying(reference, error, degree, epoch, pixel_scale):
+    """What ties the solution to the sky, as arguments of `solve`; Gaia is asked there."""
+    known, epoch = check_reference(reference, error=error, degree=degree, epoch=epoch, pixel_scale=pixel_scale)
+    tying = {"reference": known, "epoch": epoch, "pixel_scale": pixel_scale}
+    return tying | ({"reference_error": error, "reference_degree": degree} if is_gaia(known) else {})
 
 
 def _known_prior(prior, exposures=None, degree=3):

@@ -31,6 +31,8 @@ from .arguments import flagged, given, wants_progress
 from .given_files import given_camera, read_given, read_matches, refuse
 from .repeating import repeatable
 
+#: What belongs to a reference.
+_TYING = ("reference_error", "reference_degree", "epoch", "pixel_scale")
 #: Size of frames from which further processes are worth their start, a second or two each.
 _MANY_BYTES = 1 << 25
 
@@ -72,7 +74,7 @@ def do_run(a):
         given(a, options.MATCHING),
         _solving(a, with_headers=True),
     )
-    own = ("psf", "degree", "prior", "clip", "reference", "reference_error", "epoch", "pixel_scale", "min_exposures")
+    own = ("psf", "degree", "prior", "clip", "min_exposures", "reference", *_TYING)
     with pipeline.called_by(a.begun, repeatable(a)):
         result = legdistort.run(
             **given(a, options.RUN_FRAMES, options.FLAGGED, options.STOPPING),
@@ -398,7 +400,7 @@ def _checks(summary):
 def _refuse_ignored(a):
     """Options of `run` and `solve` that others leave without effect."""
     if a.reference is None:
-        tying = {"reference_error": a.reference_error, "epoch": a.epoch, "pixel_scale": a.pixel_scale}
+        tying = {name: getattr(a, name) for name in _TYING}
         refuse(tying, "is for the catalogue of --reference")
     if a.command == "run":
         _refuse_drops(a)

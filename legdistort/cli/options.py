@@ -268,6 +268,9 @@ SOLVING = Group(
             type=word_or(float, "found"),
             metavar="MAS",
         ),
+        "reference_degree": Option(
+            "of a map that belongs to the catalogue alone (default: none)", type=int, metavar="D"
+        ),
         "epoch": Option("of the exposures, for proper motions (default: header)", type=float, metavar="YEAR"),
         "pixel_scale": Option("helps to find the stars without a header WCS", type=float, metavar="ARCSEC"),
     },

@@ -76,6 +76,7 @@ def solve(
     pose_sigma: Mapping[str, float | Quantity] | None = None,
     reference: Table | SkyCoord | Solution | StrPath | None = None,
     reference_error: float | Quantity | str | None = None,
+    reference_degree: int | None = None,
     epoch: float | Time | None = None,
     pixel_scale: float | None = None,
     progress: bool = False,
@@ -181,6 +182,10 @@ def solve(
     reference_error : float, `~astropy.units.Quantity` or "found", optional
         Error per axis of its positions where it states none: mas on the sky, else pixels. Found: the size of its errors
         is the one at which its stars agree with the exposures, and stated errors count relative to one another alone.
+    reference_degree : int, optional
+        Degree of a map that belongs to the catalogue alone, up to 30, as if it had been made with another distortion.
+        Nothing is known of it but that shift, rotation and scale over the field are none of it, so that these alone are
+        known from the catalogue up to that degree. None: it has no such map.
     epoch : float or `~astropy.time.Time`, optional
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
@@ -228,7 +233,7 @@ def solve(
         max_iterations=max_iterations, validate=validate, motion=motion, motion_sigma=motion_sigma,
         motion_epoch=motion_epoch, night_sigma=night_sigma, pose_sigma=matches.pose_sigma,
     )  # fmt: skip
-    tying = {"error": reference_error, "epoch": epoch, "pixel_scale": pixel_scale}
+    tying = {"error": reference_error, "degree": reference_degree, "epoch": epoch, "pixel_scale": pixel_scale}
     catalogue, epoch = check_tie(matches, asked, reference, **tying)
     if model is None:
         _warn_of_header(matches, prior)

@@ -10,7 +10,7 @@ from ..exceptions import InputError, MatchError
 from ..geometry import basis, fitter
 from ..geometry.detector_modes import affine_widths
 from ..geometry.epochs import year
-from ..inputs.references.catalogue import read_reference
+from ..inputs.references.catalogue import check_stated, read_reference
 from ..inputs.references.gaia import check_gaia, gaia_around, is_gaia
 from ..inputs.start_poses import POSE_ERRORS, check_place_errors, check_pose_sigma
 from ..matching.matches import Matches, alone
@@ -239,7 +239,7 @@ def prior_as_asked(prior, static):
     return named if isinstance(prior, dict) else named[None]
 
 
-def check_reference(reference, *, error=None, epoch=None, pixel_scale=None):
+def check_reference(reference, *, error=None, degree=None, epoch=None, pixel_scale=None):
     """The arguments of `solve` that concern a reference catalogue, checked: the catalogue read, and the epoch in years.
 
     Raises
@@ -251,18 +251,22 @@ def check_reference(reference, *, error=None, epoch=None, pixel_scale=None):
         raise InputError(f"pixel_scale must be a positive number of arcsec, got {pixel_scale!r}")
     epoch = year(epoch)
     if reference is None:
-        if error is not None:
-            raise InputError("reference_error is for the catalogue of reference: leave it out, or give that")
+        for name, value in (("reference_error", error), ("reference_degree", degree)):
+            if value is not None:
+                raise InputError(f"{name} is for the catalogue of reference: leave it out, or give that")
         return None, epoch
     if is_gaia(reference):  # which is asked once it is known where the field lies
         check_gaia()
+        check_stated(error, degree)
         return reference, epoch
     is_file = isinstance(reference, (str, Path)) and (Path(reference).is_dir() or Path(reference).suffix == ".asdf")
     solution = Solution.read(reference) if is_file else reference
     if not isinstance(solution, Solution):
-        return read_reference(reference, error), epoch
+        return read_reference(reference, error, degree), epoch
     if error is not None:
         raise InputError("a solution states the errors of its stars: leave reference_error out")
+    if degree is not None:
+        raise InputError("a solution states what is known of its plane: leave reference_degree out")
     name = reference if is_file else "solution"
     return known_stars(solution, f"the reference {name}"), epoch
 
@@ -298,6 +302,11 @@ def check_tie(matches, asked, reference, **tying):
         raise InputError(
             f"motion={asked.motion!r} with a solution as reference, of whose rates common errors are not kept: "
             "solve all exposures together, or give its table of stars (stars.ecsv)"
+        )
+    if catalogue is not None and catalogue.degree and asked.motion is not None:
+        raise InputError(
+            f"motion={asked.motion!r} with a map of the reference alone (reference_degree) is not supported: "
+            "leave one of them out"
         )
     if catalogue is not None and asked.pose_sigma is not None:
         raise InputError("pose_sigma and reference both say where the reference plane lies: leave one of them out")

@@ -29,7 +29,7 @@ from .equations import criterion, elimination
 from .equations.covariances import Uncertainty
 from .equations.problem import State
 from .equations.star_terms import StarPrior, packed, unpacked
-from .gauge import catalogue_map, catalogue_motions, hierarchy
+from .gauge import bent_reference, catalogue_map, catalogue_motions, hierarchy
 from .gauge.catalogue_agreement import agreement
 from .gauge.moved_fields import moved_by, poses_of, similarities
 
@@ -76,6 +76,8 @@ class ReferenceTie:
         Errors that stars have in common, as `Uncertainty` takes them.
     finds_errors : bool
         Whether the errors of the reference are found, its own only those of stars relative to others.
+    degree : int
+        Of a map that belongs to the reference alone; 0 for none.
     """
 
     identified: object
@@ -86,9 +88,12 @@ class ReferenceTie:
     solve: object
     common: dict
     finds_errors: bool = False
+    degree: int = 0
 
     def tie(self, problem, result):
         """The `Result` with the plane where the reference puts it and the `Tie` in its gauge, and the `MapPrior` there.
+
+        Third what has no map of its own any more of this `ReferenceTie`.
 
         Parameters
         ----------
@@ -141,10 +146,22 @@ class ReferenceTie:
                 else "absolute positions may be off by as much; look for mismatched stars, or give a prior",
             )
             rest = ", not settled"
-        common, open_maps = self._of_reference(result.gauge, prior.n_modes, result.state.positions.T)
-        made = replace(made, covariance=made.covariance + common @ common.T, moves=self.identified.maps is not None)
+        made = replace(made, moves=self.identified.maps is not None)
+        identified, made = bent_reference.straightened(self.identified, equations, made, result, self.degree)
+        straight = replace(self, identified=identified)
+        common, open_maps = straight._of_reference(result.gauge, prior.n_modes, result.state.positions.T)
+        made = replace(made, covariance=made.covariance + common @ common.T)
         unknown = np.hstack([equations.determined(made.used)[2], open_maps])
         unknown = hierarchy.named(unknown, result.gauge, result.state.positions.T)
+        made = replace(made, agreement=self._agreement(problem, result, equations, made))
+        self._warn(made)
+        log.info("%s", made.sentence)
+        if result.converged:
+            result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds{rest}")
+        return replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown)), prior, straight
+
+    def _agreement(self, problem, result, equations, made):
+        """The `Agreement` of the reference with everything else."""
         if problem.terms.n and self.identified.motion is None and made.ratio > _ELSEWHERE:
             raise InputError(
                 f"the stars of {self.label}, which has no proper motions, are off by {np.sqrt(made.ratio):.0f} times "
@@ -154,12 +171,12 @@ class ReferenceTie:
         motions = None if self.identified.motion is None else self.identified.motion[:, :2]
         as_stated = self.finds_errors or made.factor == 1
         stated = equations if as_stated else equations.times(1 / made.factor)
-        made = replace(made, agreement=agreement(equations, stated, made.used, motions))
-        self._warn(made)
-        log.info("%s", made.sentence)
-        if result.converged:
-            result = replace(result, status=f"{status}, tied to the reference in {count + 1} rounds{rest}")
-        return replace(result, gauge=replace(result.gauge, tie=made, unknown_maps=unknown)), prior
+        agrees = agreement(equations, stated, made.used, motions)
+        may_be_bent = self.identified.maps is None and not (self.finds_errors or problem.terms.n)
+        if not may_be_bent or bent_reference.is_as_stated(made, agrees):
+            return agrees
+        cure = bent_reference.cure(stated, self._estimate, result, self.identified, self.degree)
+        return replace(agrees, **cure)
 
     def hold_stars(self, problem, result, prior):
         """The `Problem` and the `Result` with the stars of the reference at their values in it.
@@ -362,7 +379,8 @@ class ReferenceTie:
             self.identified.covariance[:, :2, :2],
         )
         relative = errors.star_matrix if len(positions) <= catalogue_map.DENSE else errors.stars
-        return catalogue_map.MapEquations(offsets, directions, relative, prior)
+        bends = bent_reference.bends(result.gauge, positions[self.identified.rows], self.degree)
+        return catalogue_map.MapEquations(offsets, directions, relative, prior, bends)
 
     def _move(self, directions, step, made):
         """By how much a step of the map moves the plane, and the error of the plane: rms over the stars, pixels."""
@@ -428,6 +446,7 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
     log.info("%d of the %d stars of %s are in the exposures", len(identified.rows), len(reference), reference.label)
     of = fit.options
     known = np.all(elimination.inverse_star_blocks(fit.blocks.v)[np.diag(packed(fit.problem.n_star))] > 0, axis=0)
+    bent_reference.check_degree(reference, len(identified.rows), fit.problem.degree)
     if not known[identified.rows].any():
         raise InputError(f"no star of {reference.label} is seen at several epochs: leave out motion, or the reference")
     tying = ReferenceTie(
@@ -439,9 +458,10 @@ def tie_to(fit, reference, *, scale=1.0, epoch=None, pixel_scale=None):
         solve=partial(minimisers.solve_joint, loss=of.loss, max_iterations=of.max_iterations),
         common={"shared_errors": fit.shared_errors, "camera": fit.camera_errors},
         finds_errors=reference.finds_errors,
+        degree=reference.degree or 0,
     )
     problem = fit.problem.scaled(fit.used.astype(float))
-    result, prior = tying.tie(problem, result)
+    result, prior, tying = tying.tie(problem, result)
     if result.gauge.n_modes >= FEWEST_MODES or problem.terms.n:
         problem, result = tying.hold_stars(problem, result, prior)
         fit = replace(fit, problem=replace(fit.problem, moving=problem.moving), **_held_back(fit, problem))
@@ -475,7 +495,7 @@ def joined_by(reference, **tying):
 def _joined(fit, *, reference, epoch, pixel_scale):
     group = np.full(fit.problem.n_stars, -1)
     group[fit.problem.star[fit.used]] = fit.matches.camera.group_of(fit.matches.table[fit.problem.order][fit.used])
-    if group.max() < 1 or fit.problem.terms.n:
+    if group.max() < 1 or fit.problem.terms.n or reference.degree:
         return fit
     found = _identified(fit, reference, fit.matches.epoch if epoch is None else epoch, pixel_scale)
     positions, agrees = fit.result.state.positions.T, np.ones(len(found.rows), dtype=bool)

@@ -236,6 +236,8 @@ SOLVE = [
     row(reference=catalogue, epoch=2016.5, pixel_scale=0.036),
     row(reference=catalogue, motion="proper"),
     row(reference=catalogue, reference_error="found"),
+    row(reference=catalogue, reference_degree=1),
+    row(reference_degree=2, refused=dict.fromkeys(("plain", "one", "pair"), "is for the catalogue of reference")),
     row(reference_error=0.1, refused=dict.fromkeys(("plain", "one", "pair"), "is for the catalogue of reference")),
     row(progress=True),
 ]

@@ -52,7 +52,11 @@ def test_a_right_reference_passes_where_exposures_are_as_good():
 @pytest.mark.parametrize(
     ("fault", "state", "words"),
     [
-        ("bent by 1 px", "fail", "bent against what the exposures show by 1.1 px rms"),
+        (
+            "bent by 1 px",
+            "fail",
+            "bent against what the exposures show by 1 px rms; with a map of its own, of degree 2, it agrees",
+        ),
         ("five years off", "fail", "they agree with epochs that are 5 years later"),
         ("errors x 1000", "warn", "its errors are smaller than it states"),
         ("errors / 1000", "warn", "its errors were taken 9.4e+02 times as large"),
@@ -131,3 +135,113 @@ def test_wrong_references_are_found(prior, rolls):
     for fault in ("bent by 1 px", "five years off", "errors x 1000"):
         states = [check_of(solved(seed, fault, prior=prior, taken={"rolls": rolls})).state for seed in range(10)]
         assert set(states) <= {"warn", "fail"}, fault
+
+
+# --- a map of its own --------------------------------------------------------------------------------------------
+
+
+def bent(table, stars, degree, size, seed=0):
+    """A table whose positions have a polynomial of a degree added to them, `size` px rms."""
+    rng, out = np.random.default_rng([seed, 5]), table.copy()
+    u, v = ((np.column_stack([table["x"], table["y"]]) - stars.mean(axis=0)) / 1024).T
+    powers = [u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i) if i + j > 1]
+    move = np.stack(powers, axis=1) @ rng.normal(size=(len(powers), 2))
+    for name, each in zip("xy", (size * move / np.sqrt(np.mean(move**2))).T, strict=True):
+        out[name] += each
+    return out
+
+
+def without_similarity(offsets, xy, weight):
+    """Offsets (n, 2) less the shift, rotation and scale that fit them best with weights (n,)."""
+    (x, y), one = (xy - xy.mean(axis=0)).T, np.ones(len(xy))
+    design = np.stack([one, 0 * one, x, -y, 0 * one, one, y, x], axis=1).reshape(len(xy), 2, 4)
+    root = np.sqrt(weight)[:, None, None]
+    fit = np.linalg.lstsq((root * design).reshape(-1, 4), (root[:, :, 0] * offsets).ravel(), rcond=None)[0]
+    return offsets - design @ fit
+
+
+def columns(solution, suffix):
+    return np.column_stack([solution.stars[f"{axis}_{suffix}"].value for axis in "xy"])
+
+
+@pytest.mark.parametrize(
+    ("degree", "options"),
+    [(2, {"prior": True}), (3, {"prior": True}), (3, {"prior": False, "static": "fit", "taken": {"dynamic": 0.0}})],
+)
+def test_what_bends_a_reference_alone_bends_nothing_else(degree, options):
+    """A polynomial of that degree, of a pixel, changes positions by no more than a similarity, and no error."""
+    taken = {"rolls": 30.0, "dynamic": 0.05} | options.get("taken", {})
+    data, truth = dense_model.drawn_set(1, **taken)
+    matches, plain = drawn_sets.as_matches(data), made_catalogues.catalogue(truth["stars"], 1)
+    given = {"prior": ld.Prior(truth["static"])} if options["prior"] else {"static": options["static"]}
+    found = []
+    for table in (plain, bent(plain, truth["stars"], degree, 1.0)):
+        found.append(ld.solve(matches, **given, reference=table, reference_degree=degree))
+    first, second = found
+    error = columns(first, "err")
+    moved = second.estimate.positions - first.estimate.positions
+    assert np.abs(without_similarity(moved, truth["stars"], error[:, 0] ** -2) / error).max() < 0.05
+    for suffix in ("err", "err_abs"):
+        assert_allclose(columns(second, suffix), columns(first, suffix), rtol=0.01)
+    assert second.gauge.tie.own.rms == pytest.approx(1, abs=0.3)
+    assert first.gauge.tie.own.rms < 0.2
+    assert f"a map of degree {degree} that is its own" in second.gauge.tie.statement
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("degree", "error", "prior"), [(2, 0.001, True), (3, 0.01, True), (3, 0.001, False)])
+def test_errors_beside_a_map_of_the_reference_alone_are_calibrated(degree, error, prior, monkeypatch):
+    """20 sets each: absolute errors, and those of the catalogue's stars relative to the others."""
+    monkeypatch.setattr(made_catalogues, "ERROR", error)
+    squares = np.zeros((20, 2))
+    for seed in range(20):
+        data, truth = dense_model.drawn_set(seed, rolls=30.0, dynamic=0.05 if prior else 0.0)
+        given = {"prior": ld.Prior(truth["static"])} if prior else {"static": "fit"}
+        table = made_catalogues.catalogue(truth["stars"], seed)
+        solution = ld.solve(drawn_sets.as_matches(data), **given, reference=table, reference_degree=degree)
+        off = solution.estimate.positions - truth["stars"]
+        squares[seed] = np.sum(off**2), np.sum(columns(solution, "err_abs") ** 2)
+    assert squares[:, 0].sum() / squares[:, 1].sum() == pytest.approx(1, abs=0.2)
+
+
+@pytest.mark.parametrize("degree", [2, 3])
+def test_the_degree_that_is_named_cures(degree):
+    data, truth = dense_model.drawn_set(2, rolls=30.0, dynamic=0.05)
+    table = bent(made_catalogues.catalogue(truth["stars"], 2), truth["stars"], degree, 1.0)
+    matches, prior = drawn_sets.as_matches(data), ld.Prior(truth["static"])
+    with warnings.catch_warnings(action="ignore", category=LegdistortWarning):
+        check = check_of(ld.solve(matches, prior=prior, reference=table))
+    assert check.state == "fail"
+    assert check.cure.startswith(f"--reference-degree {degree}, if it is the reference that is bent")
+    assert 0.4 < check.value < 1.2  # similarities take some of it
+    cured = check_of(ld.solve(matches, prior=prior, reference=table, reference_degree=degree))
+    assert cured.state in ("unknown", "pass")
+    assert "agree with the exposures" in cured.sentence
+
+
+def test_a_map_of_its_own_is_written_and_read(tmp_path):
+    solution = solved(3, "bent by 1 px", reference_degree=2)
+    back = ld.Solution.read(solution.write(tmp_path / "s.asdf"))
+    assert back.gauge.tie.statement == solution.gauge.tie.statement
+    assert_allclose(columns(back, "err_abs"), columns(solution, "err_abs"), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"reference_degree": 4}, "reference_degree=4 is beyond the degree of the fit"),
+        ({"reference_degree": 2.5}, "reference_degree must be an integer from 0 to 30, got 2.5"),
+        ({"reference_degree": 3, "n": 9}, "reference_degree=3 needs 11 stars of the reference in the exposures"),
+    ],
+)
+def test_degrees_that_cannot_be(options, words):
+    with pytest.raises(ld.exceptions.InputError, match=words):
+        solved(0, **options)
+
+
+def test_whose_map_it_cannot_be():
+    matches = drawn_sets.as_matches(dense_model.drawn_set(0)[0])
+    with pytest.raises(ld.exceptions.InputError, match="reference_degree is for the catalogue of reference"):
+        ld.solve(matches, reference_degree=2)
+    with pytest.raises(ld.exceptions.InputError, match="a solution states what is known of its plane"):
+        ld.solve(matches, reference=ld.solve(matches), reference_degree=2)

@@ -18,6 +18,7 @@ from astropy.table import Column, Table
 from astropy.time import Time
 
 from ...exceptions import AssumptionWarning, InputError, warn
+from ...geometry import basis
 from ...geometry.epochs import year
 from ...geometry.tangent_plane import angles, compass, directions
 from ...runtime import checks
@@ -83,6 +84,8 @@ class Reference:
         deviates.
     unknown : ndarray, shape (n, 2, k), or None
         Displacements that may be in its positions by any amount.
+    degree : int or None
+        Of a map that belongs to it alone and may be any, shift, rotation and scale aside; None for none.
     """
 
     label: str
@@ -96,6 +99,7 @@ class Reference:
     finds_errors: bool = False
     maps: np.ndarray | None = None
     unknown: np.ndarray | None = None
+    degree: int | None = None
 
     def __len__(self):
         return len(self.covariance)
@@ -203,7 +207,7 @@ def _degrees(place):
     return np.stack([lon % 360, lat], axis=1)
 
 
-def read_reference(reference, error=None):
+def read_reference(reference, error=None, degree=None):
     """The `Reference` in a table or file.
 
     Parameters
@@ -214,6 +218,8 @@ def read_reference(reference, error=None):
     error : float, `~astropy.units.Quantity` or "found", optional
         Of positions for which it states none, per axis: mas on the sky, else pixels. Found: stated errors count only
         relative to one another, all others are equal, and their size follows from how the stars agree.
+    degree : int, optional
+        See `Reference`.
 
     Raises
     ------
@@ -227,7 +233,7 @@ def read_reference(reference, error=None):
     """
     if isinstance(reference, Reference):
         return reference
-    _check_error(error)
+    check_stated(error, degree)
     if isinstance(reference, (str, Path)):
         label, table = f"the reference {reference}", read_table(reference)
     elif isinstance(reference, Table):
@@ -254,7 +260,7 @@ def read_reference(reference, error=None):
     if made.star is not None and len(np.unique(made.star[good])) < np.count_nonzero(good):
         names, count = np.unique(made.star[good], return_counts=True)
         raise InputError(f"{label} names star {names[count > 1][0]} more than once")
-    return replace(made.subset(good), finds_errors=is_found(error))
+    return replace(made.subset(good), finds_errors=is_found(error), degree=degree)
 
 
 def is_found(error):
@@ -262,8 +268,10 @@ def is_found(error):
     return isinstance(error, str) and error == FOUND
 
 
-def _check_error(error):
-    """Raise `InputError` for what is no error of positions."""
+def check_stated(error, degree):
+    """Raise `InputError` for what is no error of positions, and no degree of a map."""
+    if degree is not None:
+        basis.check_degree(degree, "reference_degree")
     if error is None or is_found(error):
         return
     value = error.value if isinstance(error, u.Quantity) else error

@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import special
 
 from ...runtime.trees.facts import array, number
+from ..check import FALSE_ALARM
 
 if TYPE_CHECKING:
     from ...geometry.plane_modes import PlaneModes
@@ -28,6 +30,8 @@ class Agreement:
         By how much it departs from that, pixels, rms over the stars and axes; NaN where it was not determined.
     unseen : float
         Rms [px] up to which a bend of the reference would not be found, 19 times of 20; infinite if nothing tests it.
+    cure : int
+        Lowest degree of a map of its own with which it would agree, where it is bent; 0 for none.
     years : float
         By which its epochs would have to be later for its stars to agree; NaN where no other epoch is better.
     """
@@ -39,6 +43,35 @@ class Agreement:
     bend: float = field(metadata=number(minimum=0, nan=True))
     unseen: float = field(metadata=number(minimum=0, infinite=True))
     years: float = field(default=float("nan"), metadata=number(nan=True))
+    cure: int = field(default=0, metadata=number(minimum=0))
+
+    @property
+    def p(self) -> float:
+        """Chance of a map that departs so much."""
+        return float(special.chdtrc(self.bend_dof, self.bend_chi2)) if self.bend_dof > 0 else 1.0
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether it is bent beyond chance."""
+        return self.bend_dof >= 1 and self.p < FALSE_ALARM
+
+
+@dataclass(frozen=True, eq=False)
+class OwnMap:
+    """A map that belongs to a reference alone, of which nothing was known.
+
+    Attributes
+    ----------
+    degree : int
+    rms : float
+        Of what it moves the stars of the reference by, per axis, pixels.
+    follow : ndarray, shape (2 l, 2 k)
+        Modes of it, along x and then y, that take up those of a common map.
+    """
+
+    degree: int = field(metadata=number(minimum=1))
+    rms: float = field(metadata=number(minimum=0))
+    follow: np.ndarray = field(metadata=array("2 l", "2 k"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +108,8 @@ class Tie:
         None where a file does not have it.
     moves : bool
         Whether its stars move with the plane where common maps do, as those of a solution, whose errors these are.
+    own : OwnMap or None
+        What was taken off its positions.
     freedom : float
         Of the residuals of the exposures, taken by the map: what of it they determine, not the reference.
     """
@@ -93,6 +128,7 @@ class Tie:
     )
     agreement: Agreement | None = None
     moves: bool = False
+    own: OwnMap | None = None
     freedom: float = field(default=0.0, metadata=number(minimum=0))
 
     @property
@@ -142,6 +178,8 @@ class Tie:
         if self.found and self.known is not None:
             variance = np.einsum("jaa->ja", self.known[self.used])
             taken = f"; its errors were found: {np.sqrt(np.mean(variance)):.2g} px rms per axis"
+        if self.own is not None:
+            taken += f"; a map of degree {self.own.degree} that is its own, {self.own.rms:.2g} px rms, is taken off"
         return f"The plane is {self.sentence}{ratio}{taken}."
 
     def __repr__(self) -> str:

@@ -34,7 +34,8 @@ def _in_words(solution, tie, label):
     """The check without its tests."""
     made, name = tie.agreement, f"the reference {label.name}" if label and label.name else "the reference"
     ratio = np.sqrt(made.chi2 / made.dof) if made.dof >= _FEWEST else np.nan
-    wrong = as_one(judge(name, tie, ratio, solution) for judge in (_scatter, _mismatches, _bend))
+    judges = (_bend,) if made.cure else (_scatter, _mismatches, _bend)
+    wrong = as_one(judge(name, tie, ratio, solution) for judge in judges)
     if wrong is not None:
         return wrong
     told, error = np.isfinite(ratio), _error(solution)
@@ -99,15 +100,16 @@ def _mismatches(name, tie, ratio, solution):
 def _bend(name, tie, ratio, solution):
     """Is it bent against what exposures and the prior know?"""
     made = tie.agreement
-    if made.bend_dof < 1:
-        return None
-    state = state_of(special.chdtrc(made.bend_dof, made.bend_chi2), True)
-    error = _error(solution)
-    if state == "pass" or made.bend < NEGLIGIBLE * error:
+    if not made.cure and (not made.is_bent or made.bend < NEGLIGIBLE * _error(solution)):
         return None
     by = f" by {made.bend:.2g} px rms" if np.isfinite(made.bend) else ""
+    found = f"{name} is bent against what the exposures show{by}"
+    if made.cure:
+        return Check("reference", "fail", made.bend, None,
+                     f"{found}; with a map of its own, of degree {made.cure}, it agrees with them",
+                     f"--reference-degree {made.cure}, if it is the reference that is bent; else leave out the static "
+                     "distortion given")  # fmt: skip
     more = np.sqrt(made.bend_chi2 / made.bend_dof)
-    return Check("reference", state, made.bend, None,
-                 f"{name} is bent against what the exposures show{by} ({more:.2g} times the errors of both)",
+    return Check("reference", state_of(made.p), made.bend, None, f"{found} ({more:.2g} times the errors of both)",
                  "its positions have a distortion of their own, or the static distortion given is not that of these "
                  "exposures: leave one of them out")  # fmt: skip

@@ -193,12 +193,15 @@ class Uncertainty:
         gauge = self._gauge
         moved = np.stack([system.follow(d)[:2] for d in system.moves[: gauge.n_constraints]], axis=2)
         out = -(moved @ gauge.reach).transpose(1, 0, 2)
-        catalogue = self._problem.terms.catalogue
-        if gauge.tie is not None and gauge.tie.moves and catalogue is not None:
-            precision, values = unpacked(catalogue.precision), gauge.modes_at(self._blocks.stars[:2].T)
-            for k, m in np.ndindex(2, gauge.n_modes):
-                pull = precision[:, :, k].T * values[m]
-                out[:, :, k * gauge.n_modes + m] += system.settle(np.zeros_like(self._blocks.g_exposure), pull)[0][:2].T
+        tie, catalogue = gauge.tie, self._problem.terms.catalogue
+        if tie is None or catalogue is None or not (tie.moves or tie.own):
+            return out
+        follow = np.eye(2 * gauge.n_modes) if tie.own is None else tie.own.follow
+        precision = unpacked(catalogue.precision)[:, :, :2]
+        moved = plain_maps(gauge, self._blocks.stars[:2].T, len(follow) // 2)[:, :2, : len(follow)] @ follow
+        for column, move in enumerate(moved.transpose(2, 0, 1)):
+            pull = np.einsum("nab,nb->an", precision, move)
+            out[:, :, column] += system.settle(np.zeros_like(self._blocks.g_exposure), pull)[0][:2].T
         return out
 
     @cached_property

@@ -31,19 +31,19 @@ def agreement(equations, stated, used, motions=None):
     value, covariance, _ = alone.solve(used)
     whole, both, _ = equations.solve(used)
     off, prior = whole - equations.prior.centre, equations.prior.information
-    total = equations.chi2(equations.left(whole), used) + off @ prior @ off
+    total = equations.chi2(equations.left(whole, used), used) + off @ prior @ off
     n_maps, bends = len(alone.determined(used)[1]), _bends(equations)
     known = np.count_nonzero(np.linalg.eigvalsh(bends.T @ prior @ bends) * LIMIT**2 > 1)
     dof = known + n_maps - len(equations.determined(used)[1])
     gain = equations.gain(used)[0]
     shown = np.linalg.eigvalsh(bends.T @ (gain - gain @ both @ gain) @ bends).min(initial=np.inf)
     moved = bends.T @ equations.metric @ (value - equations.prior.centre)
-    left = at_stated.left(at_stated.solve(used)[0])
+    left = at_stated.left(at_stated.solve(used)[0], used)
     chi2 = at_stated.chi2(left, used)
     return Agreement(
         chi2=float(chi2),
-        dof=float(2 * np.count_nonzero(used) - n_maps),
-        bend_chi2=float(max(total - alone.chi2(alone.left(value), used), 0)),
+        dof=float(2 * np.count_nonzero(used) - n_maps - equations.bends.shape[2]),
+        bend_chi2=float(max(total - alone.chi2(alone.left(value, used), used), 0)),
         bend_dof=float(dof),
         bend=float(np.sqrt(np.sum(moved**2))) if n_maps == len(covariance) else np.nan,
         unseen=float(np.sqrt(addition_that_shows(dof) / shown)) if shown > 0 else np.inf,
@@ -64,7 +64,7 @@ def _years(alone, used, left, chi2, motions):
         return np.nan
     motions = np.nan_to_num(motions)
     moving = alone.of_values(motions)
-    moved = moving.left(moving.solve(used)[0])
+    moved = moving.left(moving.solve(used)[0], used)
     square, pull = alone.chi2(moved, used), alone.chi2(moved, used, left)
     if not square > 0 or special.chdtrc(1, pull**2 / square) > CERTAIN or pull**2 / square < 0.5 * chi2:
         return np.nan

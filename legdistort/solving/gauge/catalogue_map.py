@@ -4,6 +4,9 @@ A common map g of the reference plane, X -> X + D g, is all that a reference det
 ``r_j = X_cat,j - X_j`` off the relative solution, ``r = D g`` but for the errors of both. What the exposures and a
 prior determine of g (`legdistort.solving.gauge.hierarchy`) counts with its information, that is, of shift, rotation and
 scale nothing. What neither determines to `LIMIT` stays where the convention has it.
+
+A reference may have a map of its own, ``r = D g + F p``, of which nothing is known. What of the offsets it can explain
+tells nothing of g: with ``Q = 1 - F (F' W F)^-1 F' W``, W the inverse of their covariance, ``Q r = Q D g`` is left.
 """
 
 from copy import copy
@@ -106,10 +109,13 @@ class MapEquations:
     relative : ndarray, shape (2 n_stars, 2 n_stars) or (3, n_stars)
         Covariance of the relative positions, all x first; or xx, yy, xy of each.
     prior : MapPrior
+    bends : ndarray, shape (n, 2, q), optional
+        F, maps of which the reference may have any, at its stars.
     """
 
-    def __init__(self, offsets, directions, relative, prior):
+    def __init__(self, offsets, directions, relative, prior, bends=None):
         self.offsets, self.directions, self.relative, self.prior = offsets, directions, relative, prior
+        self.bends = np.zeros((len(offsets.rows), 2, 0)) if bends is None else bends
         self._factors = {}
         rows, n = offsets.rows, len(directions)
         self.dense = len(relative) == 2 * n
@@ -120,13 +126,19 @@ class MapEquations:
 
     def times(self, factor):
         """The same with other errors of the reference, by a factor."""
-        covariance = factor**2 * self.offsets.covariance
-        return MapEquations(replace(self.offsets, covariance=covariance), self.directions, self.relative, self.prior)
+        offsets = replace(self.offsets, covariance=factor**2 * self.offsets.covariance)
+        return MapEquations(offsets, self.directions, self.relative, self.prior, self.bends)
 
     def without_prior(self):
         """The same with nothing known of the map beforehand."""
         out = copy(self)
         out.prior = replace(self.prior, information=0 * self.prior.information, centre=0 * self.prior.centre)
+        return out
+
+    def with_bends(self, bends):
+        """The same for a reference that may have any of these maps (n, 2, q)."""
+        out = copy(self)
+        out.bends = bends
         return out
 
     def of_values(self, values):
@@ -149,8 +161,15 @@ class MapEquations:
         index = (self.offsets.rows[used, None] + [0, len(self.directions)]).ravel()
         return self.relative[np.ix_(index, index)]
 
-    def _weighted(self, used, values):
-        """The inverse of that covariance times values (2 n, ...), factorised once for the same stars."""
+    def _weighted(self, used, values, weights=None):
+        """The inverse of that covariance times values (2 n, ...), factorised once for the same stars.
+
+        With `weights` (n,) every star counts by itself, so much.
+        """
+        if weights is not None or not self.dense:
+            precision = np.linalg.inv(self.blocks[used])
+            precision = precision if weights is None else precision * weights[:, None, None]
+            return (precision @ values.reshape(len(precision), 2, -1)).reshape(values.shape)
         key = used.tobytes()
         if key not in self._factors:
             self._factors.clear()
@@ -162,14 +181,27 @@ class MapEquations:
 
         With `weights` (n,) every star counts by itself, so much.
         """
-        design = self.design[used].reshape(-1, self.design.shape[2])
-        if self.dense and weights is None:
-            weighted = self._weighted(used, design).T
-        else:
-            precision = np.linalg.inv(self.blocks[used])
-            precision = precision if weights is None else precision * weights[:, None, None]
-            weighted = (precision @ self.design[used]).reshape(-1, design.shape[1]).T
+        design = self.straightened(self.design, used, weights)[used].reshape(-1, self.design.shape[2])
+        weighted = self._weighted(used, design, weights).T
         return weighted @ design, weighted
+
+    def bend(self, values, used, weights=None):
+        """The map (q, ...) of the reference alone that fits the used ones of values (n, 2, ...) best."""
+        bends = self.bends[used].reshape(2 * np.count_nonzero(used), self.bends.shape[2])
+        weighted = self._weighted(used, bends, weights)
+        right = weighted.T @ values[used].reshape(len(bends), *values.shape[2:])
+        return np.linalg.pinv(bends.T @ weighted, hermitian=True) @ right
+
+    def bend_covariance(self, used):
+        """Covariance (q, q) of that map, the common one held."""
+        bends = self.bends[used].reshape(2 * np.count_nonzero(used), self.bends.shape[2])
+        return np.linalg.pinv(bends.T @ self._weighted(used, bends), hermitian=True)
+
+    def straightened(self, values, used, weights=None):
+        """Values (n, 2, ...) less that map."""
+        if not self.bends.shape[2]:
+            return values
+        return values - self.bends @ self.bend(values, used, weights)
 
     def determined(self, used, weights=None):
         """Maps (2 k, m) that offsets and prior determine, with their information (m,), and the others (2 k, 2 k - m).
@@ -192,15 +224,18 @@ class MapEquations:
         value = covariance @ self.prior.information @ self.prior.centre + gain @ self.offsets.values[used].ravel()
         return value, covariance, gain
 
-    def left(self, value):
-        """What a map (2 k,) leaves of all offsets, (n, 2)."""
-        return self.offsets.values - self.design @ value
+    def left(self, value, used, weights=None):
+        """What a map (2 k,), and that of the reference alone, leave of all offsets, (n, 2)."""
+        return self.straightened(self.offsets.values - self.design @ value, used, weights)
+
+    def freedom(self, used):
+        """Degrees of freedom of the used offsets that these maps leave to chance alone."""
+        _, covariance, _ = self.solve(used)
+        return 2 * np.count_nonzero(used) - self.bends.shape[2] - np.trace(covariance @ self.gain(used)[0])
 
     def agreement(self, used):
         """chi2 of the used offsets less the map, and its degrees of freedom."""
-        value, covariance, _ = self.solve(used)
-        left = self.left(value)
-        return self.chi2(left, used), 2 * np.count_nonzero(used) - np.trace(covariance @ self.gain(used)[0])
+        return self.chi2(self.left(self.solve(used)[0], used), used), self.freedom(used)
 
     def chi2(self, left, used, other=None):
         """That of what is left (n, 2) of the used offsets; or its product with something else of that kind."""
@@ -212,8 +247,9 @@ class MapEquations:
     def pulls(self, used):
         """Length of every offset less the map, in its standard errors; those of the used ones without their own say."""
         value, covariance, _ = self.solve(used)
-        left = self.left(value)
-        spread = self.design @ covariance @ self.design.transpose(0, 2, 1)
+        left, design = self.left(value, used), self.straightened(self.design, used)
+        spread = design @ covariance @ design.transpose(0, 2, 1)
+        spread = spread + self.bends @ self.bend_covariance(used) @ self.bends.transpose(0, 2, 1)
         whole = np.where(used[:, None, None], self.blocks - 0.9 * _at_most(spread, self.blocks), self.blocks + spread)
         return np.sqrt(np.einsum("na,nab,nb->n", left, np.linalg.inv(whole), left))
 
@@ -222,8 +258,9 @@ class MapEquations:
 
         Every star counts by itself, whatever errors they have in common.
         """
-        value = self.solve(used, np.ones(np.count_nonzero(used)))[0]
-        left, off = self.left(value), value - self.prior.centre
+        equal = np.ones(np.count_nonzero(used))
+        value = self.solve(used, equal)[0]
+        left, off = self.left(value, used, equal), value - self.prior.centre
         return np.einsum("na,nab,nb->n", left, np.linalg.inv(self.blocks), left), off @ self.prior.information @ off
 
 
@@ -299,7 +336,7 @@ def _majority(equations):
     """As many of the offsets as are a majority whatever the others are: those that agree best among themselves."""
     n, rng = len(equations.offsets.rows), np.random.default_rng(0)
     order = np.argsort(equations.offsets.rows)  # whatever the order of the reference
-    modes = equations.design.shape[2] // 2
+    modes = (equations.design.shape[2] + equations.bends.shape[2]) // 2
     few, enough = min(n, modes + 1), min(n, (n + modes + 1) // 2)
 
     def nearest(used):
@@ -380,13 +417,13 @@ def estimate(equations, used, names):
         Degrees of freedom of these offsets.
     """
     value, covariance, gain = equations.solve(used)
-    left = equations.left(value)
+    left = equations.left(value, used)
     information, weighted = equations.gain(used)
     share = covariance @ information
     parts = map_parts(equations.prior.modes)[1:]
     pointing = 1.0 if np.count_nonzero(used) > 1 else 0.5  # a single star determines the shift alone
     measured = [pointing, *(np.trace(part.T @ share @ part) / part.shape[1] for part in parts)]
-    dof = 2 * np.count_nonzero(used) - np.trace(share)
+    dof = equations.freedom(used)
     tie = Tie(
         covariance=covariance,
         shared=_shared(equations, used, gain),
