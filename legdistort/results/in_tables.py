@@ -8,7 +8,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from astropy.time import Time
 
-from ..geometry import similarity
+from ..geometry import basis, similarity
 from ..geometry.epochs import year
 from ..inputs import column_contract
 from . import motions as star_motions
@@ -54,6 +54,23 @@ def _are_apart(solution, used):
     """Whether nothing determines how groups of detectors lie to each other, by the observations used."""
     errors = solution.estimate.uncertainty.camera
     return errors is not None and errors.unknown.shape[2] > 0 and len(solution.camera.groups(used)) > 1
+
+
+def higher_static(solution):
+    """See `Solution.higher_static`."""
+    errors, n = solution.estimate.uncertainty.camera, basis.n_modes(solution.degree)
+    if errors is None or errors.owner is None:
+        return None
+    owners, first = np.unique(errors.owner, return_index=True)
+    values = solution.estimate.prior_mean[first, :, n:]
+    error = np.sqrt(np.sum(errors.changes**2, axis=1)).reshape(values.shape)
+    m_order, n_order = (orders[n:] for orders in basis.orders(basis.degree_of(n + values.shape[2])))
+    out = QTable()
+    out["detector"] = np.repeat([solution[solution.names[i]].detectors[0] for i in first], values.shape[2])
+    out["m"], out["n"] = np.tile(m_order, len(owners)), np.tile(n_order, len(owners))
+    for suffix, each in (("", values), ("_err", error)):
+        out[f"x{suffix}"], out[f"y{suffix}"] = each.swapaxes(0, 1).reshape(2, -1) * u.pix
+    return out
 
 
 def stars_at(solution, time):

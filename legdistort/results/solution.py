@@ -169,6 +169,16 @@ class Solution(ShownAsPrinted):
         columns = [[getattr(test, name) for test in tests] for name in types]
         return QTable(columns, names=list(types), dtype=list(types.values()))
 
+    @cached_property
+    def higher_static(self) -> QTable | None:
+        """The static distortion beyond the degree that the exposures of a detector have in common; None if they show none.
+
+        One row for each mode of a detector: ``detector``, its orders ``m`` (along x) and ``n`` (along y), ``x``, ``y``
+        [pix], coefficients with what a prior has of them, and their errors ``x_err``, ``y_err``. It is part of the
+        distortion of every exposure (`coefficients`), so of its WCS.
+        """
+        return in_tables.higher_static(self)
+
     # -- stars
 
     @cached_property

@@ -137,6 +137,21 @@ def test_what_exposures_have_in_common_beyond_the_degree_is_part_of_the_distorti
     without = solved(dense_model.drawn_set(3, **words | {"higher": 0.0})[0])
     assert without.coefficients.shape[2] == basis.n_modes(3)
     assert without.diagnostics.higher_static is None
+    assert without.higher_static is None
+
+
+def test_what_is_common_beyond_the_degree_is_a_table(tmp_path):
+    """Of every mode, in pixels, with errors; a file has it too."""
+    words = ROWS["terms beyond the degree"][0]
+    data, truth = dense_model.drawn_set(3, **words)
+    solution = solved(data)
+    for table in (solution.higher_static, ld.Solution.read(solution.write(tmp_path / "s.asdf")).higher_static):
+        assert list(zip(table["m"], table["n"], strict=True)) == dense_model.orders(5)[10:]
+        assert set(table["detector"]) == {"1"}
+        for axis, name in enumerate("xy"):
+            np.testing.assert_allclose(table[name].value, solution.coefficients[4, axis, 10:], rtol=1e-12)
+            off = table[name].value - truth["beyond"][axis, 10:]
+            assert np.abs(off / table[f"{name}_err"].value).max() < 5
 
 
 def _without_map(offset, at, data, truth, seen):
@@ -149,7 +164,7 @@ def _without_map(offset, at, data, truth, seen):
 @pytest.mark.parametrize("sets", [5, pytest.param(30, marks=pytest.mark.slow)])
 def test_errors_have_those_of_what_is_common_beyond_the_degree(sets):
     """As known they leave a squared pull of 1.55 of stars and of 1.33 of new positions."""
-    pulls = {"stars": [], "new": []}
+    pulls = {"stars": [], "new": [], "terms": []}
     for seed in range(sets):
         words = {"static": 1.5, "dynamic": 0.9, "rolls": 30.0, "higher": 0.03, "errors": (0.01, 0.01)}
         data, truth = dense_model.drawn_set(seed, n=5, n_stars=60, **words)
@@ -166,6 +181,9 @@ def test_errors_have_those_of_what_is_common_beyond_the_degree(sets):
         found = solution[solution.names[1]].correct(pixels, errors=np.zeros((40, 2)))
         offset = _without_map(found.xy - at, at, data, truth, seen)
         pulls["new"].append([np.sum(offset**2), np.einsum("naa->", found.relative)])
+        terms = solution.higher_static
+        offset = np.stack([terms["x"].value, terms["y"].value]) - truth["beyond"][:, 10:]
+        pulls["terms"].append([np.sum(offset**2), np.sum(terms["x_err"] ** 2 + terms["y_err"] ** 2).value])
     for name, each in pulls.items():
         true, stated = np.sum(each, axis=0)
         assert true / stated == pytest.approx(1, abs=0.25 if sets > 5 else 0.35), name
