@@ -171,7 +171,7 @@ class Solution(ShownAsPrinted):
 
     @cached_property
     def higher_static(self) -> QTable | None:
-        """The static distortion beyond the degree that the exposures of a detector have in common; None if they show none.
+        """The static distortion of detectors beyond the degree, as their exposures share it; None if they show none.
 
         One row for each mode of a detector: ``detector``, its orders ``m`` (along x) and ``n`` (along y), ``x``, ``y``
         [pix], coefficients with what a prior has of them, and their errors ``x_err``, ``y_err``. It is part of the

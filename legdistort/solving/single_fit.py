@@ -161,7 +161,33 @@ def estimate(matches, options, **how):
             return estimate(fit.matches, options)
     if np.mean(fit.used) < 1 - clipping.USUAL and (plain := _with_plain_widths(matches, options)):
         return plain
-    return replace(fit, widths=widths)
+    return _about_their_static(replace(fit, widths=widths))
+
+
+def _about_their_static(fit):
+    """The fit with widths about the static distortion that the exposures show, where no mean of a prior is stated.
+
+    About none they would have its size, and exposures would be drawn to nothing by so much.
+    """
+    prior, options = fit.widths.priors[0], fit.options
+    stated = prior.states_mean or isinstance(options.prior, dict)
+    if stated or options.errors == "scale":  # which the widths were found beside
+        return fit
+    weight = fit.weighted.weight
+    problem = replace(_problem(fit.matches, options), prior_sigma=None, weight=weight)
+    if fit.matches.camera.has_focal_plane or not most_probable.is_possible(problem):
+        return fit
+    common = {"loss": options.loss, "max_iterations": options.max_iterations}
+    with warnings.catch_warnings(action="ignore", category=ConvergenceWarning), contextlib.suppress(SolveError):
+        found = most_probable.most_probable(problem, _padded(fit.result.state, problem))
+        whole = found.posed(problem)
+        held = minimisers.solve_joint(whole, found.state, hold=True, **common)
+        if found.converged and held.converged:
+            sizes = found.posterior.sizes[: fit.widths.values.shape[1]]
+            widths = replace(fit.widths, values=sizes[None])
+            whole = replace(whole, weight=fit.problem.weight)
+            return replace(fit, problem=whole, result=_as_known(held, found, widths=True), widths=widths)
+    return fit
 
 
 def _with_plain_widths(matches, options):
@@ -188,15 +214,7 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
     matches. One on `trial` is for comparison with others, of which `near` is one: `TRIAL` is accurate enough, so that
     `near` serves as the plain fit of the same degree, and where it explains the observations its plane is kept.
     """
-    problem = build_problem(
-        matches,
-        options.degree,
-        prior=options.prior,
-        error_floor=options.error_floor,
-        own_degree=options.own_degree,
-        motion=star_motions.terms_of(options),
-        night_sigma=options.night_sigma,
-    )
+    problem = _problem(matches, options)
     nominal = np.stack([matches.poses[name] for name in matches.names])
     near_by = near is not None and near.matches is matches and near.result.converged
     if near_by:
@@ -244,6 +262,19 @@ def minimise(matches, options, *, judged=True, near=None, trial=False):
     if result is plain and not plain.converged:
         warn(plain.status, ConvergenceWarning)
     return fit
+
+
+def _problem(matches, options):
+    """The `Problem` of some matches with some `SolveOptions`."""
+    return build_problem(
+        matches,
+        options.degree,
+        prior=options.prior,
+        error_floor=options.error_floor,
+        own_degree=options.own_degree,
+        motion=star_motions.terms_of(options),
+        night_sigma=options.night_sigma,
+    )
 
 
 def _plain(problem, start, common):
@@ -308,13 +339,21 @@ def _unbent(matches, problem, start, result, common, *, loss="linear", or_else=N
             better = held.converged and held.blocks.cost < was.cost
             better &= not misfit or is_noise(found)  # else the misfit has another cause
         if better and held is not None:
-            positions = held.state.positions.T[elimination.typical_stars(held.blocks.v)]
-            gauge = known_maps.as_in_posterior(held.gauge, found.blocks.unknowns, positions, *found.covariances())
             widths = any(problem.has_widths(i) for i in range(problem.n_exposures))  # those that were given
-            held = replace(held, gauge=replace(gauge, prior=widths), higher=found.higher_covariance)
+            held = _as_known(held, found, widths=widths)
         if better:
             return whole, held, found.state
     return before, result, start
+
+
+def _as_known(held, found, *, widths):
+    """The `Result` of a fit with the plane held at the minimum of all that is known, with its errors there.
+
+    `widths`: exposures have those of a prior.
+    """
+    positions = held.state.positions.T[elimination.typical_stars(held.blocks.v)]
+    gauge = known_maps.as_in_posterior(held.gauge, found.blocks.unknowns, positions, *found.covariances())
+    return replace(held, gauge=replace(gauge, prior=widths), higher=found.higher_covariance)
 
 
 def _typical(problem, blocks):

@@ -3,6 +3,8 @@
 import itertools
 import re
 
+import dense_model
+import drawn_sets
 import numpy as np
 import oracle
 import pytest
@@ -15,7 +17,7 @@ from legdistort.assessment import baselines
 from legdistort.cli import parser
 from legdistort.exceptions import ConvergenceWarning, InputError, LegdistortError, SolveError
 from legdistort.geometry.detector_modes import dynamic_basis, dynamic_degrees
-from legdistort.priors.prior import Prior
+from legdistort.priors.prior import UNSTATED, Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
 from legdistort.simulation.prediction import predict
@@ -491,3 +493,38 @@ def test_widths_that_do_not_settle_are_warned_of(monkeypatch):
     monkeypatch.setattr(prior_widths, "MAX_ROUNDS", 1)
     with warns_here(ConvergenceWarning, match="the widths of the prior have not settled after 1 fits"):
         found(simulate(40))
+
+
+# --- without a mean ----------------------------------------------------------------------------------------------
+
+
+def _drawn_to_what_they_show(seed, **words):
+    """Sums of squared absolute errors, similarities aside, and of the stated variances; of widths without a mean."""
+    data, truth = dense_model.drawn_set(seed, rolls=30.0, **words)
+    prior = Prior([[0.0], [0.0]], source=UNSTATED).with_sigma("evidence", degree=0)
+    solution = solve(drawn_sets.as_matches(data), prior=prior)
+    stars = truth["stars"]
+    offset, root = solution.estimate.positions - stars, 1 / solution.stars["x_err"].value[:, None]
+    similar = np.stack([np.ones(len(stars)), stars @ [1, 1j] / 1024], axis=1)
+    offset = offset @ [1, 1j]
+    offset = offset - similar @ np.linalg.lstsq(root * similar, root[:, 0] * offset, rcond=None)[0]
+    variance = sum(solution.stars[f"{axis}_err_abs"].value ** 2 for axis in "xy")
+    return np.sum(np.abs(offset) ** 2), np.sum(variance), solution
+
+
+@pytest.mark.parametrize(("words", "limit"), [({}, 0.06), ({"n_stars": 16}, 0.12)])
+def test_without_a_mean_exposures_are_drawn_to_the_static_distortion_that_they_show(words, limit):
+    """A static distortion of 1 px a mode, departures of 0.05: about nothing, widths would be of a pixel."""
+    square, variance, solution = _drawn_to_what_they_show(1, dynamic=0.05, **words)
+    assert np.sqrt(square / 2 / len(solution.stars)) < limit
+    assert square < 2 * variance
+    for width in solution.diagnostics.widths[1:]:
+        assert 0.02 < width < 0.1
+    assert "scatter of a coefficient, found from the exposures" in str(solution)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dynamic", [0.05, 0.4])
+def test_errors_without_a_mean_are_calibrated(dynamic):
+    square, variance = np.sum([_drawn_to_what_they_show(seed, dynamic=dynamic)[:2] for seed in range(20)], axis=0)
+    assert square / variance == pytest.approx(1, abs=0.25)

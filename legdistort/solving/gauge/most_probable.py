@@ -118,6 +118,13 @@ class MostProbable:
         return data.n_data - float((self.posterior.covariance[:n, :n] * data.curvature).sum())
 
 
+def is_possible(problem):
+    """Whether the most probable stars, distortions and static distortions can be sought at all."""
+    if problem.unknowns.shared or problem.terms.n or problem.fixed is not None or problem.pose_width is not None:
+        return False
+    return problem.degree >= 2 and problem.n_exposures >= FEWEST and reduced_system.is_small(problem)
+
+
 def counts(problem, state, shown=1.0):
     """Whether a bend of the plane by as much as exposures depart from their prior would show in their residuals.
 
@@ -125,9 +132,7 @@ def counts(problem, state, shown=1.0):
     plane that a convention holds elsewhere keeps the data from their minimum. It would move stars by more than `shown`
     typical errors.
     """
-    if problem.unknowns.shared or problem.terms.n or problem.fixed is not None or problem.pose_width is not None:
-        return False
-    if problem.degree < 2 or problem.n_exposures < FEWEST or not reduced_system.is_small(problem):
+    if not is_possible(problem):
         return False
     if problem.prior_sigma is not None and problem.mean_sigma is not None and problem.mean_sigma.any():
         return True  # widths draw exposures to the mean of the prior, and not to the static distortion that they show
