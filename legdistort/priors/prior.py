@@ -57,7 +57,10 @@ def _per_mode(value, n, name):
 def _declared(sigma, static_sigma):
     """The size of a static distortion of which nothing else is known, a positive number."""
     if sigma is not None:
-        raise InputError("sigma is the scatter of exposures around a mean: give the mean as well, or leave sigma out")
+        raise InputError(
+            "sigma is the scatter of exposures around a mean: give the mean as well, or leave sigma out; without one "
+            f"it is {EVIDENCE!r}, alone"
+        )
     given = isinstance(static_sigma, Real) and not isinstance(static_sigma, bool)
     if not (given and 0 < static_sigma < np.inf):
         raise InputError(
@@ -76,7 +79,7 @@ class Prior(ShownAsPrinted):
     ----------
     mean : array_like, shape (2, n_modes), or None
         Static distortion A_0 in the normalised Legendre basis, pixels, x then y (reference -> detector). None: only its
-        size is known, see `static_sigma`.
+        size is known, see `static_sigma`; or, with ``sigma="evidence"`` alone, nothing.
     sigma : array_like, optional
         Scatter of single exposures around the mean, pixels: a number, (n_modes,) or (2, n_modes). It shrinks modes
         that the data do not determine. None leaves the exposures free. Zero keeps a mode at the mean, infinity leaves
@@ -133,6 +136,10 @@ class Prior(ShownAsPrinted):
     source: str | dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
+        is_sought = isinstance(self.sigma, str) and self.sigma == EVIDENCE
+        if self.mean is None and is_sought and self.static_sigma is None:
+            object.__setattr__(self, "mean", np.zeros((2, 1)))
+            object.__setattr__(self, "source", UNSTATED)
         if self.mean is None:
             object.__setattr__(self, "static_sigma", _declared(self.sigma, self.static_sigma))
             return
@@ -213,8 +220,11 @@ class Prior(ShownAsPrinted):
     def __repr__(self) -> str:
         if self.mean is None:
             return f"<Prior: not known, {self.static_sigma:g} px a mode>"
-        words = [f"degree {self.degree}", f"{self.mean.shape[1]} modes an axis"]
-        words += [f"{name} given" for name in ("sigma", "static_sigma") if getattr(self, name) is not None]
+        words = [f"degree {self.degree}", f"{self.mean.shape[1]} modes an axis"] if self.states_mean else ["not known"]
+        widths = {name: getattr(self, name) for name in ("sigma", "static_sigma")}
+        words += [
+            f"{name} {'by evidence' if isinstance(v, str) else 'given'}" for name, v in widths.items() if v is not None
+        ]
         return f"<Prior: {', '.join(words)}>"
 
     @property

@@ -101,7 +101,16 @@ def test_size_must_be_a_positive_number(static_sigma):
         ld.Prior(None, static_sigma=static_sigma)
 
 
+def test_scatter_alone_is_found_about_what_exposures_show(tmp_path):
+    prior = ld.Prior(None, sigma="evidence")
+    for each in (prior, ld.Prior.read(prior.write(tmp_path / "p.asdf"))):
+        assert repr(each) == "<Prior: not known, sigma by evidence>"
+        assert not each.states_mean
+
+
 def test_scatter_needs_a_mean():
+    with pytest.raises(InputError, match="without one it is 'evidence', alone"):
+        ld.Prior(None, sigma=0.3)
     with pytest.raises(InputError, match="sigma is the scatter of exposures around a mean"):
         ld.Prior(None, sigma=0.3, static_sigma=2.0)
     with pytest.raises(InputError, match="scatter of exposures around a mean"):

@@ -17,7 +17,7 @@ from legdistort.assessment import baselines
 from legdistort.cli import parser
 from legdistort.exceptions import ConvergenceWarning, InputError, LegdistortError, SolveError
 from legdistort.geometry.detector_modes import dynamic_basis, dynamic_degrees
-from legdistort.priors.prior import UNSTATED, Prior
+from legdistort.priors.prior import Prior
 from legdistort.results import accuracy
 from legdistort.simulation.observations import simulate_matches
 from legdistort.simulation.prediction import predict
@@ -501,8 +501,7 @@ def test_widths_that_do_not_settle_are_warned_of(monkeypatch):
 def _drawn_to_what_they_show(seed, **words):
     """Sums of squared absolute errors, similarities aside, and of the stated variances; of widths without a mean."""
     data, truth = dense_model.drawn_set(seed, rolls=30.0, **words)
-    prior = Prior([[0.0], [0.0]], source=UNSTATED).with_sigma("evidence", degree=0)
-    solution = solve(drawn_sets.as_matches(data), prior=prior)
+    solution = solve(drawn_sets.as_matches(data), prior=Prior(None, sigma="evidence"))
     stars = truth["stars"]
     offset, root = solution.estimate.positions - stars, 1 / solution.stars["x_err"].value[:, None]
     similar = np.stack([np.ones(len(stars)), stars @ [1, 1j] / 1024], axis=1)
