@@ -342,7 +342,7 @@ def do_show(a):
         stated = {exposure.name: exposure.stated for exposure in exposures}
         _say(a, "\n\n".join(map(str, stated.values())), {name: each.to_dict() for name, each in stated.items()})
         return 0
-    refuse({"ext": a.ext, "dq_good": a.dq_good}, "is for a frame")
+    refuse({"ext": a.ext, "dq_good": a.dq_good, "weight_maps": a.weight_maps}, "is for a frame")
     solution = _solution(a)
     summary = summarise(solution)
     _report(a, solution, summary)

@@ -51,7 +51,13 @@ FORGETTING = {
         "options of the earlier run that do not hold; all: none does", type=names, default=[], metavar="NAME,..."
     )
 }
-FLAGGED = {"dq_good": Option("flags that leave a pixel good: a sum, or 64,32", metavar="BITS")}
+FLAGGED = {
+    "dq_good": Option("flags that leave a pixel good: a sum, or 64,32", metavar="BITS"),
+    "weight_maps": Option(
+        "MAP_WEIGHT, MAP_VARIANCE or MAP_RMS beside every frame; none (default: NAME.weight.fits where there is one)",
+        metavar="TYPE[,SUFFIX]",
+    ),
+}
 STOPPING = {"stop_at_bad": Option("refuse blank and damaged frames, do not leave them out", action="store_true")}
 STRICT = {"strict": Option("exit status 3 if a check of the result fails", action="store_true")}
 NAMED_SOLUTION = {"solution": Option("solution.asdf, or the folder of the results with it", required=True, path="read")}

@@ -19,6 +19,7 @@ from astropy.wcs import WCS
 from ..exceptions import ExportError, InputError, some_of, without_astropy_warnings
 from ..inputs import detector_files, exposure_files, exposure_names, file_images
 from ..inputs.frames import wcs_cards
+from ..inputs.frames.weight_maps import WeightMaps
 from ..inputs.sky_wcs import header_wcs, leads_elsewhere, warn_of_another_field
 from ..inputs.wcs_files import PLACES
 from ..runtime import provenance
@@ -205,7 +206,7 @@ class _Plan:
 
 def _files(paths):
     """The files meant, each once."""
-    given = exposure_files.expand_paths(paths)
+    given = WeightMaps().frames_of(exposure_files.expand_paths(paths))
     other = next((path for path in given if not isinstance(path, (str, Path))), None)
     if other is not None:
         raise InputError(f"frames must be paths of FITS files, got {type(other).__name__}")
