@@ -242,7 +242,8 @@ def do_coadd(a):
     CoaddOptions(**coadding)  # which refuses them before a frame is read
     mosaic = legdistort.coadd(_open(a), solution, **coadding, **_share(a))
     mosaic.write(a.out, overwrite=a.overwrite)
-    figures = {"shape": list(mosaic.shape), "n_exposures": len(mosaic.exposures), "left_out": mosaic.left_out}
+    counts = {"n_exposures": mosaic.n_exposures, "n_images": len(mosaic.exposures)}
+    figures = {"shape": list(mosaic.shape)} | counts | {"left_out": mosaic.left_out}
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
 
 
