@@ -26,7 +26,7 @@ COMMON = {
 }
 FRAMES = {
     "paths": Option(
-        "FITS files, plain or compressed; ASDF files of Roman", "frames", nargs="+", metavar="FRAME", path="read"
+        "FITS files, plain or compressed; ASDF files of Roman", "frames", nargs="+", metavar="FRAME", path="inputs"
     ),
     "ext": Option("extension: number, name, or NAME,VERSION", type=extension),
 }
@@ -37,7 +37,7 @@ RUN_FRAMES = {
         none=[],
         nargs="*",
         metavar="FRAME",
-        path="read",
+        path="inputs",
     ),
     "ext": FRAMES["ext"],
     "earlier": Option(
@@ -81,11 +81,11 @@ TABLE = {
 }
 TABLES = {
     "tables": Option(
-        "positions; without a column exposure, one exposure", "tables", nargs="+", metavar="TABLE", path="read"
+        "positions; without a column exposure, one exposure", "tables", nargs="+", metavar="TABLE", path="inputs"
     )
 }
 WCS_OF_TABLES = {
-    "wcs": Option("frames of the tables: WCS, shape and time", nargs="+", metavar="FRAME", path="read"),
+    "wcs": Option("frames of the tables: WCS, shape and time", nargs="+", metavar="FRAME", path="inputs"),
     "ext": Option("extension of those frames: number, name, or NAME,VERSION", type=extension),
 }
 POSITIONS = {"table": Option("exposure, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
@@ -95,7 +95,7 @@ MATCHED = {
         "tables",
         nargs="+",
         metavar="TABLE",
-        path="read",
+        path="inputs",
     )
 }
 WORKERS = {"workers": Option("cores to use (default: all, where frames are not few and small)", type=int, metavar="N")}
