@@ -341,7 +341,9 @@ def do_show(a):
         refuse({"max_bytes": a.max_bytes, "strict": a.strict}, "is for a solution")
         exposures = read_exposures(str(a.solution), **given(a, {"ext": options.FRAMES["ext"]}, options.FLAGGED))
         stated = {exposure.name: exposure.stated for exposure in exposures}
-        _say(a, "\n\n".join(map(str, stated.values())), {name: each.to_dict() for name, each in stated.items()})
+        several = len(stated) > 1
+        texts = [f"{name}\n{each}" if several else str(each) for name, each in stated.items()]
+        _say(a, "\n\n".join(texts), {name: each.to_dict() for name, each in stated.items()})
         return 0
     refuse({"ext": a.ext, "dq_good": a.dq_good, "weight_maps": a.weight_maps}, "is for a frame")
     solution = _solution(a)

@@ -67,8 +67,8 @@ SOLUTION = {
 }
 SHOWN = {
     "solution": Option("solution.asdf, the folder of the results with it, or a FITS frame", "solution", path="read"),
+    "ext": Option("of a frame: number, name, or NAME,VERSION; a name of several shows each detector", type=extension),
     "max_bytes": SOLUTION["max_bytes"],
-    "ext": FRAMES["ext"],
 }
 COLUMNS = {
     "columns": Option("names of columns", type=columns, default=[], metavar="OURS=THEIRS,..."),

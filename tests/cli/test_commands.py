@@ -936,3 +936,16 @@ def test_all_files_that_are_missing_are_named_before_any_is_read(tmp_path, capsy
         f"legdistort: 2 of 3 files are not there (b.ecsv, c.ecsv, looked for from {tmp_path}): correct their names, or "
         "leave them out\n"
     )
+
+
+def test_show_names_the_detector_of_what_it_prints(tmp_path, capsys):
+    planes = [fits.ImageHDU(np.random.default_rng(k).normal(9, 1, (20, 20)), name="SCI", ver=k) for k in (1, 2)]
+    for k, plane in enumerate(planes, start=1):
+        plane.header["GAIN"] = float(k)
+    fits.HDUList([fits.PrimaryHDU(), *planes]).writeto(tmp_path / "a.fits")
+    assert main(["show", str(tmp_path / "a.fits"), "--ext", "SCI"]) == 0
+    parts = capsys.readouterr().out.split("\n\n")
+    assert [part.splitlines()[0] for part in parts] == ["a-1", "a-2"]
+    assert ["GAIN of the image" in part for part in parts] == [True, True]
+    assert main(["show", str(tmp_path / "a.fits"), "--ext", "SCI,1"]) == 0
+    assert capsys.readouterr().out.startswith("quantity")
