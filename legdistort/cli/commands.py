@@ -465,7 +465,10 @@ def _solving(a, shape=None, *, with_headers=False):
 def _prior(text, shape, static_sigma):
     """Whatever `Prior.from_file` recognises; without a text, a distortion of which only the size is known."""
     if text == HEADER and not Path(text).exists():
-        raise InputError("only run reads frames: write the distortion of one, legdistort prior FRAME --out FILE")
+        raise InputError(
+            "--prior header is for run, which reads frames: write the distortion of one of them with legdistort prior "
+            "FRAME --out prior.asdf, and give --prior prior.asdf"
+        )
     if text is None:
         return None if static_sigma is None else legdistort.Prior(None, static_sigma=static_sigma)
     return legdistort.Prior.from_file(text, shape=shape, static_sigma=static_sigma)
