@@ -467,7 +467,7 @@ def _prior(text, shape, static_sigma):
     if text == HEADER and not Path(text).exists():
         raise InputError(
             "--prior header is for run, which reads frames: write the distortion of one of them with legdistort prior "
-            "FRAME --out prior.asdf, and give --prior prior.asdf"
+            "FRAME --out prior.asdf, and give --prior prior.asdf; --static fit finds those of several detectors"
         )
     if text is None:
         return None if static_sigma is None else legdistort.Prior(None, static_sigma=static_sigma)

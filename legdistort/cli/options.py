@@ -212,6 +212,7 @@ MATCHING = Group(
     "matching",
     {
         "min_exposures": Option("keep stars seen in so many exposures (default 4)", type=int),
+        "tolerance": Option("largest distance of a star in two exposures, pixels (default: found)", type=float),
         "isolation": Option("largest crowding of a star; inf keeps all (default 3)", type=float),
     },
 )

@@ -489,6 +489,7 @@ def in_words(names):
     powers = [name for name in names if "z^" in name]
     degrees = [name.removeprefix("degree ") for name in names if name.startswith("degree ")]
     words = [name for name in names if name not in powers and not name.startswith("degree ")]
+    words = ["part of the static distortion" if name == "static" else name for name in words]
     words += [f"change of scale over the field ({', '.join(powers)} with z = x + iy)"] * bool(powers)
     words += [f"maps of degree {', '.join(degrees)}"] * bool(degrees)
     return f"{', '.join(words[:-1])} and {words[-1]}" if len(words) > 1 else words[0]

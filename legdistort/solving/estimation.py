@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..cameras.exchanged import check_places
-from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, by_reason, some_of, warn
 from ..matching.header_poses import sky_by_layout
 from ..matching.matches import Matches
 from ..priors.prior import Prior, has_distortion
@@ -446,14 +446,13 @@ def _tell(fit, matches):
 
 def _tell_lost_exposures(fit, matches):
     """Warn of exposures left out: of each, but of those of a night that has another distortion together."""
-    nights, reasons = {}, {k: v for k, v in fit.matches.left_out.items() if k not in matches.left_out}
-    for name, reason in reasons.items():
-        night = int(matches.blocks[matches.names.index(name)]) if ALIKE in reason else name
-        nights.setdefault(night, []).append(name)
-    for names in nights.values():
-        several = f"{len(names)} exposures of a night are left out ({some_of(names, MOST_NAMED)}); "
-        words = f"{several}{names[0]}" if len(names) > 1 else f"exposure {names[0]} is left out"
-        warn(f"{words}: {reasons[names[0]]}", AssumptionWarning)
+    new = {name: reason for name, reason in fit.matches.left_out.items() if name not in matches.left_out}
+    for reason, names in by_reason(new).items():
+        if ALIKE in reason and len(names) > 1:
+            warn(f"{len(names)} exposures are left out ({some_of(names, MOST_NAMED)}): {reason}", AssumptionWarning)
+        else:
+            for name in names:
+                warn(f"exposure {name} is left out: {reason}", AssumptionWarning)
 
 
 def _tell_lost_stars(fit):
