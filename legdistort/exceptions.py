@@ -113,12 +113,17 @@ def some_of(names, most):
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def reasons_of(names, most=5):
-    """Names with their reasons, ``{name: reason}``, for a message: by reason, some of both, and how many more."""
+def by_reason(names):
+    """``{reason: list of names}`` of ``{name: reason}``."""
     alike = {}
     for name, reason in names.items():
         alike.setdefault(reason, []).append(name)
-    listed = [f"{some_of(same, most)}: {reason}" for reason, same in alike.items()]
+    return alike
+
+
+def reasons_of(names, most=5):
+    """Names with their reasons, ``{name: reason}``, for a message: by reason, some of both, and how many more."""
+    listed = [f"{some_of(same, most)}: {reason}" for reason, same in by_reason(names).items()]
     return "; ".join(listed[:most]) + (f"; and {len(listed) - most} more reasons" if len(listed) > most else "")
 
 

@@ -114,6 +114,7 @@ def run(
     earlier: StrPath | None = None,
     ext: Extension | None = None,
     dq_good: int | str | Sequence[int] | None = None,
+    weight_maps: str | None = None,
     degree: int = DEGREE,
     prior: Prior | Mapping[str, Prior] | str | HeaderPrior | None = None,
     camera: Camera | None = None,
@@ -155,6 +156,8 @@ def run(
         Extension to read from every file.
     dq_good : int, str or sequence of int, optional
         Flags with which a pixel is used nevertheless.
+    weight_maps : str, optional
+        Weight maps beside the frames, see `legdistort.read_exposures`.
     degree : int
         Total degree of the distortion.
     prior : Prior, dict, "header" or HeaderPrior, optional
@@ -230,7 +233,8 @@ def run(
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"}, wanted=mosaic)
     tying = _tying(reference, reference_error, reference_degree, epoch, pixel_scale)
     _check_others(workers, truth, catalogue)
-    paths, reading, before = _where_to_begin(paths, earlier, measuring, ext=ext, dq_good=dq_good, camera=camera)
+    reading = {"ext": ext, "dq_good": dq_good, "weight_maps": weight_maps, "camera": camera}
+    paths, reading, before = _where_to_begin(paths, earlier, measuring, **reading)
     measuring = before.measuring if before else measuring
     share, timings = {"workers": workers, "progress": progress}, _of_start()
     with outputs.replacing_folder(out, results=RESULTS, keep=keep) as target:
@@ -335,11 +339,11 @@ def _of_start():
     return {} if since is None else {"start": time.perf_counter() - since}
 
 
-def _open_frames(paths, min_exposures, stop_at_bad, progress, tied, *, ext, dq_good, camera):
+def _open_frames(paths, min_exposures, stop_at_bad, progress, tied, *, camera, **reading):
     """Exposures that can be solved together, and the bad ones as ``{name: reason}``."""
     bad = {}
-    options = {"ext": ext, "dq_good": dq_good, "stop_at_bad": stop_at_bad, "progress": progress}
-    exposures = exposure_files.open_exposures(paths, left_out=bad, **options)
+    options = {"left_out": bad, "stop_at_bad": stop_at_bad, "progress": progress}
+    exposures = exposure_files.open_exposures(paths, **options, **reading)
     exposures = camera.of_detectors(exposures) if camera else exposures
     _check_exposures(exposures, min_exposures, bad, tied)
     return exposures, bad

@@ -1,6 +1,7 @@
 """What an option of the command line is: value from text, way to a function, paths checked before any work."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
@@ -91,8 +92,9 @@ class Option:
         The flag, or a word for a positional argument; by default the name of the argument as a flag.
     none : object
         What stands for None.
-    path : {"read", "file", "folder", "results"}, optional
-        It names what is read, and must not be replaced; or what is written: a file, a folder in which nothing is
+    path : {"read", "inputs", "file", "folder", "results"}, optional
+        It names what is read, and must not be replaced; several such files, all of which must be there; or what is
+        written: a file, a folder in which nothing is
         replaced, or the folder of the results of a run.
     endings : tuple of str, optional
         Endings that a name of a file may have: they select its format.
@@ -149,12 +151,12 @@ def check_paths(arguments, groups):
     from ..inputs.exposure_files import expand_paths
     from ..runtime.outputs import check_ending, check_file, check_folder, check_not_read, try_to_write
 
-    named = {"read": [], "file": [], "folder": [], "results": []}
+    named = {"read": [], "inputs": [], "file": [], "folder": [], "results": []}
     for _, _, dest, option in flagged(groups):
         value = getattr(arguments, dest)
         if option.path is not None and value not in (None, option.none):
             named[option.path].append(value)
-    inputs = [path for value in named["read"] for path in expand_paths(value)]
+    inputs = [path for value in named["read"] + named["inputs"] if value for path in expand_paths(value)]
     replaced = [path for path in named["file"] if not path.is_dir()]
     for folder in named["results"]:
         from ..pipeline import RESULTS
@@ -171,6 +173,21 @@ def check_paths(arguments, groups):
             check_ending(getattr(arguments, dest), option.endings)
     for path in named["file"] + named["folder"] + named["results"]:
         try_to_write(path)
+    for value in filter(None, named["inputs"]):
+        _check_all_there(expand_paths(value))
+
+
+def _check_all_there(paths):
+    """Raise one `InputError` for all of several files that are missing; of one alone whoever reads it says so."""
+    from ..exceptions import InputError, some_of
+
+    missing = [path for path in paths if not os.path.lexists(path)]
+    if len(paths) > 1 and missing:
+        here = f", looked for from {os.getcwd()}" * any(not os.path.isabs(path) for path in missing)
+        raise InputError(
+            f"{len(missing)} of {len(paths)} files are not there ({some_of(missing, 5)}{here}): correct their names, "
+            "or leave them out"
+        )
 
 
 def wants_progress(arguments):

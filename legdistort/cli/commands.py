@@ -244,7 +244,8 @@ def do_coadd(a):
     CoaddOptions(**coadding)  # which refuses them before a frame is read
     mosaic = legdistort.coadd(_open(a), solution, **coadding, **_share(a))
     mosaic.write(a.out, overwrite=a.overwrite)
-    figures = {"shape": list(mosaic.shape), "n_exposures": len(mosaic.exposures), "left_out": mosaic.left_out}
+    counts = {"n_exposures": mosaic.n_exposures, "n_images": len(mosaic.exposures)}
+    figures = {"shape": list(mosaic.shape)} | counts | {"left_out": mosaic.left_out}
     _say(a, f"{mosaic!r}"[1:-1] + f" in {a.out}", figures)
 
 
@@ -342,9 +343,11 @@ def do_show(a):
         refuse({"max_bytes": a.max_bytes, "strict": a.strict}, "is for a solution")
         exposures = read_exposures(str(a.solution), **given(a, {"ext": options.FRAMES["ext"]}, options.FLAGGED))
         stated = {exposure.name: exposure.stated for exposure in exposures}
-        _say(a, "\n\n".join(map(str, stated.values())), {name: each.to_dict() for name, each in stated.items()})
+        several = len(stated) > 1
+        texts = [f"{name}\n{each}" if several else str(each) for name, each in stated.items()]
+        _say(a, "\n\n".join(texts), {name: each.to_dict() for name, each in stated.items()})
         return 0
-    refuse({"ext": a.ext, "dq_good": a.dq_good}, "is for a frame")
+    refuse({"ext": a.ext, "dq_good": a.dq_good, "weight_maps": a.weight_maps}, "is for a frame")
     solution = _solution(a)
     summary = summarise(solution)
     _report(a, solution, summary)
@@ -464,7 +467,10 @@ def _solving(a, shape=None, *, with_headers=False):
 def _prior(text, shape, static_sigma):
     """Whatever `Prior.from_file` recognises; without a text, a distortion of which only the size is known."""
     if text == HEADER and not Path(text).exists():
-        raise InputError("only run reads frames: write the distortion of one, legdistort prior FRAME --out FILE")
+        raise InputError(
+            "--prior header is for run, which reads frames: write the distortion of one of them with legdistort prior "
+            "FRAME --out prior.asdf, and give --prior prior.asdf; --static fit finds those of several detectors"
+        )
     if text is None:
         return None if static_sigma is None else legdistort.Prior(None, static_sigma=static_sigma)
     return legdistort.Prior.from_file(text, shape=shape, static_sigma=static_sigma)

@@ -26,7 +26,7 @@ COMMON = {
 }
 FRAMES = {
     "paths": Option(
-        "FITS files, plain or compressed; ASDF files of Roman", "frames", nargs="+", metavar="FRAME", path="read"
+        "FITS files, plain or compressed; ASDF files of Roman", "frames", nargs="+", metavar="FRAME", path="inputs"
     ),
     "ext": Option("extension: number, name, or NAME,VERSION", type=extension),
 }
@@ -37,7 +37,7 @@ RUN_FRAMES = {
         none=[],
         nargs="*",
         metavar="FRAME",
-        path="read",
+        path="inputs",
     ),
     "ext": FRAMES["ext"],
     "earlier": Option(
@@ -51,7 +51,13 @@ FORGETTING = {
         "options of the earlier run that do not hold; all: none does", type=names, default=[], metavar="NAME,..."
     )
 }
-FLAGGED = {"dq_good": Option("flags that leave a pixel good: a sum, or 64,32", metavar="BITS")}
+FLAGGED = {
+    "dq_good": Option("flags that leave a pixel good: a sum, or 64,32", metavar="BITS"),
+    "weight_maps": Option(
+        "MAP_WEIGHT, MAP_VARIANCE or MAP_RMS beside every frame; none (default: NAME.weight.fits where there is one)",
+        metavar="TYPE[,SUFFIX]",
+    ),
+}
 STOPPING = {"stop_at_bad": Option("refuse blank and damaged frames, do not leave them out", action="store_true")}
 STRICT = {"strict": Option("exit status 3 if a check of the result fails", action="store_true")}
 NAMED_SOLUTION = {"solution": Option("solution.asdf, or the folder of the results with it", required=True, path="read")}
@@ -61,8 +67,8 @@ SOLUTION = {
 }
 SHOWN = {
     "solution": Option("solution.asdf, the folder of the results with it, or a FITS frame", "solution", path="read"),
+    "ext": Option("of a frame: number, name, or NAME,VERSION; a name of several shows each detector", type=extension),
     "max_bytes": SOLUTION["max_bytes"],
-    "ext": FRAMES["ext"],
 }
 COLUMNS = {
     "columns": Option("names of columns", type=columns, default=[], metavar="OURS=THEIRS,..."),
@@ -75,11 +81,11 @@ TABLE = {
 }
 TABLES = {
     "tables": Option(
-        "positions; without a column exposure, one exposure", "tables", nargs="+", metavar="TABLE", path="read"
+        "positions; without a column exposure, one exposure", "tables", nargs="+", metavar="TABLE", path="inputs"
     )
 }
 WCS_OF_TABLES = {
-    "wcs": Option("frames of the tables: WCS, shape and time", nargs="+", metavar="FRAME", path="read"),
+    "wcs": Option("frames of the tables: WCS, shape and time", nargs="+", metavar="FRAME", path="inputs"),
     "ext": Option("extension of those frames: number, name, or NAME,VERSION", type=extension),
 }
 POSITIONS = {"table": Option("exposure, x, y, x_err, y_err", "table", metavar="TABLE", path="read")}
@@ -89,7 +95,7 @@ MATCHED = {
         "tables",
         nargs="+",
         metavar="TABLE",
-        path="read",
+        path="inputs",
     )
 }
 WORKERS = {"workers": Option("cores to use (default: all, where frames are not few and small)", type=int, metavar="N")}
@@ -206,6 +212,7 @@ MATCHING = Group(
     "matching",
     {
         "min_exposures": Option("keep stars seen in so many exposures (default 4)", type=int),
+        "tolerance": Option("largest distance of a star in two exposures, pixels (default: found)", type=float),
         "isolation": Option("largest crowding of a star; inf keeps all (default 3)", type=float),
     },
 )

@@ -65,7 +65,7 @@ class Mosaic(ShownAsPrinted):
     wcs : `~astropy.wcs.WCS`
         TAN if the sky is known, else linear with the reference plane (0-based) as world; or the WCS asked for.
     exposures : tuple of str
-        Names of the exposures used.
+        Names of the exposures used; of a camera those of the images of its detectors.
     left_out : dict
         Names of the others, with the reason.
     offset : tuple of int or None
@@ -139,10 +139,17 @@ class Mosaic(ShownAsPrinted):
         """Image shape ``(ny, nx)``."""
         return self.data.shape
 
+    @property
+    def n_exposures(self) -> int:
+        """Number of exposures, each counted once where several detectors share it."""
+        return self.header.get("NEXPOSUR", len(self.exposures))
+
     def __repr__(self) -> str:
         ny, nx = self.shape
+        n_images = len(self.exposures)
+        images = f", {n_images} images of their detectors" if n_images != self.n_exposures else ""
         left_out = f", {len(self.left_out)} left out" if self.left_out else ""
-        return f"<Mosaic: {nx} x {ny} px, {len(self.exposures)} exposures{left_out}>"
+        return f"<Mosaic: {nx} x {ny} px, {self.n_exposures} exposures{images}{left_out}>"
 
     def plot(self, *, stars: ArrayLike | None = None, ax: Axes | None = None) -> Axes:
         """The image less its smooth sky, see `legdistort.plots.stack_plots.plot_mosaic`.

@@ -8,6 +8,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 from ..geometry.epochs import read_date
+from ..inputs.exposure_names import whole_name
 from ..inputs.frames.integrations import value_time
 from ..inputs.frames.value_units import value_unit
 
@@ -45,9 +46,13 @@ def mosaic_header(frames, left_out, factors, settings):
     if None not in times:
         mean = float(np.mean([value_time(f) * factors[f.name] for f in frames]))
         header["EXPTIME"] = (round(mean, 9), "[s] exposure time that the values stand for")
-        header["TEXPTIME"] = (sum(times), "[s] sum of the exposure times")
+        header["TEXPTIME"] = (
+            sum(dict(zip(map(whole_name, frames), times, strict=True)).values()),
+            "[s] sum of the exposure times",
+        )
     header.extend(_dates(frames, times))
-    header["NCOMBINE"] = (len(frames), "number of exposures combined")
+    header["NCOMBINE"] = (len(frames), "number of images combined")
+    header["NEXPOSUR"] = (len(set(map(whole_name, frames))), "number of exposures that they are of")
     for key, value, meaning in settings:
         if isinstance(value, str) or (value is not None and np.isfinite(value)):
             header[key] = (value, meaning)

@@ -6,7 +6,6 @@ import contextlib
 import glob
 import hashlib
 import logging
-import os
 import re
 import threading
 from collections.abc import Sequence
@@ -37,10 +36,11 @@ from . import repetitions
 from .detector_files import with_detectors
 from .exposure_names import detector_name, exposure_name
 from .exposures import LEAVE_OUT, Exposure
-from .file_images import find_image, images_of_detectors, is_image, of_detector
-from .fits_images import from_hdulist, planes_of, told_as_damaged
+from .file_images import as_plane, find_image, images_of_detectors, is_image, of_detector, weight_number
+from .fits_images import from_hdulist, planes_of, told_as_damaged, with_weights, with_weights_stated
 from .foreign_images import from_nddata, is_nddata, read_roman
 from .frames.pixel_flags import good_bits
+from .frames.weight_maps import WeightMaps, WeightPlane
 
 if TYPE_CHECKING:
     from astropy.wcs.wcsapi import BaseHighLevelWCS
@@ -49,9 +49,6 @@ if TYPE_CHECKING:
     from .frames.statement import FrameStatement
 
 log = logging.getLogger(__name__)
-
-#: Ending of a frame before which its weight map has `.weight`.
-_WEIGHT_MAP = re.compile(r"(?<!\.weight)\.(fits?|fts)$", re.IGNORECASE)
 
 _FILTERS = threading.Lock()  # warning filters belong to the process, not to the thread that changes them
 _NO_FRAME = "tables of positions go to match(table) (legdistort match)"
@@ -75,6 +72,8 @@ class ExposureFile(ShownAsPrinted):
         The extension asked for.
     dq_good : int or None
         Flags that are no reason to leave a pixel out.
+    weights : WeightPlane or None
+        Of the weight map beside it.
     """
 
     name: str
@@ -95,6 +94,7 @@ class ExposureFile(ShownAsPrinted):
     exposure: str | None = None
     detector: str | None = None
     stated: FrameStatement | None = None
+    weights: WeightPlane | None = None
 
     def read(self) -> Exposure:
         """The `Exposure` with its pixels; what else is known is not worked out again.
@@ -105,8 +105,7 @@ class ExposureFile(ShownAsPrinted):
             If the file is gone, or holds anything else than it did.
         """
         with unchanged(self.path) as (found,):
-            if found != self.identity:
-                self._check_content()
+            _check_content(self.path, found, self)
             if _is_asdf(self.path):
                 with _quiet(), _file(self.path) as file:
                     image = read_roman(file, str(self.path), self.path, self.dq_good)
@@ -114,16 +113,23 @@ class ExposureFile(ShownAsPrinted):
             else:
                 with _quiet(), _opened(self.path) as hdulist, told_as_damaged(self.path):
                     planes = planes_of(hdulist, find_image(hdulist, self.ext, self.path), self.dq_good)
-        return Exposure(**{name: getattr(self, name) for name in _SHARED}, **planes)
-
-    def _check_content(self):
-        """The file may have been touched or moved, or be seen from another machine: what counts is its content."""
-        with _file(self.path) as file:
-            if checksum(file) != self.checksum:
-                raise InputError(f"{self.path} has changed since it was first read: its SHA-256 is another")
+        exposure = Exposure(**{name: getattr(self, name) for name in _SHARED}, **planes)
+        if self.weights is None:
+            return exposure
+        with unchanged(self.weights.path) as (found,), _quiet(), _opened(self.weights.path) as hdulist:
+            _check_content(self.weights.path, found, self.weights)
+            return _with_weights(exposure, hdulist, self.weights)[0]
 
     def __repr__(self):
         return f"<ExposureFile {self.name!r}: {self.shape[1]} x {self.shape[0]} px in {self.path}>"
+
+
+def _check_content(path, found, known):
+    """The file may have been touched or moved, or be seen from another machine: what counts is its content."""
+    if found != known.identity:
+        with _file(path) as file:
+            if checksum(file) != known.checksum:
+                raise InputError(f"{path} has changed since it was first read: its SHA-256 is another")
 
 
 #: What an `Exposure` and an `ExposureFile` both have.
@@ -135,6 +141,7 @@ def read_exposures(
     *,
     ext: Extension | None = None,
     dq_good: int | str | Sequence[int] | None = None,
+    weight_maps: str | None = None,
     progress: bool = False,
 ) -> list[Exposure]:
     """Read images.
@@ -161,6 +168,10 @@ def read_exposures(
         ``CCDCHIP``, ``DETECTOR``, ``CHIP`` or ``EXTVER`` of its header.
     dq_good : int, str or sequence of int, optional
         Flags of the DQ plane that are no reason to leave a pixel out, a sum of bits or ``"64,32"``; all others are.
+    weight_maps : str, optional
+        What the weight maps beside the files are: ``"MAP_WEIGHT"``, ``"MAP_VARIANCE"`` or ``"MAP_RMS"``, as SWarp calls
+        them, perhaps with what their names end in, ``"MAP_RMS,.rms.fits"``; every file must have one then. ``"none"``
+        reads none. By default ``NAME.weight.fits``, where there is one, is of the kind ``"MAP_WEIGHT"``.
     progress : bool, optional
         Show a progress bar.
 
@@ -187,7 +198,8 @@ def read_exposures(
     >>> ld.read_exposures("night/*.fits")[0].shape
     (512, 512)
     """
-    return _read_each(paths, partial(_read, good=good_bits(dq_good)), ext, progress)
+    maps = WeightMaps.parse(weight_maps)
+    return _read_each(paths, partial(_read, good=good_bits(dq_good)), ext, maps, progress)
 
 
 def open_exposures(
@@ -195,6 +207,7 @@ def open_exposures(
     *,
     ext: Extension | None = None,
     dq_good: int | str | Sequence[int] | None = None,
+    weight_maps: str | None = None,
     left_out: dict[str, str] | None = None,
     stop_at_bad: bool = False,
     progress: bool = False,
@@ -207,7 +220,7 @@ def open_exposures(
 
     Parameters
     ----------
-    paths, ext, dq_good, progress
+    paths, ext, dq_good, weight_maps, progress
         As for `legdistort.read_exposures`; the names are the same.
     left_out : dict, optional
         If given, what is blank (all pixels alike, hidden or NaN), truncated, damaged or without the image wanted is
@@ -236,11 +249,11 @@ def open_exposures(
     >>> [exposure.name for exposure in ld.open_exposures(paths)]
     ['exp00', 'exp01']
     """
-    good = good_bits(dq_good)
+    good, maps = good_bits(dq_good), WeightMaps.parse(weight_maps)
     if left_out is None and not stop_at_bad:
-        return _read_each(paths, partial(_open, good=good), ext, progress)
+        return _read_each(paths, partial(_open, good=good), ext, maps, progress)
     bad, copies = {}, {}
-    exposures = _read_each(paths, partial(_open, good=good, even_blank=False), ext, progress, bad, copies)
+    exposures = _read_each(paths, partial(_open, good=good, even_blank=False), ext, maps, progress, bad, copies)
     kept, reasons = {exposure.name for exposure in exposures}, repetitions.warned(copies)
     if bad:
         _tell_bad(bad, len(exposures), stop_at_bad)
@@ -264,17 +277,17 @@ def _tell_bad(bad, n_good, stop_at_bad):
     warn(f"{unusable}; they are left out; stop_at_bad=True (--stop-at-bad) refuses them", AssumptionWarning)
 
 
-def _read_each(paths, read, ext, progress, bad=None, copies=None):
+def _read_each(paths, read, ext, maps, progress, bad=None, copies=None):
     """What `read` makes of every source and its name in want of a better one; the names found are checked.
 
     What cannot be used is an error, or goes into the dict `bad`: ``{name: (file, reason, error)}``. An image that is
     there already goes into the dict `copies`, if there is one: ``{name: reason}``.
     """
     origins, exposures, images = {}, [], {}
-    sources = expand_paths(paths)
+    sources = maps.frames_of(expand_paths(paths))
     parts = _parts(sources, ext)
     bar = Bar(total=sum(map(len, parts)), desc="reading", unit="frame", disable=not progress)
-    with bar, contextlib.closing(_one_after_another(sources, parts)) as opened:
+    with bar, contextlib.closing(_one_after_another(sources, parts, maps)) as opened:
         for i, source, ext, key in opened:
             bar.update()
             try:
@@ -304,7 +317,15 @@ def _read_each(paths, read, ext, progress, bad=None, copies=None):
             origins[exposure.name] = origin
             exposures.append(exposure)
     _warn_of_doubts(exposures)
+    _tell_weight_maps(sources, maps)
     return with_detectors(exposures)
+
+
+def _tell_weight_maps(sources, maps):
+    """Say once which weight maps are read."""
+    read = [each for each in map(maps.beside, filter(_is_path, sources)) if each is not None]
+    if read:
+        log.info("weight maps are read as %s: %s", maps.kind, some_of([path.name for path in read], 3))
 
 
 def _warn_of_doubts(exposures):
@@ -318,19 +339,21 @@ def _warn_of_doubts(exposures):
         warn(f"{sentences} (legdistort show FRAME prints what a frame states)", AssumptionWarning)
 
 
-def _one_after_another(sources, parts):
+def _one_after_another(sources, parts, maps):
     """Number of the source, the source, extension and id of the detector of every image; a file is opened but once."""
     for i, (source, images) in enumerate(zip(sources, parts, strict=True)):
         with contextlib.ExitStack() as stack:
-            if isinstance(source, (str, Path)):
-                source = stack.enter_context(_OpenFile(Path(source)))
+            if _is_path(source):
+                source = stack.enter_context(_OpenFile(Path(source), maps))
             for ext, key in images:
                 yield i, source, ext, key
 
 
 def file_checksums(exposures):
-    """``{base name: SHA-256}`` of the files of exposures that `open_exposures` gave; others have none."""
-    return {exposure.path.name: exposure.checksum for exposure in exposures if isinstance(exposure, ExposureFile)}
+    """``{base name: SHA-256}`` of the files of exposures that `open_exposures` gave, maps too; others have none."""
+    files = [exposure for exposure in exposures if isinstance(exposure, ExposureFile)]
+    files += [exposure.weights for exposure in files if exposure.weights is not None]
+    return {each.path.name: each.checksum for each in files}
 
 
 def listed(exposures, function):
@@ -363,21 +386,7 @@ def expand_paths(paths):
             sources.append(source)
     if not sources:
         raise InputError("no exposures to read: paths is empty")
-    _tell_weight_maps(sources)
     return sources
-
-
-def _tell_weight_maps(sources):
-    """Say of weight maps beside frames, as SWarp and SExtractor have them, that they are not read."""
-    beside = [_WEIGHT_MAP.sub(r".weight.\1", str(path)) for path in sources if isinstance(path, (str, Path))]
-    # a name so much longer may be one that no file can have
-    found = [path for path in beside if ".weight." in path and os.path.exists(path)]
-    if found:
-        log.warning(
-            "weight maps are not read (%s): pixels without weight count as good ones; set them to NaN in the frames, "
-            "or give these an extension DQ",
-            some_of([Path(path).name for path in found], 3),
-        )
 
 
 def _parts(sources, ext):
@@ -401,9 +410,9 @@ def _headers_of_images(source):
 class _OpenFile(contextlib.ExitStack):
     """A file that stays open while its images are read one after another, and is checked to be the same in the end."""
 
-    def __init__(self, path):
+    def __init__(self, path, maps=None):
         super().__init__()
-        self.path = path
+        self.path, self.maps = path, maps
 
     @cached_property
     def identity(self):
@@ -422,6 +431,25 @@ class _OpenFile(contextlib.ExitStack):
         self.file.seek(0)
         return checksum(self.file)
 
+    @cached_property
+    def weights(self):
+        """The weight map, open, or None."""
+        path = None if self.maps is None or _is_asdf(self.path) else self.maps.beside(self.path)
+        return None if path is None else self.enter_context(_OpenFile(path))
+
+    def plane_of_weights(self, ext):
+        """The `WeightPlane` of the image in an extension; None without a map."""
+        if self.weights is None:
+            return None
+        image = find_image(self.hdulist, ext, str(self.path))
+        number = weight_number(self.weights.hdulist, self.hdulist, image, (self.weights.path, self.path))
+        return WeightPlane(self.weights.path, self.maps.kind, number, self.weights.checksum, self.weights.identity)
+
+
+def _with_weights(exposure, hdulist, plane):
+    with told_as_damaged(plane.path):
+        return with_weights(exposure, as_plane(hdulist[plane.number].data), plane.kind)
+
 
 def _read(source, default, ext, good=None):
     if is_nddata(source):
@@ -438,6 +466,9 @@ def _read(source, default, ext, good=None):
             return read_roman(file, str(source.path), source.path, good)
     with readable(source.path):
         exposure = from_hdulist(source.hdulist, ext, str(source.path), source.path, good)
+        if (plane := source.plane_of_weights(ext)) is not None:
+            exposure, used = _with_weights(exposure, source.weights.hdulist, plane)
+            exposure = with_weights_stated(exposure, plane.path, used)
         for hdu in filter(is_image, source.hdulist):
             del hdu.data  # the memory need hold but one detector of a camera
     return exposure
@@ -450,6 +481,7 @@ def _open(source, default, ext, good=None, even_blank=True):
     if not known:
         return exposure
     known |= {"shape": exposure.shape, "checksum": source.checksum, "pixels": _pixels(exposure)}
+    known["weights"] = source.plane_of_weights(ext)
     return ExposureFile(**{name: getattr(exposure, name) for name in _SHARED}, **known, ext=ext, dq_good=good)
 
 
@@ -460,6 +492,10 @@ def _pixels(exposure):
     digest = hashlib.sha256(f"{exposure.shape} {exposure.data.dtype}".encode())
     digest.update(np.ascontiguousarray(exposure.data))
     return digest.hexdigest()
+
+
+def _is_path(source):
+    return isinstance(source, str | Path)
 
 
 def _is_asdf(path):

@@ -116,6 +116,45 @@ def planes_beside(hdulist, image):
     return planes if len(planes) == len(alike) - 1 else []
 
 
+def weight_number(weights, hdulist, image, paths):
+    """Number of the extension of a weight map that belongs to an image of a file.
+
+    That of the same name and version, or at the same place in the file, or the only one.
+
+    Parameters
+    ----------
+    weights, hdulist : HDUList
+        The map, and the file of the image.
+    image : HDU
+        One of `hdulist`.
+    paths : tuple
+        Their names, for the message.
+
+    Raises
+    ------
+    InputError
+        Where the map has none, or it has another shape.
+    """
+    images = {i: hdu for i, hdu in enumerate(weights) if is_image(hdu)}
+    place = next(i for i, hdu in enumerate(hdulist) if hdu is image)
+    named = [i for i, hdu in images.items() if hdu.name and (hdu.name, hdu.ver) == (image.name, image.ver)]
+    several = sum(is_image(hdu) and hdu.name == image.name for hdu in hdulist) > 1
+    number = (named or [i for i in images if i == place or (len(images) == 1 and not several)] or [None])[0]
+    if number is None:
+        form = f"{image.name},{image.ver}" if image.name else place
+        raise InputError(
+            f"the weight map {paths[0]} has no image for extension {form} of {paths[1]}: give it the same extensions, "
+            "or read no maps, weight_maps='none' (--weight-maps none)"
+        )
+    if plane_shape(images[number]) != plane_shape(image):
+        raise InputError(
+            f"the weight map {paths[0]} has the shape {plane_shape(images[number])}, the image {paths[1]} "
+            f"{plane_shape(image)} (ny, nx): give it that of the image, or read no maps, weight_maps='none' "
+            "(--weight-maps none)"
+        )
+    return number
+
+
 def is_image(hdu):
     """Whether an HDU is an image that has pixels."""
     return isinstance(hdu, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)) and len(hdu.shape) > 0

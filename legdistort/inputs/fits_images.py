@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import zlib
+from dataclasses import replace
 
 import numpy as np
 from astropy.io import fits
@@ -16,6 +17,7 @@ from .frames.cards import Stated
 from .frames.pixel_flags import bad_pixels, descriptive_flags
 from .frames.statement import read_statement
 from .frames.wcs_cards import header_of_image, is_left_out, make_numbers, two_matrices
+from .frames.weight_maps import bad_and_sky_errors
 from .sky_wcs import believable_wcs, header_wcs
 
 log = logging.getLogger(__name__)
@@ -141,6 +143,47 @@ def planes_of(hdulist, hdu, good=None):
                     values = 1 / np.sqrt(values)
                 planes["uncertainty"] = values
     return planes
+
+
+def with_weights(exposure, weights, kind):
+    """An exposure with what a weight map says of its pixels.
+
+    Pixels without weight are bad. Noise that differs from pixel to pixel becomes the uncertainty, if there is none yet
+    and the gain is known: that of the sky by the map, and that of the light above it by the gain, as in SExtractor.
+
+    Parameters
+    ----------
+    exposure : Exposure
+    weights : ndarray, shape (ny, nx)
+    kind : str
+        One of `legdistort.inputs.frames.weight_maps.KINDS`.
+
+    Returns
+    -------
+    exposure : Exposure
+    used : bool
+        Whether all that the map says is.
+    """
+    bad, errors = bad_and_sky_errors(weights, kind, exposure.data, exposure.mask)
+    planes = {"mask": exposure.mask | bad, "uncertainty": exposure.uncertainty}
+    if errors is not None and exposure.uncertainty is None and exposure.gain:
+        light = np.maximum(exposure.data - np.median(exposure.data[~planes["mask"]]), 0)
+        planes["uncertainty"] = np.sqrt(errors**2 + light / exposure.gain)
+    used = errors is None or planes["uncertainty"] is not None
+    return replace(exposure, **planes), used
+
+
+def with_weights_stated(exposure, path, used):
+    """An exposure with a weight map, whose statement names the map, and whether all that it says is used."""
+    before = exposure.stated.mask
+    words = [before.value, "without weight"] if before.value else ["without weight"]
+    source = f"{before.source}, {path.name}" if before.value else path.name
+    stated = replace(exposure.stated, mask=Stated(" and ".join(words), source))
+    if not used:
+        stated = stated.with_doubt(
+            "no gain is stated, so that of the weight map only pixels without weight are used, not their noise"
+        )
+    return replace(exposure, stated=stated)
 
 
 def _alike(hdulist, hdu):

@@ -6,11 +6,22 @@ from dataclasses import replace
 import numpy as np
 from astropy.table import vstack
 
-from ..exceptions import InputError, MatchError
+from ..exceptions import AssumptionWarning, InputError, MatchError, some_of, warn
 from ..geometry import similarity
 from ..inputs import exposure_names, start_poses
 
 _BY_NAME = {"shape": "shapes", "poses": "poses", "left_out": "left_out"}
+
+
+def in_words(groups):
+    """Groups of exposures, as lists of their names, in a sentence."""
+    return "; ".join(some_of(group, 6) for group in groups[:6]) + f"; and {len(groups) - 6} more" * (len(groups) > 6)
+
+
+def apart(groups, cure):
+    """The `MatchError` for groups of exposures without a common star, lists of their names; with what to do."""
+    words = f"the exposures form {len(groups)} groups with no star in common: {in_words(groups)}; {cure}"
+    return MatchError(words, groups=groups)
 
 
 def estimated(seen):
@@ -39,7 +50,7 @@ def side_by_side(seen, poses, shapes, sky):
         return poses
     if sky is not None:
         raise MatchError(
-            f"exposures overlap on the sky and have no star in common: {seen.groups_in_words}; match them anew, or "
+            f"exposures overlap on the sky and have no star in common: {in_words(seen.groups)}; match them anew, or "
             "solve each group by itself"
         )
     shifts = [np.column_stack([np.eye(2), -move]) for move in moves[seen.fields]]
@@ -82,4 +93,17 @@ def joined(parts):
     known |= {"pose_sigma": first.pose_sigma, "sky": first.sky if same["sky"] else None}
     known |= {"camera": first.camera if first.camera.is_known else None}
     known["header_distortion"] = next((p.header_distortion for p in parts.values() if p.header_distortion), None)
+    _warn_of_lost_columns(dict(zip(parts, tables, strict=True)))
     return vstack(tables, join_type="inner", metadata_conflicts="silent"), known
+
+
+def _warn_of_lost_columns(tables):
+    """Warn of columns that not all tables of fields have, ``{name of the field: table}``."""
+    lost = {}
+    for name in dict.fromkeys(name for table in tables.values() for name in table.colnames):
+        lacking = [label for label, table in tables.items() if name not in table.colnames]
+        if lacking:
+            lost.setdefault(tuple(lacking), []).append(name)
+    if lost:
+        named = "; ".join(f"{', '.join(names)} (not in {some_of(lacking, 3)})" for lacking, names in lost.items())
+        warn(f"columns that not all fields have are left out: {named}; add them there to keep them", AssumptionWarning)

@@ -27,6 +27,7 @@ from ..runtime import parallel
 from ..runtime.guards.units import plain_numbers
 from . import detector_layout, detector_places
 from .exposure_groups import interlink, link, standing, unite, without
+from .fields import apart
 from .header_poses import HeaderPoses
 from .lattices import warn_of_lattice
 from .matches import Matches, in_focal_plane, shapes_by_exposure
@@ -368,12 +369,7 @@ def _check_groups(groups, lists, names, left_out):
             left_out[names[only]] = f"none of its {len(lists[only])} detections fit other exposures better than chance"
     large = [sorted(names[i] for i in group.poses) for group in groups if len(group.poses) > 1]
     if len(large) > 1:
-        listed = "; ".join(some_of(group, 6) for group in large[:6])
-        raise MatchError(
-            f"the exposures form {len(large)} groups with no star in common: {listed}; match each group by itself; "
-            "fields of one camera can be solved together then",
-            groups=large,
-        )
+        raise apart(large, "match each group by itself; fields of one camera can be solved together then")
     if not large:
         raise MatchError(
             f"no two exposures show the same stars (tried {some_of(names, 6)}); check that they overlap and that the "

@@ -13,7 +13,7 @@ from astropy.table import QTable
 from scipy.sparse.csgraph import connected_components
 
 from ..cameras.camera import Camera, check_camera
-from ..exceptions import AssumptionWarning, InputError, MatchError, reasons_of, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, MatchError, reasons_of, warn
 from ..geometry import similarity
 from ..geometry.epochs import exposure_years
 from ..geometry.tangent_plane import TangentPlane
@@ -21,7 +21,7 @@ from ..inputs import column_contract, exposure_names, repetitions, start_poses
 from ..runtime.checks import check_choice
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
-from .fields import estimated, joined, side_by_side
+from .fields import apart, estimated, joined, side_by_side
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -119,18 +119,14 @@ class Observations:
             For exposures in more groups.
         """
         _check_duplicates(self)
-        if (count := int(self.fields.max()) + 1) > n_fields:
-            raise MatchError(
-                f"the exposures form {count} groups with no star in common: {self.groups_in_words}; solve each group "
-                "by itself"
-            )
+        if len(self.groups) > n_fields:
+            raise apart(self.groups, "solve each group by itself")
         _check_spread(self)
 
     @property
-    def groups_in_words(self) -> str:
+    def groups(self) -> list[list[str]]:
         """The exposures of every group that has common stars."""
-        groups = [[str(self.names[i]) for i in np.flatnonzero(self.fields == g)] for g in range(self.fields.max() + 1)]
-        return "; ".join(some_of(group, 6) for group in groups)
+        return [[str(self.names[i]) for i in np.flatnonzero(self.fields == g)] for g in range(self.fields.max() + 1)]
 
     @classmethod
     def of(cls, table: Table) -> Observations:

@@ -73,9 +73,9 @@ class EarlierRun:
 
     @property
     def reading(self):
-        """Arguments ``ext`` and ``dq_good`` with which the frames were read."""
-        ext = self.table.meta.get("ext")
-        return {"ext": tuple(ext) if isinstance(ext, list) else ext, "dq_good": self.table.meta.get("dq_good")}
+        """Arguments ``ext``, ``dq_good`` and ``weight_maps`` with which the frames were read."""
+        reading = {name: self.table.meta.get(name) for name in ("ext", "dq_good", "weight_maps")}
+        return reading | {"ext": tuple(reading["ext"]) if isinstance(reading["ext"], list) else reading["ext"]}
 
     @property
     def measuring(self):
@@ -160,7 +160,17 @@ def measured_frames(tables):
 
 
 def write_detections(
-    path, detections, exposures, out, *, measuring, ext=None, dq_good=None, camera=None, overwrite=False
+    path,
+    detections,
+    exposures,
+    out,
+    *,
+    measuring,
+    ext=None,
+    dq_good=None,
+    weight_maps=None,
+    camera=None,
+    overwrite=False,
 ):
     """Write what was measured, for `EarlierRun` and for the command ``match``.
 
@@ -174,7 +184,7 @@ def write_detections(
         Where the file will be found: paths of frames are relative to it.
     measuring : MeasureOptions
         How it was measured.
-    ext, dq_good, camera
+    ext, dq_good, weight_maps, camera
         As given to `legdistort.run`.
     overwrite : bool
         Replace a file that exists.
@@ -187,6 +197,7 @@ def write_detections(
         "shapes": {exposure.name: list(exposure.shape) for exposure in exposures},
         "ext": list(ext) if isinstance(ext, tuple) else ext,
         "dq_good": dq_good,
+        "weight_maps": weight_maps,
         "camera": camera and camera.to_meta(),
         "measuring": _plain_options(measuring),
     }

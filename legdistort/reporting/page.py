@@ -1,11 +1,13 @@
 """One HTML page for a finished run, complete in itself: pictures, style and script inside, no network."""
 
+import os
 import warnings
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
 from ..assessment.pulls import pulls_of
+from ..exceptions import InputError
 from ..runtime.outputs import replacing
 from .checks_table import verdict
 from .comparison import compared_corrections, compared_stacks
@@ -57,7 +59,7 @@ def write_report(
         are added.
     exposures : sequence of Exposure or ExposureFile, optional
         What was co-added: stars of some of them are shown beside those of the mosaic.
-    files : sequence of str, optional
+    files : sequence of str or path, optional
         Other results, as the page links to them.
     overwrite : bool
         Replace a file that exists.
@@ -69,8 +71,10 @@ def write_report(
     Raises
     ------
     InputError
-        If the file exists and `overwrite` is false, or its folder does not exist.
+        If the file exists and `overwrite` is false, or its folder does not exist; for `files` that are no names.
     """
+    if isinstance(files, str) or not all(isinstance(name, str | os.PathLike) for name in files):
+        raise InputError(f"files must be names of results, ('stars.ecsv', 'wcs/'), got {files!r}")
     with replacing(path, overwrite=overwrite) as file:
         shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks}
         page = render(solution, summary=summary, **shown, exposures=exposures, files=files)
@@ -96,7 +100,7 @@ def render(solution, *, mosaic=None, psfs=None, summary=None, comparison=None, s
             "truth": truth_rows(facts),
             "methods": methods(solution, facts, stacked=mosaic is not None),
             "bibtex": BIBTEX,
-            "files": list(files),
+            "files": list(map(str, files)),
             "version": version("legdistort"),
             "names": {"s": [str(n) for n in solution.estimate.star_names], "e": list(solution.names)},
             "cutouts": cut_out(solution, mosaic, exposures, fwhm=_fwhm(facts)),

@@ -421,7 +421,7 @@ class Gauge(ShownAsPrinted):
             return ""
         why = _STATIC[self.static][0]
         cure = "give dynamic (--dynamic)" if self.static == "open" else CURE
-        return f"absolute positions are not known: {why} ({', '.join(self.unknown_names)} unknown); {cure}"
+        return f"absolute positions are not known: {why} ({in_words(self.unknown_names)} not determined); {cure}"
 
     @property
     def sentence(self) -> str:
@@ -430,7 +430,7 @@ class Gauge(ShownAsPrinted):
             return f"{self.kind}: the plane is {self.plane}; absolute errors are not available"
         error = np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()]))
         tied = f"{self.tie.sentence}; " if self.tie is not None else ""
-        after = f" after {_listed(self.unknown_names)}" if self.unknown_names else ""
+        after = f" after {in_words(self.unknown_names)}" if self.unknown_names else ""
         aside = ", apart from the pointing" if self.tie is None and not self.poses_known else ""
         known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}"
         if after and error == 0:  # nothing of the common map is known
@@ -459,7 +459,7 @@ class Gauge(ShownAsPrinted):
             cause = measured.get(name) or ("the nominal poses, mean over exposures" if np.isnan(error) else convention)
             here = [w for w in self.unknown_maps if (f"degree {w.degree}" if w.degree > 1 else "shear") == name]
             if here:
-                cause += f"; {len(here)} of them ({_listed(w.name for w in here)}) not known"
+                cause += f"; {len(here)} of them ({in_words(w.name for w in here)}) not known"
                 size = "not known" if len(here) == n else size
             lines.append(f"{name:24s} {n:6d} {size:>15s}  {cause}")
         if self.released is not None:
@@ -483,6 +483,13 @@ class Gauge(ShownAsPrinted):
         return "\n".join(lines)
 
 
-def _listed(names):
+def in_words(names):
+    """Names of unknown maps for a reader, each once: those of powers of z are changes of scale, with their formulas."""
     names = list(dict.fromkeys(names))
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    powers = [name for name in names if "z^" in name]
+    degrees = [name.removeprefix("degree ") for name in names if name.startswith("degree ")]
+    words = [name for name in names if name not in powers and not name.startswith("degree ")]
+    words = ["part of the static distortion" if name == "static" else name for name in words]
+    words += [f"change of scale over the field ({', '.join(powers)} with z = x + iy)"] * bool(powers)
+    words += [f"maps of degree {', '.join(degrees)}"] * bool(degrees)
+    return f"{', '.join(words[:-1])} and {words[-1]}" if len(words) > 1 else words[0]

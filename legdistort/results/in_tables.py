@@ -8,6 +8,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from astropy.time import Time
 
+from ..exceptions import by_reason, some_of
 from ..geometry import basis, similarity
 from ..geometry.epochs import year
 from ..inputs import column_contract
@@ -211,7 +212,7 @@ def printed(solution):
     lines += [_row(view) for view in solution]
     if solution.camera.has_focal_plane:
         lines += ["", *solution.camera.table_lines()]
-    lines += [f"left out {name}: {reason}" for name, reason in solution.left_out.items()]
+    lines += [f"left out {some_of(names, 6)}: {reason}" for reason, names in by_reason(solution.left_out).items()]
     return "\n".join(lines)
 
 

@@ -66,9 +66,8 @@ def describe(prediction):
 
 
 def _absolute(prediction):
-    unknown = ", ".join(prediction.solution.gauge.unknown_names)
-    if unknown and np.isfinite(prediction.b_abs):
-        return f"b, absolute, after {unknown}"
+    if prediction.solution.gauge.unknown_names and np.isfinite(prediction.b_abs):
+        return "b, absolute, without what is not determined"
     return "b, absolute (mean dynamic distortion too)"
 
 

@@ -48,13 +48,15 @@ def unfollowed(problem, good):
         n = problem.start[i + 1] - problem.start[i]
         n_off = n - np.count_nonzero(good[problem.part(i)])
         if n_off == n or pair_agreement.beyond_chance(n_off, n):
-            out[name] = f"{n_off} of its {n} stars deviate from the solution of the others"
-    alike = _alike(problem, [problem.names.index(name) for name in out]) if len(out) > 1 else {}
-    return {name: f"{why} {alike.get(name, '(mismatched, or not this field?)')}" for name, why in out.items()}
+            why = f"{n_off} of its {n} stars deviate from the solution of the others"
+            out[name] = f"{why} (mismatched, or not this field?)"
+    return out | (_alike(problem, [problem.names.index(name) for name in out]) if len(out) > 1 else {})
 
 
 def _alike(problem, odd):
     """What is to be said of exposures that agree with others of their night, and not with all the rest, by name.
+
+    It is the same for all of a night.
 
     Parameters
     ----------
@@ -62,17 +64,19 @@ def _alike(problem, odd):
     odd : list of int
         Exposures that the fit cannot follow.
     """
-    night, rest, out = np.broadcast_to(problem.night, problem.n_exposures), range(problem.n_exposures), {}
-    rest = [k for k in rest if k not in odd]
+    night, alike = np.broadcast_to(problem.night, problem.n_exposures), {}
+    rest = [k for k in range(problem.n_exposures) if k not in odd]
     for i in odd:
         own = [_distance(problem, i, k) for k in odd if k != i and night[k] == night[i]]
         others = [_distance(problem, i, k) for k in rest[:: len(rest) // _PARTNERS + 1]]
         if own and np.median(own) < _NEARER * np.median(others):
-            out[problem.names[i]] = (
-                f"in the same way as those of {len(own)} more of its night, with which it agrees to "
-                f"{np.median(own):.2g} px: this night {ALIKE}"
-            )
-    return out
+            alike.setdefault(night[i], {})[problem.names[i]] = np.median(own)
+    return {
+        name: f"the exposures of its night agree to {np.median(list(apart.values())):.2g} px with one another, and "
+        f"most of their stars deviate from the solution of the others: this night {ALIKE}"
+        for apart in alike.values()
+        for name in apart
+    }
 
 
 def _distance(problem, i, k):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..cameras.exchanged import check_places
-from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, by_reason, some_of, warn
 from ..matching.header_poses import sky_by_layout
 from ..matching.matches import Matches
 from ..priors.prior import Prior, has_distortion
@@ -22,6 +22,7 @@ from ..runtime.guards.units import plain_numbers
 from . import minimisers, model_forms, reference_tie, single_fit, star_motions
 from .assembly import assemble
 from .camera_fit import CameraFit, Sought, common_widths, held, with_errors_times
+from .checks.limits import ALIKE, MOST_NAMED
 from .choices import prior_widths
 from .choices.degree_choice import choose_degree
 from .choices.held_out import hold_out, validation
@@ -44,9 +45,6 @@ if TYPE_CHECKING:
     from ..runtime.annotations import StrPath
 
 log = logging.getLogger(__name__)
-
-#: Stars and exposures that a warning names.
-_MOST_NAMED = 6
 
 
 @plain_numbers
@@ -439,9 +437,7 @@ def _choose_degree(matches, options):
 def _tell(fit, matches):
     """Log how the fit ended and what it left out, and warn of what these exposures cannot determine."""
     log.info("%s; chi2 %.1f for %.0f degrees of freedom", fit.result.status, fit.chi2, fit.dof)
-    for name, reason in fit.matches.left_out.items():
-        if name not in matches.left_out:
-            warn(f"exposure {name} is left out: {reason}", AssumptionWarning)
+    _tell_lost_exposures(fit, matches)
     _tell_lost_stars(fit)
     if why := known_poses.contradiction(fit.problem, fit.result.state, fit.uncertainty):
         warn(why, AssumptionWarning)
@@ -453,6 +449,17 @@ def _tell(fit, matches):
         )
 
 
+def _tell_lost_exposures(fit, matches):
+    """Warn of exposures left out: of each, but of those of a night that has another distortion together."""
+    new = {name: reason for name, reason in fit.matches.left_out.items() if name not in matches.left_out}
+    for reason, names in by_reason(new).items():
+        if ALIKE in reason and len(names) > 1:
+            warn(f"{len(names)} exposures are left out ({some_of(names, MOST_NAMED)}): {reason}", AssumptionWarning)
+        else:
+            for name in names:
+                warn(f"exposure {name} is left out: {reason}", AssumptionWarning)
+
+
 def _tell_lost_stars(fit):
     """Warn of stars whose observations contradict one another, so that none of them is used."""
     star, used = fit.problem.star, fit.used
@@ -462,9 +469,9 @@ def _tell_lost_stars(fit):
     if not len(lost):
         return
     named = []
-    for j in lost[:_MOST_NAMED]:
+    for j in lost[:MOST_NAMED]:
         seen = fit.problem.exposure[star == j]
-        named.append(f"{fit.matches.stars[j]} ({some_of([fit.problem.names[i] for i in seen], _MOST_NAMED)})")
+        named.append(f"{fit.matches.stars[j]} ({some_of([fit.problem.names[i] for i in seen], MOST_NAMED)})")
     more = f" and {len(lost) - len(named)} more" * (len(lost) > len(named))
     warn(
         f"{len(lost)} star{'s have' if len(lost) > 1 else ' has'} no position, the observations contradict one another "

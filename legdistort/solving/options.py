@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..exceptions import InputError, MatchError
+from ..exceptions import InputError
 from ..geometry import basis, fitter
 from ..geometry.detector_modes import affine_widths
 from ..geometry.epochs import year
 from ..inputs.references.catalogue import check_stated, read_reference
 from ..inputs.references.gaia import check_gaia, gaia_around, is_gaia
 from ..inputs.start_poses import POSE_ERRORS, check_place_errors, check_pose_sigma
+from ..matching.fields import apart
 from ..matching.matches import Matches, alone
 from ..results.settings import Settings
 from ..results.solution import Solution
@@ -278,10 +279,10 @@ def _check_fields(matches, options, reference):
     prior = options.prior.values() if isinstance(options.prior, dict) else [options.prior]
     known = matches.camera.has_focal_plane or reference is not None or any(each is not None for each in prior)
     if not known and options.static != "fit":
-        raise MatchError(
-            f"the exposures form {matches.fields.max() + 1} groups with no star in common: "
-            f"{matches.observations.groups_in_words}; solve each group by itself, or all together for the distortion "
-            "of their detector: static='fit' (--static fit), or a prior"
+        raise apart(
+            matches.observations.groups,
+            "solve each group by itself, or all together for the distortion of their detector: static='fit' "
+            "(--static fit), or a prior",
         )
 
 

@@ -7,7 +7,7 @@ import re
 import shutil
 import textwrap
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from astropy.wcs import WCS
 from ..exceptions import ExportError, InputError, some_of, without_astropy_warnings
 from ..inputs import detector_files, exposure_files, exposure_names, file_images
 from ..inputs.frames import wcs_cards
+from ..inputs.frames.weight_maps import WeightMaps
 from ..inputs.sky_wcs import header_wcs, leads_elsewhere, warn_of_another_field
 from ..inputs.wcs_files import PLACES
 from ..runtime import provenance
@@ -29,6 +30,7 @@ from ..runtime.outputs import replacing, replacing_files, replacing_folder
 from ..runtime.progress import Bar
 from .fits_headers import header_error
 from .foreign_trees import model_wcs, refined_tree, table_of
+from .refinement import corner_move
 from .storage import wcs_tree
 
 log = logging.getLogger(__name__)
@@ -147,6 +149,11 @@ def attach(
         plan = _plan(images, path, target, kind=kind, max_error=max_error, ext=ext, overwrite=overwrite)
         plans += [plan] if plan.headers else []
     warn_of_another_field([name for plan in plans for name in plan.elsewhere])
+    if images.moved:
+        far = max(images.moved, key=images.moved.get)
+        log.info(
+            "corners of %d images move by up to %.3g arcsec (%s)", len(images.moved), images.moved[far].arcsec, far
+        )
     if not plans:
         raise InputError("none of the frames is part of the solution; give those it was made from")
     with replacing_files([plan.target for plan in plans]) if in_place else _copies(Path(out), overwrite) as writing:
@@ -158,12 +165,16 @@ def attach(
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """Views of a solution by the names of images, and why others were left out; ``SOLSHA`` of its file."""
+    """Views of a solution by the names of images, and why others were left out; ``SOLSHA`` of its file.
+
+    And by how much each gwcs that is refined `moved` the corners of its image.
+    """
 
     views: dict
     left_out: dict
     checksum: str | None
     of_camera: bool
+    moved: dict = field(default_factory=dict)
 
     def of_file(self, name, header):
         """Name of the exposure, or of the part of one, in a file of one detector; None if it is of another."""
@@ -205,7 +216,7 @@ class _Plan:
 
 def _files(paths):
     """The files meant, each once."""
-    given = exposure_files.expand_paths(paths)
+    given = WeightMaps().frames_of(exposure_files.expand_paths(paths))
     other = next((path for path in given if not isinstance(path, (str, Path))), None)
     if other is not None:
         raise InputError(f"frames must be paths of FITS files, got {type(other).__name__}")
@@ -293,6 +304,7 @@ def _plan_of_tree(known, path, target, raw, kind):
     if name not in known.views:
         return _Plan(path, target, zlib.crc32(raw), _nothing(known, path, name), [], [])
     whole = refined_tree(raw, found, known.views[name], str(path))
+    known.moved[name] = corner_move(found[1], known.views[name])[0]
     return _Plan(path, target, zlib.crc32(raw), {name: None}, [], [], whole)
 
 
@@ -307,7 +319,9 @@ def _foreign_edits(known, images, spans, raw, path):
         found = model_wcs(content, label)
     if found is None:
         return []
-    return [(span.start, span.stop, table_of(span.header, refined_tree(content, found, known.views[name], label)))]
+    whole = refined_tree(content, found, known.views[name], label)
+    known.moved[name] = corner_move(found[1], known.views[name])[0]
+    return [(span.start, span.stop, table_of(span.header, whole))]
 
 
 def _head(hdulist, of_images):

@@ -115,15 +115,21 @@ def _check_place(wcs, view):
                 f"the bounding box of wcs, x {x0} to {x1}, y {y0} to {y1}, is not within the {nx} x {ny} pixels of "
                 f"exposure {name}"
             )
-    corners = np.array([[-0.5, nx - 0.5, nx - 0.5, -0.5], [-0.5, -0.5, ny - 0.5, ny - 0.5]])
-    places = [SkyCoord(*w(*corners, with_bounding_box=False), unit="deg") for w in (wcs, view.wcs)]
-    apart, size = places[0].separation(places[1]).max(), places[1][0].separation(places[1][2])
+    apart, size = corner_move(wcs, view)
     if not apart < size:
         raise InputError(
             f"wcs and exposure {name} of the solution lie {apart:.3g} apart on the sky, more than the detector is "
             "wide: is it the WCS of another exposure?"
         )
-    log.info("%s: corners move by up to %.3g arcsec", name, apart.arcsec)
+    log.debug("%s: corners move by up to %.3g arcsec", name, apart.arcsec)
+
+
+def corner_move(wcs, view):
+    """How far the corners of an image lie apart in a WCS and in that of a view, at most, and its diagonal: `Angle`."""
+    ny, nx = view.wcs.array_shape
+    corners = np.array([[-0.5, nx - 0.5, nx - 0.5, -0.5], [-0.5, -0.5, ny - 0.5, ny - 0.5]])
+    places = [SkyCoord(*w(*corners, with_bounding_box=False), unit="deg") for w in (wcs, view.wcs)]
+    return places[0].separation(places[1]).max(), places[1][0].separation(places[1][2])
 
 
 def _inverse(transform, frames):

@@ -669,7 +669,9 @@ def test_files_that_cannot_be_written(line, tmp_path, capsys, monkeypatch):
     }
     old = f"old{endings.get(command, '.ecsv')}"
     (tmp_path / old).write_text("precious")
-    (tmp_path / "in.fits").write_text("")
+    monkeypatch.chdir(tmp_path)
+    for name in ("in.fits", "other.fits", "other.ecsv"):
+        (tmp_path / name).write_text("")
     for name, words in ((old, f"{old} exists already"), ("", "is a folder"), ("none/m.fits", "none does not exist")):
         failed(capsys, main(_ready(monkeypatch, line, read=tmp_path / "in.fits", out=tmp_path / name)), words)
     assert (tmp_path / old).read_text() == "precious"
@@ -920,3 +922,30 @@ def test_outputs_are_tried_and_not_only_permitted(night, tmp_path, capsys, monke
 )
 def test_messages_in_the_shell_have_no_words_of_python(python, shell):
     assert in_shell_words(python) == shell
+
+
+@pytest.mark.parametrize(
+    "flags", [["match", "{}", "--shape", "9", "9"], ["match", "a.ecsv", "--wcs", "{}"], ["solve", "{}"]]
+)
+def test_all_files_that_are_missing_are_named_before_any_is_read(tmp_path, capsys, monkeypatch, flags):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.ecsv").write_text("not read")
+    given = [each for flag in flags for each in (["a.ecsv", "b.ecsv", "c.ecsv"] if flag == "{}" else [flag])]
+    assert main([*given, "--out", "out.ecsv"]) == 1
+    assert capsys.readouterr().err == (
+        f"legdistort: 2 of 3 files are not there (b.ecsv, c.ecsv, looked for from {tmp_path}): correct their names, or "
+        "leave them out\n"
+    )
+
+
+def test_show_names_the_detector_of_what_it_prints(tmp_path, capsys):
+    planes = [fits.ImageHDU(np.random.default_rng(k).normal(9, 1, (20, 20)), name="SCI", ver=k) for k in (1, 2)]
+    for k, plane in enumerate(planes, start=1):
+        plane.header["GAIN"] = float(k)
+    fits.HDUList([fits.PrimaryHDU(), *planes]).writeto(tmp_path / "a.fits")
+    assert main(["show", str(tmp_path / "a.fits"), "--ext", "SCI"]) == 0
+    parts = capsys.readouterr().out.split("\n\n")
+    assert [part.splitlines()[0] for part in parts] == ["a-1", "a-2"]
+    assert ["GAIN of the image" in part for part in parts] == [True, True]
+    assert main(["show", str(tmp_path / "a.fits"), "--ext", "SCI,1"]) == 0
+    assert capsys.readouterr().out.startswith("quantity")

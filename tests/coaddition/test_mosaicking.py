@@ -19,6 +19,8 @@ from caller_warnings import warns_here
 from stacks import SHAPE, SIGMA, StandIn, check_stars, covered, expose, plain, scene, star_image
 
 from legdistort.coaddition.grids import read_grid, reference_grid
+from legdistort.coaddition.mosaic import Mosaic
+from legdistort.coaddition.mosaic_header import mosaic_header
 from legdistort.coaddition.mosaicking import coadd
 from legdistort.coaddition.options import CoaddOptions
 from legdistort.coaddition.resampling.pixel_maps import map_exposure, tabulate, trace
@@ -684,3 +686,15 @@ def test_sky_of_the_stand_in_is_consistent():
     ok = np.isfinite(seen).all(axis=1)
     sky = SkyCoord(*solution["frame0"].wcs(*seen[ok].T) * u.deg)
     assert solution.sky.to_sky(stars[ok]).separation(sky).max() < 1e-9 * u.deg
+
+
+def test_detectors_do_not_count_as_exposures():
+    """Six exposures of four detectors are six, with the time of six."""
+    parts = [(f"e{i}", key) for i in range(6) for key in "1234"]
+    frames = [Exposure(f"{e}-{k}", np.eye(8), exposure=e, detector=k, exposure_time=10.0) for e, k in parts]
+    header = mosaic_header(frames, {}, dict.fromkeys([f.name for f in frames], 1.0), [])
+    assert (header["NCOMBINE"], header["NEXPOSUR"], header["TEXPTIME"]) == (24, 6, 60.0)
+    names = tuple(f.name for f in frames)
+    mosaic = Mosaic(*(np.zeros((4, 4)) for _ in range(6)), wcs=None, exposures=names, header=header)
+    assert repr(mosaic) == "<Mosaic: 4 x 4 px, 6 exposures, 24 images of their detectors>"
+    assert "exposures, " not in repr(replace(mosaic, exposures=names[:6]))

@@ -1,25 +1,10 @@
-"""What lies beside frames, or stands in the names of lists, and is not used: it is said."""
+"""What stands in the names of lists and is not used: it is said."""
 
-import logging
-
-import numpy as np
 import pytest
-from astropy.io import fits
 
 import legdistort as ld
 from legdistort.cli.parser import main
 from legdistort.inputs.detector_files import named_detectors
-
-
-def test_weight_maps_beside_frames_are_named(tmp_path, caplog):
-    for name in ("a.fits", "b.fits", "b.weight.fits"):
-        fits.writeto(tmp_path / name, np.random.default_rng(len(name)).normal(100, 1, (40, 40)).astype(np.float32))
-    with caplog.at_level(logging.WARNING, "legdistort"):
-        ld.open_exposures([tmp_path / "a.fits"])
-        assert "weight maps" not in caplog.text
-        ld.open_exposures([tmp_path / "a.fits", tmp_path / "b.fits"])
-    assert "weight maps are not read (b.weight.fits)" in caplog.text
-    assert "set them to NaN" in caplog.text
 
 
 def test_names_of_several_detectors():

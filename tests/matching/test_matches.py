@@ -106,8 +106,9 @@ def test_groups_without_a_common_star_are_listed(sim):
     given["star"][np.isin(given["exposure"], ["exp01", "exp04"])] += 1000
     matches = Matches.from_table(given, shape=SHAPE)
     assert matches.fields.tolist() == [0, 1, 0, 0, 1]
-    with pytest.raises(MatchError, match="2 groups with no star in common: exp00, exp02, exp03; exp01, exp04"):
+    with pytest.raises(MatchError, match="2 groups with no star in common: exp00, exp02, exp03; exp01, exp04") as told:
         solve(matches)
+    assert told.value.groups == (["exp00", "exp02", "exp03"], ["exp01", "exp04"])
 
 
 @pytest.mark.parametrize("by", [["exposure", "star"], ["star", "exposure"]])

@@ -222,7 +222,8 @@ def test_prediction_without_a_prior_is_relative_and_says_so(more):
     assert all(len(line) <= 110 for line in str(free).splitlines())
     assert np.isfinite(free.b_abs) == bool(more)
     if more:
-        assert "b, absolute, after shear, z^2, i z^2" in text
+        assert "b, absolute, without what is not determined" in text
+        assert "shear and change of scale over the field (z^2, i z^2 with z = x + iy) not determined" in text
         assert "no static distortion was given" in text
         assert exact.solution.gauge.unknown == ()
         sized = ld.predict(**plan, **more, prior=ld.Prior(None, static_sigma=2.0))

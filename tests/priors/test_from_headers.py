@@ -309,7 +309,6 @@ def test_the_prior_of_headers_is_for_one_detector(tmp_path, monkeypatch):
 def test_the_prior_of_headers_needs_frames(capsys):
     line = ["predict", "--n-exposures", "4", "--n-stars", "50", "--sigma", "0.02", "--prior", "header", "--quiet"]
     assert main(line) == 1
-    assert (
-        "only run reads frames: write the distortion of one, legdistort prior FRAME --out FILE"
-        in capsys.readouterr().err
-    )
+    told = capsys.readouterr().err
+    assert "--prior header is for run" in told
+    assert "legdistort prior FRAME --out prior.asdf, and give --prior prior.asdf" in told

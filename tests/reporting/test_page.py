@@ -338,6 +338,9 @@ def test_file_is_written_once(tmp_path, solution, monkeypatch):
     assert path.read_text(encoding="utf-8") == "second"
     with pytest.raises(InputError, match="does not exist"):
         report.write_report(tmp_path / "nowhere" / "report.html", solution)
+    for files in ([("a", "b")], "stars.ecsv", [1]):
+        with pytest.raises(InputError, match="files must be names of results"):
+            report.write_report(path, solution, files=files, overwrite=True)
 
 
 def test_nothing_is_left_behind_when_it_fails(tmp_path, solution, monkeypatch):

@@ -278,6 +278,20 @@ def test_fields_are_joined_by_name():
         ld.Matches.of_fields({"a/b": parts["M15"], "c": parts["M92"]})
 
 
+def test_columns_that_only_some_fields_have_are_named():
+    data, truth = field_sets.drawn_fields(9)
+    parts = {name: drawn_sets.as_matches(only(data, truth, k)[0]) for k, name in enumerate(("a", "b"))}
+    with warnings.catch_warnings(action="error"):
+        both = ld.Matches.of_fields(parts)
+    table = parts["a"].table.copy()
+    table["flux"], table["fwhm"] = 1.0, 3.0
+    more = parts | {"a": ld.Matches.from_table(table, shape=parts["a"].shapes, poses=parts["a"].poses)}
+    with pytest.warns(LegdistortWarning, match=r"are left out: flux, fwhm \(not in b\); add them there") as told:
+        again = ld.Matches.of_fields(more)
+    assert len(told) == 1
+    assert again.table.colnames == both.table.colnames
+
+
 def test_refused_where_nothing_is_shared():
     data, truth = field_sets.drawn_fields(9)
     with pytest.raises(MatchError, match=r"2 groups with no star in common.*static='fit'"):

@@ -24,6 +24,13 @@ def near():
     return night, legdistort.match(night.table, exposures=night.exposures)
 
 
+def test_a_prior_of_one_detector_of_several_is_refused_with_what_to_do(near):
+    _, matches = near
+    prior = legdistort.Prior(np.zeros((2, 6)), shape=next(iter(matches.camera.detectors.values())).shape)
+    with pytest.raises(InputError, match=r"the focal plane of several: .* a camera .*static='fit' \(--static fit\)"):
+        legdistort.solve(matches, prior=prior)
+
+
 @pytest.fixture(scope="module")
 def far():
     return header_layouts.Night(11, off=10.0, turn=0.1, n=7, n_stars=250)

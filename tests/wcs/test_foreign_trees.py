@@ -4,6 +4,7 @@ import asdf
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
@@ -140,6 +141,23 @@ def test_a_file_of_the_archive_after_tweakreg(shared_data, tmp_path):
     assert read.wcs.available_frames == ["detector", "v2v3", "v2v3vacorr", "v2v3corr", "world"]
     off = read.wcs.invert(ra, dec, with_bounding_box=False) - xy.T
     assert np.abs(off).max() < 0.02
+
+
+def test_by_how_much_corners_move_is_said_once(night, tmp_path, caplog):
+    paths, solution = night
+    with caplog.at_level("INFO", "legdistort"):
+        attach(solution, paths, out=tmp_path / "out")
+    (said,) = [record.getMessage() for record in caplog.records if "corners" in record.getMessage()]
+    old, new = (ld.read_exposures(each) for each in (paths, [tmp_path / "out" / path.name for path in paths]))
+    far = {}
+    for a, b in zip(old, new, strict=True):
+        x, y = np.array(
+            [[-0.5, -0.5], [-0.5, a.shape[0] - 0.5], [a.shape[1] - 0.5, -0.5], np.array(a.shape[::-1]) - 0.5]
+        ).T
+        there = [SkyCoord(*each.wcs(x, y, with_bounding_box=False), unit="deg") for each in (a, b)]
+        far[a.name] = there[0].separation(there[1]).arcsec.max()
+    worst = max(far, key=far.get)
+    assert said == f"corners of {len(paths)} images move by up to {far[worst]:.3g} arcsec ({worst})"
 
 
 def test_a_model_that_cannot_be_refined_is_named(night, tmp_path):

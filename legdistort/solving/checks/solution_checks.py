@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from scipy import special
 
-from ...exceptions import some_of
+from ...exceptions import reasons_of, some_of
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from .camera_check import camera_check, contradicted_layout, undetermined
@@ -396,15 +396,14 @@ def rejection_check(solution):
     words = f"{out} of {n} observations ({share:.1%}) were left out" if out else f"all {n} observations were used"
     if lost:
         number = f"{len(lost)} exposures were" if len(lost) > 1 else "one exposure was"
-        words += f"; {number} left out: " + "; ".join(f"{k} ({v})" for k, v in list(lost.items())[:3])
-        words += f"; and {len(lost) - 3} more" * (len(lost) > 3)
+        words += f"; {number} left out: {reasons_of(lost, 3)}"
     if any(ALIKE in why for why in lost.values()):
         own = "one distortion is not that of all nights: "
         cure = f"{own}{without_static(solution)}" if solution.settings.static == "fit" else f"{own}raise --degree"
         return Check("rejection", "warn", share, GROSS_ERRORS, words, cure)
     if p < FALSE_ALARM:
         return Check("rejection", "fail" if share > 0.3 else "warn", share, GROSS_ERRORS, words,
-                     "mismatches or blends: look at the exposures with most of them, or match with a smaller radius"
+                     "mismatches or blends: look at the exposures with most of them; match with a smaller --tolerance"
                      )  # fmt: skip
     if lost:
         return Check("rejection", "warn", share, GROSS_ERRORS, words, "look at these frames")

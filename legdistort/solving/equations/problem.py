@@ -311,6 +311,23 @@ def as_given(prior):
     return type(prior).__name__
 
 
+def _check_shapes(matches, priors):
+    """Raise `InputError` for a prior of a detector of another shape, or of one where exposures have several."""
+    cure = "; give the prior of this detector"
+    if matches.camera.has_focal_plane:
+        cure = (
+            ", the focal plane of several: give their static distortions in a camera (camera=, --camera), or let them "
+            "be found: static='fit' (--static fit)"
+        )
+    for name, prior in zip(matches.names, priors, strict=True):
+        shape = matches.shapes[name]
+        if prior is not None and prior.shape is not None and tuple(prior.shape) != tuple(shape):
+            raise InputError(
+                f"the prior belongs to a detector of shape {tuple(prior.shape)} (ny, nx), exposure {name} has "
+                f"{tuple(shape)}{cure}"
+            )
+
+
 def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=None, motion=None, night_sigma=None):
     """The problem posed by `legdistort.matching.matches.Matches`.
 
@@ -345,12 +362,7 @@ def build_problem(matches, degree, *, prior=None, error_floor=0.0, own_degree=No
     counts = np.bincount(obs.exposure, minlength=len(matches.names))
     weight = _weights(obs.covariance.T[:, order], error_floor)
     priors = by_exposure(matches, prior)
-    for name, p in zip(matches.names, priors, strict=True):
-        if p is not None and p.shape is not None and tuple(p.shape) != tuple(matches.shapes[name]):
-            raise InputError(
-                f"the prior belongs to a detector of shape {tuple(p.shape)} (ny, nx), exposure {name} has "
-                f"{tuple(matches.shapes[name])}; give the prior of this detector"
-            )
+    _check_shapes(matches, priors)
     n_fit = basis.n_modes(degree)
     top = max([degree, *(p.degree for p in priors if p is not None)])
     mean = np.zeros((len(priors), 2, basis.n_modes(top)))
