@@ -207,6 +207,9 @@ MATCHING = Group(
     {
         "min_exposures": Option("keep stars seen in so many exposures (default 4)", type=int),
         "isolation": Option("largest crowding of a star; inf keeps all (default 3)", type=float),
+        "start": Option(
+            "where stars lie: exposure, xshift, yshift [pixels], rotation [degrees]", metavar="TABLE", path="read"
+        ),
     },
 )
 
