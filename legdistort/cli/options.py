@@ -114,6 +114,13 @@ def picture(what):
     return {"plot": Option(what, type=Path, metavar="FILE.png", path="file", endings=PICTURE_ENDINGS)}
 
 
+MAPS = {
+    "first": Option(
+        "camera file, solution, or whatever the command prior reads as one file", "first", metavar="CAMERA", path="read"
+    ),
+    "second": Option("another, or the solution of a night", "second", metavar="NIGHT", path="read"),
+}
+COMPARED = {"degree": Option("of the series for a map that is none yet (default 5)", type=int)}
 REPLACING = {"overwrite": Option("replace a picture that exists", action="store_true")}
 
 KNOWN_STATIC = {
