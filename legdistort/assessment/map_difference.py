@@ -207,6 +207,11 @@ def difference(first: Any, second: Any, *, degree: int = 5) -> MapDifference:
     InputError
         For maps of different detectors or shapes, and nights of a camera whose static distortions were not fitted.
 
+    See Also
+    --------
+    legdistort.Prior.from_model : Makes a map of a model, a WCS or a function.
+    legdistort.Solution.factors : The tests of what a night was solved with.
+
     Examples
     --------
     >>> import legdistort as ld
