@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` states the same for Python
+    from .assessment.map_difference import difference as difference
     from .cameras.camera import Camera as Camera
     from .cameras.detector import Detector as Detector
     from .coaddition.mosaic import Mosaic as Mosaic
@@ -55,6 +56,7 @@ _PLACES = {
     "calibrate_noise": "measurement.noise_calibration",
     "catalogue": "photometry.catalogue",
     "coadd": "coaddition.mosaicking",
+    "difference": "assessment.map_difference",
     "effective_psf": "measurement.positions",
     "match": "matching.matcher",
     "measure": "measurement.positions",

@@ -354,6 +354,20 @@ def do_show(a):
     return _status(a, summary)
 
 
+def do_difference(a):
+    """``legdistort difference``."""
+    found = legdistort.difference(a.first, a.second, **given(a, options.COMPARED))
+    _draw(found, a)
+    figures = {
+        "agrees": found.agrees, "rms_px": found.rms, "rms_error_px": found.rms_error, "sigmas": found.sigmas,
+        "chi2": found.chi2, "dof": found.dof, "p": found.p,
+    }  # fmt: skip
+    figures = {name: value if value == value else None for name, value in figures.items()}
+    figures |= {"n_undetermined": found.n_undetermined, "sentence": found.sentence, "modes": _records(found.modes)}
+    _say(a, found, figures)
+    return 3 if a.strict and found.agrees is False else 0
+
+
 def do_stars(a):
     """``legdistort stars``."""
     solution = _solution(a)

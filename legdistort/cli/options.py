@@ -120,6 +120,13 @@ def picture(what):
     return {"plot": Option(what, type=Path, metavar="FILE.png", path="file", endings=PICTURE_ENDINGS)}
 
 
+MAPS = {
+    "first": Option(
+        "camera file, solution, or whatever the command prior reads as one file", "first", metavar="CAMERA", path="read"
+    ),
+    "second": Option("another, or the solution of a night", "second", metavar="NIGHT", path="read"),
+}
+COMPARED = {"degree": Option("of the series for a map that is none yet (default 5)", type=int)}
 REPLACING = {"overwrite": Option("replace a picture that exists", action="store_true")}
 
 KNOWN_STATIC = {
@@ -214,6 +221,9 @@ MATCHING = Group(
         "min_exposures": Option("keep stars seen in so many exposures (default 4)", type=int),
         "tolerance": Option("largest distance of a star in two exposures, pixels (default: found)", type=float),
         "isolation": Option("largest crowding of a star; inf keeps all (default 3)", type=float),
+        "start": Option(
+            "where stars lie: exposure, xshift, yshift [pixels], rotation [degrees]", metavar="TABLE", path="read"
+        ),
     },
 )
 

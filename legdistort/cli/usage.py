@@ -159,6 +159,15 @@ COMMANDS = {
         options.FLAGGED,
         options.STRICT,
     ),
+    "difference": _command(
+        "is an old distortion map still right? its difference from another, or from a night",
+        "camera.asdf results/solution.asdf --plot difference.png",
+        options.MAPS,
+        options.COMPARED,
+        options.STRICT,
+        options.picture("picture of the difference"),
+        options.REPLACING,
+    ),
     "stars": _command(
         "the stars of a solution as a table",
         "results/solution.asdf --out stars.fits",

@@ -2,12 +2,16 @@
 
 from collections.abc import Mapping
 from numbers import Real
+from pathlib import Path
 
 import numpy as np
+from astropy.table import Table
 
 from ..exceptions import InputError, MatchError
 from ..geometry import pair_agreement, similarity
 from ..geometry.detector_modes import detector_corners
+from ..runtime.checks import check_is_file
+from .star_lists import formats
 
 #: Exposures whose stars typically lie farther from their means than this part of their extent are compared in pairs.
 _FAR = 0.01
@@ -58,6 +62,61 @@ def _number(argument, name, value):
             f"{argument}: the error of {name} must be a number [{POSE_ERRORS[name]}], 0 or more, got {value!r}"
         )
     return float(value)
+
+
+def given_starts(start):
+    """Start positions as they are given: ``{exposure: (xshift, yshift, rotation)}``, pixels and degrees.
+
+    Parameters
+    ----------
+    start : Mapping, `~astropy.table.Table`, or path of a table
+        ``{exposure: (xshift, yshift)}``, or with a rotation; columns ``exposure``, ``xshift``, ``yshift``, and perhaps
+        ``rotation``.
+
+    Raises
+    ------
+    InputError
+        Naming the exposure or column at fault.
+    """
+    if isinstance(start, str | Path):
+        check_is_file(start)
+        return _starts_of(formats.read(Path(start))[0], str(start))
+    if isinstance(start, Table):
+        return _starts_of(start, "the table of start positions")
+    if not isinstance(start, Mapping):
+        raise InputError(
+            f"start must be a dict {{exposure: (xshift, yshift)}}, a table or its file, got {type(start).__name__}"
+        )
+    return {str(name): _start(name, each) for name, each in start.items()}
+
+
+def _starts_of(table, label):
+    named = {name.lower(): name for name in table.colnames}
+    missing = [name for name in ("exposure", "xshift", "yshift") if name not in named]
+    if missing:
+        raise InputError(
+            f"{label} has no column {missing[0]}: start positions have exposure, xshift, yshift [px], and perhaps "
+            f"rotation [deg]; it has {', '.join(table.colnames)}"
+        )
+    columns = [table[named[name]] for name in ("xshift", "yshift", "rotation") if name in named]
+    names = [str(name) for name in table[named["exposure"]]]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{label} has exposure {twice} twice: leave one out")
+    return {name: _start(name, each) for name, *each in zip(names, *columns, strict=True)}
+
+
+def _start(name, values):
+    try:
+        found = [float(getattr(each, "value", each)) for each in values]
+    except (TypeError, ValueError):
+        found = []
+    if not (len(found) in (2, 3) and np.all(np.isfinite(found))):
+        raise InputError(
+            f"the start position of {name} must be (xshift, yshift) [px] or (xshift, yshift, rotation [deg]), got "
+            f"{values!r}"
+        )
+    return (*found, 0.0)[:3]
 
 
 def star_means(xy, star, n_stars):

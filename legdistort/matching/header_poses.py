@@ -33,17 +33,18 @@ class HeaderPoses:
         ``{exposure: (ny, nx)}``.
     sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
         Where the plane of these poses lies.
-    shifts : dict
-        ``{exposure: (2,)}``, pixels by which stars are shifted, of exposures that state that and have no WCS.
+    starts : dict
+        ``{exposure: (2, 3)}``, plane -> pixels, as `legdistort.match` is given them; and by `XSHIFT`, `YSHIFT`, of
+        exposures that state these and have no WCS.
     """
 
     poses: dict
     shapes: dict
     sky: TangentPlane | None
-    shifts: dict = field(default_factory=dict)
+    starts: dict = field(default_factory=dict)
 
     @classmethod
-    def of(cls, exposures, shapes):
+    def of(cls, exposures, shapes, start=None):
         """Those of some exposures.
 
         Parameters
@@ -51,10 +52,15 @@ class HeaderPoses:
         exposures : list of `legdistort.Exposure`
         shapes : dict
             ``{exposure: (ny, nx)}``.
+        start : dict, optional
+            ``{exposure: (xshift, yshift, rotation)}``, see `legdistort.match`; of exposures of `shapes`.
         """
         stated = {e.name: [e.header.get(key) for key in ("XSHIFT", "YSHIFT")] for e in exposures if e.wcs is None}
-        shifts = {name: np.array(each, float) for name, each in stated.items() if all(map(_is_number, each))}
-        return replace(cls.from_wcs({e.name: e.wcs for e in exposures if e.wcs is not None}, shapes), shifts=shifts)
+        starts = {
+            name: np.column_stack([np.eye(2), each]) for name, each in stated.items() if all(map(_is_number, each))
+        }
+        starts |= {name: _turned(shapes[name], *each) for name, each in (start or {}).items()}
+        return replace(cls.from_wcs({e.name: e.wcs for e in exposures if e.wcs is not None}, shapes), starts=starts)
 
     @classmethod
     def from_wcs(cls, wcss, shapes):
@@ -88,11 +94,10 @@ class HeaderPoses:
 
     def step(self, source, target):
         """Nominal pose from one exposure's pixels to another's, or None."""
-        if {source, target} <= self.shifts.keys():
-            return np.column_stack([np.eye(2), self.shifts[target] - self.shifts[source]])
-        if not {source, target} <= self.poses.keys():
-            return None
-        return similarity.compose(self.poses[target], similarity.invert(self.poses[source]))
+        for known in (self.starts, self.poses):
+            if {source, target} <= known.keys():
+                return similarity.compose(known[target], similarity.invert(known[source]))
+        return None
 
     def place(self, found):
         """Poses in any plane carried to the headers' plane, by the mean of the headers that agree.
@@ -168,6 +173,13 @@ class HeaderPoses:
                 "the headers",
                 AssumptionWarning,
             )
+
+
+def _turned(shape, x, y, rotation):
+    """Pose that turns about the centre of a detector, by degrees from x to y, and shifts."""
+    angle, centre = np.deg2rad(rotation), _grid(shape, 1)[0]
+    matrix = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.column_stack([matrix, centre + [x, y] - matrix @ centre])
 
 
 def _is_number(value):

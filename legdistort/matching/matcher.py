@@ -29,7 +29,8 @@ from . import detector_layout, detector_places
 from .exposure_groups import interlink, link, standing, unite, without
 from .fields import apart
 from .header_poses import HeaderPoses
-from .lattices import warn_of_lattice
+from .lattices.identification import identify_holes
+from .lattices.periods import warn_of_lattice
 from .matches import Matches, in_focal_plane, shapes_by_exposure
 from .options import MatchOptions, check_enough
 from .star_labels import label_stars
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from ..inputs.exposures import Exposure
-    from ..runtime.annotations import Shape
+    from ..runtime.annotations import Shape, StrPath
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +68,7 @@ def match(
     tolerance: float | None = None,
     reject_flags: int = UNUSABLE,
     isolation: float | None = LIMIT,
+    start: Mapping[str, Sequence[float]] | Table | StrPath | None = None,
     progress: bool = False,
 ) -> Matches:
     """Find out which detections are the same star.
@@ -104,6 +106,11 @@ def match(
         Largest ``crowding`` of a detection, see `legdistort.measurement.crowding`; deformed ones are left out too.
         They still help to identify stars before that. None = all are kept. Tables without the column are
         taken as they are.
+    start : dict, `~astropy.table.Table` or path of a table, optional
+        Where stars lie in the exposures: ``{exposure: (xshift, yshift)}``, pixels, or ``(xshift, yshift, rotation)``,
+        degrees about the centre of the detector from x to y; columns ``exposure``, ``xshift``, ``yshift``,
+        ``rotation``. It is tried first, as header WCSs are, in place of these. Of the holes of a mask, which match as
+        well when they are shifted by a period, it selects the period, if it is right to half of one.
     progress : bool
         Show progress bars.
 
@@ -120,7 +127,8 @@ def match(
         For missing columns, bad values, a missing shape, fewer exposures than `min_exposures`, or detectors that
         seem to lie in each other's places.
     MatchError
-        For exposures in groups without a star in common, or no star in `min_exposures` exposures.
+        For exposures in groups without a star in common, no star in `min_exposures` exposures, or holes of a mask of
+        which nothing tells by how many periods they are shifted.
 
     See Also
     --------
@@ -137,7 +145,7 @@ def match(
     """
     options = MatchOptions(
         min_exposures=min_exposures, columns=columns, tolerance=tolerance, reject_flags=reject_flags,
-        isolation=isolation, progress=progress,
+        isolation=isolation, start=start, progress=progress,
     )  # fmt: skip
     _check_measured(detections)
     check_camera(camera)
@@ -148,6 +156,11 @@ def match(
     exposures = None if exposures is None else listed(exposures, "match")
     if camera is None:
         if detector_layout.is_needed(table, exposures):
+            if start is not None:
+                raise InputError(
+                    "start positions are those of whole exposures, and how the detectors of these lie to each other is "
+                    "not known: give the camera too, camera= (--camera)"
+                )
             shapes = detector_layout.shapes_of(table, exposures, shape)
             log.info("neither a camera nor headers: how the detectors lie is sought in the dithers")
             _add_epochs(table, {whole_name(exposure): exposure for exposure in exposures or ()})
@@ -169,7 +182,7 @@ def match(
     table = _without_repetitions(_without_flagged(table, int(reject_flags)))
     copies = _copies(table)
     table, names = table[~np.isin(table["exposure"], list(copies))], [name for name in names if name not in copies]
-    headers = HeaderPoses.of((named or {}).values(), shapes)
+    headers = HeaderPoses.of((named or {}).values(), shapes, _known_starts(options.start, shapes))
 
     with parallel.one_blas_thread():  # matrices are small
         label = _label_over_gaps if camera is not None and len(camera.detectors) > 1 and len(names) > 1 else _label
@@ -185,7 +198,6 @@ def match(
     _add_epochs(table, named or {})
     distortions = header_distortions(named[name] for name in np.unique(table["exposure"])) if named else {}
     matches = _finish(table, star, shapes, headers, left_out, epoch, distortions)
-    warn_of_lattice(matches, headers)
     return replace(matches, left_out=copies | left_out, camera=camera)
 
 
@@ -200,7 +212,10 @@ def _label(table, names, shapes, headers, options, camera=None):
         log.info("one exposure (%s): every detection is a star; a reference catalogue solves it", names[0])
         star[:] = np.arange(len(table))
         return star, left_out
-    for name, labels in _associate(lists, kept, headers, left_out, options).items():
+    found = identify_holes(lists, kept, headers, left_out, gaps=len(camera.detectors) > 1 if camera else False)
+    if found is None:
+        found = _associate(lists, kept, headers, left_out, options)
+    for name, labels in found.items():
         star[rows[name]] = labels
     return star, left_out
 
@@ -294,6 +309,16 @@ def _without_repetitions(table):
     return table[first]
 
 
+def _known_starts(start, shapes):
+    """Start positions of exposures that there are."""
+    unknown = sorted(set(start or ()) - set(shapes))
+    if unknown:
+        raise InputError(
+            f"start has exposure {unknown[0]}, which is none of those of the table: {some_of(sorted(shapes), 6)}"
+        )
+    return start
+
+
 def _copies(table):
     """Exposures that repeat another one, ``{name: reason}``."""
     names, exposure = np.unique(table["exposure"], return_inverse=True)
@@ -352,6 +377,7 @@ def _associate(lists, names, headers, left_out, options):
         few = max(h.mean() for h in hot) < FEW_HOT  # they have not led the registrations astray
         groups = [without(group, hot) for group in groups] if few else grouped(lists)
     _check_groups(groups, lists, names, left_out)
+    warn_of_lattice(lists, names, groups[0].poses, headers)
     registrations, misfits = interlink(lists, groups[0], tolerance=tolerance, progress=progress)
     left_out.update({names[i]: reason for i, reason in misfits.items()})
     good = {pair: r for pair, r in registrations.items() if not misfits.keys() & set(pair)}

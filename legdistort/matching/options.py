@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass
 from numbers import Integral, Real
+from typing import Any
 
 from ..exceptions import InputError
+from ..inputs.start_poses import given_starts
 from ..measurement.crowding import LIMIT, check_isolation
 from ..measurement.flags import UNUSABLE
 from ..runtime.checks import LARGEST
@@ -33,6 +35,7 @@ class MatchOptions:
     tolerance: float | None = None
     reject_flags: int = UNUSABLE
     isolation: float | None = LIMIT
+    start: Any = None
     progress: bool = False
 
     def __post_init__(self):
@@ -46,3 +49,5 @@ class MatchOptions:
         if not isinstance(self.reject_flags, Integral):
             raise InputError(f"reject_flags must be an integer, whose bits are flags, got {self.reject_flags!r}")
         check_isolation(self.isolation)
+        if self.start is not None:
+            object.__setattr__(self, "start", given_starts(self.start))

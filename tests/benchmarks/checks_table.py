@@ -29,7 +29,7 @@ from scipy.stats import beta
 import legdistort as ld
 from legdistort.exceptions import LegdistortWarning
 from legdistort.inputs.exposures import Exposure
-from legdistort.matching.lattices import periods
+from legdistort.matching.lattices.periods import periods
 from legdistort.simulation.pupil import PupilPSF
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

@@ -495,6 +495,7 @@ def test_help_has_an_example(command, capsys):
         (predict, [options.PREDICTING]),
         (Prior.from_model, [options.EXPANDING]),
         (Solution.read, [options.SOLUTION]),
+        (legdistort.difference, [options.MAPS, options.COMPARED]),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
@@ -635,6 +636,7 @@ FILES = {
     "coadd's solution": "coadd other.fits --solution IN --out OUT",
     "coadd's grid": "coadd other.fits --solution s.asdf --grid IN --out OUT",
     "predict": "predict --n-exposures 4 --stars IN --plot OUT",
+    "difference": "difference IN s.asdf --plot OUT",
     "stars": "stars IN --out OUT",
     "report": "report IN --out OUT",
 }

@@ -408,6 +408,7 @@ MATCH = [
     row(tolerance=2.0),
     row(reject_flags=0),
     row(isolation=None),
+    row(start={"exp00": (0.0, 0.0), "exp01": (3.0, -2.0, 10.0)}),
     row(progress=True),
 ]
 MEASURE = [

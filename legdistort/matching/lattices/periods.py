@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..exceptions import AssumptionWarning, some_of, warn
-from ..geometry import similarity
+from ...exceptions import AssumptionWarning, some_of, warn
+from ...geometry import similarity
 
 _NEIGHBOURS = 6  # of every star among which the periods are
 _LOOKED_AT, _TRIED = 4000, 300  # stars, and distances between neighbours of which the commonest is sought
@@ -14,36 +14,37 @@ _FEWEST, _SHARE = 8, 0.5  # stars that a period must show, and part of those tha
 _ALONG = 0.5  # sine of the angle between two periods
 
 
-def warn_of_lattice(matches, headers):
+def warn_of_lattice(lists, names, poses, headers):
     """Warn of stars on a lattice where headers do not tell matches from those that are off by a period.
 
     Parameters
     ----------
-    matches : `~legdistort.matching.matches.Matches`
+    lists : list of `~legdistort.matching.star_lists.StarList`
+    names : list of str
+    poses : dict of int to ndarray, each (2, 3)
+        By the place of an exposure in these lists: how it was matched.
     headers : `~legdistort.matching.header_poses.HeaderPoses`
     """
-    observed = matches.observations
-    richest = int(np.argmax(np.bincount(observed.exposure)))
-    xy = observed.xy[observed.exposure == richest]
+    richest = max(poses, key=lambda i: (len(lists[i]), -i))
+    xy, first = lists[richest].xy, names[richest]
     found = periods(xy)
     if not len(found):
         return
-    names, reach = matches.names, np.hypot(*found[0]) / 2
-    first, middle = names[richest], xy.mean(axis=0)
-    to_plane = similarity.invert(matches.poses[first])
+    reach, middle = np.hypot(*found[0]) / 2, xy.mean(axis=0)
+    to_plane = similarity.invert(poses[richest])
     open_ones = []
-    for name in names:
-        step, pose = headers.step(first, name), similarity.compose(matches.poses[name], to_plane)
+    for i in sorted(poses):
+        step, pose = headers.step(first, names[i]), similarity.compose(poses[i], to_plane)
         if step is None or np.hypot(*((pose - step) @ [*middle, 1])) > reach:
-            open_ones.append(name)
+            open_ones.append(names[i])
     if not open_ones:
         return
     shown = " and ".join(f"({x:.1f}, {y:.1f})" for x, y in found)
     warn(
         f"the stars lie on a lattice, as of a mask: of period {shown} px in x, y of {first}; positions alone do not "
         f"tell right matches from those that are off by a period, nor do the headers of {some_of(open_ones, 3)}; give "
-        "exposures= whose WCSs are right to half a period, or number the stars and give their start positions: "
-        "Matches.from_table(..., poses=)",
+        "start positions right to half a period: start= (--start), exposures= with WCSs (--wcs); or number the stars: "
+        "Matches.from_table",
         AssumptionWarning,
     )
 

@@ -1,0 +1,52 @@
+"""Picture of the difference of two distortion maps."""
+
+import numpy as np
+
+from ..geometry import basis
+from . import elements
+
+_ARROWS = 13  # along the longer side of a detector
+
+
+def plot_difference(difference, *, ax=None, scale=None):
+    """Arrows by which the second map displaces beyond the first, magnified, detectors side by side.
+
+    Parameters
+    ----------
+    difference : `legdistort.assessment.map_difference.MapDifference`
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw.
+    scale : float, optional
+        Magnification; by default a round number that makes the longest arrow 6 % of a detector.
+    """
+    shapes, count = difference.shapes, len(difference.shapes)
+    columns = int(np.ceil(np.sqrt(count)))
+    ax = elements.new_axes(ax, (6.8, 7.2))
+    size = max(max(shape) for shape in shapes.values())
+    t = (np.arange(_ARROWS) + 0.5) / _ARROWS * 2 - 1
+    u, v = (each.ravel() for each in np.meshgrid(t, t))
+    fields = {key: np.tensordot(each, basis.values(basis.degree_of(each.shape[1]), u, v), 1)
+              for key, each in difference.coefficients.items()}  # fmt: skip
+    longest = max(np.hypot(*each).max() for each in fields.values())
+    scale = scale or elements.round_down(0.06 * size / (longest or 1))
+    for number, (key, (ny, nx)) in enumerate(shapes.items()):
+        corner = 1.08 * size * np.array([number % columns, -(number // columns)])
+        edge = np.array([[0, 0], [nx, 0], [nx, ny], [0, ny]]) - 0.5 + corner
+        ax.fill(*edge.T, facecolor="#eef3f8", edgecolor=elements.BLUE, linewidth=1.2, zorder=0)
+        if count > 1:
+            ax.annotate(key, edge[0], xytext=(5, 5), textcoords="offset points", color=elements.BLUE, parse_math=False)
+        if longest > 0:
+            places = basis.denormalize(u, v, (ny, nx)) + corner
+            ax.quiver(*places.T, *(scale * fields[key]), angles="xy", scale_units="xy", scale=1, width=2.4e-3)
+    ax.set_aspect("equal")
+    ax.set_xlabel("x [pix]")
+    ax.set_ylabel("y [pix]")
+    verdict = {
+        True: "as far as is known none",
+        False: f"{min(difference.sigmas, 37):.1f} sigma",
+        None: "no errors stated",
+    }
+    words = f"difference {difference.rms:.2g} px rms ({verdict[difference.agrees]}), arrows x {scale:g}"
+    first, second = (elements.shorten(each) for each in difference.labels)
+    elements.set_title(ax, f"{second}\nagainst {first}:\n{words}", size="small")
+    return ax

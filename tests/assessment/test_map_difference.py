@@ -1,0 +1,237 @@
+"""Differences of distortion maps and of nights; maps, nights and their truth are made by numpy alone."""
+
+import json
+
+import four_detectors
+import numpy as np
+import pytest
+from astropy.modeling.models import Identity, Legendre2D, Mapping
+from night_sets import SIZE, field
+from numpy.testing import assert_allclose
+from rolled_night import modes, night
+
+import legdistort as ld
+from legdistort.cli import main
+from legdistort.exceptions import InputError
+
+SHAPE = (SIZE, SIZE)
+
+
+def static(seed):
+    return field(np.random.default_rng(1000 + seed), 1.5)
+
+
+def solved(seed, of=None, **how):
+    """A night of a detector whose map is that of the seed, or another."""
+    known = {key: how.pop(key) for key in ("prior", "static") if key in how}
+    table = night(seed, static(seed) if of is None else of, **how)
+    return ld.solve(ld.Matches.from_table(table, shape=SHAPE), degree=3, **known)
+
+
+def old(seed, **widths):
+    return ld.Prior(modes(static(seed)), shape=SHAPE, **widths)
+
+
+def test_a_map_does_not_differ_from_itself():
+    prior = old(1, static_sigma=0.01)
+    same = ld.difference(prior, prior)
+    assert same.rms == same.chi2 == 0
+    assert same.p == 1
+    assert same.dof == 16
+    assert same.agrees
+    assert "is still right" in same.sentence
+    nothing = ld.difference(old(1), old(1))
+    assert nothing.agrees is None
+    assert "neither states an error" in nothing.sentence
+    assert np.isnan(nothing.modes["error"]).all()
+
+
+def test_a_night_does_not_differ_from_itself():
+    solution = solved(2)
+    same = ld.difference(solution, solution)
+    assert same.rms < 1e-6
+    assert same.p == 1
+
+
+def test_a_bend_is_found_with_its_stated_error():
+    extra = np.zeros((2, 10))
+    extra[0, 4], extra[1, 7] = 0.1, -0.06  # L1(x) L1(y) along x, L2(x) L1(y) along y
+    bent = ld.Prior(modes(static(3)) + extra, shape=SHAPE, static_sigma=0.01)
+    found = ld.difference(old(3, static_sigma=0.01), bent)
+    assert_allclose(
+        found.coefficients["1"][:, 3:], extra[:, 3:], atol=2e-3
+    )  # less a similarity of 1.5 px times its slope
+    assert_allclose(found.errors["1"][:, 3:], 0.01 * np.sqrt(2), rtol=1e-9)
+    assert_allclose(found.chi2, (0.1**2 + 0.06**2) / 0.02**2 * 2, rtol=0.05)
+    assert found.agrees is False
+    assert "mostly in L1(x) L1(y) along x (+0.1 +- 0.014 px a coefficient)" in found.sentence
+
+
+@pytest.mark.parametrize("shape", [(512, 700), (700, 512)])
+def test_shift_turn_scale_and_parity_do_not_matter(shape):
+    """A map that ends in a plane of its own: mirrored, turned by 70 degrees, in units of 0.03 px."""
+    coefficients = modes(static(4) / 3)
+    ny, nx = shape
+
+    def other(x, y):
+        q = x + 1j * y
+        for _ in range(20):
+            u, v = (2 * q.real + 1) / nx - 1, (2 * q.imag + 1) / ny - 1
+            shift = [sum(c * p for c, p in zip(row, plain(u, v), strict=True)) for row in coefficients]
+            q = x - shift[0] + 1j * (y - shift[1])
+        w = 30 * np.exp(1.2j) * q.conj()
+        return w.real + 77, w.imag - 5
+
+    def plain(u, v):
+        norm = np.sqrt((2 * np.arange(4) + 1) / 2)
+        eye = [np.polynomial.legendre.Legendre.basis(k) for k in range(4)]
+        return [norm[d - k] * norm[k] * eye[d - k](u) * eye[k](v) for d in range(4) for k in range(d + 1)]
+
+    made = ld.Prior.from_model(other, shape=shape, direction="detector_to_reference", degree=3)
+    found = ld.difference(ld.Prior(coefficients, shape=shape, static_sigma=0.01), made)
+    assert found.rms < 1e-3
+    assert found.agrees
+
+
+@pytest.mark.parametrize("known", ["nothing", "old", "wrong", "fit"])
+def test_what_a_night_was_solved_with_does_not_count(known):
+    how = {"nothing": {}, "old": {"prior": old(5)}, "wrong": {"prior": ld.Prior(1.3 * modes(static(5)))},
+           "fit": {"static": "fit"}}[known]  # fmt: skip
+    right, off = ld.difference(old(5), solved(5, **how)), static(5)
+    assert right.agrees
+    assert right.rms < 0.01
+    assert (right.dof, right.n_undetermined) == (16, 0)
+    off[0, 1, 2] += 0.05
+    wrong = ld.difference(old(5), solved(5, of=off, **how))
+    assert wrong.agrees is False
+    assert wrong.sigmas > 5
+    assert "mostly in L1(x) L2(y) along x" in wrong.sentence
+    error = wrong.errors["1"][0, 8]
+    assert abs(wrong.coefficients["1"][0, 8] - modes(off - static(5))[0, 8]) < 4 * error
+
+
+def test_undetermined_directions_do_not_count():
+    """Without rolls nothing tells z^2 and i z^2 of the detector from those of the sky."""
+    off = static(6)
+    square = np.zeros((2, 4, 4))  # z^2: x^2 - y^2 and 2 x y
+    square[0, 2, 0], square[0, 0, 2], square[1, 1, 1] = 2 / 3, -2 / 3, 2.0
+    solution = solved(6, of=off + 0.3 * square, turns=(0,))
+    found = ld.difference(old(6), solution)
+    assert found.n_undetermined >= 2
+    assert found.agrees
+    assert "directions are not determined and do not count" in found.sentence
+    turned = ld.difference(old(6), solved(6, of=off + 0.3 * square))
+    assert turned.agrees is False
+
+
+def test_detectors_of_cameras_are_compared_one_by_one():
+    def camera(name, extra=0.0, sigma=0.01):
+        left, right = modes(static(7)), modes(static(8))
+        left[:, :3] = right[:, :3] = 0
+        right[1, 5] += extra
+        beside = np.array([[1.0, 0, -1100], [0, 1, 0]])
+        chips = {"a": ld.Detector(SHAPE, static=left, static_sigma=sigma),
+                 "b": ld.Detector(SHAPE, layout=beside, static=right, static_sigma=sigma)}  # fmt: skip
+        return ld.Camera(name, chips)
+
+    assert ld.difference(camera("one"), camera("two")).agrees
+    found = ld.difference(camera("one"), camera("two", extra=0.2))
+    assert found.agrees is False
+    assert found.labels == ("one", "two")
+    assert "L0(x) L2(y) along y of detector b (+0.2 +- 0.014" in found.sentence
+    with pytest.raises(
+        InputError, match=r"camera one has detectors a, b, .* has 1: compare maps of the same detectors"
+    ):
+        ld.difference(camera("camera one"), old(7))
+
+
+def test_maps_of_other_kinds_and_of_other_detectors():
+    box = {"x_domain": (-0.5, 99.5), "y_domain": (-0.5, 79.5)}
+    series = Legendre2D(2, 2, c2_0=0.2, **box) & Legendre2D(2, 2, c1_1=0.1, **box)
+    model = Identity(2) + (Mapping((0, 1, 0, 1)) | series)
+    prior = ld.Prior.from_model(model, shape=(80, 100), direction="reference_to_detector", static_sigma=0.01)
+    assert ld.difference(prior, ld.Prior.from_model(model, shape=(80, 100), direction="reference_to_detector")).agrees
+    with pytest.raises(InputError, match="does not state what it does: give direction"):
+        ld.difference(prior, model)
+    with pytest.raises(InputError, match=r"is for \(80, 100\) \(ny, nx\), .* for \(1024, 1024\)"):
+        ld.difference(prior, old(1))
+    with pytest.raises(InputError, match=r"neither .* states the shape of its detector: give Prior"):
+        ld.difference(ld.Prior(np.zeros((2, 6))), ld.Prior(np.zeros((2, 6))))
+    with pytest.raises(InputError, match="the second map states only the size of a distortion"):
+        ld.difference(prior, ld.Prior(None, static_sigma=1.0))
+
+
+def test_the_command_compares_files(tmp_path, capsys):
+    solution = solved(9)
+    solution.write(tmp_path / "night.asdf")
+    old(9).write(tmp_path / "old.asdf")
+    old(10).write(tmp_path / "other.asdf")
+    ld.Camera("chip", {"1": ld.Detector(SHAPE, static=old(9))}).write(tmp_path / "camera.asdf")
+    for name in ("old", "camera"):
+        assert main(["difference", str(tmp_path / f"{name}.asdf"), str(tmp_path / "night.asdf"), "--strict"]) == 0
+        assert f"{name}.asdf is still right: " in capsys.readouterr().out
+    line = ["difference", str(tmp_path / "other.asdf"), str(tmp_path / "night.asdf"), "--json", "--strict"]
+    assert main([*line, "--plot", str(tmp_path / "d.png")]) == 3
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["agrees"] is False
+    assert figures["rms_px"] > 0.5
+    assert len(figures["modes"]) == 18
+    assert (tmp_path / "d.png").stat().st_size > 10_000
+
+
+def four(seed, extra=0.0):
+    """The camera of `four_detectors.matches("static", seed)` as it is, with x y of detector 1 off by some pixels."""
+    rng, norm = np.random.default_rng(seed), np.sqrt((2 * np.arange(3) + 1) / 2)
+    rng.uniform(size=(160, 2)), rng.normal(size=4), rng.normal(size=(4, 2))
+    bends, chips = rng.normal(size=(4, 2, 3)), {}
+    for k, bent in enumerate(bends):  # by x^2, x y and y^2: x^2 is 2/3 P_2 + 1/3
+        plain = np.zeros((2, 6))
+        plain[:, 3:] = bent * [2 / 3 / (norm[2] * norm[0]), 1 / norm[1] ** 2, 2 / 3 / (norm[2] * norm[0])]
+        plain[0, 4] += extra * (k == 1)
+        corner = np.array([k % 2, k // 2]) * (four_detectors.SIZE + four_detectors.GAP)
+        layout = np.column_stack([np.eye(2), -corner])
+        chips[str(k)] = ld.Detector((four_detectors.SIZE,) * 2, layout=layout, static=plain)
+    return ld.Camera("as made", chips)
+
+
+def test_a_night_of_a_camera_is_compared_detector_by_detector():
+    matches = four_detectors.matches("static", 1)
+    night = ld.solve(matches, static="fit", layout="fit", degree=2)
+    right, wrong = ld.difference(four(1), night), ld.difference(four(1, extra=0.2), night)
+    assert right.agrees
+    assert right.n_undetermined == 14  # of eight shears, which layouts have, and a common quadratic of the plane
+    assert 0.002 < right.rms < 0.02
+    assert wrong.sigmas > 8
+    assert "mostly in L1(x) L1(y) along x of detector 1 (-0.1" in wrong.sentence
+    with pytest.raises(InputError, match=r"static distortions of camera FOUR as given, .* solve it with static='fit'"):
+        ld.difference(four(1), ld.solve(four_detectors.matches("layout", 1), layout="fit", degree=2))
+
+
+@pytest.mark.slow
+def test_chances_of_the_detectors_of_a_camera_are_even():
+    chances = [
+        ld.difference(four(s), ld.solve(four_detectors.matches("static", s), static="fit", layout="fit", degree=2)).p
+        for s in range(20)
+    ]
+    assert min(chances) > 0.002
+    assert 0.3 < np.mean(chances) < 0.7
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [{}, {"turns": (0,), "single": 0.03}, {"turns": (0, 180), "exposures": 8}])
+def test_chances_are_even_and_five_sigma_are_found(how):
+    """20 nights: p is anything, and a camera that is off by 5 sigma in a direction that is determined is found."""
+    chances, found = [], 0
+    for seed in range(20):
+        solution = solved(seed, **how)
+        right = ld.difference(old(seed), solution)
+        chances.append(right.p)
+        m = (0, 7)
+        wrong = modes(static(seed))
+        wrong[m] += 6 * right.errors["1"][m] * np.sign(-right.coefficients["1"][m])
+        found += ld.difference(ld.Prior(wrong, shape=SHAPE), solution).p < 0.01
+    assert min(chances) > 1e-4
+    assert np.count_nonzero(np.array(chances) < 0.05) <= 4
+    assert 0.3 < np.mean(chances) < 0.7
+    assert 0.15 < np.std(chances) < 0.4
+    assert found >= 18

@@ -1,0 +1,34 @@
+"""A night of dithered and rolled exposures of one detector whose static distortion is known; numpy alone."""
+
+import numpy as np
+from astropy.table import QTable
+from night_sets import SIZE, field
+from numpy.polynomial.legendre import legval2d
+
+_NORM = np.sqrt((2 * np.arange(4) + 1) / 2)
+
+
+def bend(x, y, tensor):
+    """Displacement (n, 2) by coefficients (2, 4, 4) of plain Legendre polynomials."""
+    return legval2d((2 * x + 1) / SIZE - 1, (2 * y + 1) / SIZE - 1, tensor.transpose(1, 2, 0)).T
+
+
+def modes(tensor):
+    """The normalised coefficients (2, 10) of a cubic, mode m = l (l + 1) / 2 + k for x^(l-k) y^k."""
+    plain = tensor / (_NORM[:, None] * _NORM)
+    return np.stack([plain[:, d - k, k] for d in range(4) for k in range(d + 1)], axis=1)
+
+
+def night(seed, static, *, turns=(0, 90, 200), exposures=9, single=0.01, sigma=0.02, n_stars=120):
+    """Matched positions of exposures, turned by these angles in turn, each with a distortion of its own."""
+    rng, rows = np.random.default_rng(seed), []
+    sky = rng.uniform(-150, SIZE + 150, (n_stars, 2))
+    for i in range(exposures):
+        angle = np.radians(turns[i % len(turns)])
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        q = (sky - SIZE / 2) @ turn.T + SIZE / 2 + rng.uniform(-90, 90, 2)
+        q = q + bend(*q.T, static + field(rng, single))
+        q = q + rng.normal(0, sigma, q.shape)
+        for j in np.flatnonzero(np.all((q > 0) & (q < SIZE - 1), axis=1)):
+            rows.append((f"e{i}", j, *q[j], sigma, sigma))
+    return QTable(rows=rows, names=["exposure", "star", "x", "y", "x_err", "y_err"])
