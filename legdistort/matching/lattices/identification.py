@@ -93,7 +93,10 @@ def identify_holes(lists, names, headers, left_out, *, gaps=False):
     MatchError
         Where nothing decides by how many periods most exposures are shifted.
     """
-    starts = [sum(headers.step(name, other) is not None for other in names) for name in names]
+    if len(lists) < 2:
+        return None
+    known = [(len(each.keys() & set(names)), each) for each in (headers.starts, headers.poses)]
+    starts = [max((n for n, each in known if name in each), default=0) for name in names]
     hub = min(range(len(names)), key=lambda i: (-starts[i], -len(lists[i])))
     if Holes.of(lists[hub]) is None:
         return None
