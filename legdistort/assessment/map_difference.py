@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -173,7 +175,10 @@ class MapDifference(ShownAsPrinted):
         return f"<MapDifference: {self.rms:.2g} px rms, {words}>"
 
     def __str__(self) -> str:
-        lines = [self.sentence[0].upper() + self.sentence[1:] + ".", ""]
+        sentence = self.sentence
+        if sentence.startswith("the "):  # and no name of a file
+            sentence = "T" + sentence[1:]
+        lines = [f"{sentence}.", ""]
         lines.append(f"{'detector':10s} {'axis':4s} {'mode':14s} {'difference [px]':>15s} {'error':>9s} {'sigma':>6s}")
         for row in self.modes:
             mode, error = f"L{row['x_degree']}(x) L{row['y_degree']}(y)", row["error"].value
@@ -436,9 +441,9 @@ def _of_night(solution, label, other):
     around = _pointed(around, shape)
     for _ in range(_ROUNDS):
         prior = Prior(around, shape=shape)
-        static, covariance, dof = _shown(
-            solve(matches, degree=solution.degree, prior=prior, clip=None, **options), shape
-        )
+        with _untold():
+            again = solve(matches, degree=solution.degree, prior=prior, clip=None, **options)
+        static, covariance, dof = _shown(again, shape)
         known = np.linalg.inv(np.eye(2 * n) + covariance / (_MEAN_SQUARE * LIMIT**2))
         around = around + (known @ (static - around).ravel()).reshape(2, n)
     return _Known(label, {"1": static}, {"1": shape}, covariance, dof, solution.degree)
@@ -528,6 +533,18 @@ def _errors(solution, rows):
         shared = np.einsum("ka,iar->ikr", pick, shared).reshape(count * k, -1)
         out = out + shared @ shared.T
     return out
+
+
+@contextmanager
+def _untold():
+    """Solving without a word of how it went."""
+    log = logging.getLogger("legdistort.solving.estimation")
+    level = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
 
 
 def _least_squares(values, design, covariance, k):
