@@ -228,14 +228,18 @@ class MapEquations:
         """What a map (2 k,), and that of the reference alone, leave of all offsets, (n, 2)."""
         return self.straightened(self.offsets.values - self.design @ value, used, weights)
 
-    def freedom(self, used):
-        """Degrees of freedom of the used offsets that these maps leave to chance alone."""
-        _, covariance, _ = self.solve(used)
-        return 2 * np.count_nonzero(used) - self.bends.shape[2] - np.trace(covariance @ self.gain(used)[0])
+    def freedom(self, used, share):
+        """Degrees of freedom of the used offsets that these maps leave to chance alone.
+
+        `share` (2 k, 2 k): what of the common map the offsets determine, its covariance times their information.
+        """
+        return 2 * np.count_nonzero(used) - self.bends.shape[2] - np.trace(share)
 
     def agreement(self, used):
         """chi2 of the used offsets less the map, and its degrees of freedom."""
-        return self.chi2(self.left(self.solve(used)[0], used), used), self.freedom(used)
+        value, covariance, _ = self.solve(used)
+        share = covariance @ self.gain(used)[0]
+        return self.chi2(self.left(value, used), used), self.freedom(used, share)
 
     def chi2(self, left, used, other=None):
         """That of what is left (n, 2) of the used offsets; or its product with something else of that kind."""
@@ -423,7 +427,7 @@ def estimate(equations, used, names):
     parts = map_parts(equations.prior.modes)[1:]
     pointing = 1.0 if np.count_nonzero(used) > 1 else 0.5  # a single star determines the shift alone
     measured = [pointing, *(np.trace(part.T @ share @ part) / part.shape[1] for part in parts)]
-    dof = equations.freedom(used)
+    dof = equations.freedom(used, share)
     tie = Tie(
         covariance=covariance,
         shared=_shared(equations, used, gain),
