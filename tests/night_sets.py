@@ -10,9 +10,9 @@ FAR = 5.0
 _ORDERS = np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1))
 
 
-def field(rng, size):
-    """Legendre coefficients (2, 4, 4) of a cubic displacement, smaller by order."""
-    return rng.normal(0, size, (2, *_ORDERS.shape)) * (_ORDERS <= DEGREE) / (1 + _ORDERS)
+def field(rng, size, degree=DEGREE):
+    """Legendre coefficients (2, 4, 4) of a displacement, by default a cubic one, smaller by order."""
+    return rng.normal(0, size, (2, *_ORDERS.shape)) * (_ORDERS <= degree) / (1 + _ORDERS)
 
 
 class Nights:
@@ -33,17 +33,19 @@ class Nights:
         Of the stars, pixels a year; the nights span six years.
     sigma : float
         Of the positions [pix].
+    degree : int
+        Of all distortions, at most 3.
     """
 
     def __init__(self, seed, *, nights=8, per=5, nightly=0.02, single=0.01, odd=0.0, roll=30.0, motion=0.0, sigma=0.03,
-                 n_stars=200):  # fmt: skip
+                 n_stars=200, degree=DEGREE):  # fmt: skip
         rng = np.random.default_rng(seed)
         self.sky = rng.uniform(-120, SIZE + 120, (n_stars, 2))
         self.motion = rng.normal(0, motion, (n_stars, 2))
-        self.static, rows = field(rng, STATIC), []
+        self.static, rows = field(rng, STATIC, degree), []
         years = np.linspace(2014.4, 2020.6, nights) if nights > 1 else [2014.4]
         for i, year in enumerate(years):
-            common = field(rng, odd if odd and i == nights // 2 else nightly)
+            common = field(rng, odd if odd and i == nights // 2 else nightly, degree)
             for k in range(per):
                 angle = np.radians(rng.normal(0, 0.05) + roll * (i >= nights - max(1, nights // 3)))
                 turn = (1 + rng.normal(0, 1e-4)) * np.array([[np.cos(angle), -np.sin(angle)],
@@ -51,7 +53,7 @@ class Nights:
                 moved = self.sky + self.motion * (year - 2017) - SIZE / 2
                 q = moved @ turn.T + SIZE / 2 + rng.uniform(-90, 90, 2)
                 u = (2 * q + 1) / SIZE - 1
-                q = q + legval2d(*u.T, (self.static + common + field(rng, single)).transpose(1, 2, 0)).T
+                q = q + legval2d(*u.T, (self.static + common + field(rng, single, degree)).transpose(1, 2, 0)).T
                 q = q + rng.normal(0, sigma, q.shape)
                 for j in np.flatnonzero(np.all((q > 0) & (q < SIZE - 1), axis=1)):
                     rows.append((f"n{i}e{k}", j, *q[j], sigma, sigma, year + k * 1e-5, i))

@@ -17,7 +17,11 @@ _SHARED, _BORROWED = 10.0, 0.3
 TAILS, CHANCE = 4.0, 3.0
 #: Nights scatter if the squares of their means exceed what is expected of independent exposures by so many standard
 #: deviations.
-SEEN = 3.0
+SEEN = 2.0
+
+#: A static distortion is at most so many times what is seen: one far beyond, undone by a bend of the plane that nearly
+#: equal dithers hardly tell from none, would explain whatever two nights differ by.
+_LARGE = 10.0
 
 _SMALLEST = 1e-6  # scatter, pixels: where none is seen beyond the errors, Lambda stays invertible
 
@@ -91,14 +95,28 @@ def _of_nights(problem, own, variance, counts, moved, night, group, static):
     dof = np.maximum(counts.sum(axis=0) - leverage, 0.0).sum()
     if dof > 1 and np.sum(counts * total * left**2) < dof + SEEN * np.sqrt(2 * dof):
         return scatter2, np.zeros(free.shape), True
-    found, odd = _scatter(means, 1 / total, counts, moved, owner, static, robust=True)
-    return scatter2, odd[:, None] ** 2 * found, dof > 1
+    shape = _falling(scatter2)
+    unit = np.sqrt(shape)
+    terms = means / unit, 1 / (total * shape), counts, moved / unit[:, None], owner, static / shape
+    found, odd = _scatter(*terms, robust=True)
+    return scatter2, odd[:, None] ** 2 * found * shape, dof > 1
+
+
+def _falling(variance):
+    """Mean variance (K,) of the degree of every mode, or of a higher one if that is larger.
+
+    Few nights tell little of how they scatter by degree: as exposures do, as long as nothing else is seen.
+    """
+    degree = dynamic_degrees(len(variance) // 2 + 2)
+    mean = np.bincount(degree, variance) / np.maximum(np.bincount(degree), 1)
+    return np.maximum.accumulate(mean[::-1])[::-1][degree] + _SMALLEST**2
 
 
 def _common(own, moved, owner, static):
     """Design (n, K, m) of maps and of what those of an owner have in common, and inverse variances (m,) known of it."""
     common = [(owner == g)[:, None, None] * np.eye(own.shape[1])[:, of > 0] for g, of in enumerate(static)]
-    return np.concatenate([moved, *common], axis=2), np.concatenate([np.zeros(moved.shape[2]), 1 / static[static > 0]])
+    known = np.minimum(static[static > 0], _LARGE**2 * np.mean(own**2) + 1e-300)
+    return np.concatenate([moved, *common], axis=2), np.concatenate([np.zeros(moved.shape[2]), 1 / known])
 
 
 def _scatter(own, variance, counts, moved, owner, static, *, robust=False):

@@ -269,7 +269,10 @@ class _Search:
         if self.holds_sizes:
             self.posterior = Posterior(data, factor, self.sizes)
         else:
-            start = np.full(self.known.n_sizes, 100 * self.unit) if before is None else before
+            start = before
+            if before is None:  # few nights that hardly differ may seem to differ by as much as the static distortion
+                start = np.full((2, self.known.n_sizes), 100 * self.unit)
+                start[1, : self.known.n_scatters] = self.unit
             self.posterior = most_likely(data, factor, start, self.unit * np.array(RANGE))
             self.sizes = self.posterior.sizes
         odd = self.known.oddness(self.posterior)

@@ -161,7 +161,8 @@ def most_likely(data, factor, start, bounds):
     ----------
     data : ReducedData
     factor : Factor
-    start : array-like, shape (n_sizes,)
+    start : array-like, shape (n_sizes,) or (k, n_sizes)
+        Several where the likelihood may have several maxima: the best of those they lead to counts.
     bounds : (float, float)
         Within which all sizes are sought.
 
@@ -169,8 +170,14 @@ def most_likely(data, factor, start, bounds):
     -------
     Posterior
     """
+    found = [_climbed(Posterior(data, factor, np.clip(each, *bounds)), bounds) for each in np.atleast_2d(start)]
+    return min(found, key=lambda each: each.cost)
+
+
+def _climbed(here, bounds):
+    """The posterior at the sizes of the next maximum of the likelihood."""
     low, high = np.log(bounds)
-    here = Posterior(data, factor, np.clip(start, *bounds))
+    data, factor = here.data, here.factor
     for _ in range(_ROUNDS):
         first, second = here.cost_slopes
         logs = np.log(here.sizes)
