@@ -12,7 +12,7 @@ _ORDERS = np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1))
 
 def field(rng, size, degree=DEGREE):
     """Legendre coefficients (2, 4, 4) of a displacement, by default a cubic one, smaller by order."""
-    return rng.normal(0, size, (2, *_ORDERS.shape)) * (_ORDERS <= degree) / (1 + _ORDERS)
+    return rng.normal(0, size, (2, *_ORDERS.shape)) * (degree >= _ORDERS) / (1 + _ORDERS)
 
 
 class Nights:
