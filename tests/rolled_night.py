@@ -19,7 +19,7 @@ def modes(tensor):
     return np.stack([plain[:, d - k, k] for d in range(4) for k in range(d + 1)], axis=1)
 
 
-def night(seed, static, *, turns=(0, 90, 200), exposures=9, single=0.01, sigma=0.02, n_stars=120):
+def night(seed, static, *, turns=(0, 90, 200), exposures=9, single=0.01, sigma=0.02, n_stars=120, year=None):
     """Matched positions of exposures, turned by these angles in turn, each with a distortion of its own."""
     rng, rows = np.random.default_rng(seed), []
     sky = rng.uniform(-150, SIZE + 150, (n_stars, 2))
@@ -31,4 +31,7 @@ def night(seed, static, *, turns=(0, 90, 200), exposures=9, single=0.01, sigma=0
         q = q + rng.normal(0, sigma, q.shape)
         for j in np.flatnonzero(np.all((q > 0) & (q < SIZE - 1), axis=1)):
             rows.append((f"e{i}", j, *q[j], sigma, sigma))
-    return QTable(rows=rows, names=["exposure", "star", "x", "y", "x_err", "y_err"])
+    table = QTable(rows=rows, names=["exposure", "star", "x", "y", "x_err", "y_err"])
+    if year is not None:
+        table["epoch"] = float(year)
+    return table

@@ -354,6 +354,21 @@ def do_show(a):
     return _status(a, summary)
 
 
+def do_nights(a):
+    """``legdistort nights``."""
+    words = given(a, options.NIGHTS) | {"progress": wants_progress(a)}
+    found = legdistort.combine_nights(**words, workers=a.workers or min(parallel.n_cores(), len(a.results)))
+    found.write(a.out, date=a.date, overwrite=a.overwrite)
+    _draw(found, a)
+    figures = {
+        "camera": str(a.out), "name": found.name, "degree": found.degree, "scatter_px": found.scatter.tolist(),
+        "rate_px_yr": found.rate, "walk_px_root_yr": found.walk, "odd": list(found.odd),
+        "modes": _records(found.modes(a.date)), "nights": _records(found.table),
+    }  # fmt: skip
+    _say(a, found, figures)
+    return 3 if a.strict and found.odd else 0
+
+
 def do_difference(a):
     """``legdistort difference``."""
     found = legdistort.difference(a.first, a.second, **given(a, options.COMPARED))

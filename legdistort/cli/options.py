@@ -127,6 +127,21 @@ MAPS = {
     "second": Option("another, or the solution of a night", "second", metavar="NIGHT", path="read"),
 }
 COMPARED = {"degree": Option("of the series for a map that is none yet (default 5)", type=int)}
+NIGHTS = {
+    "results": Option(
+        "solutions of nights or fields, folders with one, and camera files that this command wrote before",
+        "results",
+        nargs="+",
+        metavar="RESULTS",
+        path="inputs",
+    ),
+    "name": Option("of the camera", metavar="NAME"),
+}
+AT_DATE = {
+    "date": Option(
+        "at which the camera is to be, a decimal year (default: of the last night)", type=float, metavar="YEAR"
+    )
+}
 REPLACING = {"overwrite": Option("replace a picture that exists", action="store_true")}
 
 KNOWN_STATIC = {

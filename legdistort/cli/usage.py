@@ -159,6 +159,16 @@ COMMANDS = {
         options.FLAGGED,
         options.STRICT,
     ),
+    "nights": _command(
+        "combine nights to one camera, and say which nights are odd",
+        "night*/results --out camera.asdf --plot coefficients.png",
+        options.NIGHTS,
+        options.AT_DATE,
+        options.WORKERS,
+        options.STRICT,
+        options.out("camera file (ASDF), for --prior and --camera, which also holds the nights"),
+        options.picture("picture of all coefficients against time"),
+    ),
     "difference": _command(
         "is an old distortion map still right? its difference from another, or from a night",
         "camera.asdf results/solution.asdf --plot difference.png",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import asdf
 
+from ..cameras.camera import Camera
 from ..cameras.source import check_shape
 from ..exceptions import InputError
 from ..geometry import similarity
@@ -82,7 +83,7 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
 
 
 def _ready(where, kind):
-    """The prior in a prior.asdf or solution.asdf; None for anything else."""
+    """The prior in a file of a prior, a solution or a camera; None for anything else."""
     if not isinstance(where, (str, Path)) or not Path(where).is_file():
         return None
     with open(where, "rb") as file:
@@ -91,7 +92,21 @@ def _ready(where, kind):
         return read_prior(where, kind)
     if start.startswith(b"#ASDF") and re.search(rb"^legdistort:", start, re.MULTILINE):
         return _of_solution(where, kind)
+    if start.startswith(b"#ASDF") and re.search(rb"^legdistort_camera:", start, re.MULTILINE):
+        return _of_camera(where, kind)
     return None
+
+
+def _of_camera(path, kind):
+    """The static distortion of a camera of one detector, with its uncertainty."""
+    camera = Camera.read(path)
+    if camera.has_focal_plane:
+        raise InputError(
+            f"{path} is camera {camera.name} with several detectors or a layout: give it as camera (--camera)"
+        )
+    (detector,) = camera.detectors.values()
+    given = {"static_sigma": detector.static_sigma, "shape": detector.shape}
+    return kind(detector.static, source={"kind": "camera", "name": str(path)}, **given)
 
 
 def _of_solution(path, kind):

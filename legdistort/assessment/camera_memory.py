@@ -1,0 +1,457 @@
+"""A camera that remembers: its static distortion from many nights, at a date, with its error."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import asdf
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+from scipy import special
+
+from ..cameras.camera import Camera
+from ..cameras.detector import Detector
+from ..exceptions import InputError, some_of
+from ..geometry import basis, detector_modes, epochs
+from ..plots.memory_plots import plot_memory
+from ..priors.prior import Prior
+from ..results.solution import Solution
+from ..runtime import asdf_files, provenance
+from ..runtime.guards.units import plain_numbers
+from ..runtime.notebook import ShownAsPrinted
+from ..runtime.outputs import replacing
+from ..runtime.parallel import map_items
+from ..runtime.trees import codec
+from ..runtime.trees.facts import SIZE, array, number
+from .combined_nights import Chain, contradiction, fitted
+from .known_maps import shown_by
+
+if TYPE_CHECKING:
+    from astropy.time import Time
+    from matplotlib.figure import Figure
+
+    from ..runtime.annotations import StrPath
+
+#: Version of the layout under ``legdistort_nights``, and that entry of a file.
+LAYOUT, ROOT = 1, "legdistort_nights"
+#: Chance below which one of all nights is odd.
+ALARM = 0.003
+_FAR = (
+    1.0  # rms distance [pix] of the map round which a night was linearised from that of all, beyond which it is again
+)
+_MEAN_SQUARE = 8  # a coefficient of 1 px displaces by sqrt(1/8) px rms per axis
+_UNKNOWN = 100.0  # error of a coefficient [pix] from which on nothing is known of it
+
+
+@dataclass(frozen=True, eq=False)
+class Night:
+    """What the exposures of a night say of the static distortion of their detector, and nothing else.
+
+    ``-2 ln L = z' information z - 2 pull' z`` for a step z from the map `around`, in the order of
+    `legdistort.geometry.detector_modes.dynamic_basis`: stars, departures of exposures and a common map of the plane are
+    eliminated, and what was known beforehand is left out.
+
+    Attributes
+    ----------
+    name : str
+    date : float or None
+        Mean Julian year of its exposures.
+    n_exposures, n_stars : int
+    around : ndarray, shape (2, n_modes)
+        Pixels.
+    information : ndarray, shape (k, k)
+        Pixels^-2.
+    pull : ndarray, shape (k,)
+        Pixels^-1.
+    scatter : ndarray, shape (degree,)
+        Of its exposures about it, by degree, pixels.
+    dof : float
+        Degrees of freedom of these.
+    exposures : tuple of str
+        Fingerprints of what was measured, so that nothing counts twice.
+    """
+
+    name: str
+    _: KW_ONLY
+    date: float | None = field(metadata=number(unit="yr"))
+    n_exposures: int
+    n_stars: int
+    around: np.ndarray = field(metadata=array(2, "n_modes", unit="pix"))
+    information: np.ndarray = field(metadata=array("n_rows", "n_rows", unit="pix-2"))
+    pull: np.ndarray = field(metadata=array("n_rows", unit="pix-1"))
+    scatter: np.ndarray = field(metadata=array("n_degrees", unit="pix", minimum=0))
+    dof: float = field(metadata=number(minimum=0))
+    exposures: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, solution: Solution, name: str, around: np.ndarray | None = None) -> Night:
+        """That of a solution, linearised round a map (2, n_modes) where the night itself shows none."""
+        shown = shown_by(solution, name, around)
+        given = {each: getattr(shown, each) for each in ("around", "information", "pull", "scatter", "dof")}
+        counts = {"n_exposures": len(solution.names), "n_stars": len(solution.estimate.star_names)}
+        return cls(name, date=solution.diagnostics.epoch, exposures=_fingerprints(solution), **counts, **given)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CombinedNights(ShownAsPrinted):
+    """The static distortion of one detector from many nights, made by `legdistort.combine_nights`.
+
+    Night n sees ``S(t_n) + B_n``. S is constant; where the nights show that it changes, it has a rate and a random walk
+    in time. B_n is what the exposures of a night have in common beside it.
+
+    Attributes
+    ----------
+    nights : tuple of Night
+        By date.
+    shape : tuple
+        ``(ny, nx)`` of the detector.
+    name : str
+        Of the camera.
+    scatter : ndarray, shape (degree,)
+        Of B by degree, pixels a normalised coefficient; of a single night nothing tells it, and it is zero.
+    oddness : ndarray, shape (n_nights,)
+        Factors >= 1 on it, as for Student's t distribution: odd nights count less.
+    rate, walk : float
+        Sizes of the change of a coefficient, pixels a year, and pixels in the square root of a year; 0: none seen.
+    """
+
+    nights: tuple[Night, ...]
+    _: KW_ONLY
+    shape: tuple[int, int] = field(metadata=SIZE)
+    name: str
+    scatter: np.ndarray = field(metadata=array("n_degrees", unit="pix", minimum=0))
+    oddness: np.ndarray = field(metadata=array("n_nights", minimum=1))
+    rate: float = field(default=0.0, metadata=number(minimum=0))
+    walk: float = field(default=0.0, metadata=number(minimum=0))
+
+    @property
+    def degree(self) -> int:
+        """Total degree of the distortion."""
+        return basis.degree_of(self.nights[0].around.shape[1])
+
+    def _year(self, date):
+        return float(self.dates.max() if date is None else epochs.year(date))
+
+    @cached_property
+    def _rows(self):
+        return detector_modes.dynamic_basis(self.shape, basis.n_modes(self.degree))
+
+    @cached_property
+    def _widths(self):
+        """Scatter of nights, of every row."""
+        return self.scatter[detector_modes.dynamic_degrees(basis.n_modes(self.degree)) - 1]
+
+    @cached_property
+    def _chain(self):
+        information = np.stack([each.information for each in self.nights])
+        moved = np.stack([self._rows @ each.around.ravel() for each in self.nights])
+        pull = np.stack([each.pull for each in self.nights]) + np.einsum("nkl,nl->nk", information, moved)
+        width = np.maximum(self._widths, 1e-6) * self.oddness[:, None]
+        return Chain(information, pull, width**2, self.dates, self.rate, self.walk)
+
+    @plain_numbers
+    def static(self, date: float | Time | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """S at a date, normalised Legendre modes (2, n_modes), and its covariance (2 n_modes, 2 n_modes), pixels.
+
+        Parameters
+        ----------
+        date : float or `~astropy.time.Time`, optional
+            Julian year; that of the last night if not given. Without a drift it does not matter.
+        """
+        mean, covariance = self._chain.at(self._year(date))
+        return (self._rows.T @ mean).reshape(2, -1), self._rows.T @ covariance @ self._rows
+
+    @plain_numbers
+    def prior(self, date: float | Time | None = None) -> Prior:
+        """What is known of the static distortion of a further night: S at its date, with its error and nights' scatter.
+
+        Parameters
+        ----------
+        date : float or `~astropy.time.Time`, optional
+            As for `static`.
+        """
+        mean, covariance = self._chain.at(self._year(date))
+        sigma = np.sqrt(np.diag(covariance) + self._widths**2)
+        known = sigma < _UNKNOWN
+        static = (self._rows.T @ np.where(known, mean, 0)).reshape(2, -1)
+        # every coefficient of a shear has the width of the shear: that is what a prior of widths states of it
+        widths = np.max(np.where(self._rows != 0, np.where(known, sigma, np.inf)[:, None], 0), axis=0).reshape(2, -1)
+        record = {"kind": "nights", "name": self.name, "nights": len(self.nights)}
+        return Prior(static, static_sigma=widths, shape=self.shape, source=record)
+
+    @plain_numbers
+    def camera(self, date: float | Time | None = None) -> Camera:
+        """The same as a `Camera` of one detector.
+
+        Parameters
+        ----------
+        date : float or `~astropy.time.Time`, optional
+            As for `static`.
+        """
+        return Camera(self.name, {"1": Detector(self.shape, static=self.prior(date))})
+
+    @plain_numbers
+    def modes(self, date: float | Time | None = None) -> QTable:
+        """One row a mode and axis: ``axis``, ``x_degree``, ``y_degree``, ``coefficient``, ``error``, ``night_scatter``,
+        pixels; shift, rotation and scale are taken off.
+
+        Parameters
+        ----------
+        date : float or `~astropy.time.Time`, optional
+            As for `static`.
+        """  # fmt: skip
+        static, covariance = self.static(date)
+        error = np.sqrt(np.diag(covariance)).reshape(2, -1)
+        scatter = np.sqrt(self._widths**2 @ self._rows**2).reshape(2, -1)
+        i, j = (np.tile(np.asarray(each)[1:], 2) for each in basis.orders(self.degree))
+        columns = {"axis": np.repeat(["x", "y"], static.shape[1] - 1), "x_degree": i, "y_degree": j}
+        values = {"coefficient": static, "error": np.where(error < _UNKNOWN, error, np.nan), "night_scatter": scatter}
+        return QTable(columns | {name: each[:, 1:].ravel() * u.pix for name, each in values.items()})
+
+    @cached_property
+    def table(self) -> QTable:
+        """One row a night, worst first: ``night``, ``date`` [yr], ``n_exposures``, ``n_stars``, ``departure`` [pix]
+        (rms per axis, from what all others say, in the directions that the night determines), ``chi2``, ``dof``, ``p``,
+        ``oddness`` and whether it is ``odd``.
+        """  # fmt: skip
+        rows, count = [], len(self.nights)
+        for n, night in enumerate(self.nights):
+            chi2, dof, away = contradiction(self._chain, n, self._widths) if count > 1 else (0.0, 0, np.zeros(1))
+            p = float(special.fdtrc(dof, night.dof, chi2 / dof)) if dof else 1.0
+            rms = np.sqrt(np.sum(away**2) / _MEAN_SQUARE)
+            date = np.nan if night.date is None else night.date
+            rows.append((night.name, date, night.n_exposures, night.n_stars, rms, chi2, dof, p, self.oddness[n]))
+        rows.sort(key=lambda row: row[7])
+        names = "night", "date", "n_exposures", "n_stars", "departure", "chi2", "dof", "p", "oddness"
+        out = QTable(rows=rows, names=names)
+        out["date"], out["departure"] = out["date"] * u.yr, out["departure"] * u.pix
+        out["odd"] = out["p"] < ALARM / count
+        return out
+
+    @property
+    def odd(self) -> tuple[str, ...]:
+        """Names of the nights that contradict the others, worst first."""
+        return tuple(str(name) for name in self.table["night"][self.table["odd"]])
+
+    def seen_by(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """What night number n alone says of the static distortion, and its error: (2, n_modes) each, pixels.
+
+        The error holds the scatter of nights; it is large where the night does not tell.
+        """
+        chain, scatter2 = self._chain, self._widths**2
+        whole = np.linalg.inv(chain.information[n] + np.eye(len(scatter2)) / _UNKNOWN**2)
+        covariance = self._rows.T @ (whole + np.diag(scatter2)) @ self._rows
+        return (self._rows.T @ whole @ chain.pull[n]).reshape(2, -1), np.sqrt(np.diag(covariance)).reshape(2, -1)
+
+    @property
+    def dates(self) -> np.ndarray:
+        """Years of the nights, (n_nights,); zeros if one has none."""
+        return _dates(self.nights)
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the static distortion changes with time."""
+        return self.rate > 0 or self.walk > 0
+
+    def plot(self, *, fig: Figure | None = None) -> Figure:
+        """Coefficients against time, see `legdistort.plots.memory_plots.plot_memory`."""
+        return plot_memory(self, fig=fig)
+
+    def write(self, path: StrPath, *, date: float | Time | None = None, overwrite: bool = False) -> Path:
+        """Write a camera file (`Camera.read`, ``--prior``, ``--camera``), with the nights; returns the path."""
+        camera = {"layout": 1, "provenance": provenance.stamp()} | codec.to_tree(self.camera(date))
+        own = {"layout": LAYOUT, "provenance": provenance.stamp()} | codec.to_tree(self)
+        with replacing(path, overwrite=overwrite) as file:
+            asdf.AsdfFile({"legdistort_camera": camera, ROOT: own}, version=asdf_files.ASDF_STANDARD).write_to(file)
+        return Path(path)
+
+    @classmethod
+    def read(cls, path: StrPath) -> CombinedNights:
+        """Read what `write` wrote.
+
+        Raises
+        ------
+        InputError
+            Naming the file: if it holds no nights, or is damaged.
+        """
+        tree = asdf_files.read_tree(path).get(ROOT)
+        if not isinstance(tree, dict) or "layout" not in tree:
+            raise InputError(f"{path} holds no nights (no entry '{ROOT}'); make one: legdistort nights")
+        asdf_files.check_layout(tree["layout"], LAYOUT, path)
+        return asdf_files.understood(path, partial(_from_tree, cls), tree)
+
+    def __repr__(self) -> str:
+        return f"<CombinedNights: {self.name}, degree {self.degree}, {len(self.nights)} nights, {len(self.odd)} odd>"
+
+    def __str__(self) -> str:
+        n_exposures, count = sum(each.n_exposures for each in self.nights), len(self.nights)
+        what = f"static distortion of degree {self.degree} from {n_exposures} exposures of {count} nights"
+        lines = [f"Camera {self.name}: {what}."]
+        if count == 1:
+            lines.append("One night does not tell how far nights scatter: errors are those of this night alone.")
+        else:
+            scatter = ", ".join(f"{each:.2g} (degree {d})" for d, each in enumerate(self.scatter, 1))
+            lines.append(f"Nights scatter by {scatter} px a coefficient.")
+            drift = f"{self.rate:.2g} px a year, and wanders by {self.walk:.2g} px in the root of a year"
+            lines.append(f"A coefficient changes by {drift}." if self.drifts else "No change with time is seen.")
+        odd = (
+            f"Odd nights, which count less: {some_of(list(self.odd), 10)}."
+            if self.odd
+            else "No night contradicts the others."
+        )
+        modes = self.modes()
+        for column in modes.columns[3:]:
+            modes[column].info.format = ".4f"
+        lines += [odd, ""] if count > 1 else [""]
+        lines += modes.pformat(max_lines=-1, max_width=-1)
+        shown = self.table["night", "date", "n_exposures", "n_stars", "departure", "chi2", "dof", "p", "oddness"]
+        for name, form in (("date", ".3f"), ("departure", ".4f"), ("chi2", ".1f"), ("p", ".2g"), ("oddness", ".2f")):
+            shown[name].info.format = form
+        return "\n".join([*lines, "", *shown.pformat(max_lines=22, max_width=-1)])
+
+
+def combine_nights(
+    results: Sequence[Solution | CombinedNights | StrPath],
+    *,
+    name: str | None = None,
+    workers: int | None = None,
+    progress: bool = False,
+) -> CombinedNights:
+    """Combine nights to one static distortion of the camera, with what each night adds found from all.
+
+    Of every night counts what its exposures tell of the static distortion by dithers and rolls, whatever prior it was
+    solved with, so that a prior counts nowhere. What a night does not determine it does not state.
+
+    Parameters
+    ----------
+    results : list of Solution, CombinedNights or path
+        Solutions of nights or fields, folders with one, and earlier combinations, to which the others are added.
+    name : str, optional
+        Of the camera; by default the instrument of an earlier combination, else "camera".
+    workers : int, optional
+        Processes that solve nights.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    CombinedNights
+
+    Raises
+    ------
+    InputError
+        Naming the night: of another detector or degree, of a camera of several detectors, with exposures that were
+        given before.
+
+    See Also
+    --------
+    legdistort.difference : Whether an old map is still right.
+    legdistort.Prior : What is known of a further night, `CombinedNights.prior`.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> nights = [ld.solve(ld.simulate_matches(seed=7 + i, static=1.0, rotations=[0, 90] * 4, n_exposures=8, n_stars=60,
+    ...           truth=None).matches, degree=2) for i in range(2)]  # doctest: +SKIP
+    >>> ld.combine_nights(nights).prior()  # doctest: +SKIP
+    """
+    given = [results] if isinstance(results, (str, Path, Solution, CombinedNights)) else list(results)
+    if not given:
+        raise InputError("no nights: give solutions, folders with one, or an earlier combination")
+    earlier, solved = [], []
+    for count, thing in enumerate(map(_opened, given), 1):
+        label = str(thing) if isinstance(thing, Path) else f"solution {count}"
+        (earlier if isinstance(thing, CombinedNights) else solved).append((label, thing))
+    nights = [night for _, each in earlier for night in each.nights]
+    shapes = {each.shape for _, each in earlier}
+    made = list(map_items(_made, solved, workers=workers, progress=progress, description="nights", unit="night"))
+    nights += [night for night, _ in made]
+    _check(nights, shapes | {shape for _, shape in made})
+    name = name or (earlier[0][1].name if earlier else "camera")
+    shape = next(iter(shapes | {shape for _, shape in made}))
+    return _combined(nights, shape, name)
+
+
+def _opened(thing):
+    """A solution or combination as it is; a path to a solution as a path, that to a combination read."""
+    if isinstance(thing, (Solution, CombinedNights)):
+        return thing
+    if not isinstance(thing, (str, Path)):
+        raise InputError(f"nights are solutions, folders with one, or earlier combinations, got {type(thing).__name__}")
+    path = Path(thing)
+    if path.is_file():
+        with path.open("rb") as file:
+            if re.search(rb"^" + ROOT.encode() + rb":", file.read(1 << 20), re.MULTILINE):
+                return CombinedNights.read(path)
+    return path
+
+
+def _made(item):
+    """The night of a labelled solution or path, and the shape of its detector."""
+    label, thing = item
+    solution = thing if isinstance(thing, Solution) else Solution.read(thing)
+    if solution.camera.has_focal_plane:
+        raise InputError(f"{label} is of camera {solution.camera.name} with several detectors: solve them one by one")
+    shapes = set(solution.estimate.shapes.values())
+    return Night.of(solution, label), next(iter(shapes))
+
+
+def _check(nights, shapes):
+    """Nights of one detector and degree, no exposure twice."""
+    if len(shapes) > 1:
+        raise InputError(f"nights are of detectors of several shapes, {sorted(shapes)} (ny, nx): combine those of one")
+    degrees = {}
+    for each in nights:
+        degrees.setdefault(basis.degree_of(each.around.shape[1]), each.name)
+    if len(degrees) > 1:
+        words = ", ".join(f"{degree} ({name})" for degree, name in sorted(degrees.items()))
+        raise InputError(f"nights were solved with several degrees, {words}: solve all with one (--degree)")
+    seen = {}
+    for night in nights:
+        for exposure in night.exposures:
+            if exposure in seen:
+                raise InputError(
+                    f"{night.name} has an exposure that {seen[exposure]} has too: give every exposure once"
+                )
+        seen |= dict.fromkeys(night.exposures, night.name)
+
+
+def _combined(nights, shape, name):
+    nights = sorted(nights, key=lambda night: np.inf if night.date is None else night.date)
+    n = nights[0].around.shape[1]
+    rows, degrees = detector_modes.dynamic_basis(shape, n), detector_modes.dynamic_degrees(n)
+    given = [(rows @ each.around.ravel(), each.information, each.pull) for each in nights]
+    chain, oddness, scatter = fitted(given, _dates(nights), degrees)
+    scatter = scatter if len(nights) > 1 else np.zeros_like(scatter)
+    drift = {"rate": chain.rate, "walk": chain.walk}
+    return CombinedNights(tuple(nights), shape=shape, name=name, scatter=scatter, oddness=oddness, **drift)
+
+
+def _dates(nights):
+    """Years of nights, (N,); zeros if one has none."""
+    dates = np.array([np.nan if each.date is None else each.date for each in nights])
+    return dates if np.all(np.isfinite(dates)) else np.zeros(len(dates))
+
+
+def _fingerprints(solution):
+    """Of the positions that were measured in every exposure."""
+    table = solution.residuals
+    name, x, y = (np.asarray(getattr(table[c], "value", table[c])) for c in ("exposure", "x", "y"))
+    out = []
+    for exposure in solution.names:
+        mine = name == exposure
+        xy = np.column_stack([x[mine], y[mine]])
+        xy = np.round(xy[np.lexsort(xy.T)], 6)
+        out.append(hashlib.sha256(np.ascontiguousarray(xy).tobytes()).hexdigest()[:16])
+    return tuple(out)
+
+
+def _from_tree(kind, tree):
+    return codec.from_tree(kind, tree, ROOT, strict=False)

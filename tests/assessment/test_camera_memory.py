@@ -1,0 +1,291 @@
+"""The static distortion of a camera from many nights; nights and their truth are made by numpy alone."""
+
+import json
+
+import numpy as np
+import pytest
+from night_sets import SIZE, field
+from numpy.testing import assert_allclose, assert_array_equal
+from rolled_night import modes, night
+
+import legdistort as ld
+from legdistort.assessment.combined_nights import Chain, fitted
+from legdistort.cli import main
+from legdistort.exceptions import InputError
+
+SHAPE = (SIZE, SIZE)
+ORDERS = np.add.outer(np.arange(4), np.arange(4))
+#: Degree of the coefficients that are no similarity, as nights state them: two shears, then x and y.
+DEGREES = np.array([1, 1, *[2] * 3, *[3] * 4, *[2] * 3, *[3] * 4])
+
+
+def curved(seed, size):
+    """A map of degrees 2 and 3, so that it has no part of a similarity."""
+    return field(np.random.default_rng(seed), size) * (ORDERS > 1)
+
+
+def static(seed):
+    return curved(9000 + seed, 1.5)
+
+
+def solved(seed, of, **how):
+    table = night(seed, of, n_stars=how.pop("n_stars", 70), exposures=how.pop("exposures", 6), **how)
+    return ld.solve(ld.Matches.from_table(table, shape=SHAPE))
+
+
+def campaign(seed, n, *, nightly=0.02, rate=0.0, odd=None, **how):
+    """Solutions of n nights half a year apart, and their static distortion in the mean of the time."""
+    slope, out = curved(7000 + seed, rate), []
+    for i in range(n):
+        own = curved(100 * seed + i, 0.5 if i == odd else nightly)
+        out.append(
+            solved(5000 + 100 * seed + i, static(seed) + own + slope * (i - (n - 1) / 2) / 2, year=2014 + i / 2, **how)
+        )
+    return out
+
+
+@pytest.fixture(scope="module")
+def three():
+    return campaign(1, 3)
+
+
+# --- the chain of nights ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("rate", "walk"), [(0.0, 0.0), (0.0, 0.3), (0.2, 0.0), (0.2, 0.3)])
+def test_a_chain_is_a_dense_least_squares(rate, walk):
+    """Of S at all dates and one more, and of a rate, with nights that determine part of S alone."""
+    rng, n, k = np.random.default_rng(3), 5, 4
+    dates, asked = np.array([2001.0, 2000.0, 2003.5, 2001.0, 2006.0]), 2002.2
+    roots = rng.normal(size=(n, k, k))
+    roots[:, -1] = 0
+    information, scatter2 = roots @ roots.mT, rng.uniform(0.1, 1, (n, k))
+    pull = np.einsum("nkl,nl->nk", information, rng.normal(size=(n, k)))
+    chain = Chain(information, pull, scatter2, dates, rate, walk)
+    times = np.unique([*dates, asked])
+
+    def dense(date, used):
+        # z: S without its rate at all times, the rate, B of every night
+        size = k * (len(times) + 1 + n)
+        place = {t: np.arange(k) + k * i for i, t in enumerate(times)}
+        slope = np.arange(k) + k * len(times)
+        whole, right = np.zeros((size, size)), np.zeros(size)
+
+        def row(time, b=None):
+            out = np.zeros((k, size))
+            out[:, place[time]] = np.eye(k)
+            out[:, slope] = (time - dates.mean()) * np.eye(k) if rate else 0
+            if b is not None:
+                out[:, k * (len(times) + 1 + b) + np.arange(k)] = np.eye(k)
+            return out
+
+        for i in used:
+            seen = row(dates[i], i)
+            whole += seen.T @ information[i] @ seen
+            right += seen.T @ pull[i]
+        for i in range(n):
+            own = k * (len(times) + 1 + i) + np.arange(k)
+            whole[own, own] += 1 / scatter2[i]
+        whole[slope, slope] += 1 / (rate**2 or 1)
+        whole[place[times[0]], place[times[0]]] += 1e-6
+        for early, late in zip(times[:-1], times[1:], strict=True):
+            step = np.zeros((k, size))
+            step[:, place[late]], step[:, place[early]] = np.eye(k), -np.eye(k)
+            whole += step.T @ step / ((walk**2 or 1e-12) * (late - early))
+        seen, covariance = row(date), np.linalg.inv(whole)
+        return seen @ covariance @ right, seen @ covariance @ seen.T
+
+    known = slice(0, k - 1)  # nights say nothing of the last
+    for found, expected in [
+        (chain.at(asked), dense(asked, range(n))),
+        *[(chain.others[i], dense(dates[i], [j for j in range(n) if j != i])) for i in range(n)],
+    ]:
+        assert_allclose(found[0][known], expected[0][known], atol=2e-4)
+        assert_allclose(found[1][known, known], expected[1][known, known], atol=2e-4)
+        assert found[1][-1, -1] > 1e4
+
+
+def linear_nights(seed, n, *, scatter=0.02, rate=0.0, odd=None, unknown=2):
+    """S in the mean of the time, its rate, dates and nights that see it with a covariance, two directions not at all."""
+    rng, k = np.random.default_rng(seed), len(DEGREES)
+    true, slope, dates = rng.normal(0, 2, k), rng.normal(0, rate, k), np.sort(rng.uniform(2014, 2020, n))
+    nights = []
+    for i in range(n):
+        seen = true + slope * (dates[i] - 2017) + rng.normal(0, 0.5 if i == odd else scatter / DEGREES)
+        turn = np.linalg.qr(rng.normal(size=(k, k)))[0]
+        error = rng.uniform(0.005, 0.05, k)
+        error[:unknown] = np.inf
+        noise = np.where(np.isinf(error), rng.normal(0, 3, k), rng.normal(0, 1, k) * np.minimum(error, 1))
+        nights.append((seen + turn @ noise, (turn / error**2) @ turn.T, np.zeros(k)))
+    return true, slope, dates, nights
+
+
+def squares(sets, date):
+    """Squared error of S at a date, and its stated variance, summed; and how many sets have a drift."""
+    sums = np.zeros(3)
+    for true, slope, dates, nights in sets:
+        chain, _, _ = fitted(nights, dates, DEGREES)
+        mean, covariance = chain.at(date)
+        away = mean + nights[0][0] - true - slope * (date - 2017)
+        sums += np.sum(away**2), np.trace(covariance), chain.rate > 0
+    return sums
+
+
+@pytest.mark.parametrize(
+    ("words", "low", "high"),
+    [({"n": 12}, 0.4, 2.2), ({"n": 16, "rate": 0.05}, 0.4, 2.2), ({"n": 12, "odd": 5}, 0.3, 2.2)],
+    ids=["constant", "drift", "odd"],
+)
+def test_sizes_are_found(words, low, high):
+    off, stated, drifts = squares([linear_nights(seed, **words) for seed in range(2)], 2019.0)
+    assert low < off / stated < high
+    assert drifts == (2 if "rate" in words else 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "low", "high"),
+    [
+        ({"n": 20}, 0.8, 1.25),
+        ({"n": 40, "rate": 0.05}, 0.7, 1.25),
+        ({"n": 20, "odd": 5}, 0.6, 1.25),
+        ({"n": 2}, 0.6, 1.4),
+        ({"n": 3}, 0.6, 1.4),
+    ],
+    ids=["constant", "drift", "odd", "two", "three"],
+)
+def test_a_camera_at_a_date_is_calibrated(words, low, high):
+    off, stated, drifts = squares([linear_nights(100 + seed, **words) for seed in range(20)], 2019.0)
+    assert low < off / stated < high
+    assert drifts >= 19 if "rate" in words else drifts <= 1
+
+
+# --- nights of stars ----------------------------------------------------------------------------------------------
+
+
+def test_nights_make_one_camera(three, tmp_path):
+    combined = ld.combine_nights(three, name="NIRC9")
+    found, covariance = combined.static()
+    off = (found - modes(static(1)))[:, 3:].ravel()
+    error = np.sqrt(np.diag(covariance)).reshape(2, -1)[:, 3:].ravel()
+    assert np.all(error < 0.05)
+    assert 0.2 < np.mean((off / error) ** 2) < 3
+    assert combined.odd == ()
+    assert not combined.drifts
+    # of a further night the scatter of nights is not known beforehand
+    prior = combined.prior()
+    assert_allclose(
+        prior.static_sigma[:, 3:].ravel() ** 2, error**2 + np.array([combined.scatter[d - 1] for d in DEGREES[2:]]) ** 2
+    )
+    again = combined.write(tmp_path / "camera.asdf")
+    read = ld.CombinedNights.read(again)
+    assert_array_equal(read.static()[0], found)
+    assert str(read) == str(combined)
+    for other in (ld.Prior.from_file(again), ld.Camera.read(again)["1"]):
+        assert_array_equal(other.static_sigma, prior.static_sigma)
+        assert other.shape == SHAPE
+    assert ld.Camera.read(again).name == "NIRC9"
+    assert ld.difference(again, static_prior(1)).agrees
+
+
+def static_prior(seed, factor=1.0):
+    return ld.Prior(factor * modes(static(seed)), shape=SHAPE)
+
+
+def test_what_a_night_was_solved_with_does_not_count(three):
+    """A prior that is wrong by a fifth and taken as exact leaves as it is what the night says of the distortion."""
+    table = night(5100, static(1) + curved(100, 0.02), n_stars=70, exposures=6, year=2014)
+    matches = ld.Matches.from_table(table, shape=SHAPE)
+    free, wrong = (ld.combine_nights([ld.solve(matches, prior=p)]) for p in (None, static_prior(1, 1.2)))
+    error = np.sqrt(np.diag(free.static()[1])).reshape(2, -1)
+    assert np.abs(wrong.static()[0] - free.static()[0])[error > 0].max() < 0.05 * error.max()
+    assert "One night does not tell how far nights scatter" in str(free)
+
+
+def test_nights_one_after_the_other_or_in_any_order_are_the_same(three):
+    all_at_once = ld.combine_nights(three)
+    later = ld.combine_nights([ld.combine_nights(three[:2]), three[2]])
+    turned = ld.combine_nights([three[2], three[0], three[1]])
+    for other in (later, turned):
+        for one, two in zip(other.static(), all_at_once.static(), strict=True):
+            assert_allclose(one, two, atol=1e-9)
+
+
+def test_an_odd_night_is_named_and_counts_less():
+    solutions = campaign(2, 5, odd=3)
+    combined = ld.combine_nights(solutions)
+    assert combined.odd == ("solution 4",)
+    without = ld.combine_nights([each for i, each in enumerate(solutions) if i != 3])
+    true = modes(static(2))
+    errors = [np.sqrt(np.mean((each.static()[0] - true) ** 2)) for each in (combined, without)]
+    assert errors[0] < 1.5 * errors[1] + 0.002
+    assert "Odd nights, which count less: solution 4." in str(combined)
+
+
+def test_a_camera_makes_the_next_night_absolute(three):
+    """Exposures of one orientation alone leave shears and more unknown; the camera of the nights before knows them."""
+    table = night(77, static(1) + curved(78, 0.02), turns=(0,), n_stars=70, exposures=6)
+    matches = ld.Matches.from_table(table, shape=SHAPE)
+    alone = ld.solve(matches)
+    known = ld.solve(matches, prior=ld.combine_nights(three).prior())
+    assert alone.gauge.unknown
+    assert not known.gauge.unknown
+    assert np.nanmedian(known.stars["x_err_abs"].value) < 0.05
+
+
+def test_nights_that_do_not_go_together_are_refused(three, tmp_path):
+    with pytest.raises(
+        InputError, match="solution 2 has an exposure that solution 1 has too: give every exposure once"
+    ):
+        ld.combine_nights([three[0], three[0]])
+    bent = static(1) * (ORDERS < 3)
+    lower = ld.solve(ld.Matches.from_table(night(5, bent, n_stars=60, exposures=4), shape=SHAPE), degree=2)
+    with pytest.raises(InputError, match=r"several degrees, 2 \(solution 2\), 3 \(solution 1\): solve all with one"):
+        ld.combine_nights([three[0], lower])
+    other = ld.solve(ld.Matches.from_table(night(6, static(1), n_stars=60, exposures=4), shape=(SIZE, SIZE + 8)))
+    with pytest.raises(InputError, match="detectors of several shapes"):
+        ld.combine_nights([three[0], other])
+    with pytest.raises(InputError, match="no nights: give solutions"):
+        ld.combine_nights([])
+    with pytest.raises(InputError, match="earlier combinations, got int"):
+        ld.combine_nights([3])
+    with pytest.raises(InputError, match=r"prior.asdf holds no nights \(no entry 'legdistort_nights'\)"):
+        ld.CombinedNights.read(static_prior(1).write(tmp_path / "prior.asdf"))
+
+
+def test_the_command(three, tmp_path, capsys):
+    for i, each in enumerate(three):
+        each.write(tmp_path / f"night{i}.asdf")
+    camera, picture = tmp_path / "camera.asdf", tmp_path / "all.png"
+    files = [str(tmp_path / f"night{i}.asdf") for i in range(3)]
+    assert main(["nights", *files[:2], "--out", str(camera), "--workers", "1", "--quiet"]) == 0
+    capsys.readouterr()
+    line = ["nights", str(camera), files[2], "--out", str(tmp_path / "more.asdf"), "--plot", str(picture)]
+    assert main([*line, "--json", "--quiet", "--workers", "1"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert len(figures["nights"]) == 3
+    assert len(figures["modes"]) == 18
+    assert figures["odd"] == []
+    assert picture.stat().st_size > 10_000
+    found = ld.CombinedNights.read(tmp_path / "more.asdf")
+    assert_allclose(found.static()[0], ld.combine_nights(three).static()[0], atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "words", [{"n": 6}, {"n": 6, "turns": (0, 40)}, {"n": 8, "rate": 0.05}, {"n": 6, "odd": 2}], ids=str
+)
+def test_a_campaign_is_calibrated(words):
+    """Ten of each: squared errors of coefficients over their variance, at the last date, of what is determined."""
+    off = stated = named = 0
+    for seed in range(20, 30):
+        combined = ld.combine_nights(campaign(seed, **words))
+        end = (words["n"] - 1) / 4
+        true = modes(static(seed) + curved(7000 + seed, words.get("rate", 0.0)) * end)
+        found, covariance = combined.static()
+        variance = np.diag(covariance).reshape(2, -1)
+        known = variance < 0.3**2
+        off, stated = off + np.sum((found - true)[known] ** 2), stated + variance[known].sum()
+        named += combined.odd == ((f"solution {words['odd'] + 1}",) if "odd" in words else ())
+    assert 0.7 < off / stated < 1.4
+    assert named >= 9
