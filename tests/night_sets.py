@@ -35,18 +35,22 @@ class Nights:
         Of the positions [pix].
     degree : int
         Of all distortions, at most 3.
+    alone : bool
+        The middle one of the nights, which is the one that may be odd, has one list.
     """
 
     def __init__(self, seed, *, nights=8, per=5, nightly=0.02, single=0.01, odd=0.0, roll=30.0, motion=0.0, sigma=0.03,
-                 n_stars=200, degree=DEGREE):  # fmt: skip
+                 n_stars=200, degree=DEGREE, alone=False):  # fmt: skip
         rng = np.random.default_rng(seed)
         self.sky = rng.uniform(-120, SIZE + 120, (n_stars, 2))
         self.motion = rng.normal(0, motion, (n_stars, 2))
         self.static, rows = field(rng, STATIC, degree), []
+        self.odd, self.common = nights // 2, []
         years = np.linspace(2014.4, 2020.6, nights) if nights > 1 else [2014.4]
         for i, year in enumerate(years):
-            common = field(rng, odd if odd and i == nights // 2 else nightly, degree)
-            for k in range(per):
+            common = field(rng, odd if odd and i == self.odd else nightly, degree)
+            self.common.append(common)
+            for k in range(1 if alone and i == self.odd else per):
                 angle = np.radians(rng.normal(0, 0.05) + roll * (i >= nights - max(1, nights // 3)))
                 turn = (1 + rng.normal(0, 1e-4)) * np.array([[np.cos(angle), -np.sin(angle)],
                                                             [np.sin(angle), np.cos(angle)]])  # fmt: skip

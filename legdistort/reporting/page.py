@@ -15,7 +15,7 @@ from .cutouts import cut_out
 from .facts import BIBTEX, facts_of, methods, observed_rows, solution_rows, truth_rows
 from .pictures import Gallery
 from .svg import STYLE
-from .tables import count, detectors_table, exposures_table, stars_table, stated_table
+from .tables import count, detectors_table, exposures_table, nights_table, stars_table, stated_table
 
 
 def write_report(
@@ -149,6 +149,7 @@ def _details(gallery, solution, pulls, psfs, facts, comparison, stacks):
             *([compared_stacks(stacks, gallery)] if stacks else []),
         ],
         "exposures": exposures_table(solution, (facts.get("quality") or {}).get("exposures")),
+        "nights": nights_table(solution),
         "stated": stated_table(facts["stated"]) if facts.get("stated") else None,
         "detectors": (camera.name, detectors_table(camera)) if camera.has_focal_plane else None,
         "stars": stars_table(solution, pulls),

@@ -3,11 +3,10 @@
 from dataclasses import asdict
 
 import numpy as np
-from astropy import units as u
 
 from ..geometry import similarity
-from ..inputs import column_contract
 from ..results import accuracy, in_tables
+from ..results import nights as night_tables
 from ..runtime import provenance
 from ..runtime.trees.codec import to_tree
 from .tables import departures, exposure_rms, rms_length, sizes
@@ -52,7 +51,7 @@ def exposures(solution):
     """
     dx, dy, n = exposure_rms(solution)
     distortion, dynamic = sizes(solution)
-    block, epoch = _times(solution)
+    block, _, epoch = night_tables.blocks(solution)
     out = []
     for i, view in enumerate(solution):
         pose = similarity.describe(view.pose)
@@ -68,7 +67,7 @@ def exposures(solution):
 
 
 def nights(solution, found):
-    """One dict of numbers a night, or other block, of what `exposures` gives: these, and the mean of their figures.
+    """One dict of numbers a night, or other block, the worst first: `Solution.nights`, and what `exposures` gives.
 
     `common_px` is the size of their mean departure from the static distortion, `common_err_px` that of its standard
     error, by how they scatter about it; None of one exposure.
@@ -76,17 +75,24 @@ def nights(solution, found):
     of, departing = {}, departures(solution)
     for each in found:
         of.setdefault(each["block"], []).append(each)
-    return [
-        {
-            "block": block,
-            "exposures": [each["name"] for each in mine],
-            "epoch_yr": _mean(each["epoch_yr"] for each in mine),
-            "rms_px": _rms(each[key] for each in mine for key in ("rms_x_px", "rms_y_px")),
-            "dynamic_px": _rms(each["dynamic_px"] for each in mine),
-            **_in_common(departing[[each["block"] == block for each in found]]),
-        }
-        for block, mine in sorted(of.items())
-    ]
+    out = []
+    for row in solution.nights:
+        mine = of[row["block"]]
+        figures = {key: row[key] for key in ("n_stars", "rms_ratio", "ratio", "chi2", "dof", "p", "odd")}
+        out.append(
+            {
+                "name": str(row["name"]),
+                "block": int(row["block"]),
+                "exposures": [each["name"] for each in mine],
+                "epoch_yr": _mean(each["epoch_yr"] for each in mine),
+                "rms_px": _rms(each[key] for each in mine for key in ("rms_x_px", "rms_y_px")),
+                "dynamic_px": _rms(each["dynamic_px"] for each in mine),
+                "departure_px": _plain(row["departure"].value),
+                **{key: _plain(value) for key, value in figures.items()},
+                **_in_common(departing[[each["block"] == row["block"] for each in found]]),
+            }
+        )
+    return out
 
 
 def _in_common(departing):
@@ -113,15 +119,6 @@ def detectors(camera):
             }
         )  # fmt: skip
     return out
-
-
-def _times(solution):
-    """Number of the night and year of every exposure."""
-    table = solution.residuals
-    names, rows = np.unique(column_contract.labels(table, "exposure"), return_index=True)
-    first = rows[np.searchsorted(names, solution.names)]
-    epoch = column_contract.values(table, "epoch", u.yr)[first] if "epoch" in table.colnames else [np.nan] * len(first)
-    return column_contract.blocks(table, first), epoch
 
 
 def _plain(value):

@@ -109,6 +109,33 @@ def exposures_table(solution, shapes=None):
     )
 
 
+def nights_table(solution):
+    """One row a night, the worst first, as `Solution.nights` has it; None of a single one."""
+    nights = solution.nights
+    if len(nights) < 2:
+        return None
+    head = {"night": "", "exposures": "", "stars": "", "rms": "px", "rms over errors": "", "departure": "rms, px"}
+    head |= {"over scatter": "", "chi2": "", "dof": "", "p": "", "which": ""}
+    rows = []
+    for row in nights:
+        departing = [f"{row['departure'].value:.4f}", f"{row['ratio']:.2f}", f"{row['chi2']:.1f}", f"{row['dof']:.0f}"]
+        departing = [*departing, f"{row['p']:.2g}"] if row["dof"] else ["–"] * 5
+        cells = [row["name"], f"{row['n_exposures']}", f"{row['n_stars']}", _number(row["rms"].value)]
+        rows.append(
+            Row(
+                [*cells, _number(row["rms_ratio"], 3), *departing, some_of(row["exposures"].split(", "), 6)],
+                (0, 5, 6) if row["odd"] else (),
+            )
+        )
+    return Table(
+        head,
+        rows,
+        "The worst first. Departure: what the exposures of a night have in common, from the static distortion of all "
+        "other nights; over the scatter of these and all errors; p is the probability of so much by chance. Nights "
+        "that depart farther than the others do are marked, and the rest is compared without them.",
+    )
+
+
 def stated_table(stated):
     """What frames state (`legdistort.inputs.frames.statement.stated_rows`): one row a quantity, value and source."""
     rows = []

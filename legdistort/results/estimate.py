@@ -41,6 +41,8 @@ class Estimate:
         usual form, which is the same function.
     checked : callable or tuple of Check
         The checks, or a function that makes them from the solution.
+    nights : callable or tuple of `legdistort.results.nights.NightTest`
+        The tests of nights, or a function that makes them from the solution; empty where they were not made.
     certified : dict
         ``{exposure: Distortion}`` that views have made, or a file has, with their certified inverses; they count as
         long as the coefficients are the same.
@@ -54,6 +56,7 @@ class Estimate:
     motions: StarMotions | None = None
     form: object = None
     checked: Any = field(default=(), repr=False)
+    nights: Any = field(default=(), repr=False)
     certified: dict[str, Distortion] = field(default_factory=dict, repr=False)
 
 

@@ -13,7 +13,7 @@ from ..geometry import basis, similarity
 from ..geometry.epochs import year
 from ..inputs import column_contract
 from . import motions as star_motions
-from . import new_positions
+from . import new_positions, nights
 from .check import in_lines
 from .errors import absolute_errors
 
@@ -210,6 +210,7 @@ def printed(solution):
         f"{'rms x':>7s} {'rms y':>7s} {'distortion':>10s}{'' if solution.sky is None else _SKY_HEADS}",
     ]
     lines += [_row(view) for view in solution]
+    lines += nights.lines(solution)
     if solution.camera.has_focal_plane:
         lines += ["", *solution.camera.table_lines()]
     lines += [f"left out {some_of(names, 6)}: {reason}" for reason, names in by_reason(solution.left_out).items()]

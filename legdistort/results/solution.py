@@ -16,7 +16,7 @@ from ..geometry.tangent_plane import TangentPlane
 from ..plots import residual_plots
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
-from . import in_tables, new_positions
+from . import in_tables, new_positions, nights
 from .diagnostics import Diagnostics
 from .errors import absolute_errors
 from .estimate import Estimate, plain_covariances
@@ -142,7 +142,8 @@ class Solution(ShownAsPrinted):
     def __getstate__(self) -> dict[str, Any]:
         """What goes into a pickle: numbers as a file has them, nothing of the equations that they came from."""
         state = {each.name: getattr(self, each.name) for each in fields(self)}
-        estimate = replace(self.estimate, checked=self.checks, uncertainty=plain_covariances(self.estimate))
+        known = {"checked": self.checks, "nights": nights.tests(self)}
+        estimate = replace(self.estimate, **known, uncertainty=plain_covariances(self.estimate))
         return state | {"estimate": estimate, "gauge": replace(self.gauge, responses=estimate.uncertainty)}
 
     def __copy__(self) -> Solution:
@@ -168,6 +169,21 @@ class Solution(ShownAsPrinted):
         types = {"name": str, "source": str, "rows": int, "chi2": float, "dof": float, "p": float}
         columns = [[getattr(test, name) for test in tests] for name in types]
         return QTable(columns, names=list(types), dtype=list(types.values()))
+
+    @cached_property
+    def nights(self) -> QTable:
+        """One row a night, or other block of exposures (`Matches.blocks`): which one differs? The worst first.
+
+        ``name`` (the label of the column ``block``, else the date), ``block`` (its number), ``epoch`` [yr],
+        ``n_exposures``, ``n_stars``; ``rms`` [pix] of its residuals, per axis, and ``rms_ratio`` of these over their
+        errors; ``departure`` [pix], rms over the detector, of what its exposures have in common from the static
+        distortion of all other nights, ``ratio`` over the scatter of these and all errors, with its ``chi2``, ``dof``
+        and ``p``, the probability of so much by chance. A night that is ``odd`` departs farther than the others do
+        (p < 0.001 over the number of nights, and three times as far), and the rest is compared without it; none is
+        where there are no two others. Of two nights p is that of no departure at all. Without others, and where
+        exposures have no distortion of their own, there is no departure (NaN, ``dof`` 0). ``exposures``: their names.
+        """
+        return nights.table(self)
 
     @cached_property
     def higher_static(self) -> QTable | None:

@@ -1,7 +1,7 @@
 """The one place where arrays of a fit become a `Solution`, in the order and the words of the user."""
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from astropy import units as u
@@ -13,6 +13,7 @@ from ..results.estimate import Estimate
 from ..results.motions import StarMotions
 from ..results.solution import Solution
 from ..runtime import provenance
+from .checks.night_departures import night_tests
 from .checks.solution_checks import check_solution
 from .equations import criterion
 from .equations.elimination import inverse_star_blocks
@@ -75,6 +76,7 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
             uncertainty=uncertainty,
             motions=motions,
             form=form,
+            nights=cache(partial(night_tests, problem=problem, blocks=blocks)),
             checked=partial(
                 check_solution,
                 problem=problem,

@@ -6,7 +6,7 @@ import four_detectors
 import numpy as np
 import pytest
 from astropy.modeling.models import Identity, Legendre2D, Mapping
-from night_sets import SIZE, field
+from night_sets import SIZE, Nights, field
 from numpy.testing import assert_allclose
 from rolled_night import modes, night
 
@@ -215,6 +215,23 @@ def test_chances_of_the_detectors_of_a_camera_are_even():
     ]
     assert min(chances) > 0.002
     assert 0.3 < np.mean(chances) < 0.7
+
+
+@pytest.mark.slow
+def test_chances_are_even_where_nights_scatter():
+    """Six nights, the last two of which are turned. Were their exposures independent, p would be 1e-5 in one of ten."""
+    chances = {"nights": [], "one": []}
+    for seed in range(12):
+        nights = Nights(seed, nights=6, per=3, n_stars=100, nightly=0.04)
+        known = ld.Prior(modes(nights.static), shape=SHAPE)
+        for name, each in chances.items():
+            if name == "one":
+                nights.table["block"] = 0
+            each.append(ld.difference(known, ld.solve(ld.Matches.from_table(nights.table, shape=SHAPE))).p)
+    assert min(chances["nights"]) > 1e-4
+    assert 0.25 < np.mean(chances["nights"]) < 0.75
+    assert min(chances["one"]) < 1e-4
+    assert np.mean(chances["one"]) < 0.15
 
 
 @pytest.mark.slow

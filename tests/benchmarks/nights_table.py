@@ -1,7 +1,9 @@
 """Absolute errors where the exposures of a night share a departure: ``python tests/benchmarks/nights_table.py``.
 
 By setting: squared pull of finite absolute errors (nights found by the epochs, and all taken for one), share of the
-sets with finite ones, rms error in pixels and that of the same sets without the odd night.
+sets with finite ones, rms error in pixels and that of the same sets without the odd night; share of the sets in which
+the odd night is named with all its exposures, in which anything else is named, and in which exposures are called
+duplicates.
 """
 
 import argparse
@@ -24,9 +26,15 @@ SETTINGS = {
     "independent, roll 30, motions": {"nightly": 0.0, "single": 0.03, "motion": 0.25},
     "roll 0.7": {"roll": 0.7},
     "odd night, roll 30": {"odd": 0.5},
+    "odd night, roll 0.7": {"odd": 0.5, "roll": 0.7},
+    "odd night, roll 0": {"odd": 0.5, "roll": 0.0},
+    "odd night, independent": {"odd": 0.5, "nightly": 0.0, "single": 0.03},
+    "odd night of one exposure": {"odd": 0.5, "alone": True},
     "odd night, roll 0.7, motions": {"odd": 0.5, "roll": 0.7, "motion": 0.25},
     "2 nights": {"nights": 2},
     "3 nights": {"nights": 3},
+    "3 nights, one odd, roll 0.7": {"nights": 3, "odd": 0.5, "roll": 0.7},
+    "a night of one exposure": {"alone": True},
     "2 nights, departures 0.2": {"nights": 2, "nightly": 0.2},
     "3 nights, departures 0.2": {"nights": 3, "nightly": 0.2},
 }
@@ -45,18 +53,32 @@ def square(nights, solution):
     return np.sum(off[finite] ** 2), np.sum(stated[finite] ** 2), np.nanmean(off**2)
 
 
-def row(words, n):
-    """Figures of a setting, over n sets."""
-    sums = {"found": [], "one": [], "without": []}
+def names(solution, odd):
+    """Whether the exposures of the odd night are named as such, whether anything else is, and duplicates."""
+    checks = {check.name: check for check in solution.checks}
+    check, nights = checks["dynamic part"], solution.nights[solution.nights["odd"]]
+    right = [each for each in nights["exposures"] if set(each.split(", ")) == odd and f"({each})" in check.sentence]
+    return len(right) > 0, len(check.tests) > len(right), checks["duplicates"].state != "pass"
+
+
+def row(words, n, *, one=True):
+    """Figures of a setting, over n sets, and as if all were `one` night."""
+    sums = {"found": [], "one": [], "without": [], "names": []}
     for seed in range(n):
         nights = Nights(seed, **words)
         tables = {"found": nights.table, "one": nights.table.copy()}
-        if "odd" in words:
-            tables["without"] = nights.table[nights.table["block"] != words.get("nights", 8) // 2]
+        odd = nights.odd if "odd" in words else None
+        if "odd" in words and one:
+            tables["without"] = nights.table[nights.table["block"] != odd]
         tables["one"]["block"] = 0
         del tables["found"]["block"]
         for name, table in tables.items():
-            sums[name].append(square(nights, solved(table, words.get("motion"))))
+            if name == "one" and not one:
+                continue
+            solution = solved(table, words.get("motion"))
+            sums[name].append(square(nights, solution))
+            if name == "found":
+                sums["names"].append(names(solution, {e for e in solution.names if e.startswith(f"n{odd}e")}))
     return {name: np.array(each) for name, each in sums.items() if each}
 
 
@@ -65,15 +87,21 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", type=int, default=20)
     parser.add_argument("--only", nargs="*", default=list(SETTINGS))
+    parser.add_argument("--names", action="store_true", help="alone: nothing is taken for one night")
     asked = parser.parse_args()
-    print(f"{'':32} {'pull^2':>7} {'finite':>7} {'one':>7} {'finite':>7} {'rms':>7} {'without':>7}")
+    heads = "pull^2", "finite", "one", "finite", "rms", "without", "named", "false", "twice"
+    print(f"{'':32} " + " ".join(f"{head:>7}" for head in heads))
     for name in asked.only:
-        sums = row(SETTINGS[name], asked.sets)
+        sums = row(SETTINGS[name], asked.sets, one=not asked.names)
         cells = []
         for each in ("found", "one"):
+            if each not in sums:
+                cells += [np.nan, np.nan]
+                continue
             off, stated, _ = sums[each].T
             cells += [off.sum() / stated.sum() if stated.any() else np.nan, np.mean(stated > 0)]
         cells += [np.sqrt(sums[each][:, 2].mean()) if each in sums else np.nan for each in ("found", "without")]
+        cells += sums["names"].mean(axis=0).tolist()
         print(f"{name:32} " + " ".join(f"{cell:7.2f}" for cell in cells), flush=True)
 
 

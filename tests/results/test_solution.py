@@ -152,10 +152,11 @@ class TestEveryProducer:
             if field.name not in ("estimate", "checksum"):
                 assert_same(getattr(produced, field.name), getattr(back, field.name), field.name)
         for field in dataclasses.fields(Estimate):
-            if field.name not in ("uncertainty", "form", "checked", "certified"):
+            if field.name not in ("uncertainty", "form", "checked", "nights", "certified"):
                 one, other = (getattr(each.estimate, field.name) for each in (produced, back))
                 assert_same(one, other, f"estimate.{field.name}")
         assert back.checks == produced.checks
+        assert_same(back.nights, produced.nights, "nights")
         for name in ("coefficients", "stars"):
             assert_same(getattr(produced.estimate.uncertainty, name), getattr(back.estimate.uncertainty, name), name)
         assert_same(produced.stars, back.stars, "stars")
@@ -220,7 +221,7 @@ def assert_survives(solution, remake):
                 assert one[name].inverse.error == other[name].inverse.error
         elif field.name == "form":
             assert (one is None) == (other is None)
-        elif field.name != "checked":
+        elif field.name not in ("checked", "nights"):
             assert_same(one, other, f"estimate.{field.name}")
     assert again.checks == filled.checks
     assert_same(filled[filled.names[1]].errors, again[filled.names[1]].errors, "errors")
@@ -234,6 +235,7 @@ def test_copies(what, remake):
     assert_survives(solution, remake)
     again = remake(solution)
     assert_same(solution.stars, again.stars, "stars")
+    assert_same(solution.nights, again.nights, "nights")
     if what == "motions":
         assert_same(solution.stars_at(2020.0), again.stars_at(2020.0), "stars later")
     else:
@@ -276,7 +278,7 @@ def test_size_of_a_pickle_of_degree_3():
 def test_members_are_few():
     public = {name for name in dir(Solution) if not name.startswith("_")}
     public |= {field.name for field in dataclasses.fields(Solution)}
-    assert len(public) <= 27, sorted(public)
+    assert len(public) <= 28, sorted(public)
     assert len([field.name for field in dataclasses.fields(Solution)]) <= 17
 
 

@@ -1,6 +1,7 @@
 """Exposures of a night that share a departure from the static distortion."""
 
 import logging
+import pickle
 import re
 import warnings
 
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from astropy.time import Time
-from night_sets import SIZE, Nights
+from night_sets import SIZE, Nights, field
+from numpy.polynomial.legendre import legval2d
 from numpy.testing import assert_allclose, assert_array_equal
 
 import legdistort as ld
@@ -160,11 +162,141 @@ def test_a_right_prior_is_right_whatever_nights_add():
     assert states["nights"].value > 1e-3 > states["one"].value
 
 
-@pytest.mark.parametrize(("odd", "named"), [(0.5, ["departure of the night of n4e0"]), (0.0, [])])
+@pytest.mark.parametrize(("odd", "named"), [(0.5, ["departure of night 4"]), (0.0, [])])
 def test_an_odd_night_is_named(odd, named):
     solution = ld.solve(matches(Nights(5, per=3, odd=odd, roll=0.7, n_stars=100).table))
     found = [str(row["name"]) for row in solution.factors if str(row["name"]).startswith("departure")]
     assert found == named
+
+
+# --- which night is odd -------------------------------------------------------------------------------------------
+
+
+def solved(nights, **columns):
+    return ld.solve(matches(nights.table, block=None, **columns))
+
+
+def beyond_similarity(tensor):
+    """Rms over the detector of a displacement by plain Legendre coefficients (2, 4, 4), a similarity fitted off."""
+    u, v = np.meshgrid(*2 * [np.linspace(-1, 1, 41)[1:-1]])
+    w = legval2d(u, v, tensor[0]) + 1j * legval2d(u, v, tensor[1])
+    design = np.stack([np.ones(u.size), (u + 1j * v).ravel()], axis=1)
+    return np.sqrt(np.mean(np.abs(w.ravel() - design @ np.linalg.lstsq(design, w.ravel(), rcond=None)[0]) ** 2))
+
+
+def test_the_odd_night_is_named_with_all_its_exposures(tmp_path):
+    nights = Nights(5, odd=0.5, roll=0.7)
+    solution = solved(nights)
+    table, worst = solution.nights, solution.nights[0]
+    names = [f"n4e{k}" for k in range(5)]
+    assert table["odd"].tolist() == [True] + 7 * [False]
+    assert (worst["name"], worst["exposures"]) == ("2017-12-11", ", ".join(names))
+    away = nights.common[4] - np.mean(np.delete(nights.common, 4, axis=0), axis=0)
+    assert_allclose(worst["departure"].value, beyond_similarity(away), rtol=0.1)
+    assert worst["ratio"] > 10
+    assert worst["p"] < 1e-20
+    assert table["p"][1:].min() > 1e-3
+    sentence = next(check.sentence for check in solution.checks if check.name == "dynamic part")
+    assert re.search(rf"night 2017-12-11 \({', '.join(names)}\) 2\d times as far as the others, by 0\.3\d", sentence)
+    assert "2017-12-11" in str(solution).splitlines()[-8]
+    assert str(solution).splitlines()[-8].endswith("odd")
+    solution.write(tmp_path / "solution.asdf")
+    for again in (ld.Solution.read(tmp_path / "solution.asdf"), pickle.loads(pickle.dumps(solution))):
+        assert again.nights.pformat() == table.pformat()
+
+
+def test_an_odd_night_moves_nothing_of_what_the_others_are_compared_with():
+    figures = []
+    for odd in (0.5, 3.0):
+        table = solved(Nights(5, odd=odd, roll=0.7)).nights
+        figures.append(table[np.argsort(table["block"])][[0, 1, 2, 3, 5, 6, 7]])
+    for name in ("departure", "chi2"):
+        assert_allclose(figures[1][name], figures[0][name], rtol=0.15)
+
+
+def test_figures_of_a_night_are_those_of_its_observations():
+    nights = Nights(1, nights=4, per=2, n_stars=80)
+    solution = ld.solve(matches(nights.table, block=np.array(["b", "a", "d", "c"])[nights.table["block"]]), clip=None)
+    assert set(solution.nights["name"]) == set("abcd")
+    rows = solution.residuals
+    for night in solution.nights:
+        mine = rows[np.asarray(rows["block"]) == night["name"]]
+        assert night["n_exposures"] == 2
+        assert night["n_stars"] == len(set(mine["star"]))
+        off = np.concatenate([mine["dx"].value, mine["dy"].value])
+        assert_allclose(night["rms"].value, np.sqrt(np.mean(off**2)))
+        assert_allclose(night["rms_ratio"], np.sqrt(np.mean((off / 0.03) ** 2) * 2 * len(rows) / solution.dof))
+
+
+@pytest.mark.parametrize(
+    ("words", "odd"),
+    [
+        ({"odd": 0.5, "alone": True}, [4]),  # one exposure
+        ({"odd": 0.5, "alone": True, "per": 1, "nights": 10}, [5]),  # as all others
+        ({"nights": 3, "odd": 0.5}, [1]),
+        ({"nights": 2, "odd": 0.5}, []),  # nothing tells which
+        ({"nights": 3}, []),
+        ({"alone": True}, []),
+    ],
+)
+def test_nights_are_odd_among_few_and_unlike_ones(words, odd):
+    solution = solved(Nights(7, roll=0.7, **words))
+    table = solution.nights
+    assert sorted(table["block"][table["odd"]]) == odd
+    assert len(table) == words.get("nights", 8)
+    if words.get("nights") == 2:  # that they differ is seen all the same
+        assert table["p"].max() < 1e-6
+
+
+def test_one_night_has_nothing_to_be_compared_with():
+    (row,) = solved(Nights(0, nights=1)).nights
+    assert (row["n_exposures"], row["dof"], row["p"], row["odd"]) == (5, 0, 1, False)
+    assert np.isnan(row["departure"])
+
+
+@pytest.mark.parametrize("single", [True, False])
+def test_all_that_are_odd_are_named(single):
+    """Seven of thirty exposures, or three of ten nights: each hides behind the others."""
+    rng, nights = np.random.default_rng(3), Nights(3, nights=10, per=3, roll=0.0, nightly=0.01)
+    odd = ["n0e1", "n1e0", "n3e2", "n5e0", "n6e1", "n7e2", "n9e0"] if single else ["n2", "n5", "n8"]
+    table = nights.table
+    for name in odd:
+        mine = np.char.startswith(np.asarray(table["exposure"], str), name)
+        xy = np.column_stack([table["x"][mine], table["y"][mine]])
+        xy += legval2d(*((2 * xy + 1) / SIZE - 1).T, field(rng, 1.0).transpose(1, 2, 0)).T
+        table["x"][mine], table["y"][mine] = xy.T
+    solution = solved(nights)
+    found = [str(name).removeprefix("departure of ") for name in solution.factors["name"]]
+    sentence = next(check.sentence for check in solution.checks if check.name == "dynamic part")
+    if single:
+        assert sorted(found) == odd
+        assert all(name in sentence for name in odd)
+    else:
+        assert sorted(row["exposures"][:2] for row in solution.nights[:3]) == odd
+        assert solution.nights["odd"].sum() == len(found) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [{}, {"nightly": 0.0, "single": 0.03, "roll": 0.7}])
+def test_departures_of_nights_are_what_their_errors_lead_to_expect(words):
+    tables = [solved(Nights(seed, **words)).nights for seed in range(15)]
+    squares = np.concatenate([table["chi2"] / table["dof"] for table in tables])
+    assert 0.85 < squares.mean() < 1.2
+    p = np.concatenate([table["p"] for table in tables])  # the least of three degrees, times three
+    assert np.mean(p < 0.05) < 0.09
+    assert p.min() > 1e-4
+    assert not any(table["odd"].any() for table in tables)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("roll", [0.0, 0.7, 30.0])
+def test_odd_nights_are_found_by_name(roll):
+    for seed in range(6):
+        table = solved(Nights(seed, odd=0.5, roll=roll)).nights
+        assert table["block"][table["odd"]].tolist() == [4]
+
+
+# --- absolute errors -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -3,12 +3,11 @@
 import numpy as np
 from scipy import special
 
-from ...exceptions import some_of
 from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
 from ...results.check import FALSE_ALARM, Check, FactorTest
-from .limits import MOST_NAMED
+from ...results.nights import table as night_table
 
-#: Exposures, or nights, of one detector from which the scatter of the others tells whether one is odd.
+#: Exposures of one detector from which the scatter of the others tells whether one is odd.
 _FEWEST = 6
 #: Times the scatter of the others that matter to their common map.
 _ODD = 3.0
@@ -41,49 +40,76 @@ def dynamic_check(solution, problem, blocks):
         return Check("dynamic part", "warn", p, FALSE_ALARM,
                      f"none of {len(solution.names)} exposures departs from {static} beyond noise",
                      "a lower --degree fits as well, with smaller errors")  # fmt: skip
-    odd = _odd(solution, problem, blocks)
+    nights = night_table(solution)
+    nights = nights[nights["odd"]]
+    odd = [(f"night {row['name']} ({row['exposures']})", row["ratio"], row["departure"].value) for row in nights]
+    tests = [_of_night(row) for row in nights]
+    for name, ratio, rms, test in _odd(solution, problem, blocks, set(nights["block"])):
+        odd.append((name, ratio, rms))
+        tests.append(test)
     found = f"exposures depart from {static} beyond noise"
     if odd:
-        named = [f"{name} {ratio:.2g} times as far as the others, by {rms:.2g} px rms" for name, ratio, rms, _ in odd]
+        named = [f"{name} {ratio:.2g} times as far as the others, by {rms:.2g} px rms" for name, ratio, rms in odd]
         found += (
-            f", {some_of(named, MOST_NAMED)}: look at what was different then; its distortions are its own, and do "
+            f", {', '.join(named)}: look at what was different then; its distortions are its own, and do "
+            "no harm, but absolute positions are surer without"
         )
-        found += "no harm, but absolute positions are surer without"
-    return Check("dynamic part", "pass", p, FALSE_ALARM, found, tests=tuple(test for *_, test in odd))
+    return Check("dynamic part", "pass", p, FALSE_ALARM, found, tests=tuple(tests))
 
 
-def _odd(solution, problem, blocks):
-    """Exposures and nights that depart from the others of their detector more than these among themselves.
+def _of_night(row):
+    """The `FactorTest` of a night of `Solution.nights`."""
+    known = float(row["chi2"]), float(row["dof"]), float(row["p"])
+    return FactorTest(f"departure of night {row['name']}", _OTHERS, int(row["dof"]), *known)
+
+
+def _odd(solution, problem, blocks, nights):
+    """Exposures that depart from the others of their detector more than these among themselves, but for some nights.
 
     The farthest first: name, how many times as far as these, by how many pixels rms, and the `FactorTest`: squares by
     degree over those of the others, beyond the errors of the coefficients. If all scatter alike, by degree, they are
-    distributed as F.
+    distributed as F. The exposures of nights that are odd as a whole, by their numbers, are not among them.
     """
     found, names = [], np.array(solution.names)
     size, degrees = problem.n_modes, dynamic_degrees(problem.n_modes)
+    asked = ~np.isin(np.broadcast_to(problem.night, len(names)), list(nights))
     for detector in np.unique(problem.detectors):
-        each = np.flatnonzero(problem.detectors == detector)
+        each = np.flatnonzero((problem.detectors == detector) & asked)
+        if len(each) < _FEWEST:
+            continue
         rows = dynamic_basis(problem.shapes[each[0]], size)
         a = (solution.coefficients - solution.estimate.prior_mean)[each, :, :size].reshape(len(each), -1) @ rows.T
         noise = np.einsum("ka,iab,kb->ik", rows, np.linalg.inv(blocks.u[each]), rows)
-        owners = [(np.arange(len(each)), "")]
-        if problem.nights is not None:
-            owners.append((np.unique(problem.nights[each], return_inverse=True)[1], "the night of "))
-        for owner, whose in owners:
-            mean = np.eye(owner.max() + 1)[:, owner] / np.bincount(owner)[:, None]
-            if len(mean) < _FEWEST:
-                continue
-            departing = mean @ a
-            for k, ratio, chi2, p in _beyond(departing, mean**2 @ noise, degrees, len(names)):
-                name = whose + names[each][owner == k][0]
-                test = FactorTest(f"departure of {name}", _OTHERS, len(rows), chi2, len(rows), p)
-                rms = np.linalg.norm(departing[k] - np.delete(departing, k, axis=0).mean(axis=0)) / 2  # as `rms_length`
+        out = _beyond_chance(a, noise, degrees, FALSE_ALARM / len(names))
+        for k in out:
+            others = np.delete(np.arange(len(each)), [i for i in out if i != k])
+            ratio, chi2, p = (value[others == k][0] for value in _compared(a[others], noise[others], degrees))
+            if p < FALSE_ALARM / len(names) and ratio > _ODD:
+                name = names[each[k]]
+                test = FactorTest(f"departure of {name}", _OTHERS, len(rows), float(chi2), len(rows), float(p))
+                rms = np.linalg.norm(a[k] - a[others[others != k]].mean(axis=0)) / 2  # as `rms_length`
                 found.append((name, ratio, rms, test))
     return sorted(found, key=lambda each: -each[1])
 
 
-def _beyond(a, noise, degrees, n_tests):
-    """Which of departures (n, k), with variances of their errors and degrees (k,), are odd: row, ratio, chi2 and p."""
+def _beyond_chance(a, noise, degrees, alarm):
+    """Which of departures (n, k) are left out, the least probable first, until all others are alike, or half are left.
+
+    Several odd ones would hide behind one another.
+    """
+    out, left = [], np.arange(len(a))
+    while len(left) > max(_FEWEST - 1, len(a) / 2):
+        ratio, _, p = _compared(a[left], noise[left], degrees)
+        worst = np.lexsort([-ratio, p])[0]
+        if p[worst] >= alarm:
+            break
+        out.append(int(left[worst]))
+        left = np.delete(left, worst)
+    return out
+
+
+def _compared(a, noise, degrees):
+    """Departures (n, k), with variances of errors and degrees (k,), each by the others: ratio, chi2 and p, (n,)."""
     n = len(a)
     squares = (a - a.mean(axis=0)) ** 2
     square, p = squares * (n / (n - 1)) ** 2, []  # from the mean of the others
@@ -95,6 +121,4 @@ def _beyond(a, noise, degrees, n_tests):
         scatter = np.maximum(whole - errors, 0)
         square[:, of] /= (scatter + whole / (n - 1))[:, None] + noise[:, of]
         p.append(special.fdtrc(m, m * (n - 2), square[:, of].mean(axis=1)))
-    p = np.minimum(1, len(each) * np.min(p, axis=0))
-    for i in np.flatnonzero((p < FALSE_ALARM / n_tests) & (square.mean(axis=1) > _ODD**2)):
-        yield i, np.sqrt(square[i].mean()), square[i].sum(), float(p[i])
+    return np.sqrt(square.mean(axis=1)), square.sum(axis=1), np.minimum(1, len(each) * np.min(p, axis=0))

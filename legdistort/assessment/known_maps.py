@@ -1,0 +1,288 @@
+"""What is known of the static distortions of detectors, from a map, a camera or a night, with its covariance."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from astropy import units as u
+
+from ..cameras.camera import Camera
+from ..exceptions import InputError
+from ..geometry import basis, detector_modes
+from ..geometry.similarity import apply, invert
+from ..matching.matches import Matches
+from ..priors.prior import Prior
+from ..results.solution import Solution
+from ..solving import single_fit
+from ..solving.equations.reduced_system import DIRECT_LIMIT
+from ..solving.gauge.constraints import absorb_similarities
+from ..solving.knowledge.exposures import RANGE, ExposureModel
+from ..solving.knowledge.factors import Factor
+from ..solving.knowledge.posterior import Posterior, most_likely
+from ..solving.knowledge.reduced_data import drawn, part_of
+from ..solving.options import SolveOptions
+
+#: A coefficient of 1 px displaces by sqrt(1/8) px rms per axis: b_m has mean square 1/4.
+MEAN_SQUARE = 8
+#: Information [pix^-2] from which a direction is determined: its error is 0.3 px at most, rms per axis over a detector.
+DETERMINED = 1 / (MEAN_SQUARE * 0.3**2)
+_NOTHING, _FREE = 1e4, 1e3  # error of a coefficient of which nothing is known, and where digits count [pix]
+_ROUNDS = 3
+_KEPT = "loss", "motion", "motion_sigma", "motion_epoch", "night_sigma"  # settings of a night
+_MOST = 500  # coefficients from which the scatter of exposures is found
+_LARGER = 1.1  # sizes, by which a derivative is taken
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMap:
+    """What is known of static distortions, ``{detector: (2, n_modes)}``, of detectors of some shapes.
+
+    Attributes
+    ----------
+    label : str
+    statics, shapes : dict
+    covariance : ndarray or None
+        Of all coefficients, one detector after the other, x modes first; None where no error is stated.
+    dof : float
+        Degrees of freedom of a covariance that is estimated from the scatter of exposures.
+    degree : int or None
+        Modes beyond are not known.
+    """
+
+    label: str
+    statics: dict
+    shapes: dict
+    covariance: np.ndarray | None = None
+    dof: float = np.inf
+    degree: int | None = None
+
+    @property
+    def highest(self):
+        """Degree of the coefficients that there are."""
+        return max(basis.degree_of(each.shape[1]) for each in self.statics.values())
+
+
+def opened(thing, degree, argument):
+    """A solution, camera or prior, and its label."""
+    label = f"the {argument} map"
+    if isinstance(thing, (str, Path)) or (isinstance(thing, (list, tuple)) and len(thing) == 2):
+        label = str(thing) if isinstance(thing, (str, Path)) else f"{thing[0]}, {thing[1]}"
+        thing = _read(thing, degree)
+    if isinstance(thing, Mapping):
+        raise InputError(f"{label} is a dict: compare its maps one by one, or give a Camera")
+    if not isinstance(thing, (Solution, Camera, Prior)):
+        thing = Prior.from_model(thing, degree=degree)
+    if isinstance(thing, Prior) and thing.mean is None:
+        raise InputError(f"{label} states only the size of a distortion: give a map")
+    return thing, label
+
+
+def known_map(thing, label, other=None):
+    """What a solution, camera or prior knows; the `other` is that of what it is compared with."""
+    if isinstance(thing, Solution):
+        if thing.camera.has_focal_plane:
+            return _of_focal_plane(thing, label)
+        return _of_night(thing, label, next(iter(other.statics.values())) if other else None)
+    if isinstance(thing, Camera):
+        return _of_camera(thing, label)
+    widths = thing.static_sigma
+    covariance = None if widths is None else np.diag(np.minimum(widths.ravel(), _NOTHING) ** 2)
+    return KnownMap(label, {"1": thing.mean}, {"1": thing.shape}, covariance)
+
+
+def _read(where, degree):
+    """The camera, solution or prior in files."""
+    if isinstance(where, (str, Path)):
+        path = Path(where)
+        if path.is_dir():
+            return Solution.read(path)
+        if path.is_file():
+            with path.open("rb") as file:
+                start = file.read(1 << 20)  # the arrays come later
+            for entry, kind in (
+                (b"legdistort_camera", Camera),
+                (b"legdistort", Solution),
+                (b"legdistort_prior", Prior),
+            ):
+                if start.startswith(b"#ASDF") and re.search(rb"^" + entry + rb":", start, re.MULTILINE):
+                    return kind.read(path)
+    return Prior.from_file(where, degree=degree)
+
+
+def _of_camera(camera, label):
+    statics = {key: each.static for key, each in camera.detectors.items()}
+    shapes = {key: each.shape for key, each in camera.detectors.items()}
+    widths = [each.static_sigma for each in camera.detectors.values()]
+    covariance = None
+    if any(each is not None for each in widths):
+        widths = [np.zeros(s.shape) if w is None else w for w, s in zip(widths, statics.values(), strict=True)]
+        covariance = np.diag(np.concatenate([np.minimum(each.ravel(), _NOTHING) ** 2 for each in widths]))
+    return KnownMap(camera.name if label.startswith("the ") else label, statics, shapes, covariance)
+
+
+def _of_focal_plane(solution, label):
+    """The detectors of a camera that was fitted: layouts are free, and a common map of the focal plane."""
+    errors, camera = solution.estimate.uncertainty.camera, solution.camera
+    if errors is None or not errors.free[:, :, 3:].any():
+        raise InputError(
+            f"{label} was solved with the static distortions of camera {camera.name} as given, and says nothing of "
+            "them: solve it with static='fit' (--static fit)"
+        )
+    known, n = _of_camera(camera, label), errors.free.shape[2]
+    statics = {key: basis.change_degree(each, basis.degree_of(n)) for key, each in known.statics.items()}
+    covariance = np.zeros((errors.free.size, errors.free.size))
+    free = np.flatnonzero(errors.free.ravel())
+    covariance[np.ix_(free, free)] = errors.changes @ errors.changes.T
+    of_layouts = np.zeros(errors.free.shape)
+    of_layouts[:, :, :3] = _NOTHING**2
+    covariance += np.diag(of_layouts.ravel())
+    common = np.concatenate([_common_maps(camera, each, n) for each in camera.detectors.values()])
+    return replace(
+        known, statics=statics, covariance=covariance + _NOTHING**2 * common @ common.T, degree=basis.degree_of(n)
+    )
+
+
+def _common_maps(camera, detector, n):
+    """Coefficients (2 n, 2 n) on a detector of the modes of the focal plane."""
+    degree, back = basis.degree_of(n), invert(detector.layout)
+
+    def modes(u, v):
+        there = apply(back, basis.denormalize(u, v, detector.shape))
+        return basis.values(degree, *basis.normalize(there, camera.field))
+
+    alone = basis.project(modes, degree)
+    return np.einsum("ab,mk->akbm", detector.layout[:, :2], alone).reshape(2 * n, 2 * n)
+
+
+def _of_night(solution, label, other):
+    """The static distortion of the exposures of one detector, from all but what was known of it."""
+    night = shown_by(solution, label, other)
+    sizes, vectors = np.linalg.eigh(night.information)
+    covariance = vectors / np.maximum(sizes, _NOTHING**-2) @ vectors.T
+    rows = detector_modes.dynamic_basis(night.shape, night.around.shape[1])
+    return KnownMap(label, {"1": night.around}, {"1": night.shape}, rows.T @ covariance @ rows, night.dof, night.degree)
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What exposures of one detector show of its static distortion, from all but what was known of it.
+
+    ``-2 ln L = z' information z - 2 pull' z`` for a step z of the coefficients, in the order of
+    `legdistort.geometry.detector_modes.dynamic_basis`, from a map.
+
+    Attributes
+    ----------
+    around : ndarray, shape (2, n_modes)
+        That map: what they show where they determine it, the rest as it was.
+    information : ndarray, shape (K, K)
+    pull : ndarray, shape (K,)
+    scatter : ndarray, shape (degree,)
+        Of exposures about it, by degree, pixels.
+    dof : float
+        Degrees of freedom of the scatter that the information rests on.
+    degree : int
+    shape : tuple
+    """
+
+    around: np.ndarray
+    information: np.ndarray
+    pull: np.ndarray
+    scatter: np.ndarray
+    dof: float
+    degree: int
+    shape: tuple
+
+
+def shown_by(solution, label, other=None):
+    """What the exposures of a solution show of the static distortion of their detector (`Shown`).
+
+    It is solved again around what it shows and, where it shows nothing, around the `other` map (2, n_modes) or None, so
+    that a common map of the plane is small, and what is linear in it exact. Exposures and nights scatter about it by
+    what they show (`legdistort.solving.knowledge.exposures.ExposureModel`).
+    """
+    shapes = set(solution.estimate.shapes.values())
+    if len(shapes) > 1:
+        raise InputError(f"{label} has detectors of several shapes, {sorted(shapes)}: it gives no single map")
+    shape, matches = shapes.pop(), _at_errors_in_force(solution)
+    degree, n = solution.degree, basis.n_modes(solution.degree)
+    around = solution.coefficients[:, :, :n].mean(axis=0) if other is None else basis.change_degree(other, degree)
+    around, rows = pointed(around, shape), detector_modes.dynamic_basis(shape, n)
+    kept, fit = {name: getattr(solution.settings, name) for name in _KEPT}, None
+    for _ in range(_ROUNDS):
+        options = SolveOptions(degree=degree, prior=Prior(around, shape=shape), clip=None, **kept)
+        fit = single_fit.estimate(matches, options, near=fit)
+        information, pull, scatter, dof = _shown(fit)
+        sizes, vectors = np.linalg.eigh(information)
+        found = np.where(sizes > DETERMINED, 1 / np.maximum(sizes, DETERMINED), 0)  # others stay where they are
+        step = vectors * found @ vectors.T @ pull
+        around = around + (rows.T @ step).reshape(2, n)
+    return Shown(around, information, pull - information @ step, scatter[:degree], dof, degree, shape)
+
+
+def _at_errors_in_force(solution):
+    """The matches that were used, with errors as they counted."""
+    used = solution.residuals[np.asarray(solution.residuals["used"])]
+    kept = [name for name in used.colnames if name not in ("dx", "dy", "used")]
+    table, covariance = used[kept], solution.diagnostics.errors_of(used)
+    for name, variance in zip(("x_err", "y_err"), (covariance[:, 0, 0], covariance[:, 1, 1]), strict=True):
+        table[name] = np.sqrt(variance) * u.pix
+    if "xy_corr" in kept:
+        table["xy_corr"] = covariance[:, 0, 1] / np.sqrt(covariance[:, 0, 0] * covariance[:, 1, 1])
+    return Matches.from_table(table, shape=next(iter(solution.estimate.shapes.values())), poses=solution.poses)
+
+
+def _shown(fit):
+    """What exposures say of their static distortion from the prior: information (K, K), pull (K,), sizes, dof.
+
+    Sizes are found with nothing known of it, from exposures drawn at random where these are many. The degrees of
+    freedom are those by which they tell the determinant of the information, in the directions that count.
+    """
+    problem, state = fit.weighted, absorb_similarities(fit.weighted, fit.result.state)
+
+    def known(most):
+        keep = drawn(problem.detectors, most // (2 * problem.n_modes))
+        part = part_of(problem, state, keep)
+        model = ExposureModel.of(*part, fit.result.gauge.all_motion[keep], np.zeros(len(keep), dtype=int))
+        free = model.statics(width=_FREE)
+        return model, free, Factor.joined([model.departures, free])
+
+    model, _, factor = known(_MOST)
+    unit = 1 / np.sqrt(np.median(np.diag(model.data.curvature)))
+    found = most_likely(model.data, factor, np.full(model.n_scatters, 10 * unit), unit * np.array(RANGE))
+    model, free, factor = known(DIRECT_LIMIT)
+    whole = Posterior(model.data, factor, found.sizes)
+    information, pull = whole.without(free)
+    sizes, vectors = np.linalg.eigh(information)
+    directions = vectors[:, sizes > DETERMINED].T
+
+    def certain(posterior):
+        return np.linalg.slogdet(directions @ posterior.without(free)[0] @ directions.T)[1] / max(len(directions), 1)
+
+    larger = found.sizes * (1 + (_LARGER - 1) * np.eye(len(found.sizes)))
+    share = certain(whole) - np.array([certain(replace(whole, sizes=each)) for each in larger])
+    share /= 2 * np.log(_LARGER)
+    return information, pull, found.sizes, float(1 / np.sum(share**2 / np.maximum(_freedom(found), 1) + 1e-12))
+
+
+def _freedom(posterior):
+    """Degrees of freedom of squared sizes that were found, (n_sizes,): twice their square over its variance."""
+    width, label = posterior.widths, posterior.factor.size
+    left = (np.eye(len(width)) - posterior.of_rows / width / width[:, None]) ** 2
+    return np.array([left[np.ix_(label == j, label == j)].sum() for j in range(len(posterior.sizes))])
+
+
+def pointed(static, shape):
+    """Coefficients of the same map after a similarity, as a pose has it, so that they have no part of one."""
+    degree = basis.degree_of(static.shape[1])
+    for _ in range(_ROUNDS):
+        back = invert(detector_modes.similarity_part(static, shape))
+
+        def displacement(u, v, static=static, back=back):
+            there = basis.denormalize(u, v, shape)
+            q = apply(back, there)
+            return (q - there).T + static @ basis.values(degree, *basis.normalize(q, shape))
+
+        static = basis.project(displacement, degree)
+    return static

@@ -1,0 +1,133 @@
+"""Nights, or other blocks of exposures, of a solution: how well each is fitted, and how far it is from the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+from astropy.time import Time
+
+from ..inputs import column_contract
+from ..runtime.trees.facts import number
+
+
+@dataclass(frozen=True)
+class NightTest:
+    """How far what the exposures of a night have in common is from the static distortion of the other nights.
+
+    Attributes
+    ----------
+    departure : float or None
+        Pixels, rms over the detector; None if there are no others.
+    ratio : float
+        Root of its mean square over that of its errors and of the scatter of the other nights.
+    chi2, dof : float
+        Of the departure, under the sum of these, in the directions that are determined.
+    p : float
+        Probability of so large a departure by chance.
+    odd : bool
+        Whether it is named as one that departs farther than the others do.
+    """
+
+    departure: float | None = field(default=None, metadata=number(minimum=0, unit="pix"))
+    ratio: float = field(default=0.0, metadata=number(minimum=0))
+    chi2: float = field(default=0.0, metadata=number(minimum=0))
+    dof: float = field(default=0.0, metadata=number(minimum=0))
+    p: float = field(default=1.0, metadata=number(minimum=0, maximum=1))
+    odd: bool = False
+
+
+_DATES = 1800, 2200  # years that are dates beyond doubt
+
+
+def blocks(solution):
+    """Number of the night (n_exposures,), label of every night (n_nights,), and year (n_exposures,), NaN if unknown."""
+    table = solution.residuals
+    names, rows = np.unique(column_contract.labels(table, "exposure"), return_index=True)
+    first = rows[np.searchsorted(names, solution.names)]
+    number = column_contract.blocks(table, first)
+    years = np.full(len(first), np.nan)
+    if "epoch" in table.colnames:
+        years = column_contract.values(table, "epoch", u.yr)[first]
+    begins = [np.flatnonzero(number == n) for n in range(number.max() + 1)]
+    if "block" in table.colnames:
+        return number, [str(table["block"][first[mine[0]]]) for mine in begins], years
+    if not np.all((years > _DATES[0]) & (years < _DATES[1])):
+        return number, [solution.names[mine[0]] for mine in begins], years
+    means = Time([years[mine].mean() for mine in begins], format="jyear")
+    dates = means.to_value("iso", subfmt="date").tolist()
+    times = means.to_value("iso", subfmt="date_hm").tolist()
+    return number, [time if dates.count(date) > 1 else date for date, time in zip(dates, times, strict=True)], years
+
+
+def tests(solution):
+    """The `NightTest` of every night, in the order of their numbers; none where they were not made."""
+    found = solution.estimate.nights
+    return found(solution) if callable(found) else found
+
+
+def table(solution):
+    """`Solution.nights`; see there."""
+    number, labels, years = blocks(solution)
+    observed = solution.residuals[np.asarray(solution.residuals["used"])]
+    exposure = column_contract.labels(observed, "exposure")
+    order = np.argsort(solution.names)
+    night = number[order][np.searchsorted(np.array(solution.names)[order], exposure)]
+    offset = np.column_stack([observed[each].to_value(u.pix) for each in ("dx", "dy")])
+    stated = np.column_stack([observed[each].to_value(u.pix) for each in ("x_err", "y_err")])
+    freedom = offset.size / max(solution.dof, 1)
+    rows = []
+    for n, (label, test) in enumerate(zip(labels, tests(solution) or (NightTest(),) * len(labels), strict=True)):
+        mine, own = night == n, number == n
+        known = years[own][np.isfinite(years[own])]
+        rows.append(
+            {
+                "name": label,
+                "block": n,
+                "epoch": known.mean() if len(known) else np.nan,
+                "n_exposures": np.count_nonzero(own),
+                "n_stars": len(np.unique(observed["star"][mine])),
+                "rms": _rms(offset[mine]),
+                "rms_ratio": _rms((offset / stated)[mine]) * np.sqrt(freedom),
+                "departure": np.nan if test.departure is None else test.departure,
+                "ratio": test.ratio,
+                "chi2": test.chi2,
+                "dof": test.dof,
+                "p": test.p,
+                "odd": test.odd,
+                "exposures": ", ".join(np.array(solution.names)[own]),
+            }
+        )
+    out = QTable(rows=sorted(rows, key=lambda row: (not row["odd"], row["p"], -row["ratio"])))
+    for name, unit in {"epoch": u.yr, "rms": u.pix, "departure": u.pix}.items():
+        out[name] = out[name] * unit
+    for name, shown in _FORMATS.items():
+        out[name].info.format = shown
+    return out
+
+
+_FORMATS = {"epoch": ".4f", "rms": ".4f", "rms_ratio": ".3f", "departure": ".4f", "ratio": ".2f", "chi2": ".1f"}
+_FORMATS |= {"dof": ".0f", "p": ".2g"}
+
+
+def lines(solution):
+    """What `print` shows of them; nothing of a single one."""
+    nights = solution.nights
+    if len(nights) < 2:
+        return []
+    width = max(10, *map(len, nights["name"]))
+    out = ["", f"{'night':{width}s} {'exposures':>9s} {'stars':>5s} {'rms':>7s} {'rms/error':>9s} {'departure':>9s} "
+               f"{'ratio':>6s} {'p':>8s}"]  # fmt: skip
+    for row in nights:
+        departure = f"{row['departure'].value:9.4f} {row['ratio']:6.2f} {row['p']:8.2g}" if row["dof"] else f"{'-':>9s}"
+        out.append(
+            f"{row['name']:{width}s} {row['n_exposures']:9d} {row['n_stars']:5d} {row['rms'].value:7.4f} "
+            f"{row['rms_ratio']:9.3f} {departure}{'  odd' * bool(row['odd'])}"
+        )
+    return out
+
+
+def _rms(values):
+    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
