@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import asdf
 import numpy as np
@@ -20,6 +20,7 @@ from ..cameras.camera import Camera
 from ..cameras.detector import Detector
 from ..exceptions import InputError, some_of
 from ..geometry import basis, detector_modes, epochs
+from ..inputs.table_files import records
 from ..plots.memory_plots import plot_memory
 from ..priors.prior import Prior
 from ..results.solution import Solution
@@ -120,6 +121,18 @@ class CombinedNights(ShownAsPrinted):
         Factors >= 1 on it, as for Student's t distribution: odd nights count less.
     rate, walk : float
         Sizes of the change of a coefficient, pixels a year, and pixels in the square root of a year; 0: none seen.
+
+    See Also
+    --------
+    legdistort.combine_nights : Makes it.
+
+    Examples
+    --------
+    >>> import legdistort as ld
+    >>> seen = ld.simulate_matches(degree=2, n_exposures=6, rotations=[0, 90] * 3, dither=300.0, sigma=0.02)
+    >>> night = ld.solve(seen.matches, degree=2)
+    >>> ld.combine_nights([night], name="NIRC2")
+    <CombinedNights: NIRC2, degree 2, 1 nights, 0 odd>
     """
 
     nights: tuple[Night, ...]
@@ -260,6 +273,19 @@ class CombinedNights(ShownAsPrinted):
         """Whether the static distortion changes with time."""
         return self.rate > 0 or self.walk > 0
 
+    @plain_numbers
+    def to_dict(self, date: float | Time | None = None) -> dict[str, Any]:
+        """Everything but what nights say one by one as numbers and texts for JSON.
+
+        Parameters
+        ----------
+        date : float or `~astropy.time.Time`, optional
+            As for `static`.
+        """
+        sizes = {"scatter_px": self.scatter.tolist(), "rate_px_yr": self.rate, "walk_px_root_yr": self.walk}
+        named = {"name": self.name, "degree": self.degree, "date": self._year(date) or None, "odd": list(self.odd)}
+        return named | sizes | {"modes": records(self.modes(date)), "nights": records(self.table)}
+
     def plot(self, *, fig: Figure | None = None) -> Figure:
         """Coefficients against time, see `legdistort.plots.memory_plots.plot_memory`."""
         return plot_memory(self, fig=fig)
@@ -292,7 +318,7 @@ class CombinedNights(ShownAsPrinted):
 
     def __str__(self) -> str:
         n_exposures, count = sum(each.n_exposures for each in self.nights), len(self.nights)
-        what = f"static distortion of degree {self.degree} from {n_exposures} exposures of {count} nights"
+        what = f"static distortion of degree {self.degree} from {n_exposures} exposures of {count} night{'s' * (count > 1)}"
         lines = [f"Camera {self.name}: {what}."]
         if count == 1:
             lines.append("One night does not tell how far nights scatter: errors are those of this night alone.")
@@ -358,9 +384,10 @@ def combine_nights(
     Examples
     --------
     >>> import legdistort as ld
-    >>> nights = [ld.solve(ld.simulate_matches(seed=7 + i, static=1.0, rotations=[0, 90] * 4, n_exposures=8, n_stars=60,
-    ...           truth=None).matches, degree=2) for i in range(2)]  # doctest: +SKIP
-    >>> ld.combine_nights(nights).prior()  # doctest: +SKIP
+    >>> seen = ld.simulate_matches(degree=2, n_exposures=6, rotations=[0, 90] * 3, dither=300.0, sigma=0.02)
+    >>> camera = ld.combine_nights([ld.solve(seen.matches, degree=2)])
+    >>> camera.prior()
+    <Prior: degree 2, 6 modes an axis, static_sigma given>
     """
     given = [results] if isinstance(results, (str, Path, Solution, CombinedNights)) else list(results)
     if not given:

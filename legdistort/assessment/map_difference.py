@@ -12,6 +12,7 @@ from scipy import special
 
 from ..exceptions import InputError, some_of
 from ..geometry import basis, detector_modes
+from ..inputs.table_files import records
 from ..plots.difference_plots import plot_difference
 from ..results.solution import Solution
 from ..runtime.guards.units import plain_numbers
@@ -131,6 +132,13 @@ class MapDifference(ShownAsPrinted):
         mode = f"L{row['x_degree']}(x) L{row['y_degree']}(y)"
         found, error = row["difference"].value, row["error"].value
         return f"{mode} along {row['axis']}{of} ({found:+.2g} +- {error:.2g} px a coefficient)"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as numbers and texts for JSON, None where nothing is known."""
+        figures = {"rms_px": self.rms, "rms_error_px": self.rms_error, "sigmas": self.sigmas, "chi2": self.chi2}
+        figures = {name: value if value == value else None for name, value in (figures | {"p": self.p}).items()}
+        more = {"agrees": self.agrees, "dof": self.dof, "n_undetermined": self.n_undetermined}
+        return figures | more | {"sentence": self.sentence, "modes": records(self.modes)}
 
     def plot(self, *, ax: Axes | None = None, scale: float | None = None) -> Axes:
         """Picture of the difference as arrows, see `legdistort.plots.difference_plots.plot_difference`."""

@@ -19,7 +19,7 @@ from ..inputs import column_contract
 from ..inputs.detector_files import warn_of_detectors
 from ..inputs.exposure_names import detector_name
 from ..inputs.star_lists.formats import stack
-from ..inputs.table_files import named_after, write_stars
+from ..inputs.table_files import named_after, records, write_stars
 from ..priors.prior import EVIDENCE, HEADER, UNSTATED, HeaderPrior
 from ..results.check import WRONG, Check, worst
 from ..runtime import outputs, parallel, provenance
@@ -133,7 +133,7 @@ def do_noise(a):
     curves = legdistort.calibrate_noise(_open(a), **injecting, measuring=measuring, **_share(a))
     curves.write(a.out, overwrite=a.overwrite)
     _draw(curves, a)
-    _say(a, curves, {"laws": _records(curves.laws), "out": str(a.out)})
+    _say(a, curves, {"laws": records(curves.laws), "out": str(a.out)})
 
 
 def do_match(a):
@@ -312,7 +312,7 @@ def do_predict(a):
     prediction = legdistort.predict(**keywords)
     _draw(prediction, a)
     plans = prediction.alternatives()
-    own, *others = _records(plans)
+    own, *others = records(plans)
     own |= {"unknown": list(prediction.solution.gauge.unknown_names), "alternatives": others}
     _say(a, f"{prediction}\n\n{describe_plans(plans)}", own | {"failed": plans.meta["failed"]})
 
@@ -360,12 +360,7 @@ def do_nights(a):
     found = legdistort.combine_nights(**words, workers=a.workers or min(parallel.n_cores(), len(a.results)))
     found.write(a.out, date=a.date, overwrite=a.overwrite)
     _draw(found, a)
-    figures = {
-        "camera": str(a.out), "name": found.name, "degree": found.degree, "scatter_px": found.scatter.tolist(),
-        "rate_px_yr": found.rate, "walk_px_root_yr": found.walk, "odd": list(found.odd),
-        "modes": _records(found.modes(a.date)), "nights": _records(found.table),
-    }  # fmt: skip
-    _say(a, found, figures)
+    _say(a, found, found.to_dict(a.date))
     return 3 if a.strict and found.odd else 0
 
 
@@ -373,13 +368,7 @@ def do_difference(a):
     """``legdistort difference``."""
     found = legdistort.difference(a.first, a.second, **given(a, options.COMPARED))
     _draw(found, a)
-    figures = {
-        "agrees": found.agrees, "rms_px": found.rms, "rms_error_px": found.rms_error, "sigmas": found.sigmas,
-        "chi2": found.chi2, "dof": found.dof, "p": found.p,
-    }  # fmt: skip
-    figures = {name: value if value == value else None for name, value in figures.items()}
-    figures |= {"n_undetermined": found.n_undetermined, "sentence": found.sentence, "modes": _records(found.modes)}
-    _say(a, found, figures)
+    _say(a, found, found.to_dict())
     return 3 if a.strict and found.agrees is False else 0
 
 
@@ -456,12 +445,6 @@ def _status(a, summary):
 
 def _say(a, sentence, figures):
     print(json.dumps(figures, indent=1) if a.json else sentence)
-
-
-def _records(table):
-    """The rows of a table for JSON, which knows no NaN."""
-    rows = [zip(table.colnames, row, strict=True) for row in table.as_array().tolist()]
-    return [{name: value if value == value else None for name, value in row} for row in rows]
 
 
 def _share(a):

@@ -216,3 +216,9 @@ def write_table(table, path, *, kind="ascii.ecsv", overwrite=False):
                 for_fits(table).write(file, format=kind)
         else:
             with_text(table).write(file, format=kind)
+
+
+def records(table):
+    """The rows of a table for JSON, which knows no NaN."""
+    rows = [zip(table.colnames, row, strict=True) for row in table.as_array().tolist()]
+    return [{name: value if value == value else None for name, value in row} for row in rows]

@@ -115,7 +115,7 @@ def _falling(variance):
 def _common(own, moved, owner, static):
     """Design (n, K, m) of maps and of what those of an owner have in common, and inverse variances (m,) known of it."""
     common = [(owner == g)[:, None, None] * np.eye(own.shape[1])[:, of > 0] for g, of in enumerate(static)]
-    known = np.minimum(static[static > 0], _LARGE**2 * np.mean(own**2) + 1e-300)
+    known = np.minimum(static[static > 0], _LARGE**2 * np.sum(own**2) / max(own.size, 1) + 1e-300)
     return np.concatenate([moved, *common], axis=2), np.concatenate([np.zeros(moved.shape[2]), 1 / known])
 
 
