@@ -318,8 +318,8 @@ class CombinedNights(ShownAsPrinted):
 
     def __str__(self) -> str:
         n_exposures, count = sum(each.n_exposures for each in self.nights), len(self.nights)
-        what = f"static distortion of degree {self.degree} from {n_exposures} exposures of {count} night{'s' * (count > 1)}"
-        lines = [f"Camera {self.name}: {what}."]
+        of = f"{n_exposures} exposures of {count} night{'s' * (count > 1)}"
+        lines = [f"Camera {self.name}: static distortion of degree {self.degree} from {of}."]
         if count == 1:
             lines.append("One night does not tell how far nights scatter: errors are those of this night alone.")
         else:

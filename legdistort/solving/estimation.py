@@ -249,7 +249,8 @@ def solve(
         diagnostics = replace(_diagnostics(fit, prior, scale), **chosen)
         if catalogue is not None:
             fit = reference_tie.tie_to(fit, catalogue, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
-        fit = fit if sought is None or catalogue is not None else _on_headers(fit, given)
+        else:
+            fit = _placed(fit, sought, given)
     epoch = given.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
@@ -371,9 +372,13 @@ def _fitted(matches, options, sought, join):
     return fit, options, {"selection": selection, "motion_scatter": scatter, **errors_found}
 
 
-def _on_headers(fit, matches):
-    """The fit of a camera with the sky of the headers that have its detectors where they were found."""
-    if matches.sky is None:
+def _placed(fit, sought, matches):
+    """The fit with motions relative to the mean of the stars.
+
+    Of a camera that was sought with the sky of the headers that have its detectors where they were found.
+    """
+    fit = replace(fit, result=star_motions.at_rest(fit.problem, fit.result))
+    if sought is None or matches.sky is None:
         return fit
     sky = sky_by_layout(matches, fit.matches.camera, fit.result.state.poses)
     return replace(fit, matches=replace(fit.matches, sky=sky))

@@ -1,5 +1,6 @@
 """The motions that `solve` was asked for, as terms of the stars of a problem."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from ..exceptions import AssumptionWarning, InputError, warn
 from ..geometry import parallax
 from ..geometry.epochs import ONE_EPOCH
+from .equations.elimination import typical_stars
 from .equations.star_terms import StarTerms
 
 #: A parallax that the other unknowns take up to all but this part is not determined.
@@ -78,3 +80,26 @@ def condition(years, factors):
     basis = np.linalg.qr(design)[0] if np.ptp(time) > 0 else design[:, :1] / np.sqrt(len(time))
     left = factors - basis @ (basis.T @ factors)
     return float(np.linalg.norm(factors) / max(np.linalg.norm(left), 1e-300))
+
+
+def at_rest(problem, result):
+    """The same `Result` with motions relative to the mean of the stars, those with far larger errors than others aside.
+
+    What they share is a shift of every exposure with time, exactly, and is in its pose: nothing tells the two apart
+    unless something is known of the poses or of the motions, and then they stay as they are.
+    """
+    terms, state = problem.terms, result.state
+    if "vx" not in terms.names or terms.is_held or problem.pose_width is not None:
+        return result
+    typical, stars, poses = typical_stars(result.blocks.v), state.stars.copy(), state.poses.copy()
+    for number in range(problem.n_fields):
+        mine = problem.field_of_stars == number
+        if not np.any(mine & typical):
+            continue
+        first = 2 + terms.names.index("vx")
+        common = stars[first : first + 2, mine & typical].mean(axis=1)
+        stars[first : first + 2, mine] -= common[:, None]
+        seen = problem.fields == number
+        drift = (terms.years[seen] - terms.epoch)[:, None] * common
+        poses[seen, :, 2] += np.einsum("iab,ib->ia", poses[seen, :, :2], drift)
+    return replace(result, state=replace(state, stars=stars, poses=poses))

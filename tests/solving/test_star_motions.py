@@ -1,6 +1,7 @@
 """Stars that move: proper motions and parallaxes in the same solution, against oracles that share no code with it."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -177,6 +178,27 @@ def test_the_common_rates_are_unknown_and_said():
     assert "common rates of shift, rotation and scale, which are not known without a reference" in str(gauge)
     assert gauge.n_maps == 20
     assert gauge.n_constraints == 40
+
+
+def test_a_drift_of_the_nominal_poses_is_no_motion():
+    """They come from where stars were matched; the motions of all stars are at rest in the mean, whatever they are."""
+    sim = field(seed=3, sigma=0.02, motion=0.2)
+    drift = {name: np.array([0.4, -0.3]) * (year - 2017) for name, year in zip(sim.matches.names, THREE, strict=True)}
+    moved = {name: pose + np.column_stack([np.zeros((2, 2)), drift[name]]) for name, pose in sim.matches.poses.items()}
+    plain, other = (solve(each, motion="proper") for each in (sim.matches, replace(sim.matches, poses=moved)))
+    typical = plain.stars["vx_err"] < 5 * np.median(plain.stars["vx_err"])
+    for axis in ("vx", "vy"):
+        assert abs(np.mean(plain.stars[axis][typical].value)) < 1e-3
+        error = plain.stars[f"{axis}_err_abs"]  # the smallest dynamic part is not quite the same after a shift
+        assert np.all(np.abs(other.stars[axis] - plain.stars[axis]) < 0.1 * error)
+    assert other.chi2 == pytest.approx(plain.chi2, rel=1e-6)
+    for solution in (plain, other):  # stars are where the exposures have them
+        table = solution.residuals[solution.residuals["exposure"] == solution.names[0]]
+        there = solution.stars_at(THREE[0])
+        row = {name: k for k, name in enumerate(there["star"])}
+        at = [row[name] for name in table["star"]]
+        xy = solution[solution.names[0]].distort(np.column_stack([there["x"].value, there["y"].value])[at])
+        assert_allclose(xy, np.column_stack([table["x"].value, table["y"].value]), atol=0.15)
 
 
 @pytest.mark.parametrize(("size", "chosen"), [(0.0, None), (1.1, "proper")])
