@@ -22,6 +22,7 @@ from ..exceptions import InputError, some_of
 from ..geometry import basis, detector_modes, epochs
 from ..inputs.table_files import records
 from ..plots.memory_plots import plot_memory
+from ..priors.mode_tables import mode_table
 from ..priors.prior import Prior
 from ..results.solution import Solution
 from ..runtime import asdf_files, provenance
@@ -223,10 +224,8 @@ class CombinedNights(ShownAsPrinted):
         static, covariance = self.static(date)
         error = np.sqrt(np.diag(covariance)).reshape(2, -1)
         scatter = np.sqrt(self._widths**2 @ self._rows**2).reshape(2, -1)
-        i, j = (np.tile(np.asarray(each)[1:], 2) for each in basis.orders(self.degree))
-        columns = {"axis": np.repeat(["x", "y"], static.shape[1] - 1), "x_degree": i, "y_degree": j}
-        values = {"coefficient": static, "error": np.where(error < _UNKNOWN, error, np.nan), "night_scatter": scatter}
-        return QTable(columns | {name: each[:, 1:].ravel() * u.pix for name, each in values.items()})
+        known = np.where(error < _UNKNOWN, error, np.nan)
+        return mode_table(coefficient=static, error=known, night_scatter=scatter)
 
     @cached_property
     def table(self) -> QTable:
@@ -332,11 +331,8 @@ class CombinedNights(ShownAsPrinted):
             if self.odd
             else "No night contradicts the others."
         )
-        modes = self.modes()
-        for column in modes.columns[3:]:
-            modes[column].info.format = ".4f"
         lines += [odd, ""] if count > 1 else [""]
-        lines += modes.pformat(max_lines=-1, max_width=-1)
+        lines += self.modes().pformat(max_lines=-1, max_width=-1)
         shown = self.table["night", "date", "n_exposures", "n_stars", "departure", "chi2", "dof", "p", "oddness"]
         for name, form in (("date", ".3f"), ("departure", ".4f"), ("chi2", ".1f"), ("p", ".2g"), ("oddness", ".2f")):
             shown[name].info.format = form

@@ -283,6 +283,21 @@ class Camera(ShownAsPrinted):
     def __str__(self) -> str:
         return "\n".join([repr(self)[1:-1], *self.table_lines()])
 
+    def to_dict(self) -> dict[str, Any]:
+        """Where the detectors lie as numbers and texts for JSON, None where a layout is exact or nothing is known."""
+
+        def stated(place):
+            figures = {"x": place.x, "y": place.y, "rotation_deg": place.rotation, "scale": place.scale}
+            errors = (None,) * 3 if place.errors is None else place.errors
+            errors = [each if each is not None and np.isfinite(each) else None for each in errors]
+            return figures | dict(zip(("x_error", "y_error", "rotation_error_deg"), errors, strict=True))
+
+        detectors = [
+            {"id": key, "shape": list(each.shape), "static_rms_px": each.rms} | stated(each.place)
+            for key, each in self.detectors.items()
+        ]
+        return {"name": self.name, "field": list(self.field), "detectors": detectors}
+
     def table_lines(self) -> list[str]:
         """Lines of a table of where the detectors lie, with the errors of that where it is not exact."""
         places = {key: each.place for key, each in self.detectors.items()}

@@ -28,7 +28,7 @@ from ..solving.choices.degree_choice import AUTO, HIGHEST
 from ..solving.options import DEGREE
 from . import options
 from .arguments import flagged, given, wants_progress
-from .given_files import given_camera, read_given, read_matches, refuse
+from .given_files import given_camera, known_file, read_given, read_matches, refuse
 from .repeating import repeatable
 
 #: What belongs to a reference.
@@ -348,6 +348,10 @@ def do_show(a):
         _say(a, "\n\n".join(texts), {name: each.to_dict() for name, each in stated.items()})
         return 0
     refuse({"ext": a.ext, "dq_good": a.dq_good, "weight_maps": a.weight_maps}, "is for a frame")
+    if (known := known_file(a.solution)) is not None:
+        refuse({"max_bytes": a.max_bytes, "strict": a.strict}, "is for a solution")
+        _say(a, known, known.to_dict())
+        return 0
     solution = _solution(a)
     summary = summarise(solution)
     _report(a, solution, summary)

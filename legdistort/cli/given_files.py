@@ -1,12 +1,15 @@
 """Files that are given on the command line: tables, cameras, matched positions of one field or several."""
 
+import re
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import legdistort
 
-from ..exceptions import InputError
+from ..exceptions import InputError, some_of
 from ..inputs import column_contract
 from ..inputs.table_files import read_table
+from ..solving.checks.limits import ASKED
 
 
 def refuse(given, reason):
@@ -36,14 +39,48 @@ def read_matches(a):
         raise InputError("a table stands twice on the command line: every field has one of its own")
     read = {path: _read(path, a) for path in paths}
     inputs = {name: checksum for _, files in read.values() for name, checksum in files.items()}
+    return _without(_joined(read), a.without), inputs
+
+
+def _joined(read):
+    """The matches of ``{path: (matches, inputs)}``, as fields if there are several."""
     if len(read) == 1:
-        return read[paths[0]][0], inputs
+        ((matches, _),) = read.values()
+        return matches
     stems = [path.stem for path in read]
     labels = stems if len(set(stems)) == len(stems) else [path.resolve().parent.name for path in read]
     if len(set(labels)) < len(labels):
         raise InputError(f"tables of fields must differ in their names, or those of their folders: {', '.join(stems)}")
     fields = {label: matches for label, (matches, _) in zip(labels, read.values(), strict=True)}
-    return legdistort.Matches.of_fields(fields), inputs
+    return legdistort.Matches.of_fields(fields)
+
+
+def _without(matches, patterns):
+    """The matches without the exposures that were asked to be left out."""
+    reasons = {}
+    for pattern in patterns or ():
+        found = [name for name in matches.names if fnmatchcase(str(name), pattern)]
+        if not found:
+            raise InputError(f"--without {pattern} is none of the exposures: {some_of(list(matches.names), 6)}")
+        reasons |= dict.fromkeys(found, ASKED)
+    return matches.without(reasons) if reasons else matches
+
+
+def known_file(path):
+    """The camera, nights or prior in a file that holds one of these and no solution; else None."""
+    kinds = {
+        "legdistort_nights": legdistort.CombinedNights,
+        "legdistort_camera": legdistort.Camera,
+        "legdistort_prior": legdistort.Prior,
+    }
+    if not Path(path).is_file():
+        return None
+    with open(path, "rb") as file:
+        start = file.read(1 << 20)  # the arrays come later
+    for entry, kind in kinds.items():
+        if start.startswith(b"#ASDF") and re.search(rf"^{entry}:".encode(), start, re.MULTILINE):
+            return kind.read(path)
+    return None
 
 
 def _read(path, a):

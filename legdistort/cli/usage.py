@@ -84,6 +84,7 @@ COMMANDS = {
         "matched positions to distortions",
         "matched.ecsv --degree 2 --out results",
         options.MATCHED,
+        options.LEFT_OUT,
         options.STRICT,
         options.out("folder for the results", path="results"),
         options.TABLE,
@@ -153,7 +154,7 @@ COMMANDS = {
         options.OPTICS,
     ),
     "show": _command(
-        "print a solution, or what a frame states and where",
+        "print a solution, a camera, nights, a prior, or what a frame states and where",
         "results/solution.asdf",
         options.SHOWN,
         options.FLAGGED,

@@ -16,8 +16,10 @@ from ..geometry import basis
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
 from ..runtime.trees.facts import SIZE, array, number
+from .mode_tables import mode_table
 
 if TYPE_CHECKING:
+    from astropy.table import QTable
     from numpy.typing import ArrayLike
 
     from ..inputs.exposures import Exposure
@@ -226,6 +228,26 @@ class Prior(ShownAsPrinted):
             f"{name} {'by evidence' if isinstance(v, str) else 'given'}" for name, v in widths.items() if v is not None
         ]
         return f"<Prior: {', '.join(words)}>"
+
+    @property
+    def modes(self) -> QTable:
+        """One row a mode and axis: ``axis``, ``x_degree``, ``y_degree``, ``coefficient``, widths if given; pixels."""
+        mean = np.zeros((2, 1)) if self.mean is None else self.mean
+        widths = {name: getattr(self, name) for name in ("sigma", "static_sigma")}
+        given = {name: value for name, value in widths.items() if isinstance(value, np.ndarray)}
+        return mode_table(coefficient=mean, **given)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as numbers and texts for JSON, None for infinite widths."""
+        modes = self.modes
+        rows = (dict(zip(modes.colnames, row, strict=True)) for row in modes.as_array().tolist())
+        known = [{key: None if value == np.inf else value for key, value in row.items()} for row in rows]
+        stated = {key: value for key, value in self.describe().items() if not isinstance(value, list) or key == "shape"}
+        return stated | {"modes": known}
+
+    def __str__(self) -> str:
+        lines = [repr(self)[1:-1], *(self.modes.pformat(max_lines=-1, max_width=-1) if self.states_mean else [])]
+        return "\n".join(lines)
 
     @property
     def rms(self) -> np.ndarray:

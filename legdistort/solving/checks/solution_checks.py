@@ -19,7 +19,7 @@ from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
 from .dynamic_check import dynamic_check, significance
 from .known_effects import Observed
-from .limits import ALIKE, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
+from .limits import ALIKE, ASKED, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
 from .reference_check import reference_check
 from .residual_tests import Residuals
@@ -405,7 +405,7 @@ def rejection_check(solution):
         return Check("rejection", "fail" if share > 0.3 else "warn", share, GROSS_ERRORS, words,
                      "mismatches or blends: look at the exposures with most of them; match with a smaller --tolerance"
                      )  # fmt: skip
-    if lost:
+    if any(why != ASKED for why in lost.values()):
         return Check("rejection", "warn", share, GROSS_ERRORS, words, "look at these frames")
     return Check("rejection", "pass", share, GROSS_ERRORS, words)
 

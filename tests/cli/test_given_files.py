@@ -1,0 +1,47 @@
+"""What a command line names: exposures to leave out, files that hold no solution."""
+
+import json
+
+import numpy as np
+import pytest
+
+import legdistort as ld
+from legdistort.cli import main
+
+
+@pytest.fixture
+def table(tmp_path):
+    sim = ld.simulate_matches(n_exposures=6, n_stars=40, degree=2, sigma=0.02, dither=100.0)
+    sim.matches.table.write(tmp_path / "m.ecsv")
+    return tmp_path / "m.ecsv"
+
+
+def test_exposures_may_be_left_out_by_name(table, tmp_path, capsys):
+    line = ["solve", str(table), "--shape", "2048", "2048", "--degree", "2", "--quiet", "--json", "--out"]
+    assert main([*line, str(tmp_path / "r"), "--without", "exp00", "exp*4"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert set(summary["left_out"]) == {"exp00", "exp04"}
+    check = next(each for each in summary["checks"] if each["name"] == "rejection")
+    assert check["state"] == "pass"  # nothing is odd about what was asked for
+    assert "2 exposures were left out: exp00, exp04: as asked (--without)" in check["sentence"]
+    assert main([*line, str(tmp_path / "s"), "--without", "night*"]) == 1
+    assert "--without night* is none of the exposures: exp00, exp01" in capsys.readouterr().err
+
+
+def test_cameras_and_priors_are_shown(tmp_path, capsys):
+    prior = ld.Prior(np.full((2, 3), 0.25), static_sigma=[0.1, 0.1, np.inf], shape=(512, 512))
+    prior.write(tmp_path / "prior.asdf")
+    ld.Camera.gsaoi().write(tmp_path / "camera.asdf")
+    for name, words in (
+        ("prior", "coefficient static_sigma"),
+        ("camera", "Camera GSAOI: 4 detectors in a focal plane"),
+    ):
+        assert main(["show", str(tmp_path / f"{name}.asdf")]) == 0
+        assert words in capsys.readouterr().out
+    assert main(["show", "--json", str(tmp_path / "prior.asdf")]) == 0
+    modes = json.loads(capsys.readouterr().out)["modes"]
+    assert [row["static_sigma"] for row in modes] == [0.1, None, 0.1, None]
+    assert main(["show", "--json", str(tmp_path / "camera.asdf")]) == 0
+    assert [each["id"] for each in json.loads(capsys.readouterr().out)["detectors"]] == ["1", "2", "3", "4"]
+    assert main(["show", str(tmp_path / "camera.asdf"), "--strict"]) == 1
+    assert "--strict is for a solution: leave it out" in capsys.readouterr().err
