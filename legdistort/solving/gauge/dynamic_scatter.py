@@ -64,7 +64,7 @@ def dynamic_covariance(problem, state, error, moved, others, night, group, stati
     variance = (others @ error * others).sum(axis=2)
     counts = variance <= 10 * np.median(variance, axis=0)  # values less certain would add noise and nothing else
     nightly, told = np.zeros((0 if night is None else night.max() + 1, own.shape[1])), False
-    if len(nightly):
+    if nightly.size:
         scatter2, nightly, told = _of_nights(problem, own, variance, counts, moved, night, group, static)
     if not nightly.any():
         scatter2, _ = _scatter(own, variance, counts, moved, group, static)
