@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from astropy import units as u
@@ -65,8 +65,8 @@ class NightsFound:
     Attributes
     ----------
     tests : tuple of NightTest
-    statics : tuple of NightStatic
-        Of every detector; empty where there are no two nights.
+    statics : tuple of NightStatic, or callable
+        Of every detector, or a function that makes them; empty where there are no two nights.
     """
 
     tests: tuple[NightTest, ...] = ()
@@ -97,7 +97,12 @@ def blocks(solution):
 
 
 def found(solution):
-    """The `NightsFound` of a solution; nothing where it was not looked for."""
+    """The `NightsFound` of a solution, whole; nothing where it was not looked for."""
+    nights = _found(solution)
+    return replace(nights, statics=nights.statics()) if callable(nights.statics) else nights
+
+
+def _found(solution):
     nights = solution.estimate.nights
     return (nights(solution) if callable(nights) else nights) or NightsFound()
 
@@ -113,7 +118,7 @@ def table(solution):
     stated = np.column_stack([observed[each].to_value(u.pix) for each in ("x_err", "y_err")])
     freedom = offset.size / max(solution.dof, 1)
     rows = []
-    for n, (label, test) in enumerate(zip(labels, found(solution).tests or (NightTest(),) * len(labels), strict=True)):
+    for n, (label, test) in enumerate(zip(labels, _found(solution).tests or (NightTest(),) * len(labels), strict=True)):
         mine, own = night == n, number == n
         known = years[own][np.isfinite(years[own])]
         rows.append(

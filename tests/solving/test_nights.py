@@ -223,6 +223,7 @@ def test_figures_of_a_night_are_those_of_its_observations():
         ({"odd": 0.5, "alone": True}, [4]),  # one exposure
         ({"odd": 0.5, "alone": True, "per": 1, "nights": 10}, [5]),  # as all others
         ({"nights": 3, "odd": 0.5}, [1]),
+        ({"nights": 30, "odd": 0.5, "per": 2, "n_stars": 60}, [15]),  # in two groups
         ({"nights": 2, "odd": 0.5}, []),  # nothing tells which
         ({"nights": 3}, []),
         ({"alone": True}, []),
@@ -235,6 +236,15 @@ def test_nights_are_odd_among_few_and_unlike_ones(words, odd):
     assert len(table) == words.get("nights", 8)
     if words.get("nights") == 2:  # that they differ is seen all the same
         assert table["p"].max() < 1e-6
+
+
+@pytest.mark.parametrize(("size", "named"), [(0.06, False), (0.1, True)])
+def test_a_night_is_odd_from_three_times_the_scatter_of_the_others(size, named):
+    """However improbable."""
+    worst = solved(Nights(3, roll=0.7, odd=size, n_stars=120)).nights[0]
+    assert worst["block"] == 4
+    assert worst["p"] < 1e-4
+    assert (worst["ratio"] > 3) == worst["odd"] == named
 
 
 def test_one_night_has_nothing_to_be_compared_with():

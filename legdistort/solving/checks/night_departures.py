@@ -8,6 +8,7 @@ so that a night that is odd moves nothing of what it is compared with; the rest 
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy import sparse, special
@@ -65,8 +66,13 @@ def found_nights(solution, problem, state, blocks):
     tests = {n: _together(each) for n, each in found.items()}
     sound = np.isin(night, [n for n, test in tests.items() if not test.odd])
     parts = [np.flatnonzero((problem.detectors == detector) & sound) for detector in np.unique(problem.detectors)]
-    statics = [_static(solution, problem, state, each) for each in parts]
-    return NightsFound(tuple(tests.values()), tuple(each for each in statics if each is not None))
+
+    @cache
+    def statics():
+        each = [_static(solution, problem, state, part) for part in parts]
+        return tuple(static for static in each if static is not None)
+
+    return NightsFound(tuple(tests.values()), statics)
 
 
 def _static(solution, problem, state, each):
@@ -213,12 +219,16 @@ class _Means:
         """The test of night k by those that are not left out; by the scatter of these, or that of a posterior."""
         n = len(self.values)
         unseen = out if others is not None or n - len(out | {k}) < FEWEST < n else out | {k}
+        rows, screened = slice(k * len(self.degrees), (k + 1) * len(self.degrees)), others is not None
         others = self._posterior(unseen) if others is None else others
-        free = others if unseen == out | {k} else self._posterior(out | {k}, others.sizes)
-        rows, scatter = slice(k * len(self.degrees), (k + 1) * len(self.degrees)), others.sizes[self.degrees - 1] ** 2
-        away, errors = free.left[0][rows], free.of_rows[rows, rows]
-        covariance = errors + np.diag(scatter)
-        size, directions = np.linalg.eigh(errors)
+        scatter = others.sizes[self.degrees - 1] ** 2
+        if screened:  # what it departs by from the prediction of all others follows from the posterior of all
+            covariance = np.linalg.inv(self._precision(others, k))
+            away = covariance @ (others.left[0][rows] / scatter)
+        else:
+            free = others if unseen == out | {k} else self._posterior(out | {k}, others.sizes)
+            away, covariance = free.left[0][rows], free.of_rows[rows, rows] + np.diag(scatter)
+        size, directions = np.linalg.eigh(covariance - np.diag(scatter))
         directions = directions[:, size < _KNOWN**2 + scatter.max()].T
         if not len(directions):
             return NightTest()
@@ -234,14 +244,19 @@ class _Means:
 
     def _freedom(self, posterior, unseen):
         """Degrees of freedom, by degree, of the squares of those nights from which the scatter was found."""
-        out, n_modes = np.zeros(len(posterior.sizes)), len(self.degrees)
+        out = np.zeros(len(posterior.sizes))
         scatter = np.diag(posterior.sizes[self.degrees - 1] ** 2)
         for k in set(range(len(self.values))) - set(unseen):
-            rows = slice(k * n_modes, (k + 1) * n_modes)
-            inverse = 1 / posterior.widths[rows] ** 2
-            left = np.diag(inverse) - inverse[:, None] * posterior.of_rows[rows, rows] * inverse
-            out += np.bincount(self.degrees - 1, np.diag((self.covariance[k] + scatter) @ left), len(out))
+            share = np.diag((self.covariance[k] + scatter) @ self._precision(posterior, k))
+            out += np.bincount(self.degrees - 1, share, len(out))
         return out
+
+    def _precision(self, posterior, k):
+        """Inverse covariance (K, K) of what a night departs by from the prediction of all others in a posterior."""
+        rows = slice(k * len(self.degrees), (k + 1) * len(self.degrees))
+        inverse = 1 / posterior.widths[rows] ** 2
+        out = np.diag(inverse) - inverse[:, None] * posterior.of_rows[rows, rows] * inverse
+        return (out + out.T) / 2
 
 
 def _chance(away, covariance, of, dof):
