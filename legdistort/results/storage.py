@@ -238,6 +238,8 @@ def _check_consistent(solution):
     for column, known in (("exposure", solution.names), ("star", estimate.star_names)):
         if not np.isin(np.asarray(table[column]), known).all():
             raise ValueError(f"the table of residuals names {column}s that are not in the list of them")
+    if (tests := nights.found(solution).tests) and len(tests) != len(nights.blocks(solution)[1]):
+        raise ValueError(f"there are tests of {len(tests)} nights, and {len(nights.blocks(solution)[1])} of these")
 
 
 def _check_common(gauge, uncertainty):

@@ -5,6 +5,7 @@ import pickle
 import re
 import warnings
 
+import asdf
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -192,6 +193,15 @@ def test_the_odd_night_is_named_with_all_its_exposures(tmp_path):
     solution.write(tmp_path / "solution.asdf")
     for again in (ld.Solution.read(tmp_path / "solution.asdf"), pickle.loads(pickle.dumps(solution))):
         assert again.nights.pformat() == table.pformat()
+
+
+def test_a_file_with_tests_of_other_nights_is_refused(tmp_path):
+    solution = solved(Nights(1, nights=3, per=2, n_stars=60))
+    with asdf.open(solution.write(tmp_path / "solution.asdf"), lazy_load=False, memmap=False) as file:
+        file["legdistort"]["nights"]["tests"].pop()
+        file.write_to(tmp_path / "other.asdf")
+    with pytest.raises(InputError, match="tests of 2 nights, and 3 of these"):
+        ld.Solution.read(tmp_path / "other.asdf")
 
 
 def test_an_odd_night_moves_nothing_of_what_the_others_are_compared_with():
