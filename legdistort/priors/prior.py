@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from ..inputs.exposures import Exposure
+    from ..results.solution import Solution
     from ..runtime.annotations import Extension, Shape, StrPath
 
 #: As `sigma` of a `Prior`: to be found from the exposures.
@@ -345,7 +346,7 @@ class Prior(ShownAsPrinted):
         Parameters
         ----------
         where : str, path, or sequence of two of them
-            ``prior.asdf``, ``solution.asdf`` (the mean of its exposures), or any source of
+            ``prior.asdf``, ``solution.asdf`` or the folder with it (`from_solution`), or any source of
             `legdistort.priors.from_files.read_source`: ASDF with a gwcs or a model, FITS headers, two FITS maps,
             Drizzle coefficients, ``gsaoi-1`` ... ``gsaoi-4``, ``siaf:INSTRUMENT/APERTURE``.
         ext : int, str or (str, int), optional
@@ -404,6 +405,29 @@ class Prior(ShownAsPrinted):
         from .from_headers import from_headers
 
         return from_headers(exposures, cls, degree=degree, sigma=sigma, static_sigma=static_sigma)
+
+    @classmethod
+    def from_solution(cls, solution: Solution) -> Prior:
+        """Static distortion of the exposures of an earlier solution, for nights that come.
+
+        Of several nights it is that about which they scatter, odd ones left out, and `static_sigma` is the scatter of
+        single nights and its own error together; infinite where nothing determines it (shear, and maps of degree 2,
+        without rolls or a prior). Of one night it is the mean of its exposures, without a width: it does not tell how
+        far nights scatter.
+
+        Parameters
+        ----------
+        solution : Solution
+            Of one detector.
+
+        Raises
+        ------
+        InputError
+            If it has detectors of several shapes.
+        """
+        from .storage import of_solution
+
+        return of_solution(solution, cls, {})
 
     def write(self, path: StrPath, *, overwrite: bool = False) -> Path:
         """Write everything to an ASDF file (`legdistort.priors.storage`)."""

@@ -12,6 +12,7 @@ from ..cameras.source import check_shape
 from ..exceptions import InputError
 from ..geometry import similarity
 from ..geometry.basis import check_degree
+from ..results.nights import found
 from ..results.solution import Solution
 from ..runtime import provenance
 from ..runtime.asdf_files import ASDF_STANDARD, check_layout, check_tree, read_tree, understood
@@ -83,7 +84,9 @@ def open_prior(where, kind, *, ext=None, frame=None, sigma=None, static_sigma=No
 
 
 def _ready(where, kind):
-    """The prior in a file of a prior, a solution or a camera; None for anything else."""
+    """The prior in a file of a prior, a solution or a camera, or a folder of results; None for anything else."""
+    if isinstance(where, (str, Path)) and (Path(where) / "solution.asdf").is_file():
+        where = Path(where) / "solution.asdf"
     if not isinstance(where, (str, Path)) or not Path(where).is_file():
         return None
     with open(where, "rb") as file:
@@ -110,10 +113,19 @@ def _of_camera(path, kind):
 
 
 def _of_solution(path, kind):
-    """The mean distortion of the exposures of another field."""
+    """The static distortion of the exposures of another field."""
     earlier = Solution.read(path)
-    shapes = set(earlier.estimate.shapes.values())
+    return of_solution(earlier, kind, {"name": str(path), "files": {Path(path).name: earlier.checksum}})
+
+
+def of_solution(solution, kind, source):
+    """See `Prior.from_solution`; with where it is from."""
+    shapes = set(solution.estimate.shapes.values())
     if len(shapes) > 1:
-        raise InputError(f"{path} has detectors of several shapes, {sorted(shapes)}; it gives no single prior")
-    record = {"kind": "solution", "name": str(path), "files": {Path(path).name: earlier.checksum}}
-    return kind(earlier.coefficients.mean(axis=0), shape=shapes.pop(), source=record)
+        name = source.get("name", "the solution")
+        raise InputError(f"{name} has detectors of several shapes, {sorted(shapes)}; it gives no single prior")
+    known = {"shape": shapes.pop(), "source": {"kind": "solution"} | source}
+    statics = found(solution).statics
+    if len(statics) != 1:
+        return kind(solution.coefficients.mean(axis=0), **known)
+    return kind(statics[0].mean, static_sigma=statics[0].sigma, **known)

@@ -41,8 +41,8 @@ class Estimate:
         usual form, which is the same function.
     checked : callable or tuple of Check
         The checks, or a function that makes them from the solution.
-    nights : callable or tuple of `legdistort.results.nights.NightTest`
-        The tests of nights, or a function that makes them from the solution; empty where they were not made.
+    nights : callable or `legdistort.results.nights.NightsFound`
+        What nights show, or a function that makes it from the solution; None where it was not looked for.
     certified : dict
         ``{exposure: Distortion}`` that views have made, or a file has, with their certified inverses; they count as
         long as the coefficients are the same.
@@ -56,7 +56,7 @@ class Estimate:
     motions: StarMotions | None = None
     form: object = None
     checked: Any = field(default=(), repr=False)
-    nights: Any = field(default=(), repr=False)
+    nights: Any = field(default=None, repr=False)
     certified: dict[str, Distortion] = field(default_factory=dict, repr=False)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from astropy import units as u
@@ -10,7 +10,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from ..inputs import column_contract
-from ..runtime.trees.facts import number
+from ..runtime.trees.facts import array, number
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,40 @@ class NightTest:
     odd: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class NightStatic:
+    """The static distortion of a detector that nights scatter about, as known of one that comes.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (2, n_modes)
+        Pixels.
+    sigma : ndarray, shape (2, n_modes)
+        Of a night that comes: the error of the mean and the scatter of nights; infinite where it is not determined.
+    n_nights : int
+        From which it was found.
+    """
+
+    mean: np.ndarray = field(metadata=array(2, "n_series", unit="pix"))
+    sigma: np.ndarray = field(metadata=array(2, "n_series", unit="pix", minimum=0, infinite=True))
+    n_nights: int = field(metadata=number(minimum=1))
+
+
+@dataclass(frozen=True, eq=False)
+class NightsFound:
+    """What nights show: the test of every one, in the order of their numbers, and the static distortion of detectors.
+
+    Attributes
+    ----------
+    tests : tuple of NightTest
+    statics : tuple of NightStatic, or callable
+        Of every detector, or a function that makes them; empty where there are no two nights.
+    """
+
+    tests: tuple[NightTest, ...] = ()
+    statics: tuple[NightStatic, ...] = ()
+
+
 _DATES = 1800, 2200  # years that are dates beyond doubt
 
 
@@ -62,10 +96,15 @@ def blocks(solution):
     return number, [time if dates.count(date) > 1 else date for date, time in zip(dates, times, strict=True)], years
 
 
-def tests(solution):
-    """The `NightTest` of every night, in the order of their numbers; none where they were not made."""
-    found = solution.estimate.nights
-    return found(solution) if callable(found) else found
+def found(solution):
+    """The `NightsFound` of a solution, whole; nothing where it was not looked for."""
+    nights = _found(solution)
+    return replace(nights, statics=nights.statics()) if callable(nights.statics) else nights
+
+
+def _found(solution):
+    nights = solution.estimate.nights
+    return (nights(solution) if callable(nights) else nights) or NightsFound()
 
 
 def table(solution):
@@ -79,7 +118,7 @@ def table(solution):
     stated = np.column_stack([observed[each].to_value(u.pix) for each in ("x_err", "y_err")])
     freedom = offset.size / max(solution.dof, 1)
     rows = []
-    for n, (label, test) in enumerate(zip(labels, tests(solution) or (NightTest(),) * len(labels), strict=True)):
+    for n, (label, test) in enumerate(zip(labels, _found(solution).tests or (NightTest(),) * len(labels), strict=True)):
         mine, own = night == n, number == n
         known = years[own][np.isfinite(years[own])]
         rows.append(

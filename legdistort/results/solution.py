@@ -142,7 +142,7 @@ class Solution(ShownAsPrinted):
     def __getstate__(self) -> dict[str, Any]:
         """What goes into a pickle: numbers as a file has them, nothing of the equations that they came from."""
         state = {each.name: getattr(self, each.name) for each in fields(self)}
-        known = {"checked": self.checks, "nights": nights.tests(self)}
+        known = {"checked": self.checks, "nights": nights.found(self)}
         estimate = replace(self.estimate, **known, uncertainty=plain_covariances(self.estimate))
         return state | {"estimate": estimate, "gauge": replace(self.gauge, responses=estimate.uncertainty)}
 

@@ -36,7 +36,7 @@ from .errors.absolute_errors import absolute_variance, own_blocks
 from .estimate import Estimate, StoredUncertainty, plain_covariances
 from .gauge import Gauge
 from .motions import StarMotions
-from .nights import NightTest
+from .nights import NightsFound
 from .settings import Settings
 
 #: Version of the layout under ``legdistort``.
@@ -101,7 +101,7 @@ def write_solution(solution, path, *, overwrite=False):
         "left_out": solution.left_out,
         "camera": to_tree(solution.camera) if solution.camera.is_known else None,
         "checks": [to_tree(each) for each in solution.checks],
-        "nights": [to_tree(each) for each in nights.tests(solution)],
+        "nights": to_tree(nights.found(solution)),
     }
     content = asdf.AsdfFile({"legdistort": tree}, version=ASDF_STANDARD)
     for column in tree["observations"].values():  # names repeat; covariances and coefficients would not get smaller
@@ -175,7 +175,7 @@ def _from_tree(kind, checksum, tree):
             uncertainty=uncertainty,
             motions=motions,
             checked=_part(tuple[Check, ...], tree, "checks", sizes),
-            nights=_part(tuple[NightTest, ...], tree, "nights", sizes),
+            nights=_part(NightsFound | None, tree, "nights", sizes),
             certified={
                 e.name: Distortion(e.coefficients, e.shape, e.name, e.inverse)  # checks the certificate
                 for e in exposures
@@ -190,7 +190,7 @@ def _from_tree(kind, checksum, tree):
 
 def _part(kind, tree, entry, sizes, *, strict=True):
     """An entry of the tree; none of it for one that files of earlier versions lack."""
-    given = tree.get(entry, [] if entry in ("checks", "nights") else None)
+    given = tree.get(entry, [] if entry == "checks" else None)
     return from_tree(kind, given, f"{ROOT}.{entry}", sizes=sizes, strict=strict)
 
 
@@ -238,6 +238,8 @@ def _check_consistent(solution):
     for column, known in (("exposure", solution.names), ("star", estimate.star_names)):
         if not np.isin(np.asarray(table[column]), known).all():
             raise ValueError(f"the table of residuals names {column}s that are not in the list of them")
+    if (tests := nights.found(solution).tests) and len(tests) != len(nights.blocks(solution)[1]):
+        raise ValueError(f"there are tests of {len(tests)} nights, and {len(nights.blocks(solution)[1])} of these")
 
 
 def _check_common(gauge, uncertainty):

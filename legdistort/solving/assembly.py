@@ -13,7 +13,7 @@ from ..results.estimate import Estimate
 from ..results.motions import StarMotions
 from ..results.solution import Solution
 from ..runtime import provenance
-from .checks.night_departures import night_tests
+from .checks.night_departures import found_nights
 from .checks.solution_checks import check_solution
 from .equations import criterion
 from .equations.elimination import inverse_star_blocks
@@ -76,7 +76,7 @@ def assemble(matches, problem, state, blocks, gauge, uncertainty, *, settings, s
             uncertainty=uncertainty,
             motions=motions,
             form=form,
-            nights=cache(partial(night_tests, problem=problem, blocks=blocks)),
+            nights=cache(partial(found_nights, problem=problem, state=state, blocks=blocks)),
             checked=partial(
                 check_solution,
                 problem=problem,

@@ -5,6 +5,7 @@ import pickle
 import re
 import warnings
 
+import asdf
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -205,6 +206,15 @@ def test_the_odd_night_is_named_with_all_its_exposures(tmp_path):
         assert again.nights.pformat() == table.pformat()
 
 
+def test_a_file_with_tests_of_other_nights_is_refused(tmp_path):
+    solution = solved(Nights(1, nights=3, per=2, n_stars=60))
+    with asdf.open(solution.write(tmp_path / "solution.asdf"), lazy_load=False, memmap=False) as file:
+        file["legdistort"]["nights"]["tests"].pop()
+        file.write_to(tmp_path / "other.asdf")
+    with pytest.raises(InputError, match="tests of 2 nights, and 3 of these"):
+        ld.Solution.read(tmp_path / "other.asdf")
+
+
 def test_an_odd_night_moves_nothing_of_what_the_others_are_compared_with():
     figures = []
     for odd in (0.5, 3.0):
@@ -234,6 +244,7 @@ def test_figures_of_a_night_are_those_of_its_observations():
         ({"odd": 0.5, "alone": True}, [4]),  # one exposure
         ({"odd": 0.5, "alone": True, "per": 1, "nights": 10}, [5]),  # as all others
         ({"nights": 3, "odd": 0.5}, [1]),
+        ({"nights": 30, "odd": 0.5, "per": 2, "n_stars": 60}, [15]),  # in two groups
         ({"nights": 2, "odd": 0.5}, []),  # nothing tells which
         ({"nights": 3}, []),
         ({"alone": True}, []),
@@ -246,6 +257,15 @@ def test_nights_are_odd_among_few_and_unlike_ones(words, odd):
     assert len(table) == words.get("nights", 8)
     if words.get("nights") == 2:  # that they differ is seen all the same
         assert table["p"].max() < 1e-6
+
+
+@pytest.mark.parametrize(("size", "named"), [(0.06, False), (0.1, True)])
+def test_a_night_is_odd_from_three_times_the_scatter_of_the_others(size, named):
+    """However improbable."""
+    worst = solved(Nights(3, roll=0.7, odd=size, n_stars=120)).nights[0]
+    assert worst["block"] == 4
+    assert worst["p"] < 1e-4
+    assert (worst["ratio"] > 3) == worst["odd"] == named
 
 
 def test_one_night_has_nothing_to_be_compared_with():
@@ -294,6 +314,72 @@ def test_odd_nights_are_found_by_name(roll):
     for seed in range(6):
         table = solved(Nights(seed, odd=0.5, roll=roll)).nights
         assert table["block"][table["odd"]].tolist() == [4]
+
+
+# --- other nights as a prior --------------------------------------------------------------------------------------
+
+
+def next_night(nights, prior_of=ld.Prior.from_solution, **options):
+    """Squares of absolute errors of the last night with the others as prior, and the sum of the variances stated."""
+    new = nights.table["block"] == nights.table["block"].max()
+    prior = prior_of(solved_table(nights.table[~new]))
+    solution = ld.solve(ld.Matches.from_table(nights.table[new], shape=(SIZE, SIZE)), prior=prior, **options)
+    off = nights.offsets(solution.stars)
+    stated = np.column_stack([solution.stars[c].value for c in ("x_err_abs", "y_err_abs")])
+    finite = np.isfinite(off) & np.isfinite(stated)
+    return np.sum(off[finite] ** 2), np.sum(stated[finite] ** 2)
+
+
+def solved_table(table):
+    return ld.solve(matches(table, block=None))
+
+
+def plain_modes(tensor):
+    """Normalised coefficients (2, 10) of plain Legendre ones (2, 4, 4)."""
+    orders = [(total - k, k) for total in range(4) for k in range(total + 1)]
+    return np.array([[2 * each[i, j] / np.sqrt((2 * i + 1) * (2 * j + 1)) for i, j in orders] for each in tensor])
+
+
+def test_other_nights_are_a_prior_with_their_scatter_as_its_width(tmp_path):
+    """Where their static distortion was known exactly it is the width; else it is as much at least."""
+    nights = Nights(3, nights=12, per=3, n_stars=120, single=0.003, nightly=0.05, odd=1.0)
+    known = ld.Prior(plain_modes(nights.static), shape=(SIZE, SIZE))
+    solution = ld.solve(matches(nights.table, block=None), prior=known)
+    solution.write(tmp_path / "solution.asdf")
+    prior, free = ld.Prior.from_file(tmp_path), ld.Prior.from_solution(solved_table(nights.table))
+    scatter = np.array([plain_modes(each) for each in np.delete(nights.common, nights.odd, axis=0)]).std(axis=0)
+    for of in (slice(3, 6), slice(6, 10)):  # by degree; the odd night has no part in it
+        seen, width, wide = (
+            np.sqrt(np.mean(each[:, of] ** 2)) for each in (scatter, prior.static_sigma, free.static_sigma)
+        )
+        assert_allclose(width, seen, rtol=0.3)
+        assert width < wide < 3 * seen
+    assert_allclose(prior.mean[:, 3:], known.mean[:, 3:], atol=1e-3)
+    assert np.abs(free.mean - known.mean)[:, 3:].max() < 0.1
+    assert_array_equal(ld.Prior.from_solution(solution).static_sigma, prior.static_sigma)
+    assert ld.Prior.from_file(tmp_path, static_sigma=0.5).static_sigma[0, 4] == 0.5
+
+
+def test_what_other_nights_do_not_determine_is_infinite():
+    """Without rolls: shear and z^2. One night alone tells nothing of how far nights scatter."""
+    solution = solved_table(Nights(3, roll=0.0, nights=5, per=3, n_stars=100).table)
+    prior = ld.Prior.from_solution(solution)
+    assert np.isinf(prior.static_sigma[:, 1:6]).all()
+    assert np.isfinite(prior.static_sigma[:, 6:]).all()
+    assert ld.Prior.from_solution(solved_table(Nights(3, nights=1, n_stars=100).table)).static_sigma is None
+
+
+@pytest.mark.slow
+def test_absolute_errors_of_a_night_with_others_as_prior_are_right():
+    """With their mean as exact, as it was, the squares are 1.8 times what is stated."""
+
+    def exact(solution):
+        return ld.Prior(solution.coefficients.mean(axis=0), shape=(SIZE, SIZE))
+
+    off, stated = np.sum([next_night(Nights(seed)) for seed in range(20)], axis=0)
+    assert 0.8 < off / stated < 1.2
+    off, stated = np.sum([next_night(Nights(seed), exact) for seed in range(20)], axis=0)
+    assert off / stated > 1.4
 
 
 # --- absolute errors -----------------------------------------------------------------------------------------------

@@ -3,21 +3,23 @@
 Of the exposures of night n, ``m_n = S + M_n g + B_n + d_n``: their mean coefficients, S the static distortion of the
 detector, g a common map of the reference plane (with motions one that grows with time beside), ``B_n ~ N(0, Lambda)``
 the departure of the night, d_n the mean of departures and errors of its exposures. Lambda, by degree, is that which
-makes the other nights most likely (`most_likely`), and S and g are free, so that a night that is odd moves nothing of
-what it is compared with. Nights that are odd are left out of what the rest is compared with.
+makes the other nights most likely (`most_likely`). S is free, and g but for what differences within nights show of it,
+so that a night that is odd moves nothing of what it is compared with; the rest is compared without it.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy import sparse, special
 
-from ...geometry.detector_modes import dynamic_basis, dynamic_degrees
+from ...geometry.detector_modes import dynamic_basis, dynamic_degrees, row_variances
 from ...results.check import FALSE_ALARM
-from ...results.nights import NightTest
+from ...results.nights import NightsFound, NightStatic, NightTest
+from ..knowledge.exposures import RANGE, ExposureModel
 from ..knowledge.factors import GIVEN, Factor
 from ..knowledge.posterior import Posterior, most_likely
-from ..knowledge.reduced_data import ReducedData
+from ..knowledge.reduced_data import ReducedData, drawn, part_of
 
 #: Times the scatter of the others and the errors, from which a departure is odd.
 ODD = 3.0
@@ -27,28 +29,30 @@ FEWEST = 2
 _MOST = 24
 #: Up to so many nights the scatter of the others is found anew for each; among more a single one does not count.
 _EACH = 12
+_COEFFICIENTS = 500  # from which the static distortion of nights is found
 _FREE = 100.0  # size of what is free [pix]
 #: Scatter is sought within these factors of the typical error of a mean; less is none, and smaller numbers lose digits.
 _RANGE = 0.1, 1e6
 _MAP = 2.0  # size of a common map, in that of the coefficients: the plane is none that would need larger ones
-_SMALLEST = 1e-6  # pixels
+_SMALLEST = 1e-5  # pixels: as good as exact
 _KNOWN = 0.3 * np.sqrt(8)  # error of a coefficient beyond which a direction is not determined [pix]
 
 
-def night_tests(solution, problem, blocks):
-    """The `NightTest` of every night, in the order of their numbers.
+def found_nights(solution, problem, state, blocks):
+    """What nights show, a `NightsFound`.
 
     Parameters
     ----------
     solution : Solution
     problem : Problem
         With the weights that were in force.
+    state : State
     blocks : Blocks
     """
     night = np.broadcast_to(problem.night, problem.n_exposures)
     number = np.unique(night)
     if solution.gauge.plane is not None or problem.degree < 1 or problem.unknowns.shared or len(number) < 2:
-        return tuple(NightTest() for _ in number)
+        return NightsFound(tuple(NightTest() for _ in number))
     found = {n: [] for n in number}
     rng = np.random.default_rng(0)
     for detector in np.unique(problem.detectors):
@@ -59,7 +63,46 @@ def night_tests(solution, problem, blocks):
             means = _Means.of(solution, problem, blocks, some, np.unique(night[some], return_inverse=True)[1])
             for n, test in zip(np.sort(part), means.tests(FALSE_ALARM / len(number)), strict=True):
                 found[n].append(test)
-    return tuple(_together(tests) for tests in found.values())
+    tests = {n: _together(each) for n, each in found.items()}
+    sound = np.isin(night, [n for n, test in tests.items() if not test.odd])
+    parts = [np.flatnonzero((problem.detectors == detector) & sound) for detector in np.unique(problem.detectors)]
+
+    @cache
+    def statics():
+        each = [_static(solution, problem, state, part) for part in parts]
+        return tuple(static for static in each if static is not None)
+
+    return NightsFound(tuple(tests.values()), statics)
+
+
+def _static(solution, problem, state, each):
+    """The `NightStatic` of a detector from some of its exposures (k,), by the model of all exposures.
+
+    What is stated of it counts. A common map of the plane is free as it is.
+    """
+    keep = each[drawn(np.zeros(len(each)), _COEFFICIENTS // (2 * problem.n_modes))]
+    problem, state = part_of(problem, state, keep)
+    if len(np.unique(problem.night)) < FEWEST:
+        return None
+    n, rows = problem.n_modes, dynamic_basis(problem.shapes[0], problem.n_modes)
+    stated = np.zeros((2, n)) if problem.mean_sigma is None else problem.mean_sigma[0][:, :n]
+    stated = np.clip(np.sqrt(row_variances(rows, stated.ravel())), _SMALLEST, _FREE)
+    model = ExposureModel.of(problem, state, solution.gauge.all_motion[keep], np.zeros(len(keep), dtype=int))
+    unit = 1 / np.sqrt(np.median(np.diag(model.data.curvature)))
+    factor = Factor.joined([model.departures, model.statics(width=stated)])
+    found = most_likely(model.data, factor, np.full(model.n_scatters, 10 * unit), unit * np.array(RANGE))
+    mine, covariance = slice(-len(rows), None), found.covariance[-len(rows) :, -len(rows) :]
+    scatter = problem.night_sigma
+    if scatter is None:  # where every night has one exposure, that of exposures
+        scatter = found.sizes[model.degrees - 1 + (model.degrees.max() if model.n_nights else 0)]
+    # widths have no correlations: a diagonal matrix of such sums is no smaller than the covariance in any direction
+    variance = np.abs(covariance).sum(axis=1) + scatter**2
+    variance[np.diag(covariance) > _KNOWN**2] = np.inf
+    out = problem.prior_mean[0].copy()
+    out[:, :n] += (rows.T @ found.mean[mine]).reshape(2, n)
+    sigma = np.zeros(out.shape)
+    sigma[:, :n] = np.sqrt([variance[of].sum() for of in (rows != 0).T]).reshape(2, n)  # each is in one row, or in none
+    return NightStatic(out, sigma, len(np.unique(problem.night)))
 
 
 def _together(tests):
@@ -90,12 +133,16 @@ class _Means:
     maps : ndarray, shape (n, K, m)
         M_n.
     degrees : ndarray of int, shape (K,)
+    root, seen : ndarray, shapes (m, m) and (m,)
+        ``root g - seen ~ N(0, 1)``: what differences of exposures within nights show of g.
     """
 
     values: np.ndarray
     covariance: np.ndarray
     maps: np.ndarray
     degrees: np.ndarray
+    root: np.ndarray
+    seen: np.ndarray
 
     @classmethod
     def of(cls, solution, problem, blocks, each, owner):
@@ -108,9 +155,16 @@ class _Means:
         motion = np.pad(motion, ((0, 0), (0, 0), (0, size - gauge.n_own), (0, 0)))
         maps = np.einsum("ka,iam->ikm", rows, motion.reshape(len(each), 2 * size, -1))
         mean = np.eye(owner.max() + 1)[:, owner] / np.bincount(owner)[:, None]
-        covariance = np.einsum("ni,ikl->nkl", mean**2, noise)
-        covariance += _within(a, np.diagonal(noise, axis1=1, axis2=2), owner, degrees)[:, :, None] * np.eye(len(rows))
-        return cls(mean @ a, covariance, np.einsum("ni,ikm->nkm", mean, maps), degrees)
+        values, variance = mean @ a, np.diagonal(noise, axis1=1, axis2=2)
+        map_means = np.einsum("ni,ikm->nkm", mean, maps)
+        apart, moved = a - values[owner], maps - map_means[owner]
+        information = np.eye(maps.shape[2]) / (_MAP * max(np.sqrt(np.mean(values**2)), _SMALLEST)) ** 2
+        weight = 1 / (variance + (_within(apart, variance, owner, degrees) * np.bincount(owner)[:, None])[owner])
+        root = np.linalg.cholesky(information + np.einsum("ikm,ik,ikl->ml", moved, weight, moved)).T
+        seen = np.linalg.solve(root.T, np.einsum("ikm,ik,ik->m", moved, weight, apart))
+        scatter = _within(apart - moved @ np.linalg.solve(root, seen), variance, owner, degrees)
+        covariance = np.einsum("ni,ikl->nkl", mean**2, noise) + scatter[:, :, None] * np.eye(len(rows))
+        return cls(values, covariance, map_means, degrees, root, seen)
 
     def tests(self, alarm):
         """The `NightTest` of every night, whose p is odd below an alarm.
@@ -131,16 +185,18 @@ class _Means:
         return [tests[k] if k in tests else self._test(k, odd - {k}, alarm) for k in range(n)]
 
     def _factor(self, out):
-        """What is known of the departures, those of some nights but that they are free."""
+        """What is known of the departures, those of some nights but that they are free, and of S and g."""
         n, k = self.values.shape
         m = self.maps.shape[2]
         static, maps = sparse.kron(np.ones((n, 1)), -np.eye(k)), sparse.csr_array(-self.maps.reshape(n * k, m))
         own = sparse.hstack([sparse.eye_array(n * k), static, maps], format="csr")
-        free = sparse.eye_array(k + m, (n + 1) * k + m, k=n * k, format="csr")
+        free = sparse.block_array(
+            [[sparse.csr_array((k + m, n * k)), sparse.block_diag([np.eye(k), self.root])]]
+        ).tocsr()
         size = np.where(np.isin(np.arange(n), list(out))[:, None], GIVEN, self.degrees - 1).ravel()
         own = Factor("departures of nights", own, self.values.ravel(), np.full(n * k, _FREE), size)
-        width = np.append(np.full(k, _FREE), np.full(m, _MAP * max(np.sqrt(np.mean(self.values**2)), _SMALLEST)))
-        free = Factor("common", free, np.zeros(k + m), width, np.full(k + m, GIVEN))
+        width, value = np.append(np.full(k, _FREE), np.ones(m)), np.append(np.zeros(k), -self.seen)
+        free = Factor("common", free, value, width, np.full(k + m, GIVEN))
         return Factor.joined([own, free])
 
     def _posterior(self, out, sizes=None):
@@ -148,7 +204,10 @@ class _Means:
         n, k = self.values.shape
         curvature = np.zeros((n, k, n, k))
         curvature[np.arange(n), :, np.arange(n)] = np.linalg.inv(self.covariance)
-        data, factor = ReducedData(curvature.reshape(n * k, n * k), np.zeros(n * k), 0.0, n * k), self._factor(out)
+        data, factor = (
+            ReducedData(curvature.reshape(n * k, n * k), np.zeros(n * k), 0.0, n * k),
+            self._factor(out),
+        )
         if sizes is not None:
             return Posterior(data, factor, sizes)
         unit = 1 / np.sqrt(np.median(np.diag(data.curvature)))
@@ -160,12 +219,16 @@ class _Means:
         """The test of night k by those that are not left out; by the scatter of these, or that of a posterior."""
         n = len(self.values)
         unseen = out if others is not None or n - len(out | {k}) < FEWEST < n else out | {k}
+        rows, screened = slice(k * len(self.degrees), (k + 1) * len(self.degrees)), others is not None
         others = self._posterior(unseen) if others is None else others
-        free = others if unseen == out | {k} else self._posterior(out | {k}, others.sizes)
-        rows, scatter = slice(k * len(self.degrees), (k + 1) * len(self.degrees)), others.sizes[self.degrees - 1] ** 2
-        away, errors = free.left[0][rows], free.of_rows[rows, rows]
-        covariance = errors + np.diag(scatter)
-        size, directions = np.linalg.eigh(errors)
+        scatter = others.sizes[self.degrees - 1] ** 2
+        if screened:  # what it departs by from the prediction of all others follows from the posterior of all
+            covariance = np.linalg.inv(self._precision(others, k))
+            away = covariance @ (others.left[0][rows] / scatter)
+        else:
+            free = others if unseen == out | {k} else self._posterior(out | {k}, others.sizes)
+            away, covariance = free.left[0][rows], free.of_rows[rows, rows] + np.diag(scatter)
+        size, directions = np.linalg.eigh(covariance - np.diag(scatter))
         directions = directions[:, size < _KNOWN**2 + scatter.max()].T
         if not len(directions):
             return NightTest()
@@ -181,14 +244,19 @@ class _Means:
 
     def _freedom(self, posterior, unseen):
         """Degrees of freedom, by degree, of the squares of those nights from which the scatter was found."""
-        out, n_modes = np.zeros(len(posterior.sizes)), len(self.degrees)
+        out = np.zeros(len(posterior.sizes))
         scatter = np.diag(posterior.sizes[self.degrees - 1] ** 2)
         for k in set(range(len(self.values))) - set(unseen):
-            rows = slice(k * n_modes, (k + 1) * n_modes)
-            inverse = 1 / posterior.widths[rows] ** 2
-            left = np.diag(inverse) - inverse[:, None] * posterior.of_rows[rows, rows] * inverse
-            out += np.bincount(self.degrees - 1, np.diag((self.covariance[k] + scatter) @ left), len(out))
+            share = np.diag((self.covariance[k] + scatter) @ self._precision(posterior, k))
+            out += np.bincount(self.degrees - 1, share, len(out))
         return out
+
+    def _precision(self, posterior, k):
+        """Inverse covariance (K, K) of what a night departs by from the prediction of all others in a posterior."""
+        rows = slice(k * len(self.degrees), (k + 1) * len(self.degrees))
+        inverse = 1 / posterior.widths[rows] ** 2
+        out = np.diag(inverse) - inverse[:, None] * posterior.of_rows[rows, rows] * inverse
+        return (out + out.T) / 2
 
 
 def _chance(away, covariance, of, dof):
@@ -199,15 +267,15 @@ def _chance(away, covariance, of, dof):
     return special.fdtrc(m, dof, square / m) if dof >= 1 else 1.0
 
 
-def _within(a, noise, owner, degrees):
-    """Variance (n_nights, K) of the means of nights by the scatter of their exposures (n, K), by degree.
+def _within(apart, noise, owner, degrees):
+    """Variance (n_nights, K) of the means of nights by how far their exposures are apart from these (n, K), by degree.
 
     That of a night whose exposures scatter more than those of the others is its own.
     """
     count = np.bincount(owner)
     mean = np.eye(len(count))[:, owner] / count[:, None]
     by_degree = (degrees == np.unique(degrees)[:, None]).astype(float)
-    squares = (count[:, None] * mean) @ ((a - (mean @ a)[owner]) ** 2) @ by_degree.T
+    squares = (count[:, None] * mean) @ apart**2 @ by_degree.T
     expected = (count[:, None] * mean) @ noise @ by_degree.T * (1 - 1 / count)[:, None]
     free = (count - 1)[:, None] * by_degree.sum(axis=1)
     excess, others = squares - expected, ~np.eye(len(count), dtype=bool)
