@@ -51,8 +51,8 @@ def dynamic_check(solution, problem, blocks):
     if odd:
         named = [f"{name} {ratio:.2g} times as far as the others, by {rms:.2g} px rms" for name, ratio, rms in odd]
         found += (
-            f", {', '.join(named)}: look at what was different then; its distortions are its own, and do "
-            "no harm, but absolute positions are surer without"
+            f", {', '.join(named)}: look at what was different then; its distortions are its own and count less; "
+            "to compare, leave it out (--without)"
         )
     return Check("dynamic part", "pass", p, FALSE_ALARM, found, tests=tuple(tests))
 
