@@ -17,7 +17,7 @@ from .known_maps import DETERMINED
 KEPT = 6.0
 _FREE = 1e3  # width of what nothing is known of [pix]
 _EXACT = 1e-6  # scatter of one night, of which nothing tells [pix]
-_MOST = 1000  # unknowns from which sizes are found
+_MOST, _FEWEST = 600, 12  # unknowns from which sizes are found, and nights, if there are as many
 _ROUNDS, _SETTLED = 20, 0.02
 
 
@@ -146,7 +146,7 @@ def fitted(nights, dates, degrees):
     """
     dated = np.all(np.isfinite(dates))
     dates = dates if dated else np.zeros(len(dates))
-    keep = drawn(np.zeros(len(nights), int), _MOST // (2 * len(degrees)))
+    keep = drawn(np.zeros(len(nights), int), max(_FEWEST, _MOST // (2 * len(degrees))))
     some, n_scatters = [nights[i] for i in keep], int(degrees.max(initial=0))
     sizes, part = np.full(n_scatters, _EXACT), np.ones(len(keep))
     if len(nights) > 1:
