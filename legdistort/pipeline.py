@@ -132,6 +132,7 @@ def run(
     coadding: Mapping[str, Any] | None = None,
     mosaic: bool = True,
     catalogue: str = "none",
+    artificial: int | None = None,
     compare: bool = False,
     truth: Truth | None = None,
     stop_at_bad: bool = False,
@@ -183,6 +184,8 @@ def run(
         'joint': also every star measured in all exposures at once (`legdistort.catalogue`), with what measuring was
         told of detector and PSF, in ``catalogue.ecsv`` and ``photometry.ecsv``. Where none can be made there is a
         warning, and all else is there.
+    artificial : int, optional
+        So many artificial stars for the catalogue: its column ``flux_bias``, and what it misses in the report.
     compare : bool
         Also correct by shifts, by the prior's static distortion and shifts, and by a relative polynomial
         (`legdistort.assessment.baselines`), and report the scatter and the sharpness of the stack that each of them
@@ -232,7 +235,7 @@ def run(
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"}, wanted=mosaic)
     tying = _tying(reference, reference_error, reference_degree, epoch, pixel_scale)
-    _check_others(workers, truth, catalogue)
+    _check_others(workers, truth, catalogue, artificial)
     reading = {"ext": ext, "dq_good": dq_good, "weight_maps": weight_maps, "camera": camera}
     paths, reading, before = _where_to_begin(paths, earlier, measuring, **reading)
     measuring = before.measuring if before else measuring
@@ -252,11 +255,15 @@ def run(
             solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
         kept = [exposure for exposure in exposures if whole_name(exposure) in solution.names]
         stack, quality = _coadded(kept, solution, coadding, share, timings) if mosaic else (None, None)
-        joint = _catalogued(catalogue, kept, solution, measuring, psfs, coadding.scratch, timings, progress)
+        joint = _catalogued(
+            catalogue, kept, solution, measuring, psfs, timings,
+            artificial=artificial, scratch=coadding.scratch, progress=progress,
+        )  # fmt: skip
         comparison, stacks = _compared(compare, matches, solution, solving, quality and stack, kept, coadding, timings)
         summary = summarise(solution, timings=timings) | _counted(joint)
         summary |= _assessed(solution, kept, stack, quality, comparison, stacks, truth, joint)
         shown = {"mosaic": stack, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
+        shown["completeness"] = joint and joint.completeness
         with parallel.beside(partial(_write_report, target, solution, summary, shown), workers=workers) as report:
             with timed(timings, "write"):
                 write_results(solution, target, psfs=psfs, mosaic=stack, joint=joint, progress=progress)
@@ -276,7 +283,7 @@ def _coadded(exposures, solution, coadding, share, timings):
         return stack, _if_possible(stack_quality.assess, stack, solution, exposures=exposures)
 
 
-def _catalogued(kind, exposures, solution, measuring, psfs, scratch, timings, progress):
+def _catalogued(kind, exposures, solution, measuring, psfs, timings, **options):
     """The catalogue of all exposures; None if its kind is "none", and with a warning where there can be none."""
     if kind == "none":
         return None
@@ -286,7 +293,7 @@ def _catalogued(kind, exposures, solution, measuring, psfs, scratch, timings, pr
     psf = {exposure.name: psfs.get(exposure.name, "moffat") for exposure in exposures} if psfs else measuring.psf
     try:
         with timed(timings, "catalogue"):
-            return catalogue(exposures, solution, **told, psf=psf, scratch=scratch, progress=progress)
+            return catalogue(exposures, solution, **told, psf=psf, **options)
     except LegdistortError as error:
         warn(f"no catalogue of all exposures together: {error}", AssumptionWarning)
         return None
@@ -413,10 +420,16 @@ def _step_options(kind, given, argument, *, defaults=None, wanted=True, **own):
     return checks.options_from(kind, given, argument)
 
 
-def _check_others(workers, truth, catalogue):
+def _check_others(workers, truth, catalogue, artificial):
     """Raise `InputError` for arguments that no step looks at before it begins."""
     parallel.check_workers(workers)
     checks.check_choice(catalogue, CATALOGUES, "catalogue")
+    if artificial is not None:
+        checks.check_counts(artificial=artificial)
+        if catalogue == "none":
+            raise InputError(
+                "artificial stars tell what a catalogue misses: give catalogue='joint' (--catalogue joint)"
+            )
     if truth is not None and not isinstance(truth, Truth):
         raise InputError(
             f"truth must be that of a simulation (simulate_exposures(...).truth), got {type(truth).__name__}"

@@ -21,6 +21,7 @@ _SCATTER, _CHANCE = 3.0, 1e-4  # chi2 per degree of freedom of the fluxes, and t
 _FAINT = 30.0  # signal-to-noise ratio: of brighter stars the error of the PSF is larger than that of the fluxes
 _SEEN = 3.0  # signal-to-noise ratio at which an exposure confirms a star
 _CLOSE = 2.0  # FWHM of blended stars
+_DEVIATES = 4.0  # standard deviations of a pixel in the core of a star that is too bright in one exposure alone
 _SEARCHED = 3.0  # FWHM from a place around which it was searched
 
 
@@ -76,11 +77,15 @@ def measure_field(field, xy, left_out, threshold):
     rejected = lone = 0
     while True:
         rejected += lone
+        field.update_sky()
         errors = transmissions.update(field)
         field.fit(np.ones(len(field.flux), dtype=bool), 2)
-        flux, error, varying, lone = _without_lone(field, threshold)
-        if not lone:
-            return Measured(flux, error, image_flags(field), errors, varying, rejected + field.rejected)
+        flux, error, (gone, varying, spoiled) = _by_fluxes(field, threshold)
+        lone = np.count_nonzero(gone)
+        if not _masked(field, spoiled) and not lone:
+            flags = image_flags(field) | np.where(spoiled, Flag.DEFECT, 0)
+            return Measured(flux, error, flags, errors, varying, rejected + field.rejected)
+        field.remove(gone)
 
 
 def measure_again(field, threshold, around=None):
@@ -100,20 +105,35 @@ def measure_again(field, threshold, around=None):
     reach = _SEARCHED * field.fwhm
     while True:
         near = np.ones(len(field.flux), dtype=bool) if around is None else cKDTree(around).query(field.xy)[0] < reach
-        if not _without_lone(field, threshold, np.flatnonzero(near))[-1]:
+        rows, gone = np.flatnonzero(near), np.zeros(len(near), dtype=bool)
+        gone[rows] = _by_fluxes(field, threshold, rows)[2][0]
+        if not gone.any():
             return
+        field.remove(gone)
 
 
-def _without_lone(field, threshold, rows=None):
-    """Fluxes by image, errors and which stars vary, before what one image alone shows is taken off; and its number.
-
-    Of all stars, or of some rows.
-    """
+def _by_fluxes(field, threshold, rows=None):
+    """Fluxes by image of stars, all or some, their errors, and what they tell of the stars (`judged`)."""
     flux, error = by_image(field, rows)
-    rows, gone = np.arange(len(field.flux)) if rows is None else rows, np.zeros(len(field.flux), dtype=bool)
-    gone[rows], varying = judged(flux, error, field.flux[rows], field.snr(rows), threshold)
-    field.remove(gone)
-    return flux, error, varying, int(gone.sum())
+    mean = field.flux if rows is None else field.flux[rows]
+    return flux, error, judged(flux, error, mean, field.snr(rows), threshold)
+
+
+def _masked(field, spoiled):
+    """Whether pixels of images in which a star is too bright (m, n) were found that do so; they are bad from now on."""
+    masked = False
+    for layer, stars in zip(field.layers, spoiled, strict=True):
+        _, own = layer.own(np.flatnonzero(stars))
+        if not len(own):
+            continue
+        scene = layer.scene
+        params, _, pixels, inside = scene.on_stamps(own)
+        high = scene.residual_at(pixels) * np.sqrt(scene.weights.ravel()[pixels]) > _DEVIATES
+        y, x = np.unravel_index(pixels[high & inside & scene.near(params)], scene.light.shape)
+        if len(x):
+            scene.mask(y, x)
+            masked = True
+    return masked
 
 
 def _retune(field):
@@ -136,10 +156,11 @@ def by_image(field, rows=None):
 
 
 def judged(flux, error, mean, snr, threshold):
-    """What is no star, since one exposure alone shows it, and which stars vary; masks (n,).
+    """What is no star, since one exposure alone shows it, which stars vary, and which exposures are spoiled.
 
     A star that three exposures see stands without the strongest of them. Below a signal-to-noise ratio of 30 its
-    fluxes scatter as their errors state, or two exposures confirm it by themselves and it varies.
+    fluxes scatter as their errors state; or those of all exposures but one do, in which it is too bright; or two
+    exposures confirm it by themselves and it varies.
 
     Parameters
     ----------
@@ -148,20 +169,39 @@ def judged(flux, error, mean, snr, threshold):
     mean, snr : ndarray, shape (n,)
         Of the star.
     threshold : float
+
+    Returns
+    -------
+    gone, varying : ndarray of bool, shape (n,)
+    spoiled : ndarray of bool, shape (m, n)
     """
     weight = 1 / error**2
     ratio = np.where(weight > 0, flux / error, -np.inf)
     count, stars = (weight > 0).sum(axis=0), np.arange(flux.shape[1])
-    first = ratio.argmax(axis=0)
-    others = weight.copy()
-    others[first, stars] = 0
-    rest = (others * flux).sum(axis=0) / np.sqrt(np.maximum(others.sum(axis=0), 1e-30))
-    lone = (count >= CONFIRMED) & (rest < threshold - LESS)
-    chi2, dof = (weight * (flux - mean) ** 2).sum(axis=0), np.maximum(count - 1, 1)
-    limit = np.maximum(_SCATTER * dof, chi2_distribution.isf(_CHANCE, dof))
-    varying = (count >= CONFIRMED) & (snr < _FAINT) & (chi2 > limit)
+    _, rest, total = _without(weight, flux, ratio.argmax(axis=0))
+    lone = (count >= CONFIRMED) & (rest * np.sqrt(total) < threshold - LESS)
+    scatter = (count >= CONFIRMED) & (snr < _FAINT) & _scatter(weight, flux, mean)
+    highest = np.where(weight > 0, (flux - mean) / error, -np.inf).argmax(axis=0)
+    others, rest, _ = _without(weight, flux, highest)
+    spoiled = np.zeros(flux.shape, dtype=bool)
+    spoiled[highest, stars] = scatter & ~lone & ~_scatter(others, flux, rest)
+    varying = scatter & ~spoiled.any(axis=0)
     confirmed = (ratio > _SEEN).sum(axis=0) >= 2
-    return lone | (varying & ~confirmed), varying & confirmed & ~lone
+    return lone | (varying & ~confirmed), varying & confirmed & ~lone, spoiled
+
+
+def _without(weight, flux, left_out):
+    """Weights (m, n) without an exposure of each star (n,), the mean flux by them, and their sum."""
+    weight = weight.copy()
+    weight[left_out, np.arange(len(left_out))] = 0
+    total = np.maximum(weight.sum(axis=0), 1e-30)
+    return weight, (weight * flux).sum(axis=0) / total, total
+
+
+def _scatter(weight, flux, mean):
+    """Whether fluxes (m, n) scatter by more than their errors; (n,)."""
+    chi2, dof = (weight * (flux - mean) ** 2).sum(axis=0), np.maximum((weight > 0).sum(axis=0) - 1, 1)
+    return chi2 > np.maximum(_SCATTER * dof, chi2_distribution.isf(_CHANCE, dof))
 
 
 def image_flags(field):
