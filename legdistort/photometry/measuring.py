@@ -74,18 +74,27 @@ def measure_field(field, xy, left_out, threshold):
     """
     transmissions.start(field, xy, left_out)
     search(field, threshold, _retune, pairs)
-    rejected = lone = 0
-    while True:
-        rejected += lone
-        field.update_sky()
-        errors = transmissions.update(field)
-        field.fit(np.ones(len(field.flux), dtype=bool), 2)
-        flux, error, (gone, varying, spoiled) = _by_fluxes(field, threshold)
-        lone = np.count_nonzero(gone)
-        if not _masked(field, spoiled) and not lone:
-            flags = image_flags(field) | np.where(spoiled, Flag.DEFECT, 0)
-            return Measured(flux, error, flags, errors, varying, rejected + field.rejected)
+    field.update_sky()
+    errors, rejected = transmissions.update(field), field.rejected
+    changed, first = np.ones(len(field.flux), dtype=bool), True
+    while changed.any():
+        field.fit(changed, 2)
+        rows, (gone, wrong) = np.flatnonzero(changed), np.zeros((2, len(changed)), dtype=bool)
+        gone[rows], _, spoiled = _by_fluxes(field, threshold, rows)[2]
+        if first:  # once: what is left of a star that follows no PSF would be taken off pixel by pixel
+            wrong[rows] = _masked(field, rows, spoiled)
+            first = False
+        changed = _near(field.xy[~gone], field.xy[gone | wrong], _SEARCHED * field.fwhm)
         field.remove(gone)
+        rejected += int(gone.sum())
+    flux, error, (_, varying, spoiled) = _by_fluxes(field, threshold)
+    flags = image_flags(field) | np.where(spoiled, Flag.DEFECT, 0)
+    return Measured(flux, error, flags, errors, varying, rejected)
+
+
+def _near(xy, places, reach):
+    """Which stars (n, 2) lie so near to some places (m, 2); (n,)."""
+    return np.zeros(len(xy), dtype=bool) if not len(places) else cKDTree(places).query(xy)[0] < reach
 
 
 def measure_again(field, threshold, around=None):
@@ -104,7 +113,7 @@ def measure_again(field, threshold, around=None):
     search(field, threshold, None, pairs, settled=True, around=around)
     reach = _SEARCHED * field.fwhm
     while True:
-        near = np.ones(len(field.flux), dtype=bool) if around is None else cKDTree(around).query(field.xy)[0] < reach
+        near = np.ones(len(field.flux), dtype=bool) if around is None else _near(field.xy, around, reach)
         rows, gone = np.flatnonzero(near), np.zeros(len(near), dtype=bool)
         gone[rows] = _by_fluxes(field, threshold, rows)[2][0]
         if not gone.any():
@@ -119,21 +128,20 @@ def _by_fluxes(field, threshold, rows=None):
     return flux, error, judged(flux, error, mean, field.snr(rows), threshold)
 
 
-def _masked(field, spoiled):
-    """Whether pixels of images in which a star is too bright (m, n) were found that do so; they are bad from now on."""
-    masked = False
+def _masked(field, rows, spoiled):
+    """Pixels that make stars (n,) too bright in some images (m, n) are bad from now on; which stars have some; (n,)."""
+    out = np.zeros(len(rows), dtype=bool)
     for layer, stars in zip(field.layers, spoiled, strict=True):
-        _, own = layer.own(np.flatnonzero(stars))
+        there, own = layer.own(rows[stars])
         if not len(own):
             continue
         scene = layer.scene
         params, _, pixels, inside = scene.on_stamps(own)
         high = scene.residual_at(pixels) * np.sqrt(scene.weights.ravel()[pixels]) > _DEVIATES
-        y, x = np.unravel_index(pixels[high & inside & scene.near(params)], scene.light.shape)
-        if len(x):
-            scene.mask(y, x)
-            masked = True
-    return masked
+        high &= inside & scene.near(params)
+        scene.mask(*np.unravel_index(pixels[high], scene.light.shape))
+        out[np.flatnonzero(stars)[there[high.any(axis=1)]]] = True
+    return out
 
 
 def _retune(field):

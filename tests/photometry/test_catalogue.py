@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table, vstack
-from deep_frames import artificial_inside, compared, deep_frames, excess
+from deep_frames import artificial_inside, compared, deep_frames, excess, light
 
 import legdistort as ld
 from legdistort.cli import main
@@ -201,6 +201,41 @@ def test_what_one_exposure_alone_shows_is_no_star():
     assert lone.tolist() == [False, True, False, False, False, False]
     assert varying.tolist() == [False, False, True, False, False, False]
     assert np.argwhere(spoiled).tolist() == [[6, 5]]
+
+
+def test_a_hit_on_a_faint_star_is_left_out(truth, solution, found):
+    """Its flux stays; a star that brightens in two exposures varies; what one of them alone shows is none."""
+    frames = [frame.copy() for frame in truth.frames]
+    start = np.full_like(truth.xy, np.nan)
+    inside = ((truth.pixels > 60) & (truth.pixels < 260)).all(axis=(0, 2))
+    start[inside] = solution["f00"].correct(truth.pixels[0][inside])
+    apart = np.hypot(*(truth.xy[:, None] - truth.xy).T) + 99 * np.eye(len(truth.xy))
+    faint = np.flatnonzero(inside & (truth.snr > 9) & (truth.snr < 18) & (apart.min(axis=0) > 8))[:4]
+    (hit, other, *_), (variable, *_) = faint[:2], faint[2:]
+    for star in (hit, other):
+        x, y = np.round(truth.pixels[4, star]).astype(int)
+        frames[4][y, x + 1] += 400  # 40 times the noise
+    for k in (2, 5):
+        x, y = truth.pixels[k, variable]
+        columns, rows = (np.arange(round(c) - 8, round(c) + 9) for c in (x, y))
+        frames[k][rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += 700 * light((x, y), columns, rows)[0]
+    frames[1][100, 100], frames[6][200, 150] = 3e3, 3e3
+    again = ld.catalogue(exposures_of(replace(truth, frames=frames)), solution, zero_point=25.0)
+
+    def row(stars, star):
+        away = np.hypot(stars["x"].value - start[star, 0], stars["y"].value - start[star, 1])
+        assert away.min() < 2
+        return stars[np.argmin(away)]
+
+    assert abs(len(again.stars) - len(found.stars)) <= 1
+    for star in (hit, other):
+        one, its = row(again.stars, star), row(found.stars, star)
+        assert abs(one["flux"] - its["flux"]) < one["flux_err"]
+        assert np.hypot(one["x"] - its["x"], one["y"] - its["y"]) < 1.5 * one["x_err"]
+        assert not one["flags"] & Flag.VARIABLE
+        images = again.photometry[again.photometry["star"] == one["star"]]
+        assert set(images["exposure"][(images["flags"] & Flag.DEFECT) > 0]) == {"f04"}
+    assert row(again.stars, variable)["flags"] & Flag.VARIABLE
 
 
 @pytest.mark.parametrize("k", [1, 3])
