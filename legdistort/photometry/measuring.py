@@ -21,7 +21,8 @@ _SCATTER, _CHANCE = 3.0, 1e-4  # chi2 per degree of freedom of the fluxes, and t
 _FAINT = 30.0  # signal-to-noise ratio: of brighter stars the error of the PSF is larger than that of the fluxes
 _SEEN = 3.0  # signal-to-noise ratio at which an exposure confirms a star
 _CLOSE = 2.0  # FWHM of blended stars
-_DEVIATES = 4.0  # standard deviations of a pixel in the core of a star that is too bright in one exposure alone
+# standard deviations of a pixel in the core of a star that is too bright in one exposure alone, and of those beside it
+_DEVIATES, _SKIRT = 4.0, 2.0
 _SEARCHED = 3.0  # FWHM from a place around which it was searched
 
 
@@ -137,8 +138,8 @@ def _masked(field, rows, spoiled):
             continue
         scene = layer.scene
         params, _, pixels, inside = scene.on_stamps(own)
-        high = scene.residual_at(pixels) * np.sqrt(scene.weights.ravel()[pixels]) > _DEVIATES
-        high &= inside & scene.near(params)
+        ratio = scene.residual_at(pixels) * np.sqrt(scene.weights.ravel()[pixels]) * (inside & scene.near(params))
+        high = (ratio > _SKIRT) & (ratio > _DEVIATES).any(axis=1)[:, None]
         scene.mask(*np.unravel_index(pixels[high], scene.light.shape))
         out[np.flatnonzero(stars)[there[high.any(axis=1)]]] = True
     return out

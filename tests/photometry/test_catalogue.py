@@ -204,7 +204,7 @@ def test_what_one_exposure_alone_shows_is_no_star():
 
 
 def test_a_hit_on_a_faint_star_is_left_out(truth, solution, found):
-    """Its flux stays; a star that brightens in two exposures varies; what one of them alone shows is none."""
+    """And a flash of one exposure; a star that brightens in two varies; what one of them alone shows is none."""
     frames = [frame.copy() for frame in truth.frames]
     start = np.full_like(truth.xy, np.nan)
     inside = ((truth.pixels > 60) & (truth.pixels < 260)).all(axis=(0, 2))
@@ -212,13 +212,12 @@ def test_a_hit_on_a_faint_star_is_left_out(truth, solution, found):
     apart = np.hypot(*(truth.xy[:, None] - truth.xy).T) + 99 * np.eye(len(truth.xy))
     faint = np.flatnonzero(inside & (truth.snr > 9) & (truth.snr < 18) & (apart.min(axis=0) > 8))[:4]
     (hit, other, *_), (variable, *_) = faint[:2], faint[2:]
-    for star in (hit, other):
-        x, y = np.round(truth.pixels[4, star]).astype(int)
-        frames[4][y, x + 1] += 400  # 40 times the noise
-    for k in (2, 5):
-        x, y = truth.pixels[k, variable]
+    x, y = np.round(truth.pixels[4, other]).astype(int)
+    frames[4][y, x + 1] += 400  # 40 times the noise
+    for star, k, flux in ((hit, 4, 1500), (variable, 2, 700), (variable, 5, 700)):
+        x, y = truth.pixels[k, star]
         columns, rows = (np.arange(round(c) - 8, round(c) + 9) for c in (x, y))
-        frames[k][rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += 700 * light((x, y), columns, rows)[0]
+        frames[k][rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += flux * light((x, y), columns, rows)[0]
     frames[1][100, 100], frames[6][200, 150] = 3e3, 3e3
     again = ld.catalogue(exposures_of(replace(truth, frames=frames)), solution, zero_point=25.0)
 
@@ -230,7 +229,7 @@ def test_a_hit_on_a_faint_star_is_left_out(truth, solution, found):
     assert abs(len(again.stars) - len(found.stars)) <= 1
     for star in (hit, other):
         one, its = row(again.stars, star), row(found.stars, star)
-        assert abs(one["flux"] - its["flux"]) < one["flux_err"]
+        assert abs(one["flux"] - its["flux"]) < 1.5 * one["flux_err"]
         assert np.hypot(one["x"] - its["x"], one["y"] - its["y"]) < 1.5 * one["x_err"]
         assert not one["flags"] & Flag.VARIABLE
         images = again.photometry[again.photometry["star"] == one["star"]]
