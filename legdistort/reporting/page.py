@@ -28,7 +28,7 @@ def write_report(
     comparison=None,
     stacks=None,
     exposures=(),
-    completeness=None,
+    joint=None,
     files=(),
     overwrite=False,
 ):
@@ -60,8 +60,8 @@ def write_report(
         are added.
     exposures : sequence of Exposure or ExposureFile, optional
         What was co-added: stars of some of them are shown beside those of the mosaic.
-    completeness : `~legdistort.photometry.artificial_stars.Completeness`, optional
-        Of the catalogue of all exposures.
+    joint : `~legdistort.photometry.catalogue.Catalogue`, optional
+        Of all exposures: what it misses is drawn, where artificial stars tell.
     files : sequence of str or path, optional
         Other results, as the page links to them.
     overwrite : bool
@@ -80,8 +80,7 @@ def write_report(
         raise InputError(f"files must be names of results, ('stars.ecsv', 'wcs/'), got {files!r}")
     with replacing(path, overwrite=overwrite) as file:
         shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks}
-        shown["completeness"] = completeness
-        page = render(solution, summary=summary, **shown, exposures=exposures, files=files)
+        page = render(solution, summary=summary, **shown, exposures=exposures, joint=joint, files=files)
         file.write(page.encode())
     return Path(path)
 
@@ -95,7 +94,7 @@ def render(
     comparison=None,
     stacks=None,
     exposures=(),
-    completeness=None,
+    joint=None,
     files=(),
 ):
     """The page of `write_report` as a string."""
@@ -119,7 +118,7 @@ def render(
             "version": version("legdistort"),
             "names": {"s": [str(n) for n in solution.estimate.star_names], "e": list(solution.names)},
             "cutouts": cut_out(solution, mosaic, exposures, fwhm=_fwhm(facts)),
-            **_pictures(gallery, solution, pulls, mosaic, completeness),
+            **_pictures(gallery, solution, pulls, mosaic, joint and joint.completeness),
             **_details(gallery, solution, pulls, psfs, facts, comparison, stacks),
         }
     return _template().render(shown)
