@@ -132,6 +132,7 @@ def run(
     coadding: Mapping[str, Any] | None = None,
     mosaic: bool = True,
     catalogue: str = "none",
+    artificial: int | None = None,
     compare: bool = False,
     truth: Truth | None = None,
     stop_at_bad: bool = False,
@@ -183,6 +184,8 @@ def run(
         'joint': also every star measured in all exposures at once (`legdistort.catalogue`), with what measuring was
         told of detector and PSF, in ``catalogue.ecsv`` and ``photometry.ecsv``. Where none can be made there is a
         warning, and all else is there.
+    artificial : int, optional
+        So many artificial stars for the catalogue: its column ``flux_bias``, and what it misses in the report.
     compare : bool
         Also correct by shifts, by the prior's static distortion and shifts, and by a relative polynomial
         (`legdistort.assessment.baselines`), and report the scatter and the sharpness of the stack that each of them
@@ -232,7 +235,7 @@ def run(
     solving = _step_options(SolveOptions, solving, "solving", degree=degree, prior=_known_prior(prior), clip=clip)
     coadding = _step_options(CoaddOptions, coadding, "coadding", defaults={"method": "clipped"}, wanted=mosaic)
     tying = _tying(reference, reference_error, reference_degree, epoch, pixel_scale)
-    _check_others(workers, truth, catalogue)
+    asked = _checked_others(workers, truth, catalogue, artificial)
     reading = {"ext": ext, "dq_good": dq_good, "weight_maps": weight_maps, "camera": camera}
     paths, reading, before = _where_to_begin(paths, earlier, measuring, **reading)
     measuring = before.measuring if before else measuring
@@ -252,12 +255,12 @@ def run(
             solution = provenance.with_inputs(solution, exposure_files.file_checksums(exposures))
         kept = [exposure for exposure in exposures if whole_name(exposure) in solution.names]
         stack, quality = _coadded(kept, solution, coadding, share, timings) if mosaic else (None, None)
-        joint = _catalogued(catalogue, kept, solution, measuring, psfs, coadding.scratch, timings, progress)
+        joint = _catalogued(asked, kept, solution, measuring, psfs, coadding.scratch, timings, progress)
         comparison, stacks = _compared(compare, matches, solution, solving, quality and stack, kept, coadding, timings)
         summary = summarise(solution, timings=timings) | _counted(joint)
         summary |= _assessed(solution, kept, stack, quality, comparison, stacks, truth, joint)
         shown = {"mosaic": stack, "psfs": psfs, "comparison": comparison, "stacks": stacks, "exposures": kept}
-        with parallel.beside(partial(_write_report, target, solution, summary, shown), workers=workers) as report:
+        with parallel.beside(partial(_report, target, solution, summary, shown, joint), workers=workers) as report:
             with timed(timings, "write"):
                 write_results(solution, target, psfs=psfs, mosaic=stack, joint=joint, progress=progress)
                 write_detections(
@@ -276,9 +279,9 @@ def _coadded(exposures, solution, coadding, share, timings):
         return stack, _if_possible(stack_quality.assess, stack, solution, exposures=exposures)
 
 
-def _catalogued(kind, exposures, solution, measuring, psfs, scratch, timings, progress):
-    """The catalogue of all exposures; None if its kind is "none", and with a warning where there can be none."""
-    if kind == "none":
+def _catalogued(asked, exposures, solution, measuring, psfs, scratch, timings, progress):
+    """The catalogue of all exposures; None if none is asked for, and with a warning where there can be none."""
+    if asked is None:
         return None
     from .photometry.catalogue import catalogue  # it loads numba
 
@@ -286,7 +289,7 @@ def _catalogued(kind, exposures, solution, measuring, psfs, scratch, timings, pr
     psf = {exposure.name: psfs.get(exposure.name, "moffat") for exposure in exposures} if psfs else measuring.psf
     try:
         with timed(timings, "catalogue"):
-            return catalogue(exposures, solution, **told, psf=psf, scratch=scratch, progress=progress)
+            return catalogue(exposures, solution, **told, psf=psf, **asked, scratch=scratch, progress=progress)
     except LegdistortError as error:
         warn(f"no catalogue of all exposures together: {error}", AssumptionWarning)
         return None
@@ -301,12 +304,12 @@ def _counted(joint):
     return {"catalogue": {"n_stars": len(joint.stars)} | counts}
 
 
-def _write_report(target, solution, summary, shown):
+def _report(target, solution, summary, shown, joint):
     """The report of all that `run` leaves, whether it is there yet or written beside it."""
     absent = CATALOGUE * ("catalogue" not in summary) + ("psf/*.fits",) * (not shown["psfs"])
     absent += ("mosaic.fits",) * (shown["mosaic"] is None)
     files = linked_files(name for name in RESULTS if name not in absent)
-    write_report(target / "report.html", solution, summary=summary, **shown, files=files)
+    write_report(target / "report.html", solution, summary=summary, **shown, joint=joint, files=files)
 
 
 def _written_summary(target, summary, timings, report):
@@ -413,14 +416,21 @@ def _step_options(kind, given, argument, *, defaults=None, wanted=True, **own):
     return checks.options_from(kind, given, argument)
 
 
-def _check_others(workers, truth, catalogue):
-    """Raise `InputError` for arguments that no step looks at before it begins."""
+def _checked_others(workers, truth, catalogue, artificial):
+    """What is asked of a catalogue, None without one; `InputError` for arguments that no step looks at before."""
     parallel.check_workers(workers)
     checks.check_choice(catalogue, CATALOGUES, "catalogue")
+    if artificial is not None:
+        checks.check_counts(artificial=artificial)
+        if catalogue == "none":
+            raise InputError(
+                "artificial stars tell what a catalogue misses: give catalogue='joint' (--catalogue joint)"
+            )
     if truth is not None and not isinstance(truth, Truth):
         raise InputError(
             f"truth must be that of a simulation (simulate_exposures(...).truth), got {type(truth).__name__}"
         )
+    return None if catalogue == "none" else {"artificial": artificial}
 
 
 def _assessed(solution, exposures, stack, quality, comparison, stacks, truth, joint):

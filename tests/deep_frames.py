@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 from scipy.special import erf
 
 SIGMA, SKY, LEVEL, MARGIN = 1.7, 10.0, 100.0, 30  # of the PSF [px]; noise of the sky and its level [e-]; px
+EDGE = 40  # px of the field that are not compared
 _HALF = 9
 
 
@@ -162,7 +163,7 @@ class Compared:
         return tuple(np.sqrt(np.mean((self.off / each)[use] ** 2)) for each in (self.bound, self.error))
 
 
-def compared(truth, stars, start, *, edge=40):
+def compared(truth, stars, start, *, edge=EDGE):
     """A catalogue beside the truth, a common cubic map of the plane taken off, which nothing determines.
 
     Parameters
@@ -203,7 +204,7 @@ def compared(truth, stars, start, *, edge=40):
     return Compared(order, truth.snr[order], row, off, truth.bound[order, :2], error[row], *counts, shift)
 
 
-def artificial_inside(truth, compared, made, *, edge=40):
+def artificial_inside(truth, compared, made, *, edge=EDGE):
     """Which artificial stars of a table lie where `compared` looks; (n,)."""
     there = np.column_stack([made["x"].value, made["y"].value]) - compared.shift
     return ((there > edge) & (there < truth.frames[0].shape[0] - 1 - edge)).all(axis=1)

@@ -336,6 +336,7 @@ COMPARING = {"compare": Option("also correct by shifts, static map and relative 
 LAST_STEP = {
     "mosaic": Option("co-add nothing", "--no-mosaic", action="store_false"),
     "catalogue": Option("joint: every star measured in all exposures at once (default none)", choices=words.CATALOGUES),
+    "artificial": Option("so many artificial stars: what the catalogue misses, in the report", type=int, metavar="N"),
 }
 EXPANDING = {
     "where": Option(

@@ -205,9 +205,9 @@ class JointScene(JointFit):
         return assembled(parts or [_NOTHING], len(rows)), right.ravel()
 
     def update_sky(self):
-        """The sky of every exposure changed by what is left."""
+        """The sky of every exposure made anew: most of the stars that are found last no exposure shows."""
         for layer in self.layers:
-            layer.scene.update_sky(max(1, int(layer.scene.fwhm)))
+            layer.scene.update_sky(max(1, int(layer.scene.fwhm)), afresh=True)
 
     def update_misfit(self):
         """The misfit that bright stars show in every exposure."""

@@ -21,6 +21,8 @@ _SCATTER, _CHANCE = 3.0, 1e-4  # chi2 per degree of freedom of the fluxes, and t
 _FAINT = 30.0  # signal-to-noise ratio: of brighter stars the error of the PSF is larger than that of the fluxes
 _SEEN = 3.0  # signal-to-noise ratio at which an exposure confirms a star
 _CLOSE = 2.0  # FWHM of blended stars
+# standard deviations of a pixel in the core of a star that is too bright in one exposure alone, and of those beside it
+_DEVIATES, _SKIRT = 4.0, 2.0
 _SEARCHED = 3.0  # FWHM from a place around which it was searched
 
 
@@ -73,14 +75,27 @@ def measure_field(field, xy, left_out, threshold):
     """
     transmissions.start(field, xy, left_out)
     search(field, threshold, _retune, pairs)
-    rejected = lone = 0
-    while True:
-        rejected += lone
-        errors = transmissions.update(field)
-        field.fit(np.ones(len(field.flux), dtype=bool), 2)
-        flux, error, varying, lone = _without_lone(field, threshold)
-        if not lone:
-            return Measured(flux, error, image_flags(field), errors, varying, rejected + field.rejected)
+    field.update_sky()
+    errors, rejected = transmissions.update(field), field.rejected
+    changed, first = np.ones(len(field.flux), dtype=bool), True
+    while changed.any():
+        field.fit(changed, 2)
+        rows, (gone, wrong) = np.flatnonzero(changed), np.zeros((2, len(changed)), dtype=bool)
+        gone[rows], _, spoiled = _by_fluxes(field, threshold, rows)[2]
+        if first:  # once: what is left of a star that follows no PSF would be taken off pixel by pixel
+            wrong[rows] = _masked(field, rows, spoiled)
+            first = False
+        changed = _near(field.xy[~gone], field.xy[gone | wrong], _SEARCHED * field.fwhm)
+        field.remove(gone)
+        rejected += int(gone.sum())
+    flux, error, (_, varying, spoiled) = _by_fluxes(field, threshold)
+    flags = image_flags(field) | np.where(spoiled, Flag.DEFECT, 0)
+    return Measured(flux, error, flags, errors, varying, rejected)
+
+
+def _near(xy, places, reach):
+    """Which stars (n, 2) lie so near to some places (m, 2); (n,)."""
+    return np.zeros(len(xy), dtype=bool) if not len(places) else cKDTree(places).query(xy)[0] < reach
 
 
 def measure_again(field, threshold, around=None):
@@ -99,21 +114,35 @@ def measure_again(field, threshold, around=None):
     search(field, threshold, None, pairs, settled=True, around=around)
     reach = _SEARCHED * field.fwhm
     while True:
-        near = np.ones(len(field.flux), dtype=bool) if around is None else cKDTree(around).query(field.xy)[0] < reach
-        if not _without_lone(field, threshold, np.flatnonzero(near))[-1]:
+        near = np.ones(len(field.flux), dtype=bool) if around is None else _near(field.xy, around, reach)
+        rows, gone = np.flatnonzero(near), np.zeros(len(near), dtype=bool)
+        gone[rows] = _by_fluxes(field, threshold, rows)[2][0]
+        if not gone.any():
             return
+        field.remove(gone)
 
 
-def _without_lone(field, threshold, rows=None):
-    """Fluxes by image, errors and which stars vary, before what one image alone shows is taken off; and its number.
-
-    Of all stars, or of some rows.
-    """
+def _by_fluxes(field, threshold, rows=None):
+    """Fluxes by image of stars, all or some, their errors, and what they tell of the stars (`judged`)."""
     flux, error = by_image(field, rows)
-    rows, gone = np.arange(len(field.flux)) if rows is None else rows, np.zeros(len(field.flux), dtype=bool)
-    gone[rows], varying = judged(flux, error, field.flux[rows], field.snr(rows), threshold)
-    field.remove(gone)
-    return flux, error, varying, int(gone.sum())
+    mean = field.flux if rows is None else field.flux[rows]
+    return flux, error, judged(flux, error, mean, field.snr(rows), threshold)
+
+
+def _masked(field, rows, spoiled):
+    """Pixels that make stars (n,) too bright in some images (m, n) are bad from now on; which stars have some; (n,)."""
+    out = np.zeros(len(rows), dtype=bool)
+    for layer, stars in zip(field.layers, spoiled, strict=True):
+        there, own = layer.own(rows[stars])
+        if not len(own):
+            continue
+        scene = layer.scene
+        params, _, pixels, inside = scene.on_stamps(own)
+        ratio = scene.residual_at(pixels) * np.sqrt(scene.weights.ravel()[pixels]) * (inside & scene.near(params))
+        high = (ratio > _SKIRT) & (ratio > _DEVIATES).any(axis=1)[:, None]
+        scene.mask(*np.unravel_index(pixels[high], scene.light.shape))
+        out[np.flatnonzero(stars)[there[high.any(axis=1)]]] = True
+    return out
 
 
 def _retune(field):
@@ -136,10 +165,11 @@ def by_image(field, rows=None):
 
 
 def judged(flux, error, mean, snr, threshold):
-    """What is no star, since one exposure alone shows it, and which stars vary; masks (n,).
+    """What is no star, since one exposure alone shows it, which stars vary, and which exposures are spoiled.
 
     A star that three exposures see stands without the strongest of them. Below a signal-to-noise ratio of 30 its
-    fluxes scatter as their errors state, or two exposures confirm it by themselves and it varies.
+    fluxes scatter as their errors state; or those of all exposures but one do, in which it is too bright; or two
+    exposures confirm it by themselves and it varies.
 
     Parameters
     ----------
@@ -148,20 +178,39 @@ def judged(flux, error, mean, snr, threshold):
     mean, snr : ndarray, shape (n,)
         Of the star.
     threshold : float
+
+    Returns
+    -------
+    gone, varying : ndarray of bool, shape (n,)
+    spoiled : ndarray of bool, shape (m, n)
     """
     weight = 1 / error**2
     ratio = np.where(weight > 0, flux / error, -np.inf)
     count, stars = (weight > 0).sum(axis=0), np.arange(flux.shape[1])
-    first = ratio.argmax(axis=0)
-    others = weight.copy()
-    others[first, stars] = 0
-    rest = (others * flux).sum(axis=0) / np.sqrt(np.maximum(others.sum(axis=0), 1e-30))
-    lone = (count >= CONFIRMED) & (rest < threshold - LESS)
-    chi2, dof = (weight * (flux - mean) ** 2).sum(axis=0), np.maximum(count - 1, 1)
-    limit = np.maximum(_SCATTER * dof, chi2_distribution.isf(_CHANCE, dof))
-    varying = (count >= CONFIRMED) & (snr < _FAINT) & (chi2 > limit)
+    _, rest, total = _without(weight, flux, ratio.argmax(axis=0))
+    lone = (count >= CONFIRMED) & (rest * np.sqrt(total) < threshold - LESS)
+    scatter = (count >= CONFIRMED) & (snr < _FAINT) & _scatter(weight, flux, mean)
+    highest = np.where(weight > 0, (flux - mean) / error, -np.inf).argmax(axis=0)
+    others, rest, _ = _without(weight, flux, highest)
+    spoiled = np.zeros(flux.shape, dtype=bool)
+    spoiled[highest, stars] = scatter & ~lone & ~_scatter(others, flux, rest)
+    varying = scatter & ~spoiled.any(axis=0)
     confirmed = (ratio > _SEEN).sum(axis=0) >= 2
-    return lone | (varying & ~confirmed), varying & confirmed & ~lone
+    return lone | (varying & ~confirmed), varying & confirmed & ~lone, spoiled
+
+
+def _without(weight, flux, left_out):
+    """Weights (m, n) without an exposure of each star (n,), the mean flux by them, and their sum."""
+    weight = weight.copy()
+    weight[left_out, np.arange(len(left_out))] = 0
+    total = np.maximum(weight.sum(axis=0), 1e-30)
+    return weight, (weight * flux).sum(axis=0) / total, total
+
+
+def _scatter(weight, flux, mean):
+    """Whether fluxes (m, n) scatter by more than their errors; (n,)."""
+    chi2, dof = (weight * (flux - mean) ** 2).sum(axis=0), np.maximum((weight > 0).sum(axis=0) - 1, 1)
+    return chi2 > np.maximum(_SCATTER * dof, chi2_distribution.isf(_CHANCE, dof))
 
 
 def image_flags(field):

@@ -5,6 +5,7 @@ from astropy import units as u
 from astropy.table import QTable
 from scipy.spatial import cKDTree
 
+from ..inputs.exposure_names import whole_name
 from ..measurement.crowding import crowding
 from ..measurement.flags import Flag
 from ..results.new_positions import add_sky
@@ -82,7 +83,7 @@ def photometry_table(field, measured, names, rows, frames):
     """
     star, image = np.nonzero(measured.seen.T[rows])
     own = [frames[layer.name] for layer in field.layers]
-    table = QTable({"star": names[star], "exposure": np.array([each.exposure for each in own])[image]})
+    table = QTable({"star": names[star], "exposure": np.array([whole_name(each) for each in own])[image]})
     if any(each.detector is not None for each in own):
         table["detector"] = np.array([str(each.detector) for each in own])[image]
     for name in ("flux", "flux_err", "flags"):

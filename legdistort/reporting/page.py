@@ -28,6 +28,7 @@ def write_report(
     comparison=None,
     stacks=None,
     exposures=(),
+    joint=None,
     files=(),
     overwrite=False,
 ):
@@ -59,6 +60,8 @@ def write_report(
         are added.
     exposures : sequence of Exposure or ExposureFile, optional
         What was co-added: stars of some of them are shown beside those of the mosaic.
+    joint : `~legdistort.photometry.catalogue.Catalogue`, optional
+        Of all exposures: what it misses is drawn, where artificial stars tell.
     files : sequence of str or path, optional
         Other results, as the page links to them.
     overwrite : bool
@@ -77,12 +80,23 @@ def write_report(
         raise InputError(f"files must be names of results, ('stars.ecsv', 'wcs/'), got {files!r}")
     with replacing(path, overwrite=overwrite) as file:
         shown = {"mosaic": mosaic, "psfs": psfs, "comparison": comparison, "stacks": stacks}
-        page = render(solution, summary=summary, **shown, exposures=exposures, files=files)
+        page = render(solution, summary=summary, **shown, exposures=exposures, joint=joint, files=files)
         file.write(page.encode())
     return Path(path)
 
 
-def render(solution, *, mosaic=None, psfs=None, summary=None, comparison=None, stacks=None, exposures=(), files=()):
+def render(
+    solution,
+    *,
+    mosaic=None,
+    psfs=None,
+    summary=None,
+    comparison=None,
+    stacks=None,
+    exposures=(),
+    joint=None,
+    files=(),
+):
     """The page of `write_report` as a string."""
     from matplotlib import style
 
@@ -104,7 +118,7 @@ def render(solution, *, mosaic=None, psfs=None, summary=None, comparison=None, s
             "version": version("legdistort"),
             "names": {"s": [str(n) for n in solution.estimate.star_names], "e": list(solution.names)},
             "cutouts": cut_out(solution, mosaic, exposures, fwhm=_fwhm(facts)),
-            **_pictures(gallery, solution, pulls, mosaic),
+            **_pictures(gallery, solution, pulls, mosaic, joint and joint.completeness),
             **_details(gallery, solution, pulls, psfs, facts, comparison, stacks),
         }
     return _template().render(shown)
@@ -120,7 +134,7 @@ def _template():
     return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, **options).get_template("report.html")
 
 
-def _pictures(gallery, solution, pulls, mosaic):
+def _pictures(gallery, solution, pulls, mosaic, completeness):
     """What everybody looks at: the steps of the correction, and pairs of pictures that stand side by side."""
     pairs = [
         ("Error of the correction", [gallery.error_map(solution), gallery.mean_residuals(solution)]),
@@ -128,6 +142,7 @@ def _pictures(gallery, solution, pulls, mosaic):
         ("Distortion", [gallery.coefficients(solution)]),
         ("Motions of the stars", list(gallery.motions(solution))),
         ("Mosaic", [gallery.mosaic(solution, mosaic) if mosaic is not None else None]),
+        ("Catalogue of all exposures", [gallery.completeness(completeness) if completeness is not None else None]),
     ]
     pairs = [(title, [each for each in pictures if each is not None]) for title, pictures in pairs]
     return {"steps": gallery.steps(solution), "pairs": [pair for pair in pairs if pair[1]]}

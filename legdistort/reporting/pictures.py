@@ -7,7 +7,15 @@ from markupsafe import Markup
 
 from ..assessment.pulls import exposure_rms
 from ..exceptions import FoldError, LegdistortError
-from ..plots import motion_plots, psf_plots, residual_plots, solution_plots, stack_plots, trend_plots
+from ..plots import (
+    completeness_plots,
+    motion_plots,
+    psf_plots,
+    residual_plots,
+    solution_plots,
+    stack_plots,
+    trend_plots,
+)
 from ..results.view import error_map
 from .svg import detached_figure, svg_of
 from .tables import sizes
@@ -127,6 +135,16 @@ class Gallery:
             "The co-added image less its smooth sky, pale blue where no exposure contributes, the stars of the "
             "solution circled: double or elongated stars, more so towards one edge, would mean that the exposures are "
             "not aligned there.",
+        )
+
+    def completeness(self, completeness):
+        """What the catalogue of all exposures misses."""
+        return self.add(
+            completeness_plots.plot_completeness(completeness, ax=_quick_figure(6.4, 4.4).subplots()).figure,
+            f"The part of {len(completeness.stars)} artificial stars, put into all exposures at random places, that "
+            "the catalogue finds, with binomial errors; above the signal-to-noise ratio of all exposures together. "
+            "Less than all bright stars found would mean stars hidden in a crowd.",
+            top=0.6,
         )
 
     def distortions(self, solution):

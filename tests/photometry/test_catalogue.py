@@ -7,14 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import QTable, Table
-from deep_frames import artificial_inside, compared, deep_frames
+from astropy.table import QTable, Table, vstack
+from deep_frames import artificial_inside, compared, deep_frames, excess, light
 
 import legdistort as ld
 from legdistort.cli import main
 from legdistort.exceptions import AssumptionWarning, InputError
 from legdistort.inputs.exposures import Exposure
+from legdistort.measurement.detection import Frame
 from legdistort.measurement.flags import Flag
+from legdistort.measurement.scene.joint_fit import Scene
 from legdistort.measurement.scene.normal_equations import neighbour_covariance
 from legdistort.photometry.agreement import catalogue_check
 from legdistort.photometry.artificial_stars import flux_bias, matched
@@ -185,18 +187,54 @@ def test_bad_arguments_are_named(truth, solution):
 
 
 def test_what_one_exposure_alone_shows_is_no_star():
-    """Constant, a hit of one exposure, a flare that two confirm, a faint one, one that two exposures see."""
+    """Constant, a hit of one exposure, a flare that two confirm, a faint one, one that two see, a hit on a star."""
     rng = np.random.default_rng(1)
-    flux, error = 2 + rng.normal(0, 1, (11, 5)), np.ones((11, 5))
+    flux, error = 2 + rng.normal(0, 1, (11, 6)), np.ones((11, 6))
+    flux[6, 5] = 12
     flux[:, 1] -= 2
     flux[4, 1] = 30
     flux[:, 2] -= 1
     flux[[2, 3], 2] = 9
     error[2:, 4], flux[:2, 4] = np.inf, (9, 2)
     mean = np.array([np.average(f, weights=1 / e**2) for f, e in zip(flux.T, error.T, strict=True)])
-    lone, varying = judged(flux, error, mean, mean * np.sqrt((1 / error**2).sum(axis=0)), 5.0)
-    assert lone.tolist() == [False, True, False, False, False]
-    assert varying.tolist() == [False, False, True, False, False]
+    lone, varying, spoiled = judged(flux, error, mean, mean * np.sqrt((1 / error**2).sum(axis=0)), 5.0)
+    assert lone.tolist() == [False, True, False, False, False, False]
+    assert varying.tolist() == [False, False, True, False, False, False]
+    assert np.argwhere(spoiled).tolist() == [[6, 5]]
+
+
+def test_a_hit_on_a_faint_star_is_left_out(truth, solution, found):
+    """And a flash of one exposure; a star that brightens in two varies; what one of them alone shows is none."""
+    frames = [frame.copy() for frame in truth.frames]
+    start = np.full_like(truth.xy, np.nan)
+    inside = ((truth.pixels > 60) & (truth.pixels < 260)).all(axis=(0, 2))
+    start[inside] = solution["f00"].correct(truth.pixels[0][inside])
+    apart = np.hypot(*(truth.xy[:, None] - truth.xy).T) + 99 * np.eye(len(truth.xy))
+    faint = np.flatnonzero(inside & (truth.snr > 9) & (truth.snr < 18) & (apart.min(axis=0) > 8))[:4]
+    (hit, other, *_), (variable, *_) = faint[:2], faint[2:]
+    x, y = np.round(truth.pixels[4, other]).astype(int)
+    frames[4][y, x + 1] += 400  # 40 times the noise
+    for star, k, flux in ((hit, 4, 1500), (variable, 2, 700), (variable, 5, 700)):
+        x, y = truth.pixels[k, star]
+        columns, rows = (np.arange(round(c) - 8, round(c) + 9) for c in (x, y))
+        frames[k][rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += flux * light((x, y), columns, rows)[0]
+    frames[1][100, 100], frames[6][200, 150] = 3e3, 3e3
+    again = ld.catalogue(exposures_of(replace(truth, frames=frames)), solution, zero_point=25.0)
+
+    def row(stars, star):
+        away = np.hypot(stars["x"].value - start[star, 0], stars["y"].value - start[star, 1])
+        assert away.min() < 2
+        return stars[np.argmin(away)]
+
+    assert abs(len(again.stars) - len(found.stars)) <= 1
+    for star in (hit, other):
+        one, its = row(again.stars, star), row(found.stars, star)
+        assert abs(one["flux"] - its["flux"]) < 1.5 * one["flux_err"]
+        assert np.hypot(one["x"] - its["x"], one["y"] - its["y"]) < 1.5 * one["x_err"]
+        assert not one["flags"] & Flag.VARIABLE
+        images = again.photometry[again.photometry["star"] == one["star"]]
+        assert set(images["exposure"][(images["flags"] & Flag.DEFECT) > 0]) == {"f04"}
+    assert row(again.stars, variable)["flags"] & Flag.VARIABLE
 
 
 @pytest.mark.parametrize("k", [1, 3])
@@ -358,6 +396,10 @@ def test_artificial_stars_are_found_as_stars_are(truth, solution, found, monkeyp
     np.testing.assert_allclose(np.diff(table["mag_low"]), -0.5)
     assert table.meta["n_rows"] == len(found.stars)
     assert table.meta["n_false"] <= 2
+    ax = other.completeness.plot()
+    shown = table["n"] > 0
+    np.testing.assert_allclose(ax.containers[0].lines[0].get_ydata(), 100 * table["completeness"][shown])
+    assert ax.get_xlabel() == "magnitude"
     assert repr(other.completeness) == f"<Completeness: 24 artificial stars, {len(seen)} of them found>"
     assert "rows are false, by negative light" in str(other.completeness)
 
@@ -376,11 +418,31 @@ def test_the_bias_of_faint_fluxes_is_that_of_their_selection():
     measured = flux + rng.normal(size=len(flux))
     stars = QTable({"found": measured > 5, "snr_found": measured, "flux_off": measured - flux})
     stars["flux_err"] = 1.0
-    snr = np.array([5.5, 7.0])
+    snr = np.array([5.5, 7.0, 10.0])
     true = [np.median((measured - flux)[np.abs(measured - s) < 0.1]) for s in snr]
-    np.testing.assert_allclose(flux_bias(stars, snr, np.array([2.0, 3.0])), [2 * true[0], 3 * true[1]], atol=0.1)
-    assert np.isnan(flux_bias(stars[:3], snr, np.ones(2))).all()
-    assert np.isnan(flux_bias(stars[:0], snr, np.ones(2))).all()
+    np.testing.assert_allclose(flux_bias(stars, snr, np.array([2.0, 3, 1])), true * np.array([2.0, 3, 1]), rtol=0.15)
+    few = flux_bias(stars[np.flatnonzero(stars["found"])[:400]], snr, np.ones(3))
+    np.testing.assert_allclose(few, true, rtol=0.4)
+    assert np.isnan(flux_bias(stars[:3], snr, np.ones(3))).all()
+    assert np.isnan(flux_bias(stars[:0], snr, np.ones(3))).all()
+
+
+def test_a_sky_made_anew_takes_no_more_of_a_star_that_is_not_seen():
+    """However often: the mean with Gaussian weights of 3 FWHM, which has 4 % of a star; sums of means have more."""
+    yx, nothing = np.mgrid[-100:101, -100:101], np.zeros((201, 201), dtype=bool)
+    star = np.exp(-(yx**2).sum(axis=0) / (2 * 1.7**2)).astype(np.float32)
+    psf = ld.EffectivePSF.from_array(star[90:111, 90:111], oversampling=1)
+    weight = star / (star**2).sum()
+    taken = {}
+    for afresh in (True, False):
+        frame = Frame(star.copy(), np.ones_like(star), np.zeros_like(star), ~nothing, nothing, 0.0)
+        scene = Scene(frame, psf, 12, 0.0)
+        taken[afresh] = []
+        for _ in range(4):
+            scene.update_sky(4, afresh=afresh)
+            taken[afresh].append(float((weight * scene.sky).sum()))
+    np.testing.assert_allclose(taken[True], 2 * (1.7 / (3 * scene.fwhm)) ** 2, rtol=0.1)
+    assert taken[False][-1] > 2 * taken[False][0]
 
 
 def test_artificial_stars_of_the_command(truth, solution, tmp_path, capsys):
@@ -409,7 +471,9 @@ def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
         fits.PrimaryHDU(data, fits.Header([("GAIN", 1.0)])).writeto(paths[-1])
     with pytest.raises(InputError, match="catalogue must be one of 'none', 'joint', got 'all'"):
         ld.run(paths, out=tmp_path / "out", catalogue="all")
-    made = ld.run(paths, out=tmp_path / "out", psf="moffat", degree=1, catalogue="joint")
+    with pytest.raises(InputError, match=r"what a catalogue misses: give catalogue='joint' \(--catalogue joint\)"):
+        ld.run(paths, out=tmp_path / "out", artificial=5)
+    made = ld.run(paths, out=tmp_path / "out", psf="moffat", degree=1, catalogue="joint", artificial=3)
     expected = ld.catalogue(ld.open_exposures(paths), ld.Solution.read(made.out), psf="moffat")
     stars, photometry = (QTable.read(made.out / name) for name in ("catalogue.ecsv", "photometry.ecsv"))
     for found, same in ((stars, expected.stars), (photometry, expected.photometry)):
@@ -420,6 +484,8 @@ def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
     report = (made.out / "report.html").read_text()
     assert f"{len(stars)} stars, {stars.meta['n_new']} of them new" in report
     assert 'href="photometry.ecsv"' in report
+    assert "The part of 3 artificial stars" in report
+    assert "flux_bias" in stars.colnames
 
     def impossible(_):
         raise InputError("the solution has motions of stars")
@@ -433,7 +499,9 @@ def test_run_ends_with_the_catalogue(truth, tmp_path, monkeypatch):
     names = {path.name for path in made.out.iterdir()}
     assert {"mosaic.fits", "solution.asdf", "report.html"} <= names
     assert not names & {"catalogue.ecsv", "photometry.ecsv"}
-    assert "photometry.ecsv" not in (made.out / "report.html").read_text()
+    report = (made.out / "report.html").read_text()
+    assert "photometry.ecsv" not in report
+    assert "artificial stars" not in report
     made = ld.run(paths, out=made.out, earlier=made.out, degree=1, overwrite=True, mosaic=False)
     assert made.mosaic is None
     assert not (made.out / "mosaic.fits").exists()
@@ -486,24 +554,29 @@ def test_a_deep_field_with_hits_of_particles():
 
 @pytest.mark.slow
 def test_artificial_stars_tell_the_truth():
-    """The part found of them is that found of true stars, field by field more of these."""
-    true, artificial = [], []
-    for seed in range(1, 6):
+    """The part found of them is that found of true stars, and so is the excess of fluxes near the threshold."""
+    true, artificial, bias = [], [], []
+    for seed in range(1, 9):
         truth = deep_frames(seed, size=320, n_stars=230, n_frames=6)
         solution = solved(truth)
-        found = ld.catalogue(exposures_of(truth), solution, artificial=40 if seed < 3 else None)
-        c = beside_truth(truth, solution, found.stars, edge=20)
+        found = ld.catalogue(exposures_of(truth), solution, artificial=90 if seed < 5 else None)
+        c = beside_truth(truth, solution, found.stars)
         true.append((c.snr, c.row >= 0))
+        bias.append(excess(truth, c, found.stars)[:2])
         if found.completeness:
             made = found.completeness.stars
-            made = made[artificial_inside(truth, c, made, edge=20)]
-            artificial.append((np.asarray(made["snr"]), np.asarray(made["found"])))
-    sets = [np.concatenate(each, axis=1) for each in (true, artificial)]
-    for low, high in ((2, 4.5), (4.5, 8), (8, 50)):
+            artificial.append(made[artificial_inside(truth, c, made)])
+    artificial = vstack(artificial, metadata_conflicts="silent")
+    sets = [np.concatenate(true, axis=1), np.array([artificial["snr"], artificial["found"]])]
+    for low, high in ((2.65, 4.5), (4.5, 8), (8, 50)):
         hits = [hit[(snr >= low) & (snr < high)] for snr, hit in sets]
         n, both = [len(hit) for hit in hits], (sum(hit.sum() for hit in hits) + 0.5) / (sum(map(len, hits)) + 1)
         error = np.sqrt(both * (1 - both) * (1 / n[0] + 1 / n[1]))
-        assert abs(hits[0].mean() - hits[1].mean()) < 0.03 + 2.5 * error, (low, high)
+        assert abs(hits[0].mean() - hits[1].mean()) < 0.03 + 2 * error, (low, high)
+    snr, off = np.concatenate(bias, axis=1)
+    near = snr < 8
+    true, stated = np.median(off[near]), np.median(flux_bias(artificial, snr[near], np.ones(near.sum())))
+    assert abs(stated - true) < true / 3 + 2 * 1.25 * np.std(off[near]) / np.sqrt(near.sum()), (stated, true)
 
 
 @pytest.mark.slow

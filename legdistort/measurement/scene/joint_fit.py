@@ -138,6 +138,14 @@ class Scene(JointFit):
         stamps.inverse_variances(*planes, float(self.photon), LEAST_SKY, float(self.misfit), self.weights, boxes)
         self._snr = None
 
+    def mask(self, y, x):
+        """Pixels that are defects from now on."""
+        if self.frame.defects is None:
+            self.frame = replace(self.frame, defects=np.zeros(self.good.shape, dtype=bool))
+        self.frame.defects[y, x] = True
+        self.good[y, x] = False
+        self.weights[y, x] = 0
+
     def update_misfit(self):
         """The misfit that bright stars show, and weights with it."""
         self.misfit = 0.0
@@ -161,7 +169,7 @@ class Scene(JointFit):
         left -= self.light[part]
         return left
 
-    def update_sky(self, step=1):
+    def update_sky(self, step=1, *, afresh=False):
         """The sky changed by what is left around every pixel, over what a change leaves once the stars follow.
 
         Parameters
@@ -169,6 +177,9 @@ class Scene(JointFit):
         step : int
             Pixels are binned in squares of this side first, and the change interpolated: faster, and exact enough for
             squares within a star.
+        afresh : bool
+            It becomes one mean of all light that stars leave, however often it is changed. Means of what is left that
+            are added up follow slopes better, and take in stars that are not seen yet, more of them with every change.
         """
         sigma, weights = _SKY * self.fwhm, self.weights
         root = np.sqrt(weights)
@@ -177,17 +188,19 @@ class Scene(JointFit):
             return gaussian_sums(binned(image.astype(np.float32), step), sigma / step)[0]
 
         left = root * np.clip(root * self.residual, -_OUTLIER, _OUTLIER)  # a blend that has passed for a star is no sky
-        left, norm = around(left), around(weights)
+        before = self.sky if afresh else np.zeros_like(weights)
+        left, norm = around(left + weights * before), around(weights)
         norm = np.maximum(norm, 1e-3 * norm.max())
+        planes = [left / norm]
         if len(self.flux):
             slopes, right, centres = self.slopes(np.arange(len(self.flux)), (np.ones_like(weights),))
             normal = normal_matrix(slopes, centres, self.half)
             response = solved(normal, right.ravel(), np.sqrt(np.maximum(normal.diagonal(), 1e-30))).reshape(-1, 3)
             taken = np.zeros_like(weights)
             stamps.lay(taken, np.einsum("nap,na->np", slopes, response.astype(_KIND)), centres, self.half, 1)
-            norm = np.maximum(norm - around(root * taken), _LEAST * norm)
-        change = left / norm
-        self.sky += change if step == 1 else spread(change, step, weights.shape)
+            planes.append(norm / np.maximum(norm - around(root * taken), _LEAST * norm))
+        level, *gain = planes if step == 1 else [spread(each, step, weights.shape) for each in planes]
+        self.sky += np.prod([level - before, *gain], axis=0)
 
     def on_stamps(self, rows):
         """Of some stars `stars`, and the flat indices of the pixels of their stamps and which lie in the image."""
