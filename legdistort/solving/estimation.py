@@ -247,10 +247,8 @@ def solve(
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
         diagnostics = replace(_diagnostics(fit, prior, scale), **chosen)
-        if catalogue is not None:
-            fit = reference_tie.tie_to(fit, catalogue, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
-        else:
-            fit = _placed(fit, sought, given)
+        how = {"scale": scale, "epoch": epoch, "pixel_scale": pixel_scale}
+        fit = _placed(fit, sought, given) if catalogue is None else reference_tie.tie_to(fit, catalogue, **how)
     epoch = given.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)

@@ -62,9 +62,8 @@ def main():
     least = np.sqrt(np.mean(scale) * (NIGHTLY**2 + SINGLE**2 / 10) / asked.nights)
     print(f"{n_lists} lists, {n_rows} positions; {os.cpu_count()} cores, {asked.workers} workers")
     print(f"nights solved in {each:.1f} s, all in {whole:.1f} s")
-    print(
-        f"error of a coefficient {np.sqrt(np.mean(off**2)):.4f} px, {np.sqrt(np.mean(off**2)) / least:.2f} of what departures leave"
-    )
+    error = np.sqrt(np.mean(off**2))
+    print(f"error of a coefficient {error:.4f} px, {error / least:.2f} of what departures leave")
     print(f"squared pull {np.sum(off**2) / variance.sum():.2f}, drift {camera.rate:.3g}, odd {len(camera.odd)}")
     more = night(999, static + curved(rng, NIGHTLY), exposures=10, single=SINGLE, n_stars=1700, year=2016.2)
     begun = time.perf_counter()
