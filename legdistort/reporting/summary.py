@@ -5,12 +5,14 @@ from dataclasses import asdict
 import numpy as np
 from astropy import units as u
 
+from ..assessment.pulls import exposure_rms
 from ..geometry import similarity
 from ..inputs import column_contract
 from ..results import accuracy, in_tables
+from ..results.accuracy import departures, rms_length, sizes
+from ..results.errors.pose_errors import pose_numbers
 from ..runtime import provenance
 from ..runtime.trees.codec import to_tree
-from .tables import departures, exposure_rms, rms_length, sizes
 
 
 def summarise(solution, *, timings=None):
@@ -39,6 +41,7 @@ def summarise(solution, *, timings=None):
         "exposures": (each := exposures(solution)),
         "nights": nights(solution, each),
         "detectors": detectors(solution.camera),
+        "layout_errors": in_tables.layout_errors(solution) or None,
         "command": provenance.command_line(),
         **found.summary(),
         "timings": rounded(timings or {}),
@@ -54,17 +57,24 @@ def exposures(solution):
     distortion, dynamic = sizes(solution)
     block, epoch = _times(solution)
     out = []
-    for i, view in enumerate(solution):
-        pose = similarity.describe(view.pose)
-        angle, scale = (None, None) if solution.sky is None else view.orientation
+    for i, (name, pose) in enumerate(zip(solution.names, pose_numbers(solution), strict=True)):
         figures = {
-            "n_stars": n[i], "block": block[i], "epoch_yr": epoch[i],
-            "shift_x_px": pose["dx"], "shift_y_px": pose["dy"], "rotation_deg": pose["rotation"],
-            "scale": pose["scale"], "rms_x_px": dx[i], "rms_y_px": dy[i], "distortion_px": distortion[i],
-            "dynamic_px": dynamic[i], "position_angle_deg": angle, "pixel_scale_arcsec": scale,
+            "n_stars": n[i], "block": block[i], "epoch_yr": epoch[i], "rms_x_px": dx[i], "rms_y_px": dy[i],
+            "distortion_px": distortion[i], "dynamic_px": dynamic[i],
         }  # fmt: skip
-        out.append({"name": view.name, "mirrored": pose["parity"] < 0} | {key: _plain(v) for key, v in figures.items()})
+        for key, (symbol, unit) in _POSE.items():
+            figures |= {f"{key}{unit}": pose.values.get(symbol), f"{key}_err{unit}": pose.errors.get(symbol)}
+            figures[f"{key}_unknown{unit}"] = pose.unknown.get(symbol)
+        mirrored = similarity.describe(solution.poses[name])["parity"] < 0
+        out.append({"name": name, "mirrored": mirrored} | {key: _plain(v) for key, v in figures.items()})
     return out
+
+
+#: Figures of a pose, with their names in `PoseNumbers` and their units.
+_POSE = {
+    "shift_x": ("dx", "_px"), "shift_y": ("dy", "_px"), "rotation": ("rotation", "_deg"), "scale": ("scale", ""),
+    "position_angle": ("position_angle", "_deg"), "pixel_scale": ("pixel_scale", "_arcsec"),
+}  # fmt: skip
 
 
 def nights(solution, found):
