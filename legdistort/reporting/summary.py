@@ -6,6 +6,7 @@ import numpy as np
 from astropy import units as u
 
 from ..assessment.pulls import exposure_rms
+from ..cameras import ties
 from ..geometry import similarity
 from ..inputs import column_contract
 from ..results import accuracy, in_tables
@@ -41,6 +42,7 @@ def summarise(solution, *, timings=None):
         "exposures": (each := exposures(solution)),
         "nights": nights(solution, each),
         "detectors": detectors(solution.camera),
+        "ties": ties.pairs(solution.camera, solution.residuals) if solution.camera.has_focal_plane else [],
         "layout_errors": in_tables.layout_errors(solution) or None,
         "command": provenance.command_line(),
         **found.summary(),
@@ -110,16 +112,24 @@ def detectors(camera):
     """One dict of numbers a detector: its place in the focal plane, with errors where it is not exact."""
     out, headers, off = [], camera.headers, {}
     if headers is not None:
-        off = dict(zip(headers.names, np.column_stack([headers.shifts, headers.rotations]).tolist(), strict=True))
+        off = dict(
+            zip(
+                headers.names,
+                np.column_stack([headers.shifts, headers.rotations, headers.errors]).tolist(),
+                strict=True,
+            )
+        )
     for key, each in camera.detectors.items() if camera.has_focal_plane else ():
         place = each.place
-        x_off, y_off, turned = off.get(key, (None, None, None))
+        x_off, y_off, turned, off_err, turned_err = off.get(key, (None,) * 5)
         x_err, y_err, rotation_err = map(_plain, place.errors or (None, None, None))
         out.append(
             {
                 "name": key, "x_px": place.x, "y_px": place.y, "rotation_deg": place.rotation, "scale": place.scale,
                 "x_err_px": x_err, "y_err_px": y_err, "rotation_err_deg": rotation_err, "static_px": float(each.rms),
                 "header_x_off_px": x_off, "header_y_off_px": y_off, "header_turned_deg": turned,
+                "header_off_err_px": _plain(off_err),
+                "header_turned_err_deg": _plain(turned_err),
             }
         )  # fmt: skip
     return out

@@ -8,6 +8,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from astropy.time import Time
 
+from ..cameras import ties
 from ..exceptions import by_reason, some_of
 from ..geometry import basis
 from ..geometry.epochs import year
@@ -173,11 +174,11 @@ def camera_sentence(solution):
     ny, nx = camera.field
     ids = ", ".join(camera.detectors)
     words = f"{camera.name}, detectors {ids}; positions in its focal plane, {nx} x {ny} px"
-    groups = camera.groups(solution.residuals[solution.residuals["used"]])
-    if len(groups) > 1:
-        words += f"; no star in common: {' | '.join(', '.join(group) for group in groups)}"
+    if apart := ties.apart(camera, solution.residuals):
+        words += f"; {apart}"
         held = any(np.isinf(each.place.errors).any() for each in camera.detectors.values() if each.place.errors)
         words += ", so that their places relative to each other are not determined" * held
+    words += f"; {common}" if (common := _common_stars(camera, solution.residuals)) else ""
     common = camera.common_sigma
     if common is not None and np.isinf(common[:, 1:3]).any() and "shear" in solution.gauge.unknown_names:
         words += (
@@ -185,6 +186,15 @@ def camera_sentence(solution):
             "another"
         )
     return words
+
+
+def _common_stars(camera, table):
+    """How many stars pairs of detectors have in common, the fewest first, in words; empty without any."""
+    listed = []
+    for each in sorted(ties.pairs(camera, table), key=lambda pair: pair["n_used"]):
+        of = f" of {each['n_stars']}" if each["n_used"] < each["n_stars"] else ""
+        listed.append(f"{' and '.join(each['detectors'])} {each['n_used']}{of}")
+    return f"stars used on both of two detectors: {some_of(listed, 6)}" if listed else ""
 
 
 def printed(solution):

@@ -217,7 +217,9 @@ class CameraFit:
         """
         step = self.step
         if step.length >= _SMALL:
-            warn(f"the camera has not settled in {_STEPS} steps; give better layouts", ConvergenceWarning)
+            words = f"layouts and static distortions not, whose last step was {step.length:.2g} of their errors"
+            fit = replace(fit, result=replace(fit.result, status=f"{fit.result.status}; {words}"))
+            warn(f"{words} (of {_STEPS} steps): see the checks, and the ties of the detectors", ConvergenceWarning)
         unknown = _unknown(fit.matches.camera, step)
         _tell_unknown(fit.matches, step, unknown)
         camera = with_errors(fit.matches.camera, step, unknown)
@@ -367,7 +369,7 @@ def camera_step(fit, sought, departure):
     precision = 1 / prior[free] ** 2
     pull = follow.pull - precision * departure[free]
     covariance, weak = _inverse(follow.normal, precision, follow.alone)
-    held = _held(weak, np.nonzero(free)[2])
+    held = _held(weak, np.nonzero(free)[2], _slides(fit, free))
     change = np.zeros(free.shape)
     change[free] = held @ (departure[free] + covariance @ pull) - departure[free]
     covariance = held @ covariance @ held.T
@@ -417,7 +419,19 @@ def _inverse(normal, precision, alone):
     return known @ inner @ known.T, (vectors[:, ~good] * unit[:, None]).T
 
 
-def _held(weak, modes):
+def _slides(fit, free):
+    """Shifts (m, k) in the focal plane, by the free modes, of groups of detectors that no star ties to each other."""
+    camera = fit.matches.camera
+    groups = camera.groups(fit.matches.table[fit.problem.order][fit.used])
+    rows = np.zeros((len(groups), 2, *free.shape))
+    for group, row in zip(groups, rows, strict=True):
+        for c, (key, chip) in enumerate(camera.detectors.items()):
+            if key in group:
+                row[:, c, :, 0] = np.linalg.inv(chip.layout[:, :2]) / len(group)
+    return rows[..., free].reshape(-1, np.count_nonzero(free)) if len(groups) > 1 else np.zeros((0, free.sum()))
+
+
+def _held(weak, modes, slides):
     """What takes directions (m, k) that are not determined off a change of the camera, (k, k).
 
     Static distortions stay as they were, as far as that holds these directions, and layouts as far as it does not:
@@ -428,9 +442,12 @@ def _held(weak, modes):
     weak : ndarray, shape (m, k)
     modes : ndarray of int, shape (k,)
         That each unknown belongs to.
+    slides : ndarray, shape (m, k)
+        Those of `_slides`: groups that no star ties to each other stay where they were, as far as that can be.
     """
-    weights = np.select([modes == 0, modes < 3], [_SHIFT_WEIGHT, _LAYOUT_WEIGHT], 1.0)
-    return np.eye(len(modes)) - weak.T @ np.linalg.pinv(weak.T * weights[:, None]) * weights
+    weights = np.diag(np.select([modes == 0, modes < 3], [_SHIFT_WEIGHT, _LAYOUT_WEIGHT], 1.0))
+    weights = np.concatenate([weights, slides])
+    return np.eye(len(modes)) - weak.T @ np.linalg.pinv(weights @ weak.T) @ weights
 
 
 def changed(camera, change):
