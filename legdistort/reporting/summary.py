@@ -35,6 +35,7 @@ def summarise(solution, *, timings=None):
         "gauge": solution.gauge.sentence,
         "unknown": list(solution.gauge.unknown_names),
         "sky": in_tables.sky_sentence(solution),
+        "header_pointing": _pointing(solution),
         "reference": found.reference and asdict(found.reference),
         "max_inverse_error_px": _plain(in_tables.largest_inverse_error(solution)),
         "folded": in_tables.folds(solution),
@@ -48,6 +49,18 @@ def summarise(solution, *, timings=None):
         **found.summary(),
         "timings": rounded(timings or {}),
     }
+
+
+def _pointing(solution):
+    """What headers say of where the plane lies on the sky; None where none does."""
+    found, scale = solution.diagnostics.pointing, np.nan if solution.sky is None else solution.sky.pixel_scale
+    if found is None:
+        return None
+    off = [{"name": name, "off_px": pixels, "turned_deg": turn} for name, (pixels, turn) in found.off.items()]
+    return {
+        "n_used": found.n_used, "err_mas": _plain(1000 * scale * found.shift), "rotation_err_deg": _plain(found.turn),
+        "contradicting": off, "groups": [list(group) for group in found.groups],
+    }  # fmt: skip
 
 
 def exposures(solution):

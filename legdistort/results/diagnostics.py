@@ -10,6 +10,7 @@ from scipy.optimize import nnls
 
 from ..inputs import column_contract
 from ..runtime.trees.facts import YEARS, number, text
+from .errors.header_pointing import HeaderPointing
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -334,6 +335,8 @@ class Diagnostics:
     higher_static : float or None
         Rms per axis over the detector, pixels, of what exposures were found to have in common beyond the degree of the
         fit; it is part of every distortion. None: nothing was found.
+    pointing : HeaderPointing or None
+        How well the headers tell where the plane lies on the sky, where they do.
     """
 
     error_floor: float = field(default=0.0, metadata=_PIXELS)
@@ -351,6 +354,7 @@ class Diagnostics:
     correlated: CorrelatedErrors | None = None
     motion_scatter: MotionScatter | None = None
     higher_static: float | None = field(default=None, metadata=_PIXELS)
+    pointing: HeaderPointing | None = None
 
     def found_errors(
         self,

@@ -162,6 +162,11 @@ def sky_sentence(solution):
     tied = ", tied to the reference" if source and solution.gauge.tie is not None and "head" in source else ""
     if "head" in source and not tied and solution.camera.headers is not None and (odd := solution.camera.headers.odd):
         source += f" of all detectors but {', '.join(odd)}"
+    pointing = None if solution.gauge.poses_known else solution.diagnostics.pointing
+    if source == "from the headers" and not tied and pointing is not None and pointing.off:
+        source += f" of {pointing.n_used} of {pointing.n_used + len(pointing.off)} exposures"
+    known = pointing.error(sky.pixel_scale) if pointing is not None and "head" in source and not tied else ""
+    source += f"; {known}" if known else ""
     words = f"tangent point {sky.lon:.6f} {sky.lat:+.6f} deg, {sky.pixel_scale:.5g} arcsec/px"
     return f"{words}{', ' * bool(source)}{source}{tied}"
 
@@ -210,7 +215,7 @@ def printed(solution):
         *_static_in_words(solution),
         *_wrapped("odd", next((c.sentence for c in solution.checks if c.name == "dynamic part" and c.tests), "")),
         *_wrapped("gauge", solution.gauge.sentence),
-        f"sky     {sky_sentence(solution)}",
+        *_wrapped("sky", sky_sentence(solution)),
         *(_wrapped("stars", motions.sentence) if motions is not None else []),
         f"rms     {both[0]:.4f}, {both[1]:.4f} px in x, y; {np.count_nonzero(used)} of {len(used)} observations used",
         *(line for key, text in solution.diagnostics.in_words().items() for line in _wrapped(key, text)),

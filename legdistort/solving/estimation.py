@@ -254,6 +254,7 @@ def solve(
     epoch = given.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
+    found = replace(found, pointing=given.pointing)
     solution = _solution(fit, scale, _settings(asked, options, form), found, form)
     if solution.gauge.warning:
         log.warning("%s", solution.gauge.warning)

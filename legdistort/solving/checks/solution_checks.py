@@ -15,6 +15,7 @@ from scipy import special
 from ...exceptions import reasons_of, some_of
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
+from ...results.errors.header_pointing import CURE as POINTING_CURE
 from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
 from .dynamic_check import dynamic_check, significance
@@ -34,6 +35,7 @@ _CAUSES["duplicates"] = "degree", "time", "place"
 _ORDER = (
     "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "prior", "reference", "camera",
     "absolute", "overlaps", "extrapolation", "rejection", "stars", "completeness", "duplicates", "header distortion",
+    "header pointing",
 )  # fmt: skip
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
@@ -90,6 +92,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
         stars_check(solution, observed),
         completeness_check(solution, residuals),
         header_check(header_distortion),
+        pointing_check(solution),
     )
     made |= {check.name: check for check in others if check is not None}
     made["absolute"] = absolute_check(solution, made)
@@ -463,6 +466,15 @@ def duplicates_check(solution, residuals):
         return Check("duplicates", "pass", value[same[0]], _SAME, f"{found}; the errors found here count that")
     cure = "exposures that are close in time or place share a distortion or errors of the measurement: "
     return Check("duplicates", "warn", value[same[0]], _SAME, found, f"{cure}--errors correlated counts that")
+
+
+def pointing_check(solution):
+    """Do headers say that exposures lie otherwise to each other than the stars have them? None where none does."""
+    pointing = solution.diagnostics.pointing
+    if pointing is None or not (words := pointing.sentence):
+        return None
+    n = len(pointing.off) + sum(map(len, pointing.groups))
+    return Check("header pointing", "warn", float(n), 0.0, words, POINTING_CURE)
 
 
 def header_check(header_distortion):
