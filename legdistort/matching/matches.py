@@ -410,7 +410,7 @@ class Matches(ShownAsPrinted):
         allow_copies: bool = False,
         camera: Camera | None = None,
         pose_sigma: Mapping[str, float | u.Quantity] | None = None,
-        pointing: HeaderPointing | None = None,
+        **passed_on: HeaderPointing | None,
     ) -> Matches:
         """Matches from a table of positions whose stars are identified.
 
@@ -441,8 +441,8 @@ class Matches(ShownAsPrinted):
             Where exposures have several detectors, distinguished by the column ``detector``: they become one, the focal
             plane of the camera, whose layout and static distortion count as known. What an exposure adds is then a
             distortion of the focal plane as a whole.
-        pointing : HeaderPointing, optional
-            Passed on.
+        **passed_on
+            ``pointing``, as `read_meta` has it.
         pose_sigma : dict, optional
             Standard errors of the poses given, which are then more than start values: of ``shift``, that of the middle
             of the detector [pix, both axes], ``rotation`` [deg] about it, and ``scale`` (relative); 0 is exact, and
@@ -494,7 +494,7 @@ class Matches(ShownAsPrinted):
         if epoch is None and "epoch" in table.colnames:
             epochs = column_contract.values(table, "epoch", u.yr)
             epoch = float(np.nanmean(epochs)) if np.isfinite(epochs).any() else None
-        known = {"observations": seen, "camera": camera, "pose_sigma": pose_sigma, "pointing": pointing}
+        known = {"observations": seen, "camera": camera, "pose_sigma": pose_sigma, **passed_on}
         return cls(table, shapes, poses, sky, left_out, epoch, header_distortion, **known)
 
 

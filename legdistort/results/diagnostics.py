@@ -110,8 +110,8 @@ class Validation:
 
     def __str__(self) -> str:
         return (
-            f"{self.n_stars} stars, {self.n_observations} observations: they scatter by {self.scatter:.4f} px "
-            f"per axis, {self.expected:.4f} expected from the errors (ratio {self.ratio:.2f})"
+            f"{self.n_stars} stars, {self.n_observations} observations, out of the solution: they scatter by "
+            f"{self.scatter:.4f} px per axis, {self.expected:.4f} expected from the errors (ratio {self.ratio:.2f})"
         )
 
 

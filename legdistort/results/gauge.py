@@ -415,6 +415,11 @@ class Gauge(ShownAsPrinted):
         return rows
 
     @property
+    def absolute_error(self) -> float:
+        """Error of the common map, rms over the field and axis, pixels; what is unknown and noise of stars aside."""
+        return float(np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()])))
+
+    @property
     def unknown_names(self) -> list[str]:
         """Names of what is unknown, each once."""
         weak = () if self.responses is None else self.responses.weak
@@ -439,7 +444,7 @@ class Gauge(ShownAsPrinted):
         """The convention in a sentence."""
         if self.plane is not None:
             return f"{self.kind}: the plane is {self.plane}; absolute errors are not available"
-        error = np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()]))
+        error = self.absolute_error
         tied = f"{self.tie.sentence}; " if self.tie is not None else ""
         after = f" after {self.unknown_in_words}" if self.unknown_names else ""
         aside = ", apart from the pointing" if self.tie is None and not self.poses_known else ""

@@ -247,14 +247,13 @@ def solve(
         fit, options, chosen = _fitted(given, options, sought, join)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
-        diagnostics = replace(_diagnostics(fit, prior, scale), **chosen)
+        diagnostics = replace(_diagnostics(fit, prior, scale), pointing=given.pointing, **chosen)
         if catalogue is not None:
             fit = reference_tie.tie_to(fit, catalogue, scale=scale, epoch=epoch, pixel_scale=pixel_scale)
         fit = fit if sought is None or catalogue is not None else _on_headers(fit, given)
     epoch = given.epoch if epoch is None else epoch
     sky = "exposures" if given.sky is not None else None if fit.matches.sky is None else "reference"
     found = replace(diagnostics, sky=sky, reference=reference_tie.used_reference(fit, catalogue), epoch=epoch)
-    found = replace(found, pointing=given.pointing)
     solution = _solution(fit, scale, _settings(asked, options, form), found, form)
     if solution.gauge.warning:
         log.warning("%s", solution.gauge.warning)

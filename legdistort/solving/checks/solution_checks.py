@@ -39,6 +39,7 @@ _ORDER = (
 )  # fmt: skip
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
+_PASSES = f"passes (chance, or errors right to {100 * NEGLIGIBLE:.0f} %)"
 _TELL_STATIC = "dithers by a good part of the field, or a turned camera, show it"
 _TOO_MUCH = 0.5  # of a frame without stars around
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
@@ -188,11 +189,11 @@ def errors_check(solution, residuals):
     ratio, whole = chi2 / dof, solution.chi2 / solution.dof
     low, high = of_chi2(dof)
     if found := _errors_in_force(solution):
-        found += f": chi2/dof {ratio:.3g} with them, {low:.2f} to {high:.2f} by chance"
+        found += f": chi2/dof {ratio:.3g} with them, {low:.2f} to {high:.2f} {_PASSES}"
         if solution.diagnostics.error_law is None:
             found += f" ({_chi2_at_stated_errors(solution) / solution.dof:.3g} at the stated errors)"
     else:
-        found = f"chi2/dof {ratio:.3g} at the stated errors, {low:.2f} to {high:.2f} by chance"
+        found = f"chi2/dof {ratio:.3g} at the stated errors, {low:.2f} to {high:.2f} {_PASSES}"
         if abs(ratio - whole) > 5e-3 * ratio:
             found += f" ({whole:.3g} with what holding the common map leaves in the residuals)"
     if ratio > high:
@@ -331,10 +332,8 @@ def absolute_check(solution, others):
     if unknown:
         sentence, _, cure = warning.partition("; ")
         return Check("absolute", "unknown", len(unknown), 0, sentence, cure)
-    stars = solution.stars
-    variance = stars["x_err_abs"].value ** 2 + stars["y_err_abs"].value ** 2
-    error = float(np.sqrt(np.nanmean(variance) / 2))
-    known = f"absolute positions of the stars are known to {error:.2g} px rms per axis"
+    error = solution.gauge.absolute_error
+    known = f"absolute positions are known to {error:.2g} px rms per axis over the field, the noise of stars aside"
     return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")
 
 
@@ -348,6 +347,8 @@ def _grounds(gauge, others):
     for name in grounds.keys() & others.keys():
         if others[name].state == "unknown":
             grounds[name] += " (not tested)"
+    if gauge.poses_known:
+        grounds["poses"] = "the errors stated of the poses"
     return " and ".join(grounds.values()) or "dithers and rolls alone"
 
 
