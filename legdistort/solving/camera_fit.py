@@ -31,6 +31,8 @@ _TOLD = 0.1
 #: Weights of a change of a layout, its shift and the rest, beside that of a static distortion, where a map can be put
 #: into either: shifts are the least known.
 _SHIFT_WEIGHT, _LAYOUT_WEIGHT = 0.003, 0.03
+#: Part of a direction that may be left of it where it counts as one of several.
+_LIES_IN = 0.3
 #: Steps at most, and their length in standard errors at which they end.
 _STEPS, _SMALL = 10, 0.01
 
@@ -369,7 +371,7 @@ def camera_step(fit, sought, departure):
     precision = 1 / prior[free] ** 2
     pull = follow.pull - precision * departure[free]
     covariance, weak = _inverse(follow.normal, precision, follow.alone)
-    held = _held(weak, np.nonzero(free)[2], _slides(fit, free))
+    held = _held(weak, np.nonzero(free)[2], _slides(fit, free, weak))
     change = np.zeros(free.shape)
     change[free] = held @ (departure[free] + covariance @ pull) - departure[free]
     covariance = held @ covariance @ held.T
@@ -419,16 +421,23 @@ def _inverse(normal, precision, alone):
     return known @ inner @ known.T, (vectors[:, ~good] * unit[:, None]).T
 
 
-def _slides(fit, free):
-    """Shifts (m, k) in the focal plane, by the free modes, of groups of detectors that no star ties to each other."""
+def _slides(fit, free, weak):
+    """Shifts (m, k) in the focal plane, by the free modes, of groups of detectors that nothing ties to each other.
+
+    No star, nor a catalogue: to move such a group is one of the directions `weak` (w, k) that are not determined.
+    """
     camera = fit.matches.camera
     groups = camera.groups(fit.matches.table[fit.problem.order][fit.used])
-    rows = np.zeros((len(groups), 2, *free.shape))
-    for group, row in zip(groups, rows, strict=True):
+    rows, moves = np.zeros((2, len(groups), 2, *free.shape))
+    for g, group in enumerate(groups):
         for c, (key, chip) in enumerate(camera.detectors.items()):
             if key in group:
-                row[:, c, :, 0] = np.linalg.inv(chip.layout[:, :2]) / len(group)
-    return rows[..., free].reshape(-1, np.count_nonzero(free)) if len(groups) > 1 else np.zeros((0, free.sum()))
+                rows[g, :, c, :, 0] = np.linalg.inv(chip.layout[:, :2]) / len(group)
+                moves[g, :, c, :, 0] = chip.layout[:, :2].T
+    rows, moves = (each[..., free].reshape(2 * len(groups), np.count_nonzero(free)) for each in (rows, moves))
+    along = np.linalg.qr(weak.T)[0]
+    left = np.linalg.norm(moves - moves @ along @ along.T, axis=1)
+    return rows[(left < _LIES_IN * np.linalg.norm(moves, axis=1)) & (len(groups) > 1)]
 
 
 def _held(weak, modes, slides):
