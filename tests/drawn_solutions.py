@@ -45,7 +45,9 @@ def make_solution(
         chi2=1432.1,
         dof=1380,
         status="converged after 4 iterations",
-        gauge=SimpleNamespace(sentence="minimal: by convention", warning="", motion=coefficients, tie=None),
+        gauge=SimpleNamespace(
+            sentence="minimal: by convention", warning="", motion=coefficients, tie=None, plane="one of our own"
+        ),
         settings=Settings(degree),
         diagnostics=Diagnostics(),
         estimate=Estimate(

@@ -68,6 +68,21 @@ class HeaderLayout:
             out.append(similarity.describe(similarity.fit_similarity(stated, found, parity=1))["rotation"])
         return np.array(out)
 
+    @cached_property
+    def errors(self):
+        """Standard deviations (n, 2) of the shifts [pix, per axis] and rotations [degrees], by those that agree.
+
+        By how these scatter about the similarity, which is not known better; NaN where fewer than three agree.
+        """
+        n, middles = np.count_nonzero(self.agree), self.found.mean(axis=1)
+        if n < 3:
+            return np.full((len(self.names), 2), np.nan)
+        arms = np.sum((middles - middles[self.agree].mean(axis=0)) ** 2, axis=1)
+        leverage = 1 / n + arms / arms[self.agree].sum()
+        shift = np.sum(self.shifts[self.agree] ** 2) / (2 * n - 4) * (1 + leverage)
+        turn = np.mean(self.rotations[self.agree] ** 2)  # places too turn the similarity, and so all of these
+        return np.sqrt(np.column_stack([shift, np.full(len(shift), turn)]))
+
     @property
     def odd(self):
         """Detectors whose header contradicts the others, tuple of str."""
@@ -97,12 +112,19 @@ class HeaderLayout:
                 return f"the headers of detectors {' and '.join(self.names)} have these {far}"
             return f"the headers have the detectors up to {far}"
         told = [
-            f"{name} {np.hypot(*shift):.0f} px ({shift[0]:+.0f} in x, {shift[1]:+.0f} in y, turned by {angle:.2f} deg)"
-            for name, shift, angle, agrees in zip(self.names, self.shifts, self.rotations, self.agree, strict=True)
+            f"{name} {np.hypot(*shift):.0f} px ({shift[0]:+.0f} in x, {shift[1]:+.0f} in y of the focal plane"
+            f"{_told_error(off)}, turned by {angle:.2f}{_told_error(turn)} deg)"
+            for name, shift, angle, (off, turn), agrees in zip(
+                self.names, self.shifts, self.rotations, self.errors, self.agree, strict=True
+            )
             if not agrees
         ]
         others = f"the headers of the other {np.count_nonzero(self.agree)} agree to {self.scatter:.2g} px"
         return f"the headers have detector {', '.join(told)} from where {there}; {others}" if told else ""
+
+
+def _told_error(error):
+    return f" +- {error:.1g}" if np.isfinite(error) else ""
 
 
 def compare_headers(camera):

@@ -123,7 +123,10 @@ def checked_wcs(grid):
     if not wcs.has_celestial or wcs.naxis != 2:
         raise InputError("grid must have two axes, both celestial; grid=None takes the reference plane")
     if wcs.array_shape is None:
-        raise InputError("grid has no shape: give NAXIS1 and NAXIS2 in the header, or set wcs.array_shape = (ny, nx)")
+        raise InputError(
+            "grid has no shape: give NAXIS1 and NAXIS2 in the header, or set wcs.array_shape = (ny, nx); the .head of "
+            "a frame, as legdistort attach --head writes it, has none: give the stack that SWarp made (--grid STACK)"
+        )
     _check_pixels(wcs, "grid")
     return wcs
 

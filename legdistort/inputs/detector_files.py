@@ -29,8 +29,8 @@ _APART, _SAME_TIME = 60 / 3.156e7, 2 / 3.156e7
 def with_detectors(exposures):
     """Exposures with `exposure` and `detector`, if they are those of several detectors in files of their own.
 
-    Else as they are. Every file must be of a detector that its header names, no exposure have one twice, and one at
-    least have several.
+    Else as they are. Every file must be of a detector that its header names, or its own name where it states nothing (a
+    gwcs alone), no exposure have one twice, and one at least have several.
 
     Parameters
     ----------
@@ -38,8 +38,8 @@ def with_detectors(exposures):
     """
     if any(exposure.detector is not None for exposure in exposures):
         return exposures
-    for keyword in _OF_FILES:
-        ids = [str(exposure.header.get(keyword, "")).strip() for exposure in exposures]
+    for keyword in (*_OF_FILES, None):
+        ids = [_stated(exposure, keyword) for exposure in exposures]
         if len(set(ids)) < 2 or "" in ids or not all(re.fullmatch(r"[\w.+-]+", key) for key in ids):
             continue
         for whole in (_by_name(exposures, ids), _by_time(exposures)):
@@ -54,6 +54,14 @@ def with_detectors(exposures):
                     for exposure, name, key in zip(exposures, whole, ids, strict=True)
                 ]
     return exposures
+
+
+def _stated(exposure, keyword):
+    """The detector by a keyword of the header; without one by the name of a file that has no header, such as a gwcs."""
+    if keyword is not None:
+        return str(exposure.header.get(keyword, "")).strip()
+    found = None if set(exposure.header) - {"EXPTIME"} else _IN_NAME.search(exposure.name)
+    return "" if found is None else found[1].upper()
 
 
 def _by_name(exposures, ids):

@@ -92,6 +92,7 @@ def joined(parts):
     first = next(iter(parts.values()))
     known |= {"pose_sigma": first.pose_sigma, "sky": first.sky if same["sky"] else None}
     known |= {"camera": first.camera if first.camera.is_known else None}
+    known["pointing"] = first.pointing if same["sky"] else None
     known["header_distortion"] = next((p.header_distortion for p in parts.values() if p.header_distortion), None)
     _warn_of_lost_columns(dict(zip(parts, tables, strict=True)))
     return vstack(tables, join_type="inner", metadata_conflicts="silent"), known

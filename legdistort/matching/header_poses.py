@@ -7,12 +7,14 @@ import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from scipy import special
+from scipy.sparse.csgraph import connected_components
 
-from ..exceptions import AssumptionWarning, some_of, warn
+from ..exceptions import AssumptionWarning, warn
 from ..geometry import similarity
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs.sky_wcs import to_icrs
 from ..priors.from_headers import undistorted_plane
+from ..results.errors.header_pointing import HeaderPointing
 
 #: Headers that disagree with the others by more than this part of the field do not determine where the field lies.
 TOLERANCE = 0.1
@@ -113,31 +115,52 @@ class HeaderPoses:
         sky : `~legdistort.geometry.tangent_plane.TangentPlane` or None
             Where their plane lies; None, with the poses as they were, if the headers do not determine it.
         """
-        names = [name for name in found if name in self.poses]
-        if not names:
+        agreement = self._agreement(found)
+        if agreement is None:
             return found, None
-        # every header states where the plane of the poses lies in the plane of the sky
-        steps = np.array([similarity.compose(similarity.invert(found[n]), self.poses[n]) for n in names])
-        size = max(max(self.shapes[n]) for n in names)
-        corners = np.array([similarity.apply(step, _grid(self.shapes[names[0]], 2)) for step in steps])
-        apart = np.linalg.norm(corners - np.median(corners, axis=0), axis=2).max(axis=1)
-        good = apart < TOLERANCE * size
+        names, steps, _, good = agreement
+        if words := self.pointing(found).sentence:
+            warn(words, AssumptionWarning)
         if 2 * np.count_nonzero(good) <= len(names):
-            warn(
-                "the header WCSs contradict the stars and one another; they are ignored, and the sky stays unknown",
-                AssumptionWarning,
-            )
             return found, None
-        off = [name for name, agrees in zip(names, good, strict=True) if not agrees]
-        if off:
-            warn(
-                f"the header WCS of {some_of(off, 3)} contradicts the stars by up to {apart.max():.0f} px; the sky is "
-                "that of the other headers",
-                AssumptionWarning,
-            )
         mean = steps[good].mean(axis=0)
         self._compare_dithers({name: found[name] for name, agrees in zip(names, good, strict=True) if agrees}, mean)
         return {name: similarity.compose(pose, mean) for name, pose in found.items()}, self.sky
+
+    def pointing(self, found):
+        """The `HeaderPointing` of poses ``{exposure: (2, 3)}`` in any plane; None without headers."""
+        agreement = self._agreement(found)
+        if agreement is None:
+            return None
+        names, steps, corners, good = agreement
+        n = np.count_nonzero(good)
+        if 2 * n <= len(names):
+            return HeaderPointing(0, np.nan, np.nan, groups=_groups(names, corners, TOLERANCE * self._size(names)))
+        middles, turns = corners.mean(axis=1), np.array([similarity.describe(step)["rotation"] for step in steps])
+        turns = (turns - turns[good][0] + 180) % 360 - 180
+        turns = (turns - turns[good].mean() + 180) % 360 - 180
+        errors = [np.nan, np.nan]
+        if n > 1:
+            errors = [np.sqrt(np.mean(np.var(each[good], axis=0, ddof=1)) / n) for each in (middles, turns[:, None])]
+        apart = np.linalg.norm(corners - np.median(corners, axis=0), axis=2).max(axis=1)
+        off = {names[k]: (float(apart[k]), float(turns[k])) for k in np.flatnonzero(~good)}
+        return HeaderPointing(int(n), *map(float, errors), off)
+
+    def _size(self, names):
+        return max(max(self.shapes[n]) for n in names)
+
+    def _agreement(self, found):
+        """Names of exposures with headers, where each states that the plane lies, and which agree; None without.
+
+        As similarities (n, 2, 3) to the plane of the headers, and the corners (n, 4, 2) there.
+        """
+        names = [name for name in found if name in self.poses]
+        if not names:
+            return None
+        steps = np.array([similarity.compose(similarity.invert(found[n]), self.poses[n]) for n in names])
+        corners = np.array([similarity.apply(step, _grid(self.shapes[names[0]], 2)) for step in steps])
+        apart = np.linalg.norm(corners - np.median(corners, axis=0), axis=2).max(axis=1)
+        return names, steps, corners, apart < TOLERANCE * self._size(names)
 
     def _compare_dithers(self, found, mean):
         """Warn where the stars move between exposures as no WCS of that scale and orientation lets them move.
@@ -173,6 +196,14 @@ class HeaderPoses:
                 "the headers",
                 AssumptionWarning,
             )
+
+
+def _groups(names, corners, tolerance):
+    """Names whose corners (n, 4, 2) lie within a tolerance of each other, directly or through others; largest first."""
+    apart = np.linalg.norm(corners[:, None] - corners, axis=3).max(axis=2)
+    _, group = connected_components(apart < tolerance, directed=False)
+    found = [tuple(np.array(names)[group == g].tolist()) for g in range(group.max() + 1)]
+    return tuple(sorted(found, key=len, reverse=True))
 
 
 def _turned(shape, x, y, rotation):

@@ -432,8 +432,10 @@ def _finish(table, star, shapes, headers, left_out, epoch, distortions):
     if left_out:
         log.warning("left out: %s", reasons_of(left_out))
     matches = Matches.from_table(table, shape=shapes, left_out=left_out, epoch=epoch)
-    poses, sky = headers.place(_undistorted_poses(matches, distortions))
-    return replace(matches, poses=poses, sky=sky, header_distortion=describe(distortions))
+    undistorted = _undistorted_poses(matches, distortions)
+    poses, sky = headers.place(undistorted)
+    known = {"header_distortion": describe(distortions), "pointing": headers.pointing(undistorted)}
+    return replace(matches, poses=poses, sky=sky, **known)
 
 
 def _undistorted_poses(matches, distortions):

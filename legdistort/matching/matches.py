@@ -18,6 +18,7 @@ from ..geometry import similarity
 from ..geometry.epochs import exposure_years
 from ..geometry.tangent_plane import TangentPlane
 from ..inputs import column_contract, exposure_names, repetitions, start_poses
+from ..results.errors.header_pointing import HeaderPointing
 from ..runtime.checks import check_choice
 from ..runtime.guards.units import plain_numbers
 from ..runtime.notebook import ShownAsPrinted
@@ -183,6 +184,8 @@ class Matches(ShownAsPrinted):
     pose_sigma : dict or None
         Errors of all poses, ``shift`` [pix], ``rotation`` [deg], ``scale``, those that are known; None: poses are where
         a solution starts.
+    pointing : HeaderPointing or None
+        How well headers tell where the plane lies on the sky, where they put it there.
 
     See Also
     --------
@@ -209,6 +212,7 @@ class Matches(ShownAsPrinted):
     observations: Observations | None = None
     camera: Camera = field(default=None, metadata={READ: Camera.from_meta})
     pose_sigma: dict[str, float] | None = None
+    pointing: HeaderPointing | None = field(default=None, metadata={READ: HeaderPointing.of_meta})
 
     def __post_init__(self) -> None:
         if self.camera is None:
@@ -406,6 +410,7 @@ class Matches(ShownAsPrinted):
         allow_copies: bool = False,
         camera: Camera | None = None,
         pose_sigma: Mapping[str, float | u.Quantity] | None = None,
+        **passed_on: HeaderPointing | None,
     ) -> Matches:
         """Matches from a table of positions whose stars are identified.
 
@@ -436,6 +441,8 @@ class Matches(ShownAsPrinted):
             Where exposures have several detectors, distinguished by the column ``detector``: they become one, the focal
             plane of the camera, whose layout and static distortion count as known. What an exposure adds is then a
             distortion of the focal plane as a whole.
+        **passed_on
+            ``pointing``, as `read_meta` has it.
         pose_sigma : dict, optional
             Standard errors of the poses given, which are then more than start values: of ``shift``, that of the middle
             of the detector [pix, both axes], ``rotation`` [deg] about it, and ``scale`` (relative); 0 is exact, and
@@ -487,7 +494,7 @@ class Matches(ShownAsPrinted):
         if epoch is None and "epoch" in table.colnames:
             epochs = column_contract.values(table, "epoch", u.yr)
             epoch = float(np.nanmean(epochs)) if np.isfinite(epochs).any() else None
-        known = {"observations": seen, "camera": camera, "pose_sigma": pose_sigma}
+        known = {"observations": seen, "camera": camera, "pose_sigma": pose_sigma, **passed_on}
         return cls(table, shapes, poses, sky, left_out, epoch, header_distortion, **known)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..assessment.pulls import pulls_of
 from ..exceptions import InputError
+from ..results.in_tables import layout_errors
 from ..runtime.outputs import replacing
 from .checks_table import verdict
 from .comparison import compared_corrections, compared_stacks
@@ -152,6 +153,9 @@ def _details(gallery, solution, pulls, psfs, facts, comparison, stacks):
     """What stands in the section that is folded: tables and more pictures."""
     first = next(iter((psfs or {}).items()), None)
     camera = solution.camera
+    detectors = None
+    if camera.has_focal_plane:
+        detectors = camera.name, detectors_table(camera, layout_errors(solution))
     pictures = [
         *([gallery.camera(camera)] if camera.has_focal_plane else []),
         *gallery.distortions(solution),
@@ -166,7 +170,7 @@ def _details(gallery, solution, pulls, psfs, facts, comparison, stacks):
         "exposures": exposures_table(solution, (facts.get("quality") or {}).get("exposures")),
         "nights": nights_table(solution),
         "stated": stated_table(facts["stated"]) if facts.get("stated") else None,
-        "detectors": (camera.name, detectors_table(camera)) if camera.has_focal_plane else None,
+        "detectors": detectors,
         "stars": stars_table(solution, pulls),
         "more": pictures,
     }

@@ -16,9 +16,9 @@ from ..plots import (
     stack_plots,
     trend_plots,
 )
+from ..results.accuracy import sizes
 from ..results.view import error_map
 from .svg import detached_figure, svg_of
-from .tables import sizes
 
 #: Spaces between panels that have a title each.
 _PANELS = {"wspace": 0.06, "hspace": 0.14, "top": 0.6}

@@ -4,12 +4,15 @@ from dataclasses import asdict
 
 import numpy as np
 
+from ..assessment.pulls import exposure_rms
+from ..cameras import ties
 from ..geometry import similarity
 from ..results import accuracy, in_tables
 from ..results import nights as night_tables
+from ..results.accuracy import departures, rms_length, sizes
+from ..results.errors.pose_errors import pose_numbers
 from ..runtime import provenance
 from ..runtime.trees.codec import to_tree
-from .tables import departures, exposure_rms, rms_length, sizes
 
 
 def summarise(solution, *, timings=None):
@@ -31,6 +34,7 @@ def summarise(solution, *, timings=None):
         "gauge": solution.gauge.sentence,
         "unknown": list(solution.gauge.unknown_names),
         "sky": in_tables.sky_sentence(solution),
+        "header_pointing": _pointing(solution),
         "reference": found.reference and asdict(found.reference),
         "max_inverse_error_px": _plain(in_tables.largest_inverse_error(solution)),
         "folded": in_tables.folds(solution),
@@ -38,10 +42,24 @@ def summarise(solution, *, timings=None):
         "exposures": (each := exposures(solution)),
         "nights": nights(solution, each),
         "detectors": detectors(solution.camera),
+        "ties": ties.pairs(solution.camera, solution.residuals) if solution.camera.has_focal_plane else [],
+        "layout_errors": in_tables.layout_errors(solution) or None,
         "command": provenance.command_line(),
         **found.summary(),
         "timings": rounded(timings or {}),
     }
+
+
+def _pointing(solution):
+    """What headers say of where the plane lies on the sky; None where none does."""
+    found, scale = solution.diagnostics.pointing, np.nan if solution.sky is None else solution.sky.pixel_scale
+    if found is None:
+        return None
+    off = [{"name": name, "off_px": pixels, "turned_deg": turn} for name, (pixels, turn) in found.off.items()]
+    return {
+        "n_used": found.n_used, "err_mas": _plain(1000 * scale * found.shift), "rotation_err_deg": _plain(found.turn),
+        "contradicting": off, "groups": [list(group) for group in found.groups],
+    }  # fmt: skip
 
 
 def exposures(solution):
@@ -53,17 +71,24 @@ def exposures(solution):
     distortion, dynamic = sizes(solution)
     block, _, epoch = night_tables.blocks(solution)
     out = []
-    for i, view in enumerate(solution):
-        pose = similarity.describe(view.pose)
-        angle, scale = (None, None) if solution.sky is None else view.orientation
+    for i, (name, pose) in enumerate(zip(solution.names, pose_numbers(solution), strict=True)):
         figures = {
-            "n_stars": n[i], "block": block[i], "epoch_yr": epoch[i],
-            "shift_x_px": pose["dx"], "shift_y_px": pose["dy"], "rotation_deg": pose["rotation"],
-            "scale": pose["scale"], "rms_x_px": dx[i], "rms_y_px": dy[i], "distortion_px": distortion[i],
-            "dynamic_px": dynamic[i], "position_angle_deg": angle, "pixel_scale_arcsec": scale,
+            "n_stars": n[i], "block": block[i], "epoch_yr": epoch[i], "rms_x_px": dx[i], "rms_y_px": dy[i],
+            "distortion_px": distortion[i], "dynamic_px": dynamic[i],
         }  # fmt: skip
-        out.append({"name": view.name, "mirrored": pose["parity"] < 0} | {key: _plain(v) for key, v in figures.items()})
+        for key, (symbol, unit) in _POSE.items():
+            figures |= {f"{key}{unit}": pose.values.get(symbol), f"{key}_err{unit}": pose.errors.get(symbol)}
+            figures[f"{key}_unknown{unit}"] = pose.unknown.get(symbol)
+        mirrored = similarity.describe(solution.poses[name])["parity"] < 0
+        out.append({"name": name, "mirrored": mirrored} | {key: _plain(v) for key, v in figures.items()})
     return out
+
+
+#: Figures of a pose, with their names in `PoseNumbers` and their units.
+_POSE = {
+    "shift_x": ("dx", "_px"), "shift_y": ("dy", "_px"), "rotation": ("rotation", "_deg"), "scale": ("scale", ""),
+    "position_angle": ("position_angle", "_deg"), "pixel_scale": ("pixel_scale", "_arcsec"),
+}  # fmt: skip
 
 
 def nights(solution, found):
@@ -106,16 +131,24 @@ def detectors(camera):
     """One dict of numbers a detector: its place in the focal plane, with errors where it is not exact."""
     out, headers, off = [], camera.headers, {}
     if headers is not None:
-        off = dict(zip(headers.names, np.column_stack([headers.shifts, headers.rotations]).tolist(), strict=True))
+        off = dict(
+            zip(
+                headers.names,
+                np.column_stack([headers.shifts, headers.rotations, headers.errors]).tolist(),
+                strict=True,
+            )
+        )
     for key, each in camera.detectors.items() if camera.has_focal_plane else ():
         place = each.place
-        x_off, y_off, turned = off.get(key, (None, None, None))
+        x_off, y_off, turned, off_err, turned_err = off.get(key, (None,) * 5)
         x_err, y_err, rotation_err = map(_plain, place.errors or (None, None, None))
         out.append(
             {
                 "name": key, "x_px": place.x, "y_px": place.y, "rotation_deg": place.rotation, "scale": place.scale,
                 "x_err_px": x_err, "y_err_px": y_err, "rotation_err_deg": rotation_err, "static_px": float(each.rms),
                 "header_x_off_px": x_off, "header_y_off_px": y_off, "header_turned_deg": turned,
+                "header_off_err_px": _plain(off_err),
+                "header_turned_err_deg": _plain(turned_err),
             }
         )  # fmt: skip
     return out

@@ -8,6 +8,8 @@ from ..assessment.pulls import exposure_rms
 from ..exceptions import some_of
 from ..geometry import similarity
 from ..measurement.flags import TRAILED
+from ..results.accuracy import sizes
+from ..results.errors import pose_errors
 
 #: An exposure whose residuals exceed the median by this factor is marked.
 _MARK = 2.0
@@ -77,15 +79,13 @@ def exposures_table(solution, shapes=None):
         "distortion": "rms, px",
         "dynamic part": "rms, px",
     } | (_SHAPE if shapes else {})
-    rows = []
+    rows, numbers = [], pose_errors.pose_numbers(solution)
     for i, name in enumerate(solution.names):
-        pose = similarity.describe(solution.poses[name])
+        pose = {key: _known(numbers[i], key) for key in pose_errors.POSE}
+        pose["rotation"] += ", mirrored" * (similarity.describe(solution.poses[name])["parity"] < 0)
         cells = [
             name,
-            f"{pose['dx']:.2f}",
-            f"{pose['dy']:.2f}",
-            f"{pose['rotation']:.4f}{', mirrored' if pose['parity'] < 0 else ''}",
-            f"{pose['scale']:.6f}",
+            *pose.values(),
             f"{n[i]}",
             *(_number(rms[i]) for rms in (dx, dy)),
             f"{distortion[i]:.3f}",
@@ -102,8 +102,8 @@ def exposures_table(solution, shapes=None):
     return Table(
         head,
         rows,
-        "Shift, rotation and scale lead from the reference plane to the detector. Distortion: length of the "
-        "displacement over the detector, less its mean; dynamic part: the same of the departure from the "
+        f"Shift, rotation and scale lead from the reference plane to the detector{_how_known(numbers)}. Distortion: "
+        "length of the displacement over the detector, less its mean; dynamic part: the same of the departure from the "
         f"{reference}. Residuals above {_MARK:g} times the median are marked"
         + (f", and stars longer than {TRAILED:g} times their width: they are trailed." if shapes else "."),
     )
@@ -177,7 +177,20 @@ def stars_table(solution, pulls):
     )
 
 
-def detectors_table(camera):
+def _known(pose, name):
+    """A number of a pose with its error, or with what there is of it where that is not determined."""
+    error = pose.errors[name]
+    if pose.is_lost(name) or not np.isfinite(error):
+        return pose.text(name)
+    return _with_error(pose.values[name], pose_errors.POSE[name][1], error)
+
+
+def _how_known(numbers):
+    words = pose_errors.in_words(numbers)
+    return f" ({words})" if words else ""
+
+
+def detectors_table(camera, after=""):
     """One row a detector: where it lies, with the errors of that, and the size of its static distortion."""
     head = {"detector": "", "centre x": "px", "centre y": "px", "rotation": "deg", "scale": "", "static": "rms, px"}
     rows = []
@@ -189,31 +202,8 @@ def detectors_table(camera):
     return Table(
         head,
         rows,
-        "Centres in the focal plane. Errors, where the layout was fitted, are standard deviations after one affine map "
-        "of all detectors together, which exposures can take over.",
+        f"Centres in the focal plane{': ' if after else '.'}{after}{'.' if after else ''}",
     )
-
-
-def sizes(solution):
-    """Rms length over the detector of each distortion and of its dynamic part, without the constant mode, pixels.
-
-    The basis is orthonormal on a square of area 4: the mean square is the sum of squared coefficients over 4.
-    """
-    return [rms_length(part) for part in (solution.coefficients, departures(solution))]
-
-
-def departures(solution):
-    """Dynamic parts (n_exposures, 2, n_modes): from the static distortion, without one from the median exposure.
-
-    The median: one night that is odd is not in what all others depart from.
-    """
-    static = solution.estimate.prior_mean
-    return solution.coefficients - (static if np.any(static) else np.median(solution.coefficients, axis=0))
-
-
-def rms_length(coefficients):
-    """Rms length (...) over the detector of displacements (..., 2, n_modes) without the constant mode, pixels."""
-    return np.sqrt(np.sum(coefficients[..., 1:] ** 2, axis=(-2, -1))) / 2
 
 
 def _with_error(value, digits, error):

@@ -355,6 +355,28 @@ def scatter_summary(solution):
     return {"n_stars": len(sigma), "mean": mean, "std": std, **both}
 
 
+def sizes(solution):
+    """Rms length over the detector of each distortion and of its dynamic part, without the constant mode, pixels.
+
+    The basis is orthonormal on a square of area 4: the mean square is the sum of squared coefficients over 4.
+    """
+    return [rms_length(part) for part in (solution.coefficients, departures(solution))]
+
+
+def departures(solution):
+    """Dynamic parts (n_exposures, 2, n_modes): from the static distortion, without one from the median exposure.
+
+    The median: one night that is odd is not in what all others depart from.
+    """
+    static = solution.estimate.prior_mean
+    return solution.coefficients - (static if np.any(static) else np.median(solution.coefficients, axis=0))
+
+
+def rms_length(coefficients):
+    """Rms length (...) over the detector of displacements (..., 2, n_modes) without the constant mode, pixels."""
+    return np.sqrt(np.sum(coefficients[..., 1:] ** 2, axis=(-2, -1))) / 2
+
+
 def expected_scatter(solution, xy, sigma, *, seen=None, covariance=None):
     """What `scatter` should be for new positions that the solution has not seen, from its Fisher matrix.
 

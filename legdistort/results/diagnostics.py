@@ -10,6 +10,7 @@ from scipy.optimize import nnls
 
 from ..inputs import column_contract
 from ..runtime.trees.facts import YEARS, number, text
+from .errors.header_pointing import HeaderPointing
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -109,8 +110,8 @@ class Validation:
 
     def __str__(self) -> str:
         return (
-            f"{self.n_stars} stars, {self.n_observations} observations: they scatter by {self.scatter:.4f} px "
-            f"per axis, {self.expected:.4f} expected from the errors (ratio {self.ratio:.2f})"
+            f"{self.n_stars} stars, {self.n_observations} observations, out of the solution: they scatter by "
+            f"{self.scatter:.4f} px per axis, {self.expected:.4f} expected from the errors (ratio {self.ratio:.2f})"
         )
 
 
@@ -334,6 +335,8 @@ class Diagnostics:
     higher_static : float or None
         Rms per axis over the detector, pixels, of what exposures were found to have in common beyond the degree of the
         fit; it is part of every distortion. None: nothing was found.
+    pointing : HeaderPointing or None
+        How well the headers tell where the plane lies on the sky, where they do.
     """
 
     error_floor: float = field(default=0.0, metadata=_PIXELS)
@@ -351,6 +354,7 @@ class Diagnostics:
     correlated: CorrelatedErrors | None = None
     motion_scatter: MotionScatter | None = None
     higher_static: float | None = field(default=None, metadata=_PIXELS)
+    pointing: HeaderPointing | None = None
 
     def found_errors(
         self,

@@ -363,12 +363,18 @@ class Gauge(ShownAsPrinted):
 
         Posterior standard deviation above 1 px, rms over the stars, where no size of the static distortion is stated.
         """
-        shape = (len(self.motion), 2, self.n_own)
         mapped = tuple(
-            UnknownDirection(each.name, self.directions @ each.map, -(self.motion @ each.map).reshape(shape))
-            for each in self.unknown_maps
+            UnknownDirection(each.name, self.directions @ each.map, changes)
+            for each, changes in zip(self.unknown_maps, self.unknown_coefficients, strict=False)
         )
         return mapped + self.responses.weak
+
+    @property
+    def unknown_coefficients(self) -> list[np.ndarray]:
+        """How the coefficients change with each direction of `unknown`, (n_exposures, 2, n) each, pixels."""
+        shape = (len(self.motion), 2, self.n_own)
+        mapped = [-(self.motion @ each.map).reshape(shape) for each in self.unknown_maps]
+        return mapped + [each.coefficients for each in (() if self.responses is None else self.responses.weak)]
 
     @property
     def absolute_covariance(self) -> np.ndarray:
@@ -409,10 +415,20 @@ class Gauge(ShownAsPrinted):
         return rows
 
     @property
+    def absolute_error(self) -> float:
+        """Error of the common map, rms over the field and axis, pixels; what is unknown and noise of stars aside."""
+        return float(np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()])))
+
+    @property
     def unknown_names(self) -> list[str]:
         """Names of what is unknown, each once."""
         weak = () if self.responses is None else self.responses.weak
         return tuple(dict.fromkeys(each.name for each in (*self.unknown_maps, *weak)))
+
+    @property
+    def unknown_in_words(self) -> str:
+        """The same for a reader; empty for nothing."""
+        return in_words(self.unknown_names) if self.unknown_names else ""
 
     @property
     def warning(self) -> str:
@@ -421,16 +437,16 @@ class Gauge(ShownAsPrinted):
             return ""
         why = _STATIC[self.static][0]
         cure = "give dynamic (--dynamic)" if self.static == "open" else CURE
-        return f"absolute positions are not known: {why} ({in_words(self.unknown_names)} not determined); {cure}"
+        return f"absolute positions are not known: {why} ({self.unknown_in_words} not determined); {cure}"
 
     @property
     def sentence(self) -> str:
         """The convention in a sentence."""
         if self.plane is not None:
             return f"{self.kind}: the plane is {self.plane}; absolute errors are not available"
-        error = np.sqrt(np.nansum([error**2 for *_, error in self.absolute_errors()]))
+        error = self.absolute_error
         tied = f"{self.tie.sentence}; " if self.tie is not None else ""
-        after = f" after {in_words(self.unknown_names)}" if self.unknown_names else ""
+        after = f" after {self.unknown_in_words}" if self.unknown_names else ""
         aside = ", apart from the pointing" if self.tie is None and not self.poses_known else ""
         known = f"{tied}absolute to {error:.2g} px rms per axis{after}{aside}"
         if after and error == 0:  # nothing of the common map is known

@@ -8,14 +8,15 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from astropy.time import Time
 
+from ..cameras import ties
 from ..exceptions import by_reason, some_of
-from ..geometry import basis, similarity
+from ..geometry import basis
 from ..geometry.epochs import year
 from ..inputs import column_contract
+from . import accuracy, new_positions, nights
 from . import motions as star_motions
-from . import new_positions, nights
 from .check import in_lines
-from .errors import absolute_errors
+from .errors import absolute_errors, pose_errors
 
 
 def stars(solution):
@@ -161,6 +162,11 @@ def sky_sentence(solution):
     tied = ", tied to the reference" if source and solution.gauge.tie is not None and "head" in source else ""
     if "head" in source and not tied and solution.camera.headers is not None and (odd := solution.camera.headers.odd):
         source += f" of all detectors but {', '.join(odd)}"
+    pointing = None if solution.gauge.poses_known else solution.diagnostics.pointing
+    if source == "from the headers" and not tied and pointing is not None and pointing.off:
+        source += f" of {pointing.n_used} of {pointing.n_used + len(pointing.off)} exposures"
+    known = pointing.error(sky.pixel_scale) if pointing is not None and "head" in source and not tied else ""
+    source += f"; {known}" if known else ""
     words = f"tangent point {sky.lon:.6f} {sky.lat:+.6f} deg, {sky.pixel_scale:.5g} arcsec/px"
     return f"{words}{', ' * bool(source)}{source}{tied}"
 
@@ -173,11 +179,11 @@ def camera_sentence(solution):
     ny, nx = camera.field
     ids = ", ".join(camera.detectors)
     words = f"{camera.name}, detectors {ids}; positions in its focal plane, {nx} x {ny} px"
-    groups = camera.groups(solution.residuals[solution.residuals["used"]])
-    if len(groups) > 1:
-        words += f"; no star in common: {' | '.join(', '.join(group) for group in groups)}"
+    if apart := ties.apart(camera, solution.residuals):
+        words += f"; {apart}"
         held = any(np.isinf(each.place.errors).any() for each in camera.detectors.values() if each.place.errors)
         words += ", so that their places relative to each other are not determined" * held
+    words += f"; {common}" if (common := _common_stars(camera, solution.residuals)) else ""
     common = camera.common_sigma
     if common is not None and np.isinf(common[:, 1:3]).any() and "shear" in solution.gauge.unknown_names:
         words += (
@@ -185,6 +191,15 @@ def camera_sentence(solution):
             "another"
         )
     return words
+
+
+def _common_stars(camera, table):
+    """How many stars pairs of detectors have in common, the fewest first, in words; empty without any."""
+    listed = []
+    for each in sorted(ties.pairs(camera, table), key=lambda pair: pair["n_used"]):
+        of = f" of {each['n_stars']}" if each["n_used"] < each["n_stars"] else ""
+        listed.append(f"{' and '.join(each['detectors'])} {each['n_used']}{of}")
+    return f"stars used on both of two detectors: {some_of(listed, 6)}" if listed else ""
 
 
 def printed(solution):
@@ -200,44 +215,62 @@ def printed(solution):
         *_static_in_words(solution),
         *_wrapped("odd", next((c.sentence for c in solution.checks if c.name == "dynamic part" and c.tests), "")),
         *_wrapped("gauge", solution.gauge.sentence),
-        f"sky     {sky_sentence(solution)}",
+        *_wrapped("sky", sky_sentence(solution)),
         *(_wrapped("stars", motions.sentence) if motions is not None else []),
         f"rms     {both[0]:.4f}, {both[1]:.4f} px in x, y; {np.count_nonzero(used)} of {len(used)} observations used",
         *(line for key, text in solution.diagnostics.in_words().items() for line in _wrapped(key, text)),
         "",
-        f"{'exposure':{_width(solution)}s} {'stars':>5s} {'shift x':>9s} {'shift y':>9s} {'rotation':>9s} "
-        f"{'scale':>9s} "
-        f"{'rms x':>7s} {'rms y':>7s} {'distortion':>10s}{'' if solution.sky is None else _SKY_HEADS}",
+        *_exposure_lines(solution),
     ]
-    lines += [_row(view) for view in solution]
     lines += nights.lines(solution)
     if solution.camera.has_focal_plane:
-        lines += ["", *solution.camera.table_lines()]
+        lines += ["", *solution.camera.table_lines(), *_wrapped("", layout_errors(solution))]
     lines += [f"left out {some_of(names, 6)}: {reason}" for reason, names in by_reason(solution.left_out).items()]
     return "\n".join(lines)
 
 
-def _width(solution):
-    """Letters of the longest name of an exposure, some at least."""
-    return max(16, *map(len, solution.names))
+def _exposure_lines(solution):
+    """Lines of the printed table of the exposures: names, units, one each, and how well the poses are known."""
+    numbers = pose_errors.pose_numbers(solution)
+    distortion, dynamic = accuracy.sizes(solution)
+    table, names = solution.residuals, ["exposure", "", *solution.names]
+    used = [table[table["used"] & (table["exposure"] == name)] for name in solution.names]
+    rms = [[np.sqrt(np.mean(rows[k].to_value(u.pix) ** 2)) if len(rows) else np.nan for rows in used] for k in _RMS]
+
+    def pose(name):
+        return [each.text(name) for each in numbers]
+
+    columns = [
+        (5, "stars", "", [str(len(rows)) for rows in used]),
+        (9, "shift x", "px", pose("dx")), (9, "shift y", "px", pose("dy")),
+        (9, "rotation", "deg", pose("rotation")), (9, "scale", "", pose("scale")),
+        (7, "rms x", "px", [f"{each:.4f}" for each in rms[0]]), (7, "rms y", "px", [f"{each:.4f}" for each in rms[1]]),
+        (8, "dynamic", "px", [f"{each:.3f}" for each in dynamic]),
+        (10, "distortion", "px", [f"{each:.3f}" for each in distortion]),
+    ]  # fmt: skip
+    if solution.sky is not None:
+        columns += [(9, "PA", "deg", pose("position_angle")), (9, "scale", "arcsec/px", pose("pixel_scale"))]
+    width = max(16, *map(len, names))
+    lines = [f"{name:{width}s}" for name in names]
+    for size, *texts in ((size, head, unit, *rows) for size, head, unit, rows in columns):
+        lines = [f"{line} {text:>{size}s}" for line, text in zip(lines, texts, strict=True)]
+    return [*lines, *_wrapped("poses", pose_errors.in_words(numbers))]
 
 
-_SKY_HEADS = f" {'PA [deg]':>9s} {'arcsec/px':>9s}"
+_RMS = "dx", "dy"
 
 
-def _row(view):
-    """Line of an exposure in the printed table."""
-    table = view.solution.residuals
-    rows = table[table["used"] & (table["exposure"] == view.name)]
-    d = similarity.describe(view.pose)
-    rms = [np.sqrt(np.mean(rows[k].to_value(u.pix) ** 2)) if len(rows) else np.nan for k in ("dx", "dy")]
-    sky = ""
-    if view.solution.sky is not None:
-        angle, scale = view.orientation
-        sky = f" {angle:9.4f} {scale:9.6f}"
+def layout_errors(solution):
+    """What the errors of a layout that was fitted leave out, in words; empty where none was."""
+    errors = solution.estimate.uncertainty.camera
+    if errors is None or not solution.camera.has_focal_plane or not (free := errors.free.any(axis=(0, 1)))[:3].any():
+        return ""
+    degree = basis.degree_of(np.count_nonzero(free)) if free[:3].all() else 1
+    which = "one affine map" if degree < 2 else f"one map of degree {degree}"
+    unknown = f", and {solution.gauge.unknown_in_words}" if solution.gauge.unknown_names else ""
     return (
-        f"{view.name:{_width(view.solution)}s} {len(rows):5d} {d['dx']:9.2f} {d['dy']:9.2f} {d['rotation']:9.4f} "
-        f"{d['scale']:9.6f} {rms[0]:7.4f} {rms[1]:7.4f} {np.sqrt((view.coefficients**2).sum()) / 2:10.3f}{sky}"
+        f"errors of the layout are those of detectors relative to each other, after {which} of all together, which "
+        f"exposures take over{unknown} (not determined): places and rotations in the focal plane are not known so well"
     )
 
 

@@ -31,6 +31,8 @@ _TOLD = 0.1
 #: Weights of a change of a layout, its shift and the rest, beside that of a static distortion, where a map can be put
 #: into either: shifts are the least known.
 _SHIFT_WEIGHT, _LAYOUT_WEIGHT = 0.003, 0.03
+#: Part of a direction that may be left of it where it counts as one of several.
+_LIES_IN = 0.3
 #: Steps at most, and their length in standard errors at which they end.
 _STEPS, _SMALL = 10, 0.01
 
@@ -217,7 +219,9 @@ class CameraFit:
         """
         step = self.step
         if step.length >= _SMALL:
-            warn(f"the camera has not settled in {_STEPS} steps; give better layouts", ConvergenceWarning)
+            words = f"layouts and static distortions not, whose last step was {step.length:.2g} of their errors"
+            fit = replace(fit, result=replace(fit.result, status=f"{fit.result.status}; {words}"))
+            warn(f"{words} (of {_STEPS} steps): see the checks, and the ties of the detectors", ConvergenceWarning)
         unknown = _unknown(fit.matches.camera, step)
         _tell_unknown(fit.matches, step, unknown)
         camera = with_errors(fit.matches.camera, step, unknown)
@@ -367,7 +371,7 @@ def camera_step(fit, sought, departure):
     precision = 1 / prior[free] ** 2
     pull = follow.pull - precision * departure[free]
     covariance, weak = _inverse(follow.normal, precision, follow.alone)
-    held = _held(weak, np.nonzero(free)[2])
+    held = _held(weak, np.nonzero(free)[2], _slides(fit, free, weak))
     change = np.zeros(free.shape)
     change[free] = held @ (departure[free] + covariance @ pull) - departure[free]
     covariance = held @ covariance @ held.T
@@ -417,7 +421,26 @@ def _inverse(normal, precision, alone):
     return known @ inner @ known.T, (vectors[:, ~good] * unit[:, None]).T
 
 
-def _held(weak, modes):
+def _slides(fit, free, weak):
+    """Shifts (m, k) in the focal plane, by the free modes, of groups of detectors that nothing ties to each other.
+
+    No star, nor a catalogue: to move such a group is one of the directions `weak` (w, k) that are not determined.
+    """
+    camera = fit.matches.camera
+    groups = camera.groups(fit.matches.table[fit.problem.order][fit.used])
+    rows, moves = np.zeros((2, len(groups), 2, *free.shape))
+    for g, group in enumerate(groups):
+        for c, (key, chip) in enumerate(camera.detectors.items()):
+            if key in group:
+                rows[g, :, c, :, 0] = np.linalg.inv(chip.layout[:, :2]) / len(group)
+                moves[g, :, c, :, 0] = chip.layout[:, :2].T
+    rows, moves = (each[..., free].reshape(2 * len(groups), np.count_nonzero(free)) for each in (rows, moves))
+    along = np.linalg.qr(weak.T)[0]
+    left = np.linalg.norm(moves - moves @ along @ along.T, axis=1)
+    return rows[(left < _LIES_IN * np.linalg.norm(moves, axis=1)) & (len(groups) > 1)]
+
+
+def _held(weak, modes, slides):
     """What takes directions (m, k) that are not determined off a change of the camera, (k, k).
 
     Static distortions stay as they were, as far as that holds these directions, and layouts as far as it does not:
@@ -428,9 +451,12 @@ def _held(weak, modes):
     weak : ndarray, shape (m, k)
     modes : ndarray of int, shape (k,)
         That each unknown belongs to.
+    slides : ndarray, shape (m, k)
+        Those of `_slides`: groups that no star ties to each other stay where they were, as far as that can be.
     """
-    weights = np.select([modes == 0, modes < 3], [_SHIFT_WEIGHT, _LAYOUT_WEIGHT], 1.0)
-    return np.eye(len(modes)) - weak.T @ np.linalg.pinv(weak.T * weights[:, None]) * weights
+    weights = np.diag(np.select([modes == 0, modes < 3], [_SHIFT_WEIGHT, _LAYOUT_WEIGHT], 1.0))
+    weights = np.concatenate([weights, slides])
+    return np.eye(len(modes)) - weak.T @ np.linalg.pinv(weights @ weak.T) @ weights
 
 
 def changed(camera, change):

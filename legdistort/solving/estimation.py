@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..cameras import ties
 from ..cameras.exchanged import check_places
-from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, by_reason, some_of, warn
+from ..exceptions import AssumptionWarning, InputError, LegdistortWarning, SolveError, by_reason, some_of, warn
 from ..matching.header_poses import sky_by_layout
 from ..matching.matches import Matches
 from ..priors.prior import Prior, has_distortion
@@ -246,7 +247,7 @@ def solve(
         fit, options, chosen = _fitted(given, options, sought, join)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
-        diagnostics = replace(_diagnostics(fit, prior, scale), **chosen)
+        diagnostics = replace(_diagnostics(fit, prior, scale), pointing=given.pointing, **chosen)
         how = {"scale": scale, "epoch": epoch, "pixel_scale": pixel_scale}
         fit = _placed(fit, sought, given) if catalogue is None else reference_tie.tie_to(fit, catalogue, **how)
     epoch = given.epoch if epoch is None else epoch
@@ -352,7 +353,36 @@ def _knows_nothing_of_a_mode(prior):
 
 
 def _fitted(matches, options, sought, join):
-    """The fit, its options, and what was chosen and found for the `Diagnostics`; with the camera that is `sought`."""
+    """The fit, its options, and what was chosen and found for the `Diagnostics`; with the camera that is `sought`.
+
+    Groups of detectors that a star or two tie to each other, wrongly, would slide to where these have them, off where
+    the headers do: they are left as they were then, without a tie.
+    """
+    thin = np.zeros(len(matches.table), dtype=bool)
+    if sought is not None and np.isinf(sought.prior[:, :, :3][sought.free[:, :, :3]]).any():
+        thin = ties.alone(matches.camera, matches.table)
+    if not thin.any():
+        return _in_camera(matches, options, sought, join)
+    try:
+        found = _in_camera(matches, options, sought, join)
+        fit = found[0]
+        used, camera = fit.matches.table[fit.problem.order][fit.used], fit.matches.camera
+        if len(camera.groups(used)) == len(camera.groups(fit.matches.table)):
+            return found
+        why = "were left out of the fit as deviant"
+    except SolveError:
+        why = "contradict all others"
+    listed = ties.in_words(ties.few(matches.camera, matches.table))
+    warn(
+        f"how groups of detectors lie to each other rests on {listed}, which {why}: they are left out, and what is not "
+        f"determined then stays as the layout of camera {matches.camera.name} has it",
+        AssumptionWarning,
+    )
+    return _in_camera(replace(matches, table=matches.table[~thin]), options, sought, join)
+
+
+def _in_camera(matches, options, sought, join):
+    """What `_fitted` gives, all ties of detectors believed."""
     camera, selection = None if sought is None else CameraFit(sought, join), None
     if camera is not None:  # to a layout that is wrong by pixels all observations seem to deviate
         plain = partial(single_fit.estimate, options=_plain(options))

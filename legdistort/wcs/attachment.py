@@ -154,6 +154,13 @@ def attach(
         log.info(
             "corners of %d images move by up to %.3g arcsec (%s)", len(images.moved), images.moved[far].arcsec, far
         )
+    if unknown := _unknown_sky(solution):
+        log.warning("%s", unknown)
+    if kind != "head" and not in_place and (maps := [m for plan in plans if (m := WeightMaps().beside(plan.path))]):
+        log.warning(
+            "weight maps stay where they are (%s): SWarp looks for them beside the copies; copy or link them into %s",
+            some_of([each.name for each in maps], 3), out,
+        )  # fmt: skip
     if not plans:
         raise InputError("none of the frames is part of the solution; give those it was made from")
     with replacing_files([plan.target for plan in plans]) if in_place else _copies(Path(out), overwrite) as writing:
@@ -161,6 +168,18 @@ def attach(
             with writing(plan.target) as file:
                 plan.write(file)
     return [Attachment(plan.target, *item, kind) for plan in plans for item in plan.headers.items()]
+
+
+def _unknown_sky(solution):
+    """By how much what is unknown of the common map could move the sky of the images, in words; empty for nothing."""
+    unknown = [] if solution.sky is None else solution.gauge.unknown
+    if not unknown:
+        return ""
+    far = np.sqrt(np.nanmax(np.sum([np.sum(each.stars**2, axis=1) for each in unknown], axis=0)))
+    return (
+        f"what is not determined of absolute positions ({solution.gauge.unknown_in_words}) is in these WCSs too: "
+        f"if it is 1 px rms, it moves places on the sky by up to {far * solution.sky.pixel_scale:.2g} arcsec"
+    )
 
 
 @dataclass(frozen=True, eq=False)

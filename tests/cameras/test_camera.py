@@ -468,7 +468,7 @@ class TestFittedCamera:
         xy = np.array([[300.0, 1700.0]])
         assert np.isnan(solution["frame00", "1"].correct(xy, errors=[[0.01, 0.01]]).absolute).all()
         assert "so that their places relative to each other are not determined" in in_tables.camera_sentence(solution)
-        assert "inf" in str(solution).splitlines()[-4]
+        assert any(line.startswith("3 ") and "inf" in line for line in str(solution).splitlines())
         again = legdistort.Camera.read(solution.camera.write("camera.asdf"))
         assert np.array_equal(again["1"].layout_sigma, solution.camera["1"].layout_sigma)
 

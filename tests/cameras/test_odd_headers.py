@@ -1,6 +1,7 @@
 """Headers that have one detector of a camera elsewhere than it lies: it is named, and has no part in the sky."""
 
 import json
+import re
 import warnings
 from dataclasses import replace
 
@@ -53,7 +54,26 @@ def test_the_odd_one_is_found_and_measured_by_the_others(parity):
     assert headers.odd == ("2",)
     np.testing.assert_allclose(headers.shifts, wrong[:, :2], atol=1e-6)
     np.testing.assert_allclose(headers.rotations, wrong[:, 2], atol=1e-6)
-    assert "detector 2 45 px (+35 in x, -28 in y, turned by 0.80 deg)" in headers.sentence("the stars put it")
+    words = r"detector 2 45 px \(\+35 in x, -28 in y of the focal plane \+- \S+, turned by 0.80 \+- \S+ deg\)"
+    assert re.search(words, headers.sentence("the stars put it"))
+
+
+@pytest.mark.parametrize(("n_x", "n_y"), [(2, 2), (3, 3)])
+def test_errors_of_how_far_it_is_off_are_those_of_drawn_headers(n_x, n_y):
+    """Variances of what is stated, over those of what others have wrong, drawn at 1 px and 0.05 degrees."""
+    rng, off, stated = np.random.default_rng(5), [], []
+    for _ in range(60):
+        wrong = rng.normal(0, [1.0, 1.0, 0.05], (n_x * n_y, 3))
+        wrong[2] += np.multiply(ODD, 10)
+        headers = camera(n_x, n_y, wrong).headers
+        assert "2" in headers.odd
+        k = headers.names.index("2")
+        off.append([*(headers.shifts[k] - np.multiply(ODD, 10)[:2]), headers.rotations[k] - 10 * ODD[2]])
+        stated.append(headers.errors[k])
+    off, stated = np.square(off).mean(axis=0), np.square(stated).mean(axis=0)
+    assert off[:2].mean() / stated[0] == pytest.approx(1, abs=0.4)
+    assert off[2] / stated[1] == pytest.approx(1, abs=0.4)
+    assert np.isnan(camera(3, 1, [(0, 0, 0), (0, 0, 0), ODD]).headers.errors).all()
 
 
 def test_two_odd_ones_of_nine():

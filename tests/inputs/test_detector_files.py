@@ -2,6 +2,7 @@
 
 import io
 import shutil
+from dataclasses import replace
 
 import asdf
 import gwcs
@@ -214,6 +215,16 @@ def test_catalogues_beside_bare_gwcs(visit, tmp_path, monkeypatch):
     assert solution.sky.lon == pytest.approx(80, abs=0.05)
     assert main(["attach", "sol", *files, "--out", "out", "--quiet"]) == 0
     assert scatter(*stars_on_sky(visit, tmp_path / "out", "*", read)) == pytest.approx(0.01, rel=0.2)
+
+
+def test_bare_gwcs_are_of_the_detectors_that_their_names_say(visit):
+    """As the catalogues beside them: exposures of two detectors; names without a detector say nothing."""
+    opened = open_wcs([str(path) for path in sorted(visit.glob("*_wcs.asdf"))])
+    assert {each.detector for each in opened} == {"NRCA1", "NRCA2"}
+    assert len({each.exposure for each in opened}) == len(DITHERS)
+    assert all(each.detector.lower() in each.name for each in opened)
+    plain = [replace(each, name=f"e{k}", exposure=None, detector=None) for k, each in enumerate(opened)]
+    assert all(each.detector is None for each in with_detectors(plain))
 
 
 def test_foreign_files_with_a_gwcs_alone(shared_data):

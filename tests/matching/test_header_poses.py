@@ -1,5 +1,7 @@
 """What the stars say of the WCSs of headers."""
 
+import re
+
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -85,3 +87,50 @@ def test_shifts_of_headers_are_tried_and_verified():
         matches = ld.match(table, exposures=exposures, min_exposures=2)
         step = similarity.compose(matches.poses["e1"], similarity.invert(matches.poses["e0"]))
         assert_allclose(step[:, 2], [150.0, -140.0], atol=1.0)
+
+
+def told(stated, found=SHIFTS):
+    names = [f"e{k}" for k in range(len(stated))]
+    headers = HeaderPoses(dict(zip(names, stated, strict=True)), dict.fromkeys(names, SHAPE), SKY)
+    return headers.pointing(dict(zip(names, map(pose, found[: len(stated)]), strict=True)))
+
+
+def test_pointing_is_as_uncertain_as_the_mean_of_headers():
+    """Error of the mean pointing of headers that scatter by 2 px an axis and 0.01 degrees: rms over draws."""
+    rng, off, said = np.random.default_rng(3), [], []
+    for _ in range(150):
+        shift, angle = rng.normal(0, 2.0, SHIFTS.shape), np.radians(rng.normal(0, 0.01, len(SHIFTS)))
+        stated = [
+            np.column_stack([np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]), s])
+            for a, s in zip(angle, SHIFTS + shift, strict=True)
+        ]
+        made = told(stated)
+        off.append([*shift.mean(axis=0), np.degrees(angle.mean())])
+        said.append([made.shift, made.shift, made.turn])
+        assert (made.n_used, made.off, made.sentence) == (len(SHIFTS), {}, "")
+    assert_allclose(np.mean(np.square(off), axis=0), np.mean(np.square(said), axis=0), rtol=0.3)
+    assert np.isnan(told([pose(SHIFTS[0])]).shift)
+    assert "known to 100 mas" in ld.results.errors.header_pointing.HeaderPointing(2, 1.0, 0.1).error(0.1)
+
+
+def test_headers_turned_by_180_degrees_are_named_so():
+    stated = list(map(pose, SHIFTS))
+    for k in (1, 4):  # about the middle of the detector
+        stated[k] = np.column_stack([-np.eye(2), 299 - SHIFTS[k]])
+    made = told(stated)
+    assert set(made.off) == {"e1", "e4"}
+    for pixels, turn in made.off.values():
+        assert abs(turn) == pytest.approx(180, abs=0.5)
+        assert pixels > 300
+    assert re.match(
+        r"the header WCS of e1, e4 contradicts the stars by up to \d+ px \(turned by 180 deg\)", made.sentence
+    )
+    assert made.sentence.endswith("the sky is that of the other headers, 4 of 6")
+    assert made.shift == pytest.approx(0, abs=1e-9)
+
+
+def test_where_no_majority_agrees_the_groups_are_named():
+    stated = list(map(pose, SHIFTS[:4] + [[0, 0], [0, 0], [200, 0], [200, 0]]))
+    made = told(stated)
+    assert (made.n_used, made.groups) == (0, (("e0", "e1"), ("e2", "e3")))
+    assert made.sentence.endswith("(headers that agree with one another: e0, e1 | e2, e3)")

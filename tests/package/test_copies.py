@@ -30,6 +30,7 @@ from legdistort.matching.matches import Matches
 from legdistort.measurement.injection import MoffatStars, inject
 from legdistort.measurement.options import MeasureOptions
 from legdistort.priors.prior import Prior
+from legdistort.results.errors.header_pointing import HeaderPointing
 from legdistort.simulation.observations import simulate_matches
 from legdistort.solving.camera_fit import in_camera
 from legdistort.solving.choices.held_out import hold_out
@@ -74,6 +75,7 @@ def matches():
     return Matches.from_table(
         table, camera=pair, poses=sim.matches.poses, sky=sky, left_out={"bad": "no stars: 'none'"}, epoch=2020.25,
         header_distortion="SIP, up to 4.48 px over the detector", pose_sigma={"shift": 20.0, "scale": 0.1},
+        pointing=HeaderPointing(2, 0.5, 0.1, {"e0": (30.0, 180.0)}, (("e0", "e1"), ("e2",))),
     )  # fmt: skip
 
 

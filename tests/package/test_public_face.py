@@ -113,7 +113,7 @@ def test_printed_solution_is_a_table(solution):
     for name in solution.names:
         assert sum(line.startswith(name) for line in lines) == 1
     header = next(line for line in lines if line.startswith("exposure"))
-    columns = "exposure stars shift x shift y rotation scale rms x rms y distortion PA [deg] arcsec/px"
+    columns = "exposure stars shift x shift y rotation scale rms x rms y dynamic distortion PA scale"
     assert " ".join(header.split()) == columns
     row = next(line for line in lines if line.startswith(solution.names[0]))
     assert len(row) == len(header)

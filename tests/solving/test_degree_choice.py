@@ -145,7 +145,9 @@ def test_solution_says_it(tmp_path):
     solution = solved(simulate(30, 0.5, 0.5), degree=1, validate=0.1)
     got = solution.diagnostics.validation
     text = " ".join(str(solution).split())
-    assert f"kept 3 stars, 30 observations: they scatter by {got.scatter:.4f} px per axis, " in text
+    assert (
+        f"kept 3 stars, 30 observations, out of the solution: they scatter by {got.scatter:.4f} px per axis, " in text
+    )
     solution.write(tmp_path / "solution.asdf")
     assert Solution.read(tmp_path / "solution.asdf").diagnostics.validation == got
 

@@ -1,5 +1,6 @@
 """Layouts of headers, found with everything else; what no star ties is not determined."""
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -9,7 +10,8 @@ import pytest
 from astropy.table import Table
 
 import legdistort
-from legdistort.exceptions import AssumptionWarning, InputError
+from legdistort.cameras import ties
+from legdistort.exceptions import AssumptionWarning, InputError, LegdistortWarning
 
 STATES = ("camera", "absolute")
 
@@ -100,6 +102,58 @@ def test_what_no_star_ties_is_not_determined(apart, groups):
             assert "1 | 2 | 3 | 4" in check.sentence
             assert "dithers larger than the gaps" in check.cure
     assert groups.camera["2"].place.errors == (np.inf,) * 3
+
+
+def with_false_ties(matches, n):
+    """Matches in which n stars of detector 1 are named as stars of detector 3: ties that are none."""
+    table, detector = matches.table.copy(), np.asarray(matches.table["detector"]).astype(str)
+    star = np.asarray(table["star"]).copy()
+    for k in range(n):
+        star[star == np.unique(star[detector == "1"])[5 + k]] = np.unique(star[detector == "3"])[9 + k]
+    table["star"] = star
+    return replace(matches, table=table)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_a_false_tie_moves_no_detector(apart, n):
+    """One or two stars that tie detectors wrongly are left out, and named; the layout stays as headers have it."""
+    matches = with_false_ties(legdistort.match(apart.table, exposures=apart.exposures), n)
+    words = f"rests on {n} stars? seen on both 1 and 3, which .*: they are left out"
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        solution = legdistort.solve(matches)
+    assert sum(bool(re.search(words, str(each.message))) for each in told) == 1
+    for key in header_layouts.KEYS:
+        place, begun = solution.camera[key].place, matches.camera[key].place
+        assert np.hypot(place.x - begun.x, place.y - begun.y) < 0.5
+        assert place.errors == (np.inf,) * 3
+    assert "1 | 2 | 3 | 4" in next(check.sentence for check in solution.checks if check.name == "camera")
+
+
+def test_ties_are_counted_and_few_are_told(near):
+    """By sets of the numbers of true stars; of each pair with stars in common; what rests on one or two warns."""
+    _, matches = near
+    table, detector = matches.table, np.asarray(matches.table["detector"]).astype(str)
+    star = np.asarray(table["star"])
+    both = np.intersect1d(star[detector == "1"], star[detector == "2"])
+    assert len(both) > 3
+    for key in ("3", "4"):  # two of the stars that tie one detector to each of the others are left
+        for other in ("1", "2"):
+            common = np.intersect1d(star[detector == key], star[detector == other])[1 if other == "1" else 0 :]
+            keep = ~(np.isin(star, common) & (detector == key))
+            table, detector, star = table[keep], detector[keep], star[keep]
+    seen = {(a, b): set(star[detector == a]) & set(star[detector == b]) for a in "1234" for b in "1234" if a < b}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LegdistortWarning)
+        solution = legdistort.solve(replace(matches, table=table))
+    found = {tuple(each["detectors"]): each["n_stars"] for each in ties.pairs(solution.camera, solution.residuals)}
+    assert found == {pair: len(stars) for pair, stars in seen.items() if stars}
+    camera = next(check for check in solution.checks if check.name == "camera")
+    n = len(set(star[np.isin(detector, ["1", "2"])]) & set(star[np.isin(detector, ["3", "4"])]))
+    assert 0 < n < 3
+    assert camera.state == "warn"
+    assert f"rests on {n} star{'s' * (n > 1)} seen on both 1 or 2 and 3 or 4" in camera.sentence
+    assert "more stars" in camera.cure
 
 
 def test_stated_widths_determine_it(apart):

@@ -863,3 +863,27 @@ def test_copies_come_together_beside_other_files(three, tmp_path, monkeypatch):
     assert everything(tmp_path).keys() == before.keys()
     assert everything(tmp_path)[out / "notes.txt"] == b"mine"
     assert all(map(has_wcs, out.glob("*.fits")))
+
+
+def test_what_is_unknown_of_the_sky_and_maps_left_behind_are_said(tmp_path, caplog):
+    """One line with the largest move of a star by 1 px of what is unknown; none where a prior determines all."""
+    night = legdistort.simulate_exposures(small=True, n_exposures=4, seed=4)
+    for name, hdu in night.hdus.items():
+        hdu.writeto(tmp_path / f"{name}.fits")
+        fits.writeto(tmp_path / f"{name}.weight.fits", np.ones(hdu[0].data.shape, "f4"))
+    frames = [tmp_path / f"{name}.fits" for name in night.hdus]
+    exposures = legdistort.read_exposures(list(night.hdus.values()))
+    matches = legdistort.match(legdistort.measure(exposures, psf="moffat"), exposures=exposures)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", legdistort.exceptions.LegdistortWarning)
+        free = legdistort.solve(matches, degree=2)
+    moved = sum(np.nansum(each.stars**2, axis=1) for each in free.gauge.unknown)
+    far = np.sqrt(moved.max()) * free.sky.pixel_scale
+    attach(free, frames, out=tmp_path / "free")
+    assert f"if it is 1 px rms, it moves places on the sky by up to {far:.2g} arcsec" in caplog.text
+    assert "weight maps stay where they are (exp00.weight.fits, " in caplog.text
+    caplog.clear()
+    known = legdistort.solve(matches, degree=2, prior=legdistort.Prior(np.zeros((2, 6)), static_sigma=1.0))
+    attach(known, frames, out=tmp_path / "known", kind="head")
+    assert "not determined of absolute positions" not in caplog.text
+    assert "weight maps" not in caplog.text

@@ -119,17 +119,31 @@ def coefficient_variance(gauge, block, i, response=None):
     NaN for what an unknown direction of unit rms changes by more than the rest of the error. Or of what follows these
     coefficients by a `response` (k, 2 n_modes), with its covariance in the place of theirs.
     """
-    n, own = gauge.n_modes, gauge.n_own
-    size = len(block) // 2 if response is None else response.shape[1] // 2
-    moved = np.zeros((2, size, 2 * n))
-    moved[:, :own] = gauge.motion[i].reshape(2, own, -1)
-    moved = moved.reshape(2 * size, -1)
-    follow = np.eye(2 * size) if response is None else response
-    moved = follow @ moved
-    covariance = gauge.covariance if gauge.tie is None or len(gauge.tie.covariance) != 2 * n else gauge.tie.covariance
-    out = np.diag(block) + np.einsum("ab,bc,ac->a", moved, covariance, moved)
-    for each in gauge.unknown:
-        change = np.zeros((2, size))
-        change[:, : each.coefficients.shape[2]] = each.coefficients[i]
-        out[(follow @ change.ravel()) ** 2 > out] = np.nan
+    follow = np.eye(len(block)) if response is None else response
+    moved = follow @ known_changes(gauge, follow.shape[1] // 2)[i]
+    out = np.diag(block) + np.einsum("ab,bc,ac->a", moved, known_covariance(gauge), moved)
+    for each in unknown_changes(gauge, follow.shape[1] // 2)[:, i]:
+        out[(follow @ each) ** 2 > out] = np.nan
     return out.reshape(2, -1)
+
+
+def known_changes(gauge, n_modes):
+    """How coefficients change with the modes of the common map, up to the sign, (n_exposures, 2 n_modes, 2 n)."""
+    n_exposures, _, n = gauge.motion.shape
+    out = np.zeros((n_exposures, 2, n_modes, n))
+    out[:, :, : gauge.n_own] = gauge.motion.reshape(n_exposures, 2, gauge.n_own, n)
+    return out.reshape(n_exposures, 2 * n_modes, n)
+
+
+def known_covariance(gauge):
+    """Covariance (2 n, 2 n) of these modes, what is unknown left out; with a reference what that leaves open."""
+    tied = None if gauge.tie is None else gauge.tie.covariance
+    return gauge.covariance if tied is None or len(tied) != len(gauge.covariance) else tied
+
+
+def unknown_changes(gauge, n_modes):
+    """How coefficients change with each direction that nothing determines, (m, n_exposures, 2 n_modes), pixels."""
+    out = np.zeros((len(changes := gauge.unknown_coefficients), len(gauge.motion), 2, n_modes))
+    for row, each in zip(out, changes, strict=True):
+        row[:, :, : each.shape[2]] = each
+    return out.reshape(*out.shape[:2], 2 * n_modes)

@@ -5,7 +5,8 @@ from itertools import combinations
 
 import numpy as np
 
-from ...cameras.header_layout import FAR, LEAST
+from ...cameras import ties
+from ...cameras.header_layout import FAR, LEAST, compare_headers
 from ...results.check import WRONG, Check, FactorTest, state_of
 from .known_effects import DEPARTURES, LAYOUT, STATICS
 from .limits import SEEN, addition_that_shows, as_one
@@ -17,8 +18,9 @@ _SAME = 1e-6
 #: Columns of the detectors, and their values for all stars, up to which they are looked at.
 _MOST_COLUMNS, _MOST_VALUES = 1000, 30_000_000
 _TIE = (
-    "dithers larger than the gaps, which carry stars from one detector to the others, a reference with stars on them "
-    "(--reference), or what is known of the layout (--layout-sigma, a camera file); --layout hold takes it as exact"
+    "more stars that dithers larger than the gaps carry from one detector to the others, a reference with stars "
+    "on them (--reference), or what is known of the layout (--layout-sigma, a camera file); --layout hold takes it as "
+    "exact"
 )
 _ODD = (
     "this solution does not count on that header: nothing is to be done for it; other programs need a better one, "
@@ -54,12 +56,33 @@ def camera_check(solution, residuals, observed, *, camera, contradicted, error, 
     held = {LAYOUT: not free[:3].any(), STATICS: not free[3:].any()}
     held = [effect for effect, is_held in held.items() if is_held]
     stated, apart = _stated(solution, camera and camera.departure), undetermined(solution)
-    apart = Check("camera", "unknown", None, None, *apart) if apart else None
-    headers = None if apart else _headers(solution, free[:3].any())
+    headers = _headers_by_group(solution) if apart else _headers(solution, free[:3].any())
+    apart = Check("camera", "unknown", None, None, *apart) if apart else _few(solution, free[:3].any())
     given = _held(held, solution.camera.name, residuals, observed, error, judged)
     if contradicted is not None:
         given = contradicted if given is None else replace(contradicted, tests=given.tests)
     return as_one([given, stated, apart, headers])
+
+
+def _few(solution, found):
+    """The check of ties of detectors, where the layout was `found`, that rest on a star or two; None for none."""
+    used = solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]
+    few = ties.few(solution.camera, used) if found else []
+    if not few:
+        return None
+    words = f"how groups of detectors lie to each other rests on {ties.in_words(few)}: a wrong one would not show"
+    return Check("camera", "warn", float(min(number for *_, number in few)), float(ties.FEWEST), words, _TIE)
+
+
+def _headers_by_group(solution):
+    """The check of headers against each group of detectors that stars tie to each other, where groups are apart."""
+    camera, words = solution.camera, []
+    for group in camera.groups(solution.residuals[np.asarray(solution.residuals["used"], dtype=bool)]):
+        exact = {key: replace(camera[key], layout_sigma=None, layout_covariance=None) for key in group}
+        headers = compare_headers(replace(camera, detectors=exact)) if len(group) > 1 else None
+        words += [headers.sentence("the stars have them")] if headers is not None and headers.scatter > LEAST else []
+    words = [each for each in words if each]
+    return Check("camera", "warn", None, None, "; ".join(words), _UNDECIDED) if words else None
 
 
 def _headers(solution, found):
@@ -138,9 +161,8 @@ def undetermined(solution):
     errors = solution.estimate.uncertainty.camera
     if errors is None or not errors.unknown.shape[2]:
         return None
-    groups = solution.camera.groups(solution.residuals[solution.residuals["used"]])
-    apart = f" (no star in common: {' | '.join(', '.join(group) for group in groups)})" * (len(groups) > 1)
-    return f"these exposures do not determine how the detectors lie to each other{apart}", _TIE
+    apart = ties.apart(solution.camera, solution.residuals)
+    return f"these exposures do not determine how the detectors lie to each other{f' ({apart})' * bool(apart)}", _TIE
 
 
 def _held(effects, name, residuals, observed, error, judged):

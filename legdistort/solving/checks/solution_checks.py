@@ -15,6 +15,7 @@ from scipy import special
 from ...exceptions import reasons_of, some_of
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
+from ...results.errors.header_pointing import CURE as POINTING_CURE
 from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
 from .dynamic_check import dynamic_check, significance
@@ -34,9 +35,11 @@ _CAUSES["duplicates"] = "degree", "time", "place"
 _ORDER = (
     "chi2", "exposures", "brightness", "place", "time", "degree", "dynamic part", "prior", "reference", "camera",
     "absolute", "overlaps", "extrapolation", "rejection", "stars", "completeness", "duplicates", "header distortion",
+    "header pointing",
 )  # fmt: skip
 #: What only residuals tell, and what to do where they tell nothing.
 _BY_RESIDUALS, _MORE = ("exposures", "place", "time", "degree"), "lower the degree, or add stars or exposures"
+_PASSES = f"passes (chance, or errors right to {100 * NEGLIGIBLE:.0f} %)"
 _TELL_STATIC = "dithers by a good part of the field, or a turned camera, show it"
 _TOO_MUCH = 0.5  # of a frame without stars around
 _SAME = 0.5  # correlation of residuals beyond which two exposures are one: no systematic error is so large
@@ -90,6 +93,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
         stars_check(solution, observed),
         completeness_check(solution, residuals),
         header_check(header_distortion),
+        pointing_check(solution),
     )
     made |= {check.name: check for check in others if check is not None}
     made["absolute"] = absolute_check(solution, made)
@@ -185,11 +189,11 @@ def errors_check(solution, residuals):
     ratio, whole = chi2 / dof, solution.chi2 / solution.dof
     low, high = of_chi2(dof)
     if found := _errors_in_force(solution):
-        found += f": chi2/dof {ratio:.3g} with them, {low:.2f} to {high:.2f} by chance"
+        found += f": chi2/dof {ratio:.3g} with them, {low:.2f} to {high:.2f} {_PASSES}"
         if solution.diagnostics.error_law is None:
             found += f" ({_chi2_at_stated_errors(solution) / solution.dof:.3g} at the stated errors)"
     else:
-        found = f"chi2/dof {ratio:.3g} at the stated errors, {low:.2f} to {high:.2f} by chance"
+        found = f"chi2/dof {ratio:.3g} at the stated errors, {low:.2f} to {high:.2f} {_PASSES}"
         if abs(ratio - whole) > 5e-3 * ratio:
             found += f" ({whole:.3g} with what holding the common map leaves in the residuals)"
     if ratio > high:
@@ -328,10 +332,8 @@ def absolute_check(solution, others):
     if unknown:
         sentence, _, cure = warning.partition("; ")
         return Check("absolute", "unknown", len(unknown), 0, sentence, cure)
-    stars = solution.stars
-    variance = stars["x_err_abs"].value ** 2 + stars["y_err_abs"].value ** 2
-    error = float(np.sqrt(np.nanmean(variance) / 2))
-    known = f"absolute positions of the stars are known to {error:.2g} px rms per axis"
+    error = solution.gauge.absolute_error
+    known = f"absolute positions are known to {error:.2g} px rms per axis over the field, the noise of stars aside"
     return Check("absolute", "pass", error, None, f"{known}; they rest on {_grounds(solution.gauge, others)}")
 
 
@@ -345,6 +347,8 @@ def _grounds(gauge, others):
     for name in grounds.keys() & others.keys():
         if others[name].state == "unknown":
             grounds[name] += " (not tested)"
+    if gauge.poses_known:
+        grounds["poses"] = "the errors stated of the poses"
     return " and ".join(grounds.values()) or "dithers and rolls alone"
 
 
@@ -463,6 +467,15 @@ def duplicates_check(solution, residuals):
         return Check("duplicates", "pass", value[same[0]], _SAME, f"{found}; the errors found here count that")
     cure = "exposures that are close in time or place share a distortion or errors of the measurement: "
     return Check("duplicates", "warn", value[same[0]], _SAME, found, f"{cure}--errors correlated counts that")
+
+
+def pointing_check(solution):
+    """Do headers say that exposures lie otherwise to each other than the stars have them? None where none does."""
+    pointing = solution.diagnostics.pointing
+    if pointing is None or not (words := pointing.sentence):
+        return None
+    n = len(pointing.off) + sum(map(len, pointing.groups))
+    return Check("header pointing", "warn", float(n), 0.0, words, POINTING_CURE)
 
 
 def header_check(header_distortion):
