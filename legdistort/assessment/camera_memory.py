@@ -289,6 +289,7 @@ class CombinedNights(ShownAsPrinted):
         """Coefficients against time, see `legdistort.plots.memory_plots.plot_memory`."""
         return plot_memory(self, fig=fig)
 
+    @plain_numbers
     def write(self, path: StrPath, *, date: float | Time | None = None, overwrite: bool = False) -> Path:
         """Write a camera file (`Camera.read`, ``--prior``, ``--camera``), with the nights; returns the path."""
         camera = {"layout": 1, "provenance": provenance.stamp()} | codec.to_tree(self.camera(date))
@@ -339,6 +340,7 @@ class CombinedNights(ShownAsPrinted):
         return "\n".join([*lines, "", *shown.pformat(max_lines=22, max_width=-1)])
 
 
+@plain_numbers
 def combine_nights(
     results: Sequence[Solution | CombinedNights | StrPath],
     *,

@@ -379,7 +379,7 @@ ATTACH = [
     row(refused=dict.fromkeys(MOSAICS, "give either out=")),
 ]
 REPORT = [
-    row(mosaic=None, psfs=None, summary=None, comparison=None, stacks=None, files=(), overwrite=True),
+    row(mosaic=None, psfs=None, summary=None, comparison=None, stacks=None, joint=None, files=(), overwrite=True),
     row(exposures=frames),
 ]
 STARS = np.random.default_rng(3).uniform([0, 0], [120, 80], (40, 2))

@@ -24,7 +24,7 @@ UNITS = {
     **dict.fromkeys(("spectrum", "static_spectrum", "dither", "dithers", "margin", "pose_error"), (u.pix,)),
     **dict.fromkeys(("stars", "positions", "xy", "f", "errors", "parallax"), (u.pix,)),
     **dict.fromkeys(("motion", "motion_sigma"), (u.pix / u.yr,)),
-    **dict.fromkeys(("epoch", "epochs", "motion_epoch"), (u.yr,)),
+    **dict.fromkeys(("epoch", "epochs", "motion_epoch", "date"), (u.yr,)),
     **dict.fromkeys(("saturation", "fluxes"), _COUNT),
     "covariance": (u.pix**2,),
     "shift": (u.pix,),
