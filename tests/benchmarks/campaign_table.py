@@ -1,6 +1,6 @@
 """A campaign of 403 lists of two clusters over six years to one camera: ``python tests/benchmarks/campaign_table.py``.
 
-To the figures of Freeman et al. (2023, NIRC2 on M15 and M92): 41 nights of ten lists of some 1000 stars of 0.02 px, a
+To the figures of Freeman et al. (2023, AJ 166, 125; OSIRIS): 41 nights of ten lists of some 1000 stars of 0.02 px, a
 static distortion of 20 px, mostly of second order, departures of nights and of single lists. Time of solving all nights
 and of combining them on some cores (the lists are made before), error of the map beside what departures alone leave of
 it, and squared error over stated variance.
