@@ -32,7 +32,7 @@ from ..runtime.outputs import replacing
 from ..runtime.parallel import map_items
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, number
-from .combined_nights import Chain, contradiction, fitted
+from .combined_nights import Chain, contradiction, fitted, own_scatter2
 from .known_maps import shown_by
 
 if TYPE_CHECKING:
@@ -72,8 +72,12 @@ class Night:
         Pixels^-2.
     pull : ndarray, shape (k,)
         Pixels^-1.
+    n_nights : int
+        That it is made of: more than one if they were solved together.
     scatter : ndarray, shape (degree,)
-        Of its exposures about it, by degree, pixels.
+        Of its exposures about it, or about their night, by degree, pixels.
+    nightly : ndarray, shape (degree,), or None
+        Of several nights, which is in the information then.
     dof : float
         Degrees of freedom of these.
     exposures : tuple of str
@@ -88,7 +92,9 @@ class Night:
     around: np.ndarray = field(metadata=array(2, "n_modes", unit="pix"))
     information: np.ndarray = field(metadata=array("n_rows", "n_rows", unit="pix-2"))
     pull: np.ndarray = field(metadata=array("n_rows", unit="pix-1"))
+    n_nights: int = field(metadata=number(minimum=1))
     scatter: np.ndarray = field(metadata=array("n_degrees", unit="pix", minimum=0))
+    nightly: np.ndarray | None = field(metadata=array("n_degrees", unit="pix", minimum=0))
     dof: float = field(metadata=number(minimum=0))
     exposures: tuple[str, ...] = ()
 
@@ -96,8 +102,9 @@ class Night:
     def of(cls, solution: Solution, name: str, around: np.ndarray | None = None) -> Night:
         """That of a solution, linearised round a map (2, n_modes) where the night itself shows none."""
         shown = shown_by(solution, name, around)
-        given = {each: getattr(shown, each) for each in ("around", "information", "pull", "scatter", "dof")}
+        given = {each: getattr(shown, each) for each in ("around", "information", "pull", "scatter", "nightly", "dof")}
         counts = {"n_exposures": len(solution.names), "n_stars": len(solution.estimate.star_names)}
+        counts["n_nights"] = 1 if shown.nightly is None else len(solution.nights)
         return cls(name, date=solution.diagnostics.epoch, exposures=_fingerprints(solution), **counts, **given)
 
 
@@ -117,7 +124,7 @@ class CombinedNights(ShownAsPrinted):
     name : str
         Of the camera.
     scatter : ndarray, shape (degree,)
-        Of B by degree, pixels a normalised coefficient; of a single night nothing tells it, and it is zero.
+        Of B by degree, pixels a normalised coefficient; zero where a single night does not tell it.
     oddness : ndarray, shape (n_nights,)
         Factors >= 1 on it, as for Student's t distribution: odd nights count less.
     rate, walk : float
@@ -167,8 +174,14 @@ class CombinedNights(ShownAsPrinted):
         information = np.stack([each.information for each in self.nights])
         moved = np.stack([self._rows @ each.around.ravel() for each in self.nights])
         pull = np.stack([each.pull for each in self.nights]) + np.einsum("nkl,nl->nk", information, moved)
-        width = np.maximum(self._widths, 1e-6) * self.oddness[:, None]
-        return Chain(information, pull, width**2, self.dates, self.rate, self.walk)
+        degrees = detector_modes.dynamic_degrees(basis.n_modes(self.degree))
+        scatter2 = own_scatter2(self.scatter, self.oddness, self._whole, degrees)
+        return Chain(information, pull, scatter2, self.dates, self.rate, self.walk)
+
+    @property
+    def _whole(self):
+        """Which are several nights together, and speak of S itself."""
+        return np.array([each.n_nights > 1 for each in self.nights])
 
     @plain_numbers
     def static(self, date: float | Time | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -229,19 +242,22 @@ class CombinedNights(ShownAsPrinted):
 
     @cached_property
     def table(self) -> QTable:
-        """One row a night, worst first: ``night``, ``date`` [yr], ``n_exposures``, ``n_stars``, ``departure`` [pix]
-        (rms per axis, from what all others say, in the directions that the night determines), ``chi2``, ``dof``, ``p``,
-        ``oddness`` and whether it is ``odd``.
+        """One row a night, worst first: ``night``, ``date`` [yr], ``n_nights``, ``n_exposures``, ``n_stars``,
+        ``departure`` [pix] (rms per axis, from what all others say, in the directions that the night determines),
+        ``chi2``, ``dof``, ``p``, ``oddness`` and whether it is ``odd``.
         """  # fmt: skip
         rows, count = [], len(self.nights)
         for n, night in enumerate(self.nights):
-            chi2, dof, away = contradiction(self._chain, n, self._widths) if count > 1 else (0.0, 0, np.zeros(1))
+            own = self._widths * (night.n_nights == 1)
+            chi2, dof, away = contradiction(self._chain, n, own) if count > 1 else (0.0, 0, np.zeros(1))
             p = float(special.fdtrc(dof, night.dof, chi2 / dof)) if dof else 1.0
             rms = np.sqrt(np.sum(away**2) / _MEAN_SQUARE)
             date = np.nan if night.date is None else night.date
-            rows.append((night.name, date, night.n_exposures, night.n_stars, rms, chi2, dof, p, self.oddness[n]))
-        rows.sort(key=lambda row: row[7])
-        names = "night", "date", "n_exposures", "n_stars", "departure", "chi2", "dof", "p", "oddness"
+            counts = night.n_nights, night.n_exposures, night.n_stars
+            rows.append((night.name, date, *counts, rms, chi2, dof, p, self.oddness[n]))
+        rows.sort(key=lambda row: row[8])
+        counts = "n_nights", "n_exposures", "n_stars"
+        names = "night", "date", *counts, "departure", "chi2", "dof", "p", "oddness"
         out = QTable(rows=rows, names=names)
         out["date"], out["departure"] = out["date"] * u.yr, out["departure"] * u.pix
         out["odd"] = out["p"] < ALARM / count
@@ -257,7 +273,7 @@ class CombinedNights(ShownAsPrinted):
 
         The error holds the scatter of nights; it is large where the night does not tell.
         """
-        chain, scatter2 = self._chain, self._widths**2
+        chain, scatter2 = self._chain, self._widths**2 * (self.nights[n].n_nights == 1)
         whole = np.linalg.inv(chain.information[n] + np.eye(len(scatter2)) / _UNKNOWN**2)
         covariance = self._rows.T @ (whole + np.diag(scatter2)) @ self._rows
         return (self._rows.T @ whole @ chain.pull[n]).reshape(2, -1), np.sqrt(np.diag(covariance)).reshape(2, -1)
@@ -317,24 +333,25 @@ class CombinedNights(ShownAsPrinted):
         return f"<CombinedNights: {self.name}, degree {self.degree}, {len(self.nights)} nights, {len(self.odd)} odd>"
 
     def __str__(self) -> str:
-        n_exposures, count = sum(each.n_exposures for each in self.nights), len(self.nights)
+        n_exposures, count = (sum(getattr(each, name) for each in self.nights) for name in ("n_exposures", "n_nights"))
         of = f"{n_exposures} exposures of {count} night{'s' * (count > 1)}"
         lines = [f"Camera {self.name}: static distortion of degree {self.degree} from {of}."]
-        if count == 1:
+        if not self.scatter.any():
             lines.append("One night does not tell how far nights scatter: errors are those of this night alone.")
         else:
             scatter = ", ".join(f"{each:.2g} (degree {d})" for d, each in enumerate(self.scatter, 1))
             lines.append(f"Nights scatter by {scatter} px a coefficient.")
             drift = f"{self.rate:.2g} px a year, and wanders by {self.walk:.2g} px in the root of a year"
-            lines.append(f"A coefficient changes by {drift}." if self.drifts else "No change with time is seen.")
+            if self.drifts or len(self.nights) > 2:
+                lines.append(f"A coefficient changes by {drift}." if self.drifts else "No change with time is seen.")
         odd = (
             f"Odd nights, which count less: {some_of(list(self.odd), 10)}."
             if self.odd
             else "No night contradicts the others."
         )
-        lines += [odd, ""] if count > 1 else [""]
+        lines += [odd, ""] if len(self.nights) > 1 else [""]
         lines += self.modes().pformat(max_lines=-1, max_width=-1)
-        shown = self.table["night", "date", "n_exposures", "n_stars", "departure", "chi2", "dof", "p", "oddness"]
+        shown = self.table[[name for name in self.table.colnames if name != "odd"]]
         for name, form in (("date", ".3f"), ("departure", ".4f"), ("chi2", ".1f"), ("p", ".2g"), ("oddness", ".2f")):
             shown[name].info.format = form
         return "\n".join([*lines, "", *shown.pformat(max_lines=22, max_width=-1)])
@@ -453,8 +470,13 @@ def _combined(nights, shape, name):
     n = nights[0].around.shape[1]
     rows, degrees = detector_modes.dynamic_basis(shape, n), detector_modes.dynamic_degrees(n)
     given = [(rows @ each.around.ravel(), each.information, each.pull) for each in nights]
-    chain, oddness, scatter = fitted(given, _dates(nights), degrees)
-    scatter = scatter if len(nights) > 1 else np.zeros_like(scatter)
+    whole = [each for each in nights if each.n_nights > 1]
+    known = None
+    if whole:  # squares weighted by the number of nights that they are of
+        weight = [each.n_nights for each in whole]
+        known = np.sqrt(np.average([each.nightly**2 for each in whole], axis=0, weights=weight))
+    together = np.array([each.n_nights > 1 for each in nights])
+    chain, oddness, scatter = fitted(given, _dates(nights), degrees, together, known)
     drift = {"rate": chain.rate, "walk": chain.walk}
     return CombinedNights(tuple(nights), shape=shape, name=name, scatter=scatter, oddness=oddness, **drift)
 

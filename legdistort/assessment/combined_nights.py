@@ -19,6 +19,7 @@ _FREE = 1e3  # width of what nothing is known of [pix]
 _EXACT = 1e-6  # scatter of one night, of which nothing tells [pix]
 _MOST, _FEWEST = 600, 12  # unknowns from which sizes are found, and nights, if there are as many
 _ROUNDS, _SETTLED = 20, 0.02
+_TINY = 1e-3  # of the scatter of nights, which is as good as none
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +125,7 @@ class Chain:
         return information - lost[:, :-1], pull - lost[:, -1]
 
 
-def fitted(nights, dates, degrees):
+def fitted(nights, dates, degrees, whole=None, scatter=None):
     """Nights as a `Chain` from the first's map on, with sizes that make the data most likely; and their oddness (N,).
 
     Parameters
@@ -135,6 +136,10 @@ def fitted(nights, dates, degrees):
         Years; NaN where they are not known, and then there is no drift.
     degrees : ndarray of int, shape (K,)
         Of every coefficient.
+    whole : ndarray of bool, shape (N,), optional
+        Which say it of S itself, as several nights together do.
+    scatter : ndarray, shape (degree,), optional
+        Of nights, where fewer than two others tell it.
 
     Returns
     -------
@@ -142,32 +147,38 @@ def fitted(nights, dates, degrees):
     ndarray, shape (N,)
         Factors >= 1 on the scatter of single nights, as for Student's t distribution.
     ndarray, shape (degree,)
-        Scatter of nights, by degree, pixels.
+        Scatter of nights, by degree, pixels; zero where nothing tells it.
     """
-    dated = np.all(np.isfinite(dates))
+    whole = np.zeros(len(nights), dtype=bool) if whole is None else whole
+    dated, n_scatters = np.all(np.isfinite(dates)), int(degrees.max(initial=0))
     dates = dates if dated else np.zeros(len(dates))
-    keep = drawn(np.zeros(len(nights), int), max(_FEWEST, _MOST // (2 * len(degrees))))
-    some, n_scatters = [nights[i] for i in keep], int(degrees.max(initial=0))
-    sizes, part = np.full(n_scatters, _EXACT), np.ones(len(keep))
-    if len(nights) > 1:
-        sizes, part, cost = _sizes(some, dates[keep], degrees, drifts=False)
-        if dated and len(np.unique(dates[keep])) > 2:
-            drifting = _sizes(some, dates[keep], degrees, drifts=True)
-            if cost - drifting[2] > KEPT:
-                sizes, part, cost = drifting
-    drift = [float(each) for each in sizes[n_scatters:]]
     information, moved = np.stack([each[1] for each in nights]), np.stack([each[0] for each in nights]) - nights[0][0]
     pull = np.stack([each[2] for each in nights]) + np.einsum("nkl,nl->nk", information, moved)
-    scatter = np.maximum(sizes[:n_scatters], _EXACT)
-    chain = Chain(information, pull, np.tile(scatter[degrees - 1] ** 2, (len(nights), 1)), dates, *drift)
-    odd = np.ones(len(nights))
-    odd[keep] = part
-    for _ in range(_ROUNDS if len(nights) > 1 else 0):
-        chain = replace(chain, scatter2=odd[:, None] ** 2 * scatter[degrees - 1] ** 2)
-        before, odd = odd, _oddness(chain, scatter[degrees - 1])
+    drift, odd = [], np.ones(len(nights))
+    if np.count_nonzero(~whole) > 1:
+        keep = drawn(np.zeros(len(nights), int), max(_FEWEST, _MOST // (2 * len(degrees))))
+        some = [nights[i] for i in keep], dates[keep], degrees, whole[keep]
+        sizes, part, cost = _sizes(*some, drifts=False)
+        if dated and len(np.unique(dates[keep])) > 2:
+            drifting = _sizes(*some, drifts=True)
+            if cost - drifting[2] > KEPT:
+                sizes, part, cost = drifting
+        drift, odd[keep] = [float(each) for each in sizes[n_scatters:]], part
+        scatter = np.maximum(sizes[:n_scatters], _EXACT)
+    scatter = np.zeros(n_scatters) if scatter is None else scatter
+    chain = Chain(information, pull, own_scatter2(scatter, odd, whole, degrees), dates, *drift)
+    for _ in range(_ROUNDS if np.count_nonzero(~whole) > 1 else 0):
+        before, odd = odd, np.where(whole, 1.0, _oddness(chain, np.maximum(scatter, _EXACT)[degrees - 1]))
+        chain = replace(chain, scatter2=own_scatter2(scatter, odd, whole, degrees))
         if np.all(np.abs(np.log(odd / before)) < _SETTLED):
             break
     return chain, odd, scatter
+
+
+def own_scatter2(scatter, odd, whole, degrees):
+    """Variance (N, K) of what nights depart by: as good as none of those that speak of S itself."""
+    width = np.maximum(scatter, _EXACT)[degrees - 1] * odd[:, None]
+    return np.where(whole[:, None], _EXACT, width) ** 2
 
 
 def _oddness(chain, width):
@@ -188,21 +199,20 @@ def _stretch(square, count):
     return np.sqrt(np.maximum(1.0, (TAILS + square) / (TAILS + count + CHANCE * np.sqrt(2 * count))))
 
 
-def _sizes(nights, dates, degrees, *, drifts):
+def _sizes(nights, dates, degrees, whole, *, drifts):
     """Sizes by degree, then of rate and walk if S drifts; oddness; minus twice the logarithm of the likelihood."""
     data, factor, unit = _model(nights, dates, degrees, drifts)
     n, k, odd = len(nights), len(degrees), np.ones(len(nights))
     start = np.full((2, int(degrees.max()) + 2 * drifts), 10 * unit)
     start[1] = unit
     for _ in range(_ROUNDS):
-        stretch = np.ones(len(factor.value))
-        stretch[: n * k] = np.repeat(odd, k)
-        stretch[n * k :] = factor.stretch[n * k :]
+        stretch = factor.stretch.copy()
+        stretch[: n * k] = np.repeat(np.where(whole, _TINY, odd), k)
         found = most_likely(data, replace(factor, stretch=stretch), start, unit * np.array(RANGE))
         value, variance = (each[: n * k].reshape(n, k) for each in found.left)
-        width = found.widths[: n * k].reshape(n, k) / odd[:, None]
+        width = found.widths[: n * k].reshape(n, k) / np.where(whole, _TINY, odd)[:, None]
         square = ((value**2 + variance) / width**2).sum(axis=1)
-        before, odd = odd, _stretch(square, k)
+        before, odd = odd, np.where(whole, 1.0, _stretch(square, k))
         start = found.sizes
         if np.all(np.abs(np.log(odd / before)) < _SETTLED):
             break

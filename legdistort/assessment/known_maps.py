@@ -179,7 +179,9 @@ class Shown:
     information : ndarray, shape (K, K)
     pull : ndarray, shape (K,)
     scatter : ndarray, shape (degree,)
-        Of exposures about it, by degree, pixels.
+        Of exposures about it, or about their night, by degree, pixels.
+    nightly : ndarray, shape (degree,), or None
+        Of nights about it, which is in the information; None if there is one night.
     dof : float
         Degrees of freedom of the scatter that the information rests on.
     degree : int
@@ -190,6 +192,7 @@ class Shown:
     information: np.ndarray
     pull: np.ndarray
     scatter: np.ndarray
+    nightly: np.ndarray | None
     dof: float
     degree: int
     shape: tuple
@@ -213,12 +216,15 @@ def shown_by(solution, label, other=None):
     for _ in range(_ROUNDS):
         options = SolveOptions(degree=degree, prior=Prior(around, shape=shape), clip=None, **kept)
         fit = single_fit.estimate(matches, options, near=fit)
-        information, pull, scatter, dof = _shown(fit)
+        information, pull, sizes_found, dof = _shown(fit)
         sizes, vectors = np.linalg.eigh(information)
         found = np.where(sizes > DETERMINED, 1 / np.maximum(sizes, DETERMINED), 0)  # others stay where they are
         step = vectors * found @ vectors.T @ pull
         around = around + (rows.T @ step).reshape(2, n)
-    return Shown(around, information, pull - information @ step, scatter[:degree], dof, degree, shape)
+    nightly = None if fit.problem.n_nights == 0 else sizes_found[degree:]
+    if nightly is not None and fit.problem.night_sigma is not None:
+        nightly = np.full(degree, float(fit.problem.night_sigma))
+    return Shown(around, information, pull - information @ step, sizes_found[:degree], nightly, dof, degree, shape)
 
 
 def _at_errors_in_force(solution):

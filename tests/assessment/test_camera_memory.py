@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from night_sets import SIZE, field
+from night_sets import SIZE, Nights, field
 from numpy.testing import assert_allclose, assert_array_equal
 from rolled_night import modes, night
 
@@ -210,6 +210,28 @@ def test_nights_one_after_the_other_or_in_any_order_are_the_same(three):
     for other in (later, turned):
         for one, two in zip(other.static(), all_at_once.static(), strict=True):
             assert_allclose(one, two, atol=1e-9)
+
+
+def test_nights_that_were_solved_together_speak_of_the_camera(three):
+    """Their scatter is found inside, counts once, and is that of a further night; truth 0.05 px by order."""
+    nights = Nights(4, nights=6, per=4, nightly=0.05, n_stars=90)
+    joint = ld.solve(ld.Matches.from_table(nights.table, shape=SHAPE))
+    combined = ld.combine_nights([joint])
+    assert "from 24 exposures of 6 nights." in str(combined)
+    assert "Nights scatter by" in str(combined)
+    normalised = modes(np.ones((2, 4, 4)) / (1 + ORDERS))[0]
+    for degree, found in enumerate(combined.scatter, 1):
+        of = np.flatnonzero(np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3]) == degree)
+        true = 0.05 * np.sqrt(np.mean(normalised[of] ** 2))
+        assert 0.5 * true < found < 2 * true
+    other = ld.Prior.from_solution(joint)
+    own = combined.prior()
+    known = np.isfinite(other.static_sigma[:, 3:]) & np.isfinite(own.static_sigma[:, 3:])
+    assert known.mean() > 0.5
+    ratio = own.static_sigma[:, 3:][known] / other.static_sigma[:, 3:][known]
+    assert np.all((ratio > 0.6) & (ratio < 1.2))  # the other adds up what coefficients have in common
+    both = ld.combine_nights([joint, three[0]])  # one other does not tell how nights scatter
+    assert_allclose(both.scatter, combined.scatter)
 
 
 def test_an_odd_night_is_named_and_counts_less():
