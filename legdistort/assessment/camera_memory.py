@@ -20,6 +20,7 @@ from ..cameras.camera import Camera
 from ..cameras.detector import Detector
 from ..exceptions import InputError, some_of
 from ..geometry import basis, detector_modes, epochs
+from ..inputs import column_contract
 from ..inputs.table_files import records
 from ..plots.memory_plots import plot_memory
 from ..priors.mode_tables import mode_table
@@ -33,7 +34,7 @@ from ..runtime.parallel import map_items
 from ..runtime.trees import codec
 from ..runtime.trees.facts import SIZE, array, number
 from .combined_nights import Chain, contradiction, fitted, own_scatter2
-from .known_maps import shown_by
+from .known_maps import shown_by, sound
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -45,10 +46,8 @@ if TYPE_CHECKING:
 LAYOUT, ROOT = 1, "legdistort_nights"
 #: Chance below which one of all nights is odd.
 ALARM = 0.003
-_FAR = (
-    1.0  # rms distance [pix] of the map round which a night was linearised from that of all, beyond which it is again
-)
 _MEAN_SQUARE = 8  # a coefficient of 1 px displaces by sqrt(1/8) px rms per axis
+_HASHES = 8  # positions of an exposure that are kept
 _UNKNOWN = 100.0  # error of a coefficient [pix] from which on nothing is known of it
 
 
@@ -80,6 +79,8 @@ class Night:
         Of several nights, which is in the information then.
     dof : float
         Degrees of freedom of these.
+    odd : tuple of str
+        Of several nights that were solved together those that depart farther than the others, and were left out.
     exposures : tuple of str
         Fingerprints of what was measured, so that nothing counts twice.
     """
@@ -96,6 +97,7 @@ class Night:
     scatter: np.ndarray = field(metadata=array("n_degrees", unit="pix", minimum=0))
     nightly: np.ndarray | None = field(metadata=array("n_degrees", unit="pix", minimum=0))
     dof: float = field(metadata=number(minimum=0))
+    odd: tuple[str, ...] = ()
     exposures: tuple[str, ...] = ()
 
     @classmethod
@@ -103,9 +105,12 @@ class Night:
         """That of a solution, linearised round a map (2, n_modes) where the night itself shows none."""
         shown = shown_by(solution, name, around)
         given = {each: getattr(shown, each) for each in ("around", "information", "pull", "scatter", "nightly", "dof")}
-        counts = {"n_exposures": len(solution.names), "n_stars": len(solution.estimate.star_names)}
-        counts["n_nights"] = 1 if shown.nightly is None else len(solution.nights)
-        return cls(name, date=solution.diagnostics.epoch, exposures=_fingerprints(solution), **counts, **given)
+        table, nights = solution.residuals[sound(solution)], solution.nights
+        counts = {f"n_{each}s": len(np.unique(table[each])) for each in ("exposure", "star")}
+        counts["n_nights"] = 1 if shown.nightly is None else int(np.count_nonzero(~nights["odd"]))
+        date = float(np.mean(column_contract.values(table, "epoch", u.yr))) if "epoch" in table.colnames else None
+        odd = tuple(str(each) for each in nights["name"][nights["odd"]])
+        return cls(name, date=date, odd=odd, exposures=_fingerprints(solution), **counts, **given)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -260,13 +265,16 @@ class CombinedNights(ShownAsPrinted):
         names = "night", "date", *counts, "departure", "chi2", "dof", "p", "oddness"
         out = QTable(rows=rows, names=names)
         out["date"], out["departure"] = out["date"] * u.yr, out["departure"] * u.pix
-        out["odd"] = out["p"] < ALARM / count
+        # of two that contradict one another nothing tells which is odd, unless one is of more nights
+        others = sum(each.n_nights for each in self.nights) - out["n_nights"]
+        out["odd"] = (out["p"] < ALARM / count) & (others > out["n_nights"])
         return out
 
     @property
     def odd(self) -> tuple[str, ...]:
-        """Names of the nights that contradict the others, worst first."""
-        return tuple(str(name) for name in self.table["night"][self.table["odd"]])
+        """Names of nights that contradict the others, worst first, then those left out of nights solved together."""
+        found = self.table["night"][self.table["odd"]].tolist()
+        return *found, *(f"{name} of {each.name}" for each in self.nights for name in each.odd)
 
     def seen_by(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """What night number n alone says of the static distortion, and its error: (2, n_modes) each, pixels.
@@ -332,6 +340,17 @@ class CombinedNights(ShownAsPrinted):
     def __repr__(self) -> str:
         return f"<CombinedNights: {self.name}, degree {self.degree}, {len(self.nights)} nights, {len(self.odd)} odd>"
 
+    def _said_of_odd(self):
+        """Sentences on nights that contradict one another."""
+        less, out = self.table["night"][self.table["odd"]].tolist(), self.odd[np.count_nonzero(self.table["odd"]) :]
+        said = [f"Odd nights, which count less: {some_of(less, 10)}."] * bool(less)
+        said += [f"Odd nights, left out: {some_of(list(out), 10)}."] * bool(out)
+        if not less and len(self.nights) > 1:
+            differ = np.any(self.table["p"] < ALARM / len(self.nights))
+            both = "Nights contradict one another, and nothing tells which is odd."
+            said.append(both if differ else "No night contradicts the others.")
+        return said
+
     def __str__(self) -> str:
         n_exposures, count = (sum(getattr(each, name) for each in self.nights) for name in ("n_exposures", "n_nights"))
         of = f"{n_exposures} exposures of {count} night{'s' * (count > 1)}"
@@ -344,12 +363,8 @@ class CombinedNights(ShownAsPrinted):
             drift = f"{self.rate:.2g} px a year, and wanders by {self.walk:.2g} px in the root of a year"
             if self.drifts or len(self.nights) > 2:
                 lines.append(f"A coefficient changes by {drift}." if self.drifts else "No change with time is seen.")
-        odd = (
-            f"Odd nights, which count less: {some_of(list(self.odd), 10)}."
-            if self.odd
-            else "No night contradicts the others."
-        )
-        lines += [odd, ""] if len(self.nights) > 1 else [""]
+        lines += [*self._said_of_odd(), ""]
+        lines.append("Normalised Legendre modes, undistorted to detector pixels, shift, rotation and scale taken off:")
         lines += self.modes().pformat(max_lines=-1, max_width=-1)
         shown = self.table[[name for name in self.table.colnames if name != "odd"]]
         for name, form in (("date", ".3f"), ("departure", ".4f"), ("chi2", ".1f"), ("p", ".2g"), ("oddness", ".2f")):
@@ -457,10 +472,10 @@ def _check(nights, shapes):
         raise InputError(f"nights were solved with several degrees, {words}: solve all with one (--degree)")
     seen = {}
     for night in nights:
-        for exposure in night.exposures:
-            if exposure in seen:
+        for position in night.exposures:
+            if position in seen:
                 raise InputError(
-                    f"{night.name} has an exposure that {seen[exposure]} has too: give every exposure once"
+                    f"{night.name} has an exposure that {seen[position]} has too: give every exposure once"
                 )
         seen |= dict.fromkeys(night.exposures, night.name)
 
@@ -488,15 +503,18 @@ def _dates(nights):
 
 
 def _fingerprints(solution):
-    """Of the positions that were measured in every exposure."""
+    """Of the positions that were measured in every exposure: those with the smallest hashes, so that some are the same
+    if other stars of it were matched.
+    """  # fmt: skip
     table = solution.residuals
     name, x, y = (np.asarray(getattr(table[c], "value", table[c])) for c in ("exposure", "x", "y"))
     out = []
     for exposure in solution.names:
         mine = name == exposure
-        xy = np.column_stack([x[mine], y[mine]])
-        xy = np.round(xy[np.lexsort(xy.T)], 6)
-        out.append(hashlib.sha256(np.ascontiguousarray(xy).tobytes()).hexdigest()[:16])
+        hashes = sorted(
+            hashlib.sha256(f"{a:.6f} {b:.6f}".encode()).hexdigest()[:12] for a, b in zip(x[mine], y[mine], strict=True)
+        )
+        out += hashes[:_HASHES]
     return tuple(out)
 
 

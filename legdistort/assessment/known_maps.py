@@ -227,9 +227,17 @@ def shown_by(solution, label, other=None):
     return Shown(around, information, pull - information @ step, sizes_found[:degree], nightly, dof, degree, shape)
 
 
+def sound(solution):
+    """Rows of the residuals that were used, (n,), but for nights that depart farther than the others."""
+    nights = solution.nights
+    odd = {name for exposures in nights["exposures"][nights["odd"]] for name in exposures.split(", ")}
+    table = solution.residuals
+    return np.asarray(table["used"]) & ~np.isin(np.asarray(table["exposure"]), list(odd))
+
+
 def _at_errors_in_force(solution):
-    """The matches that were used, with errors as they counted."""
-    used = solution.residuals[np.asarray(solution.residuals["used"])]
+    """The matches that were used, but for those of odd nights, with errors as they counted."""
+    used = solution.residuals[sound(solution)]
     kept = [name for name in used.colnames if name not in ("dx", "dy", "used")]
     table, covariance = used[kept], solution.diagnostics.errors_of(used)
     for name, variance in zip(("x_err", "y_err"), (covariance[:, 0, 0], covariance[:, 1, 1]), strict=True):

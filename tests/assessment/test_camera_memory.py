@@ -234,6 +234,32 @@ def test_nights_that_were_solved_together_speak_of_the_camera(three):
     assert_allclose(both.scatter, combined.scatter)
 
 
+def test_an_odd_night_among_others_that_were_solved_with_it_is_left_out():
+    nights = Nights(4, nights=6, per=4, nightly=0.02, odd=0.5, n_stars=90)
+    table = nights.table
+    joint, without = (
+        ld.solve(ld.Matches.from_table(t, shape=SHAPE)) for t in (table, table[table["block"] != nights.odd])
+    )
+    combined, expected = (ld.combine_nights([each]) for each in (joint, without))
+    (odd,) = combined.odd
+    assert odd.endswith(" of solution 1")
+    assert "Odd nights, left out: " in str(combined)
+    assert "from 20 exposures of 5 nights." in str(combined)
+    assert combined.dates[0] == pytest.approx(np.mean(table["epoch"][table["block"] != nights.odd]), abs=0.05)
+    away = np.abs(combined.static()[0] - expected.static()[0])[:, 3:]
+    error = np.sqrt(np.diag(expected.static()[1])).reshape(2, -1)[:, 3:]
+    assert np.all(away < 0.3 * error)
+    assert_allclose(combined.scatter, expected.scatter, rtol=0.5, atol=1e-3)
+
+
+def test_of_two_that_contradict_one_another_neither_is_odd(three):
+    other = solved(4242, static(1) + curved(5, 0.7))
+    two = ld.combine_nights([three[0], other])
+    assert two.odd == ()
+    many = ld.combine_nights([*three, other])
+    assert many.odd == ("solution 4",)
+
+
 def test_an_odd_night_is_named_and_counts_less():
     solutions = campaign(2, 5, odd=3)
     combined = ld.combine_nights(solutions)
@@ -261,6 +287,10 @@ def test_nights_that_do_not_go_together_are_refused(three, tmp_path):
         InputError, match="solution 2 has an exposure that solution 1 has too: give every exposure once"
     ):
         ld.combine_nights([three[0], three[0]])
+    table = three[0].residuals["exposure", "star", "x", "y", "x_err", "y_err"]
+    part = ld.Matches.from_table(table[np.asarray(table["star"]).astype(int) % 4 > 0], shape=SHAPE)
+    with pytest.raises(InputError, match="solution 2 has an exposure that solution 1 has too"):
+        ld.combine_nights([three[0], ld.solve(part)])  # other stars of it, matched by themselves
     bent = static(1) * (ORDERS < 3)
     lower = ld.solve(ld.Matches.from_table(night(5, bent, n_stars=60, exposures=4), shape=SHAPE), degree=2)
     with pytest.raises(InputError, match=r"several degrees, 2 \(solution 2\), 3 \(solution 1\): solve all with one"):
