@@ -17,7 +17,7 @@ _SHARED, _BORROWED = 10.0, 0.3
 TAILS, CHANCE = 4.0, 3.0
 #: Nights scatter if the squares of their means exceed what is expected of independent exposures by so many standard
 #: deviations.
-SEEN = 2.0
+SEEN = 2.5
 
 #: A static distortion is at most so many times what is seen: one far beyond, undone by a bend of the plane that nearly
 #: equal dithers hardly tell from none, would explain whatever two nights differ by.
