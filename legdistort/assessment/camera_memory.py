@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property, partial
@@ -16,6 +15,7 @@ from astropy import units as u
 from astropy.table import QTable
 from scipy import special
 
+from ..cameras import storage as camera_files
 from ..cameras.camera import Camera
 from ..cameras.detector import Detector
 from ..exceptions import InputError, some_of
@@ -316,10 +316,10 @@ class CombinedNights(ShownAsPrinted):
     @plain_numbers
     def write(self, path: StrPath, *, date: float | Time | None = None, overwrite: bool = False) -> Path:
         """Write a camera file (`Camera.read`, ``--prior``, ``--camera``), with the nights; returns the path."""
-        camera = {"layout": 1, "provenance": provenance.stamp()} | codec.to_tree(self.camera(date))
         own = {"layout": LAYOUT, "provenance": provenance.stamp()} | codec.to_tree(self)
         with replacing(path, overwrite=overwrite) as file:
-            asdf.AsdfFile({"legdistort_camera": camera, ROOT: own}, version=asdf_files.ASDF_STANDARD).write_to(file)
+            whole = camera_files.tree_of(self.camera(date)) | {ROOT: own}
+            asdf.AsdfFile(whole, version=asdf_files.ASDF_STANDARD).write_to(file)
         return Path(path)
 
     @classmethod
@@ -442,12 +442,7 @@ def _opened(thing):
         return thing
     if not isinstance(thing, (str, Path)):
         raise InputError(f"nights are solutions, folders with one, or earlier combinations, got {type(thing).__name__}")
-    path = Path(thing)
-    if path.is_file():
-        with path.open("rb") as file:
-            if re.search(rb"^" + ROOT.encode() + rb":", file.read(1 << 20), re.MULTILINE):
-                return CombinedNights.read(path)
-    return path
+    return Path(thing) if asdf_files.entry_of(thing, [ROOT]) is None else CombinedNights.read(thing)
 
 
 def _made(item):

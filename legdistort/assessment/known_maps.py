@@ -1,6 +1,5 @@
 """What is known of the static distortions of detectors, from a map, a camera or a night, with its covariance."""
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from ..geometry.similarity import apply, invert
 from ..matching.matches import Matches
 from ..priors.prior import Prior
 from ..results.solution import Solution
+from ..runtime.asdf_files import entry_of
 from ..solving import single_fit
 from ..solving.equations.reduced_system import DIRECT_LIMIT
 from ..solving.gauge.constraints import absorb_similarities
@@ -98,16 +98,9 @@ def _read(where, degree):
         path = Path(where)
         if path.is_dir():
             return Solution.read(path)
-        if path.is_file():
-            with path.open("rb") as file:
-                start = file.read(1 << 20)  # the arrays come later
-            for entry, kind in (
-                (b"legdistort_camera", Camera),
-                (b"legdistort", Solution),
-                (b"legdistort_prior", Prior),
-            ):
-                if start.startswith(b"#ASDF") and re.search(rb"^" + entry + rb":", start, re.MULTILINE):
-                    return kind.read(path)
+        kinds = {"legdistort_camera": Camera, "legdistort": Solution, "legdistort_prior": Prior}
+        if (entry := entry_of(path, kinds)) is not None:
+            return kinds[entry].read(path)
     return Prior.from_file(where, degree=degree)
 
 

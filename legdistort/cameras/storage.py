@@ -21,11 +21,15 @@ def from_tree(tree, kind, where=ROOT):
     return codec.from_tree(kind, tree, where, strict=False)
 
 
+def tree_of(camera):
+    """A `Camera` as the tree of a file."""
+    return {ROOT: {"layout": LAYOUT, "provenance": provenance.stamp()} | codec.to_tree(camera)}
+
+
 def write_camera(camera, path, *, overwrite=False):
     """Write a `Camera` to an ASDF file; returns the path."""
-    tree = {"layout": LAYOUT, "provenance": provenance.stamp()} | codec.to_tree(camera)
     with replacing(path, overwrite=overwrite) as file:
-        asdf.AsdfFile({ROOT: tree}, version=ASDF_STANDARD).write_to(file)
+        asdf.AsdfFile(tree_of(camera), version=ASDF_STANDARD).write_to(file)
     return path
 
 

@@ -1,6 +1,5 @@
 """Files that are given on the command line: tables, cameras, matched positions of one field or several."""
 
-import re
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import legdistort
 from ..exceptions import InputError, some_of
 from ..inputs import column_contract
 from ..inputs.table_files import read_table
+from ..runtime.asdf_files import entry_of
 from ..solving.checks.limits import ASKED
 
 
@@ -73,14 +73,8 @@ def known_file(path):
         "legdistort_camera": legdistort.Camera,
         "legdistort_prior": legdistort.Prior,
     }
-    if not Path(path).is_file():
-        return None
-    with open(path, "rb") as file:
-        start = file.read(1 << 20)  # the arrays come later
-    for entry, kind in kinds.items():
-        if start.startswith(b"#ASDF") and re.search(rf"^{entry}:".encode(), start, re.MULTILINE):
-            return kind.read(path)
-    return None
+    entry = entry_of(path, kinds)
+    return None if entry is None else kinds[entry].read(path)
 
 
 def _read(path, a):

@@ -1,7 +1,6 @@
 """Priors as ASDF files, and reading a prior of any kind."""
 
 import dataclasses
-import re
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from ..geometry.basis import check_degree
 from ..results.nights import found
 from ..results.solution import Solution
 from ..runtime import provenance
-from ..runtime.asdf_files import ASDF_STANDARD, check_layout, check_tree, read_tree, understood
+from ..runtime.asdf_files import ASDF_STANDARD, check_layout, check_tree, entry_of, read_tree, understood
 from ..runtime.outputs import replacing
 from ..runtime.trees.codec import from_tree, to_tree
 from .from_files import read_source
@@ -87,17 +86,11 @@ def _ready(where, kind):
     """The prior in a file of a prior, a solution or a camera, or a folder of results; None for anything else."""
     if isinstance(where, (str, Path)) and (Path(where) / "solution.asdf").is_file():
         where = Path(where) / "solution.asdf"
-    if not isinstance(where, (str, Path)) or not Path(where).is_file():
+    if not isinstance(where, (str, Path)):
         return None
-    with open(where, "rb") as file:
-        start = file.read(1 << 20)  # the arrays come later
-    if start.startswith(b"#ASDF") and re.search(rb"^legdistort_prior:", start, re.MULTILINE):
-        return read_prior(where, kind)
-    if start.startswith(b"#ASDF") and re.search(rb"^legdistort:", start, re.MULTILINE):
-        return _of_solution(where, kind)
-    if start.startswith(b"#ASDF") and re.search(rb"^legdistort_camera:", start, re.MULTILINE):
-        return _of_camera(where, kind)
-    return None
+    kinds = {"legdistort_prior": read_prior, "legdistort": _of_solution, "legdistort_camera": _of_camera}
+    entry = entry_of(where, kinds)
+    return None if entry is None else kinds[entry](where, kind)
 
 
 def _of_camera(path, kind):

@@ -335,3 +335,14 @@ def understood(path, function, tree):
         raise InputError(f"{path} is damaged: {error}") from None
     except Exception as error:  # there is no end to what can be wrong in a file
         raise InputError(f"{path} is damaged: {type(error).__name__} {error}") from None
+
+
+def entry_of(path, entries):
+    """The first of some entries that stands at the top of an ASDF file; None if there is no such file, or none."""
+    if not Path(path).is_file():
+        return None
+    with open(path, "rb") as file:
+        start = file.read(1 << 20)  # the arrays come later
+    if not start.startswith(b"#ASDF"):
+        return None
+    return next((each for each in entries if re.search(rf"^{each}:".encode(), start, re.MULTILINE)), None)
