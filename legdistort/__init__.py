@@ -36,6 +36,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_PLACES` states the s
     from .simulation.observations import simulate_matches as simulate_matches
     from .simulation.prediction import predict as predict
     from .solving.estimation import solve as solve
+    from .solving.terms.term import Term as Term
     from .wcs.refinement import refine as refine
     from .wcs.storage import read_wcs as read_wcs
 
@@ -56,6 +57,7 @@ _PLACES = {
     "Mosaic": "coaddition.mosaic",
     "Prior": "priors.prior",
     "Solution": "results.solution",
+    "Term": "solving.terms.term",
     "calibrate_noise": "measurement.noise_calibration",
     "catalogue": "photometry.catalogue",
     "coadd": "coaddition.mosaicking",

@@ -308,6 +308,12 @@ SOLVING = Group(
         ),
         "epoch": Option("of the exposures, for proper motions (default: header)", type=float, metavar="YEAR"),
         "pixel_scale": Option("helps to find the stars without a header WCS", type=float, metavar="ARCSEC"),
+        "terms": Option(
+            "what displaces stars beside the distortion: refraction (column colour), pixel_phase",
+            "--term",
+            action="append",
+            choices=words.TERMS,
+        ),
     },
 )
 COADDING = Group(

@@ -72,6 +72,9 @@ STARS = {
     "dec_error_abs": ("stat.error;pos.eq.dec", "the same with the common map, apart from the pointing"),
 }
 
+#: Names that a column of colours of stars may have.
+COLOURS = "colour", "color", "bp_rp", "colour_index"
+
 #: The same where the motions of stars were fitted.
 MOTIONS = {
     "vx": ("pos.cartesian.x;pos.pm", "proper motion along x of the reference plane"),
@@ -123,6 +126,14 @@ def describe_stars(table):
             ucd, table[name].info.description = known[name]
             table[name].info.meta = {"ucd": ucd}
     return table
+
+
+def colour_column(table):
+    """Name of the column of a table that holds colours of stars; None without one."""
+    for name in COLOURS:
+        if name in table.colnames and np.issubdtype(table[name].dtype, np.number):
+            return name
+    return None
 
 
 def values(table, column, unit=None):

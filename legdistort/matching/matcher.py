@@ -15,7 +15,9 @@ from ..cameras.exchanged import check_places
 from ..cameras.focal_planes import focal_planes
 from ..exceptions import AssumptionWarning, InputError, MatchError, reasons_of, some_of, warn
 from ..geometry.epochs import header_epoch, mean_epoch
+from ..geometry.zenith import stated_zenith
 from ..inputs import column_contract, repetitions
+from ..inputs.column_contract import colour_column
 from ..inputs.exposure_files import ExposureFile, listed
 from ..inputs.exposure_names import whole_name
 from ..inputs.exposures import Exposure
@@ -277,11 +279,21 @@ def _check_measured(detections):
 
 
 def _add_epochs(table, named):
-    """Add the column ``epoch`` [yr] if headers state it and the table does not; NaN where one does not."""
+    """Add the column ``epoch`` [yr] if headers state it and the table does not; NaN where one does not.
+
+    Of stars with colours also ``tan_z`` and ``parallactic_angle`` [deg], as refraction needs them.
+    """
     epochs = {name: header_epoch(exposure.header) for name, exposure in named.items()}
     if any(epoch is not None for epoch in epochs.values()) and "epoch" not in table.colnames:
         years = {name: np.nan if epoch is None else epoch for name, epoch in epochs.items()}
         table["epoch"] = [years.get(name, np.nan) for name in table["exposure"]] * u.yr
+    if colour_column(table) is None:
+        return
+    zenith = {name: stated_zenith(exposure.header) for name, exposure in named.items()}
+    for k, column in enumerate(("tan_z", "parallactic_angle")):
+        values = [zenith.get(name, (np.nan, np.nan))[k] for name in table["exposure"]]
+        if column not in table.colnames and np.isfinite(values).any():
+            table[column] = values * (u.deg if k else u.one)
 
 
 def _without_flagged(table, reject_flags):

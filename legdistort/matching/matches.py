@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
     from ..runtime.annotations import Shape
 
+#: Columns of a table that solve gives it: what terms were found to displace positions by, which is taken off these.
+DISPLACED = "x_terms", "y_terms"
 #: Positions belong on their detector, give or take this part of its size: distortions move stars over its edge.
 MARGIN = 0.1
 #: Where more than this part of the positions of an exposure does not, its shape is taken for wrong.
@@ -61,7 +63,7 @@ class Observations:
     exposure, star : ndarray of int, shape (n,)
         Indices into `names` and `stars`.
     xy : ndarray, shape (n, 2)
-        Pixels.
+        Pixels; what terms displace them by (`DISPLACED`) is taken off.
     covariance : ndarray, shape (n, 3)
         ``var_x, var_y, cov_xy`` [pix^2].
     """
@@ -137,6 +139,9 @@ class Observations:
         x_err, y_err = table["x_err"].to_value(u.pix), table["y_err"].to_value(u.pix)
         xy, covariance = np.empty((2, len(table))), np.zeros((3, len(table)))  # columns that lie in one piece
         xy[0], xy[1] = table["x"].to_value(u.pix), table["y"].to_value(u.pix)
+        for column, name in zip(xy, DISPLACED, strict=True):
+            if name in table.colnames:
+                column -= table[name].to_value(u.pix)
         np.square(x_err, out=covariance[0])
         np.square(y_err, out=covariance[1])
         if "xy_corr" in table.colnames:

@@ -302,6 +302,54 @@ def _readable(length, longest, unit):
 
 
 @dataclass(frozen=True)
+class FittedTerm:
+    """What was found of a term (`legdistort.Term`): numbers beside those of stars, poses and distortions.
+
+    Attributes
+    ----------
+    name, unit : str
+        Of the term, and of its numbers.
+    owner : {"set", "exposure", "detector"}
+    size : float
+        Scatter of the numbers about zero, found or as it was given; 0: the positions do not show the term.
+    gain : float
+        By which twice the logarithm of the likelihood is larger with it.
+    found : bool
+        Whether the size was found.
+    rms : float
+        Of the displacements, pixels per axis.
+    owners, numbers : tuple of str
+        Exposure or detector, and name, of every number.
+    values, errors : tuple of float
+        The errors as stated errors of positions have them, `Diagnostics.error_scale` not in them.
+    """
+
+    name: str
+    unit: str
+    owner: str = field(metadata=text("set", "exposure", "detector"))
+    size: float = field(metadata=_SCALE)
+    gain: float
+    found: bool
+    rms: float = field(metadata=_PIXELS)
+    owners: tuple[str, ...]
+    numbers: tuple[str, ...]
+    values: tuple[float, ...]
+    errors: tuple[float, ...] = field(metadata=_SCALE)
+
+    def __str__(self) -> str:
+        seen = f"twice the gain in log-likelihood {self.gain:.3g}"
+        if not self.size:
+            return f"{self.name}: the positions do not show it, it is left away"
+        n = len(self.values)
+        if n == 1:
+            what = f"{self.values[0]:.4g} +- {self.errors[0]:.2g} {self.unit} {self.numbers[0]}"
+        else:
+            each = {"set": "", "exposure": ", of every exposure its own", "detector": ", of every detector its own"}
+            what = f"{n} numbers{each[self.owner] if len(set(self.owners)) > 1 else ''}, {self.size:.2g} {self.unit}"
+        return f"{self.name}: {what}; it displaces positions by {self.rms:.2g} px rms per axis ({seen})"
+
+
+@dataclass(frozen=True)
 class Diagnostics:
     """What `solve` found out; None for what was not asked for.
 
@@ -337,6 +385,8 @@ class Diagnostics:
         fit; it is part of every distortion. None: nothing was found.
     pointing : HeaderPointing or None
         How well the headers tell where the plane lies on the sky, where they do.
+    terms : tuple of FittedTerm
+        Those that were asked for; what they displace positions by is taken off these.
     """
 
     error_floor: float = field(default=0.0, metadata=_PIXELS)
@@ -355,6 +405,7 @@ class Diagnostics:
     motion_scatter: MotionScatter | None = None
     higher_static: float | None = field(default=None, metadata=_PIXELS)
     pointing: HeaderPointing | None = None
+    terms: tuple[FittedTerm, ...] = ()
 
     def found_errors(
         self,
@@ -402,12 +453,13 @@ class Diagnostics:
         return self.found_errors(column_contract.covariance(table), flux=flux, exposure=table["exposure"], axes=axes)
 
     def in_words(self) -> dict[str, str]:
-        """Sentences on errors found, the widths of a prior, the degree chosen, and the stars that were kept out.
+        """Sentences on errors found, widths of a prior, the degree chosen, terms, and the stars that were kept out.
 
         Returns
         -------
         dict
-            ``{"errors" | "widths" | "modes" | "higher" | "degree" | "motion" | "kept": sentence}``, those that apply.
+            ``{"errors" | "widths" | "modes" | "higher" | "degree" | "motion" | "terms" | "kept": sentence}``, those
+            that apply.
         """
         found = self.error_law or self.correlated
         words = {} if found is None else {"errors": str(found)}
@@ -433,6 +485,8 @@ class Diagnostics:
             words["degree"] = self.selection.sentence
         if self.motion_scatter is not None:
             words["motion"] = str(self.motion_scatter)
+        if self.terms:
+            words["terms"] = "; ".join(map(str, self.terms))
         if self.validation is not None:
             words["kept"] = str(self.validation)
         return words
@@ -440,8 +494,8 @@ class Diagnostics:
     def summary(self) -> dict[str, Any]:
         """What there is of it as plain numbers and strings by name, for summaries."""
         names = "widths", "effective_modes", "departure_ratio", "selection", "validation", "error_law", "correlated"
-        names += ("motion_scatter", "higher_static")
-        return {name: found for name, found in asdict(self).items() if name in names and found is not None}
+        names += ("motion_scatter", "higher_static", "terms")
+        return {name: found for name, found in asdict(self).items() if name in names and found not in (None, ())}
 
 
 def _by_law(covariance, law, flux, exposure):

@@ -75,6 +75,18 @@ def higher_static(solution):
     return out
 
 
+def terms(solution):
+    """See `Solution.terms`."""
+    found, scale = solution.diagnostics.terms, solution.diagnostics.error_scale
+    rows = [
+        (each.name, owner, number, value, scale * error, each.unit, each.size, each.gain)
+        for each in found
+        for owner, number, value, error in zip(each.owners, each.numbers, each.values, each.errors, strict=True)
+    ]
+    names = ("term", "owner", "number", "value", "error", "unit", "size", "gain")
+    return QTable(rows=rows or None, names=names, dtype=[str] * 3 + [float] * 2 + [str] + [float] * 2)
+
+
 def stars_at(solution, time):
     """`Solution.stars_at`; see there."""
     estimate, sky, at = solution.estimate, solution.sky, year(time)

@@ -42,6 +42,8 @@ class Settings:
         What was stated of the errors of the layout: ``shift`` [px], ``rotation`` [deg], ``scale``.
     pose_sigma : dict or None
         Errors of the poses that were known: ``shift`` [px], ``rotation`` [deg], ``scale``.
+    terms : tuple of str
+        Names of the terms.
     max_iterations : int or None
     """
 
@@ -64,5 +66,6 @@ class Settings:
     night_sigma: float | None = field(default=None, metadata=_PIXELS)
     layout_sigma: dict[str, float] | None = None
     pose_sigma: dict[str, float] | None = None
+    terms: tuple[str, ...] = ()
     max_iterations: int | None = field(default=None, metadata=number(minimum=0))
     validate: float | None = field(default=None, metadata=number(minimum=0, maximum=1))

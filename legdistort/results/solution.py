@@ -54,7 +54,7 @@ class Solution(ShownAsPrinted):
         higher degree than the fit, its remaining modes follow unchanged.
     residuals : `~astropy.table.QTable`
         The matched table that was solved, one row an observation, with ``dx``, ``dy`` [pix], measured minus predicted
-        detector position, and ``used`` added.
+        detector position, and ``used`` added. With terms ``x_terms``, ``y_terms`` [pix] are what they displace it by.
     chi2 : float
         Weighted sum of squares of the used residuals.
     dof : float
@@ -194,6 +194,17 @@ class Solution(ShownAsPrinted):
         distortion of every exposure (`coefficients`), so of its WCS.
         """
         return in_tables.higher_static(self)
+
+    @cached_property
+    def terms(self) -> QTable:
+        """One row for every number of the terms that were fitted (``terms=`` of `legdistort.solve`).
+
+        ``term``, ``owner`` (the exposure or detector, if each has its own), ``number``, ``value``, ``error`` and
+        ``unit`` (they differ); ``size``, the scatter of the numbers of the term about zero, 0 where the positions do
+        not show it, and ``gain``, twice that in the logarithm of the likelihood. What they displace positions by is in
+        ``x_terms``, ``y_terms`` of `residuals`.
+        """
+        return in_tables.terms(self)
 
     # -- stars
 

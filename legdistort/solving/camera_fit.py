@@ -21,7 +21,7 @@ from ..results.errors.camera_errors import CameraErrors, Departure, moved_by, un
 from ..results.new_positions import widened_all
 from ..runtime.checks import check_choice
 from ..runtime.words import CAMERA
-from .equations.common_parts import followed
+from .equations.common_parts import followed, response
 
 #: Part of what the data would determine of a direction alone below which it is not determined beside all else: what
 #: detectors and exposures can exchange is so to first order, and by the gradient of one times the other beyond.
@@ -367,7 +367,7 @@ def camera_step(fit, sought, departure):
     """
     free, prior = sought.free, sought.prior
     patterns = _patterns(fit.matches, fit.matches.camera, fit.weighted, free)
-    follow = followed(_response(fit.uncertainty.system, fit.result.gauge), fit.weighted, fit.blocks, patterns)
+    follow = followed(response(fit.uncertainty.system, fit.result.gauge), fit.weighted, fit.blocks, patterns)
     precision = 1 / prior[free] ** 2
     pull = follow.pull - precision * departure[free]
     covariance, weak = _inverse(follow.normal, precision, follow.alone)
@@ -377,22 +377,6 @@ def camera_step(fit, sought, departure):
     covariance = held @ covariance @ held.T
     freedom = float(np.sum(covariance * follow.normal))
     return CameraStep(change, covariance, free, follow.stars, follow.coefficients, freedom, weak)
-
-
-def _response(system, gauge):
-    """``settle`` of a reduced system, with the plane that follows too where J determines it."""
-    if not gauge.poses_known:
-        return system.settle
-    moves = system.moves[: gauge.n_constraints]
-    stars, coefficients = (np.stack([of(d) for d in moves]) for of in (system.follow, system.unknowns.spread))
-    covariance = gauge.reach @ gauge.covariance @ gauge.reach.T
-
-    def respond(own, pulls):
-        held = system.settle(own, pulls)
-        values = covariance @ (np.einsum("vkn,kn->v", stars, pulls) + np.einsum("via,ia->v", coefficients, own))
-        return tuple(a + np.tensordot(values, b, 1) for a, b in zip(held, (stars, coefficients), strict=True))
-
-    return respond
 
 
 def _patterns(matches, camera, problem, free):

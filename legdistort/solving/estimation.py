@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -34,6 +34,8 @@ from .options import CLIP, DEGREE, SolveOptions, Unasked, check_detectors, check
 from .residual_errors.by_brightness import estimate_by_brightness
 from .residual_errors.correlated import estimate_with_correlations
 from .single_detectors import by_detector
+from .terms.fitting import fit_with
+from .terms.term import terms_of
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 
     from ..results.solution import Solution
     from ..runtime.annotations import StrPath
+    from .terms.term import Term
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +81,7 @@ def solve(
     reference_degree: int | None = None,
     epoch: float | Time | None = None,
     pixel_scale: float | None = None,
+    terms: str | Term | Iterable[str | Term] = (),
     progress: bool = False,
 ) -> Solution:
     """Estimate all star positions and all distortions at once.
@@ -189,6 +193,10 @@ def solve(
         Of the exposures (a decimal year), to which proper motions carry the reference; by default from their headers.
     pixel_scale : float, optional
         Arcsec, approximate; helps to find the stars where no header has a WCS on the sky.
+    terms : str, Term, or a list of them, optional
+        What displaces stars beside the distortion, found with everything else and left away where the positions do not
+        show it: "refraction" by the colours of stars, "pixel_phase", or a `legdistort.Term` of one's own. In
+        `Solution.terms`.
     progress : bool
         Show a progress bar of the iterations where they take more than a second.
 
@@ -231,6 +239,7 @@ def solve(
         gauge=gauge, method=method, loss=loss, clip=clip, error_floor=error_floor, errors=errors,
         max_iterations=max_iterations, validate=validate, motion=motion, motion_sigma=motion_sigma,
         motion_epoch=motion_epoch, night_sigma=night_sigma, pose_sigma=matches.pose_sigma,
+        terms=terms_of(terms, matches.table),
     )  # fmt: skip
     tying = {"error": reference_error, "degree": reference_degree, "epoch": epoch, "pixel_scale": pixel_scale}
     catalogue, epoch = check_tie(matches, asked, reference, **tying)
@@ -244,10 +253,10 @@ def solve(
     given, kept_out = (matches, None) if validate is None else hold_out(matches, validate)
     with single_fit.threads(given), minimisers.iterations_shown(progress):
         join = reference_tie.joined_by(catalogue, epoch=epoch, pixel_scale=pixel_scale)
-        fit, options, chosen = _fitted(given, options, sought, join)
+        fit, found, (options, chosen) = fit_with(asked.terms, _fitted, given, options, sought, join)
         _tell(fit, given)
         scale = float(np.sqrt(fit.chi2 / fit.dof)) if errors == "scale" and fit.dof > 0 else 1.0
-        diagnostics = replace(_diagnostics(fit, prior, scale), pointing=given.pointing, **chosen)
+        diagnostics = replace(_diagnostics(fit, prior, scale), pointing=given.pointing, terms=found, **chosen)
         how = {"scale": scale, "epoch": epoch, "pixel_scale": pixel_scale}
         fit = _placed(fit, sought, given) if catalogue is None else reference_tie.tie_to(fit, catalogue, **how)
     epoch = given.epoch if epoch is None else epoch
@@ -544,6 +553,7 @@ def _settings(asked, options, form):
     made = {field.name: getattr(asked, field.name) for field in fields(Settings)}
     made |= {"degree": int(options.degree), "exposure_degree": options.own_degree}
     made |= {name: getattr(options, name) for name in ("motion", "motion_sigma")}
+    made["terms"] = tuple(term.name for term in asked.terms)
     for name in ("clip", "error_floor", "validate", "motion_sigma", "night_sigma"):
         made[name] = None if made[name] is None else float(made[name])
     prior = asked.prior

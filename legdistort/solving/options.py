@@ -75,6 +75,8 @@ class SolveOptions(Settings):
             raise InputError(f"max_iterations must be a positive integer, got {self.max_iterations!r}")
         self._check_motion()
         self._check_nights()
+        if self.terms and self.validate is not None:
+            raise InputError("terms do not go with validate, for which stars kept out have none: leave one of them out")
         if self.clip is not None and not (isinstance(self.clip, Real) and 1 < self.clip < LARGEST):
             raise InputError(
                 f"clip must be a number of standard errors above 1, got {self.clip!r}; clip=None (--clip 0) keeps all"

@@ -1,6 +1,6 @@
 """What the errors of what exposures have in common do to stars, coefficients and new positions.
 
-That is a camera that was fitted, or the static distortion beyond the degree.
+That is a camera that was fitted, the static distortion beyond the degree, or the numbers of terms.
 
 Layouts and statics have a covariance of their own, and stars and coefficients follow them. All of it is written as the
 responses to independent errors of unit size: covariances are sums over these, and what two things have in common is in
@@ -78,6 +78,20 @@ class CameraErrors:
     departure: Departure | None = None
     owner: np.ndarray | None = field(default=None, metadata=array("n_exposures", holds="integers"))
 
+    @classmethod
+    def nothing(cls, n_parts: int, n_exposures: int, n_stars: int, size: int) -> CameraErrors:
+        """Those of what has no errors: of some parts, exposures with `size` coefficients, and stars."""
+        free = np.zeros((n_parts, 2, 1), dtype=bool)
+        return cls(free, np.zeros((0, 0)), np.zeros((n_stars, 2, 0)), np.zeros((n_exposures, size, 0)))
+
+    def beside(self, stars: np.ndarray, coefficients: np.ndarray) -> CameraErrors:
+        """With other independent errors of unit size, to which stars (n_stars, 2, r) and coefficients respond."""
+        changes = np.pad(self.changes, ((0, 0), (0, stars.shape[2])))
+        stars = np.concatenate([self.stars, stars], axis=2)
+        return replace(
+            self, changes=changes, stars=stars, coefficients=np.concatenate([self.coefficients, coefficients], axis=2)
+        )
+
     def scaled(self, factor: float) -> CameraErrors:
         """The same with all errors times a factor."""
         names = "changes", "stars", "coefficients"
@@ -107,6 +121,8 @@ class CameraErrors:
         In the focal plane, where there is one, on the detector of the view or else on that on which each falls; zero
         off all detectors.
         """
+        if not len(self.changes):
+            return np.zeros((len(q), 2, self.changes.shape[1]))
         changes = np.zeros((*self.free.shape, self.changes.shape[1]))
         changes[self.free] = self.changes
         if self.owner is not None:

@@ -44,7 +44,7 @@ def with_cures(checks, solution, residuals, observed, judged):
         ``{name: Check}`` of the residuals.
     solution : Solution
     residuals : Residuals
-    observed : `legdistort.solving.checks.known_effects.Observed`
+    observed : `legdistort.solving.terms.observed.Observed`
     judged : callable
         ``judged(residuals)`` makes these checks of other residuals.
 

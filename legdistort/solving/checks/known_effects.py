@@ -7,13 +7,13 @@ fitted again (`Residuals.of_columns`).
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 
 from ...geometry import basis
 from ...results.check import CERTAIN
+from ..terms.displacements import pixel_waves
 from .residual_tests import in_cells, part_of_chi2
 
 #: Effects that are named at most, and part of what chi2 is too large by that one must explain.
@@ -24,99 +24,12 @@ _MOVING = 1000  # columns of motions
 _EDGES = 32  # parts of the detector at whose edges a step is looked for
 _BEYOND = 4  # degrees of a pattern beyond that of the fit
 _FEWEST_LEFT = 10  # degrees of freedom beside an effect that tell whether it is one
-_TURNED = 0.1  # rad: less is no turned camera
-_COLOURS = "colour", "color", "bp_rp", "colour_index"
 
 
-@dataclass(frozen=True, eq=False)
-class Observed:
-    """Observations as effects need them, in the order of the problem.
-
-    Attributes
-    ----------
-    problem : Problem
-    state : State
-    table : `~astropy.table.QTable`
-        The rows behind the observations.
-    times : ndarray, shape (n_exposures,)
-        Of the exposures, or their order.
-    """
-
-    problem: object
-    state: object
-    table: object
-    times: np.ndarray
-
-    @cached_property
-    def exposure(self):
-        """Exposure of every observation, (n,)."""
-        return self.problem.exposure
-
-    @cached_property
-    def pixels(self):
-        """Positions on the detectors, pixels, (2, n)."""
-        names = ("x_detector", "y_detector") if "x_detector" in self.table.colnames else ("x", "y")
-        return np.stack([np.asarray(self.table[name].value, dtype=float) for name in names])
-
-    @cached_property
-    def size(self):
-        """Width and height of the detectors, pixels, (2, n)."""
-        if "x_detector" in self.table.colnames:
-            return np.ceil(self.pixels.max(axis=1, keepdims=True) + 1) * np.ones_like(self.pixels)
-        return self.problem.size[self.exposure].T
-
-    @cached_property
-    def place(self):
-        """Positions on the detectors from -1 to 1, (2, n)."""
-        return np.clip((2 * self.pixels + 1) / self.size - 1, -1, 1)
-
-    @cached_property
-    def linear(self):
-        """Linear parts of the poses without their scale, (n_exposures, 2, 2)."""
-        linear = self.state.poses[:, :, :2]
-        return linear / np.sqrt(np.abs(np.linalg.det(linear)))[:, None, None]
-
-    @property
-    def is_turned(self):
-        """Whether the camera is turned between exposures."""
-        return bool(np.any(np.abs(self.linear - self.linear[0]) > _TURNED))
-
-    @cached_property
-    def detector(self):
-        """Number of the detector of every observation, from 0, where a camera has several; else None."""
-        if "x_detector" not in self.table.colnames:
-            return None
-        found, number = np.unique(np.asarray(self.table["detector"]), return_inverse=True)
-        return number if len(found) > 1 else None
-
-    @cached_property
-    def faintness(self):
-        """Magnitudes about their mean over their scatter, (n,), of fluxes or else of the errors; None if all alike."""
-        if "flux" in self.table.colnames:
-            flux = np.asarray(self.table["flux"], dtype=float)
-            return _standard(-np.log(np.where(flux > 0, flux, np.nan)))
-        return _standard(np.log(np.hypot(self.table["x_err"].value, self.table["y_err"].value)))
-
-    @cached_property
-    def colour(self):
-        """Colours of the stars about their mean over their scatter, (n,); None if the table has none."""
-        for name in _COLOURS:
-            if name in self.table.colnames and np.issubdtype(self.table[name].dtype, np.number):
-                return _standard(np.asarray(getattr(self.table[name], "value", self.table[name]), dtype=float))
-        return None
-
-    def by_exposure(self, n_each):
-        """Labels (n,) of the exposures for columns of which every one needs so many: together if they are too many."""
-        n, most = self.problem.n_exposures, min(_COLUMNS, _VALUES // (2 * len(self.exposure)))
-        return self.exposure * min(n, max(most // n_each, 2)) // n
-
-
-def _standard(values):
-    """Values about their mean in units of their scatter, 0 where there is none; None if they do not differ."""
-    known = np.isfinite(values)
-    if np.count_nonzero(known) < 2 or np.ptp(values[known]) < 1e-6:
-        return None
-    return np.where(known, (values - values[known].mean()) / values[known].std(), 0.0)
+def _by_exposure(observed, n_each):
+    """Labels (n,) of the exposures for columns of which every one needs so many: together if they are too many."""
+    n, most = observed.problem.n_exposures, min(_COLUMNS, _VALUES // (2 * len(observed.exposure)))
+    return observed.exposure * min(n, max(most // n_each, 2)) // n
 
 
 def _along_a_direction(observed, size):
@@ -124,7 +37,7 @@ def _along_a_direction(observed, size):
     if size is None:
         return None
     directions = observed.linear[observed.exposure].transpose(2, 1, 0)  # of the plane, on the detector
-    return in_cells(observed.by_exposure(2), directions * size)
+    return in_cells(_by_exposure(observed, 2), directions * size)
 
 
 def _by_colour(observed):
@@ -136,10 +49,7 @@ def _by_brightness(observed):
 
 
 def _by_pixel_phase(observed):
-    """First two waves of the fraction of a pixel, along the same axis."""
-    phase = 2 * np.pi * (observed.pixels + 0.5)
-    waves = np.stack([f(k * phase) for k in (1, 2) for f in (np.sin, np.cos)])
-    return _all_alike(waves[:, None] * np.eye(2)[None, :, :, None])
+    return _all_alike(pixel_waves(observed))
 
 
 def _by_charge_trails(observed):
@@ -216,7 +126,7 @@ def _by_detector_departures(observed):
     if observed.detector is None:
         return None
     n = observed.detector.max() + 1
-    return in_cells(observed.by_exposure(4 * n) * n + observed.detector, _similarity(observed.place))
+    return in_cells(_by_exposure(observed, 4 * n) * n + observed.detector, _similarity(observed.place))
 
 
 def _by_motions(observed):
@@ -277,7 +187,7 @@ EFFECTS = (
            "correct the positions for differential refraction, or solve stars of like brightness"),
     Effect("pixel phase", _by_pixel_phase,
            "positions depend on the fraction of a pixel on which a star falls (pixel phase)",
-           "measure with --psf effective, or correct the positions for it"),
+           "--term pixel_phase (terms=['pixel_phase']) finds and removes it; or measure with --psf effective"),
     Effect("charge trails", _by_charge_trails,
            "fainter stars are displaced more, the further they are from an edge of the detector (charge trails)",
            "correct the frames for charge transfer, or leave faint stars out"),

@@ -16,10 +16,10 @@ from ...exceptions import reasons_of, some_of
 from ...geometry.star_hull import enclosed_area
 from ...results.check import CERTAIN, FALSE_ALARM, WRONG, Check, state_of
 from ...results.errors.header_pointing import CURE as POINTING_CURE
+from ..terms.observed import Observed
 from .camera_check import camera_check, contradicted_layout, undetermined
 from .cures import with_cures, without_static
 from .dynamic_check import dynamic_check, significance
-from .known_effects import Observed
 from .limits import ALIKE, ASKED, GROSS_ERRORS, MOST_NAMED, NEGLIGIBLE, SEEN, addition_that_shows, of_chi2
 from .prior_check import prior_check
 from .reference_check import reference_check
@@ -69,7 +69,7 @@ def check_solution(solution, *, problem, state, blocks, uncertainty, times, head
     residuals = Residuals(problem, state, blocks, uncertainty.system, solution.dof + of_map)
     judged = partial(_by_residuals, solution, times=times)
     made, explained = judged(residuals), ()
-    observed = Observed(problem, state, solution.residuals[problem.order], times[0])
+    observed = Observed(problem, state, solution.residuals[problem.order], times[0], solution.sky, solution.camera)
     several = problem.n_exposures > 1  # errors are not found from one
     contradicted = None if observed.detector is None else contradicted_layout(solution, uncertainty.camera)
     if contradicted is None and several and residuals.dof >= 1 and any(c.state in WRONG for c in made.values()):

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...results.errors.common_maps import fitted, plain_maps
+from ...results.new_positions import widened_all
+
 
 @dataclass(frozen=True, eq=False)
 class Followed:
@@ -48,13 +51,41 @@ def followed(respond, problem, blocks, patterns):
     stars = np.empty((2, problem.n_stars, k))
     coefficients = np.empty((*blocks.g_exposure.shape, k))
     gradients = [_gradient(problem, blocks, patterns[:, :, j], moved[:, :, j]) for j in range(k)]
-    for j, (own, of_stars) in enumerate(gradients):
-        star_response, response = respond(own, of_stars)
+    whole = np.array([np.concatenate([each.ravel() for each in pair]) for pair in gradients]).reshape(k, -1)
+    for j, pair in enumerate(gradients):
+        star_response, response = respond(*pair)
         stars[:, :, j], coefficients[:, :, j] = star_response[:2], response
-        for m, (other_own, other_stars) in enumerate(gradients):
-            normal[m, j] -= np.sum(other_own * response) + np.sum(other_stars * star_response)
+        normal[:, j] -= whole @ np.concatenate([response.ravel(), star_response.ravel()])
     pull = -np.einsum("ank,an->k", moved, blocks.residual)
     return Followed(stars, coefficients, (normal + normal.T) / 2, alone, pull)
+
+
+def response(system, gauge):
+    """``settle`` of a reduced system, with the plane that follows too where J determines it."""
+    if not gauge.poses_known:
+        return system.settle
+    moves = system.moves[: gauge.n_constraints]
+    stars, coefficients = (np.stack([of(d) for d in moves]) for of in (system.follow, system.unknowns.spread))
+    covariance = gauge.reach @ gauge.covariance @ gauge.reach.T
+
+    def respond(own, pulls):
+        held = system.settle(own, pulls)
+        values = covariance @ (np.einsum("vkn,kn->v", stars, pulls) + np.einsum("via,ia->v", coefficients, own))
+        return tuple(a + np.tensordot(values, b, 1) for a, b in zip(held, (stars, coefficients), strict=True))
+
+    return respond
+
+
+def relative_responses(follow, changes, result, uncertainty, degree):
+    """Stars (n_stars, 2, r) and coefficients (n_exposures, 2 n_modes, r) that follow changes (k, r), as a `Followed`.
+
+    Relative to a common map of the plane, which is taken off the stars and given to the coefficients.
+    """
+    gauge, stars = result.gauge, (follow.stars @ changes).transpose(1, 0, 2)
+    maps = plain_maps(gauge, result.state.positions.T, gauge.n_modes)[:, :2]
+    common = fitted(maps, uncertainty.star_weights[:, :2, :2], stars)
+    coefficients = follow.coefficients @ changes + widened_all(gauge.motion, degree) @ common
+    return stars - maps @ common, coefficients
 
 
 def _weighted(problem, patterns):

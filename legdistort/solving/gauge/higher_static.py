@@ -8,10 +8,8 @@ errors of these terms, add up.
 import numpy as np
 
 from ...results.errors.camera_errors import CameraErrors, unit_errors
-from ...results.errors.common_maps import fitted, plain_maps
-from ...results.new_positions import widened_all
 from ..equations import criterion
-from ..equations.common_parts import followed
+from ..equations.common_parts import followed, relative_responses
 
 
 def higher_errors(problem, result, uncertainty, covariance):
@@ -27,21 +25,17 @@ def higher_errors(problem, result, uncertainty, covariance):
     covariance : ndarray, shape (n_detectors * k, n_detectors * k)
         Of the k terms of every detector, those along x first.
     """
-    n, owner, blocks, gauge = problem.n_modes, problem.detectors, result.blocks, result.gauge
+    n, owner = problem.n_modes, problem.detectors
     values = criterion.predict(problem, result.state)[1][n:]
     n_all = n + len(values)
     detector, axis, mode = np.unravel_index(np.arange(len(covariance)), (owner.max() + 1, 2, len(values)))
     patterns = np.zeros((2, values.shape[1], len(covariance)))
     of = np.where(owner[problem.exposure][:, None] == detector, -values[mode].T, 0.0)
     patterns[axis, :, np.arange(len(covariance))] = of.T
-    follow = followed(uncertainty.system.settle, problem, blocks, patterns)
+    follow = followed(uncertainty.system.settle, problem, result.blocks, patterns)
     changes = unit_errors(covariance)
     free = np.zeros((owner.max() + 1, 2, n_all), dtype=bool)
     free[:, :, n:] = True
-    stars = (follow.stars @ changes).transpose(1, 0, 2)
-    positions = result.state.positions.T
-    maps = plain_maps(gauge, positions, gauge.n_modes)[:, :2]
-    common = fitted(maps, uncertainty.star_weights[:, :2, :2], stars)
-    coefficients = follow.coefficients @ changes + widened_all(gauge.motion, problem.degree) @ common
-    errors = CameraErrors(free, changes, stars - maps @ common, coefficients, owner=owner)
+    moved = relative_responses(follow, changes, result, uncertainty, problem.degree)
+    errors = CameraErrors(free, changes, *moved, owner=owner)
     return errors, float(np.sum(covariance * follow.normal))
